@@ -58,7 +58,7 @@ def pi(p: Any, s: State, m: Any) -> float:
 
 def pi_from_gap(p: Any, s: State, m: Any) -> float:
     if not hasattr(m, "first"):
-        m.first = max((s.leader_gap - p.people_gap) / p.people_headway, 0.0)
+        m.first = max((s.leader_gap - p.people_gap) / p.human_time_headway, 0.0)
     average = mean(p, m, s.speed)
     left = clip(1.0 - (m.seen - 1) * (p.time_step / p.fading), 0.0, 1.0)
     return toward(average + left * (m.first - average), average, p, s, m)
@@ -93,7 +93,7 @@ def acc(p: Any, s: State, m: Any) -> float:
     excess = s.leader_gap - p.standstill_gap - p.time_gap * s.speed
     following = p.gap_gain * excess + p.speed_gain * (s.leader_speed - s.speed)
     if not hasattr(p, "lag"):
-        return min(following, p.free_gain * (p.set_speed - s.speed))
+        return min(following, p.set_speed_gain * (p.set_speed - s.speed))
     before = getattr(m, "acceleration", 0.0)
     m.acceleration = before + min(1.0, p.time_step / p.lag) * (following - before)
     return m.acceleration
@@ -107,11 +107,11 @@ def bcm(p: Any, s: State, m: Any) -> float:
 
 def ovm(p: Any, s: State, m: Any) -> float:
     share = clip((s.leader_gap - p.stop_gap) / (p.go_gap - p.stop_gap), 0.0, 1.0)
-    optimal = p.largest_speed / 2.0 * (1.0 - math.cos(math.pi * share))
+    optimal = p.max_speed / 2.0 * (1.0 - math.cos(math.pi * share))
     return p.gap_gain * (optimal - s.speed) + p.speed_gain * (s.leader_speed - s.speed)
 
 
-# What `varying` stands for, by the length of the lap [m]: harmonics, gain, wanted gap.
+# What `use_tuned` stands for, by the length of the lap [m]: harmonics, gain, wanted gap.
 TUNED = {
     422.2: ((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
     449.0: ((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
@@ -125,14 +125,14 @@ def pacer(p: Any, s: State, m: Any) -> float:
     loop, free = s.loop_length, s.leader_gap
     if p.varying:
         harmonics, gain, wanted = TUNED[min(TUNED, key=lambda lap: abs(loop - lap))]
-        tuned = {"harmonics": harmonics, "gain": gain, "wanted_gap": wanted}
+        tuned = {"harmonics": harmonics, "gain": gain, "target_gap": wanted}
         p = SimpleNamespace(**{**vars(p), **tuned, "gathering_gap": 0.5, "regathering_gap": 0.45})
     was = 0.0 if free < p.regathering_gap * loop else getattr(m, "features", (0.0,))[0]
     m.features = (float(free >= p.gathering_gap * loop or was > 0.0),)
     (pace, *rest), place = p.harmonics or (loop / p.lap_time,), 2.0 * math.pi * s.route_position / loop
     for number, (cosine, sine) in enumerate(zip(rest[::2], rest[1::2], strict=True), start=1):
         pace += cosine * math.cos(number * place) + sine * math.sin(number * place)
-    pace = max(pace + p.gain * (free - p.wanted_gap * loop), 1.0)
+    pace = max(pace + p.gain * (free - p.target_gap * loop), 1.0)
     return ((pace if m.features[0] else p.gathering_speed) - s.speed) / p.time_constant
 
 
@@ -140,11 +140,11 @@ def jam_absorber(p: Any, s: State, m: Any) -> float:
     place, gap, ahead = s.route_position, s.leader_gap, s.leader_speed
     jam = p.first_position < place < p.last_position and ahead < p.jam_speed and gap < 60.0
     waits = jam or getattr(m, "features", (0.0,))[0] > 0.0
-    gone = (gap >= p.room and ahead >= p.going_speed) or gap >= 99.0
+    gone = (gap >= p.room and ahead >= p.release_speed) or gap >= 99.0
     m.features = (float(waits and not gone and not place > p.last_position + 50.0),)
     excess = gap - p.standstill_gap - p.time_gap * s.speed
     follow = p.gap_gain * excess + p.speed_gain * (ahead - s.speed) + getattr(p, "push", 0.0)
-    return min(p.crawling_speed - s.speed, follow) if m.features[0] else follow
+    return min(p.crawl_speed - s.speed, follow) if m.features[0] else follow
 
 
 def cruise(p: Any, s: State, m: Any) -> float:
@@ -156,9 +156,9 @@ def jam_ahead(p: Any, s: State, m: Any) -> float:
     ahead = sum(told) / len(told) if told else math.inf
     jammed = ahead < getattr(p, "jam", 0.75) * s.allowed_speed
     jammed = jammed and max(s.congestion[p.first : p.last + 1], default=0.0) >= 0.5
-    if not told or not (jammed if math.isnan(s.to_merge) else s.to_merge > 0.0):
+    if not told or not (jammed if math.isnan(s.distance_to_merge) else s.distance_to_merge > 0.0):
         return cruise(p, s, m)
-    wanted = ahead + p.margin + p.margin_by_share * s.cav_share
+    wanted = ahead + p.margin + p.margin_by_penetration * s.penetration_rate
     cap = min(max(wanted, p.lowest), s.allowed_speed)
     return max((cap - s.speed) / p.time_constant, -p.slowing)
 
@@ -173,15 +173,12 @@ def adaptive_acc(p: Any, s: State, m: Any) -> float:
         leaves = 0.0
     m.features = m.mean / 10.0, leaves
     headway, acceleration, braking = (1.0, 1.0, 0.7) if change < -p.front else (1.0, 1.0, 1.0)
-    if -p.behind < s.to_merge < p.before:
+    if -p.behind < s.distance_to_merge < p.before:
         headway, acceleration, braking = 0.7, 1.5, 1.0
     if leaves:
         headway, acceleration, braking = 0.5, 2.0, 1.0
     fitting = SimpleNamespace(**vars(p))
-    fitting.time_headway, fitting.max_acceleration = (
-        p.time_headway * headway,
-        p.max_acceleration * acceleration,
-    )
+    fitting.time_headway, fitting.max_acceleration = (p.time_headway * headway, p.max_acceleration * acceleration)
     fitting.comfortable_deceleration = p.comfortable_deceleration * braking
     fitting.desired_speed = p.desired_speed if math.isnan(s.allowed_speed) else s.allowed_speed
     return idm(fitting, s._replace(leader_gap=s.leader_gap if s.leader_gap < 100.0 else 1e6), m)
@@ -215,9 +212,4 @@ def remember(m: SimpleNamespace, s: State, time_step: float) -> tuple[float, ...
 
 EXPERTS = {"idm": idm, "pi": pi, "follower-stopper": follower_stopper, "acc": acc, "lacc": acc, "bcm": bcm}
 EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant": constant}
-EXPERTS |= {
-    "cruise": cruise,
-    "jam-ahead": jam_ahead,
-    "pi-from-gap": pi_from_gap,
-    "adaptive-acc": adaptive_acc,
-}
+EXPERTS |= {"cruise": cruise, "jam-ahead": jam_ahead, "pi-from-gap": pi_from_gap, "adaptive-acc": adaptive_acc}

@@ -16,7 +16,7 @@ GAMMA = 0.99
 
 torch.manual_seed(0)
 torch.set_num_threads(1)
-environment = gymnasium.make("unjam/Ring-v0", expert="pi", steps_per_decision=10, horizon=300)
+environment = gymnasium.make("unjam/Ring-v0", expert="pi", steps_per_control_step=10, horizon=300)
 size = environment.observation_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
 policy = nn.Sequential(nn.Linear(size, 32), nn.Tanh(), nn.Linear(32, 1))
 value = nn.Sequential(nn.Linear(size, 32), nn.Tanh(), nn.Linear(32, 1))

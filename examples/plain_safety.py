@@ -13,7 +13,7 @@ def highest(f: SimpleNamespace, s: State, step: float) -> float:
     leader, room = max(s.leader_speed - f.speed_error, 0.0), s.leader_gap - f.gap_error - f.standstill_gap
     allowed = speed_to_stop_within(room + stopping(leader, f.leader_braking, step), f.braking, step)
     if f.time_headway:
-        c, later = f.headway_braking, max(leader - f.headway_braking * step, 0.0)
+        c, later = f.time_gap_braking, max(leader - f.time_gap_braking * step, 0.0)
         end = room + stopping(leader, c, step)
         near = (end - stopping(later, c, step)) / (f.time_headway + step)
         far = speed_to_stop_within(end - c * (f.time_headway + step / 2.0) ** 2 / 2.0, c, step)

@@ -68,15 +68,15 @@ class Driver:
             "expert_memory": getattr(self.memory, "features", ()),
             "loop_length": (s.loop_length / 250.0,),
             "allowed_speed": ((s.allowed_speed - s.speed) / 10.0,),
-            "approach": nearness(s.to_merge),
-            "to_merge": (clip(s.to_merge / 1000.0, -1.0, 2.0),),
+            "approach": nearness(s.distance_to_merge),
+            "distance_to_merge": (clip(s.distance_to_merge / 1000.0, -1.0, 2.0),),
             "lane_speeds": tuple((speed - s.speed) / 10.0 for speed in s.lane_speeds),
             "road_speeds": tuple((speed - s.speed) / 10.0 for speed in s.road_speeds),
             "beside": (
-                *((speed - s.speed) / 5.0 for speed in s.beside_speeds),
-                *(gap / 20.0 for gap in s.beside_gaps),
+                *((speed - s.speed) / 5.0 for speed in s.adjacent_speeds),
+                *(gap / 20.0 for gap in s.adjacent_gaps),
             ),
-            "cav_share": (s.cav_share,),
+            "penetration_rate": (s.penetration_rate,),
             "route_position": (s.route_position / 100.0,),
             "place": (math.cos(lap := 2.0 * math.pi * s.route_position / s.loop_length), math.sin(lap)),
         }
@@ -94,9 +94,7 @@ def arrays(part: bytes) -> dict[str, np.ndarray]:
     begin = 8 + int.from_bytes(part[:8], "little")
     found = {name: about for name, about in json.loads(part[8:begin]).items() if name != "__metadata__"}
     numbers = {name: part[begin:][slice(*about["data_offsets"])] for name, about in found.items()}
-    return {
-        name: np.frombuffer(numbers[name], "<f8").reshape(about["shape"]) for name, about in found.items()
-    }
+    return {name: np.frombuffer(numbers[name], "<f8").reshape(about["shape"]) for name, about in found.items()}
 
 
 class Controller:
@@ -115,7 +113,7 @@ class Controller:
         self.limit = max(-action["low"], action["high"])
 
     def act(self, *perceived: Any, **named: Any) -> float:
-        """The acceleration to drive with [m/s2], for the fields of `State`."""
+        """The acceleration to drive with [m/s2], for the fields of `RunState`."""
         return clip(self.driver.act(State(*perceived, **named)), -self.limit, self.limit)
 
 

@@ -21,11 +21,9 @@ LARGEST_GAP = 100.0
 """[m]; stands for `nobody there`"""
 OBEDIENT = {"Accel": 20.0, "Decel": 20.0, "EmergencyDecel": 20.0, "ApparentDecel": 20.0, "MinGap": 0.5}
 """limits of SUMO's own that are wider than any command; only its check for a safe speed stays"""
-LOOK_FARTHER = (
-    "pacer jam-absorber cruise jam-ahead adaptive-acc loop_length route_position place approach to_merge"
-)
+LOOK_FARTHER = "pacer jam-absorber cruise jam-ahead adaptive-acc loop_length route_position place approach to_merge"
 LOOK_FARTHER += " allowed_speed lane_speeds road_speeds beside cav_share"
-"""experts and features that need what `perceive` does not tell, or an ACC of the car's own"""
+"""experts and features that need what `local_state` does not tell, or an ACC of the car's own"""
 
 
 def perceive(vehicles: Any, name: str) -> State:
@@ -57,9 +55,7 @@ def drive(sumo: Any, controller: Controller, name: str) -> int:
     vehicles, held = sumo.vehicle, round(controller.time_step / step)
     if abs(held * step - controller.time_step) > 1e-9:
         asked = f"it decides every {controller.time_step:g} s: start SUMO with --step-length"
-        raise SystemExit(
-            f"SUMO's step of {step:g} s does not fit the controller; {asked} {controller.time_step:g}"
-        )
+        raise SystemExit(f"SUMO's step of {step:g} s does not fit the controller; {asked} {controller.time_step:g}")
     while name not in vehicles.getIDList():
         if not sumo.simulation.getMinExpectedNumber():
             raise SystemExit(f"no vehicle {name!r} has entered")

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import settings
 
 from tests.pictures import empty_pictures
-from unjam.controller.file import hash_of
+from unjam.controller.file import sha256_of
 from unjam.drivers import LocalState
-from unjam.drivers.from_file import FileDriver
 from unjam.drivers.network import Network
+from unjam.drivers.user_driver import FileDriver
 from unjam.worlds.sumo.simulation import Simulation
 
 if "UNJAM_STATE" not in os.environ:  # which code the tests ran is not what the user ran
@@ -115,9 +115,7 @@ def state_of(speed: object, leader_speed: object, gap: object) -> LocalState:
     return LocalState(own, leader, distance, own, distance, own * 0.0, own * 0.0 + 230.0)
 
 
-def random_network(
-    inputs: int = 5, seed: int = 0, size: int = 16, scale: float = 0.3, outputs: int = 1
-) -> Network:
+def random_network(inputs: int = 5, seed: int = 0, size: int = 16, scale: float = 0.3, outputs: int = 1) -> Network:
     """A network with random weights; with two outputs it sizes its own noise."""
     generator = np.random.default_rng(seed)
     sizes = [inputs, size, size, outputs]
@@ -132,5 +130,5 @@ def strangers_driver(code: Path, first: str) -> FileDriver:
     """The driver `gentle` of a file that does something `first`, as a stranger has it: none of it has run."""
     driver = FileDriver(code, "gentle")
     code.write_text(first + code.read_text())
-    object.__setattr__(driver, "sha256", hash_of(code.read_bytes()))
+    object.__setattr__(driver, "sha256", sha256_of(code.read_bytes()))
     return driver

@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from tests.worlds.sumo.test_plain_sumo import human_baseline
-from unjam.files import to_json, write_whole
+from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.scenarios import make_scenario
 from unjam.sumo_files import read_sumo_files
@@ -48,7 +48,7 @@ def facts_of(trips: Trips) -> dict[str, float]:
     """Return the numbers of departures and arrivals, and the mean travel time [s]."""
     mean = float(trips.travel_time.mean()) if trips.vehicle_ids else float("nan")
     departed = int((trips.duration > 0).sum())
-    return {"departures": departed, "arrivals": int(trips.arrived.sum()), "travel_time": mean}
+    return {"departures": departed, "arrivals": int(trips.has_arrived.sum()), "travel_time": mean}
 
 
 def count_different(found: Trips, plain: Trips) -> int:
@@ -117,7 +117,7 @@ def main(words: list[str]) -> None:
         file, _, seconds = rest.rpartition(":")
         found[name] = {"seconds": float(seconds), **compare(Path(file).resolve(), float(seconds))}
         print(name, json.dumps(found[name]), flush=True)
-        write_whole(target, to_json({"manifest": about, "networks": found}, indent=1))
+        atomic_write(target, to_json({"manifest": about, "networks": found}, indent=1))
     return None
 
 

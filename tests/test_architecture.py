@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from unjam.drivers.registry import RECIPES
+from unjam.drivers.registry import RECIPE_BUILDERS
 
 PAGE = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
 EXAMPLES = dict(re.findall(r"^### ([^\n]+)\n.*?^```python\n(.*?)^```$", PAGE, flags=re.S | re.M))
@@ -18,16 +18,14 @@ def test_the_page_works_six_of_the_ten_changes() -> None:
 
 
 @pytest.mark.parametrize("title", EXAMPLES)
-def test_an_example_of_the_architecture_runs(
-    title: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_example_of_the_architecture_runs(title: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    before = dict(RECIPES)  # what an example adds is taken away again
+    before = dict(RECIPE_BUILDERS)  # what an example adds is taken away again
     try:
         exec(compile(EXAMPLES[title], title, "exec"), {"__name__": "example"})
     finally:
-        RECIPES.clear()
-        RECIPES.update(before)
+        RECIPE_BUILDERS.clear()
+        RECIPE_BUILDERS.update(before)
 
 
 def test_the_house_has_the_rooms_that_the_page_names() -> None:

@@ -2,7 +2,7 @@ from collections.abc import Callable
 
 import pytest
 
-from unjam.drivers.registry import named_driver
+from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
 from unjam.training.config import load_config
@@ -15,8 +15,8 @@ from unjam.worlds.reward import make_reward
         (lambda: make_scenario("rign-jammed"), "ring-jammed"),
         (lambda: make_scenario("ring", {"vehicels": 3}), "vehicles"),
         (lambda: make_scenario("ring", {"safety.time_headwy": 1}), "time_headway"),
-        (lambda: named_driver("folower-stopper", 0.1), "follower-stopper"),
-        (lambda: named_driver("pi:time_constnt=1", 0.1), "time_constant"),
+        (lambda: driver_from_name("folower-stopper", 0.1), "follower-stopper"),
+        (lambda: driver_from_name("pi:time_constnt=1", 0.1), "time_constant"),
         (lambda: make_reward("relased"), "released"),
         (lambda: load_config(preset="dmo"), "demo"),
         (lambda: load_config(changes={"trpo.gama": 0.9}), "gamma"),

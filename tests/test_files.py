@@ -14,24 +14,24 @@ from hypothesis import strategies as st
 from unjam.errors import DiskError, InputError
 from unjam.files import (
     append_line,
+    atomic_write,
     is_leftover,
     make_folder,
     open_in_place,
     remove,
     to_json,
     write_folder,
-    write_new,
-    write_whole,
+    write_new_file,
 )
-from unjam.folders import without_links
-from unjam.processes import bound, owned
+from unjam.folders import protect_folder
+from unjam.processes import bind_to_parent, lock_folder
 
 
 def test_writes_text_and_bytes_over_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "file"
-    write_whole(path, "grün\n")
+    atomic_write(path, "grün\n")
     assert path.read_bytes() == "grün\n".encode()
-    write_whole(path, b"\x00\xff")
+    atomic_write(path, b"\x00\xff")
     assert path.read_bytes() == b"\x00\xff"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -42,14 +42,14 @@ def test_a_failed_write_leaves_what_was_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, number: int
 ) -> None:
     path = tmp_path / "file"
-    write_whole(path, "old")
+    atomic_write(path, "old")
 
     def fail(*_: object, **options: object) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, step, fail)
     with pytest.raises(DiskError) as caught:
-        write_whole(path, "new")
+        atomic_write(path, "new")
     assert str(caught.value) == f"cannot write {path}: {os.strerror(number)}"
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
@@ -71,9 +71,7 @@ try:
 except DiskError as error:
     print(error)
 """
-    ran = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
-    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert ran.stdout.strip() == f"cannot write {path}: {os.strerror(errno.EFBIG)}"
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
@@ -81,7 +79,7 @@ except DiskError as error:
 
 def test_an_error_that_is_not_the_disks_stays_what_it_is(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
-        write_whole(tmp_path / "nowhere" / "file", "new")
+        atomic_write(tmp_path / "nowhere" / "file", "new")
 
 
 def test_appends_whole_lines(tmp_path: Path) -> None:
@@ -116,8 +114,8 @@ def test_a_folder_where_a_file_is_in_the_way_is_a_disk_error(tmp_path: Path, bel
 
 Writer = Callable[[Path], object]
 WRITERS: dict[str, Writer] = {
-    "whole": lambda path: write_whole(path, "new"),
-    "new": lambda path: write_new(path, b"new", 0o600),
+    "whole": lambda path: atomic_write(path, "new"),
+    "new": lambda path: write_new_file(path, b"new", 0o600),
     "line": lambda path: append_line(path, "new"),
     "in place": lambda path: os.close(open_in_place(path, os.O_RDWR | os.O_CREAT)),
 }
@@ -149,13 +147,11 @@ def test_nothing_is_written_through_a_link(how: str, target: str, outside: Path,
 
 
 @pytest.mark.parametrize("how", ["whole", "line", "in place"])
-def test_a_hard_link_of_a_file_elsewhere_is_not_written_in_place(
-    how: str, outside: Path, tmp_path: Path
-) -> None:
+def test_a_hard_link_of_a_file_elsewhere_is_not_written_in_place(how: str, outside: Path, tmp_path: Path) -> None:
     path = tmp_path / "name"
     path.hardlink_to(outside / "file")
     if how == "whole":
-        write_whole(path, "new")
+        atomic_write(path, "new")
         assert path.read_text() == "new"
         return
     with pytest.raises(InputError, match=r"name' has 2 names \(hard links\), .*; allowed: a file with one"):
@@ -163,14 +159,11 @@ def test_a_hard_link_of_a_file_elsewhere_is_not_written_in_place(
 
 
 DEEP: dict[str, Writer] = {
-    **{
-        f"{name}, deep": (lambda path, write=write: write(path / "sub" / "file"))
-        for name, write in WRITERS.items()
-    },
+    **{f"{name}, deep": (lambda path, write=write: write(path / "sub" / "file")) for name, write in WRITERS.items()},
     "folder": lambda path: write_folder(path / "sub" / "it", {"file": "new"}),
     "make": lambda path: make_folder(path / "sub" / "it"),
     "remove": lambda path: remove(path / "sub" / "file"),
-    "up": lambda path: write_whole(path / ".." / "outside" / "file", "new"),
+    "up": lambda path: atomic_write(path / ".." / "outside" / "file", "new"),
     "up by a new folder": lambda path: make_folder(path / "new" / ".." / ".." / "outside" / "new"),
 }
 
@@ -180,13 +173,13 @@ def test_inside_a_held_folder_no_path_leads_out(how: str, outside: Path, tmp_pat
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "results").symlink_to("elsewhere")  # the user's own choice
     results = tmp_path / "results"
-    with without_links(results):
-        write_whole(results / "file", "new")
+    with protect_folder(results):
+        atomic_write(results / "file", "new")
         (results / "sub").symlink_to(outside)
         with pytest.raises(InputError, match="is a symbolic link or leads out of its folder"):
             DEEP[how](results)
     assert (tmp_path / "elsewhere" / "file").read_text() == "new"
-    with pytest.raises(InputError, match=r"sub' is a symbolic link"), without_links(results):
+    with pytest.raises(InputError, match=r"sub' is a symbolic link"), protect_folder(results):
         pass
 
 
@@ -219,11 +212,11 @@ def test_a_child_process_follows_no_link_in_what_its_parent_holds(outside: Path,
         "from unjam.files import write_whole\n"
         "try:\n    write_whole(Path(sys.argv[1]), 'new')\nexcept InputError as error:\n    print(error)\n"
     )
-    with owned(tmp_path / "results"):
+    with lock_folder(tmp_path / "results"):
         (tmp_path / "results" / "trials" / "0").symlink_to(outside)
         ran = subprocess.run(
             [sys.executable, "-c", code, str(tmp_path / "results" / "trials" / "0" / "file")],
-            **{"capture_output": True, "text": True, "check": True, "env": bound(os.environ)},
+            **{"capture_output": True, "text": True, "check": True, "env": bind_to_parent(os.environ)},
         )
     assert "trials/0' is a symbolic link" in ran.stdout
 
@@ -238,7 +231,7 @@ def test_without_handles_of_folders_links_are_refused_too(
     WRITERS[before](tmp_path / "results" / "name")
     remove(tmp_path / "results" / "it")
     assert [path.name for path in (tmp_path / "results").iterdir()] == ["name"]
-    with without_links(tmp_path / "results"):
+    with protect_folder(tmp_path / "results"):
         (tmp_path / "results" / "sub").symlink_to(outside)
         with pytest.raises(InputError, match="is a symbolic link"):
             WRITERS[before](tmp_path / "results" / "sub" / "file")
@@ -253,7 +246,7 @@ def test_what_is_left_of_a_killed_write_has_a_name_that_nobody_can_guess(
     monkeypatch.setattr(os, "replace", die)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
-            write_whole(tmp_path / "file", "new")
+            atomic_write(tmp_path / "file", "new")
     left = [path for path in tmp_path.iterdir() if is_leftover(path)]
     assert len({path.name for path in left}) == 2
     assert all(len(path.name) == len(".part") + 17 for path in left)
@@ -261,19 +254,12 @@ def test_what_is_left_of_a_killed_write_has_a_name_that_nobody_can_guess(
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf"), np.float64("nan")])
 def test_json_has_null_where_a_number_is_not_finite(value: float) -> None:
-    assert (
-        to_json({"a": [value, 1.5, (value,)], "b": {"c": value}})
-        == '{"a": [null, 1.5, [null]], "b": {"c": null}}'
-    )
+    assert to_json({"a": [value, 1.5, (value,)], "b": {"c": value}}) == '{"a": [null, 1.5, [null]], "b": {"c": null}}'
 
 
 @given(
     st.recursive(
-        st.none()
-        | st.booleans()
-        | st.integers()
-        | st.floats(allow_nan=False, allow_infinity=False)
-        | st.text(),
+        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
         lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
     )
 )

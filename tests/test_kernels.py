@@ -30,23 +30,19 @@ OF = {
     "OPENBLAS_CORETYPE": {"numpy products"},
     "OPENBLAS_NUM_THREADS": {"numpy products"},
     "NPY_DISABLE_CPU_FEATURES": {"numpy functions", "numpy sums"},
-    "ATEN_CPU_CAPABILITY": {
-        "torch functions",
-        "torch sums",
-        "torch products",
-        "torch beginnings",
-        "torch steps",
-    },
+    "ATEN_CPU_CAPABILITY": {"torch functions", "torch sums", "torch products", "torch beginnings", "torch steps"},
     "MKL_CBWR": {"torch functions", "torch products", "torch beginnings", "torch steps"},
 }
 """what each may change"""
 
-needs_avx2 = pytest.mark.skipif(not kernels.pinned(), reason=f"not pinned: {kernels.kernels()['why_not']}")
+needs_avx2 = pytest.mark.skipif(
+    not kernels.has_pinned_kernels(), reason=f"not pinned: {kernels.kernel_info()['unsupported_reason']}"
+)
 
 
 def run(program: str, **variables: str) -> dict[str, Any]:
     """The JSON that a program prints last, in a process of its own with these variables."""
-    inherited = {name: value for name, value in os.environ.items() if name not in kernels.SETTINGS}
+    inherited = {name: value for name, value in os.environ.items() if name not in kernels.KERNEL_SETTINGS}
     ran = subprocess.run(
         [sys.executable, "-c", program],
         cwd=ROOT,
@@ -60,9 +56,7 @@ def run(program: str, **variables: str) -> dict[str, Any]:
     return json.loads(ran.stdout.splitlines()[-1])
 
 
-OPERATIONS = (
-    "import unjam, json; from tests.kernels import operations; print(json.dumps(operations.hashes()))"
-)
+OPERATIONS = "import unjam, json; from tests.kernels import operations; print(json.dumps(operations.hashes()))"
 STATE = "import {first}, json; import unjam; from unjam.kernels import kernels; print(json.dumps(kernels()))"
 
 
@@ -76,11 +70,11 @@ def test_whatever_the_shell_says_the_bits_are_the_committed_ones() -> None:
 @needs_avx2
 @pytest.mark.parametrize("variable", UNPINNED)
 def test_each_variable_matters_and_changes_nothing_else(variable: str) -> None:
-    varied = {**kernels.settings(), variable: UNPINNED[variable], kernels.CHOICE: "own"}
+    varied = {**kernels.kernel_settings(), variable: UNPINNED[variable], kernels.KERNELS_VARIABLE: "own"}
     found = run(OPERATIONS, **varied)
     moved = {kind for kind, value in found.items() if value != GOLDEN["operations"][kind]}
     assert moved <= OF[variable]
-    intel, cores = kernels.processor()["vendor_id"] == "GenuineIntel", os.cpu_count() or 1
+    intel, cores = kernels.processor_info()["vendor_id"] == "GenuineIntel", os.cpu_count() or 1
     there = {"MKL_CBWR": intel, "OPENBLAS_NUM_THREADS": cores > 1}  # MKL knows others as COMPATIBLE alone
     assert moved or not there.get(variable, True)
 
@@ -101,10 +95,10 @@ def test_trainings_of_all_learners_end_with_the_committed_bits() -> None:
 def test_says_what_is_in_force() -> None:
     found = run(STATE.format(first="unjam, torch"))
     assert found["pinned"]
-    assert found["why_not"] is None
+    assert found["unsupported_reason"] is None
     assert (found["openblas"], found["torch"]) == ("Haswell", "AVX2")
     assert not [name for name in found["numpy"] if "512" in name or name == "X86_V4"]
-    assert found["settings"] == kernels.settings()
+    assert found["settings"] == kernels.kernel_settings()
     assert found["processor"]
 
 
@@ -112,12 +106,12 @@ def test_says_what_is_in_force() -> None:
 def test_says_that_numpy_came_first() -> None:
     found = run(STATE.format(first="numpy"))
     assert not found["pinned"]
-    assert found["why_not"] == "numpy was imported before unjam"
-    assert run(STATE.format(first="numpy"), **kernels.settings())["pinned"]
+    assert found["unsupported_reason"] == "numpy was imported before unjam"
+    assert run(STATE.format(first="numpy"), **kernels.kernel_settings())["pinned"]
 
 
 def test_leaves_all_as_it_is_where_asked() -> None:
-    found = run(STATE.format(first="unjam"), **{kernels.CHOICE: "own"})
+    found = run(STATE.format(first="unjam"), **{kernels.KERNELS_VARIABLE: "own"})
     assert not found["pinned"]
     assert set(found["settings"].values()) == {None}
 
@@ -130,7 +124,7 @@ def test_asks_nothing_of_other_processors(
 ) -> None:
     monkeypatch.setattr(platform, "machine", lambda: machine)
     monkeypatch.setattr(kernels, "processor", lambda: {"flags": flags})
-    assert words in (kernels._obstacle() or "")
+    assert words in (kernels._find_obstacle() or "")
 
 
 LATE = """

@@ -105,9 +105,7 @@ def part_of(module: str) -> str:
 def importers(packages: set[str]) -> set[str]:
     """The files that import one of `packages` from outside."""
     return {
-        module
-        for module, tree in MODULES.items()
-        if packages & {name.partition(".")[0] for name in imported(tree)}
+        module for module, tree in MODULES.items() if packages & {name.partition(".")[0] for name in imported(tree)}
     }
 
 
@@ -231,7 +229,7 @@ UNSAFE_BUT = {
     "studies/assess_examples.py: (folder / 'road.rou.xml').write_text('\\n'.join(lines))": PRIVATE,
     "studies/assess_examples.py: (folder / 'road.rou.xml').write_text(_document('routes', traffic))": PRIVATE,
     "studies/assess_examples.py: path.write_text(_document('configuration', lines))": PRIVATE,
-    "studies/assess_examples.py: shutil.copy(network_file(road.network), folder / 'road.net.xml')": PRIVATE,
+    "studies/assess_examples.py: shutil.copy(network_file(scenario_options.network), folder / 'road.net.xml')": PRIVATE,
     "sumo_files/program.py: open(copy, 'w', encoding='utf-8')": PRIVATE,
     "reports/film.py: imageio_ffmpeg.write_frames(str(film), (SIZE, SIZE), fps=rate, "
     "ffmpeg_log_level='error')": PRIVATE,
@@ -258,10 +256,7 @@ def changes_files(call: ast.Call) -> bool:
     if name == "open" and called != "os.open":
         if call.args and ast.unparse(call.args[0]).startswith("open_in_place("):
             return False  # it has a descriptor already
-        modes = [
-            *call.args[called == "open" : 2],
-            *(word.value for word in call.keywords if word.arg == "mode"),
-        ]
+        modes = [*call.args[called == "open" : 2], *(word.value for word in call.keywords if word.arg == "mode")]
         known = [str(mode.value) for mode in modes if isinstance(mode, ast.Constant)]
         unknown = called == "open" and len(known) < len(modes)
         return unknown or any(set("wax+") & set(mode) and set(mode) <= set("rwaxbt+") for mode in known)
@@ -306,12 +301,7 @@ def test_files_are_changed_in_one_place_which_follows_no_link() -> None:
 
 
 def test_a_users_file_is_run_in_one_place() -> None:
-    found = {
-        module
-        for module, tree in MODULES.items()
-        for call in calls(tree)
-        if name_of(call.func) == "exec_module"
-    }
+    found = {module for module, tree in MODULES.items() for call in calls(tree) if name_of(call.func) == "exec_module"}
     assert found == {"user_code.py"}
 
 

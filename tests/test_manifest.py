@@ -11,7 +11,7 @@ import pytest
 import unjam
 from unjam import manifest as module
 from unjam.manifest import manifest
-from unjam.studies.results_file import read_parts
+from unjam_paper.results_file import read_parts
 
 
 def git(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -53,9 +53,7 @@ def test_names_the_commit_of_its_source() -> None:
     assert git("rev-parse", commit.removesuffix("+")).stdout == git("rev-parse", "HEAD").stdout
 
 
-def test_elsewhere_than_in_a_checkout_there_is_no_commit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_elsewhere_than_in_a_checkout_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "__file__", str(tmp_path / "manifest.py"))
     assert manifest()["commit"] is None
 

@@ -9,11 +9,11 @@ from pydantic.dataclasses import dataclass
 from unjam.errors import InputError
 from unjam.parameters import (
     STRICT,
-    Count,
-    CountOrNone,
-    NotNegative,
+    NonNegative,
+    NonNegativeInt,
     Positive,
-    build,
+    PositiveInt,
+    build_dataclass,
     parse_assignments,
     parse_toml,
     parse_value,
@@ -22,15 +22,15 @@ from unjam.parameters import (
 
 @dataclass(frozen=True, config=STRICT)
 class Inner:
-    size: Count = 1
+    size: PositiveInt = 1
 
 
 @dataclass(frozen=True, config=STRICT)
 class Outer:
     needed: float
     positive: Positive = 1.0
-    share: NotNegative = 0.0
-    extra: CountOrNone = 0
+    share: NonNegative = 0.0
+    extra: NonNegativeInt = 0
     inner: Inner = Inner()
     names: tuple[str, ...] = ()
 
@@ -42,7 +42,7 @@ class Outer:
 
 
 def test_builds_nested_parameters() -> None:
-    made = build(Outer, {"needed": 2, "inner": {"size": 3}, "names": ["a"], "extra": 3}, "here")
+    made = build_dataclass(Outer, {"needed": 2, "inner": {"size": 3}, "names": ["a"], "extra": 3}, "here")
     assert made == Outer(needed=2.0, inner=Inner(size=3), names=("a",), extra=3)
     assert type(made.needed) is float
 
@@ -51,10 +51,7 @@ def test_builds_nested_parameters() -> None:
     ("values", "line"),
     [
         ({}, "here.needed: missing"),
-        (
-            {"needed": 1, "other": 2},
-            "here.other: unknown name; allowed: extra, inner, names, needed, positive, share",
-        ),
+        ({"needed": 1, "other": 2}, "here.other: unknown name; allowed: extra, inner, names, needed, positive, share"),
         ({"needed": 1, "inner": {"other": 2}}, "here.inner.other: unknown name; allowed: size"),
         (
             {"needed": "x"},
@@ -62,10 +59,7 @@ def test_builds_nested_parameters() -> None:
         ),
         ({"needed": 1, "positive": 0}, "here.positive: 0 is not allowed; allowed: greater than 0"),
         ({"needed": 1, "share": -1}, "here.share: -1 is not allowed; allowed: greater than or equal to 0"),
-        (
-            {"needed": 1, "inner": {"size": 0}},
-            "here.inner.size: 0 is not allowed; allowed: greater than or equal to 1",
-        ),
+        ({"needed": 1, "inner": {"size": 0}}, "here.inner.size: 0 is not allowed; allowed: greater than or equal to 1"),
         ({"needed": float("nan")}, "here.needed: nan is not allowed; allowed: a finite number"),
         ({"needed": 1, "extra": 2}, "here.extra: 2 is not allowed; allowed: <= 1"),
         ({"needed": 1, "names": [1]}, "here.names.0: 1 is not allowed; allowed: a valid string"),
@@ -73,16 +67,16 @@ def test_builds_nested_parameters() -> None:
 )
 def test_says_in_one_line_what_is_wrong(values: dict[str, Any], line: str) -> None:
     with pytest.raises(InputError) as caught:
-        build(Outer, values, "here")
+        build_dataclass(Outer, values, "here")
     assert str(caught.value) == line
 
 
 def test_without_a_field_the_line_begins_with_the_name() -> None:
     with pytest.raises(InputError) as caught:
-        build(Outer, {}, "")
+        build_dataclass(Outer, {}, "")
     assert str(caught.value) == "needed: missing"
     with pytest.raises(InputError) as caught:
-        build(Outer, {"needed": 1, "extra": 2}, "")
+        build_dataclass(Outer, {"needed": 1, "extra": 2}, "")
     assert str(caught.value) == "extra: 2 is not allowed; allowed: <= 1"
 
 
@@ -131,15 +125,12 @@ def test_numbers_come_back_as_they_were_written(value: float) -> None:
     [
         ({"needed": 2**64}, "it.needed: a number of 65 bits is not allowed; allowed: at most 63"),
         ({"needed": 1.0, "inner": {"size": -(2**70)}}, "it.inner.size: a number of 71 bits is not"),
-        (
-            {"needed": 1.0, "names": ["a", "b\0"]},
-            r"it.names: 'b\x00' is not allowed; allowed: a text without NUL",
-        ),
+        ({"needed": 1.0, "names": ["a", "b\0"]}, r"it.names: 'b\x00' is not allowed; allowed: a text without NUL"),
     ],
 )
 def test_huge_integers_and_nul_are_refused(values: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError) as caught:
-        build(Outer, values, "it")
+        build_dataclass(Outer, values, "it")
     assert str(caught.value).startswith(words)
 
 

@@ -14,21 +14,21 @@ import pytest
 from tests.training.test_run import small_config
 from tests.worlds.test_workers import has_ended
 from unjam.errors import InputError
-from unjam.folders import HELD_FOLDERS
+from unjam.folders import PROTECTED_FOLDERS_VARIABLE
 from unjam.processes import (
-    HEARTBEAT,
-    HELD,
-    LOCK,
-    MISSED,
-    PARENT,
-    bound,
-    check_not_owned,
-    end_with_parent,
-    is_owned,
-    owned,
-    sweep_private_folders,
+    HEARTBEAT_INTERVAL,
+    LOCK_FILE,
+    MAX_MISSED_HEARTBEATS,
+    PARENT_VARIABLE,
+    PRIVATE_LOCK_FILE,
+    bind_to_parent,
+    check_not_locked,
+    exit_with_parent,
+    is_locked,
+    lock_folder,
+    remove_stale_private_folders,
 )
-from unjam.training.folder import start_folder
+from unjam.training.run_folder import create_run_folder
 from unjam.training.train import train
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux tells a process that its parent is gone")
@@ -57,24 +57,24 @@ def soon(process: int) -> bool:
 def test_a_folder_has_one_owner_and_is_free_when_that_is_killed(tmp_path: Path) -> None:
     process = holder(tmp_path)
     words = "is being written by another process; allowed: one at a time"
-    with pytest.raises(InputError, match=words), owned(tmp_path):
+    with pytest.raises(InputError, match=words), lock_folder(tmp_path):
         pass
     process.kill()
     process.wait()
-    with owned(tmp_path):
-        assert (tmp_path / LOCK).is_file()
+    with lock_folder(tmp_path):
+        assert (tmp_path / LOCK_FILE).is_file()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_owner_in_this_process_keeps_others_out_too(tmp_path: Path) -> None:
-    with owned(tmp_path), pytest.raises(InputError), owned(tmp_path):
+    with lock_folder(tmp_path), pytest.raises(InputError), lock_folder(tmp_path):
         pass
-    with owned(tmp_path):
+    with lock_folder(tmp_path):
         pass
 
 
 def test_a_second_training_of_a_run_is_refused_in_one_line_and_writes_nothing(tmp_path: Path) -> None:
-    start_folder(tmp_path, small_config())
+    create_run_folder(tmp_path, small_config())
     process = holder(tmp_path)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     with pytest.raises(InputError, match="another process") as caught:
@@ -85,9 +85,9 @@ def test_a_second_training_of_a_run_is_refused_in_one_line_and_writes_nothing(tm
 
 
 def test_what_a_killed_owner_left_of_a_folder_is_a_new_one(tmp_path: Path) -> None:
-    for name in (LOCK, ".config.toml.part"):
+    for name in (LOCK_FILE, ".config.toml.part"):
         (tmp_path / name).touch()
-    start_folder(tmp_path, small_config())
+    create_run_folder(tmp_path, small_config())
     assert (tmp_path / "config.toml").is_file()
 
 
@@ -115,15 +115,15 @@ def test_a_busy_process_ends_with_the_one_that_started_it() -> None:
 def test_a_process_whose_parent_was_gone_before_ends_at_once() -> None:
     gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True)
     done = subprocess.run(
-        [sys.executable, "-c", CHILD], env={**os.environ, PARENT: gone.stdout.decode().strip()}, timeout=60
+        [sys.executable, "-c", CHILD], env={**os.environ, PARENT_VARIABLE: gone.stdout.decode().strip()}, timeout=60
     )
     assert done.returncode == -signal.SIGKILL
 
 
 def test_nobody_else_is_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(PARENT, raising=False)
-    end_with_parent(signal.SIGKILL)
-    assert bound({"A": "b"}) == {"A": "b", PARENT: str(os.getpid()), HELD_FOLDERS: "[]"}
+    monkeypatch.delenv(PARENT_VARIABLE, raising=False)
+    exit_with_parent(signal.SIGKILL)
+    assert bind_to_parent({"A": "b"}) == {"A": "b", PARENT_VARIABLE: str(os.getpid()), PROTECTED_FOLDERS_VARIABLE: "[]"}
 
 
 @pytest.mark.long
@@ -148,23 +148,23 @@ def test_a_training_that_was_started_for_another_ends_with_it(tmp_path: Path) ->
 
 
 def test_who_only_looks_neither_makes_nor_changes_a_lock(tmp_path: Path) -> None:
-    folder, lock, other = tmp_path / "run", tmp_path / "run" / LOCK, tmp_path / "other"
+    folder, lock, other = tmp_path / "run", tmp_path / "run" / LOCK_FILE, tmp_path / "other"
     folder.mkdir()
-    assert not is_owned(folder)
+    assert not is_locked(folder)
     assert list(folder.iterdir()) == []
     process = holder(folder)
     before = lock.read_bytes(), lock.stat().st_mtime_ns
-    assert is_owned(folder)
+    assert is_locked(folder)
     with pytest.raises(InputError, match="is being written by another process"):
-        check_not_owned(folder)
+        check_not_locked(folder)
     assert (lock.read_bytes(), lock.stat().st_mtime_ns) == before
     process.kill()
     process.wait()
-    assert not is_owned(folder)
+    assert not is_locked(folder)
     assert (lock.read_bytes(), lock.stat().st_mtime_ns) == before
     lock.rename(other)
     lock.symlink_to(other)
-    assert not is_owned(folder)
+    assert not is_locked(folder)
     assert (other.read_bytes(), other.stat().st_mtime_ns) == before
 
 
@@ -174,34 +174,31 @@ def test_a_lock_that_is_a_link_is_refused_and_what_it_leads_to_stays(
 ) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "mine").write_text("mine")
-    link(tmp_path / "run" / LOCK, tmp_path / "mine")
-    with (
-        pytest.raises(InputError, match=r"\.lock' (is a symbolic link|has 2 names)"),
-        owned(tmp_path / "run"),
-    ):
+    link(tmp_path / "run" / LOCK_FILE, tmp_path / "mine")
+    with pytest.raises(InputError, match=r"\.lock' (is a symbolic link|has 2 names)"), lock_folder(tmp_path / "run"):
         pass
     assert (tmp_path / "mine").read_text() == "mine"
 
 
 def test_an_owner_on_another_machine_holds_a_folder_while_its_heart_beats(tmp_path: Path) -> None:
-    (tmp_path / LOCK).write_text("elsewhere 12\n")  # a file system whose locks end at the machine
-    with pytest.raises(InputError, match="is being written on elsewhere; allowed: "), owned(tmp_path):
+    (tmp_path / LOCK_FILE).write_text("elsewhere 12\n")  # a file system whose locks end at the machine
+    with pytest.raises(InputError, match="is being written on elsewhere; allowed: "), lock_folder(tmp_path):
         pass
-    assert (tmp_path / LOCK).is_file()
-    long_ago = time.time() - 2 * MISSED * HEARTBEAT
-    os.utime(tmp_path / LOCK, (long_ago, long_ago))
-    with owned(tmp_path):
-        assert (tmp_path / LOCK).read_text().split() == [platform.node(), str(os.getpid())]
+    assert (tmp_path / LOCK_FILE).is_file()
+    long_ago = time.time() - 2 * MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
+    os.utime(tmp_path / LOCK_FILE, (long_ago, long_ago))
+    with lock_folder(tmp_path):
+        assert (tmp_path / LOCK_FILE).read_text().split() == [platform.node(), str(os.getpid())]
 
 
 def test_the_heart_of_an_owner_beats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("unjam.processes.HEARTBEAT", 0.01)
-    with owned(tmp_path):
-        os.utime(tmp_path / LOCK, (1, 1))
+    with lock_folder(tmp_path):
+        os.utime(tmp_path / LOCK_FILE, (1, 1))
         patience = time.monotonic() + 5
-        while (tmp_path / LOCK).stat().st_mtime == 1 and time.monotonic() < patience:
+        while (tmp_path / LOCK_FILE).stat().st_mtime == 1 and time.monotonic() < patience:
             time.sleep(0.01)
-        assert (tmp_path / LOCK).stat().st_mtime > 1
+        assert (tmp_path / LOCK_FILE).stat().st_mtime > 1
 
 
 def test_what_killed_processes_left_in_the_temporary_folder_is_swept(
@@ -214,25 +211,22 @@ def test_what_killed_processes_left_in_the_temporary_folder_is_swept(
     )
     started = [
         subprocess.Popen(
-            [sys.executable, "-c", code, str(tmp_path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
+            [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         for _ in range(2)
     ]
     killed, alive = (Path(process.stdout.readline().strip()) for process in started if process.stdout)
     mine = tmp_path / "unjam-results"  # of somebody who keeps results here
     mine.mkdir()
-    for name in (LOCK, HELD):
+    for name in (LOCK_FILE, PRIVATE_LOCK_FILE):
         (mine / name).touch()
     started[0].kill()
     started[0].wait()
-    sweep_private_folders.__wrapped__()
+    remove_stale_private_folders.__wrapped__()
     assert killed.exists()  # it may be so new that nobody has had the time to hold it
     for folder in (killed, alive, mine):
         os.utime(folder, (1, 1))
-    sweep_private_folders.__wrapped__()
+    remove_stale_private_folders.__wrapped__()
     assert (killed.exists(), alive.exists(), mine.exists()) == (False, True, True)
     started[1].communicate("")
     assert not alive.exists()

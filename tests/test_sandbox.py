@@ -10,12 +10,12 @@ import pytest
 from tests.test_processes import soon
 from tests.worlds.sumo.own_roads import straight
 from unjam import sandbox
-from unjam.drivers.from_file import FileDriver
-from unjam.processes import protections
+from unjam.drivers.user_driver import FileDriver
+from unjam.processes import kernel_protections
 from unjam.scenarios import Ring, make_scenario
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-kept = pytest.mark.skipif(len(protections()) < 2, reason="the kernel offers no Landlock or no seccomp")
+kept = pytest.mark.skipif(len(kernel_protections()) < 2, reason="the kernel offers no Landlock or no seccomp")
 TRIES = """
 import os, socket, subprocess, sys
 from pathlib import Path
@@ -76,11 +76,11 @@ def test_a_worker_loses_its_rights_for_networks_of_others_alone(tmp_path: Path) 
     driver, left = FileDriver(tmp_path / "driver.py", "tries"), tmp_path / "left"
     path = straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0" departSpeed="5"/>')
     own = make_scenario(str(path), {"cav_types": ["car"], "horizon": 5})
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         for scenario, found in ((own, 0.5), (own, 0.5), (Ring(horizon=5), 0.0)):
             (episode,) = workers.run([EpisodeTask(scenario, driver, (0,))])
-            assert episode.ok, episode.reason
-            assert episode.trajectories[0].applied[-1] == found
+            assert episode.has_run, episode.reason
+            assert episode.trajectories[0].applied_acceleration[-1] == found
             assert left.exists() == (found == 0.0)
 
 
@@ -89,9 +89,9 @@ def test_networks_of_others_are_read_under_a_smaller_limit_of_memory(tmp_path: P
     code = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (2**31, 2**31))\n"
         "from unjam.drivers import IDM\nfrom unjam.scenarios import make_scenario\n"
-        "from unjam.worlds.workers import EpisodeTask, Workers\n"
+        "from unjam.worlds.worker_pool import EpisodeTask, Workers\n"
         "own = make_scenario(sys.argv[1], {'cav_types': ['car'], 'horizon': 5})\n"
-        "with Workers(1) as workers:\n"
+        "with WorkerPool(1) as workers:\n"
         "    print(workers.run([EpisodeTask(own, IDM(), (0,))])[0].status)\n"
     )
     ran = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=False)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unjam.tree import leaves, mapped, pack, rebuilt, unpack
+from unjam.tree import leaves, map_leaves, pack, replace_leaves, unpack
 
 
 class Pair(NamedTuple):
@@ -77,8 +77,8 @@ TREES = st.recursive(
 
 @given(TREES)
 def test_leaves_and_rebuilt_undo_each_other(tree: dict[str, Any]) -> None:
-    again = rebuilt(tree, {path: 2.0 * leaf for path, leaf in leaves(tree)})
-    twice = mapped(lambda leaf, same: leaf + same, tree, tree)
+    again = replace_leaves(tree, {path: 2.0 * leaf for path, leaf in leaves(tree)})
+    twice = map_leaves(lambda leaf, same: leaf + same, tree, tree)
     for (path, found), (other, expected) in zip(leaves(again), leaves(twice), strict=True):
         assert path == other
         np.testing.assert_array_equal(found, expected)

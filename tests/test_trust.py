@@ -6,20 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from unjam.children import child_environment, python_command
+from unjam.child_processes import child_environment, python_command
 from unjam.controller import controller_bytes
 from unjam.controller import file as controller_file
 from unjam.controller.file import read_controller
-from unjam.drivers.from_file import FileDriver, FileReference
+from unjam.drivers.user_driver import FileDriver, FileReference
 from unjam.errors import InputError
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.trust import (
-    TRUSTED,
+    TRUSTED_VARIABLE,
     check_trusted,
-    check_values,
+    check_trusted_values,
     expecting_code,
-    is_all_trusted,
-    remember,
+    is_all_code_trusted,
+    remember_trusted,
     trusting_code,
 )
 
@@ -28,44 +28,36 @@ from unjam.trust import (
 def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Code that nobody has named."""
     monkeypatch.setenv("UNJAM_STATE", str(tmp_path / "state"))
-    monkeypatch.delenv(TRUSTED, raising=False)
+    monkeypatch.delenv(TRUSTED_VARIABLE, raising=False)
     path = tmp_path / "code+1.py"
     path.write_text("x = 1\n")
     return path
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "{}:gentle",
-        "{}:Keeper:gain=0.2",
-        "pi+{}:gentle",
-        "pi:window=30+{}:gentle",
-        "{}:a+{}:b",
-        "{}:a:b=[1,2]",
-    ],
+    "text", ["{}:gentle", "{}:Keeper:gain=0.2", "pi+{}:gentle", "pi:window=30+{}:gentle", "{}:a+{}:b", "{}:a:b=[1,2]"]
 )
 @pytest.mark.parametrize("deep", [False, True])
 def test_a_file_is_found_wherever_a_text_names_it(text: str, deep: bool, code: Path) -> None:
     named = text.replace("{}", str(code))
     values = {"tasks": [{"expert": "pi"}, {"evaluation": {"baselines": ["human", named]}}]}
     with pytest.raises(InputError, match=r"^run names Python code \('.*code\+1\.py'\), which "):
-        check_values("run", values if deep else named)
-    remember(code)
-    check_values("run", values if deep else named)
+        check_trusted_values("run", values if deep else named)
+    remember_trusted(code)
+    check_trusted_values("run", values if deep else named)
 
 
 def test_a_name_relative_to_here_is_found(code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(code.parent)
     with pytest.raises(InputError, match="it runs only with --trust-code"):
-        check_values("run", f"{code.name}:gentle")
+        check_trusted_values("run", f"{code.name}:gentle")
 
 
 def test_a_link_to_code_is_that_code(code: Path) -> None:
     link = code.with_name("link.py")
     link.symlink_to(code)
-    remember(code)
-    check_values("run", f"{link}:gentle")
+    remember_trusted(code)
+    check_trusted_values("run", f"{link}:gentle")
 
 
 def test_trust_ends_with_the_block_and_what_ran_in_it_is_remembered(code: Path) -> None:
@@ -73,11 +65,11 @@ def test_trust_ends_with_the_block_and_what_ran_in_it_is_remembered(code: Path) 
     other.write_text("y = 2\n")
     with trusting_code():
         check_trusted("run", code)
-        remember(code)
+        remember_trusted(code)
     check_trusted("run", code)
     with pytest.raises(InputError):
         check_trusted("run", other)
-    assert TRUSTED not in os.environ
+    assert TRUSTED_VARIABLE not in os.environ
 
 
 def test_trust_ends_with_the_last_of_the_blocks_that_overlap() -> None:
@@ -86,21 +78,21 @@ def test_trust_ends_with_the_last_of_the_blocks_that_overlap() -> None:
     first.__enter__()
     second.__enter__()
     first.__exit__(None, None, None)
-    assert is_all_trusted()
+    assert is_all_code_trusted()
     second.__exit__(None, None, None)
-    assert not is_all_trusted()
+    assert not is_all_code_trusted()
 
 
 def test_what_code_imports_from_beside_it_is_trusted_as_it_was(code: Path) -> None:
     helper, file = code.with_name("helper_beside.py"), FileReference(code, "x")
     helper.write_text("value = 1\n")
     code.write_text("from helper_beside import value as x\n")
-    assert file.load() == 1
+    assert file.load_object() == 1
     check_trusted("run", code)
     helper.write_text("value = 22\n")
     with pytest.raises(InputError, match="not as it is now"):
         check_trusted("run", code)
-    assert file.load() == 22  # whoever names it runs it
+    assert file.load_object() == 22  # whoever names it runs it
     check_trusted("run", code)
     helper.unlink()
     with pytest.raises(InputError):
@@ -111,9 +103,9 @@ def test_what_cannot_be_remembered_is_told_to_this_process_and_its_children(
     code: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("UNJAM_STATE", str(code / "no folder"))
-    remember(code)
+    remember_trusted(code)
     check_trusted("run", code)
-    assert len(os.environ[TRUSTED].split()) == 1
+    assert len(os.environ[TRUSTED_VARIABLE].split()) == 1
     code.write_text("x = 2\n")
     with pytest.raises(InputError):
         check_trusted("run", code)
@@ -125,7 +117,7 @@ def test_the_state_of_programs_is_where_the_system_has_it(
     monkeypatch.delenv("UNJAM_STATE")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "xdg"))
     monkeypatch.setenv("HOME", str(tmp_path))  # where the system does not ask XDG
-    remember(code)
+    remember_trusted(code)
     check_trusted("run", code)
     assert [path.parent.name for path in tmp_path.rglob("trusted/*")] == ["trusted"]
 
@@ -138,7 +130,7 @@ def folder_with_code(code: Path) -> Path:
     """Code that its user has run, with a module that it imports late, and a run folder that names it."""
     code.write_text(LATE)
     code.with_name("helper_later.py").write_text("value = 1\n")
-    assert FileReference(code, "late").load()() == 1
+    assert FileReference(code, "late").load_object()() == 1
     run = code.with_name("run")
     run.mkdir()
     (run / "config.toml").write_text(to_toml(RunConfig(expert=f"{code}:late")))
@@ -153,23 +145,21 @@ def test_what_code_imports_late_is_trusted_as_it_was(code: Path, folder_with_cod
 
 
 @pytest.mark.parametrize("changed", ["code+1.py", "helper_later.py"])
-def test_code_that_changes_after_it_was_checked_does_not_run(
-    changed: str, code: Path, folder_with_code: Path
-) -> None:
+def test_code_that_changes_after_it_was_checked_does_not_run(changed: str, code: Path, folder_with_code: Path) -> None:
     canary = code.with_name("canary")
     config = load_config(folder_with_code / "config.toml")
     file = code.with_name(changed)
     file.write_text(f"open({str(canary)!r}, 'w').close()\n{file.read_text()}")
     with pytest.raises(InputError, match=r"^code\+1\.py: has changed since the configuration was checked"):
         config.make_expert()
-    child = 'from unjam.drivers.from_file import FileReference; FileReference.of(f"{PATH}:late").load()()'
+    child = 'from unjam.drivers.user_driver import FileReference; FileReference.of(f"{PATH}:late").load()()'
     command = python_command("-c", f"PATH = {str(code)!r}; {child}")
     ran = subprocess.run(command, env=child_environment(), capture_output=True, text=True, check=False)
     assert "InputError: code+1.py: has changed since" in ran.stderr
     assert not canary.exists()
     with expecting_code():
         pass
-    FileReference(code, "late").load()()  # its user names it anew
+    FileReference(code, "late").load_object()()  # its user names it anew
     assert canary.exists()
 
 
@@ -177,9 +167,7 @@ def test_code_that_changes_after_a_controller_was_checked_does_not_run(
     code: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     helper, canary, run = code.with_name("helper_later.py"), code.with_name("canary"), code.with_name("run")
-    code.write_text(
-        "def gentle(state):\n    import helper_later\n    return helper_later.value * state.speed\n"
-    )
+    code.write_text("def gentle(state):\n    import helper_later\n    return helper_later.value * state.speed\n")
     helper.write_text("value = 0.0\n")
     run.mkdir()
     (run / "controller.unjam").write_bytes(controller_bytes(FileDriver(code, "gentle"), {}))

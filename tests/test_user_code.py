@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from unjam.errors import InputError
-from unjam.user_code import PREFIX, read_code
+from unjam.user_code import USER_MODULE_PREFIX, read_code
 
 GOOD, EVIL = "value = 'good'\n", "value = 'evil'\n"
 
@@ -96,9 +96,7 @@ def test_the_hash_is_of_all_that_can_run(changed: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".pyc", *importlib.machinery.EXTENSION_SUFFIXES])
 @pytest.mark.parametrize("late", [False, True])
-def test_a_compiled_neighbor_without_source_is_refused_in_one_line(
-    suffix: str, late: bool, tmp_path: Path
-) -> None:
+def test_a_compiled_neighbor_without_source_is_refused_in_one_line(suffix: str, late: bool, tmp_path: Path) -> None:
     source, main = tmp_path / "fast.py", tmp_path / "main.py"
     source.write_text(EVIL)
     py_compile.compile(str(source), str(tmp_path / f"fast{suffix}"))
@@ -144,7 +142,7 @@ def test_packages_of_the_folder_are_imported_as_usual(tmp_path: Path) -> None:
     assert (module.one, module.two.one, module.leaf.own, module.up.two) == (1, 1, 1, module.two)
     assert module.pack.deep.leaf is module.leaf
     assert not {"pack", "pack.two", "pack.deep.leaf"} & sys.modules.keys()
-    assert module.two.__name__.startswith(PREFIX)
+    assert module.two.__name__.startswith(USER_MODULE_PREFIX)
 
 
 @pytest.mark.parametrize(
@@ -207,14 +205,12 @@ def test_classes_of_neighbors_are_found_by_what_looks_them_up(tmp_path: Path) ->
 
 def test_every_run_begins_anew(tmp_path: Path) -> None:
     (tmp_path / "count.py").write_text("calls = []\n")
-    (tmp_path / "main.py").write_text(
-        "import count\ndef call():\n    import count\n    count.calls.append(1)\n"
-    )
+    (tmp_path / "main.py").write_text("import count\ndef call():\n    import count\n    count.calls.append(1)\n")
     code = read_code(tmp_path / "main.py")
     one, other = code.run(), code.run()
     one.call()
     assert (len(one.count.calls), len(other.count.calls)) == (1, 0)
-    names = [name for name in sys.modules if name.startswith(f"{PREFIX}main_")]
+    names = [name for name in sys.modules if name.startswith(f"{USER_MODULE_PREFIX}main_")]
     assert len([name for name in names if name.endswith(".count")]) == 1
 
 
@@ -243,9 +239,7 @@ def test_a_file_that_cannot_be_parsed_fails_when_it_runs(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("has_init", [True, False])
-def test_packages_of_the_folder_are_not_searched_for_modules_that_were_not_read(
-    has_init: bool, tmp_path: Path
-) -> None:
+def test_packages_of_the_folder_are_not_searched_for_modules_that_were_not_read(has_init: bool, tmp_path: Path) -> None:
     package = tmp_path / "plug"
     package.mkdir()
     if has_init:

@@ -17,21 +17,21 @@ if sys.argv[:1] == ["-m"] and sys.orig_argv[-len(sys.argv)].endswith("unjam") an
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from unjam.kernels import pin
+from unjam.kernels import pin_kernels
 
-pin()  # before anything imports NumPy
+pin_kernels()  # before anything imports NumPy
 
-from unjam.environments import register_all  # noqa: E402
-from unjam.errors import without_train  # noqa: E402
+from unjam.environments import register_environments  # noqa: E402
+from unjam.errors import missing_package_error  # noqa: E402
 
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from unjam.controller import load_controller, make_driver
     from unjam.drivers import Driver, LocalState, check_driver
-    from unjam.environments.several import parallel_env
-    from unjam.limited import verify_controller, write_report
+    from unjam.environments.pettingzoo_env import parallel_env
     from unjam.measures.metrics import measure
+    from unjam.resource_limits import verify_controller, write_report
     from unjam.scenarios import make_scenario
     from unjam.training.config import load_config
     from unjam.training.evaluate import drive
@@ -42,27 +42,27 @@ if TYPE_CHECKING:
     from unjam.worlds.episode import run_episode
 
 # Imported when first used: workers must stay free of torch, and the command line quick.
-_PLACES = {
+_LAZY_IMPORTS = {
     "drive": "unjam.training.evaluate",
     "train": "unjam.training.train",
     "load_config": "unjam.training.config",
     "load_controller": "unjam.controller",
     "export_controller": "unjam.training.export",
-    "verify_controller": "unjam.limited",
+    "verify_controller": "unjam.resource_limits",
     "make_driver": "unjam.controller",
     "make_scenario": "unjam.scenarios",
     "measure": "unjam.measures.metrics",
     "list_runs": "unjam.training.runs",
     "run_episode": "unjam.worlds.episode",
-    "parallel_env": "unjam.environments.several",
+    "parallel_env": "unjam.environments.pettingzoo_env",
     "trusting_code": "unjam.trust",
-    "write_report": "unjam.limited",
+    "write_report": "unjam.resource_limits",
     "Driver": "unjam.drivers",
     "LocalState": "unjam.drivers",
     "check_driver": "unjam.drivers",
 }
 
-register_all()
+register_environments()
 
 __all__ = [
     "Driver",
@@ -86,12 +86,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
+    if name not in _LAZY_IMPORTS:
         raise AttributeError(f"module 'unjam' has no attribute {name!r}")
     try:
-        return getattr(import_module(_PLACES[name]), name)
+        return getattr(import_module(_LAZY_IMPORTS[name]), name)
     except ModuleNotFoundError as error:
-        raise without_train(error) from None
+        raise missing_package_error(error) from None
 
 
 def __dir__() -> list[str]:

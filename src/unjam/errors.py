@@ -31,17 +31,15 @@ class MissingPartError(UnjamError):
     exit_code = 3
 
 
-TRAIN = "torch", "stable_baselines3", "sb3_contrib", "onnx", "onnxscript", "onnxruntime"
+TRAIN_PACKAGES = "torch", "stable_baselines3", "sb3_contrib", "onnx", "onnxscript", "onnxruntime"
 """packages of the extra `train`: what drives, measures and calibrates needs none of them"""
 
 
-def without_train(error: ModuleNotFoundError) -> MissingPartError:
+def missing_package_error(error: ModuleNotFoundError) -> MissingPartError:
     """Return the line for a package of the extra `train`; the error itself is raised for any other."""
-    if error.name is None or error.name.partition(".")[0] not in TRAIN:
+    if error.name is None or error.name.partition(".")[0] not in TRAIN_PACKAGES:
         raise error
-    return MissingPartError(
-        f"{error.name} is not installed; what learns needs it: pip install 'unjam[train]'"
-    )
+    return MissingPartError(f"{error.name} is not installed; what learns needs it: pip install 'unjam[train]'")
 
 
 class DiskError(UnjamError):
@@ -54,13 +52,13 @@ class EpisodeError(UnjamError):
     """An episode failed again and again: the message holds what is needed to repeat it."""
 
 
-class RefusedError(EpisodeError):
+class SumoInputError(EpisodeError):
     """SUMO refuses the files that it was given, and says why."""
 
     exit_code = 2
 
 
-class LostError(EpisodeError):
+class LostWorkerError(EpisodeError):
     """The process that ran an episode was lost, for whatever reason: the same may well run again."""
 
 
@@ -75,14 +73,14 @@ def disk_error(error: OSError, path: object) -> DiskError:
     return DiskError(f"cannot write {path}: {error.strerror or error}")
 
 
-def error_named(name: str, words: str) -> UnjamError:
+def error_from_name(name: str, message: str) -> UnjamError:
     """Return the error that another process told of; of a kind that is not ours, it is an `UnjamError`."""
     known = UnjamError, InputError, EpisodeError
     kinds = {each.__name__: each for kind in known for each in kind.__subclasses__()}
-    return kinds.get(name, UnjamError)(words)
+    return kinds.get(name, UnjamError)(message)
 
 
-def in_own_words(error: Exception) -> UnjamError:
+def as_unjam_error(error: Exception) -> UnjamError:
     """Return any error as one of ours, to be told to another process."""
     if isinstance(error, OSError) and error.errno in DISK_ERRNOS:
         return disk_error(error, error.filename or "a temporary file")
@@ -94,23 +92,23 @@ def in_own_words(error: Exception) -> UnjamError:
     return UnjamError(f"{type(error).__name__}: {line}")
 
 
-def wrong(field: str, value: object, allowed: str) -> InputError:
+def invalid_value(field: str, value: object, allowed: str) -> InputError:
     """Return the error for a wrong value, in the form that all of unjam uses."""
     return InputError(f"{field}: {value!r} is not allowed; allowed: {allowed}")
 
 
-def wrong_name(field: str, value: object, names: Iterable[str]) -> InputError:
+def unknown_name(field: str, value: object, names: Iterable[str]) -> InputError:
     """Return the error for a name that is not among `names`, with the one that may have been meant."""
     known = list(names)
-    return wrong(field, value, f"{', '.join(known)}{did_you_mean(value, known)}")
+    return invalid_value(field, value, f"{', '.join(known)}{spelling_hint(value, known)}")
 
 
-def go_on_with(folder: object) -> str:
+def resume_hint(folder: object) -> str:
     """Return `; go on with: ` and the command that goes on with a training, to be copied."""
     return f"; go on with: unjam train --resume {shlex.quote(str(folder))}"
 
 
-def did_you_mean(value: object, names: Iterable[str]) -> str:
+def spelling_hint(value: object, names: Iterable[str]) -> str:
     """Return `; did you mean 'ring'?`; empty where no name is like it."""
     close = get_close_matches(str(value), list(names), 1)
     return f"; did you mean {close[0]!r}?" if close else ""

@@ -19,34 +19,34 @@ from typing import Any
 from safetensors import SafetensorError
 
 from unjam.errors import DISK_ERRNOS, DiskError, InputError, disk_error
-from unjam.folders import link_error, reached, root_of
+from unjam.folders import link_error, open_folder, protected_root
 
-LONGEST_INTEGER = 20
+MAX_INTEGER_LENGTH = 20
 """characters of an integer of 64 bits"""
-SHIPPED = "unjam:"
+PACKAGED_PREFIX = "unjam:"
 """what the names of controllers and of people that are part of the package begin with"""
-DAMAGED = (
+INVALID_DATA_ERRORS = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
     SafetensorError,
 )
 """what reading JSON and arrays can raise where they are not what unjam writes"""
-NONE_OF_OURS = (*DAMAGED, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
+UNREADABLE_ERRORS = (*INVALID_DATA_ERRORS, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
 """what reading can raise where a file is none; `RuntimeError`: of a kind that zipfile does not know"""
 
-APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+APPEND_FLAGS = os.O_WRONLY | os.O_APPEND | os.O_CREAT
 """flags of `open_in_place`: append to a file, and make a missing one"""
 
 
 @contextmanager
-def reading(what: str) -> Iterator[None]:
+def reject_damaged(name: str) -> Iterator[None]:
     """Raise `InputError` where something that is read within is none of ours, or damaged."""
     try:
         yield
-    except NONE_OF_OURS as error:
-        raise InputError(f"{what}: the controller is damaged: {' '.join(f'{error!r}'.split())}") from None
+    except UNREADABLE_ERRORS as error:
+        raise InputError(f"{name}: the controller is damaged: {' '.join(f'{error!r}'.split())}") from None
 
 
-def write_whole(path: Path, content: bytes | str) -> None:
+def atomic_write(path: Path, content: bytes | str) -> None:
     """Write a file whole or not at all: to a random temporary name, to the disk, then in place.
 
     Raises:
@@ -55,20 +55,20 @@ def write_whole(path: Path, content: bytes | str) -> None:
     """
     name, temporary = path.name or ".", _temporary_name()
     try:
-        with reached(path.parent) as folder:
+        with open_folder(path.parent) as folder:
             folder.check_writable(name)
             try:
-                _write(folder.create(temporary), content)
+                _write_and_sync(folder.create(temporary), content)
                 folder.rename(temporary, name)
             except OSError:
                 with suppress(OSError):
                     folder.remove(temporary)
                 raise
     except OSError as error:
-        raise _disk(error, path) from None
+        raise _as_disk_error(error, path) from None
 
 
-def write_new(path: Path, content: bytes, mode: int) -> None:
+def write_new_file(path: Path, content: bytes, mode: int) -> None:
     """Write a file that is not there yet, whole or not at all; from the first byte on it has this `mode`.
 
     Raises:
@@ -76,10 +76,10 @@ def write_new(path: Path, content: bytes, mode: int) -> None:
         DiskError: the disk is full or cannot be written.
     """
     try:
-        with reached(path.parent) as folder:
+        with open_folder(path.parent) as folder:
             descriptor = folder.create(path.name, mode)
             try:
-                _write(descriptor, content)
+                _write_and_sync(descriptor, content)
                 folder.sync()
             except BaseException:
                 folder.remove(path.name)
@@ -87,7 +87,7 @@ def write_new(path: Path, content: bytes, mode: int) -> None:
     except FileExistsError:
         raise InputError(f"file: {str(path)!r} exists; allowed: a new one") from None
     except OSError as error:
-        raise _disk(error, path) from None
+        raise _as_disk_error(error, path) from None
 
 
 def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
@@ -103,12 +103,12 @@ def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
     make_folder(folder.parent)
     temporary = _temporary_name()
     try:
-        with reached(folder.parent) as above:
+        with open_folder(folder.parent) as above:
             try:
-                above.make(temporary)
+                above.make_subfolder(temporary)
                 with above.enter(temporary) as inner:
                     for name, content in files.items():
-                        _write(inner.create(name), content)
+                        _write_and_sync(inner.create(name), content)
                     inner.sync()
                 above.rename(temporary, folder.name)
             except OSError:
@@ -116,7 +116,7 @@ def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
                     above.remove(temporary)
                 raise
     except OSError as error:
-        raise _disk(error, folder) from None
+        raise _as_disk_error(error, folder) from None
 
 
 def _temporary_name() -> str:
@@ -129,7 +129,7 @@ def is_leftover(path: Path) -> bool:
     return path.name.startswith(".") and path.name.endswith(".part")
 
 
-def _write(descriptor: int, content: bytes | str) -> None:
+def _write_and_sync(descriptor: int, content: bytes | str) -> None:
     """Write an open file, and to the disk, and close it."""
     with open(descriptor, "wb") as file:
         file.write(content.encode() if isinstance(content, str) else content)
@@ -146,7 +146,7 @@ def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
         DiskError: it is something else than a file.
         OSError: it cannot be opened.
     """
-    with reached(path.parent) as folder:
+    with open_folder(path.parent) as folder:
         folder.check_writable(path.name)
         descriptor = folder.open(path.name, flags, mode)
     names = os.fstat(descriptor).st_nlink
@@ -165,9 +165,9 @@ def append_line(path: Path, line: str) -> None:
         DiskError: the disk is full or cannot be written.
     """
     try:
-        _write(open_in_place(path, APPEND), f"{line}\n")
+        _write_and_sync(open_in_place(path, APPEND_FLAGS), f"{line}\n")
     except OSError as error:
-        raise _disk(error, path) from None
+        raise _as_disk_error(error, path) from None
 
 
 def remove(path: Path) -> None:
@@ -178,10 +178,10 @@ def remove(path: Path) -> None:
         DiskError: it cannot be removed.
     """
     try:
-        with suppress(FileNotFoundError), reached(path.parent) as folder:
+        with suppress(FileNotFoundError), open_folder(path.parent) as folder:
             folder.remove(path.name)
     except OSError as error:
-        raise _disk(error, path) from None
+        raise _as_disk_error(error, path) from None
 
 
 def remove_if_empty(folder: Path) -> None:
@@ -190,7 +190,7 @@ def remove_if_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
     """Return the tables in a file of JSON lines; what is damaged, or cut short by a crash, is left out."""
     rows = []
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
@@ -200,7 +200,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def check_folder(path: Path) -> None:
+def check_parent_folder(path: Path) -> None:
     """Raise `DiskError` unless the folder that `path` would be written to is there."""
     if not path.absolute().parent.is_dir():
         raise DiskError(f"cannot write {path}: no such folder")
@@ -215,18 +215,18 @@ def make_folder(path: Path) -> None:
     """
     whole = path.absolute()
     try:
-        if root_of(whole) != whole:
-            with reached(whole, make=True):
+        if protected_root(whole) != whole:
+            with open_folder(whole, make=True):
                 return
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         if path.is_symlink():
             raise link_error(path) from None
-        raise _disk(error, path, errno.EEXIST) from None
+        raise _as_disk_error(error, path, errno.EEXIST) from None
 
 
-def _disk(error: OSError, path: Path, *more: int) -> OSError | DiskError:
-    return disk_error(error, path) if error.errno in (*DISK_ERRNOS, *more) else error
+def _as_disk_error(error: OSError, path: Path, *extra_errnos: int) -> OSError | DiskError:
+    return disk_error(error, path) if error.errno in (*DISK_ERRNOS, *extra_errnos) else error
 
 
 def parse_json(content: bytes | str) -> Any:
@@ -242,7 +242,7 @@ def parse_json(content: bytes | str) -> Any:
             text,
             object_pairs_hook=_unique_keys,
             parse_float=_finite_number,
-            parse_int=_short_integer,
+            parse_int=_integer_64_bits,
             parse_constant=_finite_number,
         )
     except RecursionError:
@@ -263,22 +263,22 @@ def _finite_number(text: str) -> float:
     return value
 
 
-def _short_integer(text: str) -> int:
-    if len(text) > LONGEST_INTEGER or not -(2**63) <= (value := int(text)) < 2**63:
+def _integer_64_bits(text: str) -> int:
+    if len(text) > MAX_INTEGER_LENGTH or not -(2**63) <= (value := int(text)) < 2**63:
         raise ValueError(f"the integer {text[:20]}... has more than 64 bits")
     return value
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
     """Return `value` as strict JSON: NaN and infinities, which JSON does not know, become null."""
-    return json.dumps(_finite(value), indent=indent, allow_nan=False)
+    return json.dumps(_replace_nonfinite(value), indent=indent, allow_nan=False)
 
 
-def _finite(value: Any) -> Any:
+def _replace_nonfinite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: _replace_nonfinite(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
+        return [_replace_nonfinite(entry) for entry in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -1,6 +1,6 @@
 """The same bits on every x86-64 machine with AVX2: which kernels NumPy and torch compute with.
 
-Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin` asks all for
+Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin_kernels` asks all for
 those that every processor with AVX2 has; it must come before NumPy is imported. `UNJAM_KERNELS=own` leaves
 all as it is. What was tried on which processors, and what still differs, is in docs/training.md.
 
@@ -17,8 +17,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-CHOICE = "UNJAM_KERNELS"
-SETTINGS = {
+KERNELS_VARIABLE = "UNJAM_KERNELS"
+KERNEL_SETTINGS = {
     "OPENBLAS_CORETYPE": "Haswell",
     # Threads round products of thousands of rows by the number of cores; at small ones they only wait.
     "OPENBLAS_NUM_THREADS": "1",
@@ -28,56 +28,56 @@ SETTINGS = {
     "MKL_CBWR": "COMPATIBLE",
 }
 """NumPy's products, on how many cores; its functions; torch's functions; its products and long functions"""
-OLDER_NUMPY = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+OLD_NUMPY_FEATURES = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
 """what NumPy before 2.4 calls the same"""
-LOADED = ("numpy", "torch")
+KERNEL_LIBRARIES = ("numpy", "torch")
 
 
-def pin() -> None:
+def pin_kernels() -> None:
     """Set the variables, over whatever they were; processes that are started from here inherit them."""
-    global _why_not
-    _why_not = _obstacle()
-    if _why_not is None:
-        wanted = settings()
-        late = [name for name in LOADED if name in sys.modules]
+    global _unpinned_reason
+    _unpinned_reason = _find_obstacle()
+    if _unpinned_reason is None:
+        wanted = kernel_settings()
+        late = [name for name in KERNEL_LIBRARIES if name in sys.modules]
         if late and any(os.environ.get(name) != value for name, value in wanted.items()):
-            _why_not = f"{late[0]} was imported before unjam"
+            _unpinned_reason = f"{late[0]} was imported before unjam"
         os.environ.update(wanted)
 
 
-def pinned() -> bool:
+def has_pinned_kernels() -> bool:
     """Return whether this process computes with the pinned kernels."""
-    return _why_not is None
+    return _unpinned_reason is None
 
 
-def child_would_be_pinned() -> bool:
+def needs_new_process() -> bool:
     """Return whether this process came too late, and a new one would not."""
-    return _why_not is not None and _obstacle() is None
+    return _unpinned_reason is not None and _find_obstacle() is None
 
 
-def settings() -> dict[str, str]:
+def kernel_settings() -> dict[str, str]:
     """Return the variables for the installed NumPy; it warns of names that it does not know."""
     with suppress(PackageNotFoundError, ValueError):
         if tuple(map(int, version("numpy").split(".")[:2])) < (2, 4):
-            return {**SETTINGS, "NPY_DISABLE_CPU_FEATURES": OLDER_NUMPY}
-    return SETTINGS
+            return {**KERNEL_SETTINGS, "NPY_DISABLE_CPU_FEATURES": OLD_NUMPY_FEATURES}
+    return KERNEL_SETTINGS
 
 
-def kernels() -> dict[str, Any]:
+def kernel_info() -> dict[str, Any]:
     """Return the processor and what is in force, as far as it is loaded: for the record."""
-    numpy, torch = (sys.modules.get(name) for name in LOADED)
+    numpy, torch = (sys.modules.get(name) for name in KERNEL_LIBRARIES)
     return {
-        "processor": processor().get("model name", platform.processor() or platform.machine()),
-        "pinned": pinned(),
-        "why_not": _why_not,
-        "settings": {name: os.environ.get(name) for name in SETTINGS},
+        "processor": processor_info().get("model name", platform.processor() or platform.machine()),
+        "pinned": has_pinned_kernels(),
+        "unsupported_reason": _unpinned_reason,
+        "settings": {name: os.environ.get(name) for name in KERNEL_SETTINGS},
         "openblas": _openblas_core(numpy) if numpy else None,
         "numpy": _numpy_features() if numpy else None,
         "torch": torch.backends.cpu.get_cpu_capability() if torch else None,
     }
 
 
-def processor() -> dict[str, str]:
+def processor_info() -> dict[str, str]:
     """Return what Linux says of the first processor; nothing elsewhere."""
     found: dict[str, str] = {}
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
@@ -89,13 +89,13 @@ def processor() -> dict[str, str]:
     return found
 
 
-def _obstacle() -> str | None:
+def _find_obstacle() -> str | None:
     """Return why nothing can be pinned here; None where it can."""
-    if os.environ.get(CHOICE) == "own":
-        return f"{CHOICE}=own"
+    if os.environ.get(KERNELS_VARIABLE) == "own":
+        return f"{KERNELS_VARIABLE}=own"
     if platform.machine() not in ("x86_64", "AMD64"):
         return f"the processor is no x86-64: {platform.machine()}"
-    if not {"avx2", "fma"} <= set(processor().get("flags", "").split()):
+    if not {"avx2", "fma"} <= set(processor_info().get("flags", "").split()):
         return "the processor has no AVX2, or does not say so"
     return None
 
@@ -116,4 +116,4 @@ def _numpy_features() -> list[str]:
     return [name for name in inside.__cpu_dispatch__ if inside.__cpu_features__.get(name)]
 
 
-_why_not: str | None = "pin() was not called"
+_unpinned_reason: str | None = "pin() was not called"

@@ -10,20 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from unjam import __version__
-from unjam.kernels import kernels
+from unjam.kernels import kernel_info
 
-PACKAGES = ("libsumo", "eclipse-sumo", "numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium")
+RECORDED_PACKAGES = ("libsumo", "eclipse-sumo", "numpy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium")
 
 
 def manifest() -> dict[str, Any]:
     """Return what is needed to repeat a result made now, by this process."""
     return {
         "unjam": __version__,
-        "commit": _commit(),
+        "commit": _source_commit(),
         "python": platform.python_version(),
         "packages": package_versions(),
         "machine": {"system": platform.platform(), "processor": platform.machine(), "cores": os.cpu_count()},
-        "kernels": kernels(),
+        "kernels": kernel_info(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
@@ -31,17 +31,17 @@ def manifest() -> dict[str, Any]:
 
 def package_versions() -> dict[str, str | None]:
     """Return the installed versions of what results depend on; None of what is not there."""
-    return {name: _version(name) for name in PACKAGES}
+    return {name: _package_version(name) for name in RECORDED_PACKAGES}
 
 
-def _version(package: str) -> str | None:
+def _package_version(package: str) -> str | None:
     try:
         return version(package)
     except PackageNotFoundError:
         return None
 
 
-def _commit() -> str | None:
+def _source_commit() -> str | None:
     """Return the commit of the source tree that this runs from, `+` where it was changed; None elsewhere."""
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():  # the settings of another repository can name programs

@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
-from unjam.errors import InputError, did_you_mean, wrong
+from unjam.errors import InputError, invalid_value, spelling_hint
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Configuration of every parameter dataclass: an unknown name or a NaN is an error, not a surprise.
@@ -15,10 +15,10 @@ The texts under its fields are what `unjam drivers` and the documentation show.
 """
 
 Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Count = Annotated[int, Field(ge=1)]
-Several = Annotated[int, Field(ge=2)]
-CountOrNone = Annotated[int, Field(ge=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+PositiveInt = Annotated[int, Field(ge=1)]
+IntAboveOne = Annotated[int, Field(ge=2)]
+NonNegativeInt = Annotated[int, Field(ge=0)]
 
 
 def as_range(value: Any) -> Any:
@@ -28,20 +28,20 @@ def as_range(value: Any) -> Any:
     return (value, value) if isinstance(value, int | float) else value
 
 
-OneOrRange = BeforeValidator(as_range)
+NumberOrRange = BeforeValidator(as_range)
 """lets a parameter that is a range be a single number too"""
 
-INTEGER_BITS = 63
+MAX_INTEGER_BITS = 63
 """of the size of an integer"""
 
-DEEPEST_KEY = 100
+MAX_KEY_PARTS = 100
 """parts of a key between its dots"""
-_DEEP_KEY = re.compile(rf"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{DEEPEST_KEY}}}""")
+_DEEP_KEY = re.compile(rf"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{MAX_KEY_PARTS}}}""")
 
-Checked = TypeVar("Checked")
+DataclassT = TypeVar("DataclassT")
 
 
-def build(kind: type[Checked], values: dict[str, Any], field: str) -> Checked:
+def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) -> DataclassT:
     """Return `kind(**values)`, or raise `InputError` with one line that names the first wrong value.
 
     `field` says where the values come from, for the message.
@@ -50,7 +50,7 @@ def build(kind: type[Checked], values: dict[str, Any], field: str) -> Checked:
     try:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
-        raise InputError(one_line(error, field, kind)) from None
+        raise InputError(validation_message(error, field, kind)) from None
 
 
 def _check_values(value: Any, name: str) -> None:
@@ -65,22 +65,22 @@ def _check_values(value: Any, name: str) -> None:
     elif isinstance(value, list | tuple):
         for inner in value:
             _check_values(inner, name)
-    elif isinstance(value, int) and value.bit_length() > INTEGER_BITS:
+    elif isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
         found = f"a number of {value.bit_length()} bits"
-        raise InputError(f"{name}: {found} is not allowed; allowed: at most {INTEGER_BITS}")
+        raise InputError(f"{name}: {found} is not allowed; allowed: at most {MAX_INTEGER_BITS}")
     elif isinstance(value, str) and "\0" in value:
-        raise wrong(name, value, "a text without NUL")
+        raise invalid_value(name, value, "a text without NUL")
 
 
-def one_line(error: ValidationError, field: str, kind: Any) -> str:
+def validation_message(error: ValidationError, field: str, kind: Any) -> str:
     """Return the first problem of a pydantic error as `field.name: value is not allowed; allowed: ...`."""
     problem = error.errors()[0]
     name = ".".join([field, *(str(part) for part in problem["loc"])]).strip(".")
     if problem["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         *path, last = problem["loc"]
-        names = _names_at(kind, path)
+        names = _field_names(kind, path)
         allowed = f"; allowed: {', '.join(sorted(names))}" if names else ""
-        return f"{name}: unknown name{did_you_mean(last, names) or allowed}"
+        return f"{name}: unknown name{spelling_hint(last, names) or allowed}"
     if problem["type"] == "missing":
         return f"{name}: missing"
     names_itself = not problem["loc"] or " is not allowed; allowed: " in problem["msg"]
@@ -92,7 +92,7 @@ def one_line(error: ValidationError, field: str, kind: Any) -> str:
     return f"{name}: {problem['input']!r} is not allowed; allowed: {allowed}"
 
 
-def _names_at(kind: Any, path: Sequence[object]) -> list[str]:
+def _field_names(kind: Any, path: Sequence[object]) -> list[str]:
     """Return the names of a dataclass's parameters, or of the one that a path leads to within it."""
     for part in path:
         kind = getattr(getattr(kind, "__pydantic_fields__", {}).get(part), "annotation", None)
@@ -109,7 +109,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     import tomllib
 
     if _DEEP_KEY.search(text):
-        raise ValueError(f"a key of more than {DEEPEST_KEY} parts")
+        raise ValueError(f"a key of more than {MAX_KEY_PARTS} parts")
     return tomllib.loads(text)
 
 
@@ -151,30 +151,30 @@ def _split_commas(text: str) -> list[str]:
     return [*parts, text[start:]]
 
 
-def changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def merge_changes(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Return `values` with `changes`; tables are merged key by key."""
     merged = dict(values)
     for key, value in changes.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = changed(merged[key], value) if both else value
+        merged[key] = merge_changes(merged[key], value) if both else value
     return merged
 
 
-def nested(changes: dict[str, Any]) -> dict[str, Any]:
+def nest_keys(changes: dict[str, Any]) -> dict[str, Any]:
     """Return changes whose keys may have dots as tables: `trpo.gamma` becomes `gamma` of the table `trpo`."""
     tables: dict[str, Any] = {}
     for key, value in changes.items():
         inner: Any = value
         for part in reversed(key.split(".")):
             inner = {part: inner}
-        tables = changed(tables, inner)
+        tables = merge_changes(tables, inner)
     return tables
 
 
-def flat(tables: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return tables within tables as one, whose keys have dots: `nested` undoes it."""
+def flatten_keys(tables: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return tables within tables as one, whose keys have dots: `nest_keys` undoes it."""
     found: dict[str, Any] = {}
     for key, value in tables.items():
         name = f"{prefix}{key}"
-        found |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+        found |= flatten_keys(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return found

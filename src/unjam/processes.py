@@ -18,61 +18,61 @@ from pathlib import Path
 
 from unjam.errors import DiskError, InputError
 from unjam.files import open_in_place, remove
-from unjam.folders import HELD_FOLDERS, held_folders, without_links
-from unjam.sandbox import confine, limit
+from unjam.folders import PROTECTED_FOLDERS_VARIABLE, protect_folder, protected_folders
+from unjam.sandbox import confine_process, limit_resources
 
-PARENT = "UNJAM_PARENT"
+PARENT_VARIABLE = "UNJAM_PARENT"
 """the variable that tells a process by whose side it ends"""
-OTHER_TRACI = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"
+TRACI_VARIABLES = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"
 """variables that make another library of traci, which says so on standard output"""
-LOCK = ".lock"
+LOCK_FILE = ".lock"
 """the file that holds a folder for who writes it"""
-HEARTBEAT, MISSED = 10.0, 6
+HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6
 """seconds between two signs of life of a folder's owner, and how many it may miss"""
-PREFIX, HELD = "unjam-", ".temporary"
+PRIVATE_FOLDER_PREFIX, PRIVATE_LOCK_FILE = "unjam-", ".temporary"
 """what the names of private temporary folders begin with, and the file by which a process holds its own"""
-SIGNAL_OF_PARENTS_DEATH = 1
+PR_SET_PDEATHSIG = 1
 """Linux's PR_SET_PDEATHSIG"""
-LARGEST_MEMORY = 8 * 2**30
+MAX_CHILD_MEMORY = 8 * 2**30
 """bytes that reading a file of others may take"""
-LONGEST_TIME = 600
+MAX_CHILD_TIME = 600
 """seconds that it may take"""
-_is_own = False
+_is_command_line = False
 
 
-def bound(environment: Mapping[str, str]) -> dict[str, str]:
+def bind_to_parent(environment: Mapping[str, str]) -> dict[str, str]:
     """Return the environment of a process of unjam that ends with this one, and holds the same folders."""
-    kept = {name: value for name, value in environment.items() if name not in OTHER_TRACI}
-    held = json.dumps([str(folder) for folder in held_folders()])
-    return {**kept, HELD_FOLDERS: held, PARENT: str(os.getpid())}
+    kept = {name: value for name, value in environment.items() if name not in TRACI_VARIABLES}
+    held = json.dumps([str(folder) for folder in protected_folders()])
+    return {**kept, PROTECTED_FOLDERS_VARIABLE: held, PARENT_VARIABLE: str(os.getpid())}
 
 
-def own_this_process() -> None:
+def mark_as_command_line() -> None:
     """Note that this process is the command line's: its standard output is for results alone.
 
     Only in such a process may unjam change what holds for all threads.
     """
-    global _is_own
-    _is_own = True
-    for name in OTHER_TRACI:
+    global _is_command_line
+    _is_command_line = True
+    for name in TRACI_VARIABLES:
         os.environ.pop(name, None)
 
 
-def user_output() -> AbstractContextManager[object]:
+def redirect_user_output() -> AbstractContextManager[object]:
     """Return the block for loading code of users: the command line prints what it says to standard error."""
-    return redirect_stdout(sys.stderr) if _is_own else nullcontext()
+    return redirect_stdout(sys.stderr) if _is_command_line else nullcontext()
 
 
-def end_with_parent(signum: int) -> None:
+def exit_with_parent(signum: int) -> None:
     """Let the system send this process a signal when the one that started it is gone; on Linux alone.
 
     It comes whatever this process is busy with. It is sent only where whoever started it asked for it.
     """
-    parent = os.environ.pop(PARENT, "")
+    parent = os.environ.pop(PARENT_VARIABLE, "")
     if not parent or sys.platform != "linux":
         return
     with suppress(OSError, AttributeError):  # a C library without it
-        ctypes.CDLL(None).prctl(SIGNAL_OF_PARENTS_DEATH, signum, 0, 0, 0)
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signum, 0, 0, 0)
     try:
         os.kill(int(parent), 0)
     except ProcessLookupError:  # it was gone before
@@ -80,7 +80,7 @@ def end_with_parent(signum: int) -> None:
 
 
 @contextmanager
-def printed_to(path: Path) -> Iterator[None]:
+def redirect_stderr(path: Path) -> Iterator[None]:
     """Let a file have what this process, its libraries included, prints as errors meanwhile."""
     before, descriptor = os.dup(2), open_in_place(path, os.O_WRONLY | os.O_CREAT)
     os.ftruncate(descriptor, 0)
@@ -93,7 +93,7 @@ def printed_to(path: Path) -> Iterator[None]:
         os.close(before)
 
 
-def go_on_limited(what: str, *writable: Path) -> None:
+def continue_in_limited_child(description: str, *writable: Path) -> None:
     """Go on in a child that reads `what` of others under limits; this process waits, and ends as that does.
 
     It may write under `writable` alone, and has no network, where the kernel sees to it. On Windows nothing
@@ -110,11 +110,11 @@ def go_on_limited(what: str, *writable: Path) -> None:
     here = str(os.getpid())
     child = os.fork()
     if child == 0:
-        os.environ[PARENT] = here
-        end_with_parent(signal.SIGKILL)
+        os.environ[PARENT_VARIABLE] = here
+        exit_with_parent(signal.SIGKILL)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # this process is told too, and ends it
-        limit(LARGEST_MEMORY, LONGEST_TIME)
-        confine(*writable)
+        limit_resources(MAX_CHILD_MEMORY, MAX_CHILD_TIME)
+        confine_process(*writable)
         return
     try:
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -123,29 +123,29 @@ def go_on_limited(what: str, *writable: Path) -> None:
         os.waitpid(child, 0)
         raise
     if code < 0:
-        how = f"{LARGEST_MEMORY / 2**30:g} GiB and {LONGEST_TIME:g} s: signal {-code}"
-        raise InputError(f"{what}: cannot be read within {how}")
+        how = f"{MAX_CHILD_MEMORY / 2**30:g} GiB and {MAX_CHILD_TIME:g} s: signal {-code}"
+        raise InputError(f"{description}: cannot be read within {how}")
     sys.exit(code)
 
 
-def protections() -> list[str]:
+def kernel_protections() -> list[str]:
     """Return what the kernel does here for a process that reads files of others; tried in a child."""
     if sys.platform != "linux":
         return []
     with tempfile.TemporaryDirectory() as folder:
         child = os.fork()
         if child == 0:
-            confine()
-            refused = [_refused(act) for act in (Path(folder, "file").touch, socket.socket)]
+            confine_process()
+            refused = [_is_denied(act) for act in (Path(folder, "file").touch, socket.socket)]
             os._exit(sum(2**number for number, each in enumerate(refused) if each))
         found = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     names = ("disk read-only (Landlock)", "no network (seccomp)")
     return [name for number, name in enumerate(names) if found >= 0 and found & 2**number]
 
 
-def _refused(act: Callable[[], object]) -> bool:
+def _is_denied(action: Callable[[], object]) -> bool:
     try:
-        act()
+        action()
     except PermissionError:
         return True
     return False
@@ -157,7 +157,7 @@ def has_display() -> bool:
 
 
 @contextmanager
-def owned(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder that is there for this process alone; it is free again when the process ends, however.
 
     Where machines share a folder but not its locks, the lock's age tells that an owner elsewhere still lives.
@@ -166,26 +166,26 @@ def owned(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another process holds it, or one of its entries is a link.
     """
-    with without_links(folder), _locked_folder(folder):
+    with protect_folder(folder), _hold_lock(folder):
         yield
 
 
 @contextmanager
-def _locked_folder(folder: Path) -> Iterator[None]:
+def _hold_lock(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder."""
-    path = folder / LOCK
-    descriptor = _locked(path)
-    while descriptor is not None and not _is_file(path, descriptor):  # its owner removed it just now
+    path = folder / LOCK_FILE
+    descriptor = _open_locked(path)
+    while descriptor is not None and not _is_same_file(path, descriptor):  # its owner removed it just now
         os.close(descriptor)
-        descriptor = _locked(path)
+        descriptor = _open_locked(path)
     if descriptor is None:
         yield
         return
     ended = threading.Event()
     try:
-        _refuse_other_machine(path, descriptor)
+        _check_other_machine(path, descriptor)
         os.pwrite(descriptor, f"{platform.node()} {os.getpid()}\n".ljust(300).encode(), 0)
-        beats = threading.Thread(target=_beat, args=(descriptor, ended), daemon=True)
+        beats = threading.Thread(target=_send_heartbeats, args=(descriptor, ended), daemon=True)
         beats.start()
         try:
             yield
@@ -197,19 +197,21 @@ def _locked_folder(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _beat(descriptor: int, ended: threading.Event) -> None:
-    while not ended.wait(HEARTBEAT):
+def _send_heartbeats(descriptor: int, stop: threading.Event) -> None:
+    while not stop.wait(HEARTBEAT_INTERVAL):
         with suppress(OSError):  # a disk that is away for a while
             os.utime(descriptor)
 
 
-def _refuse_other_machine(path: Path, descriptor: int) -> None:
+def _check_other_machine(path: Path, descriptor: int) -> None:
     """Raise `InputError` where a process of another machine has held a lock until just now."""
     owner = os.pread(descriptor, 300, 0).decode(errors="replace").split()
     age = time.time() - os.fstat(descriptor).st_mtime
-    if owner and owner[0] != platform.node() and abs(age) < MISSED * HEARTBEAT:
+    if owner and owner[0] != platform.node() and abs(age) < MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL:
         held = f"run: {str(path.parent)!r} is being written on {owner[0]}"
-        raise InputError(f"{held}; allowed: one at a time, or {MISSED * HEARTBEAT:g} s after its end")
+        raise InputError(
+            f"{held}; allowed: one at a time, or {MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL:g} s after its end"
+        )
 
 
 class PrivateFolder(tempfile.TemporaryDirectory[str]):
@@ -217,71 +219,73 @@ class PrivateFolder(tempfile.TemporaryDirectory[str]):
 
     def __init__(self) -> None:
         """Make it, and hold it."""
-        super().__init__(prefix=PREFIX)
-        self._held = _locked(Path(self.name, HELD))
-        if self._held is not None:
-            os.write(self._held, _identity_of(Path(self.name)))
+        super().__init__(prefix=PRIVATE_FOLDER_PREFIX)
+        self._lock_descriptor = _open_locked(Path(self.name, PRIVATE_LOCK_FILE))
+        if self._lock_descriptor is not None:
+            os.write(self._lock_descriptor, _folder_identity(Path(self.name)))
 
     def cleanup(self) -> None:
         """Remove it."""
         super().cleanup()
-        if self._held is not None:
-            os.close(self._held)
-            self._held = None
+        if self._lock_descriptor is not None:
+            os.close(self._lock_descriptor)
+            self._lock_descriptor = None
 
 
 @cache
-def sweep_private_folders() -> None:
+def remove_stale_private_folders() -> None:
     """Remove this user's private folders whose processes were killed, once in a process."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+    for folder in Path(tempfile.gettempdir()).glob(f"{PRIVATE_FOLDER_PREFIX}*"):
         with suppress(OSError, AttributeError, InputError):  # Windows has no users; somebody holds it
             found = folder.lstat()
-            young = time.time() - found.st_mtime < MISSED * HEARTBEAT
+            young = time.time() - found.st_mtime < MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
             if young or found.st_uid != os.getuid() or not stat.S_ISDIR(found.st_mode):
                 continue
-            if (folder / HELD).is_file() and (descriptor := _locked(folder / HELD)) is not None:
+            if (folder / PRIVATE_LOCK_FILE).is_file() and (
+                descriptor := _open_locked(folder / PRIVATE_LOCK_FILE)
+            ) is not None:
                 with suppress(DiskError):
-                    if os.pread(descriptor, 100, 0) == _identity_of(folder):  # or another program made it
+                    if os.pread(descriptor, 100, 0) == _folder_identity(folder):  # or another program made it
                         remove(folder)
                 os.close(descriptor)
 
 
-def _identity_of(folder: Path) -> bytes:
+def _folder_identity(folder: Path) -> bytes:
     """Return what no copy of a folder has."""
     found = folder.lstat()
     return f"unjam {found.st_dev} {found.st_ino}".encode()
 
 
-def check_not_owned(folder: Path) -> None:
+def check_not_locked(folder: Path) -> None:
     """Raise `InputError` where a process holds a folder now; its lock is only read, never written or made."""
-    path = folder / LOCK
+    path = folder / LOCK_FILE
     with suppress(OSError):  # there is none, or it cannot be read
-        if not stat.S_ISREG(path.lstat().st_mode) or (descriptor := _locked(path, reads=True)) is None:
+        if not stat.S_ISREG(path.lstat().st_mode) or (descriptor := _open_locked(path, is_shared=True)) is None:
             return
         try:
-            _refuse_other_machine(path, descriptor)
+            _check_other_machine(path, descriptor)
         finally:
             os.close(descriptor)
 
 
-def is_owned(folder: Path) -> bool:
+def is_locked(folder: Path) -> bool:
     """Return whether a process holds a folder now."""
     try:
-        check_not_owned(folder)
+        check_not_locked(folder)
     except InputError:
         return True
     return False
 
 
-def _locked(path: Path, reads: bool = False) -> int | None:
+def _open_locked(path: Path, is_shared: bool = False) -> int | None:
     """Return an open and locked file, for one that only `reads` a shared lock; None without locks."""
     try:
         import fcntl
     except ImportError:
         return None
-    descriptor = open_in_place(path, os.O_RDONLY if reads else os.O_RDWR | os.O_CREAT, 0o644)
+    descriptor = open_in_place(path, os.O_RDONLY if is_shared else os.O_RDWR | os.O_CREAT, 0o644)
     try:
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if reads else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
         held = f"run: {str(path.parent)!r} is being written by another process"
@@ -291,7 +295,7 @@ def _locked(path: Path, reads: bool = False) -> int | None:
     return descriptor
 
 
-def _is_file(path: Path, descriptor: int) -> bool:
+def _is_same_file(path: Path, descriptor: int) -> bool:
     """Return whether an open file still is the one of that name."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))

@@ -16,17 +16,17 @@ from pathlib import Path
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
 """Landlock's system calls, the same on all processors"""
 WRITE_FILE, TRUNCATE = 1 << 1, 1 << 14
-REMOVE_AND_MAKE = 0b1_1111_1111 << 4
+REMOVE_AND_CREATE = 0b1_1111_1111 << 4
 """folders, files, devices, sockets, pipes, links"""
 REFER = 1 << 13
 """moving to another folder"""
-NO_NEW_PRIVILEGES, SET_SECCOMP, FILTER = 38, 22, 2
+NO_NEW_PRIVILEGES, SET_SECCOMP, SECCOMP_FILTER_MODE = 38, 22, 2
 """of `prctl`"""
-SOCKET = {"x86_64": (0xC000003E, 41), "aarch64": (0xC00000B7, 198), "riscv64": (0xC00000F3, 198)}
+SOCKET_SYSCALLS = {"x86_64": (0xC000003E, 41), "aarch64": (0xC00000B7, 198), "riscv64": (0xC00000F3, 198)}
 """what the kernel calls a processor, and the number of `socket` there"""
-IO_URING = 425
+IO_URING_SETUP = 425
 """`io_uring_setup`, by which sockets can be had too"""
-OTHER_NUMBERS = 0x40000000
+X32_SYSCALL_BIT = 0x40000000
 """the same calls by other numbers (x32)"""
 EPERM = 1
 
@@ -38,19 +38,14 @@ class _Rule(ctypes.Structure):
 
 
 class _Instruction(ctypes.Structure):
-    _fields_ = (
-        ("code", ctypes.c_uint16),
-        ("yes", ctypes.c_uint8),
-        ("no", ctypes.c_uint8),
-        ("k", ctypes.c_uint32),
-    )
+    _fields_ = (("code", ctypes.c_uint16), ("yes", ctypes.c_uint8), ("no", ctypes.c_uint8), ("k", ctypes.c_uint32))
 
 
 class _Program(ctypes.Structure):
     _fields_ = (("length", ctypes.c_uint16), ("instructions", ctypes.POINTER(_Instruction)))
 
 
-def limit(memory: int, seconds: int = 0) -> None:
+def limit_resources(memory: int, seconds: int = 0) -> None:
     """Let this process end where it takes more memory [bytes] or time [s] than that; not on Windows."""
     with suppress(ImportError):
         import resource
@@ -64,17 +59,17 @@ def limit(memory: int, seconds: int = 0) -> None:
             signal.alarm(seconds)  # also where it only waits
 
 
-def confine(*writable: Path) -> None:
+def confine_process(*writable: Path) -> None:
     """Leave this thread and its children no sockets, and no writing but under these folders; for good.
 
     Where the kernel offers one of both, that holds; where none, nothing changes.
     """
-    keep_disk(*writable)
+    restrict_writing(*writable)
     if sys.platform == "linux":
-        _close_network(ctypes.CDLL(None))
+        _block_sockets(ctypes.CDLL(None))
 
 
-def keep_disk(*writable: Path) -> None:
+def restrict_writing(*writable: Path) -> None:
     """Leave this thread and its children no writing but under these folders, and all sockets; for good."""
     if sys.platform != "linux":
         return
@@ -84,7 +79,7 @@ def keep_disk(*writable: Path) -> None:
     if version < 1:
         return
     files = WRITE_FILE | (TRUNCATE if version > 2 else 0)
-    handled = files | REMOVE_AND_MAKE | (REFER if version > 1 else 0)
+    handled = files | REMOVE_AND_CREATE | (REFER if version > 1 else 0)
     ruleset = libc.syscall(CREATE_RULESET, ctypes.byref(ctypes.c_uint64(handled)), ctypes.c_size_t(8), 0)
     folders = filter(Path.is_dir, writable)
     for path, allowed in {**dict.fromkeys(folders, handled), Path(os.devnull): files}.items():
@@ -95,31 +90,31 @@ def keep_disk(*writable: Path) -> None:
     os.close(ruleset)
 
 
-def _close_network(libc: ctypes.CDLL) -> None:
-    if platform.machine() not in SOCKET or sys.maxsize < 2**32:
+def _block_sockets(libc: ctypes.CDLL) -> None:
+    if platform.machine() not in SOCKET_SYSCALLS or sys.maxsize < 2**32:
         return
-    processor, socket = SOCKET[platform.machine()]
+    processor, socket = SOCKET_SYSCALLS[platform.machine()]
     load, equal, at_least, answer = 0x20, 0x15, 0x35, 0x06
     instructions = (_Instruction * 8)(
         (load, 0, 0, 4),
         (equal, 0, 5, processor),
         (load, 0, 0, 0),
-        (at_least, 3, 0, OTHER_NUMBERS),
+        (at_least, 3, 0, X32_SYSCALL_BIT),
         (equal, 2, 0, socket),
-        (equal, 1, 0, IO_URING),
+        (equal, 1, 0, IO_URING_SETUP),
         (answer, 0, 0, 0x7FFF0000),  # yes
         (answer, 0, 0, 0x00050000 | EPERM),
     )
-    libc.prctl(SET_SECCOMP, FILTER, ctypes.byref(_Program(len(instructions), instructions)), 0, 0)
+    libc.prctl(SET_SECCOMP, SECCOMP_FILTER_MODE, ctypes.byref(_Program(len(instructions), instructions)), 0, 0)
 
 
-def main(memory: str, seconds: str, writable: str, program: str, *arguments: str) -> None:
+def run_sandboxed(memory: str, seconds: str, writable: str, program: str, *arguments: str) -> None:
     """Run a Python program with its arguments so, where `writable` is a folder or empty."""
-    limit(int(memory), int(seconds))
-    confine(*map(Path, filter(None, [writable])))
+    limit_resources(int(memory), int(seconds))
+    confine_process(*map(Path, filter(None, [writable])))
     sys.argv = [program, *arguments]
     runpy.run_path(program, run_name="__main__")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run_sandboxed(*sys.argv[1:])

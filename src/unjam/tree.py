@@ -15,7 +15,7 @@ import numpy as np
 
 Arrays = dict[str, np.ndarray]
 """by their path in the tree: `trajectories.0.states.speed`"""
-ARRAY = "array"
+ARRAY_KEY = "array"
 """key of the JSON object that stands for an array; its value is the path"""
 
 
@@ -23,95 +23,91 @@ def pack(tree: Any, path: str = "") -> tuple[Any, Arrays]:
     """Return a tree as JSON and arrays; `unpack` undoes it exactly."""
     arrays: Arrays = {}
 
-    def taken_apart(value: Any, path: str) -> Any:
+    def pack_value(value: Any, path: str) -> Any:
         if isinstance(value, np.ndarray):
             arrays[path] = value
-            return {ARRAY: path}
-        inner = _named(value)
+            return {ARRAY_KEY: path}
+        inner = _named_parts(value)
         if inner is not None:
-            return {name: taken_apart(part, _joined(path, name)) for name, part in inner.items()}
+            return {name: pack_value(part, _join_path(path, name)) for name, part in inner.items()}
         if isinstance(value, (tuple, list)):
-            return [taken_apart(part, _joined(path, str(index))) for index, part in enumerate(value)]
+            return [pack_value(part, _join_path(path, str(index))) for index, part in enumerate(value)]
         return value.item() if isinstance(value, np.generic) else value
 
-    return taken_apart(tree, path), arrays
+    return pack_value(tree, path), arrays
 
 
-def unpack(kind: Any, facts: Any, arrays: Arrays) -> Any:
+def unpack(kind: Any, packed: Any, arrays: Arrays) -> Any:
     """Return the tree of type `kind` that `pack` took apart.
 
     Raises:
         ValueError: it is not one: a name, a type or an array is missing, unknown or wrong.
     """
-    if isinstance(facts, dict) and facts.keys() == {ARRAY} and isinstance(facts[ARRAY], str):
-        if facts[ARRAY] not in arrays or not (kind is Any or _is_array(kind)):
-            raise ValueError(f"array {facts[ARRAY]!r} is missing, or has no place")
-        return arrays[facts[ARRAY]]
+    if isinstance(packed, dict) and packed.keys() == {ARRAY_KEY} and isinstance(packed[ARRAY_KEY], str):
+        if packed[ARRAY_KEY] not in arrays or not (kind is Any or _is_array(kind)):
+            raise ValueError(f"array {packed[ARRAY_KEY]!r} is missing, or has no place")
+        return arrays[packed[ARRAY_KEY]]
     if kind is Any:
-        if not isinstance(facts, dict):
-            return facts
-        return {name: unpack(Any, part, arrays) for name, part in facts.items()}
+        if not isinstance(packed, dict):
+            return packed
+        return {name: unpack(Any, part, arrays) for name, part in packed.items()}
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
-        if facts is None and NoneType in inner:
+        if packed is None and NoneType in inner:
             return None
         (kind,) = (one for one in inner if one is not NoneType)
-        return unpack(kind, facts, arrays)
-    types = _types_of(kind)
+        return unpack(kind, packed, arrays)
+    types = _field_types(kind)
     if types is not None:
-        _expect(dict, facts, kind)
-        unknown, missing = facts.keys() - types.keys(), types.keys() - facts.keys()
+        _check_type(dict, packed, kind)
+        unknown, missing = packed.keys() - types.keys(), types.keys() - packed.keys()
         if unknown or missing:
-            raise ValueError(
-                f"{kind.__name__}: {min(unknown | missing)!r} is {'unknown' if unknown else 'missing'}"
-            )
-        return kind(**{name: unpack(types[name], part, arrays) for name, part in facts.items()})
+            raise ValueError(f"{kind.__name__}: {min(unknown | missing)!r} is {'unknown' if unknown else 'missing'}")
+        return kind(**{name: unpack(types[name], part, arrays) for name, part in packed.items()})
     if origin is dict:
-        _expect(dict, facts, kind)
-        return {name: unpack(inner[1], part, arrays) for name, part in facts.items()}
+        _check_type(dict, packed, kind)
+        return {name: unpack(inner[1], part, arrays) for name, part in packed.items()}
     if origin in (tuple, list):
-        _expect(list, facts, kind)
-        ends = (inner[0],) * len(facts) if origin is list or inner[1:] == (...,) else inner
-        if len(ends) != len(facts):
-            raise ValueError(f"{len(facts)} values are not allowed; allowed: {len(ends)}")
-        return origin(unpack(one, part, arrays) for one, part in zip(ends, facts, strict=True))
-    if kind is float and (facts is None or type(facts) is int):
-        return float("nan") if facts is None else float(facts)
+        _check_type(list, packed, kind)
+        ends = (inner[0],) * len(packed) if origin is list or inner[1:] == (...,) else inner
+        if len(ends) != len(packed):
+            raise ValueError(f"{len(packed)} values are not allowed; allowed: {len(ends)}")
+        return origin(unpack(one, part, arrays) for one, part in zip(ends, packed, strict=True))
+    if kind is float and (packed is None or type(packed) is int):
+        return float("nan") if packed is None else float(packed)
     if isinstance(kind, type):
-        _expect(kind, facts, kind)
-    return facts
+        _check_type(kind, packed, kind)
+    return packed
 
 
 def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield each leaf of nested dicts with its path, the names joined by dots."""
     if isinstance(tree, dict):
         for name, part in tree.items():
-            yield from leaves(part, _joined(path, name))
+            yield from leaves(part, _join_path(path, name))
     else:
         yield path, tree
 
 
-def mapped(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
+def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
     """Return nested dicts with `function` of each leaf, and of the same leaf of the other trees."""
     if isinstance(tree, dict):
-        return {
-            name: mapped(function, part, *(other[name] for other in others)) for name, part in tree.items()
-        }
+        return {name: map_leaves(function, part, *(other[name] for other in others)) for name, part in tree.items()}
     return function(tree, *others)
 
 
-def rebuilt(tree: Any, values: dict[str, Any], path: str = "") -> Any:
+def replace_leaves(tree: Any, values: dict[str, Any], path: str = "") -> Any:
     """Return nested dicts like `tree` with the `values` that `leaves` would name."""
     if isinstance(tree, dict):
-        return {name: rebuilt(part, values, _joined(path, name)) for name, part in tree.items()}
+        return {name: replace_leaves(part, values, _join_path(path, name)) for name, part in tree.items()}
     return values[path]
 
 
-def _joined(path: str, name: str) -> str:
+def _join_path(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _named(value: Any) -> dict[str, Any] | None:
+def _named_parts(value: Any) -> dict[str, Any] | None:
     """Return the parts of a value that has names for them."""
     if isinstance(value, dict):
         return value
@@ -123,7 +119,7 @@ def _named(value: Any) -> dict[str, Any] | None:
 
 
 @cache
-def _types_of(kind: Any) -> dict[str, Any] | None:
+def _field_types(kind: Any) -> dict[str, Any] | None:
     """Return the declared types of a record's parts; None of what is no record."""
     if is_dataclass(kind):
         hints = get_type_hints(kind)
@@ -137,6 +133,6 @@ def _is_array(kind: Any) -> bool:
     return get_origin(kind) is np.ndarray or kind is np.ndarray
 
 
-def _expect(kind: type, facts: Any, wanted: Any) -> None:
-    if not isinstance(facts, kind):
-        raise ValueError(f"{facts!r:.60} is not allowed; allowed: {getattr(wanted, '__name__', wanted)}")
+def _check_type(kind: type, value: Any, declared: Any) -> None:
+    if not isinstance(value, kind):
+        raise ValueError(f"{value!r:.60} is not allowed; allowed: {getattr(declared, '__name__', declared)}")

@@ -23,9 +23,9 @@ from typing import Any
 
 from unjam.errors import InputError
 
-PREFIX = "unjam_user_"
+USER_MODULE_PREFIX = "unjam_user_"
 """what names of users' modules in `sys.modules` begin with"""
-INIT = "__init__.py"
+INIT_FILE = "__init__.py"
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def read_code(path: Path) -> UserCode:
     while waiting:
         name = waiting.pop()
         place, source = found[name]
-        for wanted in _imported_names(source, _package_of(name, place)):
+        for wanted in _imported_names(source, _package_name(name, place)):
             parts = wanted.split(".")
             for end in range(1, len(parts) + 1):
                 inner, parent = ".".join(parts[:end]), ".".join(parts[: end - 1])
@@ -73,17 +73,17 @@ def read_code(path: Path) -> UserCode:
                     continue
                 if parent and not _is_package(found[parent][0]):
                     break
-                if (file := _find(path, inner)) is None:
+                if (file := _find_source(path, inner)) is None:
                     break
                 found[inner] = file, file.read_bytes() if file.suffix == ".py" else b""
                 waiting.append(inner)
     return UserCode(path, found)
 
 
-def _find(path: Path, name: str) -> Path | None:
+def _find_source(path: Path, name: str) -> Path | None:
     """Return the source of a module of a file's folder, or the folder of a package that has none."""
     base = path.parent.joinpath(*name.split("."))
-    sources = [file for file in (base / INIT, base.with_name(f"{base.name}.py")) if file.is_file()]
+    sources = [file for file in (base / INIT_FILE, base.with_name(f"{base.name}.py")) if file.is_file()]
     compiled = [
         file
         for stem in (base / "__init__", base)
@@ -102,13 +102,13 @@ def _find(path: Path, name: str) -> Path | None:
 @lru_cache(1024)
 def _is_installed(name: str) -> bool:
     """Return whether a module is unjam's own, of the standard library, or of an installed package."""
-    folders = [each for each in sys.path if is_of_packages(each)]
+    folders = [each for each in sys.path if is_package_folder(each)]
     spec = PathFinder.find_spec(name, folders)
     is_package = spec is not None and spec.origin is not None  # not merely a folder
     return is_package or name == "unjam" or name in sys.stdlib_module_names
 
 
-def is_of_packages(folder: str) -> bool:
+def is_package_folder(folder: str) -> bool:
     """Return whether a folder of `sys.path` is one that packages are installed into."""
     return Path(folder).name in ("site-packages", "dist-packages")
 
@@ -134,16 +134,16 @@ def _imported_names(source: bytes, package: str) -> tuple[str, ...]:
 
 
 @lru_cache(1024)
-def _compiled(source: bytes, path: str) -> CodeType:
+def _compile_source(source: bytes, path: str) -> CodeType:
     return InspectLoader.source_to_code(source, path)
 
 
-def _is_package(place: Path) -> bool:
-    return place.name == INIT or place.suffix != ".py"
+def _is_package(path: Path) -> bool:
+    return path.name == INIT_FILE or path.suffix != ".py"
 
 
-def _package_of(name: str, place: Path) -> str:
-    return name if name and _is_package(place) else name.rpartition(".")[0]
+def _package_name(name: str, path: Path) -> str:
+    return name if name and _is_package(path) else name.rpartition(".")[0]
 
 
 class _Modules(InspectLoader):
@@ -151,9 +151,9 @@ class _Modules(InspectLoader):
 
     def __init__(self, code: UserCode) -> None:
         self._code = code
-        self._root = f"{PREFIX}{code.path.stem}_{abs(hash(str(code.path))):x}"
+        self._root = f"{USER_MODULE_PREFIX}{code.path.stem}_{abs(hash(str(code.path))):x}"
         self._modules: dict[str, ModuleType] = {}
-        self._lock, self._running = threading.RLock(), False
+        self._lock, self._is_running = threading.RLock(), False
         self._builtins = {**vars(builtins), "__import__": self._import}
 
     def run(self) -> ModuleType:
@@ -162,59 +162,57 @@ class _Modules(InspectLoader):
             if f"{name}.".startswith(f"{self._root}."):
                 del sys.modules[name]  # of the run before
         missing = [name for name in self._code.modules if name and name not in sys.modules]
-        self._running = True
+        self._is_running = True
         try:
             return self._load("")
         finally:
-            self._running = False
+            self._is_running = False
             for name in missing:
                 sys.modules.pop(name, None)
 
     def get_source(self, fullname: str) -> str:
         """Return the source of a module, for tracebacks."""
-        return importlib.util.decode_source(self._code.modules[self._inner(fullname)][1])
+        return importlib.util.decode_source(self._code.modules[self._local_name(fullname)][1])
 
     def get_code(self, fullname: str) -> CodeType:
         """Return the compiled source of a module; the lines that tracebacks show are those that run."""
-        place, source = self._code.modules[self._inner(fullname)]
-        code = _compiled(source, str(place))
+        place, source = self._code.modules[self._local_name(fullname)]
+        code = _compile_source(source, str(place))
         lines = self.get_source(fullname).splitlines(keepends=True)
         linecache.cache[str(place)] = (len(source), None, lines, str(place))
         return code
 
     def is_package(self, fullname: str) -> bool:
         """Return whether a module has modules below it."""
-        inner = self._inner(fullname)
+        inner = self._local_name(fullname)
         return bool(inner) and _is_package(self._code.modules[inner][0])
 
-    def _inner(self, fullname: str) -> str:
+    def _local_name(self, fullname: str) -> str:
         return fullname[len(self._root) + 1 :]
 
-    def _load(self, inner: str) -> ModuleType:
+    def _load(self, local_name: str) -> ModuleType:
         """Return a module, which runs where it is imported first."""
-        parent, _, own = inner.rpartition(".")
+        parent, _, own = local_name.rpartition(".")
         if parent:
             self._load(parent)
-        if inner in self._modules:
-            return self._modules[inner]
-        place, _ = self._code.modules[inner]
-        name = f"{self._root}.{inner}" if inner else self._root
-        below = [str(place.parent if place.name == INIT else place)] if self.is_package(name) else None
-        spec = importlib.util.spec_from_file_location(
-            name, place, loader=self, submodule_search_locations=below
-        )
+        if local_name in self._modules:
+            return self._modules[local_name]
+        place, _ = self._code.modules[local_name]
+        name = f"{self._root}.{local_name}" if local_name else self._root
+        below = [str(place.parent if place.name == INIT_FILE else place)] if self.is_package(name) else None
+        spec = importlib.util.spec_from_file_location(name, place, loader=self, submodule_search_locations=below)
         assert spec is not None
         if below is not None:
             spec.submodule_search_locations = []  # or Python itself would search the folder, unhashed
         module = importlib.util.module_from_spec(spec)
         module.__dict__["__builtins__"] = self._builtins
-        self._modules[inner] = sys.modules[name] = module
-        if inner and self._running:
-            sys.modules.setdefault(inner, module)
+        self._modules[local_name] = sys.modules[name] = module
+        if local_name and self._is_running:
+            sys.modules.setdefault(local_name, module)
         try:
             self.exec_module(module)
         except BaseException:
-            del self._modules[inner], sys.modules[name]
+            del self._modules[local_name], sys.modules[name]
             raise
         if parent:
             setattr(self._modules[parent], own, module)
@@ -231,8 +229,8 @@ class _Modules(InspectLoader):
         """Do what `import` does in these modules: first of the folder, then as anywhere else."""
         inner = name
         if level:
-            own = self._inner(str((globals or {})["__name__"]))
-            package = _package_of(own, self._code.modules[own][0])
+            own = self._local_name(str((globals or {})["__name__"]))
+            package = _package_name(own, self._code.modules[own][0])
             if not package:
                 raise ImportError("attempted relative import with no known parent package")
             inner = importlib.util.resolve_name("." * level + name, package)
@@ -245,10 +243,10 @@ class _Modules(InspectLoader):
             module = self._load(inner)
             if not fromlist:
                 return self._load(top)
-            for item in self._items(module, fromlist):
+            for item in self._imported_items(module, fromlist):
                 if f"{inner}.{item}" in self._code.modules and not hasattr(module, item):
                     self._load(f"{inner}.{item}")
             return module
 
-    def _items(self, module: ModuleType, fromlist: Sequence[str]) -> Iterator[str]:
+    def _imported_items(self, module: ModuleType, fromlist: Sequence[str]) -> Iterator[str]:
         yield from getattr(module, "__all__", ()) if "*" in fromlist else fromlist

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from unjam.cli import output
-from unjam.cli.train import _Progress
+from unjam.cli.train import _TrainingProgress
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate
 from unjam.parameters import parse_assignments
@@ -66,28 +66,28 @@ def aside(monkeypatch: pytest.MonkeyPatch) -> StringIO:
 def test_of_several_roads_the_one_is_named_on_which_a_training_gains_least(
     aside: StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules[_Progress.__module__], "aside", output.aside)
-    row = {"iteration": 1, "actual_steps": 10, "return_mean": 5.0, "return_expert": 4.0}
+    monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "aside", output.err_console)
+    row = {"iteration": 1, "environment_steps": 10, "return_mean": 5.0, "return_expert": 4.0}
     roads = {"ring": {"return_validation": 9.0, "return_expert": 3.0}, "eight": {"return_validation": 1.0}}
     roads["eight"]["return_expert"] = 4.4
-    with _Progress(RunConfig(steps=30), Path("run")) as shown:
-        shown.iteration({**row, "return_validation": 6.0, "tasks": roads})
-        shown.iteration({**row, "iteration": 11, "return_validation": None, "tasks": {}})
+    with _TrainingProgress(RunConfig(steps=30), Path("run")) as shown:
+        shown.show_iteration({**row, "return_validation": 6.0, "tasks": roads})
+        shown.show_iteration({**row, "iteration": 11, "return_validation": None, "tasks": {}})
     said = "return 5, validation 6 (expert 4; least beyond it on eight: -3)"
     assert [line.partition("steps, ")[2] for line in aside.getvalue().splitlines()] == [said, said]
 
 
 def test_after_a_training_of_several_roads_it_is_the_whole_run_that_goes_on(aside: StringIO) -> None:
-    output.after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"), over=False)
+    output.suggest_after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"), is_finished=False)
     assert "unjam train --resume runs/all --steps 200" in aside.getvalue()
 
 
 def test_a_training_that_is_over_is_shipped_where_it_gained_and_not_trained_on_where_it_did_not(
     aside: StringIO,
 ) -> None:
-    output.after_training(Path("runs/one"), estimate([0.0, 0.0]), 100, Path("runs/one"), over=True)
+    output.suggest_after_training(Path("runs/one"), estimate([0.0, 0.0]), 100, Path("runs/one"), is_finished=True)
     assert aside.getvalue() == ""
-    output.after_training(Path("runs/one"), estimate([5.0, 6.0, 7.0]), 100, Path("runs/one"), over=True)
+    output.suggest_after_training(Path("runs/one"), estimate([5.0, 6.0, 7.0]), 100, Path("runs/one"), is_finished=True)
     assert aside.getvalue() == "ship it: unjam export runs/one --to one.unjam\n"
 
 
@@ -97,14 +97,12 @@ def test_a_training_that_is_over_is_shipped_where_it_gained_and_not_trained_on_w
         (
             ["human", "unjam:best"],
             {"population": "unjam:ngsim", "length": [230, 240]},
-            "unjam watch ring -d unjam:best --video ring.gif --set population=unjam:ngsim --set "
-            "'length=[230, 240]'",
+            "unjam watch ring -d unjam:best --video ring.gif --set population=unjam:ngsim --set 'length=[230, 240]'",
         ),
         (
             ["human", "pi"],
             {"cavs": 2, "actuation": "raw"},
-            "unjam train ring --expert pi --preset demo --reward eq16 --set road.cavs=2 --set "
-            "road.actuation=raw",
+            "unjam train ring --expert pi --preset demo --reward eq16 --set road.cavs=2 --set road.actuation=raw",
         ),
         (["unjam:best", "human"], {}, "unjam watch ring -d unjam:best --video ring.gif"),
     ],
@@ -112,7 +110,7 @@ def test_a_training_that_is_over_is_shipped_where_it_gained_and_not_trained_on_w
 def test_what_is_proposed_after_a_drive_is_for_the_same_road(
     drivers: list[str], changes: dict[str, Any], words: str, aside: StringIO
 ) -> None:
-    output.after_drive("ring", drivers, changes, "eq16")
+    output.suggest_after_drive("ring", drivers, changes, "eq16")
     proposed = aside.getvalue().strip().partition(": ")[2]
     assert proposed == words
     asked = shlex.split(proposed)
@@ -121,15 +119,13 @@ def test_what_is_proposed_after_a_drive_is_for_the_same_road(
     assert given == changes
 
 
-def test_the_judgement_after_a_training_shows_how_far_it_is(
-    aside: StringIO, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys.modules[_Progress.__module__], "aside", output.aside)
-    monkeypatch.setattr(output, "LINE_SECONDS", -1.0)
-    monkeypatch.setattr(evaluate, "steps_to_judge", lambda config, folder: 3000)
-    with _Progress(RunConfig(), Path("run")) as shown:
+def test_the_judgement_after_a_training_shows_how_far_it_is(aside: StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "aside", output.err_console)
+    monkeypatch.setattr(output, "PROGRESS_LINE_SECONDS", -1.0)
+    monkeypatch.setattr(evaluate, "evaluation_steps", lambda config, folder: 3000)
+    with _TrainingProgress(RunConfig(), Path("run")) as shown:
         for episode, steps in ((("pi", 0), 500), (("pi", 1), 500), (("pi", 0), 1500)):
-            shown.judging(episode, steps)
+            shown.show_evaluation(episode, steps)
     words = "evaluating on held-out seeds"
     counted = [f"{words}: {steps} of 3,000 steps" for steps in ("500", "1,000", "2,000")]
     assert aside.getvalue().splitlines() == [words, *counted]

@@ -11,10 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.controller import file as files
-from unjam.controller.file import LARGEST_PART, MANIFEST, PARTS, WEIGHTS, hash_of, pack_parts, unpack_parts
+from unjam.controller.file import (
+    ARCHIVE_PARTS,
+    MANIFEST_PART,
+    MAX_PART_BYTES,
+    WEIGHTS_PART,
+    pack_parts,
+    sha256_of,
+    unpack_parts,
+)
 from unjam.errors import InputError
 
-WHOLE = {MANIFEST: b"{}", WEIGHTS: b"numbers"}
+WHOLE = {MANIFEST_PART: b"{}", WEIGHTS_PART: b"numbers"}
 
 
 def written(folder: Path, content: bytes) -> Path:
@@ -41,7 +49,7 @@ def refused(folder: Path, content: bytes) -> str:
     return str(caught.value)
 
 
-@given(st.dictionaries(st.sampled_from(PARTS[2:]), st.binary(max_size=50)))
+@given(st.dictionaries(st.sampled_from(ARCHIVE_PARTS[2:]), st.binary(max_size=50)))
 def test_parts_come_back_as_they_were(more: dict[str, bytes]) -> None:
     parts = {**WHOLE, **more}
     with tempfile.TemporaryDirectory() as folder:
@@ -52,7 +60,7 @@ def test_parts_come_back_as_they_were(more: dict[str, bytes]) -> None:
 def test_the_same_parts_have_the_same_bytes_on_any_system() -> None:
     """Signatures of other machines and versions of Python are compared with these bytes."""
     wanted = "0c76ee6c3457b1cddf8e2d648525009b7da622c0d7567322a4be99b561c21548"
-    assert hash_of(pack_parts(WHOLE)) == wanted
+    assert sha256_of(pack_parts(WHOLE)) == wanted
 
 
 @pytest.mark.parametrize(
@@ -68,22 +76,20 @@ def test_a_part_of_another_name_is_refused(tmp_path: Path, name: str) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["inner"]
 
 
-@pytest.mark.parametrize("name", [MANIFEST, WEIGHTS])
+@pytest.mark.parametrize("name", [MANIFEST_PART, WEIGHTS_PART])
 def test_a_second_part_of_a_name_is_refused(tmp_path: Path, name: str) -> None:
     assert f"has {name} twice" in refused(tmp_path, with_entry(zipfile.ZipInfo(name)))
 
 
 def test_a_link_is_refused(tmp_path: Path) -> None:
-    entry = zipfile.ZipInfo(PARTS[2])
+    entry = zipfile.ZipInfo(ARCHIVE_PARTS[2])
     entry.external_attr = (stat.S_IFLNK | 0o777) << 16
     assert "is a link" in refused(tmp_path, with_entry(entry, b"/etc/passwd"))
 
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_a_bomb_is_refused_before_it_is_unpacked(
-    tmp_path: Path, how: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = zipfile.ZipInfo(PARTS[2])
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, how: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = zipfile.ZipInfo(ARCHIVE_PARTS[2])
     entry.compress_type = how
     content = with_entry(entry, bytes(2**22))
     assert len(content) < 2**14
@@ -92,22 +98,22 @@ def test_a_bomb_is_refused_before_it_is_unpacked(
 
 
 def test_a_part_that_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "LARGEST_PART", 1000)
+    monkeypatch.setattr(files, "MAX_PART_BYTES", 1000)
     assert "has 1001 bytes; allowed: at most 1000" in refused(
-        tmp_path, with_entry(zipfile.ZipInfo(PARTS[2]), bytes(1001))
+        tmp_path, with_entry(zipfile.ZipInfo(ARCHIVE_PARTS[2]), bytes(1001))
     )
     assert "bytes; allowed: at most 6000" in refused(
-        tmp_path, with_entry(zipfile.ZipInfo(PARTS[2]), bytes(6000))
+        tmp_path, with_entry(zipfile.ZipInfo(ARCHIVE_PARTS[2]), bytes(6000))
     )
 
 
 def test_a_part_that_says_it_is_larger_than_it_is_is_refused(tmp_path: Path) -> None:
     content = bytearray(pack_parts(WHOLE))
-    struct.pack_into("<I", content, content.index(b"PK\x01\x02") + 24, LARGEST_PART)
+    struct.pack_into("<I", content, content.index(b"PK\x01\x02") + 24, MAX_PART_BYTES)
     assert "is compressed or encrypted" in refused(tmp_path, bytes(content))
 
 
-@pytest.mark.parametrize("name", [MANIFEST, WEIGHTS])
+@pytest.mark.parametrize("name", [MANIFEST_PART, WEIGHTS_PART])
 def test_without_what_every_controller_has_it_is_none(tmp_path: Path, name: str) -> None:
     parts = {key: part for key, part in WHOLE.items() if key != name}
     assert f"not a controller: it has no {name}" in refused(tmp_path, pack_parts(parts))

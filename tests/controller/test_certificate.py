@@ -9,41 +9,47 @@ import numpy as np
 import pytest
 
 from unjam.controller import certificate as certificates
-from unjam.controller.certificate import FREQUENCIES, Domain, certificate_of, certify, human_gain
-from unjam.controller.domain import outside_domain
+from unjam.controller.certificate import (
+    OSCILLATION_FREQUENCIES,
+    OperatingDomain,
+    certify_driver,
+    human_gain,
+    make_certificate,
+)
+from unjam.controller.domain import outside_domain_share
 from unjam.controller.file import (
-    CERTIFICATE,
-    MANIFEST,
-    SAMPLE,
+    CERTIFICATE_PART,
+    MANIFEST_PART,
+    SAMPLE_PART,
     add_certificate,
     controller_bytes,
-    hash_of,
     pack_parts,
     read_controller,
     sample_bytes,
+    sha256_of,
     unpack_parts,
 )
-from unjam.controller.verify import verify_controller
+from unjam.controller.verify import verify_controller_file
 from unjam.drivers import IDM, Driver, FollowerStopper, LocalState, PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.drivers.safety import SafetyFilter
-from unjam.drivers.wrappers import Filtered
+from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
 from unjam.physics.idm import PAPER_IDM, IDMParameters, equilibrium_gap
-from unjam.reports.certificate import write_certificate
+from unjam.reports.certificate import write_certificate_page
 from unjam.scenarios import Ring
-from unjam.training.folder import origin
+from unjam.training.run_folder import controller_origin
 
 
 @pytest.fixture(autouse=True)
 def few_attacks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(certificates, "ATTACKS", 24)
     monkeypatch.setattr(certificates, "GENERATIONS", 3)
-    monkeypatch.setattr(certificates, "FREQUENCIES", FREQUENCIES[::4])
+    monkeypatch.setattr(certificates, "FREQUENCIES", OSCILLATION_FREQUENCIES[::4])
 
 
-def filtered(driver: Driver, **changes: Any) -> Filtered:
-    return Filtered(driver, 1.0, SafetyFilter(**changes), 0.1)
+def filtered(driver: Driver, **changes: Any) -> FilteredDriver:
+    return FilteredDriver(driver, 1.0, SafetyFilter(**changes), 0.1)
 
 
 def visited(count: int = 60) -> LocalState:
@@ -54,31 +60,29 @@ def visited(count: int = 60) -> LocalState:
 
 
 def test_a_reckless_driver_behind_its_filter_touches_nobody() -> None:
-    worst = certify(filtered(Constant(1.0)), visited(), PAPER_IDM).worst
+    worst = certify_driver(filtered(Constant(1.0)), visited(), PAPER_IDM).worst_cases
     assert worst.contacts == 0
-    assert worst.smallest_gap == pytest.approx(1.0, abs=1e-6)
-    assert worst.smallest_headway > 1.0
-    assert 1.0 < worst.hardest_braking <= 6.0 + 1e-9
+    assert worst.min_gap == pytest.approx(1.0, abs=1e-6)
+    assert worst.min_time_gap > 1.0
+    assert 1.0 < worst.max_braking <= 6.0 + 1e-9
     assert worst.steps > 30_000
 
 
 def test_a_filter_that_does_not_act_is_found_out() -> None:
     bare = filtered(Constant(1.0), active=False)
-    assert certify(bare, visited(), PAPER_IDM).worst.contacts > 0
+    assert certify_driver(bare, visited(), PAPER_IDM).worst_cases.contacts > 0
 
 
 @pytest.mark.parametrize("humans", [PAPER_IDM, IDMParameters(time_headway=1.6, max_acceleration=2.0)])
 def test_the_measured_gain_of_an_idm_is_that_of_the_linearised_one(humans: IDMParameters) -> None:
-    idm = Filtered(IDM(**asdict(humans)), 3.0, SafetyFilter(time_headway=0.0), 0.1)
-    for each in certify(idm, visited(), humans).strings:
+    idm = FilteredDriver(IDM(**asdict(humans)), 3.0, SafetyFilter(time_gap=0.0), 0.1)
+    for each in certify_driver(idm, visited(), humans).string_stability:
         assert each.speed in (2.5, 4.5)
-        np.testing.assert_allclose(each.gains, each.people, atol=0.05)
+        np.testing.assert_allclose(each.gains, each.human_gains, atol=0.05)
 
 
 @pytest.mark.parametrize(("acceleration", "stable"), [(0.6, False), (1.0, False), (1.6, False), (3.0, True)])
-def test_people_amplify_sway_exactly_where_the_idm_is_known_to_be_unstable(
-    acceleration: float, stable: bool
-) -> None:
+def test_people_amplify_sway_exactly_where_the_idm_is_known_to_be_unstable(acceleration: float, stable: bool) -> None:
     humans, v = IDMParameters(max_acceleration=acceleration), 4.0
     s, wanted = equilibrium_gap(v, humans), 2.0 + v
     f_s = 2.0 * acceleration * wanted**2 / s**3
@@ -90,62 +94,62 @@ def test_people_amplify_sway_exactly_where_the_idm_is_known_to_be_unstable(
 
 
 def test_who_stands_still_stabilises_any_number_of_people() -> None:
-    still = certify(filtered(Constant(-1.0)), visited(), PAPER_IDM)
-    assert all(each.stabilised == certificates.MOST_BEHIND for each in still.strings)
+    still = certify_driver(filtered(Constant(-1.0)), visited(), PAPER_IDM)
+    assert all(each.max_stable_followers == certificates.MAX_FOLLOWERS for each in still.string_stability)
 
 
 def test_a_state_outside_of_the_domain_is_told_from_one_within() -> None:
-    domain = Domain((0.0, 5.0), (0.0, 6.0), (2.0, 30.0))
+    domain = OperatingDomain((0.0, 5.0), (0.0, 6.0), (2.0, 30.0))
     states = visited(3)._replace(speed=np.array([4.0, 5.5, 4.0]), leader_gap=np.array([9.0, 9.0, 40.0]))
-    assert domain.holds(states).tolist() == [True, False, False]
+    assert domain.contains(states).tolist() == [True, False, False]
 
 
 def written(folder: Path, driver: Driver | None = None) -> Path:
     driver = driver or filtered(PISaturation())
     file, ring = folder / "ring.unjam", Ring()
     sample = sample_bytes(driver, visited(), 6.0)
-    file.write_bytes(controller_bytes(driver, origin(ring, driver), {SAMPLE: sample}))
+    file.write_bytes(controller_bytes(driver, controller_origin(ring, driver), {SAMPLE_PART: sample}))
     return file
 
 
 def test_a_certificate_becomes_a_part_of_the_file_and_is_tried_again(tmp_path: Path) -> None:
     file = written(tmp_path)
     controller = read_controller(file)
-    found = certificate_of(controller)
+    found = make_certificate(controller)
     add_certificate(file, controller, found)
-    assert json.loads(read_controller(file).parts[CERTIFICATE]) == json.loads(json.dumps(found))
-    (said,) = [each.detail for each in verify_controller(file) if each.part == "certificate"]
+    assert json.loads(read_controller(file).parts[CERTIFICATE_PART]) == json.loads(json.dumps(found))
+    (said,) = [each.detail for each in verify_controller_file(file) if each.part == "certificate"]
     assert "0 contacts" in said
-    write_certificate(file.name, filtered(PISaturation()), found, tmp_path / "page.html")
+    write_certificate_page(file.name, filtered(PISaturation()), found, tmp_path / "page.html")
     assert "No contact in" in (tmp_path / "page.html").read_text()
 
 
 def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
     file = written(tmp_path)
     controller = read_controller(file)
-    found = certificate_of(controller)
-    found["worst"]["smallest_gap"] += 0.5
+    found = make_certificate(controller)
+    found["worst"]["min_gap"] += 0.5
     add_certificate(file, controller, found)
     with pytest.raises(InputError, match=r"its certificate says of worst.smallest_gap: 1.5"):
-        verify_controller(file)
-    parts = {**read_controller(file).parts, CERTIFICATE: b"{}"}
-    manifest = json.loads(parts.pop(MANIFEST))
-    manifest["sha256"] = {name: hash_of(part) for name, part in parts.items()}
-    file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
+        verify_controller_file(file)
+    parts = {**read_controller(file).parts, CERTIFICATE_PART: b"{}"}
+    manifest = json.loads(parts.pop(MANIFEST_PART))
+    manifest["sha256"] = {name: sha256_of(part) for name, part in parts.items()}
+    file.write_bytes(pack_parts({MANIFEST_PART: json.dumps(manifest).encode(), **parts}))
     with pytest.raises(InputError, match="its certificate says of comfort: nothing"):
-        verify_controller(file)
+        verify_controller_file(file)
 
 
 def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
     file = written(tmp_path, filtered(FollowerStopper()))
-    other = certificate_of(read_controller(file))
+    other = make_certificate(read_controller(file))
     file = written(tmp_path)
-    own = certificate_of(read_controller(file))
+    own = make_certificate(read_controller(file))
     assert own["worst"]["contacts"] == other["worst"]["contacts"], "both say that nothing was touched"
     for copied in (other, {**own, "worst": other["worst"]}):
         add_certificate(written(tmp_path), read_controller(file), copied)
         with pytest.raises(InputError, match="its certificate says of "):
-            verify_controller(file)
+            verify_controller_file(file)
 
 
 def test_counts_and_answers_of_a_certificate_are_compared_exactly(tmp_path: Path) -> None:
@@ -153,56 +157,56 @@ def test_counts_and_answers_of_a_certificate_are_compared_exactly(tmp_path: Path
     for change in (
         lambda found: found["worst"].update(steps=found["worst"]["steps"] + 1),
         lambda found: found["worst"].update(contacts=False),
-        lambda found: found["comfort"].update(within_iso_15622=int(found["comfort"]["within_iso_15622"])),
+        lambda found: found["comfort"].update(meets_iso_15622=int(found["comfort"]["meets_iso_15622"])),
         lambda found: found.update(another=1),
     ):
-        found = certificate_of(read_controller(written(tmp_path)))
+        found = make_certificate(read_controller(written(tmp_path)))
         change(found)
         add_certificate(file, read_controller(file), found)
         with pytest.raises(InputError, match="its certificate says of "):
-            verify_controller(file)
+            verify_controller_file(file)
 
 
 @pytest.mark.parametrize("driver", [PISaturation(), filtered(PISaturation(), active=False)])
 def test_what_has_no_filter_has_no_certificate(driver: Driver, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="without its safety filter"):
-        certificate_of(read_controller(written(tmp_path, driver)))
+        make_certificate(read_controller(written(tmp_path, driver)))
 
 
 def test_a_controller_that_names_no_road_is_not_certified(tmp_path: Path) -> None:
     file = written(tmp_path)
     parts = unpack_parts(file)
-    manifest = json.loads(parts.pop(MANIFEST))
+    manifest = json.loads(parts.pop(MANIFEST_PART))
     del manifest["scenario"]
-    file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
+    file.write_bytes(pack_parts({MANIFEST_PART: json.dumps(manifest).encode(), **parts}))
     with pytest.raises(InputError, match="a controller that names no road is not allowed"):
-        certificate_of(read_controller(file))
+        make_certificate(read_controller(file))
 
 
 def test_speeds_that_nobody_behind_would_drive_are_left_out_of_the_strings() -> None:
     slow = IDMParameters(desired_speed=4.0)
-    found = certify(filtered(PISaturation()), visited(), slow)
-    assert found.strings
-    assert all(each.speed < 4.0 for each in found.strings)
+    found = certify_driver(filtered(PISaturation()), visited(), slow)
+    assert found.string_stability
+    assert all(each.speed < 4.0 for each in found.string_stability)
 
 
 def test_a_controller_of_cars_that_obey_late_is_not_certified(tmp_path: Path) -> None:
     file = written(tmp_path)
     parts = unpack_parts(file)
-    manifest = json.loads(parts.pop(MANIFEST))
+    manifest = json.loads(parts.pop(MANIFEST_PART))
     manifest["scenario"]["actuator"]["lag"] = 0.5
-    file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
+    file.write_bytes(pack_parts({MANIFEST_PART: json.dumps(manifest).encode(), **parts}))
     with pytest.raises(InputError, match="a road whose cars obey late is not allowed"):
-        certificate_of(read_controller(file))
+        make_certificate(read_controller(file))
 
 
 def test_a_damaged_certificate_is_one_line_and_costs_no_drive(tmp_path: Path) -> None:
     file = written(tmp_path)
-    add_certificate(file, read_controller(file), certificate_of(read_controller(file)))
-    parts = {**unpack_parts(file), CERTIFICATE: b"{]"}
-    manifest = json.loads(parts.pop(MANIFEST))
-    manifest["sha256"] = {name: hash_of(part) for name, part in parts.items()}
-    file.write_bytes(pack_parts({MANIFEST: json.dumps(manifest).encode(), **parts}))
+    add_certificate(file, read_controller(file), make_certificate(read_controller(file)))
+    parts = {**unpack_parts(file), CERTIFICATE_PART: b"{]"}
+    manifest = json.loads(parts.pop(MANIFEST_PART))
+    manifest["sha256"] = {name: sha256_of(part) for name, part in parts.items()}
+    file.write_bytes(pack_parts({MANIFEST_PART: json.dumps(manifest).encode(), **parts}))
     with pytest.raises(InputError, match="the controller is damaged: JSONDecodeError"):
-        verify_controller(file)
-    assert outside_domain(read_controller(file), visited()) == 0.0
+        verify_controller_file(file)
+    assert outside_domain_share(read_controller(file), visited()) == 0.0

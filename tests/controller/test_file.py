@@ -17,16 +17,16 @@ from safetensors.numpy import load, save
 
 from tests.conftest import random_network
 from unjam.controller import controller_bytes, load_controller
-from unjam.controller.file import MANIFEST, WEIGHTS
-from unjam.controller.manifest import FORMAT
+from unjam.controller.file import MANIFEST_PART, WEIGHTS_PART
+from unjam.controller.manifest import MANIFEST_FORMAT
 from unjam.drivers import IDM, FollowerStopper, PISaturation, ResidualDriver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Driver
-from unjam.drivers.from_file import FileDriver
-from unjam.drivers.network import network_arrays
+from unjam.drivers.network import network_weights
 from unjam.drivers.observation import FeatureName, observation_size
-from unjam.drivers.registry import driver_from_recipe, recipe_of
-from unjam.drivers.wrappers import Mixed
+from unjam.drivers.registry import driver_from_recipe, driver_recipe
+from unjam.drivers.user_driver import FileDriver
+from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import InputError
 from unjam.trust import trusting_code
 
@@ -37,11 +37,7 @@ ABOUT = {"scenario": {"kind": "ring"}, "iteration": 3}
 
 
 def residual(
-    expert: Driver,
-    seed: int = 0,
-    hold: int = 1,
-    outputs: int = 1,
-    parts: tuple[FeatureName, ...] = ALL_PARTS,
+    expert: Driver, seed: int = 0, hold: int = 1, outputs: int = 1, parts: tuple[FeatureName, ...] = ALL_PARTS
 ) -> ResidualDriver:
     network = random_network(observation_size(parts, expert), seed, outputs=outputs)
     return ResidualDriver(expert, network, 1.0, parts, hold)
@@ -73,27 +69,27 @@ def refused(path: Path) -> str:
 
 def parts_of(content: bytes) -> tuple[dict[str, Any], bytes]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        return json.loads(archive.read(MANIFEST)), archive.read(WEIGHTS)
+        return json.loads(archive.read(MANIFEST_PART)), archive.read(WEIGHTS_PART)
 
 
 def archive_of(**parts: bytes | str) -> bytes:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, part in parts.items():
-            archive.writestr({"manifest": MANIFEST, "weights": WEIGHTS}.get(name, name), part)
+            archive.writestr({"manifest": MANIFEST_PART, "weights": WEIGHTS_PART}.get(name, name), part)
     return content.getvalue()
 
 
 def with_weights(weights: bytes, change: Callable[[dict[str, Any]], object] = lambda manifest: None) -> bytes:
     """A controller whose hash fits its weights, whatever they are."""
     manifest, _ = parts_of(controller_bytes(residual(IDM()), ABOUT))
-    manifest["sha256"][WEIGHTS] = hashlib.sha256(weights).hexdigest()
+    manifest["sha256"][WEIGHTS_PART] = hashlib.sha256(weights).hexdigest()
     change(manifest)
     return archive_of(manifest=json.dumps(manifest), weights=weights)
 
 
 def with_manifest(change: Callable[[dict[str, Any]], object]) -> bytes:
-    return with_weights(save(recipe_of(residual(IDM()))[1]), change)
+    return with_weights(save(driver_recipe(residual(IDM()))[1]), change)
 
 
 @pytest.mark.parametrize(
@@ -120,8 +116,8 @@ def test_the_networks_of_a_nested_residual_are_not_mixed_up(tmp_path: Path) -> N
     assert isinstance(loaded, ResidualDriver)
     assert isinstance(loaded.expert, ResidualDriver)
     for found, given_ in ((loaded.network, driver.network), (loaded.expert.network, inner.network)):
-        for name, array in network_arrays(given_).items():
-            np.testing.assert_array_equal(network_arrays(found)[name], array)
+        for name, array in network_weights(given_).items():
+            np.testing.assert_array_equal(network_weights(found)[name], array)
         assert (found.authority, found.exploration_std) == (given_.authority, given_.exploration_std)
 
 
@@ -136,11 +132,11 @@ def test_the_same_driver_has_the_same_bytes(tmp_path: Path) -> None:
 
 def test_the_manifest_says_what_it_is() -> None:
     manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
-    assert manifest["format"] == FORMAT
+    assert manifest["format"] == MANIFEST_FORMAT
     assert manifest["scenario"] == {"kind": "ring"}
     assert manifest["iteration"] == 3
     assert manifest["driver"]["expert"]["name"] == "idm"
-    assert manifest["sha256"] == {WEIGHTS: hashlib.sha256(weights).hexdigest()}
+    assert manifest["sha256"] == {WEIGHTS_PART: hashlib.sha256(weights).hexdigest()}
 
 
 def test_an_expert_of_the_users_own_is_named_with_the_hash_of_its_file(my_drivers: Path) -> None:
@@ -173,11 +169,9 @@ def test_a_file_by_itself_never_runs_code_that_it_names(tmp_path: Path, nested: 
     code = tmp_path / "code.py"
     code.write_text("from pathlib import Path\ndef trap(state):\n    return state.speed\n")
     expert: Driver = FileDriver(code, "trap")
-    content = controller_bytes(residual(Mixed((IDM(), residual(expert))) if nested else expert), ABOUT)
+    content = controller_bytes(residual(MixedDriver((IDM(), residual(expert))) if nested else expert), ABOUT)
     code.write_text(code.read_text() + f"Path({str(tmp_path / 'sprung')!r}).touch()\n")
-    assert "is Python code (code.py), which a file by itself may not run" in refused(
-        written(tmp_path, content)
-    )
+    assert "is Python code (code.py), which a file by itself may not run" in refused(written(tmp_path, content))
     assert not (tmp_path / "sprung").exists()
 
 
@@ -186,7 +180,7 @@ def seen_by_own(tmp_path: Path) -> tuple[Path, dict[str, Any], bytes]:
     """A file whose running leaves a mark; manifest and weights of a mixture that sees its feature."""
     code = tmp_path / "eyes.py"
     code.write_text("def look(state):\n    return state.speed\n")
-    driver = Mixed((IDM(), residual(IDM(), parts=("local", f"{code}:look"))))
+    driver = MixedDriver((IDM(), residual(IDM(), parts=("local", f"{code}:look"))))
     manifest, weights = parts_of(controller_bytes(driver, ABOUT))
     trap = f"from pathlib import Path\nPath({str(tmp_path / 'sprung')!r}).touch()\n"
     code.write_text(trap + code.read_text())
@@ -208,10 +202,7 @@ def seen_by_own(tmp_path: Path) -> tuple[Path, dict[str, Any], bytes]:
 )
 @pytest.mark.parametrize("own", [False, True], ids=["by itself", "run folder"])
 def test_a_feature_whose_file_is_not_listed_is_never_run(
-    tmp_path: Path,
-    seen_by_own: tuple[Path, dict[str, Any], bytes],
-    hide: Callable[[dict[str, Any]], object],
-    own: bool,
+    tmp_path: Path, seen_by_own: tuple[Path, dict[str, Any], bytes], hide: Callable[[dict[str, Any]], object], own: bool
 ) -> None:
     code, manifest, weights = seen_by_own
     hide(manifest["driver"]["drivers"][1])
@@ -231,9 +222,7 @@ def test_a_feature_that_changes_after_it_was_checked_is_never_run(
 ) -> None:
     code, manifest, weights = seen_by_own
     code.write_text(f"{code.read_text()}# replaced\n")
-    with pytest.raises(
-        InputError, match=r"the code '.*eyes\.py' of a feature has changed; allowed: as it was"
-    ):
+    with pytest.raises(InputError, match=r"the code '.*eyes\.py' of a feature has changed; allowed: as it was"):
         driver_from_recipe(manifest["driver"], load(weights))
     assert not (tmp_path / "sprung").exists()
 
@@ -244,14 +233,12 @@ def test_a_feature_of_the_users_own_runs_from_its_run_folder_alone_and_unchanged
     code, manifest, weights = seen_by_own
     content = archive_of(manifest=json.dumps(manifest), weights=weights)
     (tmp_path / "controller.unjam").write_bytes(content)
-    assert "is Python code (eyes.py), which a file by itself may not run" in refused(
-        written(tmp_path, content)
-    )
+    assert "is Python code (eyes.py), which a file by itself may not run" in refused(written(tmp_path, content))
     assert not (tmp_path / "sprung").exists()
     assert "runs only with --trust-code" in refused(tmp_path)
     assert not (tmp_path / "sprung").exists()
     with trusting_code():
-        assert isinstance(load_controller(tmp_path), Mixed)
+        assert isinstance(load_controller(tmp_path), MixedDriver)
     code.write_text(code.read_text() + "# changed")
     assert "has changed since" in refused(tmp_path)
 
@@ -261,7 +248,7 @@ def test_changed_weights_are_noticed(tmp_path: Path) -> None:
     changed = bytearray(weights)
     changed[-3] ^= 1
     content = archive_of(manifest=json.dumps(manifest), weights=bytes(changed))
-    assert f"damaged: {WEIGHTS} does not have the hash that it names" in refused(written(tmp_path, content))
+    assert f"damaged: {WEIGHTS_PART} does not have the hash that it names" in refused(written(tmp_path, content))
 
 
 @pytest.mark.parametrize("change", [{"sample.safetensors": "0"}, {"another": "0"}])
@@ -271,7 +258,7 @@ def test_parts_that_are_not_those_that_are_named_are_refused(tmp_path: Path, cha
 
 
 def test_weights_of_no_network_are_refused(tmp_path: Path) -> None:
-    arrays = {**recipe_of(residual(IDM()))[1], "expert.0.weight": np.zeros((2, 2))}
+    arrays = {**driver_recipe(residual(IDM()))[1], "expert.0.weight": np.zeros((2, 2))}
     words = refused(written(tmp_path, with_weights(save(arrays))))
     assert "weights 'expert.0.weight' belong to no network" in words
 
@@ -356,8 +343,8 @@ def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes) -> None:
 
 def test_an_archive_without_a_part_is_refused(tmp_path: Path) -> None:
     manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
-    assert WEIGHTS in refused(written(tmp_path, archive_of(manifest=json.dumps(manifest))))
-    assert MANIFEST in refused(written(tmp_path, archive_of(weights=weights)))
+    assert WEIGHTS_PART in refused(written(tmp_path, archive_of(manifest=json.dumps(manifest))))
+    assert MANIFEST_PART in refused(written(tmp_path, archive_of(weights=weights)))
     refused(written(tmp_path, archive_of()))
 
 
@@ -371,7 +358,7 @@ def test_a_manifest_that_is_none_is_refused(tmp_path: Path, manifest: str) -> No
 def test_another_format_is_refused_with_the_version_that_wrote_it(tmp_path: Path, number: int) -> None:
     content = with_manifest(lambda manifest: manifest.update(format=number, unjam="9.8.7"))
     line = refused(written(tmp_path, content))
-    assert f"format {number}, written by unjam '9.8.7', is not allowed; allowed: format {FORMAT}, " in line
+    assert f"format {number}, written by unjam '9.8.7', is not allowed; allowed: format {MANIFEST_FORMAT}, " in line
 
 
 @pytest.mark.parametrize("number", [True, 2.0, 3.0, "3", None, [3], {}], ids=str)
@@ -409,7 +396,7 @@ def test_a_manifest_that_is_too_large_is_not_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["time_step", "action_limit"])
 def test_statements_that_contradict_the_scenario_are_refused(tmp_path: Path, key: str) -> None:
-    scenario = {"simulation_step": 0.1, "steps_per_decision": 5, "action_limit": 2.0}
+    scenario = {"simulation_step": 0.1, "steps_per_control_step": 5, "action_limit": 2.0}
     about = {"scenario": scenario, "time_step": 0.5, "action_limit": 2.0}
     load_controller(written(tmp_path, controller_bytes(residual(IDM()), about)))
     content = controller_bytes(residual(IDM()), {**about, key: 0.25})
@@ -477,17 +464,15 @@ def test_a_recipe_of_endless_depth_is_refused(tmp_path: Path) -> None:
     ],
     ids=["inputs", "bias", "dimensions", "outputs", "nan", "infinite", "not what it observes"],
 )
-def test_weights_of_a_wrong_shape_or_not_finite_are_refused(
-    tmp_path: Path, change: dict[str, np.ndarray]
-) -> None:
-    arrays = {**recipe_of(residual(IDM()))[1], **change}
+def test_weights_of_a_wrong_shape_or_not_finite_are_refused(tmp_path: Path, change: dict[str, np.ndarray]) -> None:
+    arrays = {**driver_recipe(residual(IDM()))[1], **change}
     with pytest.raises(InputError) as caught:
         load_controller(written(tmp_path, with_weights(save(arrays))))
     assert "\n" not in str(caught.value)
 
 
 def test_weights_that_are_missing_are_refused(tmp_path: Path) -> None:
-    arrays = recipe_of(residual(IDM()))[1]
+    arrays = driver_recipe(residual(IDM()))[1]
     del arrays["1.bias"]
     with pytest.raises(InputError, match="network layer 1"):
         load_controller(written(tmp_path, with_weights(save(arrays))))
@@ -507,9 +492,7 @@ class Trap:
 def test_a_pickle_inside_is_never_run(tmp_path: Path, part: str) -> None:
     sprung = tmp_path / "sprung"
     trap = pickle.dumps(Trap(sprung))
-    manifest, weights = parts_of(
-        with_weights(trap if part == "weights" else save(recipe_of(residual(IDM()))[1]))
-    )
+    manifest, weights = parts_of(with_weights(trap if part == "weights" else save(driver_recipe(residual(IDM()))[1])))
     parts = {"manifest": json.dumps(manifest).encode(), "weights": weights, part: trap}
     refused(written(tmp_path, archive_of(**parts)))
     assert not sprung.exists()

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.controller.test_sample import perceived
-from unjam.controller.graph import FIELDS, check_graph, run_graph
+from unjam.controller.graph import ALLOWED_FIELDS, check_graph, run_graph
 from unjam.drivers import LACC, Constant
-from unjam.drivers.local_state import EVERYWHERE
+from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.errors import InputError, MissingPartError
 
 onnx = pytest.importorskip("onnx")
@@ -27,7 +27,7 @@ def graph(change: Change = lambda model: None, remembered: tuple[str, ...] = ())
     def value(name: str) -> Any:
         return rows(name, TensorProto.DOUBLE, ["cavs"])
 
-    inputs = [*EVERYWHERE, *(f"memory.{name}" for name in remembered)]
+    inputs = [*COMMON_FIELDS, *(f"memory.{name}" for name in remembered)]
     outputs = ["acceleration", *(f"next.{name}" for name in remembered)]
     nodes = [helper.make_node("Sub", ["leader_speed", "speed"], ["acceleration"])]
     nodes += [helper.make_node("Add", [f"memory.{name}", "speed"], [f"next.{name}"]) for name in remembered]
@@ -201,10 +201,7 @@ WRONG: dict[str, tuple[Change, str]] = {
     "an attribute of another operator": (attribute_of(0, name="axis", i=1, type=INT), "attribute of Sub"),
     "a sequence": (with_type(lambda kind: kind.sequence_type.SetInParent()), "TypeProto.sequence_type"),
     "a map": (with_type(lambda kind: kind.map_type.SetInParent()), "TypeProto.map_type"),
-    "a sparse type": (
-        with_type(lambda kind: kind.sparse_tensor_type.SetInParent()),
-        "TypeProto.sparse_tensor_type",
-    ),
+    "a sparse type": (with_type(lambda kind: kind.sparse_tensor_type.SetInParent()), "TypeProto.sparse_tensor_type"),
     "an optional type": (with_type(lambda kind: kind.optional_type.SetInParent()), "optional_type"),
 }
 """one for each place where a file, code, an operator or a text could hide, and what the refusal names"""
@@ -238,13 +235,13 @@ def test_every_field_of_onnx_that_is_not_listed_is_refused() -> None:
     while left:
         kind = left.pop()
         seen.add(kind.name)
-        allowed = FIELDS[kind.name]
+        allowed = ALLOWED_FIELDS[kind.name]
         assert allowed <= {*kind.fields_by_name}, kind.name
         kinds = {kind.fields_by_name[name].message_type for name in allowed} - {None}
         left += [each for each in kinds if each.name not in seen]
-    assert seen == FIELDS.keys(), "the list names what cannot be reached"
+    assert seen == ALLOWED_FIELDS.keys(), "the list names what cannot be reached"
     names = {"external_data", "data_location", "sparse_tensor", "g", "functions", "training_info"}
-    assert not names & set().union(*FIELDS.values())
+    assert not names & set().union(*ALLOWED_FIELDS.values())
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -15,39 +15,39 @@ from tests.controller.test_signature import KEY, OTHER
 from tests.controller.test_verify import places
 from unjam.controller import controller_bytes
 from unjam.controller.file import (
-    MANIFEST,
-    SAMPLE,
-    SIGNATURE,
+    MANIFEST_PART,
+    SAMPLE_PART,
+    SIGNATURE_PART,
     add_signature,
     pack_parts,
     read_controller,
     sample_bytes,
     unpack_parts,
 )
-from unjam.controller.manifest import STATEMENTS, first_difference
+from unjam.controller.manifest import PROVENANCE_ENTRIES, first_difference
 from unjam.controller.signature import signature_of
 from unjam.controller.verify import PartCheck, check_parts
 from unjam.drivers import PISaturation
-from unjam.drivers.registry import recipe_of
+from unjam.drivers.registry import driver_recipe
 from unjam.drivers.safety import SafetyFilter
-from unjam.drivers.wrappers import Filtered
+from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
 from unjam.scenarios import Ring
-from unjam.training.folder import origin
+from unjam.training.run_folder import controller_origin
 
-MAKER_ONLY = {*STATEMENTS, "unjam"}
+MAKER_ONLY = {*PROVENANCE_ENTRIES, "unjam"}
 """entries that nothing in the file can prove"""
 
 
 @pytest.fixture(scope="module")
 def signed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A controller with all that an exported one of a run says of itself, signed."""
-    driver = Filtered(residual(PISaturation(), hold=3), 1.0, SafetyFilter(), 0.1)
+    driver = FilteredDriver(residual(PISaturation(), hold=3), 1.0, SafetyFilter(), 0.1)
     run = {"scenario": "ring", "agent": "trpo", "seed": 3}
-    counted = {"iteration": 5, "actual_steps": 1000, "metrics": {"reward": "released"}}
-    about = {**origin(Ring(), driver), "run": run, **counted}
+    counted = {"iteration": 5, "environment_steps": 1000, "metrics": {"reward": "released"}}
+    about = {**controller_origin(Ring(), driver), "run": run, **counted}
     path = tmp_path_factory.mktemp("signed") / "it.unjam"
-    path.write_bytes(controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, perceived(), 6.0)}))
+    path.write_bytes(controller_bytes(driver, about, {SAMPLE_PART: sample_bytes(driver, perceived(), 6.0)}))
     add_signature(path, read_controller(path), KEY)
     return path
 
@@ -57,7 +57,7 @@ def known(path: Path) -> tuple[Any, dict[str, PartCheck]]:
     controller = read_controller(path)
     checks = {each.part: each for each in check_parts(controller) if each.status != "stated"}
     del checks["signature"]
-    return recipe_of(controller.driver)[0], checks
+    return driver_recipe(controller.driver)[0], checks
 
 
 def replaced(manifest: Any, place: tuple[Any, ...], change: Callable[[Any, Any], None]) -> Any:
@@ -117,19 +117,17 @@ def changes(manifest: Any, kind: str) -> Iterator[tuple[tuple[Any, ...], Any]]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_entry_of_another_type_is_refused_or_means_the_same(
-    kind: str, signed: Path, tmp_path: Path
-) -> None:
+def test_an_entry_of_another_type_is_refused_or_means_the_same(kind: str, signed: Path, tmp_path: Path) -> None:
     """A forger signs with a key of their own; that the first signature no longer fits is tested, too."""
     parts = unpack_parts(signed)
     before, count, path = known(signed), 0, tmp_path / "it.unjam"
-    for place, manifest in changes(json.loads(parts[MANIFEST]), kind):
-        forged = {**parts, MANIFEST: json.dumps(manifest).encode()}
+    for place, manifest in changes(json.loads(parts[MANIFEST_PART]), kind):
+        forged = {**parts, MANIFEST_PART: json.dumps(manifest).encode()}
         path.write_bytes(pack_parts(forged))
         with pytest.raises(InputError):
             read_controller(path)
-        del forged[SIGNATURE]
-        path.write_bytes(pack_parts({**forged, SIGNATURE: signature_of(forged, OTHER)}))
+        del forged[SIGNATURE_PART]
+        path.write_bytes(pack_parts({**forged, SIGNATURE_PART: signature_of(forged, OTHER)}))
         count += 1
         try:
             after = known(path)
@@ -172,4 +170,4 @@ def test_documents_that_mean_the_same_do_not_differ() -> None:
     assert first_difference(one, {"b": {"c": 3.0}, "a": [1, None, True, "x"]}) is None
     assert first_difference({"gap": 1.0 + 1e-7}, {"gap": 1.0}, tolerance=1e-6) is None
     assert first_difference({"gap": np.inf}, {"gap": 1.0}, tolerance=1e-6) is not None
-    assert first_difference({}, one, defaults=True) is None
+    assert first_difference({}, one, allows_missing=True) is None

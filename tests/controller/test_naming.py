@@ -6,8 +6,8 @@ import pytest
 from tests.controller.test_file import ABOUT, actions, residual, written
 from unjam.controller import controller_bytes, make_driver
 from unjam.drivers import IDM, PISaturation
-from unjam.drivers.from_file import FileDriver
-from unjam.drivers.wrappers import Mixed
+from unjam.drivers.user_driver import FileDriver
+from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import InputError
 
 
@@ -43,7 +43,7 @@ def test_what_names_no_driver_is_refused_in_one_line(
 def test_several_joined_by_a_plus_share_the_cavs(tmp_path: Path) -> None:
     path = written(tmp_path, controller_bytes(residual(IDM()), ABOUT))
     made = make_driver(f"pi:window=1e+1+{path}", 0.1)
-    assert isinstance(made, Mixed)
+    assert isinstance(made, MixedDriver)
     assert made.drivers[0] == PISaturation(window=10)
     np.testing.assert_array_equal(actions(made.drivers[1]), actions(residual(IDM())))
 

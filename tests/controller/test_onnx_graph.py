@@ -12,25 +12,15 @@ from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
 from tests.learners.task import make_policy, shake
 from tests.learners.test_trpo_ppo import mean_of
-from unjam.controller.file import replay
+from unjam.controller.file import replay_states
 from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.onnx_graph import onnx_graph
-from unjam.drivers import (
-    ACC,
-    IDM,
-    LACC,
-    Driver,
-    FollowerStopper,
-    Human,
-    Pacer,
-    PISaturation,
-    ResidualDriver,
-)
-from unjam.drivers.from_file import FileDriver
+from unjam.drivers import ACC, IDM, LACC, Driver, FollowerStopper, Human, Pacer, PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
-from unjam.drivers.registry import named_driver
-from unjam.drivers.wrappers import Mixed
+from unjam.drivers.registry import driver_from_name
+from unjam.drivers.user_driver import FileDriver
+from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import InputError, MissingPartError
 from unjam.learners.sac import SquashedResidualPolicy
 from unjam.learners.settings import PolicySettings
@@ -45,7 +35,7 @@ pytest.importorskip("onnxscript")
 onnxruntime = pytest.importorskip("onnxruntime")
 
 torch.set_num_threads(1)
-PARTS = PolicySettings().observe
+PARTS = PolicySettings().inputs
 UNDRAWN = "human", "gap-maker"
 PARITY = 1e-6
 """[m/s2]"""
@@ -57,16 +47,16 @@ def driver_of(network: Network, expert: Driver, hold: int = 10) -> ResidualDrive
 
 def longest_stay(scenario: Scenario, driver: Driver, simulation: Simulation) -> Trajectory:
     episode = run_episode(scenario, driver, (3,), simulation=simulation)
-    return max(episode.trajectories, key=lambda trajectory: len(trajectory.applied))
+    return max(episode.trajectories, key=lambda trajectory: len(trajectory.applied_acceleration))
 
 
 def agree(driver: Driver, stay: Trajectory) -> None:
     """Driver and graph, given what was perceived, answer what was commanded on the road."""
-    states = stay.states.at(slice(-1))
-    np.testing.assert_allclose(replay(driver, states, 1.0), stay.applied, rtol=0, atol=1e-9)
+    states = stay.states.select(slice(-1))
+    np.testing.assert_allclose(replay_states(driver, states, 1.0), stay.applied_acceleration, rtol=0, atol=1e-9)
     part = onnx_graph(driver, 1.0)
     check_graph(part, driver)
-    np.testing.assert_allclose(run_graph(part, driver, states), stay.applied, rtol=0, atol=PARITY)
+    np.testing.assert_allclose(run_graph(part, driver, states), stay.applied_acceleration, rtol=0, atol=PARITY)
 
 
 @pytest.mark.long
@@ -76,8 +66,8 @@ def test_policy_driver_and_graph_agree_on_a_whole_episode_of_the_ring(simulation
     shake(policy, 1)
     driver = driver_of(policy.network(), expert)
     stay = longest_stay(Ring(), driver, simulation)
-    assert len(stay.applied) == 3000
-    chosen, _ = stay.choices
+    assert len(stay.applied_acceleration) == 3000
+    chosen, _ = stay.actions_and_rewards
     assert chosen.std() > 0.1
     seen = stay.observations[:-1].astype(np.float32)
     np.testing.assert_allclose(mean_of(policy, seen), chosen, rtol=0, atol=PARITY)
@@ -108,7 +98,7 @@ def test_driver_and_graph_agree_where_the_place_on_the_road_counts(simulation: S
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in EXPERTS if name.partition(":")[0] not in UNDRAWN])
 def test_the_graph_of_every_expert_answers_what_the_expert_answers(name: str) -> None:
-    same(named_driver(name, 0.1))
+    same(driver_from_name(name, 0.1))
 
 
 @pytest.mark.slow
@@ -116,7 +106,7 @@ def test_the_graph_of_every_expert_answers_what_the_expert_answers(name: str) ->
     "driver",
     [
         residual(residual(PISaturation(), 1, hold=3), 2, hold=5),
-        Mixed((PISaturation(), IDM(), residual(ACC()))),
+        MixedDriver((PISaturation(), IDM(), residual(ACC()))),
         residual(Human()),
     ],
     ids=["nested", "mixed", "residual on human"],
@@ -129,14 +119,14 @@ def same(driver: Driver) -> None:
     states = perceived(900)
     part = onnx_graph(driver, 1.0)
     check_graph(part, driver)
-    np.testing.assert_allclose(run_graph(part, driver, states), replay(driver, states, 1.0), atol=PARITY)
+    np.testing.assert_allclose(run_graph(part, driver, states), replay_states(driver, states, 1.0), atol=PARITY)
 
 
 def test_the_graph_takes_any_number_of_vehicles_and_names_nothing_of_this_machine() -> None:
     driver = LACC()
     part = onnx_graph(driver, 0.5)
     states = perceived(7)
-    seen = {name: getattr(states, name) for name in driver.perceives}
+    seen = {name: getattr(states, name) for name in driver.input_fields}
     fed = {**seen, "memory.acceleration": np.zeros(7)}
     session = onnxruntime.InferenceSession(part, providers=["CPUExecutionProvider"])
     found, after = session.run(None, fed)
@@ -150,7 +140,7 @@ def test_the_graph_takes_any_number_of_vehicles_and_names_nothing_of_this_machin
 @pytest.mark.parametrize("name", ["human", "own", "mixed"])
 def test_a_driver_that_cannot_be_drawn_says_so_in_one_line(name: str, my_drivers: Path) -> None:
     own = FileDriver(my_drivers, "gentle")
-    driver = {"human": Human(), "own": residual(own), "mixed": Mixed((own, IDM()))}[name]
+    driver = {"human": Human(), "own": residual(own), "mixed": MixedDriver((own, IDM()))}[name]
     with pytest.raises(InputError, match="is not allowed; allowed: drivers that run on tensors") as caught:
         onnx_graph(driver, 1.0)
     assert "\n" not in str(caught.value)
@@ -158,7 +148,7 @@ def test_a_driver_that_cannot_be_drawn_says_so_in_one_line(name: str, my_drivers
 
 def test_who_asks_for_time_headways_is_not_drawn_without_them() -> None:
     with pytest.raises(InputError, match="gap-maker is not allowed: a graph asks for no time headways"):
-        onnx_graph(named_driver("gap-maker", 0.1), 1.0)
+        onnx_graph(driver_from_name("gap-maker", 0.1), 1.0)
 
 
 def test_without_onnxscript_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:

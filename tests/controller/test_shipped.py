@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 import unjam
-from unjam.controller import SHIPPED, load_controller, make_driver, shipped_file, shipped_names
-from unjam.controller.file import CERTIFICATE, read_controller
-from unjam.controller.verify import verify_controller
+from unjam.controller import PACKAGED_PREFIX, load_controller, make_driver, packaged_file, packaged_names
+from unjam.controller.file import CERTIFICATE_PART, read_controller
+from unjam.controller.verify import verify_controller_file
 from unjam.drivers import ResidualDriver
-from unjam.drivers.by_road import ByRoad
-from unjam.drivers.registry import recipe_of
-from unjam.drivers.wrappers import Filtered
+from unjam.drivers.registry import driver_recipe
+from unjam.drivers.road_type_switch import RoadTypeSwitch
+from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
-from unjam.measures.drivable import DRIVABLE, drivable_in_all
 from unjam.measures.effect import effect_of
+from unjam.measures.feasibility import FEASIBLE, overall_feasibility
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import paired_difference
 from unjam.scenarios import FigureEight, Ring
-from unjam.training.presets import BEST
+from unjam.training.presets import BEST_BY_SCENARIO
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -31,33 +31,30 @@ CERTIFIED = Path(__file__).parents[2] / "results/everywhere-controllers.zip"
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("name", packaged_names())
 def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
-    verify_controller(shipped_file(name))
-    driver = make_driver(f"{SHIPPED}{name}", 0.1)
-    driver = driver.driver if isinstance(driver, Filtered) else driver
+    verify_controller_file(packaged_file(name))
+    driver = make_driver(f"{PACKAGED_PREFIX}{name}", 0.1)
+    driver = driver.driver if isinstance(driver, FilteredDriver) else driver
     assert isinstance(driver, ResidualDriver) == name.endswith("-best")
 
 
 def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
-    best = {f"{scenario}-best" for scenario in BEST.keys() - {"merge"}}  # where nothing is drivable
-    assert {name for name in shipped_names() if not name.endswith("-tuned")} == {"best", *best}
+    best = {f"{scenario}-best" for scenario in BEST_BY_SCENARIO.keys() - {"merge"}}  # where nothing is drivable
+    assert {name for name in packaged_names() if not name.endswith("-tuned")} == {"best", *best}
 
 
 @pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])
 def test_another_name_lists_those_that_there_are(name: str) -> None:
-    with pytest.raises(
-        InputError,
-        match="allowed: unjam:best, unjam:figure-eight-best, unjam:figure-eight-tuned, ",
-    ):
-        make_driver(f"{SHIPPED}{name}", 0.1)
+    with pytest.raises(InputError, match="allowed: unjam:best, unjam:figure-eight-best, unjam:figure-eight-tuned, "):
+        make_driver(f"{PACKAGED_PREFIX}{name}", 0.1)
 
 
 def test_the_rings_earns_more_than_its_expert_on_every_seed() -> None:
     found = unjam.drive("ring", ["unjam:ring-gap-tuned", "unjam:ring-best"], episodes=2, workers=1)
     gain = paired_difference(found.rows["unjam:ring-best"], found.rows["unjam:ring-gap-tuned"], "return")
     assert gain.smallest > 5
-    assert {found.document()["drivers"][number]["drivable"] for number in (0, 1)} == {DRIVABLE}
+    assert {found.document()["drivers"][number]["drivable"] for number in (0, 1)} == {FEASIBLE}
 
 
 @pytest.mark.long
@@ -79,19 +76,19 @@ def test_the_jammed_rings_earns_more_than_its_expert_and_ends_the_wave_sooner_th
 @pytest.mark.long
 def test_the_on_ramps_adds_to_its_expert_where_a_ramp_joins_and_drives_nowhere_else() -> None:
     expert, trained = "unjam:on-ramp-tuned", "unjam:on-ramp-best"
-    road = {"peak": [0, 300], "horizon": 400, "cav_share": 0.05}
-    found = unjam.drive("on-ramp", ["human", expert, trained], episodes=2, road=road, workers=2)
+    road = {"peak": [0, 300], "horizon": 400, "penetration_rate": 0.05}
+    found = unjam.drive("on-ramp", ["human", expert, trained], episodes=2, scenario_options=road, workers=2)
     of_expert, of_trained = (effect_of(found.rows[name], found.rows["human"]) for name in (expert, trained))
     assert of_trained.travel_time != of_expert.travel_time
-    assert of_trained.drivable == DRIVABLE
+    assert of_trained.feasibility == FEASIBLE
     with pytest.raises(InputError, match="'approach' is not allowed on ring"):
         run_episode(Ring(horizon=10), make_driver(trained, 0.1), 1)
 
 
 @pytest.mark.slow
 def test_the_figure_eights_is_faster_than_its_expert_over_the_radii() -> None:
-    expert, trained = BEST["figure-eight"]["expert"], "unjam:figure-eight-best"
-    found = unjam.drive("figure-eight", [expert, trained], episodes=8, road={"radius": [32, 35]}, workers=2)
+    expert, trained = BEST_BY_SCENARIO["figure-eight"]["expert"], "unjam:figure-eight-best"
+    found = unjam.drive("figure-eight", [expert, trained], episodes=8, scenario_options={"radius": [32, 35]}, workers=2)
     assert paired_difference(found.rows[trained], found.rows[expert], "mean_speed").low > 0.0
 
 
@@ -107,9 +104,7 @@ RINGS = [
     for warmup in warmups
 ]
 """from a standstill, and out of a wave"""
-EIGHTS = [
-    FigureEight(radius=(radius, radius), vehicles=count, horizon=600) for radius, count in ((26, 9), (42, 14))
-]
+EIGHTS = [FigureEight(radius=(radius, radius), vehicles=count, horizon=600) for radius, count in ((26, 9), (42, 14))]
 
 
 @cache
@@ -119,24 +114,24 @@ def row_of(name: str, road: Ring | FigureEight, simulation: Simulation) -> dict[
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", sorted({*shipped_names()} - {"on-ramp-best"}))  # it must know a ramp
+@pytest.mark.parametrize("name", sorted({*packaged_names()} - {"on-ramp-best"}))  # it must know a ramp
 def test_none_is_undrivable_on_roads_it_was_never_trained_on(name: str, simulation: Simulation) -> None:
     for road in [*RINGS, *EIGHTS]:
-        driven, alone = (row_of(each, road, simulation) for each in (f"{SHIPPED}{name}", "human"))
-        assert drivable_in_all([driven], [alone]) == DRIVABLE, road
+        driven, alone = (row_of(each, road, simulation) for each in (f"{PACKAGED_PREFIX}{name}", "human"))
+        assert overall_feasibility([driven], [alone]) == FEASIBLE, road
 
 
 @pytest.mark.parametrize("kind", ["loop", "shared", "crossing"])
 def test_each_law_of_the_controller_for_all_closed_roads_is_certified(kind: str, tmp_path: Path) -> None:
-    best = load_controller(shipped_file("best"))
-    assert isinstance(best, ByRoad)
+    best = load_controller(packaged_file("best"))
+    assert isinstance(best, RoadTypeSwitch)
     controller = read_controller(Path(ZipFile(CERTIFIED).extract(f"{kind}.unjam", tmp_path)))
-    assert isinstance(controller.driver, Filtered)
+    assert isinstance(controller.driver, FilteredDriver)
     assert controller.driver.safety == Ring().safety, "the filter that every road has, too"
-    (recipe, arrays), (other, others) = recipe_of(best.inner[kind]), recipe_of(controller.driver.driver)
+    (recipe, arrays), (other, others) = driver_recipe(best.inner_drivers[kind]), driver_recipe(controller.driver.driver)
     assert recipe == other
     assert arrays.keys() == others.keys()
     assert all(np.array_equal(array, others[name]) for name, array in arrays.items())
-    found = json.loads(controller.parts[CERTIFICATE])
+    found = json.loads(controller.parts[CERTIFICATE_PART])
     assert found["worst"]["contacts"] == 0
     assert found["worst"]["steps"] > 1_000_000

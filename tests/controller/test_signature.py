@@ -29,31 +29,31 @@ from hypothesis import strategies as st
 
 from tests.controller.test_file import written
 from tests.controller.test_verify import content_of, refused
-from unjam.controller import load_controller, shipped_file
+from unjam.controller import load_controller, packaged_file
 from unjam.controller.file import (
-    CERTIFICATE,
-    GRAPH,
-    MANIFEST,
-    PARTS,
-    SAMPLE,
-    SIGNATURE,
-    WEIGHTS,
+    ARCHIVE_PARTS,
+    CERTIFICATE_PART,
+    GRAPH_PART,
+    MANIFEST_PART,
+    SAMPLE_PART,
+    SIGNATURE_PART,
+    WEIGHTS_PART,
     add_certificate,
     add_signature,
-    hash_of,
     pack_parts,
     read_controller,
+    sha256_of,
     unpack_parts,
 )
 from unjam.controller.signature import fingerprint_of, make_keys, read_private_key, read_public_key
-from unjam.controller.verify import verify_controller
+from unjam.controller.verify import verify_controller_file
 from unjam.errors import DiskError, InputError
 
 KEY, OTHER = (Ed25519PrivateKey.from_private_bytes(bytes([number] * 32)) for number in (1, 2))
 FINGERPRINT = fingerprint_of(KEY.public_key())
 FORGED = "controller it.unjam: forged: it was changed after it was signed"
 NONE = "controller it.unjam: its signature is not one that unjam writes"
-ALL = {GRAPH: b"drawn", CERTIFICATE: b"{}"}
+ALL = {GRAPH_PART: b"drawn", CERTIFICATE_PART: b"{}"}
 """parts that nobody looks into before the signature"""
 
 
@@ -65,9 +65,9 @@ def signed(folder: Path, key: Ed25519PrivateKey = KEY, parts: dict[str, bytes] |
 
 def forge(parts: dict[str, bytes]) -> bytes:
     """An archive of changed parts, with a manifest that names their hashes."""
-    manifest = json.loads(parts[MANIFEST])
-    manifest["sha256"] = {name: hash_of(part) for name, part in parts.items() if name in PARTS[1:-1]}
-    return pack_parts({**parts, MANIFEST: json.dumps(manifest, indent=1).encode()})
+    manifest = json.loads(parts[MANIFEST_PART])
+    manifest["sha256"] = {name: sha256_of(part) for name, part in parts.items() if name in ARCHIVE_PARTS[1:-1]}
+    return pack_parts({**parts, MANIFEST_PART: json.dumps(manifest, indent=1).encode()})
 
 
 def public_file(folder: Path, key: Ed25519PrivateKey = KEY) -> Path:
@@ -77,7 +77,7 @@ def public_file(folder: Path, key: Ed25519PrivateKey = KEY) -> Path:
 
 
 def found(path: Path, signer: Path | None = None) -> str:
-    return next(each.detail for each in verify_controller(path, signer) if each.part == "signature")
+    return next(each.detail for each in verify_controller_file(path, signer) if each.part == "signature")
 
 
 def test_who_signed_is_told(tmp_path: Path) -> None:
@@ -93,13 +93,13 @@ def test_a_file_without_a_signature_is_read_as_before(tmp_path: Path) -> None:
     path = written(tmp_path, content_of())
     assert found(path).startswith("nothing shows who made the controller: ")
     assert read_controller(path).signed_by is None
-    assert read_controller(shipped_file("ring-best")).signed_by is None
+    assert read_controller(packaged_file("ring-best")).signed_by is None
 
 
 def test_the_other_parts_stay_as_they_are_and_a_signature_is_reproducible(tmp_path: Path) -> None:
     path = signed(tmp_path)
     parts, content = unpack_parts(path), path.read_bytes()
-    assert parts.pop(SIGNATURE)
+    assert parts.pop(SIGNATURE_PART)
     assert pack_parts(parts) == content_of()
     add_signature(path, read_controller(path), KEY)
     assert path.read_bytes() == content
@@ -115,7 +115,7 @@ def test_another_key_takes_the_place_of_the_first(tmp_path: Path) -> None:
 
 def test_what_is_signed_is_what_the_documentation_says(tmp_path: Path) -> None:
     parts = unpack_parts(signed(tmp_path, parts=ALL))
-    said = json.loads(parts.pop(SIGNATURE))
+    said = json.loads(parts.pop(SIGNATURE_PART))
     lines = ["unjam controller, signature 1", f"public key {said['public_key']}"]
     lines += [f"{hashlib.sha256(parts[name]).hexdigest()}  {name}" for name in sorted(parts)]
     key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(said["public_key"]))
@@ -127,7 +127,7 @@ def test_what_is_signed_is_what_the_documentation_says(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    name=st.sampled_from([WEIGHTS, SAMPLE, GRAPH, CERTIFICATE]),
+    name=st.sampled_from([WEIGHTS_PART, SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART]),
     place=st.floats(0, 1, exclude_max=True),
     bits=st.integers(1, 255),
 )
@@ -151,7 +151,7 @@ def test_no_byte_of_a_signed_file_can_be_another(place: float, bits: int) -> Non
         assert refused(written(Path(folder), bytes(content)))
 
 
-@pytest.mark.parametrize("name", [SAMPLE, GRAPH, CERTIFICATE])
+@pytest.mark.parametrize("name", [SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART])
 def test_a_part_that_is_gone_is_missed(tmp_path: Path, name: str) -> None:
     parts = unpack_parts(signed(tmp_path, parts=ALL))
     del parts[name]
@@ -160,7 +160,7 @@ def test_a_part_that_is_gone_is_missed(tmp_path: Path, name: str) -> None:
 
 def test_a_part_that_was_added_is_noticed(tmp_path: Path) -> None:
     parts = unpack_parts(signed(tmp_path))
-    assert refused(written(tmp_path, forge({**parts, CERTIFICATE: b"{}"}))) == FORGED
+    assert refused(written(tmp_path, forge({**parts, CERTIFICATE_PART: b"{}"}))) == FORGED
 
 
 @pytest.mark.parametrize(
@@ -174,20 +174,15 @@ def test_a_part_that_was_added_is_noticed(tmp_path: Path) -> None:
 )
 def test_a_manifest_that_was_changed_is_forged(tmp_path: Path, change: Callable[[Any], object]) -> None:
     parts = unpack_parts(signed(tmp_path))
-    manifest = json.loads(parts[MANIFEST])
+    manifest = json.loads(parts[MANIFEST_PART])
     change(manifest)
-    assert (
-        refused(written(tmp_path, pack_parts({**parts, MANIFEST: json.dumps(manifest).encode()}))) == FORGED
-    )
+    assert refused(written(tmp_path, pack_parts({**parts, MANIFEST_PART: json.dumps(manifest).encode()}))) == FORGED
 
 
 def test_a_wrong_hash_is_damage_in_a_signed_file_too(tmp_path: Path) -> None:
     parts = unpack_parts(signed(tmp_path))
-    path = written(tmp_path, pack_parts({**parts, WEIGHTS: parts[WEIGHTS][:-1] + b"x"}))
-    assert (
-        refused(path)
-        == "controller it.unjam: damaged: weights.safetensors does not have the hash that it names"
-    )
+    path = written(tmp_path, pack_parts({**parts, WEIGHTS_PART: parts[WEIGHTS_PART][:-1] + b"x"}))
+    assert refused(path) == "controller it.unjam: damaged: weights.safetensors does not have the hash that it names"
 
 
 def test_what_lies_in_an_archive_beside_its_parts_is_forged(tmp_path: Path) -> None:
@@ -218,30 +213,25 @@ def test_what_lies_in_an_archive_beside_its_parts_is_forged(tmp_path: Path) -> N
         (lambda said: said.update(signature="00" * 64), FORGED),
     ],
 )
-def test_a_signature_of_another_form_is_refused(
-    tmp_path: Path, change: Callable[[Any], object], words: str
-) -> None:
+def test_a_signature_of_another_form_is_refused(tmp_path: Path, change: Callable[[Any], object], words: str) -> None:
     parts = unpack_parts(signed(tmp_path))
-    said = json.loads(parts[SIGNATURE])
+    said = json.loads(parts[SIGNATURE_PART])
     change(said)
     assert (
-        refused(written(tmp_path, pack_parts({**parts, SIGNATURE: json.dumps(said, indent=1).encode()})))
-        == words
+        refused(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: json.dumps(said, indent=1).encode()}))) == words
     )
 
 
-@pytest.mark.parametrize(
-    "part", [b"", b"[]", b"null", b"\xff", b"{}", b"[" * 9_000, b'{"public_key": "\\ud800"}']
-)
+@pytest.mark.parametrize("part", [b"", b"[]", b"null", b"\xff", b"{}", b"[" * 9_000, b'{"public_key": "\\ud800"}'])
 def test_nonsense_for_a_signature_is_refused(tmp_path: Path, part: bytes) -> None:
     parts = unpack_parts(signed(tmp_path))
-    assert refused(written(tmp_path, pack_parts({**parts, SIGNATURE: part}))) == NONE
+    assert refused(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: part}))) == NONE
 
 
 def test_the_signature_of_another_controller_does_not_fit(tmp_path: Path) -> None:
-    other = unpack_parts(signed(tmp_path, parts=ALL))[SIGNATURE]
+    other = unpack_parts(signed(tmp_path, parts=ALL))[SIGNATURE_PART]
     parts = unpack_parts(signed(tmp_path))
-    assert refused(written(tmp_path, pack_parts({**parts, SIGNATURE: other}))) == FORGED
+    assert refused(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: other}))) == FORGED
 
 
 Point = tuple[int, int]
@@ -301,14 +291,14 @@ def test_there_are_eight_points_of_small_order_in_fourteen_encodings() -> None:
 def signature_part(key: bytes, signature: bytes) -> bytes:
     """A part of the right form with this key and signature."""
     der = bytes.fromhex("302a300506032b6570032100") + key
-    said = {"algorithm": "Ed25519", "fingerprint": hash_of(der), "public_key": key.hex()}
+    said = {"algorithm": "Ed25519", "fingerprint": sha256_of(der), "public_key": key.hex()}
     return json.dumps({**said, "signature": signature.hex()}, indent=1).encode()
 
 
 def signed_with(folder: Path, key: bytes, signature: bytes) -> Path:
     """A controller with this key and signature."""
     path = written(folder, content_of())
-    path.write_bytes(pack_parts({**unpack_parts(path), SIGNATURE: signature_part(key, signature)}))
+    path.write_bytes(pack_parts({**unpack_parts(path), SIGNATURE_PART: signature_part(key, signature)}))
     return path
 
 
@@ -317,9 +307,7 @@ def test_a_weak_key_is_refused_in_a_file_and_as_signer(tmp_path: Path, key: byte
     path = signed_with(tmp_path, key, FOR_ANY_MESSAGE)
     assert refused(path).startswith("controller it.unjam: it is signed by a weak Ed25519 key, ")
     public = tmp_path / "weak.pub"
-    shown = Ed25519PublicKey.from_public_bytes(key).public_bytes(
-        Encoding.PEM, PublicFormat.SubjectPublicKeyInfo
-    )
+    shown = Ed25519PublicKey.from_public_bytes(key).public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
     public.write_bytes(shown)
     with pytest.raises(InputError, match=r"^signer: .*: a weak Ed25519 key, .* is not allowed; allowed: "):
         read_public_key(public)
@@ -328,7 +316,7 @@ def test_a_weak_key_is_refused_in_a_file_and_as_signer(tmp_path: Path, key: byte
 def test_a_weak_key_would_sign_anything_without_that_check(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr("unjam.controller.signature.is_weak", lambda point: False)
     identity = (1).to_bytes(32, "little")
-    assert verify_controller(signed_with(tmp_path, identity, FOR_ANY_MESSAGE))
+    assert verify_controller_file(signed_with(tmp_path, identity, FOR_ANY_MESSAGE))
 
 
 def test_a_weak_private_key_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
@@ -342,13 +330,13 @@ def test_a_weak_private_key_is_refused(tmp_path: Path, monkeypatch: Any) -> None
 @pytest.mark.parametrize("multiple", range(1, 16))
 def test_a_malleable_signature_is_forged(tmp_path: Path, multiple: int) -> None:
     """s + k L is the same number in the group; only the smallest is a signature."""
-    said = json.loads(unpack_parts(signed(tmp_path))[SIGNATURE])
+    said = json.loads(unpack_parts(signed(tmp_path))[SIGNATURE_PART])
     key, signature = (bytes.fromhex(said[name]) for name in ("public_key", "signature"))
     s = int.from_bytes(signature[32:], "little") + multiple * ORDER
     if s < 2**256:
         other = signature[:32] + s.to_bytes(32, "little")
         assert refused(signed_with(tmp_path, key, other)) == FORGED
-    assert verify_controller(signed_with(tmp_path, key, signature))
+    assert verify_controller_file(signed_with(tmp_path, key, signature))
 
 
 @pytest.mark.parametrize("point", [*WEAK, *NOT_CANONICAL], ids=bytes.hex)
@@ -369,7 +357,7 @@ def test_a_signature_whose_point_is_weak_is_forged_whoever_checks_it(
     monkeypatch.setattr("unjam.controller.signature.Ed25519PublicKey", Careless)
     key = KEY.public_key().public_bytes_raw()
     honest = BASE_Y.to_bytes(32, "little")
-    assert verify_controller(signed_with(tmp_path, key, honest + bytes(32)))
+    assert verify_controller_file(signed_with(tmp_path, key, honest + bytes(32)))
     assert refused(signed_with(tmp_path, key, point + bytes(32))) == FORGED
     assert refused(signed_with(tmp_path, key, honest + ORDER.to_bytes(32, "little"))) == FORGED
 
@@ -382,7 +370,7 @@ def test_with_a_signer_another_or_none_is_refused(tmp_path: Path) -> None:
         (content_of(), "it is not signed"),
     ):
         with pytest.raises(InputError) as caught:
-            verify_controller(written(tmp_path, content), signer)
+            verify_controller_file(written(tmp_path, content), signer)
         assert str(caught.value) == f"controller: {how}; allowed: signed by {str(signer)!r}, {FINGERPRINT}"
 
 
@@ -451,10 +439,7 @@ NO_PRIVATE_KEYS = {
     "RSA": (pem(RSA), "is not allowed"),
     "encrypted": (pem(KEY, BestAvailableEncryption(b"secret")), "is encrypted"),
     "empty": (b"", "is not allowed"),
-    "a public key": (
-        KEY.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo),
-        "is not allowed",
-    ),
+    "a public key": (KEY.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo), "is not allowed"),
     "DER": (KEY.private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption()), "is not allowed"),
     "cut": (pem(KEY)[:60], "is not allowed"),
     "torn": (pem(KEY).replace(b"MC4CAQ", b"MC4CAR"), "is not allowed"),
@@ -475,18 +460,11 @@ def test_what_is_no_private_key_is_refused(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [
-        b"",
-        pem(KEY),
-        RSA.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo),
-        b"\xff" * 99,
-    ],
+    [b"", pem(KEY), RSA.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo), b"\xff" * 99],
 )
 def test_what_is_no_public_key_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "maker.pub").write_bytes(content)
-    with pytest.raises(
-        InputError, match=r"^signer: .* is not allowed; allowed: an Ed25519 public key in PEM"
-    ):
+    with pytest.raises(InputError, match=r"^signer: .* is not allowed; allowed: an Ed25519 public key in PEM"):
         read_public_key(tmp_path / "maker.pub")
 
 
@@ -509,6 +487,6 @@ def test_only_signatures_need_what_checks_them(tmp_path: Path) -> None:
         words = [*command, str(path)]
         return subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
 
-    assert run(shipped_file("ring-best")).returncode == 0
+    assert run(packaged_file("ring-best")).returncode == 0
     ran = run(tmp_path / "it.unjam")
     assert "MissingPartError: cryptography is not installed; signatures need it" in ran.stderr

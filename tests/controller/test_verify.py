@@ -16,16 +16,16 @@ from tests.controller.test_file import ABOUT, residual, written
 from tests.controller.test_sample import perceived
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.file import (
-    GRAPH,
-    MANIFEST,
-    SAMPLE,
-    hash_of,
+    GRAPH_PART,
+    MANIFEST_PART,
+    SAMPLE_PART,
     pack_parts,
     read_controller,
     sample_bytes,
+    sha256_of,
     unpack_parts,
 )
-from unjam.controller.verify import check_parts, verify_controller
+from unjam.controller.verify import check_parts, verify_controller_file
 from unjam.drivers import IDM, Constant, Driver, PISaturation, ResidualDriver
 from unjam.errors import InputError, MissingPartError
 from unjam.physics.idm import PAPER_IDM, equilibrium_gap
@@ -34,31 +34,29 @@ from unjam.trust import trusting_code
 HELD = residual(PISaturation(), hold=3)
 
 
-def content_of(
-    driver: Driver = HELD, limit: float | None = None, parts: dict[str, bytes] | None = None
-) -> bytes:
+def content_of(driver: Driver = HELD, limit: float | None = None, parts: dict[str, bytes] | None = None) -> bytes:
     about = ABOUT if limit is None else {**ABOUT, "action_limit": limit}
     sample = sample_bytes(driver, perceived(), limit or 1.0)
-    return controller_bytes(driver, about, {SAMPLE: sample, **(parts or {})})
+    return controller_bytes(driver, about, {SAMPLE_PART: sample, **(parts or {})})
 
 
 def changed(folder: Path, change: Callable[[dict[str, Any]], object], content: bytes | None = None) -> Path:
     """A controller with another manifest."""
     parts = unpack_parts(written(folder, content or content_of()))
-    manifest = json.loads(parts[MANIFEST])
+    manifest = json.loads(parts[MANIFEST_PART])
     change(manifest)
-    return written(folder, pack_parts({**parts, MANIFEST: json.dumps(manifest).encode()}))
+    return written(folder, pack_parts({**parts, MANIFEST_PART: json.dumps(manifest).encode()}))
 
 
 def refused(path: Path) -> str:
     with pytest.raises(InputError) as caught:
-        verify_controller(path)
+        verify_controller_file(path)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
 def statuses(path: Path) -> dict[str, str]:
-    return {each.part: each.status for each in verify_controller(path)}
+    return {each.part: each.status for each in verify_controller_file(path)}
 
 
 FORMULA_IN_FOLDER = {
@@ -72,7 +70,7 @@ FORMULA_IN_FOLDER = {
 def test_each_part_of_a_controller_is_checked_absent_or_stated(tmp_path: Path) -> None:
     path = written(tmp_path, content_of())
     assert statuses(path) == {**FORMULA_IN_FOLDER, "sample": "checked"}
-    (sample,) = [each.detail for each in verify_controller(path) if each.part == "sample"]
+    (sample,) = [each.detail for each in verify_controller_file(path) if each.part == "sample"]
     assert sample.startswith("40 decisions: the driver repeats them within 0.0e+00 m/s2 (allowed 1e-09); ")
 
 
@@ -84,7 +82,7 @@ def test_what_a_recipe_leaves_out_is_said_to_be_a_default(tmp_path: Path) -> Non
         (content_of(), "nothing of which was ignored"),
         (changed(tmp_path, leave_out).read_bytes(), "what it leaves out has this version's default"),
     ):
-        found = verify_controller(written(tmp_path, content))
+        found = verify_controller_file(written(tmp_path, content))
         assert [each.detail.endswith(words) for each in found if each.part == "driver"] == [True]
 
 
@@ -151,7 +149,7 @@ def test_a_manifest_that_says_something_else_is_refused(
 
 def test_a_sample_that_the_driver_does_not_answer_so_is_refused(tmp_path: Path) -> None:
     other = sample_bytes(residual(PISaturation(), seed=1), perceived(), 1.0)
-    words = refused(written(tmp_path, content_of(parts={SAMPLE: other})))
+    words = refused(written(tmp_path, content_of(parts={SAMPLE_PART: other})))
     assert words.startswith("controller: step 0 of its sample: its driver answers ")
 
 
@@ -164,12 +162,12 @@ def test_a_sample_without_bounds_is_refused(tmp_path: Path) -> None:
 def test_a_sample_that_checks_nothing_or_takes_long_is_refused(tmp_path: Path, count: int) -> None:
     longest = load(sample_bytes(HELD, perceived(1001), 1.0))
     sample = save({name: values[:count] for name, values in longest.items()})
-    words = refused(written(tmp_path, content_of(parts={SAMPLE: sample})))
+    words = refused(written(tmp_path, content_of(parts={SAMPLE_PART: sample})))
     assert words == f"sample: decisions: {count} is not allowed; allowed: 1 to 1000"
 
 
 def test_a_graph_without_a_sample_is_refused(tmp_path: Path) -> None:
-    path = written(tmp_path, controller_bytes(HELD, ABOUT, {GRAPH: b"graph"}))
+    path = written(tmp_path, controller_bytes(HELD, ABOUT, {GRAPH_PART: b"graph"}))
     assert "has controller.onnx, but no recorded sample" in refused(path)
 
 
@@ -177,7 +175,7 @@ def test_a_graph_that_answers_something_else_is_refused(tmp_path: Path) -> None:
     from .test_graph import graph
 
     driver = Constant()
-    path = written(tmp_path, content_of(driver, limit=20.0, parts={GRAPH: graph()}))
+    path = written(tmp_path, content_of(driver, limit=20.0, parts={GRAPH_PART: graph()}))
     assert "step 0 of its sample: its graph answers " in refused(path)
 
 
@@ -189,9 +187,9 @@ def test_a_graph_that_agrees_on_the_makers_sample_alone_is_refused(tmp_path: Pat
         model.graph.node[0].CopyFrom(helper.make_node("Sub", ["speed", "speed"], ["acceleration"]))
 
     driver, same = IDM(), perceived(1)
-    states = same.at(np.zeros(30, int))._replace(speed=np.full(30, 5.0), leader_speed=np.full(30, 5.0))
+    states = same.select(np.zeros(30, int))._replace(speed=np.full(30, 5.0), leader_speed=np.full(30, 5.0))
     resting = states._replace(leader_gap=np.full(30, equilibrium_gap(5.0, PAPER_IDM)))
-    parts = {SAMPLE: sample_bytes(driver, resting, 9.0), GRAPH: graph(constant)}
+    parts = {SAMPLE_PART: sample_bytes(driver, resting, 9.0), GRAPH_PART: graph(constant)}
     words = refused(written(tmp_path, controller_bytes(driver, {"action_limit": 9.0}, parts)))
     assert words.startswith("controller: random state ")
 
@@ -203,14 +201,12 @@ def test_a_graph_that_cannot_be_run_here_is_not_checked_and_never_passes(
     from .test_graph import graph
 
     driver = Constant()
-    path = written(tmp_path, content_of(driver, limit=20.0, parts={GRAPH: graph()}))
+    path = written(tmp_path, content_of(driver, limit=20.0, parts={GRAPH_PART: graph()}))
     monkeypatch.setitem(sys.modules, package, None)
     (found,) = [each for each in check_parts(read_controller(path)) if each.part == "graph"]
     assert found.status == "not checked"
-    with pytest.raises(
-        MissingPartError, match=f"^controller: graph: not checked: {package} is not installed"
-    ):
-        verify_controller(path)
+    with pytest.raises(MissingPartError, match=f"^controller: graph: not checked: {package} is not installed"):
+        verify_controller_file(path)
 
 
 def mutated(content: bytes, kind: str, place: float, other: bytes) -> bytes:
@@ -236,7 +232,7 @@ def test_a_damaged_file_is_refused_or_drives_as_before(kind: str, place: float, 
     with tempfile.TemporaryDirectory() as folder:
         path = written(Path(folder), mutated(content, kind, place, other))
         try:
-            verify_controller(path)
+            verify_controller_file(path)
         except InputError as error:
             assert "\n" not in str(error)  # noqa: PT017  (the other way out is no error)
             return
@@ -253,10 +249,7 @@ JSON = st.recursive(
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Every place in a JSON document."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [
-        *([path] if path else []),
-        *(found for key, part in inner for found in places(part, (*path, key))),
-    ]
+    return [*([path] if path else []), *(found for key, part in inner for found in places(part, (*path, key)))]
 
 
 @settings(max_examples=60)
@@ -275,7 +268,7 @@ def test_whatever_a_manifest_says_it_is_refused_in_one_line_or_drives(number: in
     with tempfile.TemporaryDirectory() as folder:
         path = changed(Path(folder), change)
         try:
-            verify_controller(path)
+            verify_controller_file(path)
         except InputError as error:
             assert "\n" not in str(error)  # noqa: PT017
             return
@@ -284,12 +277,12 @@ def test_whatever_a_manifest_says_it_is_refused_in_one_line_or_drives(number: in
 
 
 def test_hashes_are_sha256() -> None:
-    assert hash_of(b"abc").startswith("ba7816bf")
+    assert sha256_of(b"abc").startswith("ba7816bf")
 
 
 def test_what_a_stranger_wrote_of_the_road_stays_on_its_line_and_out_of_the_terminal(tmp_path: Path) -> None:
     def forge(manifest: dict[str, Any]) -> None:
         manifest["scenario"] = {"kind": "ring\nchecked signature: by 'maker.pub'\x1b[31m"}
 
-    (said,) = [each.detail for each in verify_controller(changed(tmp_path, forge)) if each.part == "road"]
+    (said,) = [each.detail for each in verify_controller_file(changed(tmp_path, forge)) if each.part == "road"]
     assert said == "made for the ring?checked signature: by 'maker.pub'?[31m"

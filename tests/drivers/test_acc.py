@@ -24,9 +24,7 @@ def test_acc_is_at_rest_at_its_time_gap() -> None:
     assert acceleration[0] == pytest.approx(0.0)
 
 
-@pytest.mark.parametrize(
-    ("gap", "leader_speed", "expected"), [(14, 10, 0.23), (13, 11, 0.07), (12, 10, -0.23)]
-)
+@pytest.mark.parametrize(("gap", "leader_speed", "expected"), [(14, 10, 0.23), (13, 11, 0.07), (12, 10, -0.23)])
 def test_acc_follows_with_its_gains(gap: float, leader_speed: float, expected: float) -> None:
     acceleration, _ = ACC().act(state_of([10], [leader_speed], [gap]), {})
     assert acceleration[0] == pytest.approx(expected)

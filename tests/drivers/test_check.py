@@ -104,6 +104,6 @@ def test_what_motorways_tell_is_there_where_it_is_asked_for() -> None:
     def as_allowed(state: Any) -> Any:
         return 0.3 * (state.allowed_speed - state.speed)
 
-    check_driver(as_allowed, told=True)
+    check_driver(as_allowed, optional_fields=True)
     with pytest.raises(InputError, match="driver: step 0: TypeError: "):
         check_driver(as_allowed)

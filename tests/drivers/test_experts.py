@@ -7,8 +7,8 @@ import torch
 from tests.conftest import random_network
 from unjam.drivers import DRIVERS, Driver, ResidualDriver, check_driver
 from unjam.drivers.check import random_state
-from unjam.drivers.driver import single_row
-from unjam.drivers.registry import driver_from_recipe, named_driver, recipe_of
+from unjam.drivers.driver import scalar_memory
+from unjam.drivers.registry import driver_from_name, driver_from_recipe, driver_recipe
 
 EXPERTS = [
     "human",
@@ -18,7 +18,7 @@ EXPERTS = [
     "pi:time_constant=0,safe_gap_rule=closing,first_command=zero",
     "pi:window=0.3",
     "pi-from-gap",
-    "pi-from-gap:fading=2,watched_share=0.3",
+    "pi-from-gap:fade_time=2,history_factor=0.3",
     "follower-stopper",
     "follower-stopper:desired_speed=4",
     "acc",
@@ -29,23 +29,23 @@ EXPERTS = [
     "ovm",
     "pacer",
     "pacer:harmonics=[7,-0.8,0.7,-1.3,0.7]",
-    "pacer:varying=true",
+    "pacer:use_tuned=true",
     "jam-absorber",
     "jam-absorber:first_position=-1000,last_position=1000,jam_speed=15",
-    "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8",
+    "jam-absorber:gap_gain=0,extra_acceleration=0.9,speed_gain=0.8",
     "cruise",
     "jam-ahead",
-    "jam-ahead:all_lanes=true,last=9",
-    "gap-maker:room=1.5,behind=300",
+    "jam-ahead:all_lanes=true,last_section=9",
+    "gap-maker:merge_time_gap=1.5,downstream_distance=300",
     "adaptive-acc",
-    "adaptive-acc:time_headway=1.2,front=0.5",
+    "adaptive-acc:time_headway=1.2,jam_front_speed_change=0.5",
     "constant:acceleration=0.2",
 ]
 
 
 @pytest.fixture(params=EXPERTS)
 def expert(request: pytest.FixtureRequest) -> Driver:
-    return named_driver(request.param, 0.1)
+    return driver_from_name(request.param, 0.1)
 
 
 def test_every_driver_is_among_them() -> None:
@@ -57,28 +57,28 @@ def test_keeps_the_contract(expert: Driver) -> None:
 
 
 def test_plain_numbers_give_what_arrays_give(expert: Driver) -> None:
-    if not expert.plain_numbers:
+    if not expert.accepts_floats:
         pytest.skip("messages are arrays")
     generator = np.random.default_rng(1)
     memory = expert.initial_memory(1)
-    numbers = single_row(memory)
+    numbers = scalar_memory(memory)
     for _ in range(60):
         state = random_state(generator, 1)
         expected, memory = expert.act(state, memory)
-        found, numbers = expert.act(state.each(lambda values: float(values[0])), numbers)
+        found, numbers = expert.act(state.map(lambda values: float(values[0])), numbers)
         assert type(found) is float
         assert found == pytest.approx(float(expected[0]), abs=1e-12)
 
 
 def test_tensors_give_what_arrays_give(expert: Driver) -> None:
-    assert expert.tensors
+    assert expert.accepts_tensors
     generator = np.random.default_rng(2)
     memory = expert.initial_memory(6)
     tensors = {key: torch.tensor(values) for key, values in memory.items()}
     for _ in range(60):
         state = random_state(generator, 6)
         expected, memory = expert.act(state, memory)
-        found, tensors = expert.act(state.each(lambda values: torch.tensor(values)), tensors)
+        found, tensors = expert.act(state.map(lambda values: torch.tensor(values)), tensors)
         np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
 
 
@@ -97,21 +97,21 @@ def test_rows_of_different_age_do_not_mix(expert: Driver) -> None:
         state = random_state(generator, len(ages))
         found, together = expert.act(state, together)
         for row in range(len(ages)):
-            one = state.at(slice(row, row + 1))
+            one = state.select(slice(row, row + 1))
             expected, alone[row] = expert.act(one, alone[row])
             assert found[row] == pytest.approx(expected[0], abs=1e-12)
 
 
 def test_recipe_makes_the_same_driver_again(expert: Driver) -> None:
-    recipe, arrays = recipe_of(expert)
+    recipe, arrays = driver_recipe(expert)
     assert driver_from_recipe(recipe, arrays) == expert
 
 
 def test_recipe_of_a_residual_on_a_residual_keeps_both_networks() -> None:
-    inner = ResidualDriver(named_driver("pi", 0.1), random_network(5, seed=1), 1.0)
+    inner = ResidualDriver(driver_from_name("pi", 0.1), random_network(5, seed=1), 1.0)
     parts = ("local", "expert_acceleration", "expert_memory")
-    outer = ResidualDriver(inner, random_network(8, seed=2), 1.0, parts, hold=3)
-    again = driver_from_recipe(*recipe_of(outer))
+    outer = ResidualDriver(inner, random_network(8, seed=2), 1.0, parts, action_repeat=3)
+    again = driver_from_recipe(*driver_recipe(outer))
     check_driver(again)
     generator = np.random.default_rng(4)
     memories = [driver.initial_memory(4) for driver in (outer, again)]

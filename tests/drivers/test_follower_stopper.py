@@ -13,8 +13,7 @@ def test_flows_reference_values() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gap", "wanted"),
-    [(4.0, 0.0), (4.5, 0.0), (4.875, 2.0), (5.25, 4.0), (5.625, 6.0), (6.0, 8.0), (50.0, 8.0)],
+    ("gap", "wanted"), [(4.0, 0.0), (4.5, 0.0), (4.875, 2.0), (5.25, 4.0), (5.625, 6.0), (6.0, 8.0), (50.0, 8.0)]
 )
 def test_commanded_speed_in_each_region_at_equal_speeds(gap: float, wanted: float) -> None:
     driver = FollowerStopper(desired_speed=8.0, time_constant=0)

@@ -25,7 +25,7 @@ def test_it_crawls_before_a_jam_until_there_is_room_and_the_leader_is_off() -> N
 
 
 def test_while_it_waits_it_also_keeps_off_its_leader() -> None:
-    driver = JamAbsorber(crawling_speed=9.0)
+    driver = JamAbsorber(crawl_speed=9.0)
     crawling, memory = driver.act(before(-400.0, 8.0, 0.0, 5.0), driver.initial_memory(1))
     assert memory["waits"] == 1.0
     assert crawling < -8.0
@@ -46,13 +46,8 @@ def test_who_has_nobody_ahead_does_not_wait() -> None:
 
 
 def test_with_a_push_and_no_wanted_gap_it_closes_up_unless_its_leader_is_slower() -> None:
-    driver = JamAbsorber(gap_gain=0, push=0.9, speed_gain=0.8)
-    for leader_speed, gap, expected in [
-        (20.0, 60.0, 0.9),
-        (20.0, 3.0, 0.9),
-        (19.0, 3.0, 0.1),
-        (17.0, 60.0, -1.5),
-    ]:
+    driver = JamAbsorber(gap_gain=0, extra_acceleration=0.9, speed_gain=0.8)
+    for leader_speed, gap, expected in [(20.0, 60.0, 0.9), (20.0, 3.0, 0.9), (19.0, 3.0, 0.1), (17.0, 60.0, -1.5)]:
         found, memory = driver.act(before(-400.0, 20.0, leader_speed, gap), driver.initial_memory(1))
         np.testing.assert_allclose(found, expected)
         assert memory["waits"] == 0.0

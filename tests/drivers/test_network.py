@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.conftest import random_network
-from unjam.drivers.network import Network, network_arrays, network_from_arrays
+from unjam.drivers.network import Network, network_from_weights, network_weights
 from unjam.errors import InputError
 
 
@@ -59,7 +59,7 @@ def test_noise_that_lasts_changes_what_the_last_hidden_layer_is_weighed_with() -
     for weight, bias in network.layers[:-1]:
         hidden = np.maximum(0.0, hidden @ weight + bias)
     hidden = np.hstack([hidden, np.ones((7, 1))])  # the bias
-    assert network.noise_numbers == 17
+    assert network.episode_noise_size == 17
     found = network.explore(observation, noise)
     np.testing.assert_allclose(found, network(observation) + 0.2 * (hidden * noise).sum(1), atol=1e-12)
     plain = network.explore(tuple(observation[3].tolist()), noise[3])
@@ -97,7 +97,7 @@ def test_exploring_rows_at_once_equal_single_rows_and_plain_numbers() -> None:
 
 @pytest.mark.parametrize("network", [random_network(5), random_network(5, outputs=2)])
 def test_arrays_make_the_same_network_again(network: Network) -> None:
-    again = network_from_arrays(network_arrays(network), network.authority, network.exploration_std)
+    again = network_from_weights(network_weights(network), network.authority, network.exploration_std)
     observation, noise = np.ones((2, 5)), np.ones(2)
     np.testing.assert_array_equal(again(observation), network(observation))
     np.testing.assert_array_equal(again.explore(observation, noise), network.explore(observation, noise))
@@ -115,9 +115,9 @@ def test_arrays_make_the_same_network_again(network: Network) -> None:
 )
 def test_refuses_weights_that_do_not_fit(change: dict[str, np.ndarray], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        network_from_arrays({**network_arrays(random_network(5)), **change}, 1.0, 0.1)
+        network_from_weights({**network_weights(random_network(5)), **change}, 1.0, 0.1)
 
 
 def test_refuses_no_weights() -> None:
     with pytest.raises(InputError, match="one output"):
-        network_from_arrays({}, 1.0, 0.1)
+        network_from_weights({}, 1.0, 0.1)

@@ -11,5 +11,5 @@ def test_gives_the_reference_values_of_flow() -> None:
 
 
 def test_optimal_speed_is_the_largest_beyond_the_go_gap() -> None:
-    acceleration, _ = OVM(largest_speed=12).act(state_of([12], [12], [40]), {})
+    acceleration, _ = OVM(max_speed=12).act(state_of([12], [12], [40]), {})
     assert acceleration[0] == pytest.approx(0.0)

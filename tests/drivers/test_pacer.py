@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import LocalState, Pacer
-from unjam.drivers.road_experts import TUNED
+from unjam.drivers.road_experts import TUNED_PACERS
 
 
 def state(gap: float, place: float = 0.0, loop: float = 450.0, speed: float = 0.0) -> LocalState:
@@ -47,12 +47,12 @@ def test_pace_varies_over_the_lap_as_its_harmonics_say(place: float) -> None:
 
 @pytest.mark.parametrize(("gap", "faster"), [(270.0, 0.9), (225.0, 0.0), (180.0, -0.9)])
 def test_drives_faster_where_more_of_the_lap_is_free(gap: float, faster: float) -> None:
-    pacer = Pacer(lap_time=70, gain=0.02, wanted_gap=0.5)
+    pacer = Pacer(lap_time=70, gap_gain=0.02, target_gap=0.5)
     assert wanted(pacer, state(gap=gap)) == pytest.approx(450 / 70 + faster)
 
 
 def test_never_stands_still_however_little_is_free() -> None:
-    pacer = Pacer(lap_time=70, gain=1.0, wanted_gap=0.9)
+    pacer = Pacer(lap_time=70, gap_gain=1.0, target_gap=0.9)
     assert wanted(pacer, state(gap=200.0)) == pytest.approx(1.0)
 
 
@@ -65,18 +65,18 @@ def test_waits_anew_when_the_queue_is_broken() -> None:
     assert wanted(pacer, together, broken, together) == pytest.approx(450 / 70)
 
 
-@pytest.mark.parametrize("lap", TUNED)
+@pytest.mark.parametrize("lap", TUNED_PACERS)
 def test_varying_is_the_pacer_that_was_tuned_for_the_nearest_lap(lap: float) -> None:
     here = state(gap=0.52 * lap, place=0.3, loop=lap + 2.0)
-    assert wanted(Pacer(varying=True), here) == pytest.approx(wanted(Pacer(**TUNED[lap]), here))
+    assert wanted(Pacer(use_tuned=True), here) == pytest.approx(wanted(Pacer(**TUNED_PACERS[lap]), here))
 
 
 def test_varying_rows_are_each_led_at_the_pace_of_their_own_lap() -> None:
-    laps = list(TUNED)
-    one_by_one = [wanted(Pacer(varying=True), state(gap=0.55 * lap, place=0.2, loop=lap)) for lap in laps]
+    laps = list(TUNED_PACERS)
+    one_by_one = [wanted(Pacer(use_tuned=True), state(gap=0.55 * lap, place=0.2, loop=lap)) for lap in laps]
     first, *others = (state(gap=0.55 * lap, place=0.2, loop=lap) for lap in laps)
-    rows = first.each(lambda *columns: np.concatenate(columns), *others)
-    pacer = Pacer(varying=True)
+    rows = first.map(lambda *columns: np.concatenate(columns), *others)
+    pacer = Pacer(use_tuned=True)
     acceleration, memory = pacer.act(rows, pacer.initial_memory(len(laps)))
     assert acceleration * pacer.time_constant == pytest.approx(one_by_one)
     assert memory["gathered"].tolist() == [1.0] * len(laps)

@@ -12,9 +12,7 @@ AROUND_A_RING = state_of([5, 7.5, 7.5, 8, 7], [7.5, 7.5, 8, 7, 5], [5, 10, 15, 2
 
 def test_flows_reference_values_on_the_first_call() -> None:
     found, _ = FLOW.act(AROUND_A_RING, FLOW.initial_memory(5))
-    np.testing.assert_allclose(
-        np.minimum(found, 20.0), [20, -36.847826, -35.76087, -37.173913, -31.086957], atol=5e-7
-    )
+    np.testing.assert_allclose(np.minimum(found, 20.0), [20, -36.847826, -35.76087, -37.173913, -31.086957], atol=5e-7)
 
 
 def literal_pi(states: list[tuple[float, float, float]], constant_gap: bool, from_zero: bool) -> list[float]:
@@ -91,7 +89,7 @@ def test_recalled_warmup_counts_like_own_driving(watched: int) -> None:
 
 def test_from_a_standstill_the_gap_says_how_fast_it_begins_and_that_fades() -> None:
     state = state_of([0.0], [0.0], [8.0])
-    quick, plain = PIFromGap(people_headway=1.5, people_gap=2.0, fading=3.0), PISaturation()
+    quick, plain = PIFromGap(human_time_headway=1.5, human_standstill_gap=2.0, fade_time=3.0), PISaturation()
     memory, plain_memory, gained = quick.initial_memory(1), plain.initial_memory(1), []
     for _ in range(40):
         found, memory = quick.act(state, memory)
@@ -103,7 +101,7 @@ def test_from_a_standstill_the_gap_says_how_fast_it_begins_and_that_fades() -> N
 
 def test_in_traffic_that_was_watched_it_begins_with_a_share_of_the_mean() -> None:
     watched = state_of([[4.0, 6.0]], [[5.0, 5.0]], [[9.0, 9.0]])
-    whole, half = (PIFromGap(watched_share=share) for share in (1.0, 0.5))
+    whole, half = (PIFromGap(history_factor=share) for share in (1.0, 0.5))
     state = state_of([5.0], [5.0], [20.0])
     found = []
     for driver in (PISaturation(), whole, half):

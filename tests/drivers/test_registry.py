@@ -3,22 +3,22 @@ from typing import Any
 import pytest
 
 from unjam.drivers import Constant, FollowerStopper, PISaturation
-from unjam.drivers.registry import driver_from_recipe, named_driver, recipe_of
+from unjam.drivers.registry import driver_from_name, driver_from_recipe, driver_recipe
 from unjam.errors import InputError
 
 
 def test_names_take_parameters() -> None:
-    assert named_driver("pi:window=10,safe_gap_rule=closing", 0.2) == PISaturation(
+    assert driver_from_name("pi:window=10,safe_gap_rule=closing", 0.2) == PISaturation(
         window=10, safe_gap_rule="closing", time_step=0.2
     )
-    assert named_driver("follower-stopper:gaps=[1,2,3],desired_speed=5", 0.1) == FollowerStopper(
+    assert driver_from_name("follower-stopper:gaps=[1,2,3],desired_speed=5", 0.1) == FollowerStopper(
         gaps=(1, 2, 3), desired_speed=5
     )
 
 
 def test_description_names_what_differs_from_the_defaults() -> None:
-    assert named_driver("pi", 0.5).describe() == "pi"
-    assert named_driver("pi:window=10", 0.1).describe() == "pi:window=10.0"
+    assert driver_from_name("pi", 0.5).describe() == "pi"
+    assert driver_from_name("pi:window=10", 0.1).describe() == "pi:window=10.0"
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_description_names_what_differs_from_the_defaults() -> None:
 )
 def test_wrong_names_and_values_get_one_clear_line(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:
-        named_driver(text, 0.1)
+        driver_from_name(text, 0.1)
     assert "\n" not in str(caught.value)
 
 
@@ -48,7 +48,7 @@ def test_a_class_of_ones_own_must_come_from_a_file() -> None:
         pass
 
     with pytest.raises(InputError, match="put your class in a file"):
-        recipe_of(Mine())
+        driver_recipe(Mine())
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,12 @@ from tests.conftest import random_network
 from unjam.controller import make_driver
 from unjam.drivers import IDM, Driver, LocalState, PISaturation, ResidualDriver, check_driver
 from unjam.drivers.check import random_state
-from unjam.drivers.driver import single_row
+from unjam.drivers.driver import scalar_memory
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.safety import SafetyFilter
-from unjam.drivers.wrappers import Filtered, Remembering
-from unjam.tree import mapped
+from unjam.drivers.wrappers import FilteredDriver, HistoryDriver
+from unjam.tree import map_leaves
 
 ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position")
 
@@ -52,46 +52,44 @@ def test_keeps_the_contract_of_drivers(hold: int, parts: tuple) -> None:
 
 
 @pytest.mark.parametrize("hold", [1, 4])
-@pytest.mark.parametrize("expert", [PISaturation(), Remembering(PISaturation(), 0.1)])
+@pytest.mark.parametrize("expert", [PISaturation(), HistoryDriver(PISaturation(), 0.1)])
 def test_plain_numbers_give_what_arrays_give(expert: Driver, hold: int) -> None:
     driver = ResidualDriver(expert, random_network(observation_size(ALL_PARTS, expert)), 1.0, ALL_PARTS, hold)
     generator = np.random.default_rng(2)
     memory = driver.initial_memory(1)
-    numbers = single_row(memory)
-    assert driver.plain_numbers
+    numbers = scalar_memory(memory)
+    assert driver.accepts_floats
     for _ in range(25):
         state = random_state(generator, 1)
         expected, memory = driver.act(state, memory)
-        found, numbers = driver.act(state.each(lambda values: float(values[0])), numbers)
+        found, numbers = driver.act(state.map(lambda values: float(values[0])), numbers)
         assert found == pytest.approx(float(expected[0]), abs=1e-12)
 
 
 @pytest.mark.parametrize("hold", [1, 4])
 def test_tensors_give_what_arrays_give(hold: int) -> None:
-    inner = ResidualDriver(PISaturation(), random_network(), 1.0, hold=2)
+    inner = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=2)
     network = random_network(observation_size(ALL_PARTS, inner))
     driver = ResidualDriver(inner, network, 1.0, ALL_PARTS, hold)
-    assert driver.tensors
+    assert driver.accepts_tensors
     generator = np.random.default_rng(5)
     memory = driver.initial_memory(6)
-    tensors = mapped(torch.tensor, memory)
+    tensors = map_leaves(torch.tensor, memory)
     for _ in range(12):
         state, noise = random_state(generator, 6), generator.normal(size=6)
         expected = driver.decide(state, memory, lambda: noise)  # noqa: B023
         memory = expected.memory
-        on_tensors = state.each(lambda values: torch.tensor(values))
+        on_tensors = state.map(lambda values: torch.tensor(values))
         found = driver.decide(on_tensors, tensors, lambda: torch.tensor(noise))  # noqa: B023
         tensors = found.memory
-        np.testing.assert_allclose(
-            found.command.acceleration.numpy(), expected.command.acceleration, atol=1e-12
-        )
+        np.testing.assert_allclose(found.command.acceleration.numpy(), expected.command.acceleration, atol=1e-12)
         assert found.observation is not None
         assert expected.observation is not None
         np.testing.assert_allclose(found.observation.numpy(), expected.observation, atol=1e-12)
 
 
 def test_holds_its_residual_for_as_many_decisions_as_asked() -> None:
-    driver = ResidualDriver(IDM(), random_network(5), 1.0, hold=3)
+    driver = ResidualDriver(IDM(), random_network(5), 1.0, action_repeat=3)
     generator = np.random.default_rng(3)
     memory, residuals = driver.initial_memory(2), []
     for _ in range(9):
@@ -112,8 +110,8 @@ def test_explores_only_when_given_noise() -> None:
 
 
 def test_a_residual_on_a_residual_that_both_hold_keep_apart() -> None:
-    inner = ResidualDriver(PISaturation(), random_network(5, seed=1), 1.0, hold=2)
-    outer = ResidualDriver(inner, random_network(5, seed=2), 1.0, hold=5)
+    inner = ResidualDriver(PISaturation(), random_network(5, seed=1), 1.0, action_repeat=2)
+    outer = ResidualDriver(inner, random_network(5, seed=2), 1.0, action_repeat=5)
     check_driver(outer)
 
 
@@ -130,18 +128,18 @@ def test_observes_what_was_asked_for() -> None:
 def test_what_its_expert_asks_of_the_cars_own_accs_is_asked_however_deep_it_stands() -> None:
     expert = make_driver("gap-maker", 1.0)
     one = ResidualDriver(expert, random_network(), 1.0)
-    state = random_state(np.random.default_rng(3), 40, told=True)
-    asked = expert.time_headways(state, expert.initial_memory(40))
+    state = random_state(np.random.default_rng(3), 40, optional_fields=True)
+    asked = expert.time_gaps(state, expert.initial_memory(40))
     assert asked is not None
     assert np.isfinite(asked).any()
-    for driver in (one, ResidualDriver(one, random_network(), 1.0), Filtered(one, 1.0, SafetyFilter(), 1.0)):
-        found = driver.time_headways(state, driver.initial_memory(40))
+    for driver in (one, ResidualDriver(one, random_network(), 1.0), FilteredDriver(one, 1.0, SafetyFilter(), 1.0)):
+        found = driver.time_gaps(state, driver.initial_memory(40))
         np.testing.assert_array_equal(np.array(found), asked)
 
 
 def test_what_its_expert_remembers_is_seen_through_a_filter_too() -> None:
     expert = PISaturation()
-    around = Filtered(expert, 1.0, SafetyFilter(), 0.1)
+    around = FilteredDriver(expert, 1.0, SafetyFilter(), 0.1)
     parts = ("local", "expert_memory")
     assert observation_size(parts, around) == observation_size(parts, expert) == 7
     driver = ResidualDriver(around, random_network(7), 1.0, parts)

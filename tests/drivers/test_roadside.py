@@ -4,28 +4,28 @@ import numpy as np
 import pytest
 
 from unjam.drivers.local_state import SECTIONS_AHEAD
-from unjam.drivers.roadside import CongestionMonitor, MainRoad, Messages, Roadside
+from unjam.drivers.roadside import CongestionMonitor, RoadSections, RoadsideMessages, RoadsideSettings
 from unjam.physics.idm import IDMParameters, equilibrium_gap
 
 ALLOWED = 30.0
 RAMP, RIGHT, LEFT = 0, 1, 2
 
 
-ROAD = MainRoad(3, 1000.0)
+ROAD = RoadSections(3, 1000.0)
 
 
-def messages(**how: float) -> Messages:
-    return Messages(Roadside(**how), 1.0, np.random.default_rng(0))
+def messages(**how: float) -> RoadsideMessages:
+    return RoadsideMessages(RoadsideSettings(**how), 1.0, np.random.default_rng(0))
 
 
-def measure(told: Messages, *vehicles: tuple[int, float, float]) -> None:
+def measure(told: RoadsideMessages, *vehicles: tuple[int, float, float]) -> None:
     ways, places, speeds = zip(*vehicles, strict=True) if vehicles else ((), (), ())
     arrays = np.array(ways, np.intp), np.array(places, float), np.array(speeds, float)
-    told.send(ROAD.means(*arrays, ALLOWED))
+    told.send(ROAD.mean_speeds(*arrays, ALLOWED))
 
 
-def ahead(told: Messages, way: int, place: float) -> tuple[np.ndarray, np.ndarray]:
-    lane, road = ROAD.ahead(told.arrived, np.array([way]), np.array([place]))
+def ahead(told: RoadsideMessages, way: int, place: float) -> tuple[np.ndarray, np.ndarray]:
+    lane, road = ROAD.speeds_ahead(told.latest, np.array([way]), np.array([place]))
     return lane[0], road[0]
 
 
@@ -93,9 +93,7 @@ def test_flow_that_rises_with_density_is_free_however_slow_it_is() -> None:
 
 
 @pytest.mark.parametrize("before", [FREE, FULL])
-def test_denser_and_much_slower_than_at_the_highest_flow_is_congestion_until_it_has_gone(
-    before: float,
-) -> None:
+def test_denser_and_much_slower_than_at_the_highest_flow_is_congestion_until_it_has_gone(before: float) -> None:
     monitor = CongestionMonitor(1, 1.0)
     assert not observe(monitor, before, 600)
     assert observe(monitor, JAM, 120)

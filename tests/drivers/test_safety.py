@@ -9,19 +9,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unjam.drivers.safety import Actuator, Ahead, SafetyFilter, Underway
-from unjam.drivers.sensors import Readings, Sensors
+from unjam.drivers.safety import Actuator, ActuatorState, FollowingState, SafetyFilter
+from unjam.drivers.sensors import SensorReadings, Sensors
 from unjam.errors import InputError
-from unjam.parameters import build
-from unjam.physics.kinematics import next_speed, speed_to_stop_within, stopping_distance
+from unjam.parameters import build_dataclass
+from unjam.physics.kinematics import max_speed_to_stop, next_speed, stopping_distance
 
 STEPS = st.sampled_from([0.05, 0.1, 0.2, 0.5])
 SPEEDS = st.floats(0.0, 40.0)
 GAPS = st.floats(0.5, 200.0)
 FILTERS = [
     SafetyFilter(),
-    SafetyFilter(time_headway=0.0),
-    SafetyFilter(time_headway=1.6, headway_braking=3.0, standstill_gap=2.0),
+    SafetyFilter(time_gap=0.0),
+    SafetyFilter(time_gap=1.6, time_gap_braking=3.0, standstill_gap=2.0),
     SafetyFilter(braking=4.5, leader_braking=8.0),
 ]
 ACTUATORS = [None, Actuator(lag=0.3), Actuator(delay=0.2), Actuator(delay=0.3, lag=0.5)]
@@ -35,17 +35,13 @@ def stopping_by_steps(speed: float, braking: float, step: float) -> float:
 
 
 @given(SPEEDS, st.floats(1.0, 9.0), STEPS)
-def test_a_stopping_distance_is_what_single_steps_add_up_to(
-    speed: float, braking: float, step: float
-) -> None:
-    assert stopping_distance(speed, braking, step) == pytest.approx(
-        stopping_by_steps(speed, braking, step), abs=1e-9
-    )
+def test_a_stopping_distance_is_what_single_steps_add_up_to(speed: float, braking: float, step: float) -> None:
+    assert stopping_distance(speed, braking, step) == pytest.approx(stopping_by_steps(speed, braking, step), abs=1e-9)
 
 
 @given(st.floats(0.0, 300.0), st.floats(1.0, 9.0), STEPS)
 def test_the_speed_to_stop_within_uses_the_distance_up(distance: float, braking: float, step: float) -> None:
-    speed = speed_to_stop_within(distance, braking, step)
+    speed = max_speed_to_stop(distance, braking, step)
     assert speed * step + stopping_distance(speed, braking, step) == pytest.approx(distance, abs=1e-9)
 
 
@@ -62,29 +58,27 @@ class Pursuit:
         sensors: Sensors | None = None,
     ) -> None:
         generator = np.random.default_rng(seed)
-        self.readings = Readings(
-            sensors or Sensors(), safety.leader_braking, step, np.random.SeedSequence(seed)
-        )
+        self.readings = SensorReadings(sensors or Sensors(), safety.leader_braking, step, np.random.SeedSequence(seed))
         self.safety, self.actuator, self.step, self.generator = safety, actuator, step, generator
-        ahead = Ahead(*generator.uniform(0.0, [[35.0], [35.0], [150.0]], (3, rows)))
-        start = Underway(np.zeros(rows)) if actuator is None else actuator.start(ahead.speed, step)
-        free = safety.highest(ahead, step, actuator, start) > -min(safety.braking, safety.headway_braking)
-        self.ahead = Ahead(*(values[free] for values in ahead))
-        self.underway = Underway(start.acceleration[free], tuple(each[free] for each in start.pending))
+        ahead = FollowingState(*generator.uniform(0.0, [[35.0], [35.0], [150.0]], (3, rows)))
+        start = ActuatorState(np.zeros(rows)) if actuator is None else actuator.initial_state(ahead.speed, step)
+        free = safety.max_acceleration(ahead, step, actuator, start) > -min(safety.braking, safety.time_gap_braking)
+        self.ahead = FollowingState(*(values[free] for values in ahead))
+        self.underway = ActuatorState(start.acceleration[free], tuple(each[free] for each in start.pending))
 
     def go(self, leader: Any, wanted: Any) -> np.ndarray:
         """Make one step in which leaders accelerate with `leader`; return the cars' accelerations."""
-        step, sensed = self.step, self.readings.of_filter("all", self.ahead)
-        told = self.safety.keep(
+        step, sensed = self.step, self.readings.read_for_filter("all", self.ahead)
+        told = self.safety.limit(
             np.broadcast_to(wanted, self.ahead.speed.shape), sensed, step, self.actuator, self.underway
         )
         assert (told >= np.minimum(wanted, -self.safety.braking)).all()
         if self.actuator is not None:
-            self.underway = self.actuator.obey(told, self.ahead.speed, self.underway, step)
+            self.underway = self.actuator.apply_command(told, self.ahead.speed, self.underway, step)
             told = self.underway.acceleration
         speed = next_speed(self.ahead.speed, told, step)
         ahead = next_speed(self.ahead.leader_speed, leader, step)
-        self.ahead = Ahead(speed, ahead, self.ahead.gap + step * (ahead - speed))
+        self.ahead = FollowingState(speed, ahead, self.ahead.gap + step * (ahead - speed))
         return told
 
 
@@ -116,11 +110,11 @@ def test_the_floor_holds_behind_who_brakes_no_harder_than_it_allows_for(
     for number in range(300):
         if number % 20 == 0:
             leader = pursuit.generator.choice([-1.0, -1.0, -0.3, 0.0, 0.5], len(pursuit.ahead.gap))
-            leader *= safety.headway_braking
+            leader *= safety.time_gap_braking
         pursuit.go(leader, 3.0)
         if number > 10:  # commands given before the start have arrived
             speed, _, gap = pursuit.ahead
-            assert (gap >= safety.standstill_gap + safety.time_headway * speed - 1e-9).all()
+            assert (gap >= safety.standstill_gap + safety.time_gap * speed - 1e-9).all()
 
 
 @pytest.mark.parametrize("actuator", ACTUATORS, ids=str)
@@ -129,7 +123,7 @@ def test_sensors_that_err_within_their_bounds_and_miss_readings_change_neither_c
     sensors: Sensors, actuator: Actuator | None
 ) -> None:
     allows = SafetyFilter(gap_error=sensors.gap_error, speed_error=sensors.speed_error)
-    for hardest in (allows.leader_braking, allows.headway_braking):
+    for hardest in (allows.leader_braking, allows.time_gap_braking):
         pursuit = Pursuit(allows, actuator, 0.1, 4000, 3, sensors)
         nearest = np.minimum(pursuit.ahead.gap, allows.standstill_gap)
         leader = np.zeros(len(nearest))
@@ -139,8 +133,8 @@ def test_sensors_that_err_within_their_bounds_and_miss_readings_change_neither_c
             pursuit.go(leader, 3.0)
             speed, _, gap = pursuit.ahead
             assert (gap >= nearest - 1e-9).all()
-            if number > 10 and hardest == allows.headway_braking:
-                assert (gap >= allows.standstill_gap + allows.time_headway * speed - 1e-9).all()
+            if number > 10 and hardest == allows.time_gap_braking:
+                assert (gap >= allows.standstill_gap + allows.time_gap * speed - 1e-9).all()
 
 
 def test_a_filter_that_does_not_know_of_its_sensors_errors_lets_cars_touch() -> None:
@@ -161,12 +155,12 @@ def test_without_the_filter_the_same_cars_crash() -> None:
 def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
     speed: float, leader: float, gap: float, wanted: float, step: float
 ) -> None:
-    ahead, safety = Ahead(speed, leader, gap), SafetyFilter()
-    told = safety.keep(wanted, ahead, step)
-    rows = safety.keep(np.array([wanted]), Ahead(*(np.array([value]) for value in ahead)), step)
-    tensors = safety.keep(
+    ahead, safety = FollowingState(speed, leader, gap), SafetyFilter()
+    told = safety.limit(wanted, ahead, step)
+    rows = safety.limit(np.array([wanted]), FollowingState(*(np.array([value]) for value in ahead)), step)
+    tensors = safety.limit(
         torch.tensor([wanted], dtype=torch.float64),
-        Ahead(*(torch.tensor([value], dtype=torch.float64) for value in ahead)),
+        FollowingState(*(torch.tensor([value], dtype=torch.float64) for value in ahead)),
         step,
     )
     assert rows[0] == pytest.approx(told, abs=1e-9)
@@ -175,8 +169,8 @@ def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
 
 @given(SPEEDS, SPEEDS, st.floats(-3.0, 3.0))
 def test_with_nobody_ahead_a_car_does_what_it_wants(speed: float, nobody: float, wanted: float) -> None:
-    for actuator, underway in ((None, None), (Actuator(lag=0.3), Underway(0.0))):
-        free = SafetyFilter().keep(wanted, Ahead(speed, nobody, inf), 0.1, actuator, underway)
+    for actuator, underway in ((None, None), (Actuator(lag=0.3), ActuatorState(0.0))):
+        free = SafetyFilter().limit(wanted, FollowingState(speed, nobody, inf), 0.1, actuator, underway)
         assert free == wanted
 
 
@@ -185,8 +179,8 @@ def test_errors_of_the_sensors_within_their_bounds_never_let_more_pass(
     speed: float, leader: float, gap: float, wanted: float, far: float, fast: float
 ) -> None:
     careful = SafetyFilter(gap_error=2.0, speed_error=2.0)
-    sensed = careful.keep(wanted, Ahead(speed, leader + fast, gap + far), 0.1)
-    assert sensed <= SafetyFilter().keep(wanted, Ahead(speed, leader, gap), 0.1) + 1e-9
+    sensed = careful.limit(wanted, FollowingState(speed, leader + fast, gap + far), 0.1)
+    assert sensed <= SafetyFilter().limit(wanted, FollowingState(speed, leader, gap), 0.1) + 1e-9
 
 
 @given(st.floats(0.0, 30.0), st.floats(-6.0, 2.0), st.lists(st.floats(-6.0, 2.0), min_size=1, max_size=40))
@@ -194,13 +188,13 @@ def test_a_car_with_lag_drives_no_farther_than_its_equivalent(
     speed: float, acceleration: float, commands: list[float]
 ) -> None:
     actuator, step, braking = Actuator(lag=0.4), 0.1, 6.0
-    underway = Underway(max(acceleration, -speed / step))
+    underway = ActuatorState(max(acceleration, -speed / step))
     for command in commands:
         equivalent = actuator.equivalent_speed(speed, underway, braking, step)
-        underway = actuator.obey(command, speed, underway, step)
+        underway = actuator.apply_command(command, speed, underway, step)
         speed = next_speed(speed, underway.acceleration, step)
         following = actuator.equivalent_speed(speed, underway, braking, step)
-        standing = actuator.equivalent_speed(0.0, Underway(0.0), braking, step)
+        standing = actuator.equivalent_speed(0.0, ActuatorState(0.0), braking, step)
         assert speed <= following + 1e-9
         assert following <= max(equivalent + command * step, standing) + 1e-9
 
@@ -209,11 +203,11 @@ def test_a_car_with_lag_drives_no_farther_than_its_equivalent(
     ("values", "line"),
     [
         ({"leader_braking": 5.0}, "leader_braking: 5 is not allowed; allowed: >= braking, 6"),
-        ({"headway_braking": 7.0}, "headway_braking: 7 is not allowed; allowed: <= braking, 6"),
+        ({"time_gap_braking": 7.0}, "headway_braking: 7 is not allowed; allowed: <= braking, 6"),
         ({"time_headway": -1.0}, "time_headway: -1.0 is not allowed; allowed: greater than or equal to 0"),
     ],
 )
 def test_brakes_that_prove_nothing_are_refused(values: dict[str, float], line: str) -> None:
     with pytest.raises(InputError) as refused:
-        build(SafetyFilter, values, "safety")
+        build_dataclass(SafetyFilter, values, "safety")
     assert line in str(refused.value)

@@ -7,17 +7,17 @@ import torch
 from tests.conftest import random_network
 from unjam.controller import make_driver
 from unjam.drivers import IDM, Driver, FollowerStopper, PISaturation, check_driver
-from unjam.drivers.by_road import ByRoad
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Memory
-from unjam.drivers.from_file import as_driver
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.registry import driver_from_recipe, recipe_of
+from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.residual import ResidualDriver
-from unjam.drivers.wrappers import Impaired, Mixed, Remembering
+from unjam.drivers.road_type_switch import RoadTypeSwitch
+from unjam.drivers.user_driver import as_driver
+from unjam.drivers.wrappers import HistoryDriver, ImpairedDriver, MixedDriver
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
-from unjam.tree import mapped
+from unjam.tree import map_leaves
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -25,7 +25,7 @@ PI, STOPPER = PISaturation(), FollowerStopper()
 
 
 def test_each_row_drives_as_its_own_driver_would() -> None:
-    mixed, memory = Mixed((PI, STOPPER)), Mixed((PI, STOPPER)).initial_memory(5)
+    mixed, memory = MixedDriver((PI, STOPPER)), MixedDriver((PI, STOPPER)).initial_memory(5)
     alone = [PI.initial_memory(5), STOPPER.initial_memory(5)]
     for moment in range(4):
         state = random_state(np.random.default_rng(moment), 5)
@@ -39,18 +39,18 @@ def test_each_row_drives_as_its_own_driver_would() -> None:
 
 def test_wrappers_pass_on_what_is_asked_of_the_cars_own_accs() -> None:
     def asked(driver: Driver) -> Any:
-        return driver.decide(state, driver.initial_memory(4)).command.time_headway
+        return driver.decide(state, driver.initial_memory(4)).command.time_gap
 
     state = random_state(np.random.default_rng(1), 4)
     nan, two, asks = np.nan, 2.0, as_driver(AsksForTwoSeconds())
     everyone = [two] * 4
-    np.testing.assert_array_equal(asked(Mixed((PI, asks, STOPPER))), [nan, two, nan, nan])
-    np.testing.assert_array_equal(asked(Impaired(asks, delay=0.3)), everyone)
-    np.testing.assert_array_equal(asked(Remembering(asks, 0.1)), everyone)
+    np.testing.assert_array_equal(asked(MixedDriver((PI, asks, STOPPER))), [nan, two, nan, nan])
+    np.testing.assert_array_equal(asked(ImpairedDriver(asks, delay=0.3)), everyone)
+    np.testing.assert_array_equal(asked(HistoryDriver(asks, 0.1)), everyone)
     np.testing.assert_array_equal(asked(ResidualDriver(asks, random_network(5), 1.0)), everyone)
-    np.testing.assert_array_equal(asked(ByRoad(PI, PI, asks, PI)), everyone)
+    np.testing.assert_array_equal(asked(RoadTypeSwitch(PI, PI, asks, PI)), everyone)
     np.testing.assert_array_equal(asked(asks), everyone)
-    assert asked(Mixed((PI, STOPPER))) is None
+    assert asked(MixedDriver((PI, STOPPER))) is None
     assert asked(as_driver(lambda state: state.speed * 0.0)) is None
 
 
@@ -68,11 +68,11 @@ class AsksForTwoSeconds:
 
 
 def test_it_drives_tensors_as_it_drives_arrays() -> None:
-    mixed, state = Mixed((PI, IDM())), random_state(np.random.default_rng(1), 4)
-    assert mixed.tensors
+    mixed, state = MixedDriver((PI, IDM())), random_state(np.random.default_rng(1), 4)
+    assert mixed.accepts_tensors
     expected, _ = mixed.act(state, mixed.initial_memory(4))
-    tensors = state.each(lambda values: torch.as_tensor(values))
-    memory = mapped(torch.as_tensor, mixed.initial_memory(4))
+    tensors = state.map(lambda values: torch.as_tensor(values))
+    memory = map_leaves(torch.as_tensor, mixed.initial_memory(4))
     np.testing.assert_allclose(mixed.act(tensors, memory)[0].numpy(), expected, atol=1e-12)
 
 
@@ -80,23 +80,23 @@ def test_the_first_cav_has_the_first_driver_and_the_second_the_second(simulation
     ring = Ring(length=(260, 260), cavs=2, horizon=80)
     driver = make_driver("pi+constant:acceleration=0.3", 0.1)
     first, second = run_episode(ring, driver, (0,), simulation=simulation).trajectories
-    np.testing.assert_array_equal(second.applied, 0.3)
-    assert np.ptp(first.applied) > 0.1
+    np.testing.assert_array_equal(second.applied_acceleration, 0.3)
+    assert np.ptp(first.applied_acceleration) > 0.1
 
 
 def test_where_cavs_come_and_go_drivers_take_turns_as_they_enter(simulation: Simulation) -> None:
     driver = make_driver("constant:acceleration=0.1+constant:acceleration=0.2", 1.0)
     episode = run_episode(Merge(horizon=90), driver, (0,), simulation=simulation)
-    entered = sorted(episode.trajectories, key=lambda stay: (stay.start, -stay.states.route_position[0]))
+    entered = sorted(episode.trajectories, key=lambda stay: (stay.start_step, -stay.states.route_position[0]))
     assert len(entered) > 2
     for number, stay in enumerate(entered):
-        assert set(stay.applied) == {0.1 if number % 2 == 0 else 0.2}
+        assert set(stay.applied_acceleration) == {0.1 if number % 2 == 0 else 0.2}
 
 
 def test_a_mixture_is_named_and_written_down_like_any_driver() -> None:
     mixed = make_driver("pi:window=1e+1+follower-stopper+idm", 0.1)
     assert mixed.describe() == "pi:window=10.0+follower-stopper+idm"
-    assert driver_from_recipe(*recipe_of(mixed)) == mixed
+    assert driver_from_recipe(*driver_recipe(mixed)) == mixed
 
 
 @pytest.mark.parametrize(("text", "words"), [("pi+human", "human"), ("pi+nobody", "nobody")])
@@ -108,12 +108,12 @@ def test_what_cannot_be_mixed_is_told_in_one_line(text: str, words: str) -> None
 
 @pytest.mark.parametrize("driver", ["idm", "pi"])
 def test_it_keeps_the_contract_of_drivers(driver: str) -> None:
-    check_driver(Impaired(make_driver(driver, 0.1), delay=0.3, gap_noise=0.5))
+    check_driver(ImpairedDriver(make_driver(driver, 0.1), delay=0.3, gap_noise=0.5))
 
 
 def test_unimpaired_it_is_the_driver_itself() -> None:
     generator = np.random.default_rng(0)
-    mine, other = Impaired(make_driver("pi", 0.1)), PISaturation()
+    mine, other = ImpairedDriver(make_driver("pi", 0.1)), PISaturation()
     memory, theirs = mine.initial_memory(3), other.initial_memory(3)
     for _ in range(20):
         state = random_state(generator, 3)
@@ -124,7 +124,7 @@ def test_unimpaired_it_is_the_driver_itself() -> None:
 
 def test_what_it_says_is_carried_out_later() -> None:
     generator = np.random.default_rng(0)
-    late = Impaired(make_driver("idm", 0.1), delay=0.3)
+    late = ImpairedDriver(make_driver("idm", 0.1), delay=0.3)
     memory, said, done = late.initial_memory(2), [], []
     for _ in range(20):
         state = random_state(generator, 2)
@@ -143,7 +143,7 @@ def test_it_sees_gaps_with_noise_of_its_own_for_each_vehicle_and_moment() -> Non
             seen.append((state.leader_gap, state.follower_gap))
             return state.speed * 0.0, memory
 
-    blurred = Impaired(Eye(), 0.0, 0.5, 0.1)
+    blurred = ImpairedDriver(Eye(), 0.0, 0.5, 0.1)
     memory = blurred.initial_memory(4)
     state = random_state(np.random.default_rng(0), 4)
     state = state._replace(leader_gap=np.full(4, 20.0), follower_gap=np.full(4, 30.0), speed=np.arange(4.0))
@@ -156,6 +156,6 @@ def test_it_sees_gaps_with_noise_of_its_own_for_each_vehicle_and_moment() -> Non
 
 
 def test_an_impaired_driver_travels_to_another_process() -> None:
-    late = Impaired(make_driver("pi:window=10+idm", 0.1), delay=0.3, gap_noise=0.5)
+    late = ImpairedDriver(make_driver("pi:window=10+idm", 0.1), delay=0.3, gap_noise=0.5)
     assert late.describe() == "pi:window=10.0+idm (late 0.3 s, gap noise 0.5 m)"
-    assert driver_from_recipe(*recipe_of(late)) == late
+    assert driver_from_recipe(*driver_recipe(late)) == late

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import PISaturation
-from unjam.environments.single import RoadEnv
+from unjam.environments.gymnasium_env import RoadEnv
 from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
 

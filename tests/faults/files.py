@@ -18,44 +18,30 @@ from tests.faults.outcome import Outcome, one_line
 from tests.pictures import empty_pictures
 from unjam.controller import controller_bytes, load_controller
 from unjam.controller.file import (
-    CERTIFICATE,
-    GRAPH,
-    MANIFEST,
-    PARTS,
-    SIGNATURE,
-    WEIGHTS,
+    ARCHIVE_PARTS,
+    CERTIFICATE_PART,
+    GRAPH_PART,
+    MANIFEST_PART,
+    SIGNATURE_PART,
+    WEIGHTS_PART,
     add_signature,
     pack_parts,
     read_controller,
     unpack_parts,
 )
 from unjam.controller.signature import make_keys, read_private_key, signature_of
-from unjam.controller.verify import verify_controller
+from unjam.controller.verify import verify_controller_file
 from unjam.errors import DiskError, InputError
-from unjam.reports.html import write_report
+from unjam.reports.html import write_report_page
 from unjam.training.config import load_config, to_toml
 from unjam.training.evaluate import drive
-from unjam.training.folder import STATE, TENSORS, load_checkpoint, save_checkpoint
+from unjam.training.run_folder import CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE, load_checkpoint, save_checkpoint
 from unjam.training.runs import list_runs
 
 MUTATIONS = ("change", "cut", "insert", "double", "swap")
 LONGEST = 2.0
 """seconds in which a wrong configuration is refused"""
-JUNK = [
-    "nan",
-    "-1",
-    "1e400",
-    '""',
-    '"ghost"',
-    "[]",
-    "{}",
-    "true",
-    "9" * 30,
-    "[[[[1]]]]",
-    "0",
-    "1979-05-27",
-    "=",
-]
+JUNK = ["nan", "-1", "1e400", '""', '"ghost"', "[]", "{}", "true", "9" * 30, "[[[[1]]]]", "0", "1979-05-27", "="]
 
 
 def save(folder: Path, iteration: int) -> None:
@@ -87,7 +73,7 @@ def checkpoints(count: int, folder: Path, generator: np.random.Generator) -> Out
         place = folder / str(number)
         save(place, 1)
         save(place, 2)
-        part = place / "000002" / str(generator.choice([STATE, TENSORS]))
+        part = place / "000002" / str(generator.choice([CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE]))
         kind = generator.choice(["bytes", "bytes", "bytes", "empty", "missing", "another's", "old schema"])
         if kind == "bytes":
             part.write_bytes(any_mutation(part.read_bytes(), generator))
@@ -98,7 +84,7 @@ def checkpoints(count: int, folder: Path, generator: np.random.Generator) -> Out
         elif kind == "another's":
             part.write_bytes((place / "000001" / part.name).read_bytes())
         else:
-            (place / "000002" / STATE).write_text('{"iteration": 2, "format": 0}')
+            (place / "000002" / CHECKPOINT_STATE_FILE).write_text('{"iteration": 2, "format": 0}')
         newest = loaded(place)
         outcome.happened["the generation before was used" if newest == 1 else "nothing was lost"] += 1
     return outcome
@@ -111,7 +97,7 @@ def controllers(count: int, folder: Path, generator: np.random.Generator) -> Out
     for _ in range(count):
         path.write_bytes(any_mutation(content, generator))
         try:
-            verify_controller(path)
+            verify_controller_file(path)
         except InputError as error:
             one_line(error)
             outcome.happened["refused in one line"] += 1
@@ -125,35 +111,32 @@ def signatures(count: int, folder: Path, generator: np.random.Generator) -> Outc
     """Change a signed controller as a forger would, who makes all hashes fit, or its signature."""
     outcome, path, maker = Outcome(), folder / "it.unjam", make_keys(folder / "maker")
     key, other = read_private_key(maker.private), Ed25519PrivateKey.generate()
-    path.write_bytes(content_of(parts={GRAPH: b"drawn", CERTIFICATE: b"{}"}))
+    path.write_bytes(content_of(parts={GRAPH_PART: b"drawn", CERTIFICATE_PART: b"{}"}))
     add_signature(path, read_controller(path), key)
     whole = unpack_parts(path)
     while outcome.injected < count:
         parts = dict(whole)
-        kind, part = str(generator.choice(FORGERIES)), str(generator.choice(PARTS[1:-1]))
+        kind, part = str(generator.choice(FORGERIES)), str(generator.choice(ARCHIVE_PARTS[1:-1]))
         if kind == "a part changed":
             parts[part] = any_mutation(parts[part], generator)
-        elif kind == "a part gone" and part != WEIGHTS:
+        elif kind == "a part gone" and part != WEIGHTS_PART:
             del parts[part]
         elif kind == "its manifest changed":
-            parts[MANIFEST] = with_junk(json.loads(parts[MANIFEST]), generator).encode()
+            parts[MANIFEST_PART] = with_junk(json.loads(parts[MANIFEST_PART]), generator).encode()
         elif kind == "its signature changed":
-            parts[SIGNATURE] = any_mutation(parts[SIGNATURE], generator)
+            parts[SIGNATURE_PART] = any_mutation(parts[SIGNATURE_PART], generator)
         elif kind == "signed by another":
-            del parts[SIGNATURE]
-            parts[SIGNATURE] = signature_of(parts, other)
+            del parts[SIGNATURE_PART]
+            parts[SIGNATURE_PART] = signature_of(parts, other)
         elif kind == "signed with a weak key":
-            parts[SIGNATURE] = signature_part(WEAK[int(generator.integers(len(WEAK)))], FOR_ANY_MESSAGE)
+            parts[SIGNATURE_PART] = signature_part(WEAK[int(generator.integers(len(WEAK)))], FOR_ANY_MESSAGE)
         elif kind == "its signature taken away":
-            del parts[SIGNATURE]
+            del parts[SIGNATURE_PART]
         if parts == whole:
             continue
         path.write_bytes(pack_parts(parts) if kind == "its manifest changed" else forge(parts))
         signed = kind not in ("signed by another", "its signature taken away")
-        for read in (
-            lambda: verify_controller(path, maker.public),
-            *([lambda: read_controller(path)] * signed),
-        ):
+        for read in (lambda: verify_controller_file(path, maker.public), *([lambda: read_controller(path)] * signed)):
             with pytest.raises(InputError) as caught:
                 read()
             one_line(caught.value)
@@ -199,7 +182,7 @@ def configurations(count: int, folder: Path, generator: np.random.Generator) -> 
 def results(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     """Damage a folder of results, and ask for its report and for all runs."""
     outcome, whole = Outcome(), folder / "whole"
-    drive("ring", "pi", 1, road={"horizon": 20, "warmup": 0}, workers=1, out=whole)
+    drive("ring", "pi", 1, scenario_options={"horizon": 20, "warmup": 0}, workers=1, out=whole)
     (whole / "config.toml").write_text(to_toml(load_config()))
     (whole / "progress.jsonl").write_text('{"iteration": 1, "actual_steps": 5}\n')
     (whole / "manifest.json").write_text("{}")
@@ -208,9 +191,7 @@ def results(count: int, folder: Path, generator: np.random.Generator) -> Outcome
         shutil.copytree(whole, place)
         files = sorted(path for path in place.iterdir() if path.is_file())
         part = files[int(generator.integers(len(files)))]
-        kind = generator.choice(
-            ["bytes", "value", "value", "value", "empty", "missing", "a folder", "nested"]
-        )
+        kind = generator.choice(["bytes", "value", "value", "value", "empty", "missing", "a folder", "nested"])
         if kind == "value" and part.suffix == ".json":
             part.write_text(with_junk(json.loads(part.read_text()), generator))
         elif kind in ("bytes", "value"):
@@ -222,7 +203,7 @@ def results(count: int, folder: Path, generator: np.random.Generator) -> Outcome
             if kind != "missing":
                 part.mkdir() if kind == "a folder" else part.touch()
         happened = "the report was written"
-        for ask in (lambda at: write_report([at], at / "page.html"), list_runs):
+        for ask in (lambda at: write_report_page([at], at / "page.html"), list_runs):
             try:
                 with empty_pictures():
                     ask(place)

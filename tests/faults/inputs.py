@@ -27,20 +27,7 @@ GONE = 1
 """exit code where nobody reads what is said"""
 ENDS = {0: "it was done", GONE: "it ended without a word"}
 SPECIAL = ("/proc", "/sys", "/dev/null", "/dev/full", "/dev/zero", "/proc/self/mem", "/proc/self/fd/1")
-ODD = (
-    "$HOME",
-    "$(reboot)",
-    "`id`",
-    "[/b]",
-    "[bold red]",
-    "[link=x]",
-    "%s%n",
-    "{0}",
-    "\x1b[31m",
-    "a\nb",
-    "\\",
-    "''",
-)
+ODD = ("$HOME", "$(reboot)", "`id`", "[/b]", "[bold red]", "[link=x]", "%s%n", "{0}", "\x1b[31m", "a\nb", "\\", "''")
 
 
 @dataclass(frozen=True)
@@ -122,7 +109,7 @@ def bombs(folder: Path, generator: np.random.Generator) -> Try:
     """A configuration nested without end, or with an endless number."""
     deep, long = int(generator.integers(3000, 100_000)), int(generator.integers(500, 5000))
     key = one_of(
-        generator, "steps", "seed", "road.horizon", "trpo.gamma", "policy.hidden", "ghost", "workers"
+        generator, "steps", "seed", "scenario_options.horizon", "trpo.gamma", "policy.hidden", "ghost", "workers"
     )
     value = one_of(
         generator,
@@ -138,7 +125,7 @@ def bombs(folder: Path, generator: np.random.Generator) -> Try:
 
 def nuls(folder: Path, generator: np.random.Generator) -> Try:
     """A configuration that names a file with NUL in its path."""
-    key = one_of(generator, "expert", "reward", "scenario", "preset", "road.population", "agent")
+    key = one_of(generator, "expert", "reward", "scenario", "preset", "scenario_options.population", "agent")
     ending = one_of(generator, ".py:x", ".unjam", ".sumocfg", ".json", "")
     (folder / "nul.toml").write_text(f'{key} = "x\\u0000{ending}"\n')
     return Try("NUL in a path", ("train", "--config", "nul.toml"))
@@ -147,9 +134,7 @@ def nuls(folder: Path, generator: np.random.Generator) -> Try:
 def closed_outputs(folder: Path, generator: np.random.Generator) -> Try:
     """A standard output that is closed, full, or that nobody reads."""
     verb = one_of(generator, "scenarios", "drivers", "verify", "--version", "drive")
-    words: Words = (
-        (*DRIVE, "pi") if verb == "drive" else ("verify", "it.unjam") if verb == "verify" else (verb,)
-    )
+    words: Words = (*DRIVE, "pi") if verb == "drive" else ("verify", "it.unjam") if verb == "verify" else (verb,)
     output = one_of(generator, "closed", "/dev/full", "nobody")
     codes = {"closed": (0,), "/dev/full": (74,), "nobody": (GONE,)}[output]
     return Try(f"standard output: {output}", words, codes, output=output)
@@ -182,16 +167,8 @@ def strange_weights(folder: Path, generator: np.random.Generator) -> Try:
     """A controller with weights of a kind that no network has."""
     kind = (np.complex64, np.bool_)[int(generator.integers(2))]
     (folder / "strange.unjam").write_bytes(with_weights_of(kind))
-    words = (
-        (*DRIVE, "strange.unjam"),
-        ("verify", "strange.unjam"),
-        ("export", "strange.unjam", "--to", "x.unjam"),
-    )
-    more: tuple[Words, ...] = (
-        *words,
-        ("certify", "strange.unjam"),
-        ("sign", "strange.unjam", "--key", "maker.key"),
-    )
+    words = ((*DRIVE, "strange.unjam"), ("verify", "strange.unjam"), ("export", "strange.unjam", "--to", "x.unjam"))
+    more: tuple[Words, ...] = (*words, ("certify", "strange.unjam"), ("sign", "strange.unjam", "--key", "maker.key"))
     return Try("complex or boolean weights", more[int(generator.integers(len(more)))])
 
 
@@ -247,10 +224,7 @@ def inputs(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
         code, said, errors = ran(tried, here, environment)
         assert code in tried.codes, (tried, code, errors)
         assert "Traceback" not in errors, (tried, errors)
-        assert code == 0 or is_told(errors, 74 in tried.codes) or (code == GONE and not errors), (
-            tried,
-            errors,
-        )
+        assert code == 0 or is_told(errors, 74 in tried.codes) or (code == GONE and not errors), (tried, errors)
         assert not said or code == 0, (tried, said)
         assert contents(here) == before, tried
         assert not list(temporary.iterdir()), tried
@@ -261,9 +235,7 @@ def inputs(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
 def is_told(errors: str, begun: bool) -> bool:
     """Return whether errors are one line; where the work may have begun, after its progress."""
     lines = [line for line in errors.splitlines() if line]
-    return one_line(errors) or (
-        begun and [line for line in lines if line.startswith("unjam: ")] == lines[-1:]
-    )
+    return one_line(errors) or (begun and [line for line in lines if line.startswith("unjam: ")] == lines[-1:])
 
 
 def contents(folder: Path) -> dict[str, bytes]:

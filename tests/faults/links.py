@@ -11,7 +11,7 @@ import pytest
 from tests.faults.outcome import Outcome, one_line
 from tests.training.test_crash_points import crash, run
 from unjam.errors import UnjamError
-from unjam.processes import LOCK, owned
+from unjam.processes import LOCK_FILE, lock_folder
 from unjam.training import folder as run_folder
 
 KINDS = ("a file", "a folder", "nothing", "hard link")
@@ -56,7 +56,7 @@ def state_of(folder: Path) -> State:
 def with_temporary_names(names: list[str]) -> list[str]:
     """Return names, that of the lock, and temporary names that could be guessed in earlier versions."""
     parts = [str(Path(name).with_name(f".{Path(name).name}.part")) for name in names]
-    return [*names, LOCK, *parts]
+    return [*names, LOCK_FILE, *parts]
 
 
 def links(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
@@ -77,7 +77,7 @@ def links(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
                     plant(place / name, kind, outside)
             before, happened = state_of(outside), "the run went on"
             try:
-                with owned(place):
+                with lock_folder(place):
                     run(place)
             except UnjamError as error:
                 one_line(error)

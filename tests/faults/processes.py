@@ -22,10 +22,10 @@ from tests.worlds.test_workers import processes
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
-from unjam.training.folder import load_checkpoint
+from unjam.training.run_folder import load_checkpoint
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 LARGEST_GROWTH = 20.0
 """MB of memory that any number of resets may cost"""
@@ -37,8 +37,7 @@ ATTEMPTS = 6
 """how often an episode is tried here: on a busy machine a new worker may be silent for so long by itself"""
 NUMBERS = ("nan", "-1", "1e30", "inf", "", "0", "ghost", "1e-30")
 DEMAND = (
-    '<vehicle id="a" type="car" route="along" depart="0"/>'
-    '<trip id="b" type="car" depart="1" from="road" to="road"/>'
+    '<vehicle id="a" type="car" route="along" depart="0"/><trip id="b" type="car" depart="1" from="road" to="road"/>'
 )
 
 
@@ -48,10 +47,8 @@ def resets(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     with Simulation() as simulation:
         for number in range(count):
             length = 220 + 5 * int(generator.integers(11))
-            episode = run_episode(
-                Ring(length=(length, length), horizon=2), IDM(), (number,), simulation=simulation
-            )
-            assert episode.ok
+            episode = run_episode(Ring(length=(length, length), horizon=2), IDM(), (number,), simulation=simulation)
+            assert episode.has_run
             outcome.happened["the episode ran"] += 1
             if number == count // 10:
                 first = process.memory_info().rss
@@ -65,7 +62,7 @@ def lost_workers(count: int, folder: Path, generator: np.random.Generator) -> Ou
     """Kill, crash or stop workers in the middle of episodes."""
     outcome, road, slowest = Outcome(), Ring(horizon=8000), 0.0
     expected = fingerprint(run_episode(road, PISaturation(), (0,)))
-    with Workers(1, silence=SILENCE, attempts=ATTEMPTS) as workers:
+    with WorkerPool(1, timeout=SILENCE, max_attempts=ATTEMPTS) as workers:
         losses: dict[int, signal.Signals] = {}
 
         def disturb(task: int, steps: int) -> None:
@@ -80,7 +77,7 @@ def lost_workers(count: int, folder: Path, generator: np.random.Generator) -> Ou
             started = time.monotonic()
             (found,) = workers.run([EpisodeTask(road, PISaturation(), (0,))], disturb)
             slowest = max(slowest, time.monotonic() - started)
-            assert found.ok, found.reason
+            assert found.has_run, found.reason
             assert fingerprint(found) == expected
             for how in losses.values():
                 outcome.happened[f"{how.name}: the episode was repeated to the same bytes"] += 1
@@ -94,7 +91,7 @@ def networks(count: int, folder: Path, generator: np.random.Generator) -> Outcom
     path = straight(folder, DEMAND, length=200.0)
     names = ("road.net.xml", "demand.rou.xml", "straight.sumocfg")
     whole = {name: (folder / name).read_bytes() for name in names}
-    with Workers(1, silence=10.0, attempts=1) as workers:
+    with WorkerPool(1, timeout=10.0, max_attempts=1) as workers:
         assert driven(path, workers) == DRIVEN
         for _ in range(count):
             for name, content in whole.items():
@@ -112,7 +109,7 @@ def hostile(count: int, folder: Path, generator: np.random.Generator) -> Outcome
     path, canary = straight(here, DEMAND, length=600.0), here / "canary"
     canary.write_text("as it was")
     plain, elements = path.read_text(), re.findall(r"^  <.*/>$", WRITING, re.MULTILINE)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         for _ in range(count):
             asked = f'<{generator.choice(OPTIONS)} value="{canary}"/>'
             asked = str(generator.choice([asked, '<remote-port value="45871"/>']))
@@ -137,7 +134,7 @@ DRIVEN = "driven: the damage does not matter"
 REFUSED = "refused in one line before SUMO started"
 
 
-def driven(path: Path, workers: Workers) -> str:
+def driven(path: Path, workers: WorkerPool) -> str:
     """Return what becomes of five decisions on a network."""
     try:
         road = make_scenario(str(path), {"cav_types": ["car"], "horizon": 5})
@@ -145,7 +142,7 @@ def driven(path: Path, workers: Workers) -> str:
         one_line(error)
         return REFUSED
     (episode,) = workers.run([EpisodeTask(road, IDM(), (0,))])
-    if episode.ok:
+    if episode.has_run:
         return DRIVEN
     assert "\n" not in episode.reason
     if "workers were lost" in episode.reason:
@@ -167,16 +164,21 @@ def broken(content: bytes, generator: np.random.Generator) -> bytes:
 
 
 TINY = {
-    "ring": ["ring", "--length", "60", "--vehicles", "5", "--set", "road.horizon=100"],
-    "figure-eight": ["figure-eight", "--set", "road.horizon=100"],
-    "merge": ["merge", "--set", "road.horizon=40", "--set", "road.cav_share=0.5"],
-    "own-network": ["straight.sumocfg", "--cav-types", "car", "--set", "road.horizon=100"],
+    "ring": ["ring", "--length", "60", "--vehicles", "5", "--set", "scenario_options.horizon=100"],
+    "figure-eight": ["figure-eight", "--set", "scenario_options.horizon=100"],
+    "merge": ["merge", "--set", "scenario_options.horizon=40", "--set", "scenario_options.penetration_rate=0.5"],
+    "own-network": ["straight.sumocfg", "--cav-types", "car", "--set", "scenario_options.horizon=100"],
 }
 LEARNERS = ("trpo", "sac", "ppo")
 SETTINGS = [
-    *("evaluation.episodes=1", "evaluation.validation_episodes=1", "evaluation.every=2"),
-    *("policy.hidden=[8]", "trpo.batch_steps=100", "ppo.batch_steps=100", "ppo.epochs=3"),
-    *("sac.batch_steps=100", "sac.start_steps=200", "sac.updates_per_step=0.05", "sac.batch=16"),
+    *("evaluation.episodes=1", "evaluation.validation_episodes=1", "evaluation.validation_interval=2"),
+    *("policy.hidden=[8]", "trpo.steps_per_iteration=100", "ppo.steps_per_iteration=100", "ppo.epochs=3"),
+    *(
+        "sac.steps_per_iteration=100",
+        "sac.learning_starts=200",
+        "sac.gradient_steps_per_step=0.05",
+        "sac.batch_size=16",
+    ),
 ]
 ITERATIONS = 6
 

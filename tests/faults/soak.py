@@ -15,8 +15,8 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from tests.faults.registry import FAULTS  # noqa: E402
-from unjam.errors import wrong_name  # noqa: E402
-from unjam.files import to_json, write_whole  # noqa: E402
+from unjam.errors import unknown_name  # noqa: E402
+from unjam.files import atomic_write, to_json  # noqa: E402
 from unjam.manifest import manifest  # noqa: E402
 
 TARGET = ROOT / "results" / "soak.json"
@@ -41,11 +41,11 @@ def soak(names: list[str]) -> None:
         }
         print(json.dumps(rows[name]), flush=True)
         ordered = [rows[each] for each in FAULTS if each in rows]
-        write_whole(TARGET, to_json({"manifest": about, "rows": ordered}, indent=1) + "\n")
+        atomic_write(TARGET, to_json({"manifest": about, "rows": ordered}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
     for name in sys.argv[1:]:
         if name not in FAULTS:
-            raise SystemExit(str(wrong_name("fault", name, FAULTS)))
+            raise SystemExit(str(unknown_name("fault", name, FAULTS)))
     soak(sys.argv[1:] or list(FAULTS))

@@ -32,23 +32,23 @@ from tests.worlds.test_record import fingerprint
 from unjam import sandbox
 from unjam.cli import app
 from unjam.controller import controller_bytes
-from unjam.controller.verify import verify_controller
+from unjam.controller.verify import verify_controller_file
 from unjam.drivers import Driver, LocalState, PISaturation
-from unjam.drivers.from_file import FileReference
-from unjam.drivers.wrappers import Mixed, Remembering
+from unjam.drivers.user_driver import FileReference
+from unjam.drivers.wrappers import HistoryDriver, MixedDriver
 from unjam.errors import EpisodeError, InputError
-from unjam.processes import owned
+from unjam.processes import lock_folder
 from unjam.scenarios import Ring, make_scenario
 from unjam.training import folder as run_folder
-from unjam.training.belonging import belonging
-from unjam.training.folder import STATE, last_state, start_folder
-from unjam.trust import check_values, expecting_code, remember
+from unjam.training.fingerprint import fingerprint
+from unjam.training.run_folder import CHECKPOINT_STATE_FILE, create_run_folder, restore_newest_checkpoint
+from unjam.trust import check_trusted_values, expecting_code, remember_trusted
 from unjam.user_code import read_code
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import networks
-from unjam.worlds.sumo.apart import SimulationApart
-from unjam.worlds.sumo.files import files_of
+from unjam.worlds.sumo.inputs import sumo_inputs
 from unjam.worlds.sumo.networks import network_file
+from unjam.worlds.sumo.sandboxed import SandboxedSimulation
 from unjam.worlds.sumo.simulation import Simulation
 
 FORBIDDEN = ("write", "make", "remove", "move", "link", "by a child", "TCP", "UDP", "Unix")
@@ -65,18 +65,16 @@ def sandboxes(count: int, folder: Path, generator: np.random.Generator) -> Outco
     program, canary = folder / "tries.py", folder / "canary"
     program.write_text(TRIES)
     path = straight(folder, CARS)
-    road = make_scenario(str(path), {"cav_share": 0.5, "horizon": 5})
-    files = files_of(road, road.of_seed((0,))[0])
+    road = make_scenario(str(path), {"penetration_rate": 0.5, "horizon": 5})
+    files = sumo_inputs(road, road.draw_from_seed((0,))[0])
     canary.write_text("as it was")
     limited = [sys.executable, "-I", "-S", sandbox.__file__, str(2**30), "60", str(inside), str(program)]
     before = sorted(path.name for path in folder.iterdir())
-    with SimulationApart() as sumo:
+    with SandboxedSimulation() as sumo:
         for _ in range(count):
             if generator.random() < 0.5:
                 wanted = str(generator.choice(FORBIDDEN))
-                ran = subprocess.run(
-                    [*limited, str(canary), str(inside), wanted], capture_output=True, check=True
-                )
+                ran = subprocess.run([*limited, str(canary), str(inside), wanted], capture_output=True, check=True)
                 assert ran.stdout == b"", wanted
                 words = f"a program in the sandbox: {wanted}: refused by the kernel"
             else:
@@ -156,7 +154,7 @@ def _anothers_checkpoint(at: _Run, generator: np.random.Generator) -> Any:
 
 def _edited_checkpoint(at: _Run, generator: np.random.Generator) -> Any:
     with_checkpoint(at.folder, small_config())
-    state = next((at.folder / "checkpoint").rglob(STATE))
+    state = next((at.folder / "checkpoint").rglob(CHECKPOINT_STATE_FILE))
     state.write_text(state.read_text().replace('"seed": 0', '"seed": 7'))
     return small_config(seed=7)
 
@@ -179,7 +177,7 @@ def lineages(count: int, folder: Path, generator: np.random.Generator) -> Outcom
         config = LINEAGES[what](at, generator)
         before = content_of(at.folder)
         with pytest.raises(InputError) as caught:
-            last_state(at.folder, {at.folder}, belonging(config))
+            restore_newest_checkpoint(at.folder, {at.folder}, fingerprint(config))
         one_line(caught.value)
         assert content_of(at.folder) == before
         outcome.happened[f"{what}: refused in one line, nothing changed"] += 1
@@ -192,12 +190,12 @@ def locks(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     outcome = Outcome()
     for _ in range(count):
         process = holder(folder)
-        with pytest.raises(InputError, match="is being written by another process") as caught, owned(folder):
+        with pytest.raises(InputError, match="is being written by another process") as caught, lock_folder(folder):
             pass
         one_line(caught.value)
         process.kill()
         process.wait()
-        with owned(folder):
+        with lock_folder(folder):
             outcome.happened["refused in one line; free as soon as the owner was killed"] += 1
         assert list(folder.iterdir()) == []
     return outcome
@@ -217,7 +215,7 @@ def caches(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
             if kind != "gone":
                 edited = whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :]
                 made.write_bytes({"edited": edited, "cut": whole[:at], "empty": b""}[kind])
-            networks._whole.clear()  # as in a new process
+            networks._intact_networks.clear()  # as in a new process
             assert network_file(road) == made
             assert edges_of(made) == edges
             assert len(list(made.parent.iterdir())) == 1
@@ -231,7 +229,7 @@ def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     for number in range(count):
         place = folder / str(number)
         run, code, ran = place / "run", place / "run" / "code.py", place / "ran"
-        start_folder(run, small_config(expert=f"{code}:gentle", road__horizon=20))
+        create_run_folder(run, small_config(expert=f"{code}:gentle", road__horizon=20))
         (run / "best.toml").write_text((run / "config.toml").read_text())
         straight(place, CARS)
         code.write_text(f"{GENTLE}seen = gentle\n")
@@ -254,11 +252,11 @@ def _as_typed(words: Sequence[str]) -> Callable[[], object]:
 
 
 TRIED: dict[str, Callable[[], object]] = {
-    "verify": lambda: verify_controller("run"),
-    "verify of the file": lambda: verify_controller("run/controller.unjam"),
+    "verify": lambda: verify_controller_file("run"),
+    "verify of the file": lambda: verify_controller_file("run/controller.unjam"),
     **{verb: _as_typed(words) for verb, words in VERBS.items() if verb not in ("verify", "model")},
 }
-"""what a folder is given to, in this process; `verify` and `model` go on in a limited child"""
+"""what a folder is given to, in this process; `verify_command` and `model` go on in a limited child"""
 
 
 def _hidden(mine: Driver, generator: np.random.Generator) -> tuple[Driver, str]:
@@ -266,8 +264,8 @@ def _hidden(mine: Driver, generator: np.random.Generator) -> tuple[Driver, str]:
     choices: Sequence[tuple[Driver, str]] = (
         (mine, "a driver"),
         (residual(mine), "an expert"),
-        (Mixed((PISaturation(), mine)), "one of several drivers"),
-        (Remembering(mine, 0.1), "a driver that another holds"),
+        (MixedDriver((PISaturation(), mine)), "one of several drivers"),
+        (HistoryDriver(mine, 0.1), "a driver that another holds"),
     )
     return choices[int(generator.integers(len(choices)))]
 
@@ -288,17 +286,17 @@ def replacements(count: int, folder: Path, generator: np.random.Generator) -> Ou
         with expecting_code():
             if moment == "bytecode":
                 plant_bytecode(file, str(generator.choice(["by time", "by an unchecked hash"])))
-                late = FileReference(main, "late").load()
+                late = FileReference(main, "late").load_object()
             elif moment == "after it was read":
                 code = read_code(main)
                 file.write_text(evil)
                 late = code.run().late
             else:
-                remember(main)
-                check_values("run", f"{main}:late")
+                remember_trusted(main)
+                check_trusted_values("run", f"{main}:late")
                 file.write_text(evil)
                 with pytest.raises(InputError, match="has changed since") as caught:
-                    FileReference(main, "late").load()
+                    FileReference(main, "late").load_object()
                 one_line(caught.value)
                 late = None
         assert late is None or late() == ("good", "good", "good")
@@ -320,7 +318,7 @@ def cheats(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
         for number in range(count):
             name = ROADS[number % len(ROADS)]
             closed = name in ("ring", "figure-eight")
-            share = {"cavs": 2, "warmup": 0} if closed else {"cav_share": 1.0}
+            share = {"cavs": 2, "warmup": 0} if closed else {"penetration_rate": 1.0}
             road = make_scenario(str(own) if name == "own" else name, {**share, "horizon": 30})
             seed = int(generator.integers(10))
             if (name, seed) not in honest_ones:

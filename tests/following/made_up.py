@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from unjam.following.open_loop import Follow, drive_behind, idm_follow
+from unjam.following.open_loop import AccelerationFunction, follow_leader, idm_function
 from unjam.following.pairs import Pair
 from unjam.physics.idm import IDMParameters, equilibrium_gap
 
@@ -13,7 +13,7 @@ STEP = 0.1
 
 
 def follower(
-    driver: Follow,
+    driver: AccelerationFunction,
     name: str = "0",
     seconds: float = 40.0,
     speed: float = 8.0,
@@ -27,10 +27,9 @@ def follower(
     leader_speed = 8.0 + 3.0 * np.sin(0.25 * times + phase) + np.sin(0.9 * times)
     leader_path = gap + np.r_[0.0, np.cumsum(leader_speed[1:]) * STEP]
     leader = (leader_speed[:, None], leader_path[:, None])
-    driven = list(drive_behind(driver, (np.array([speed]), np.array([gap])), leader, STEP))
+    driven = list(follow_leader(driver, (np.array([speed]), np.array([gap])), leader, STEP))
     speeds, gaps = (
-        np.concatenate([[first], *rows])
-        for first, rows in zip((speed, gap), zip(*driven, strict=True), strict=True)
+        np.concatenate([[first], *rows]) for first, rows in zip((speed, gap), zip(*driven, strict=True), strict=True)
     )
     return Pair(name, name, STEP, speeds, leader_speed, gaps, "human", split)
 
@@ -40,7 +39,7 @@ def idm_driver(
 ) -> Pair:
     """How an IDM follows, from its own equilibrium gap on."""
     gap = equilibrium_gap(8.0, parameters)
-    return follower(idm_follow(parameters), name, seconds, 8.0, gap, seed, split)
+    return follower(idm_function(parameters), name, seconds, 8.0, gap, seed, split)
 
 
 def write_table(path: Path, drivers: int = 3) -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.following.made_up import idm_driver
-from unjam.following.calibration import CalibrationSettings, calibrate, calibrate_each, gap_objective
-from unjam.following.pairs import Pair, stretches_of
+from unjam.following.calibration import CalibrationSettings, calibrate_groups, calibrate_idm, gap_objective
+from unjam.following.pairs import Pair, make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 
 QUICK = CalibrationSettings(generations=40)
@@ -13,7 +13,7 @@ DRIVER = IDMParameters(time_headway=0.9, max_acceleration=1.4, comfortable_decel
 
 
 def test_the_true_parameters_have_no_error() -> None:
-    objective = gap_objective(stretches_of([idm_driver(DRIVER)]), (-4.0, 2.0), "trajectory")
+    objective = gap_objective(make_segments([idm_driver(DRIVER)]), (-4.0, 2.0), "trajectory")
     true = [30.0, 0.9, 1.4, 2.0, 2.5, 0.0]
     found = objective(np.array([true, [30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T)
     assert found[0] < 1e-9
@@ -22,22 +22,22 @@ def test_the_true_parameters_have_no_error() -> None:
 
 def test_the_headway_of_a_driver_is_found() -> None:
     pairs = [idm_driver(DRIVER, seed=seed) for seed in range(3)]
-    found = calibrate(pairs, QUICK)
+    found = calibrate_idm(pairs, QUICK)
     assert found.gap_error < 0.2
     assert found.parameters.time_headway == pytest.approx(0.9, abs=0.15)
-    assert found.collided == 0
+    assert found.collisions == 0
     assert found.seconds == pytest.approx(120.0)
 
 
 def test_the_result_depends_on_the_seed_alone() -> None:
     pairs = [idm_driver(DRIVER, seconds=10.0)]
     settings = CalibrationSettings(generations=3)
-    assert calibrate(pairs, settings) == calibrate(pairs, settings)
+    assert calibrate_idm(pairs, settings) == calibrate_idm(pairs, settings)
 
 
 def test_a_parameter_at_the_end_of_what_is_searched_is_named() -> None:
     settings = CalibrationSettings(generations=20, time_headway=(1.5, 3.0))
-    assert "time_headway" in calibrate([idm_driver(DRIVER)], settings).bounds
+    assert "time_headway" in calibrate_idm([idm_driver(DRIVER)], settings).parameters_at_bounds
 
 
 HEADWAYS = (0.8, 1.6, 1.15)
@@ -53,8 +53,8 @@ def groups() -> list[list[Pair]]:
 @pytest.mark.parametrize("every", ["trajectory", "moment"])
 def test_each_driver_gets_its_own_headway_and_what_is_typical(every: Literal["trajectory", "moment"]) -> None:
     told: list[int] = []
-    settings = CalibrationSettings(every=every)
-    found = calibrate_each(groups(), PAPER_IDM, ("time_headway",), settings, told.append)
+    settings = CalibrationSettings(weighting=every)
+    found = calibrate_groups(groups(), PAPER_IDM, ("time_headway",), settings, told.append)
     assert [one.parameters.time_headway for one in found] == pytest.approx(HEADWAYS, abs=5e-3)
     assert all(one.parameters.minimum_gap == PAPER_IDM.minimum_gap for one in found)
     assert all(one.gap_error < 0.05 for one in found)
@@ -64,8 +64,8 @@ def test_each_driver_gets_its_own_headway_and_what_is_typical(every: Literal["tr
 
 @pytest.mark.long
 def test_who_drives_beside_whom_does_not_matter() -> None:
-    together = calibrate_each(groups(), PAPER_IDM, ("time_headway",))
-    alone = [calibrate_each([group], PAPER_IDM, ("time_headway",))[0] for group in groups()]
+    together = calibrate_groups(groups(), PAPER_IDM, ("time_headway",))
+    alone = [calibrate_groups([group], PAPER_IDM, ("time_headway",))[0] for group in groups()]
     for one, other in zip(together, alone, strict=True):
         assert one.parameters.time_headway == pytest.approx(other.parameters.time_headway, abs=2e-3)
 
@@ -73,7 +73,7 @@ def test_who_drives_beside_whom_does_not_matter() -> None:
 def test_several_own_parameters_are_searched_for_one_driver_after_the_other() -> None:
     told: list[int] = []
     settings = CalibrationSettings(generations=5)
-    found = calibrate_each(groups()[:2], PAPER_IDM, ("time_headway", "minimum_gap"), settings, told.append)
+    found = calibrate_groups(groups()[:2], PAPER_IDM, ("time_headway", "minimum_gap"), settings, told.append)
     assert all(one.parameters.max_acceleration == PAPER_IDM.max_acceleration for one in found)
     assert found[0].parameters.time_headway < found[1].parameters.time_headway
     assert told == [1, 2]
@@ -81,14 +81,14 @@ def test_several_own_parameters_are_searched_for_one_driver_after_the_other() ->
 
 def test_a_headway_beyond_what_is_searched_is_named() -> None:
     settings = CalibrationSettings(time_headway=(1.0, 3.0))
-    (found,) = calibrate_each(groups()[:1], PAPER_IDM, ("time_headway",), settings)
-    assert (found.parameters.time_headway, found.bounds) == (1.0, ("time_headway",))
+    (found,) = calibrate_groups(groups()[:1], PAPER_IDM, ("time_headway",), settings)
+    assert (found.parameters.time_headway, found.parameters_at_bounds) == (1.0, ("time_headway",))
 
 
 @pytest.mark.parametrize("every", ["trajectory", "moment"])
 def test_a_short_rest_of_a_long_trajectory_weighs_little(every: Literal["trajectory", "moment"]) -> None:
     whole = idm_driver(DRIVER, seconds=20.0)
     wrong = np.array([[30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T
-    cut = [stretches_of([whole], seconds) for seconds in (20.0, 19.8)]
+    cut = [make_segments([whole], seconds) for seconds in (20.0, 19.8)]
     errors = [gap_objective(each, (-4.0, 2.0), every)(wrong)[0] for each in cut]
     assert errors[1] == pytest.approx(errors[0], rel=0.02)

@@ -4,10 +4,10 @@ from pathlib import Path
 import pytest
 
 from tests.following.made_up import idm_driver
-from tests.studies.test_field import table
+from tests.paper.test_field import table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings
-from unjam.following.fit_drivers import FitDriversSettings, doubts_about_units, fit_drivers, fit_from_files
+from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files, unit_warnings
 from unjam.following.pairs import Pair
 from unjam.following.settings import MultiStepSettings
 from unjam.physics.idm import IDMParameters
@@ -32,7 +32,7 @@ def test_every_driver_has_its_headway_and_what_suits_all(pairs: list[Pair]) -> N
     assert headways == sorted(headways)
     assert all(one.max_acceleration == found.typical.max_acceleration for one in found.drivers)
     assert [detail["name"] for detail in found.details] == [pair.driver for pair in pairs]
-    assert all(detail["gap_error"] < found.about["fit"]["together"]["gap_error"] for detail in found.details)
+    assert all(detail["gap_error"] < found.metadata["fit"]["together"]["gap_error"] for detail in found.details)
     assert found.residual is None
     assert told[-1] == (5, 5)
     assert headways[0] < found.typical.time_headway < headways[-1]
@@ -46,17 +46,15 @@ def test_the_typical_headway_is_one_that_suits_all(seed: int) -> None:
         for number, headway in enumerate((1.0, 1.4, 1.8))
     ]
     quick = CalibrationSettings(generations=25, candidates=3, seed=seed)
-    found = fit_drivers(people, FitDriversSettings(calibration=quick, turns=2))
+    found = fit_drivers(people, FitDriversSettings(calibration=quick, rounds=2))
     assert 1.1 < found.typical.time_headway < 1.7
 
 
 def test_a_residual_is_kept_where_it_is_better(pairs: list[Pair]) -> None:
-    steps = MultiStepSettings(hidden=(4,), seconds=5.0, batch=8, steps=2, validate_every=1)
-    settings = FitDriversSettings(
-        calibration=CalibrationSettings(generations=2), residual=True, multi_step=steps
-    )
+    steps = MultiStepSettings(hidden=(4,), segment_seconds=5.0, batch_size=8, gradient_steps=2, validation_interval=1)
+    settings = FitDriversSettings(calibration=CalibrationSettings(generations=2), residual=True, multi_step=steps)
     found = fit_drivers(pairs, settings)
-    fit = found.about["fit"]
+    fit = found.metadata["fit"]
     assert fit["residual_is_better"] == (min(fit["residual_gap_errors"]) < fit["residual_gap_errors"][0])
     assert (found.residual is not None) == fit["residual_is_better"]
 
@@ -65,7 +63,7 @@ def test_what_cannot_be_fitted(pairs: list[Pair]) -> None:
     with pytest.raises(InputError, match=r"drivers: 2 is not allowed; allowed: >= 5 for a residual"):
         fit_drivers(pairs[:2], FitDriversSettings(residual=True))
     with pytest.raises(InputError, match="own: 'exponent' is not allowed"):
-        fit_drivers(pairs, FitDriversSettings(own=("exponent",)))
+        fit_drivers(pairs, FitDriversSettings(individual=("exponent",)))
 
 
 CHANGES = {"calibration.generations": 2, "residual": False}
@@ -78,34 +76,34 @@ def data(tmp_path: Path) -> Path:
 
 def test_speeds_in_another_unit_than_gaps_are_doubted() -> None:
     pair = idm_driver(IDMParameters(time_headway=1.3))
-    assert doubts_about_units([pair]) == []
+    assert unit_warnings([pair]) == []
     kilometres = replace(pair, speed=3.6 * pair.speed, leader_speed=3.6 * pair.leader_speed)
-    (line,) = doubts_about_units([kilometres])
+    (line,) = unit_warnings([kilometres])
     assert line.startswith("warning: gaps change 0.28 times as fast as the speeds say")
 
 
 def test_a_file_becomes_a_population(data: Path) -> None:
-    found = fit_from_files([data], CHANGES)
+    found = fit_drivers_from_files([data], CHANGES)
     assert len(found.population.drivers) == 3
-    assert found.words == ["data.parquet: 3 trajectories with 723 of 723 rows"]
-    assert found.population.about["data"] == ["data.parquet"]
-    assert "one IDM for all" in found.verdict()[0]
+    assert found.notes == ["data.parquet: 3 trajectories with 723 of 723 rows"]
+    assert found.population.metadata["data"] == ["data.parquet"]
+    assert "one IDM for all" in found.report_lines()[0]
     assert found.facts()["drivers"] == 3
 
 
 def test_a_population_names_no_folder_of_the_machine(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["unjam", "fit-drivers", str(data)])
-    command = fit_from_files([data], CHANGES).population.about["manifest"]["command"]
+    command = fit_drivers_from_files([data], CHANGES).population.metadata["manifest"]["command"]
     assert command == ["unjam", "fit-drivers", "data.parquet"]
 
 
 def test_trajectories_can_be_chosen(data: Path) -> None:
-    assert len(fit_from_files([data], CHANGES, only={"kind": "human"}).population.drivers) == 2
+    assert len(fit_drivers_from_files([data], CHANGES, filters={"kind": "human"}).population.drivers) == 2
 
 
 def test_drivers_of_several_files_are_told_apart(data: Path, tmp_path: Path) -> None:
     other = Path(table(tmp_path / "other.parquet", [{}]))
-    names = [one["name"] for one in fit_from_files([data, other], CHANGES).population.details]
+    names = [one["name"] for one in fit_drivers_from_files([data, other], CHANGES).population.details]
     assert names == ["data-0", "data-1", "data-2", "other-0"]
 
 
@@ -120,12 +118,12 @@ def test_drivers_of_several_files_are_told_apart(data: Path, tmp_path: Path) -> 
 )
 def test_wrong_input_is_one_line(data: Path, changes: dict, more: dict, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        fit_from_files([data], {**CHANGES, **changes}, **more)
+        fit_drivers_from_files([data], {**CHANGES, **changes}, **more)
 
 
 def test_nothing_is_calibrated_that_cannot_be_written(data: Path, tmp_path: Path) -> None:
     with pytest.raises(DiskError):
-        fit_from_files([data], CHANGES, out=tmp_path / "gone" / "drivers.json")
+        fit_drivers_from_files([data], CHANGES, out=tmp_path / "gone" / "drivers.json")
 
 
 @pytest.mark.long
@@ -134,8 +132,8 @@ def test_files_of_the_same_name_have_different_people(data: Path, tmp_path: Path
     for day in days:
         day.parent.mkdir()
         day.write_bytes(data.read_bytes())
-    names = [each["name"] for each in fit_from_files(days, CHANGES).population.details]
-    assert len(set(names)) == len(names) == 2 * len(fit_from_files([data], CHANGES).population.details)
+    names = [each["name"] for each in fit_drivers_from_files(days, CHANGES).population.details]
+    assert len(set(names)) == len(names) == 2 * len(fit_drivers_from_files([data], CHANGES).population.details)
     assert {name.partition("-")[0] for name in names} == {"1", "2"}
     with pytest.raises(InputError, match=r"data: .* is not allowed; allowed: each file once"):
-        fit_from_files([days[0], days[0]], CHANGES)
+        fit_drivers_from_files([days[0], days[0]], CHANGES)

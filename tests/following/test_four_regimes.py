@@ -2,29 +2,27 @@ import numpy as np
 import pytest
 
 from unjam.errors import InputError
-from unjam.following.four_regimes import REGIMES, FourRegimes, four_regimes
-from unjam.following.pairs import moments_of
-from unjam.parameters import build
+from unjam.following.four_regimes import REGIMES, FourRegimesSettings, make_four_regimes
+from unjam.following.pairs import following_samples
+from unjam.parameters import build_dataclass
 
 
 def test_there_are_as_many_rows_as_in_the_paper() -> None:
-    assert len(moments_of(four_regimes(FourRegimes()))) == 262_630
+    assert len(following_samples(make_four_regimes(FourRegimesSettings()))) == 262_630
 
 
 def test_the_same_seed_gives_the_same_set() -> None:
-    settings = FourRegimes(rows=3000)
-    for one, other in zip(four_regimes(settings), four_regimes(settings), strict=True):
+    settings = FourRegimesSettings(rows=3000)
+    for one, other in zip(make_four_regimes(settings), make_four_regimes(settings), strict=True):
         np.testing.assert_array_equal(one.speed, other.speed)
         np.testing.assert_array_equal(one.gap, other.gap)
-    changed = four_regimes(FourRegimes(rows=3000, seed=1))
-    assert (changed[0].speed != four_regimes(settings)[0].speed).any()
+    changed = make_four_regimes(FourRegimesSettings(rows=3000, seed=1))
+    assert (changed[0].speed != make_four_regimes(settings)[0].speed).any()
 
 
 def test_each_regime_starts_with_its_acceleration() -> None:
-    pairs = four_regimes(FourRegimes(rows=60_000, noise=0.0))
-    starts = {
-        kind: np.array([pair.acceleration[0] for pair in pairs if pair.kind == kind]) for kind in REGIMES
-    }
+    pairs = make_four_regimes(FourRegimesSettings(rows=60_000, noise=0.0))
+    starts = {kind: np.array([pair.acceleration[0] for pair in pairs if pair.kind == kind]) for kind in REGIMES}
     assert (starts["acceleration"] > 0).all()
     assert ((starts["deceleration"] <= 0) & (starts["deceleration"] >= -2)).all()
     np.testing.assert_allclose(starts["cruising"], 0.0, atol=1e-9)
@@ -32,11 +30,11 @@ def test_each_regime_starts_with_its_acceleration() -> None:
 
 
 def test_leaders_keep_their_speed_and_followers_move_by_euler_steps() -> None:
-    for pair in four_regimes(FourRegimes(rows=3000)):
+    for pair in make_four_regimes(FourRegimesSettings(rows=3000)):
         assert len(set(pair.leader_speed)) == 1
         np.testing.assert_allclose(np.diff(pair.gap), (pair.leader_speed[1:] - pair.speed[1:]) * pair.step)
 
 
 def test_nobody_starts_faster_than_it_wants_to_be() -> None:
     with pytest.raises(InputError, match=r"speed: 40.0 m/s is not allowed at the start"):
-        build(FourRegimes, {"speed": (5.0, 40.0)}, "regimes")
+        build_dataclass(FourRegimesSettings, {"speed": (5.0, 40.0)}, "regimes")

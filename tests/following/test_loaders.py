@@ -8,10 +8,10 @@ import pytest
 
 from tests.worlds.sumo.own_roads import straight
 from unjam.errors import InputError
-from unjam.following.loaders import FOOT, Reading, read_pairs
+from unjam.following.loaders import METERS_PER_FOOT, ReadOptions, read_pairs
 from unjam.worlds.sumo.networks import sumo_program
 
-SHORT = Reading(shortest=1.0)
+SHORT = ReadOptions(min_seconds=1.0)
 SPEED, LEADER, GAP = 10.0, 12.0, 20.0
 MOMENTS = 30
 
@@ -22,15 +22,13 @@ def table(path: Path, **changes: object) -> Path:
     for pair, begin in (("one", 0.0), ("two", 100.0)):
         times = begin + 0.1 * np.arange(MOMENTS)
         gap = GAP + (LEADER - SPEED) * 0.1 * np.arange(MOMENTS)
-        parts.append(
-            pd.DataFrame({"pair": pair, "time": times, "speed": SPEED, "leader_speed": LEADER, "gap": gap})
-        )
+        parts.append(pd.DataFrame({"pair": pair, "time": times, "speed": SPEED, "leader_speed": LEADER, "gap": gap}))
     frame = pd.concat(parts, ignore_index=True).assign(**changes)
     frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
     return path
 
 
-def ngsim(path: Path, feet: float = FOOT, **changes: object) -> Path:
+def ngsim(path: Path, feet: float = METERS_PER_FOOT, **changes: object) -> Path:
     """Two vehicles, the second behind the first, in the public format: feet and milliseconds."""
     rows = []
     for vehicle, preceding, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
@@ -90,7 +88,7 @@ def highd(path: Path, sign: int = 1) -> Path:
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_highd_is_read_on_both_carriageways(tmp_path: Path, sign: int) -> None:
-    (pair,) = read_pairs(highd(tmp_path / "01_tracks.csv", sign), reading=replace(SHORT, shortest=1.0)).pairs
+    (pair,) = read_pairs(highd(tmp_path / "01_tracks.csv", sign), options=replace(SHORT, shortest=1.0)).pairs
     assert pair.step == 0.04
     np.testing.assert_allclose(pair.speed, SPEED)
     np.testing.assert_allclose(pair.leader_speed, LEADER)
@@ -106,7 +104,7 @@ def test_who_stands_on_highd_stands_where_it_was(tmp_path: Path, sign: int) -> N
     table.loc[stands, "x"] = table.loc[leader & (table["frame"] == half), "x"].item()
     table.loc[stands, "xVelocity"] = 0.0
     table.to_csv(path, index=False)
-    (pair,) = read_pairs(path, reading=replace(SHORT, shortest=1.0)).pairs
+    (pair,) = read_pairs(path, options=replace(SHORT, shortest=1.0)).pairs
     assert np.abs(np.diff(pair.gap)).max() < 0.04 * max(SPEED, LEADER) + 1e-6
 
 
@@ -129,19 +127,19 @@ def test_what_sumo_wrote_is_read_with_the_gaps_that_there_were(tmp_path: Path) -
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_plain_table(tmp_path: Path, suffix: str) -> None:
-    found = read_pairs(table(tmp_path / f"t{suffix}", kind="human", driver="me"), reading=SHORT)
+    found = read_pairs(table(tmp_path / f"t{suffix}", kind="human", driver="me"), options=SHORT)
     assert [pair.name for pair in found.pairs] == ["one", "two"]
     pair = found.pairs[0]
     assert (pair.step, pair.kind, pair.driver) == (0.1, "human", "me")
     assert (pair.speed[0], pair.leader_speed[0], pair.gap[0]) == (SPEED, LEADER, GAP)
-    assert found.words() == ["2 trajectories with 60 of 60 rows"]
+    assert found.summary_lines() == ["2 trajectories with 60 of 60 rows"]
 
 
 @pytest.mark.parametrize(
     "make", [ngsim, lambda path: reconstructed(path, True), lambda path: reconstructed(path, False), openacc]
 )
 def test_public_formats_say_the_same_in_si_units(tmp_path: Path, make) -> None:
-    pair = read_pairs(make(tmp_path / "data.csv"), reading=SHORT).pairs[0]
+    pair = read_pairs(make(tmp_path / "data.csv"), options=SHORT).pairs[0]
     assert len(pair.speed) == MOMENTS
     assert pair.step == 0.1
     np.testing.assert_allclose(pair.speed, SPEED)
@@ -150,8 +148,8 @@ def test_public_formats_say_the_same_in_si_units(tmp_path: Path, make) -> None:
 
 
 def test_who_has_nobody_ahead_is_counted(tmp_path: Path) -> None:
-    found = read_pairs(ngsim(tmp_path / "data.csv"), reading=SHORT)
-    assert found.words() == [
+    found = read_pairs(ngsim(tmp_path / "data.csv"), options=SHORT)
+    assert found.summary_lines() == [
         "1 trajectories with 30 of 60 rows",
         "left out: 30 rows: nobody ahead, or not recorded",
     ]
@@ -159,15 +157,12 @@ def test_who_has_nobody_ahead_is_counted(tmp_path: Path) -> None:
 
 def test_metres_are_not_taken_for_feet(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"median length of its vehicles would be 1\.5 m"):
-        read_pairs(ngsim(tmp_path / "data.csv", feet=1.0), reading=SHORT)
+        read_pairs(ngsim(tmp_path / "data.csv", feet=1.0), options=SHORT)
 
 
 def test_openacc_names_its_drivers(tmp_path: Path) -> None:
-    found = read_pairs(openacc(tmp_path / "platoon.csv"), reading=SHORT)
-    assert [(pair.driver, pair.kind) for pair in found.pairs] == [
-        ("Tesla(Model3)", "Human"),
-        ("BMW(X5)", "ACC"),
-    ]
+    found = read_pairs(openacc(tmp_path / "platoon.csv"), options=SHORT)
+    assert [(pair.driver, pair.kind) for pair in found.pairs] == [("Tesla(Model3)", "Human"), ("BMW(X5)", "ACC")]
 
 
 def test_who_takes_over_is_another_driver_and_a_bad_gap_cuts_its_own_follower_alone(tmp_path: Path) -> None:
@@ -177,13 +172,13 @@ def test_who_takes_over_is_another_driver_and_a_bad_gap_cuts_its_own_follower_al
     frame.loc[MOMENTS // 2 :, "Driver2"] = "ACC"
     frame.loc[MOMENTS // 2, "IVS2"] = np.nan
     path.write_text("\n".join([*lines[:3], frame.to_csv(index=False)]))
-    found = read_pairs(path, reading=replace(SHORT, cut_bad=True))
+    found = read_pairs(path, options=replace(SHORT, drop_bad_rows=True))
     behind = [(pair.driver, len(pair.speed)) for pair in found.pairs if pair.driver.startswith("Tesla")]
     half = MOMENTS // 2
     assert behind == [("Tesla(Model3)-ACC", MOMENTS - half), ("Tesla(Model3)-Human", half)]
     third = [len(pair.speed) for pair in found.pairs if pair.driver == "BMW(X5)"]
     assert sorted(third) == [MOMENTS - half - 1, half]
-    assert len(found.bad) == 1
+    assert len(found.bad_rows) == 1
 
 
 def spoilt(path: Path, row: int, column: str, value: object) -> Path:
@@ -204,25 +199,25 @@ def spoilt(path: Path, row: int, column: str, value: object) -> Path:
 )
 def test_a_bad_row_is_refused_by_its_line(tmp_path: Path, column: str, value: object, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        read_pairs(spoilt(tmp_path / "t.csv", 5, column, value), reading=SHORT)
+        read_pairs(spoilt(tmp_path / "t.csv", 5, column, value), options=SHORT)
 
 
 def test_a_bad_row_may_be_cut_out_and_is_told(tmp_path: Path) -> None:
     path = spoilt(tmp_path / "t.csv", 12, "gap", "")
-    found = read_pairs(path, reading=Reading(cut_bad=True, shortest=1.0))
+    found = read_pairs(path, options=ReadOptions(drop_bad_rows=True, min_seconds=1.0))
     assert [len(pair.speed) for pair in found.pairs] == [12, 17, 30]
     assert len({pair.name for pair in found.pairs}) == 3
-    assert [(row.line, row.why) for row in found.bad] == [(14, "gap: nan is not allowed; allowed: 0 to 1000")]
-    assert "cut out: line 14: gap: nan is not allowed; allowed: 0 to 1000" in found.words()
+    assert [(row.line, row.reason) for row in found.bad_rows] == [(14, "gap: nan is not allowed; allowed: 0 to 1000")]
+    assert "cut out: line 14: gap: nan is not allowed; allowed: 0 to 1000" in found.summary_lines()
 
 
 def test_short_trajectories_are_counted(tmp_path: Path) -> None:
     path = table(tmp_path / "t.csv")
     frame = pd.read_csv(path)
     frame.drop(index=[40]).to_csv(path, index=False)
-    found = read_pairs(path, reading=Reading(shortest=1.5))
+    found = read_pairs(path, options=ReadOptions(min_seconds=1.5))
     assert [len(pair.speed) for pair in found.pairs] == [30, 19]
-    assert found.left_out == {"trajectories shorter than 1.5 s": 10}
+    assert found.skipped_rows == {"trajectories shorter than 1.5 s": 10}
 
 
 @pytest.mark.parametrize(
@@ -245,7 +240,7 @@ def test_a_table_without_anything_long_enough(tmp_path: Path) -> None:
 
 def test_columns_may_name_the_driver(tmp_path: Path) -> None:
     path = table(tmp_path / "t.csv", period=400, follower=5)
-    pairs = read_pairs(path, reading=Reading(shortest=1.0, driver=("period", "follower"))).pairs
+    pairs = read_pairs(path, options=ReadOptions(min_seconds=1.0, driver_columns=("period", "follower"))).pairs
     assert {pair.driver for pair in pairs} == {"400-5"}
 
 
@@ -258,11 +253,11 @@ def test_a_number_that_is_given_anew_later_is_another_driver(tmp_path: Path) -> 
     first = pd.read_csv(ngsim(tmp_path / "first.csv"))
     later = first.assign(Global_Time=first["Global_Time"] + 15 * 60 * 1000)
     pd.concat([later, first]).to_csv(tmp_path / "both.csv", index=False)
-    found = read_pairs(tmp_path / "both.csv", reading=SHORT).pairs
+    found = read_pairs(tmp_path / "both.csv", options=SHORT).pairs
     assert sorted(pair.driver for pair in found) == ["i-80-8", "i-80-8-2"]
 
 
 def test_who_has_no_name_is_by_himself(tmp_path: Path) -> None:
     drivers = ["anna"] * MOMENTS + [None] * MOMENTS
-    found = read_pairs(table(tmp_path / "data.csv", driver=drivers, kind=None), reading=SHORT)
+    found = read_pairs(table(tmp_path / "data.csv", driver=drivers, kind=None), options=SHORT)
     assert [(pair.driver, pair.kind) for pair in found.pairs] == [("anna", ""), ("two", "")]

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from tests.following.made_up import idm_driver
 from unjam.errors import InputError
-from unjam.following.pairs import Pair, moments_of, of_split, split_by_trajectory, stretches_of
+from unjam.following.pairs import Pair, following_samples, make_segments, pairs_in_splits, split_by_driver
 from unjam.physics.idm import PAPER_IDM
 
 
@@ -22,22 +22,19 @@ def test_the_leaders_path_gives_back_the_recorded_gap() -> None:
 
 def test_rows_are_all_moments_with_a_next_one() -> None:
     pairs = [idm_driver(PAPER_IDM, seconds=3.0), idm_driver(PAPER_IDM, seconds=5.0)]
-    rows = moments_of(pairs)
+    rows = following_samples(pairs)
     assert len(rows) == 30 + 50
     assert rows.acceleration[30] == pytest.approx((pairs[1].speed[1] - pairs[1].speed[0]) / 0.1)
 
 
-@given(
-    seconds=st.sampled_from([1.0, 2.5, 7.0, None]),
-    lengths=st.lists(st.floats(0.5, 9.0), min_size=1, max_size=4),
-)
+@given(seconds=st.sampled_from([1.0, 2.5, 7.0, None]), lengths=st.lists(st.floats(0.5, 9.0), min_size=1, max_size=4))
 def test_stretches_hold_every_step_once(seconds: float | None, lengths: list[float]) -> None:
     pairs = [idm_driver(PAPER_IDM, seconds=length) for length in lengths]
-    stretches = stretches_of(pairs, seconds)
-    assert stretches.present[1:].sum() == sum(len(pair.speed) - 1 for pair in pairs)
+    stretches = make_segments(pairs, seconds)
+    assert stretches.is_present[1:].sum() == sum(len(pair.speed) - 1 for pair in pairs)
     for number, pair in enumerate(pairs):
-        own = np.flatnonzero(stretches.owner == number)
-        driven = [stretches.speed[1:, one][stretches.present[1:, one]] for one in own]
+        own = np.flatnonzero(stretches.pair_index == number)
+        driven = [stretches.speed[1:, one][stretches.is_present[1:, one]] for one in own]
         np.testing.assert_array_equal(np.concatenate(driven), pair.speed[1:])
 
 
@@ -45,16 +42,16 @@ def test_stretches_want_one_time_step() -> None:
     zeros = np.zeros(3)
     pairs = [Pair(str(step), "", step, zeros, zeros, zeros) for step in (0.1, 0.2)]
     with pytest.raises(InputError, match="time step"):
-        stretches_of(pairs)
+        make_segments(pairs)
 
 
 @given(count=st.integers(5, 40), drivers=st.integers(3, 40), seed=st.integers(0, 9))
 def test_a_driver_is_in_one_part_of_a_split(count: int, drivers: int, seed: int) -> None:
-    chosen = split_by_trajectory(pairs_of(count, drivers), (0.6, 0.2, 0.2), seed)
+    chosen = split_by_driver(pairs_of(count, drivers), (0.6, 0.2, 0.2), seed)
     assert len(chosen) == count
     assert len({(pair.driver, pair.split) for pair in chosen}) == len({pair.driver for pair in chosen})
 
 
 def test_parts_of_a_split_have_their_shares() -> None:
-    chosen = split_by_trajectory(pairs_of(100, 100), (0.7, 0.1, 0.2), 0)
-    assert [len(of_split(chosen, name)) for name in ("train", "validation", "test")] == [70, 10, 20]
+    chosen = split_by_driver(pairs_of(100, 100), (0.7, 0.1, 0.2), 0)
+    assert [len(pairs_in_splits(chosen, name)) for name in ("train", "validation", "test")] == [70, 10, 20]

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.worlds.sumo.own_roads import straight
-from unjam.drivers.registry import DRIVERS, named_driver
+from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
@@ -25,7 +25,7 @@ ROADS = {
     "ring-warm": ("ring-warm", {"horizon": 100, "warmup": 300}),
     "figure-eight": ("figure-eight", {"horizon": 400}),
     "merge": ("merge", {"horizon": 60}),
-    "on-ramp": ("on-ramp", {"horizon": 150, "peak": [0, 150], "cav_share": 0.3}),
+    "on-ramp": ("on-ramp", {"horizon": 150, "peak": [0, 150], "penetration_rate": 0.3}),
     "own-network": ("", {"horizon": 250, "cav_types": ["van"]}),
 }
 ON_MOTORWAYS = ("cruise", "jam-ahead", "gap-maker", "adaptive-acc")
@@ -72,7 +72,7 @@ def drive_all() -> Iterator[tuple[str, Episode]]:
     with tempfile.TemporaryDirectory() as network, Simulation() as simulation:
         for road, driver in cases():
             scenario = scenario_of(road, Path(network))
-            expert = named_driver(driver, scenario.decision_step)
+            expert = driver_from_name(driver, scenario.control_step)
             yield f"{road}-{driver}", run_episode(scenario, expert, SEED, simulation=simulation)
 
 

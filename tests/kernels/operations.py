@@ -46,14 +46,7 @@ def numpy_functions() -> list[np.ndarray]:
     found = []
     for length in LENGTHS:
         small, positive = numbers(length, low=-8.0, high=8.0), numbers(length, low=1e-3, high=50.0)
-        found += [
-            np.exp(small),
-            np.tanh(small),
-            np.log(positive),
-            np.sqrt(positive),
-            positive**4,
-            positive**0.7,
-        ]
+        found += [np.exp(small), np.tanh(small), np.log(positive), np.sqrt(positive), positive**4, positive**0.7]
         found += [np.sin(small), np.cos(small), np.square(small)]
         found += [each.astype(np.float32) for each in (np.exp(np.float32(small)), np.tanh(np.float32(small)))]
     return found

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from tests.training.test_run import learn_with, small_config
-from unjam.worlds.workers import Workers
+from unjam.worlds.worker_pool import WorkerPool
 
 DATA = ("virtual/data/", "replay/")
 """what was learned from, not what was learned"""
@@ -27,11 +27,9 @@ def hashes(learners: list[str]) -> dict[str, str]:
     """Return the hash of all that each learner has learned, its virtual environment included."""
     torch.set_num_threads(1)  # as a training does
     found = {}
-    with tempfile.TemporaryDirectory() as place, Workers(1) as workers:
+    with tempfile.TemporaryDirectory() as place, WorkerPool(1) as workers:
         for learner in learners:
-            config = small_config(
-                agent=learner, policy__hidden=[32, 32], evaluation__every=0, **LEARNERS[learner]
-            )
+            config = small_config(agent=learner, policy__hidden=[32, 32], evaluation__every=0, **LEARNERS[learner])
             run = learn_with(workers, Path(place) / learner, config)
             total = hashlib.sha256()
             for name, tensor in sorted(run.training.state()[1].items()):

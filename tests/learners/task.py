@@ -12,18 +12,11 @@ from hypothesis import strategies as st
 from stable_baselines3.common.policies import BasePolicy
 
 from unjam.drivers import LocalState, PISaturation
-from unjam.drivers.local_state import EVERYWHERE
+from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.drivers.network import Network
-from unjam.learners.algorithm_1 import Collected, Iteration, Training, Validated, algorithm_1
+from unjam.learners.algorithm_1 import Iteration, TaskEpisodes, Training, ValidationReturns, algorithm_1
 from unjam.learners.learner import AgentSpec, make_learner, policy_spaces
-from unjam.learners.settings import (
-    LearnerSettings,
-    PolicySettings,
-    PPOSettings,
-    SACSettings,
-    TD3Settings,
-    TRPOSettings,
-)
+from unjam.learners.settings import LearnerSettings, PolicySettings, PPOSettings, SACSettings, TD3Settings, TRPOSettings
 from unjam.scenarios import Ring
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Trajectory
@@ -33,8 +26,8 @@ LENGTHS = (220.0, 270.0)
 QUICK: dict[str, LearnerSettings] = {
     "trpo": TRPOSettings(critic_epochs=3),
     "ppo": PPOSettings(epochs=5),
-    "sac": SACSettings(start_steps=0, updates_per_step=0.01, batch=16, buffer_rows=1000),
-    "td3": TD3Settings(start_steps=0, updates_per_step=0.01, batch=16, buffer_rows=1000),
+    "sac": SACSettings(learning_starts=0, gradient_steps_per_step=0.01, batch_size=16, buffer_size=1000),
+    "td3": TD3Settings(learning_starts=0, gradient_steps_per_step=0.01, batch_size=16, buffer_size=1000),
 }
 """settings with which each learner is quick"""
 
@@ -69,22 +62,22 @@ def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Targe
     nothing = np.zeros(DECISIONS)
     trajectory = Trajectory(
         vehicle="cav_0",
-        start=0,
-        states=LocalState(*[np.zeros(DECISIONS + 1)] * len(EVERYWHERE)),
+        start_step=0,
+        states=LocalState(*[np.zeros(DECISIONS + 1)] * len(COMMON_FIELDS)),
         observations=observations,
-        expert=nothing,
+        expert_acceleration=nothing,
         residual=residual,
-        applied=residual,
-        filtered=nothing,
-        shield=nothing,
-        terms={"near": -((residual - wanted) ** 2)},
-        memory={},
-        hold=hold,
+        applied_acceleration=residual,
+        filter_braking=nothing,
+        shield_braking=nothing,
+        reward_terms={"near": -((residual - wanted) ** 2)},
+        initial_memory={},
+        action_repeat=hold,
         terminated=False,
     )
     drawn = {"length": LENGTHS[seed[-1] % 2]}
     speeds = np.zeros((DECISIONS + 1, 1))
-    return Episode(seed=seed, status="completed", drawn=drawn, speeds=speeds, trajectories=(trajectory,))
+    return Episode(seed=seed, status="completed", drawn_values=drawn, speeds=speeds, trajectories=(trajectory,))
 
 
 @dataclass
@@ -102,11 +95,11 @@ class Toy:
     networks: list[Network] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        spec = AgentSpec(INPUTS, int(self.policy.critic_sees_road), 1.0, self.policy, self.seed)
+        spec = AgentSpec(INPUTS, int(self.policy.privileged_critic), 1.0, self.policy, self.seed)
         self.learner = make_learner(self.settings or QUICK[self.agent], spec)
         self.training = Training([Task(Ring(), PISaturation())], self.policy, self.seed, self.learner)
 
-    def collect(self, network: Network, iteration: int) -> Collected:
+    def collect(self, network: Network, iteration: int) -> TaskEpisodes:
         self.networks.append(network)
         return [
             [
@@ -118,7 +111,7 @@ class Toy:
     def run(self, actual_steps: int) -> None:
         algorithm_1(self.training, actual_steps, self.collect, lambda _: None, self.write)
 
-    def write(self, iteration: Iteration, _: Validated) -> None:
+    def write(self, iteration: Iteration, _: ValidationReturns) -> None:
         self.iterations.append(iteration)
 
     def learn(self, iterations: int) -> "Toy":

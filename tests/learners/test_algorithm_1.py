@@ -4,21 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.learners.task import (
-    DECISIONS,
-    INPUTS,
-    Target,
-    Toy,
-    constant_target,
-    mean_return,
-    same,
-    sloped_target,
-)
+from tests.learners.task import DECISIONS, INPUTS, Target, Toy, constant_target, mean_return, same, sloped_target
 from unjam.errors import UnjamError
-from unjam.learners.algorithm_1 import actual_experience, afterwards, seed_iteration
-from unjam.learners.experience import experience_of
+from unjam.learners.algorithm_1 import environment_experience, return_after_exit, seed_iteration
+from unjam.learners.experience import make_experience
 from unjam.learners.settings import (
-    AGENTS,
+    AGENT_NAMES,
     LearnerSettings,
     PolicySettings,
     PPOSettings,
@@ -29,7 +20,7 @@ from unjam.learners.settings import (
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
 
-every_learner = pytest.mark.parametrize("agent", AGENTS)
+every_learner = pytest.mark.parametrize("agent", AGENT_NAMES)
 
 
 @every_learner
@@ -56,7 +47,7 @@ def test_what_others_draw_in_between_changes_nothing(agent: str) -> None:
 def test_counts_decisions_and_not_looks(agent: str, hold: int) -> None:
     task = Toy(agent=agent, hold=hold, episodes=3)
     task.run(2 * 3 * DECISIONS)
-    assert [entry.actual_steps for entry in task.iterations] == [300, 600]
+    assert [entry.environment_steps for entry in task.iterations] == [300, 600]
     assert [entry.number for entry in task.iterations] == [1, 2]
 
 
@@ -64,11 +55,11 @@ def test_counts_decisions_and_not_looks(agent: str, hold: int) -> None:
 def test_ends_with_the_first_iteration_that_reaches_the_budget(agent: str) -> None:
     task = Toy(agent=agent, episodes=3)
     task.run(301)
-    assert task.training.actual_steps == 600
+    assert task.training.environment_steps == 600
     task.run(600)
     assert len(task.iterations) == 2
     task.run(601)
-    assert task.training.actual_steps == 900
+    assert task.training.environment_steps == 900
 
 
 @every_learner
@@ -88,21 +79,21 @@ def test_an_iteration_tells_what_progress_needs(agent: str) -> None:
     assert all(type(value) is float and np.isfinite(value) for value in iteration.log.values())
     assert set(iteration.seconds) == {"actual", "update"}
     assert min(iteration.seconds.values()) > 0.0
-    assert iteration.virtual_steps == 0
+    assert iteration.model_steps == 0
     assert len(iteration.episodes[0]) == 8
 
 
 @every_learner
 @pytest.mark.parametrize("sees_road", [True, False])
 def test_only_the_critic_sees_the_road_that_was_drawn(agent: str, sees_road: bool) -> None:
-    policy = PolicySettings(hidden=(8,), critic_sees_road=sees_road)
+    policy = PolicySettings(hidden=(8,), privileged_critic=sees_road)
     task = Toy(policy, agent=agent, episodes=2)
-    rows = actual_experience(task.training, task.collect(task.learner.network(), 1))
+    rows = environment_experience(task.training, task.collect(task.learner.network(), 1))
     assert rows.observations.shape == (2 * DECISIONS, INPUTS + sees_road)
     if sees_road:
         assert set(rows.observations[:, INPUTS]) == {-1.0, 1.0}
     assert task.learner.sb3.observation_space.shape == (INPUTS + sees_road,)
-    assert task.learner.network().inputs == INPUTS
+    assert task.learner.network().input_size == INPUTS
 
 
 def test_what_is_earned_afterwards_is_discounted_look_by_look_to_the_last_one() -> None:
@@ -113,13 +104,13 @@ def test_what_is_earned_afterwards_is_discounted_look_by_look_to_the_last_one() 
     left = replace(stays, residual=np.zeros(4), applied=np.zeros(4), hold=2)
     whole = replace(episode, speeds=np.zeros((12, 1)), terms={"one": reward})
     expected = 0.9 * (5.0 + 6.0) + 0.9**2 * (7.0 + 8.0) + 0.9**3 * (9.0 + 10.0) + 0.9**4 * 11.0
-    assert afterwards(whole, left, 0.9, 11) == pytest.approx(expected)
-    assert afterwards(whole, replace(left, terminated=True), 0.9, 11) is None
-    assert afterwards(replace(whole, speeds=np.zeros((5, 1))), left, 0.9, 4) is None
-    assert afterwards(whole, left, 0.9, 12) is None  # broken off
+    assert return_after_exit(whole, left, 0.9, 11) == pytest.approx(expected)
+    assert return_after_exit(whole, replace(left, terminated=True), 0.9, 11) is None
+    assert return_after_exit(replace(whole, speeds=np.zeros((5, 1))), left, 0.9, 4) is None
+    assert return_after_exit(whole, left, 0.9, 12) is None  # broken off
     ended = (replace(whole, speeds=np.full((12, 1), np.nan)), replace(whole, status="collision"))
-    assert [afterwards(each, left, 0.9, 12) for each in ended] == [pytest.approx(expected)] * 2
-    alone, more = experience_of([left], [()]), experience_of([left], [()], [expected])
+    assert [return_after_exit(each, left, 0.9, 12) for each in ended] == [pytest.approx(expected)] * 2
+    alone, more = make_experience([left], [()]), make_experience([left], [()], [expected])
     assert more.rewards[-1] - alone.rewards[-1] == pytest.approx(expected)
     assert (alone.terminated.tolist(), more.terminated.tolist()) == ([False], [True])
 
@@ -151,9 +142,7 @@ def test_a_reward_that_is_not_finite_is_named_before_anything_is_learned(agent: 
 @every_learner
 def test_a_parameter_that_is_not_finite_is_named_in_the_same_iteration(agent: str) -> None:
     task = Toy(agent=agent)
-    critic = (
-        p for name, p in task.learner.sb3.policy.named_parameters() if "value" in name or "critic" in name
-    )
+    critic = (p for name, p in task.learner.sb3.policy.named_parameters() if "value" in name or "critic" in name)
     with torch.no_grad():
         next(critic)[0] = torch.nan
     with pytest.raises(UnjamError, match=r"learner: \S+ is not finite in iteration 1") as caught:
@@ -177,16 +166,22 @@ TO_LEARN: dict[str, LearnerSettings] = {
     "ppo": PPOSettings(epochs=20, gamma=0.8, gae_lambda=0.9),
     "sac": SACSettings(
         gamma=0.5,
-        start_steps=1600,
-        rate=5e-3,
+        learning_starts=1600,
+        learning_rate=5e-3,
         tau=0.02,
         reward_scale=10.0,
         temperature=0.02,
-        batch=64,
-        updates_per_step=0.04,
+        batch_size=64,
+        gradient_steps_per_step=0.04,
     ),
     "td3": TD3Settings(
-        gamma=0.5, start_steps=1600, rate=5e-3, tau=0.02, reward_scale=10.0, batch=64, updates_per_step=0.04
+        gamma=0.5,
+        learning_starts=1600,
+        learning_rate=5e-3,
+        tau=0.02,
+        reward_scale=10.0,
+        batch_size=64,
+        gradient_steps_per_step=0.04,
     ),
 }
 
@@ -195,7 +190,7 @@ TO_LEARN: dict[str, LearnerSettings] = {
     ("target", "hold"), [(constant_target, 1), pytest.param(sloped_target, 5, marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize(
-    "agent", [pytest.param(name, marks=pytest.mark.slow) if name == "ppo" else name for name in AGENTS]
+    "agent", [pytest.param(name, marks=pytest.mark.slow) if name == "ppo" else name for name in AGENT_NAMES]
 )
 def test_learns_to_be_at_the_target(agent: str, target: Target, hold: int) -> None:
     policy = PolicySettings(hidden=(16,), exploration_std=0.2)

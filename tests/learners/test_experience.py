@@ -9,15 +9,15 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 
 from tests.learners.task import make_policy, shake
 from unjam.drivers import LocalState
-from unjam.drivers.local_state import EVERYWHERE
+from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.learners.experience import (
     Experience,
     add_to_replay_buffer,
     discounted_returns,
-    experience_of,
     fill_rollout_buffer,
-    join,
-    shifted_rewards,
+    join_experience,
+    make_experience,
+    shift_rewards,
 )
 from unjam.learners.learner import policy_spaces
 from unjam.learners.trpo_ppo import ResidualPolicy
@@ -33,17 +33,17 @@ def make_trajectory(seed: int, decisions: int, hold: int = 1, terminated: bool =
     nothing = np.zeros(decisions)
     return Trajectory(
         vehicle="cav_0",
-        start=0,
-        states=LocalState(*[np.zeros(decisions + 1)] * len(EVERYWHERE)),
+        start_step=0,
+        states=LocalState(*[np.zeros(decisions + 1)] * len(COMMON_FIELDS)),
         observations=generator.normal(size=(choices + 1, INPUTS)),
-        expert=nothing,
+        expert_acceleration=nothing,
         residual=np.repeat(generator.normal(size=choices), hold)[:decisions],
-        applied=nothing,
-        filtered=nothing,
-        shield=nothing,
-        terms={"one": generator.normal(size=decisions), "other": generator.uniform(size=decisions)},
-        memory={},
-        hold=hold,
+        applied_acceleration=nothing,
+        filter_braking=nothing,
+        shield_braking=nothing,
+        reward_terms={"one": generator.normal(size=decisions), "other": generator.uniform(size=decisions)},
+        initial_memory={},
+        action_repeat=hold,
         terminated=terminated,
     )
 
@@ -64,7 +64,7 @@ def fill(
 ) -> RolloutBuffer:
     spaces = policy.observation_space, policy.action_space
     buffer = RolloutBuffer(1, *spaces, device="cpu", gamma=gamma, gae_lambda=gae_lambda)
-    fill_rollout_buffer(buffer, policy, experience_of(trajectories, extra or [()] * len(trajectories)))
+    fill_rollout_buffer(buffer, policy, make_experience(trajectories, extra or [()] * len(trajectories)))
     return buffer
 
 
@@ -76,10 +76,13 @@ def value(policy: ResidualPolicy, row: np.ndarray) -> float:
 def looks_written_out(trajectory: Trajectory) -> list[float]:
     """What was earned from one choice of the network to the next."""
     earned = [
-        float(trajectory.terms["one"][t] + trajectory.terms["other"][t])
+        float(trajectory.reward_terms["one"][t] + trajectory.reward_terms["other"][t])
         for t in range(len(trajectory.residual))
     ]
-    return [sum(earned[start : start + trajectory.hold]) for start in range(0, len(earned), trajectory.hold)]
+    return [
+        sum(earned[start : start + trajectory.action_repeat])
+        for start in range(0, len(earned), trajectory.action_repeat)
+    ]
 
 
 def advantages_written_out(
@@ -110,8 +113,7 @@ def test_advantages_and_returns_are_those_of_each_trajectory_alone(
 ) -> None:
     policy = random_policy()
     trajectories = [
-        make_trajectory(seed, decisions, hold, terminated)
-        for seed, (decisions, terminated) in enumerate(shapes)
+        make_trajectory(seed, decisions, hold, terminated) for seed, (decisions, terminated) in enumerate(shapes)
     ]
     buffer = fill(policy, trajectories, gamma=gamma, gae_lambda=gae_lambda)
     written = [advantages_written_out(policy, entry, gamma, gae_lambda) for entry in trajectories]
@@ -174,17 +176,15 @@ def test_the_value_after_the_end_is_that_of_the_trajectorys_own_road() -> None:
     policy = random_policy(critic_inputs=1)
     trajectory = make_trajectory(0, 5)
     buffer = fill(policy, [trajectory], [(0.7,)], gae_lambda=1.0)
-    expected = looks_written_out(trajectory)[-1] + 0.9 * value(
-        policy, np.append(trajectory.observations[-1], 0.7)
-    )
+    expected = looks_written_out(trajectory)[-1] + 0.9 * value(policy, np.append(trajectory.observations[-1], 0.7))
     assert buffer.returns[-1, 0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_parts_that_are_joined_are_the_rows_of_all_their_trajectories() -> None:
     trajectories = [make_trajectory(seed, 3 + seed, hold=2, terminated=seed == 1) for seed in range(4)]
     extra = [(float(seed),) for seed in range(4)]
-    parts = [experience_of(trajectories[:1], extra[:1]), experience_of(trajectories[1:], extra[1:])]
-    joined, expected = join(parts), experience_of(trajectories, extra)
+    parts = [make_experience(trajectories[:1], extra[:1]), make_experience(trajectories[1:], extra[1:])]
+    joined, expected = join_experience(parts), make_experience(trajectories, extra)
     for field in fields(Experience):
         np.testing.assert_array_equal(getattr(joined, field.name), getattr(expected, field.name))
         assert getattr(joined, field.name).dtype == getattr(expected, field.name).dtype
@@ -192,10 +192,10 @@ def test_parts_that_are_joined_are_the_rows_of_all_their_trajectories() -> None:
 
 def test_after_each_row_comes_the_next_of_its_trajectory_or_where_that_ended() -> None:
     trajectories = [make_trajectory(0, 5, hold=2), make_trajectory(1, 1), make_trajectory(2, 3)]
-    rows = experience_of(trajectories, [()] * 3)
+    rows = make_experience(trajectories, [()] * 3)
     expected = np.concatenate([trajectory.observations[1:] for trajectory in trajectories])
     np.testing.assert_array_equal(rows.next_observations, expected.astype(np.float32))
-    assert rows.lasts.tolist() == [2, 3, 6]
+    assert rows.last_rows.tolist() == [2, 3, 6]
 
 
 def test_refuses_another_number_of_trajectories_than_of_their_roads() -> None:
@@ -229,7 +229,7 @@ def test_the_ratio_is_one_in_the_shuffled_order_of_the_update_too() -> None:
 def test_a_buffer_takes_the_size_of_each_iteration() -> None:
     policy = random_policy()
     buffer = fill(policy, [make_trajectory(0, 50)])
-    fill_rollout_buffer(buffer, policy, experience_of([make_trajectory(1, 20)], [()]))
+    fill_rollout_buffer(buffer, policy, make_experience([make_trajectory(1, 20)], [()]))
     assert len(buffer.rewards) == 20
     assert sum(len(rows.returns) for rows in buffer.get(7)) == 20
     np.testing.assert_array_equal(
@@ -242,12 +242,9 @@ def test_a_buffer_takes_the_size_of_each_iteration() -> None:
     hold=st.integers(1, 4),
     gamma=st.floats(0.1, 0.99),
 )
-def test_discounted_returns_are_the_sums_written_out(
-    shapes: list[tuple[int, bool]], hold: int, gamma: float
-) -> None:
+def test_discounted_returns_are_the_sums_written_out(shapes: list[tuple[int, bool]], hold: int, gamma: float) -> None:
     trajectories = [
-        make_trajectory(seed, decisions, hold, terminated)
-        for seed, (decisions, terminated) in enumerate(shapes)
+        make_trajectory(seed, decisions, hold, terminated) for seed, (decisions, terminated) in enumerate(shapes)
     ]
     expected = []
     for trajectory in trajectories:
@@ -257,7 +254,7 @@ def test_discounted_returns_are_the_sums_written_out(
             within = sum(gamma ** (later - t) * earned[later] for later in range(t, len(earned)))
             expected.append(within + gamma ** (len(earned) - t) * after)
     np.testing.assert_allclose(
-        discounted_returns(experience_of(trajectories, [()] * len(trajectories)), gamma),
+        discounted_returns(make_experience(trajectories, [()] * len(trajectories)), gamma),
         expected,
         rtol=1e-9,
         atol=1e-9,
@@ -266,8 +263,8 @@ def test_discounted_returns_are_the_sums_written_out(
 
 def test_a_cut_trajectory_that_always_earns_the_same_is_worth_the_same_everywhere() -> None:
     trajectory = make_trajectory(0, 30)
-    trajectory.terms["one"][:], trajectory.terms["other"][:] = 1.5, 0.5
-    np.testing.assert_allclose(discounted_returns(experience_of([trajectory], [()]), 0.95), 2.0 / 0.05)
+    trajectory.reward_terms["one"][:], trajectory.reward_terms["other"][:] = 1.5, 0.5
+    np.testing.assert_allclose(discounted_returns(make_experience([trajectory], [()]), 0.95), 2.0 / 0.05)
 
 
 def replay_buffer(size: int) -> ReplayBuffer:
@@ -279,15 +276,14 @@ def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> N
     ours, theirs = replay_buffer(20), replay_buffer(20)
     for iteration in range(4):
         trajectories = [
-            make_trajectory(10 * iteration + seed, 7 + seed, hold=2, terminated=seed == 1)
-            for seed in range(2)
+            make_trajectory(10 * iteration + seed, 7 + seed, hold=2, terminated=seed == 1) for seed in range(2)
         ]
         extra = [(0.5,), (-0.5,)]
-        rows = experience_of(trajectories, extra)
+        rows = make_experience(trajectories, extra)
         add_to_replay_buffer(ours, rows, 2.0, rows.rewards)
         for trajectory, more in zip(trajectories, extra, strict=True):
             seen = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
-            residuals, earned = trajectory.choices
+            residuals, earned = trajectory.actions_and_rewards
             for choice, (residual, reward) in enumerate(zip(residuals, earned, strict=True)):
                 done = trajectory.terminated and choice == len(earned) - 1
                 action = np.array([np.float32(residual) / np.float32(2.0)])
@@ -300,7 +296,7 @@ def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> N
 
 def test_more_rows_than_a_replay_buffer_takes_leave_the_newest() -> None:
     buffer = replay_buffer(5)
-    rows = experience_of([make_trajectory(0, 13)], [(0.0,)])
+    rows = make_experience([make_trajectory(0, 13)], [(0.0,)])
     add_to_replay_buffer(buffer, rows, 2.0, rows.rewards)
     assert sorted(buffer.rewards[:, 0]) == sorted(rows.rewards[-5:].astype(np.float32))
 
@@ -314,7 +310,7 @@ def test_more_rows_than_a_replay_buffer_takes_leave_the_newest() -> None:
 def test_shifted_rewards_shift_all_that_follows_by_the_same(
     shapes: list[tuple[int, bool]], gamma: float, offset: float, after: float
 ) -> None:
-    rows = experience_of(
+    rows = make_experience(
         [make_trajectory(seed, size, 1, terminated) for seed, (size, terminated) in enumerate(shapes)],
         [()] * len(shapes),
     )
@@ -322,12 +318,12 @@ def test_shifted_rewards_shift_all_that_follows_by_the_same(
     def worth(rewards: np.ndarray, beyond: float) -> np.ndarray:
         """What follows each row, where a trajectory that was cut is worth `beyond` after its end."""
         found = np.empty(len(rewards))
-        for first, last, terminated in zip(rows.starts, rows.lasts, rows.terminated, strict=True):
+        for first, last, terminated in zip(rows.starts, rows.last_rows, rows.terminated, strict=True):
             later = 0.0 if terminated else beyond
             for row in range(last, first - 1, -1):
                 later = found[row] = rewards[row] + gamma * later
         return found
 
     missing = offset / (1.0 - gamma)
-    shifted = worth(shifted_rewards(rows, offset, gamma), after - missing)
+    shifted = worth(shift_rewards(rows, offset, gamma), after - missing)
     np.testing.assert_allclose(shifted, worth(rows.rewards, after) - missing, rtol=1e-9, atol=1e-6)

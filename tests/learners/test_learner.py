@@ -13,12 +13,14 @@ from torch.distributions import Normal
 
 from tests.learners.task import QUICK, Toy, same
 from unjam.learners.learner import policy_distance
-from unjam.learners.settings import AGENTS, LearnerSettings, PolicySettings, SACSettings
+from unjam.learners.settings import AGENT_NAMES, LearnerSettings, PolicySettings, SACSettings
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
 
-every_learner = pytest.mark.parametrize("agent", AGENTS)
-WRAPPED = SACSettings(start_steps=0, updates_per_step=0.01, batch=16, buffer_rows=900, learn_temperature=True)
+every_learner = pytest.mark.parametrize("agent", AGENT_NAMES)
+WRAPPED = SACSettings(
+    learning_starts=0, gradient_steps_per_step=0.01, batch_size=16, buffer_size=900, learn_temperature=True
+)
 """with a replay buffer that is full, and begins anew, in the third iteration of 400 rows"""
 
 
@@ -35,7 +37,7 @@ WRAPPED = SACSettings(start_steps=0, updates_per_step=0.01, batch=16, buffer_row
 def test_a_restored_learner_goes_on_to_the_last_bit(
     agent: str, settings: LearnerSettings, learned: bool, before: int
 ) -> None:
-    policy = PolicySettings(hidden=(8, 8), learn_exploration=learned)
+    policy = PolicySettings(hidden=(8, 8), learn_exploration_std=learned)
 
     def new() -> Toy:
         return Toy(policy, settings, agent, hold=2)
@@ -53,7 +55,7 @@ def test_a_restored_learner_goes_on_to_the_last_bit(
     assert resumed.training.state()[0] == through.training.state()[0]
     assert [entry.log for entry in resumed.iterations] == [entry.log for entry in through.iterations[before:]]
     assert [entry.number for entry in resumed.iterations] == [1, 2, 3, 4][before:]
-    assert resumed.iterations[-1].actual_steps == 3200
+    assert resumed.iterations[-1].environment_steps == 3200
 
 
 @every_learner
@@ -64,7 +66,7 @@ def test_a_restored_learner_has_the_state_that_was_kept(agent: str) -> None:
     other.training.restore(*kept)
     counters, tensors = other.training.state()
     assert counters == kept[0]
-    assert {"iteration": 2, "actual_steps": 1600}.items() <= counters.items()
+    assert {"iteration": 2, "environment_steps": 1600}.items() <= counters.items()
     assert same(tensors, kept[1])
 
 
@@ -77,7 +79,7 @@ def test_the_state_holds_the_momenta_of_the_critic() -> None:
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_the_state_of_sac_holds_all_that_it_learns_from(learned: bool) -> None:
-    settings = SACSettings(start_steps=0, updates_per_step=0.01, batch=16, learn_temperature=learned)
+    settings = SACSettings(learning_starts=0, gradient_steps_per_step=0.01, batch_size=16, learn_temperature=learned)
     _, tensors = Toy(settings=settings, agent="sac").learn(1).training.state()
     parts = {name.partition("/")[0] for name in tensors}
     expected = {"policy", "actor.optimizer", "critic.optimizer", "replay"}
@@ -129,9 +131,7 @@ def of(mean: float, std: float) -> Normal:
 
 @pytest.mark.long
 @given(means, stds, means, stds)
-def test_is_half_the_integral_of_the_difference_of_the_densities(
-    m: float, s: float, n: float, t: float
-) -> None:
+def test_is_half_the_integral_of_the_difference_of_the_densities(m: float, s: float, n: float, t: float) -> None:
     def difference(x: float) -> float:
         return float(abs(norm.pdf(x, m, s) - norm.pdf(x, n, t)))
 

@@ -104,7 +104,7 @@ def test_uniform_residuals_cover_their_authority_evenly() -> None:
 
 @pytest.mark.parametrize("start", ["expert", "uniform"])
 def test_sac_learns_nothing_before_its_start_is_driven(start: Any) -> None:
-    settings = SACSettings(start=start, start_steps=1700, updates_per_step=0.02, batch=8)
+    settings = SACSettings(start_policy=start, learning_starts=1700, gradient_steps_per_step=0.02, batch_size=8)
     task = Toy(PolicySettings(hidden=(16,), exploration_std=0.1), settings, "sac").learn(4)
     updates = [entry.log.get("n_updates", 0.0) for entry in task.iterations]
     assert updates == [0.0, 0.0, 48.0, 64.0]  # 800 actual steps in each iteration
@@ -118,19 +118,18 @@ def test_sac_learns_nothing_before_its_start_is_driven(start: Any) -> None:
 
 
 def test_an_iteration_of_sac_makes_at_least_one_update() -> None:
-    settings = SACSettings(start_steps=0, updates_per_step=1e-9, batch=8)
+    settings = SACSettings(learning_starts=0, gradient_steps_per_step=1e-9, batch_size=8)
     task = Toy(settings=settings, agent="sac").learn(2)
     assert [entry.log["n_updates"] for entry in task.iterations] == [1.0, 2.0]
 
 
 @pytest.mark.parametrize("normalise", [True, False])
 def test_rewards_of_sac_are_shifted_by_the_mean_of_the_first_iteration_and_scaled(normalise: bool) -> None:
-    policy = PolicySettings(hidden=(8,), normalise_value=normalise)
-    settings = SACSettings(start_steps=0, updates_per_step=0.01, batch=8, reward_scale=3.0)
+    policy = PolicySettings(hidden=(8,), normalize_value=normalise)
+    settings = SACSettings(learning_starts=0, gradient_steps_per_step=0.01, batch_size=8, reward_scale=3.0)
     task = Toy(policy, settings, "sac").learn(2)
     earned = [
-        np.concatenate([episode.trajectories[0].reward for episode in entry.episodes[0]])
-        for entry in task.iterations
+        np.concatenate([episode.trajectories[0].reward for episode in entry.episodes[0]]) for entry in task.iterations
     ]
     offset = earned[0].mean() if normalise else 0.0
     expected = 3.0 * (np.concatenate(earned) - offset)
@@ -140,7 +139,7 @@ def test_rewards_of_sac_are_shifted_by_the_mean_of_the_first_iteration_and_scale
 @pytest.mark.parametrize("learned", [True, False])
 def test_the_temperature_of_sac_changes_only_where_it_is_learned(learned: bool) -> None:
     settings = SACSettings(
-        start_steps=0, updates_per_step=0.02, batch=8, temperature=0.3, learn_temperature=learned
+        learning_starts=0, gradient_steps_per_step=0.02, batch_size=8, temperature=0.3, learn_temperature=learned
     )
     logs = [entry.log["ent_coef"] for entry in Toy(settings=settings, agent="sac").learn(3).iterations]
     assert logs[0] == pytest.approx(0.3, rel=0.01)
@@ -149,7 +148,13 @@ def test_the_temperature_of_sac_changes_only_where_it_is_learned(learned: bool) 
 
 def test_settings_reach_sac() -> None:
     settings = SACSettings(
-        gamma=0.9, tau=0.1, rate=0.02, batch=33, buffer_rows=77, learn_temperature=True, target_entropy=-3.0
+        gamma=0.9,
+        tau=0.1,
+        learning_rate=0.02,
+        batch_size=33,
+        buffer_size=77,
+        learn_temperature=True,
+        target_entropy=-3.0,
     )
     learner: Any = Toy(settings=settings, agent="sac").learner.sb3
     assert (learner.gamma, learner.tau, learner.batch_size) == (0.9, 0.1, 33)
@@ -160,5 +165,5 @@ def test_settings_reach_sac() -> None:
 
 
 def test_a_policy_may_begin_as_its_weights_are_drawn() -> None:
-    policy = fresh(PolicySettings(begin_at_expert=False))
+    policy = fresh(PolicySettings(zero_init=False))
     assert residual_of(policy, random_rows(200, 5, 0)).std() > 0.001

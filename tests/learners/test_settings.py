@@ -5,7 +5,7 @@ import pytest
 
 from unjam.errors import InputError
 from unjam.learners.settings import PolicySettings, PPOSettings, SACSettings, TRPOSettings
-from unjam.parameters import build
+from unjam.parameters import build_dataclass
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ from unjam.parameters import build
         (PolicySettings, "exploration_std", 0.0),
         (PolicySettings, "exploration_std", float("nan")),
         (PolicySettings, "hold", -1.0),
-        (PolicySettings, "learn_exploration", "perhaps"),
+        (PolicySettings, "learn_exploration_std", "perhaps"),
         (TRPOSettings, "batch_steps", 0),
         (TRPOSettings, "batch_steps", 10.5),
         (TRPOSettings, "gamma", 1.0),
@@ -30,31 +30,31 @@ from unjam.parameters import build
         (TRPOSettings, "gae_lambda", -0.1),
         (TRPOSettings, "target_kl", 0.0),
         (TRPOSettings, "cg_damping", -0.1),
-        (TRPOSettings, "critic_rate", 0.0),
+        (TRPOSettings, "critic_learning_rate", 0.0),
         (TRPOSettings, "critic_epochs", 0),
-        (TRPOSettings, "value_l2", -1e-3),
-        (TRPOSettings, "critic_batch", "many"),
-        (TRPOSettings, "critic_batch", 1),
+        (TRPOSettings, "critic_weight_decay", -1e-3),
+        (TRPOSettings, "critic_batch_size", "many"),
+        (TRPOSettings, "critic_batch_size", 1),
         (PPOSettings, "batch_steps", 0),
         (PPOSettings, "clip", 0.0),
         (PPOSettings, "clip", 1.0),
         (PPOSettings, "epochs", 0),
         (PPOSettings, "minibatches", 0),
-        (PPOSettings, "actor_rate", 0.0),
+        (PPOSettings, "actor_learning_rate", 0.0),
         (SACSettings, "gamma", 1.0),
         (SACSettings, "tau", 0.0),
         (SACSettings, "tau", 1.5),
         (SACSettings, "temperature", 0.0),
         (SACSettings, "target_entropy", 1.0),
         (SACSettings, "start", "slowly"),
-        (SACSettings, "start_steps", -1),
-        (SACSettings, "updates_per_step", 0.0),
-        (SACSettings, "buffer_rows", 0),
+        (SACSettings, "learning_starts", -1),
+        (SACSettings, "gradient_steps_per_step", 0.0),
+        (SACSettings, "buffer_size", 0),
     ],
 )
 def test_a_wrong_value_is_refused_in_one_line_that_names_it(kind: type, key: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
-        build(kind, {key: value}, "settings")
+        build_dataclass(kind, {key: value}, "settings")
     line = str(caught.value)
     assert line.startswith(f"settings.{key}")
     assert "is not allowed; allowed: " in line
@@ -64,14 +64,14 @@ def test_a_wrong_value_is_refused_in_one_line_that_names_it(kind: type, key: str
 @pytest.mark.parametrize("kind", [PolicySettings, TRPOSettings, PPOSettings, SACSettings])
 def test_an_unknown_name_is_refused(kind: type) -> None:
     with pytest.raises(InputError, match=r"settings\.learning_speed: unknown name"):
-        build(kind, {"learning_speed": 1.0}, "settings")
+        build_dataclass(kind, {"learning_speed": 1.0}, "settings")
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("gae_lambda", 0.0), ("gae_lambda", 1.0), ("value_l2", 0.0), ("gamma", 0.999)]
+    ("key", "value"), [("gae_lambda", 0.0), ("gae_lambda", 1.0), ("critic_weight_decay", 0.0), ("gamma", 0.999)]
 )
 def test_values_at_the_edge_of_what_is_allowed_are_taken(key: str, value: float) -> None:
-    assert getattr(build(TRPOSettings, {key: value}, ""), key) == value
+    assert getattr(build_dataclass(TRPOSettings, {key: value}, ""), key) == value
 
 
 @pytest.mark.parametrize("made", [PolicySettings(), TRPOSettings(), PPOSettings(), SACSettings()])
@@ -82,15 +82,15 @@ def test_settings_do_not_change_once_made(made: Any) -> None:
 
 
 def test_lists_of_a_toml_file_become_tuples() -> None:
-    made = build(PolicySettings, {"hidden": [32, 16], "observe": ["local", "loop_length"]}, "")
-    assert made == PolicySettings(hidden=(32, 16), observe=("local", "loop_length"))
+    made = build_dataclass(PolicySettings, {"hidden": [32, 16], "observe": ["local", "loop_length"]}, "")
+    assert made == PolicySettings(hidden=(32, 16), inputs=("local", "loop_length"))
 
 
 @pytest.mark.parametrize(
-    ("hold", "decision_step", "decisions"),
+    ("hold", "control_step", "decisions"),
     [(1.0, 0.1, 10), (1.0, 1.0, 1), (1.0, 0.2, 5), (0.0, 0.1, 1), (0.5, 1.0, 1), (0.3, 0.1, 3)],
 )
 def test_a_residual_is_held_for_so_many_seconds_whatever_a_decision_takes(
     hold: float, decision_step: float, decisions: int
 ) -> None:
-    assert PolicySettings(hold=hold).decisions_held(decision_step) == decisions
+    assert PolicySettings(action_duration=hold).action_repeat(decision_step) == decisions

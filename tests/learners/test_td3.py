@@ -43,7 +43,7 @@ def test_targets_start_as_what_they_follow() -> None:
 
 
 def test_td3_learns_nothing_before_its_start_is_driven_and_keeps_its_noise() -> None:
-    settings = TD3Settings(start_steps=1700, updates_per_step=0.02, batch=8)
+    settings = TD3Settings(learning_starts=1700, gradient_steps_per_step=0.02, batch_size=8)
     toy = Toy(PolicySettings(hidden=(16,), exploration_std=0.1), settings, "td3").learn(4)
     updates = [entry.log.get("n_updates", 0.0) for entry in toy.iterations]
     assert updates == [0.0, 0.0, 48.0, 64.0]  # 800 actual steps in each iteration
@@ -52,7 +52,7 @@ def test_td3_learns_nothing_before_its_start_is_driven_and_keeps_its_noise() -> 
 
 
 def test_the_policy_is_updated_once_for_so_many_updates_of_its_critics() -> None:
-    settings = TD3Settings(start_steps=0, updates_per_step=0.01, batch=8, policy_delay=4)
+    settings = TD3Settings(learning_starts=0, gradient_steps_per_step=0.01, batch_size=8, policy_delay=4)
     tensors = Toy(settings=settings, agent="td3").learn(1).parameters()
     steps = {part: int(tensors[f"{part}.optimizer/0/step"]) for part in ("actor", "critic")}
     assert steps == {"actor": 2, "critic": 8}
@@ -61,7 +61,7 @@ def test_the_policy_is_updated_once_for_so_many_updates_of_its_critics() -> None
 def test_eps_pi_is_that_of_the_exploration_noise_about_the_residual() -> None:
     toy = Toy(agent="td3").learn(2)
     seen = torch.as_tensor(random_rows(20, INPUTS + 1))
-    noise = toy.learner.gaussians(seen)
+    noise = toy.learner.residual_distribution(seen)
     mean, std = noise.mean, noise.stddev
     network = toy.learner.network()
     np.testing.assert_allclose(mean.numpy(), network(seen[:, :INPUTS].numpy().astype(float)), atol=1e-6)
@@ -69,7 +69,7 @@ def test_eps_pi_is_that_of_the_exploration_noise_about_the_residual() -> None:
 
 
 def test_settings_reach_td3() -> None:
-    settings = TD3Settings(gamma=0.9, tau=0.1, rate=0.02, batch=33, buffer_rows=77, policy_delay=3)
+    settings = TD3Settings(gamma=0.9, tau=0.1, learning_rate=0.02, batch_size=33, buffer_size=77, policy_delay=3)
     learner: Any = Toy(settings=settings, agent="td3").learner.sb3
     assert (learner.gamma, learner.tau, learner.batch_size, learner.policy_delay) == (0.9, 0.1, 33, 3)
     assert (learner.target_policy_noise, learner.target_noise_clip) == (0.2, 0.5)
@@ -79,5 +79,5 @@ def test_settings_reach_td3() -> None:
 
 
 def test_a_policy_may_begin_as_its_weights_are_drawn() -> None:
-    policy = fresh(PolicySettings(begin_at_expert=False))
+    policy = fresh(PolicySettings(zero_init=False))
     assert residual_of(policy, random_rows(200, 5, 0)).std() > 0.001

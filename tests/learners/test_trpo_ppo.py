@@ -11,7 +11,7 @@ from tests.learners.task import INPUTS, Toy, make_policy, of_any_size, random_ro
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
-from unjam.learners.experience import discounted_returns, experience_of
+from unjam.learners.experience import discounted_returns, make_experience
 from unjam.learners.learner import policy_spaces
 from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
 from unjam.learners.trpo_ppo import ResidualPolicy
@@ -42,14 +42,14 @@ def test_the_residual_of_a_fresh_policy_is_exactly_zero(seed: int) -> None:
 
 def test_a_policy_may_begin_as_its_weights_are_drawn() -> None:
     rows = random_rows(200, 5, 0)
-    assert mean_of(fresh(PolicySettings(begin_at_expert=False)), rows).std() > 0.01
+    assert mean_of(fresh(PolicySettings(zero_init=False)), rows).std() > 0.01
 
 
 @pytest.mark.parametrize("hold", [1, 10])
 @pytest.mark.parametrize("cavs", [1, 3])
 def test_a_fresh_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simulation: Simulation) -> None:
     ring = Ring(length=(230, 230), horizon=200, warmup=100, cavs=cavs)
-    expert, parts = PISaturation(), PolicySettings().observe
+    expert, parts = PISaturation(), PolicySettings().inputs
     network = fresh(inputs=observation_size(parts, expert)).network()
     driver = ResidualDriver(expert, network, ring.action_limit, parts, hold)
     alone = run_episode(ring, expert, (3,), simulation=simulation)
@@ -57,9 +57,9 @@ def test_a_fresh_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simul
     np.testing.assert_array_equal(together.speeds, alone.speeds)
     np.testing.assert_array_equal(together.positions, alone.positions)
     for ours, theirs in zip(together.trajectories, alone.trajectories, strict=True):
-        np.testing.assert_array_equal(ours.applied, theirs.applied)
+        np.testing.assert_array_equal(ours.applied_acceleration, theirs.applied_acceleration)
         assert (ours.residual == 0.0).all()
-    assert np.abs(alone.trajectories[0].applied).max() > 0.1
+    assert np.abs(alone.trajectories[0].applied_acceleration).max() > 0.1
 
 
 @of_any_size
@@ -85,10 +85,8 @@ def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
 
 def test_actor_and_critic_learn_at_rates_of_their_own() -> None:
     policy = fresh(critic_inputs=2)
-    policy.set_rates(actor=0.1, critic=0.2)
-    rates = {
-        id(parameter): group["lr"] for group in policy.optimizer.param_groups for parameter in group["params"]
-    }
+    policy.set_learning_rates(actor=0.1, critic=0.2)
+    rates = {id(parameter): group["lr"] for group in policy.optimizer.param_groups for parameter in group["params"]}
     for name, parameter in policy.named_parameters():
         assert rates.pop(id(parameter)) == (0.2 if "value" in name else 0.1), name
     assert not rates
@@ -127,7 +125,7 @@ def test_the_critic_also_sees_what_the_actor_sees() -> None:
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_explores_at_the_start_with_the_standard_deviation_that_was_set(learned: bool) -> None:
-    settings = PolicySettings(exploration_std=0.25, learn_exploration=learned)
+    settings = PolicySettings(exploration_std=0.25, learn_exploration_std=learned)
     policy = fresh(settings, action_limit=2.0)
     assert policy.network().exploration_std == pytest.approx(0.5, rel=1e-6)
     torch.manual_seed(0)
@@ -140,7 +138,7 @@ def test_noise_that_lasts_is_as_wide_in_the_network_as_the_policy_reckons() -> N
     shake(policy, 3)
     network, rows = policy.network(), random_rows(6, 5)
     assert network.exploration_std == pytest.approx(0.2, rel=1e-6)
-    noise = np.random.default_rng(0).normal(size=(20_000, 1, network.noise_numbers))
+    noise = np.random.default_rng(0).normal(size=(20_000, 1, network.episode_noise_size))
     drawn = np.stack([network.explore(rows.astype(float), each) for each in noise])
     with torch.no_grad():
         expected = cast(Normal, policy.get_distribution(torch.as_tensor(rows)).distribution)
@@ -155,13 +153,13 @@ def test_noise_that_lasts_tries_something_where_all_units_are_at_rest() -> None:
         at_rest = cast(Normal, policy.get_distribution(torch.zeros(1, 5)).distribution)
     assert float(at_rest.stddev) == pytest.approx(0.2, rel=1e-4)
     network = policy.network()
-    bias_alone = np.eye(network.noise_numbers)[-1:]
+    bias_alone = np.eye(network.episode_noise_size)[-1:]
     assert network.explore(np.zeros((1, 5)), bias_alone)[0] == pytest.approx(0.2, rel=1e-6)
 
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_exploration_is_among_the_parameters_only_where_it_is_learned(learned: bool) -> None:
-    policy = fresh(PolicySettings(learn_exploration=learned))
+    policy = fresh(PolicySettings(learn_exploration_std=learned))
     assert ("log_std" in dict(policy.named_parameters())) is learned
     optimised = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
     assert (id(policy.log_std) in optimised) is learned
@@ -213,7 +211,7 @@ def test_each_update_stays_within_the_trust_region() -> None:
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_exploration_changes_only_where_it_is_learned(learned: bool) -> None:
-    policy = PolicySettings(hidden=(8,), exploration_std=0.2, learn_exploration=learned)
+    policy = PolicySettings(hidden=(8,), exploration_std=0.2, learn_exploration_std=learned)
     task = Toy(policy).learn(3)
     found = task.learner.network().exploration_std
     assert (found == task.networks[0].exploration_std) is not learned
@@ -227,10 +225,10 @@ def same_mean(one: Network, other: Network) -> bool:
 
 @pytest.mark.parametrize("normalise", [True, False])
 def test_units_of_the_value_come_from_the_first_iteration(normalise: bool) -> None:
-    policy = PolicySettings(hidden=(8,), normalise_value=normalise)
+    policy = PolicySettings(hidden=(8,), normalize_value=normalise)
     task = Toy(policy).learn(3)
     trajectories = [episode.trajectories[0] for episode in task.iterations[0].episodes[0]]
-    returns = discounted_returns(experience_of(trajectories, [()] * len(trajectories)), 0.99)
+    returns = discounted_returns(make_experience(trajectories, [()] * len(trajectories)), 0.99)
     expected = [returns.mean(), returns.std()] if normalise else [0.0, 1.0]
     assert task.parameters()["policy/value_net.scale"].tolist() == pytest.approx(expected, rel=1e-5)
 
@@ -244,15 +242,9 @@ def test_the_units_of_a_value_that_never_changes_stay_usable() -> None:
 
 def test_settings_reach_the_learner() -> None:
     settings = TRPOSettings(
-        gamma=0.9,
-        gae_lambda=0.5,
-        target_kl=0.07,
-        cg_damping=0.2,
-        cg_steps=7,
-        critic_epochs=4,
-        critic_batch=33,
+        gamma=0.9, gae_lambda=0.5, target_kl=0.07, cg_damping=0.2, cg_max_steps=7, critic_epochs=4, critic_batch_size=33
     )
-    learner: Any = Toy(settings=replace(settings, critic_rate=0.02, value_l2=0.3)).learner.sb3
+    learner: Any = Toy(settings=replace(settings, critic_learning_rate=0.02, critic_weight_decay=0.3)).learner.sb3
     (group,) = learner.policy.optimizer.param_groups
     assert (learner.rollout_buffer.gamma, learner.rollout_buffer.gae_lambda) == (0.9, 0.5)
     assert (learner.target_kl, learner.cg_damping, learner.cg_max_steps) == (0.07, 0.2, 7)
@@ -262,11 +254,15 @@ def test_settings_reach_the_learner() -> None:
 
 def test_the_decay_of_the_value_network_leaves_the_actor_alone() -> None:
     def actor(value_l2: float) -> dict[str, Any]:
-        found = Toy(settings=TRPOSettings(value_l2=value_l2, critic_rate=0.01)).learn(1).parameters()
+        found = (
+            Toy(settings=TRPOSettings(critic_weight_decay=value_l2, critic_learning_rate=0.01)).learn(1).parameters()
+        )
         return {name: tensor for name, tensor in found.items() if "value" not in name and "policy/" in name}
 
     def critic(value_l2: float) -> torch.Tensor:
-        found = Toy(settings=TRPOSettings(value_l2=value_l2, critic_rate=0.01)).learn(1).parameters()
+        found = (
+            Toy(settings=TRPOSettings(critic_weight_decay=value_l2, critic_learning_rate=0.01)).learn(1).parameters()
+        )
         return found["policy/value_net.linear.weight"]
 
     assert same(actor(0.0), actor(5.0))
@@ -274,7 +270,9 @@ def test_the_decay_of_the_value_network_leaves_the_actor_alone() -> None:
 
 
 def test_settings_reach_ppo() -> None:
-    settings = PPOSettings(gamma=0.9, gae_lambda=0.5, clip=0.3, epochs=4, actor_rate=0.01, critic_rate=0.02)
+    settings = PPOSettings(
+        gamma=0.9, gae_lambda=0.5, clip_range=0.3, epochs=4, actor_learning_rate=0.01, critic_learning_rate=0.02
+    )
     learner: Any = Toy(settings=settings, agent="ppo").learn(1).learner.sb3
     assert (learner.rollout_buffer.gamma, learner.rollout_buffer.gae_lambda) == (0.9, 0.5)
     assert learner.clip_range(1.0) == 0.3
@@ -291,7 +289,7 @@ def test_each_epoch_of_ppo_takes_all_rows_in_so_many_parts(minibatches: int, ste
 
 def test_actor_and_critic_of_ppo_learn_at_their_own_rates() -> None:
     def moved(actor_rate: float, critic_rate: float) -> dict[bool, float]:
-        settings = PPOSettings(epochs=5, actor_rate=actor_rate, critic_rate=critic_rate)
+        settings = PPOSettings(epochs=5, actor_learning_rate=actor_rate, critic_learning_rate=critic_rate)
         task = Toy(settings=settings, agent="ppo")
         before = task.parameters()
         after = task.learn(2).parameters()

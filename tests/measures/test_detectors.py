@@ -10,8 +10,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from unjam.errors import InputError
-from unjam.measures.detectors import COLUMNS, Measurement, agreement, detected, geh, read_detectors
-from unjam.worlds.sumo.detectors import Passage
+from unjam.measures.detectors import (
+    DETECTOR_COLUMNS,
+    Measurement,
+    aggregate_passages,
+    compute_agreement,
+    geh,
+    read_detectors,
+)
+from unjam.worlds.sumo.detectors import DetectorPassage
 
 HEAD = "edge,position,begin,end,flow_veh_per_h,speed"
 
@@ -38,16 +45,14 @@ measurements = st.builds(
 def test_what_is_written_is_read_again(rows: list[Measurement], kind: str, tmp_path: Path) -> None:
     texts = [["" if isnan(value) else repr(value) for value in list(vars(row).values())[1:]] for row in rows]
     lines = [",".join([row.place, *values]) for row, values in zip(rows, texts, strict=True)]
-    found_kind, found = read_detectors(file_of(tmp_path, ",".join((kind, *COLUMNS)), *lines))
+    found_kind, found = read_detectors(file_of(tmp_path, ",".join((kind, *DETECTOR_COLUMNS)), *lines))
     assert found_kind == kind
     assert str(found) == str(rows)  # NaN is not equal to itself
 
 
 def test_other_columns_orders_and_a_byte_order_mark_are_fine(tmp_path: Path) -> None:
     path = tmp_path / "detectors.csv"
-    path.write_text(
-        "speed,name,lane,position,begin,end,flow_veh_per_h\n20,a,e_0,5,0,60,900\n", encoding="utf-8-sig"
-    )
+    path.write_text("speed,name,lane,position,begin,end,flow_veh_per_h\n20,a,e_0,5,0,60,900\n", encoding="utf-8-sig")
     assert read_detectors(path) == ("lane", [Measurement("e_0", 5.0, 0.0, 60.0, 900.0, 20.0)])
 
 
@@ -97,7 +102,7 @@ def test_geh_is_that_of_the_manual() -> None:
 
 def test_agreement_is_worked_by_hand() -> None:
     rows = [Measurement("a", 0, 0, 60, 1000, 20), Measurement("a", 0, 60, 120, 50, nan)]
-    found = agreement(rows, np.array([1100.0, 100.0]), np.array([17.0, 30.0]))
+    found = compute_agreement(rows, np.array([1100.0, 100.0]), np.array([17.0, 30.0]))
     assert found.geh == pytest.approx((3.0861 + 5.7735) / 2, abs=1e-4)
     assert found.geh_below_5 == 0.5
     assert found.flow_rmse == pytest.approx(np.sqrt((100**2 + 50**2) / 2))
@@ -106,18 +111,18 @@ def test_agreement_is_worked_by_hand() -> None:
 
 
 def test_traffic_that_never_arrives_has_no_speed() -> None:
-    found = agreement([Measurement("a", 0, 0, 60, 600, 20)], np.array([0.0]), np.array([nan]))
+    found = compute_agreement([Measurement("a", 0, 0, 60, 600, 20)], np.array([0.0]), np.array([nan]))
     assert found.speed_rmse == 20.0
 
 
 def test_passages_make_flows_and_speeds_of_each_interval() -> None:
-    rows = [
-        Measurement("a", 0, 0, 60, 0, 0),
-        Measurement("a", 0, 60, 180, 0, 0),
-        Measurement("b", 0, 0, 60, 0, 0),
+    rows = [Measurement("a", 0, 0, 60, 0, 0), Measurement("a", 0, 60, 180, 0, 0), Measurement("b", 0, 0, 60, 0, 0)]
+    passed = [
+        DetectorPassage(0, "x", 0.0, 10.0),
+        DetectorPassage(1, "y", 59.9, 20.0),
+        DetectorPassage(0, "z", 60.0, 30.0),
     ]
-    passed = [Passage(0, "x", 0.0, 10.0), Passage(1, "y", 59.9, 20.0), Passage(0, "z", 60.0, 30.0)]
-    flows, speeds = detected(rows, [(0, 1), (0, 1), (2,)], passed)
+    flows, speeds = aggregate_passages(rows, [(0, 1), (0, 1), (2,)], passed)
     assert list(flows) == [120.0, 30.0, 0.0]
     assert speeds[:2] == pytest.approx([15.0, 30.0])
     assert isnan(speeds[2])
@@ -125,22 +130,26 @@ def test_passages_make_flows_and_speeds_of_each_interval() -> None:
 
 def test_who_changes_lanes_over_the_loops_of_an_edge_is_counted_once() -> None:
     rows = [Measurement("a", 0, 0, 600, 0, 0)]
-    passed = [Passage(0, "x", 1.0, 10.0), Passage(1, "x", 1.4, 12.0), Passage(0, "x", 300.0, 14.0)]
-    flows, speeds = detected(rows, [(0, 1)], passed)
+    passed = [
+        DetectorPassage(0, "x", 1.0, 10.0),
+        DetectorPassage(1, "x", 1.4, 12.0),
+        DetectorPassage(0, "x", 300.0, 14.0),
+    ]
+    flows, speeds = aggregate_passages(rows, [(0, 1)], passed)
     assert flows[0] == 2 * 6  # a lap later it passes once more
     assert speeds[0] == 12.0
 
 
 def test_a_passage_without_a_speed_counts_in_the_flow_alone() -> None:
     rows = [Measurement("a", 0, 0, 60, 0, 0), Measurement("a", 0, 60, 120, 0, 0)]
-    passed = [Passage(0, "x", 1.0, nan), Passage(1, "x", 1.4, 12.0), Passage(0, "y", 5.0, nan)]
-    flows, speeds = detected(rows, [(0, 1)] * 2, [*passed, Passage(0, "z", 70.0, nan)])
+    passed = [DetectorPassage(0, "x", 1.0, nan), DetectorPassage(1, "x", 1.4, 12.0), DetectorPassage(0, "y", 5.0, nan)]
+    flows, speeds = aggregate_passages(rows, [(0, 1)] * 2, [*passed, DetectorPassage(0, "z", 70.0, nan)])
     assert list(flows) == [120.0, 60.0]
     assert speeds[0] == 12.0
     assert isnan(speeds[1])
 
 
 def test_where_no_speed_was_measured_its_error_is_not_known() -> None:
-    found = agreement([Measurement("a", 0, 0, 60, 600, nan)], np.array([600.0]), np.array([20.0]))
+    found = compute_agreement([Measurement("a", 0, 0, 60, 600, nan)], np.array([600.0]), np.array([20.0]))
     assert isnan(found.speed_rmse)
     assert found.score == 0.0

@@ -6,21 +6,28 @@ from typing import Any
 
 import pytest
 
-from unjam.measures.effect import LEAST_JUDGED, Effect, beside_people, effect_of, harm_of, reasons_against
+from unjam.measures.effect import (
+    MIN_VERDICT_SEEDS,
+    Effect,
+    describe_harm,
+    effect_of,
+    effects_by_driver,
+    rejection_reasons,
+)
 from unjam.measures.statistics import Estimate, estimate
 
 USUAL: dict[str, Any] = {
     "status": "completed",
     "floor": 1.0,
     "collisions": 0.0,
-    "min_headway": 0.95,
+    "min_time_gap": 0.95,
     "cav_min_ttc": 1.5,
     "cav_max_braking": 5.0,
     "overridden": 0.0,
     "mean_speed": 20.0,
     "travel_time": 100.0,
     "delay": 40.0,
-    "throughput_veh_per_h": 2000.0,
+    "outflow_veh_per_h": 2000.0,
     "fuel_ml_per_km": 80.0,
     "people_beyond_4_5": 30.0,
 }
@@ -42,56 +49,56 @@ GOOD = Effect(
     fuel=NONE,
     hard_braking=between(-9.0, 3.0),
     collisions=0.0,
-    failed=0,
-    drivable="drivable",
-    people_time=100.0,
-    people_flow=2000.0,
-    delay_cut=Estimate(nan, nan, nan, 0),
+    failed_episodes=0,
+    feasibility="drivable",
+    baseline_travel_time=100.0,
+    baseline_flow=2000.0,
+    delay_reduction=Estimate(nan, nan, nan, 0),
     speed=NONE,
 )
 
 
 def test_words_say_what_everybody_gains() -> None:
-    known = replace(GOOD, delay_cut=between(0.06, 0.14))
-    assert known.words == (
+    known = replace(GOOD, delay_reduction=between(0.06, 0.14))
+    assert known.summary == (
         "travel time -4.0 [-6.0, -2.0] s (10 % [6, 14] less delay), flow +10 [-10, +30] veh/h, "
         "fuel +0.0 [+0.0, +0.0] ml/km"
     )
-    assert "delay" not in GOOD.words
+    assert "delay" not in GOOD.summary
     slower = replace(known, travel_time=between(2.0, 6.0))
-    assert slower.words.startswith("travel time +4.0 [+2.0, +6.0] s (more delay)")
-    assert "delay" not in replace(known, travel_time=between(-6.0, 1.0)).words  # it may be none
-    assert "flow -20 [-30, -10] veh/h: a loss" in replace(GOOD, flow=between(-30.0, -10.0)).words
+    assert slower.summary.startswith("travel time +4.0 [+2.0, +6.0] s (more delay)")
+    assert "delay" not in replace(known, travel_time=between(-6.0, 1.0)).summary  # it may be none
+    assert "flow -20 [-30, -10] veh/h: a loss" in replace(GOOD, flow=between(-30.0, -10.0)).summary
     nowhere = Estimate(nan, nan, nan, 0)
     closed = replace(GOOD, travel_time=nowhere, speed=between(0.1, 0.3))
-    assert closed.words.startswith("mean speed +0.20 [+0.10, +0.30] m/s, flow")
+    assert closed.summary.startswith("mean speed +0.20 [+0.10, +0.30] m/s, flow")
 
 
 def test_every_driver_is_seen_beside_people_who_are_there() -> None:
-    found = beside_people({"pi": rows_of([98.0, 99.0]), "human": rows_of([100.0, 100.0])})
+    found = effects_by_driver({"pi": rows_of([98.0, 99.0]), "human": rows_of([100.0, 100.0])})
     assert list(found) == ["pi"]
     assert found["pi"].travel_time.mean == -1.5
-    assert not beside_people({"pi": rows_of([98.0])})
+    assert not effects_by_driver({"pi": rows_of([98.0])})
 
 
 def test_the_share_of_delay_that_is_saved_has_an_interval_of_its_own() -> None:
     people = [{**row, "delay": row["travel_time"] - 60.0} for row in rows_of([90.0, 100.0, 120.0])]
-    half = effect_of(rows_of([75.0, 80.0, 90.0]), people).delay_cut
+    half = effect_of(rows_of([75.0, 80.0, 90.0]), people).delay_reduction
     assert (half.mean, half.low, half.high) == pytest.approx((0.5, 0.5, 0.5))  # on each seed
-    assert effect_of(rows_of([75.0, 80.0, nan]), people).delay_cut.count == 2
+    assert effect_of(rows_of([75.0, 80.0, nan]), people).delay_reduction.count == 2
     nobody_arrived = [{**row, "delay": -40.0} for row in people]
-    assert effect_of(rows_of([75.0] * 3), nobody_arrived).delay_cut.count == 0
+    assert effect_of(rows_of([75.0] * 3), nobody_arrived).delay_reduction.count == 0
 
 
 def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:
     people = rows_of([100.0, 120.0, 140.0, 999.0])
-    found = effect_of(rows_of([98.0, 117.0, 136.0], throughput_veh_per_h=1990.0), people)
+    found = effect_of(rows_of([98.0, 117.0, 136.0], outflow_veh_per_h=1990.0), people)
     assert (found.travel_time.mean, found.travel_time.count) == (-3.0, 3)
     assert found.travel_time == estimate([-2.0, -3.0, -4.0])
     assert found.flow == Estimate(-10.0, -10.0, -10.0, 3)
-    assert (found.people_time, found.people_flow) == (120.0, 2000.0)
-    assert found.relative_time == -3.0 / 120.0
-    assert found.width == (found.travel_time.high - found.travel_time.low) / 2 / 120.0
+    assert (found.baseline_travel_time, found.baseline_flow) == (120.0, 2000.0)
+    assert found.relative_travel_time == -3.0 / 120.0
+    assert found.relative_half_width == (found.travel_time.high - found.travel_time.low) / 2 / 120.0
 
 
 def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -> None:
@@ -99,33 +106,30 @@ def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -
     rows[0] |= {"status": "collision", "collisions": 2.0}
     rows[2] |= {"status": "failed", "collisions": nan}
     found = effect_of(rows, rows_of([100.0] * 3))
-    assert (found.collisions, found.failed, found.ended_early) == (2.0, 1, 1)
+    assert (found.collisions, found.failed_episodes, found.early_ends) == (2.0, 1, 1)
     assert (found.travel_time.count, found.travel_time.mean) == (1, -2.0), "of the complete episode"
-    assert found.drivable == "2 vehicles in contact (1 of 3)"
+    assert found.feasibility == "2 vehicles in contact (1 of 3)"
     assert found.hard_braking.mean == 470.0
-    assert effect_of(rows_of([99.0], people_beyond_4_5=500.0), rows_of([100.0])).drivable == "drivable"
+    assert effect_of(rows_of([99.0], people_beyond_4_5=500.0), rows_of([100.0])).feasibility == "drivable"
 
 
 def test_more_confidence_is_a_wider_interval() -> None:
     people, rows = rows_of([100.0] * 12), rows_of([99.0 + 0.3 * number for number in range(12)])
-    assert effect_of(rows, people, 0.99).width > effect_of(rows, people).width > 0
+    assert effect_of(rows, people, 0.99).relative_half_width > effect_of(rows, people).relative_half_width > 0
 
 
 def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
-    assert reasons_against(GOOD) == []
-    assert harm_of(GOOD) == ""
-    assert reasons_against(replace(GOOD, flow=NONE, hard_braking=NONE)) == []
+    assert rejection_reasons(GOOD) == []
+    assert describe_harm(GOOD) == ""
+    assert rejection_reasons(replace(GOOD, flow=NONE, hard_braking=NONE)) == []
 
 
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"travel_time": between(-6, -2, LEAST_JUDGED - 1)}, "9 test seeds are too few"),
+        ({"travel_time": between(-6, -2, MIN_VERDICT_SEEDS - 1)}, "9 test seeds are too few"),
         ({"failed": 3}, "3 episodes failed"),
-        (
-            {"travel_time": between(1, 3)},
-            "travel time is longer than that of the human baseline: +2.0 [+1.0, +3.0] s",
-        ),
+        ({"travel_time": between(1, 3)}, "travel time is longer than that of the human baseline: +2.0 [+1.0, +3.0] s"),
         (
             {"travel_time": between(-6, 0)},
             "travel time is not shown to be shorter than that of the human baseline: -3.0 [-6.0, +0.0] s",
@@ -142,7 +146,7 @@ def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
     ],
 )
 def test_each_failing_is_one_reason(changes: dict[str, Any], reason: str) -> None:
-    assert reasons_against(replace(GOOD, **changes)) == [reason]
+    assert rejection_reasons(replace(GOOD, **changes)) == [reason]
 
 
 @pytest.mark.parametrize("time", [between(0.1, 0.4), between(-0.4, -0.1), between(-0.3, 0.4)])
@@ -150,9 +154,7 @@ def test_a_difference_below_half_a_percent_is_no_gain_and_no_harm(time: Estimate
     found = replace(GOOD, travel_time=time)  # of 100 s
     assert harm_of(found) == ""
     (reason,) = reasons_against(found)
-    assert reason.startswith(
-        "travel time differs from that of the human baseline by less than 0.5 %, which is "
-    )
+    assert reason.startswith("travel time differs from that of the human baseline by less than 0.5 %, which is ")
     lower = replace(found, flow=between(-150.0, -50.0))
     assert harm_of(lower) == "flow is lower than that of the human baseline: -100 [-150, -50] veh/h"
 
@@ -166,7 +168,7 @@ def test_a_difference_that_may_be_half_a_percent_is_not_too_small(time: Estimate
 
 def test_speed_does_not_excuse_a_loss_of_flow_and_all_reasons_are_told() -> None:
     found = replace(GOOD, travel_time=between(-60, -50), flow=between(-99, -50), drivable="2 in contact")
-    assert [reason.split(":")[0] for reason in reasons_against(found)] == [
+    assert [reason.split(":")[0] for reason in rejection_reasons(found)] == [
         "flow is lower than that of the human baseline",
         "infeasible",
     ]
@@ -174,7 +176,7 @@ def test_speed_does_not_excuse_a_loss_of_flow_and_all_reasons_are_told() -> None
 
 def test_one_seed_has_no_interval_and_proves_nothing() -> None:
     found = effect_of(rows_of([50.0]), rows_of([100.0]))
-    reasons = reasons_against(found)
+    reasons = rejection_reasons(found)
     assert any("too few" in reason for reason in reasons)
     assert any("not shown to be shorter" in reason for reason in reasons)
     assert any("flow may be lower" in reason for reason in reasons)
@@ -182,7 +184,7 @@ def test_one_seed_has_no_interval_and_proves_nothing() -> None:
 
 def test_both_harms_are_told_where_both_are_shown() -> None:
     both = replace(GOOD, travel_time=between(2.0, 8.0), flow=between(-150.0, -50.0))
-    longer, lower = reasons_against(both)
+    longer, lower = rejection_reasons(both)
     assert longer == "travel time is longer than that of the human baseline: +5.0 [+2.0, +8.0] s"
     assert lower == "flow is lower than that of the human baseline: -100 [-150, -50] veh/h"
-    assert harm_of(both) == f"{longer}; {lower}"
+    assert describe_harm(both) == f"{longer}; {lower}"

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from unjam.drivers import LocalState
 from unjam.measures.metrics import METRICS, measure
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.audit import Audit, Following, following
-from unjam.worlds.closed import loop_neighbours, loop_state
-from unjam.worlds.earned import earned
+from unjam.worlds.audit import Audit, FollowingStatistics, following_statistics
+from unjam.worlds.closed_road import loop_neighbors, loop_state
+from unjam.worlds.episode_reward import episode_reward_terms
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode
 
 LENGTH = 200.0
@@ -42,10 +42,10 @@ def trajectory_of(states: LocalState, applied: ArrayLike = 0.0, **changes: Any) 
     return Trajectory(**{**values, **changes})
 
 
-def followed_in(states: LocalState, cavs: int, step: float) -> Following:
+def followed_in(states: LocalState, cavs: int, step: float) -> FollowingStatistics:
     """How the first `cavs` of vehicles followed, whose states have the shape (vehicles, moments)."""
     speed, leader, gap = (values[:cavs].T for values in states[:3])
-    return following(speed, leader, gap, step)
+    return following_statistics(speed, leader, gap, step)
 
 
 def episode_of(
@@ -55,7 +55,7 @@ def episode_of(
     moved = np.asarray(speeds, float)
     vehicles = moved.shape[1]
     positions = np.arange(vehicles) * (LENGTH / vehicles) + np.cumsum(moved, axis=0) * step - moved[0] * step
-    states = loop_state(moved.T, positions.T, loop_neighbours(np.arange(vehicles), vehicles), LENGTH)
+    states = loop_state(moved.T, positions.T, loop_neighbors(np.arange(vehicles), vehicles), LENGTH)
     angles = np.linspace(0, 2 * np.pi, 81)
     radius = LENGTH / (2 * np.pi)
     values: dict[str, Any] = {
@@ -72,7 +72,7 @@ def episode_of(
         "positions": positions,
         "gaps": states.leader_gap.T,
         "outline": np.column_stack([angles * radius, radius * np.cos(angles), radius * np.sin(angles)]),
-        "trajectories": tuple(trajectory_of(states.at(n), applied) for n in range(cavs)),
+        "trajectories": tuple(trajectory_of(states.select(n), applied) for n in range(cavs)),
     }
     return Episode(**{**values, **changes})
 
@@ -96,18 +96,12 @@ def test_traffic_at_one_speed_has_that_speed_and_no_waves() -> None:
     row = measure(episode_of(steady(4.0)))
     for name in ("mean_speed", "mean_speed_steady", "cav_mean_speed"):
         assert row[name] == pytest.approx(4.0)
-    for name in (
-        "speed_std_fleet",
-        "speed_std_fleet_steady",
-        "speed_std_cav",
-        "mean_abs_jerk",
-        "share_standing",
-    ):
+    for name in ("speed_std_fleet", "speed_std_fleet_steady", "speed_std_cav", "mean_abs_jerk", "share_standing"):
         assert row[name] == pytest.approx(0.0)
     assert row["speed_limit_ratio"] == row["speed_limit_ratio_steady"] == pytest.approx(0.5)
     assert row["min_ttc"] == np.inf
-    assert row["min_headway"] == pytest.approx((LENGTH / 5 - VEHICLE_LENGTH) / 4.0)
-    assert row["throughput_veh_per_h"] == pytest.approx(5 * 4.0 / LENGTH * 3600)
+    assert row["min_time_gap"] == pytest.approx((LENGTH / 5 - VEHICLE_LENGTH) / 4.0)
+    assert row["outflow_veh_per_h"] == pytest.approx(5 * 4.0 / LENGTH * 3600)
     assert row["steps"] == 100
 
 
@@ -208,20 +202,14 @@ def test_vehicles_that_are_not_on_the_road_are_left_out() -> None:
 def seen(**changes: list[float]) -> LocalState:
     """What a CAV perceives that follows at the speed of all others, but for `changes`."""
     steps = len(next(iter(changes.values())))
-    usual = {
-        "speed": 5.0,
-        "leader_speed": 5.0,
-        "leader_gap": 10.0,
-        "follower_speed": 5.0,
-        "follower_gap": 10.0,
-    }
+    usual = {"speed": 5.0, "leader_speed": 5.0, "leader_gap": 10.0, "follower_speed": 5.0, "follower_gap": 10.0}
     values = {name: np.full(steps, value) for name, value in usual.items()}
     values |= {name: np.array(value, float) for name, value in changes.items()}
     return LocalState(**values, route_position=np.zeros(steps), loop_length=np.full(steps, LENGTH))
 
 
 def with_states(states: LocalState) -> Episode:
-    column = states.each(lambda values: np.asarray(values)[None])
+    column = states.map(lambda values: np.asarray(values)[None])
     audit, cav = Audit(following=followed_in(column, 1, 0.1)), trajectory_of(states)
     return episode_of(steady(5.0, len(states.speed) - 1), trajectories=(cav,), audit=audit)
 
@@ -242,8 +230,8 @@ def test_time_to_collision_is_infinite_where_nobody_closes_in() -> None:
 
 def test_time_headway_counts_only_while_the_cav_moves() -> None:
     states = seen(speed=[0.5, 1.0, 2.0, 5.0], leader_gap=[0.1, 0.2, 3.0, 10.0])
-    assert metric("min_headway", with_states(states)) == pytest.approx(1.5)
-    assert np.isnan(metric("min_headway", with_states(seen(speed=[0.5, 0.9]))))
+    assert metric("min_time_gap", with_states(states)) == pytest.approx(1.5)
+    assert np.isnan(metric("min_time_gap", with_states(seen(speed=[0.5, 0.9]))))
 
 
 def test_jerk_of_a_speed_with_a_constant_one() -> None:
@@ -255,25 +243,17 @@ def test_jerk_of_a_speed_with_a_constant_one() -> None:
 
 def test_jerk_of_speeding_up_and_slowing_down_counts_both_ways() -> None:
     speeds = steady(4.0, 4)
-    speeds[:, 0] = [
-        4.0,
-        4.1,
-        4.1,
-        4.1,
-        4.0,
-    ]  # accelerations 1, 0, 0, -1: two changes of 1 in 0.1 s among three
+    speeds[:, 0] = [4.0, 4.1, 4.1, 4.1, 4.0]  # accelerations 1, 0, 0, -1: two changes of 1 in 0.1 s among three
     assert metric("mean_abs_jerk", episode_of(speeds)) == pytest.approx(2 * 10.0 / 3)
 
 
 def test_acceleration_is_what_the_cav_was_told() -> None:
-    assert metric(
-        "mean_abs_accel", episode_of(steady(4.0, 4), applied=[1.0, -0.5, 0.0, 0.5])
-    ) == pytest.approx(0.5)
+    assert metric("mean_abs_accel", episode_of(steady(4.0, 4), applied=[1.0, -0.5, 0.0, 0.5])) == pytest.approx(0.5)
 
 
 def test_throughput_is_the_flow_past_a_point_of_the_loop() -> None:
     speeds = np.tile([2.0, 4.0, 6.0, 8.0], (1001, 1))
-    assert metric("throughput_veh_per_h", episode_of(speeds)) == pytest.approx(20.0 / LENGTH * 3600)
+    assert metric("outflow_veh_per_h", episode_of(speeds)) == pytest.approx(20.0 / LENGTH * 3600)
 
 
 def test_fuel_of_a_constant_rate() -> None:
@@ -316,7 +296,7 @@ def test_a_collision_is_measured_up_to_its_end() -> None:
     assert row["mean_speed"] == pytest.approx(4.0)
     seen = (episode.speeds, episode.trajectories)
     crashed, calm = (
-        earned(lambda outcome: {"end": 1.0 * outcome.crashed}, *seen, end, episode.waiting)["end"]
+        episode_reward_terms(lambda outcome: {"end": 1.0 * outcome.has_crashed}, *seen, end, episode.backlog)["end"]
         for end in (True, False)
     )
     assert np.flatnonzero(crashed).tolist() == [20 - 1]
@@ -388,7 +368,7 @@ def test_speed_std_is_zero_exactly_where_all_drive_alike(speeds: Floats) -> None
 
 @given(SPEEDS, st.sampled_from([0.25, 2.0, 10.0]))
 def test_speeds_scale_with_the_unit_they_are_told_in(speeds: Floats, scale: float) -> None:
-    for name in ("mean_speed", "speed_std_fleet", "speed_std_cav", "cav_mean_speed", "throughput_veh_per_h"):
+    for name in ("mean_speed", "speed_std_fleet", "speed_std_cav", "cav_mean_speed", "outflow_veh_per_h"):
         told, scaled = metric(name, episode_of(speeds)), metric(name, episode_of(speeds * scale))
         assert scaled == pytest.approx(told * scale, abs=1e-9)
 
@@ -397,7 +377,7 @@ def test_speeds_scale_with_the_unit_they_are_told_in(speeds: Floats, scale: floa
 def test_the_fleets_metrics_do_not_depend_on_who_is_who(speeds: Floats, chance: Any) -> None:
     order = list(range(speeds.shape[1]))
     chance.shuffle(order)
-    for name in ("mean_speed", "speed_std_fleet", "share_standing", "throughput_veh_per_h"):
+    for name in ("mean_speed", "speed_std_fleet", "share_standing", "outflow_veh_per_h"):
         one, other = episode_of(speeds), episode_of(speeds[:, order])
         assert metric(name, one) == pytest.approx(metric(name, other), abs=1e-9)
 
@@ -413,11 +393,11 @@ def test_metrics_stay_within_their_bounds(speeds: Floats) -> None:
 
 @given(st.floats(0.5, 20.0), st.sampled_from([0.05, 0.1, 0.5]))
 def test_flow_of_even_traffic_is_its_density_times_its_speed(speed: float, step: float) -> None:
-    found = metric("throughput_veh_per_h", episode_of(steady(speed), step=step))
+    found = metric("outflow_veh_per_h", episode_of(steady(speed), step=step))
     assert found == pytest.approx(5 / LENGTH * speed * 3600)
 
 
-@pytest.mark.parametrize("name", ["mean_speed", "fuel_ml_per_km", "throughput_veh_per_h", "mean_abs_accel"])
+@pytest.mark.parametrize("name", ["mean_speed", "fuel_ml_per_km", "outflow_veh_per_h", "mean_abs_accel"])
 @pytest.mark.parametrize("times", [2, 5])
 def test_a_longer_episode_of_the_same_measures_the_same(name: str, times: int) -> None:
     def measured(steps: int) -> float:
@@ -459,9 +439,7 @@ def open_episode(speeds: ArrayLike, **changes: Any) -> Episode:
 def test_vehicles_count_while_they_are_on_the_road() -> None:
     episode = open_episode([[4.0, NAN], [4.0, 1.0], [NAN, 3.0], [NAN, 0.0]])
     assert metric("mean_speed", episode) == pytest.approx((4.0 + 1.0 + 3.0 + 0.0) / 4)
-    assert metric("mean_speed_steady", episode) == pytest.approx(
-        (3.0 + 0.0) / 2
-    )  # of three steps the last two
+    assert metric("mean_speed_steady", episode) == pytest.approx((3.0 + 0.0) / 2)  # of three steps the last two
     assert metric("speed_std_fleet", episode) == pytest.approx((1.5 + 0.0 + 0.0) / 3)
     assert metric("share_standing", episode) == pytest.approx(1 / 4)
     burnt = 4 * 100.0 / 742.0
@@ -471,9 +449,9 @@ def test_vehicles_count_while_they_are_on_the_road() -> None:
 
 def test_throughput_of_a_road_with_ends_is_who_left_it_and_backlog_who_waits_at_the_end() -> None:
     episode = open_episode(np.full((121, 3), 5.0), arrived=7, waiting=np.arange(121.0))
-    assert metric("throughput_veh_per_h", episode) == pytest.approx(7 * 30.0)
-    assert metric("backlog_veh", episode) == 120.0
-    assert metric("backlog_veh", episode_of(steady(4.0))) == 0.0
+    assert metric("outflow_veh_per_h", episode) == pytest.approx(7 * 30.0)
+    assert metric("insertion_backlog_veh", episode) == 120.0
+    assert metric("insertion_backlog_veh", episode_of(steady(4.0))) == 0.0
 
 
 def test_a_collision_makes_nobody_quicker_who_is_still_under_way() -> None:
@@ -485,12 +463,9 @@ def test_a_collision_makes_nobody_quicker_who_is_still_under_way() -> None:
 
 
 @pytest.mark.parametrize(
-    ("steps", "counted"),
-    [(1, 1), (2, 1), (3, 2), (10, 5), (999, 500), (1000, 500), (1001, 1000), (3000, 1000)],
+    ("steps", "counted"), [(1, 1), (2, 1), (3, 2), (10, 5), (999, 500), (1000, 500), (1001, 1000), (3000, 1000)]
 )
-def test_steady_are_the_last_thousand_steps_and_of_a_shorter_episode_its_second_half(
-    steps: int, counted: int
-) -> None:
+def test_steady_are_the_last_thousand_steps_and_of_a_shorter_episode_its_second_half(steps: int, counted: int) -> None:
     speeds = np.zeros((steps + 1, 3))
     speeds[-counted:] = 4.0
     assert metric("mean_speed_steady", episode_of(speeds)) == pytest.approx(4.0)
@@ -504,21 +479,13 @@ def test_an_episode_in_which_nobody_came_is_measured_without_complaint() -> None
         warnings.simplefilter("error")
         for vehicles in (0, 2):
             row = measure(open_episode(np.full((700, vehicles), np.nan)))
-            for name in (
-                "mean_speed",
-                "mean_speed_steady",
-                "speed_std_fleet",
-                "share_standing",
-                "fuel_ml_per_km",
-            ):
+            for name in ("mean_speed", "mean_speed_steady", "speed_std_fleet", "share_standing", "fuel_ml_per_km"):
                 assert np.isnan(row[name])
-            assert row["throughput_veh_per_h"] == row["backlog_veh"] == 0.0
+            assert row["outflow_veh_per_h"] == row["insertion_backlog_veh"] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("peak", "flow"), [((60.0, 90.0), 3600.0), ((0.0, 90.0), 1200.0), ((150.0, 200.0), 1440.0)]
-)
+@pytest.mark.parametrize(("peak", "flow"), [((60.0, 90.0), 3600.0), ((0.0, 90.0), 1200.0), ((150.0, 200.0), 1440.0)])
 def test_flow_of_a_peak_is_of_the_peak_alone(peak: tuple[float, float], flow: float) -> None:
     # Somebody leaves every second from the sixtieth on; where the peak never comes all of it counts.
     speeds = np.where(np.arange(101)[:, None] <= np.arange(60, 160), 10.0, np.nan)
-    assert metric("throughput_veh_per_h", open_episode(speeds, peak=peak)) == pytest.approx(flow)
+    assert metric("outflow_veh_per_h", open_episode(speeds, peak=peak)) == pytest.approx(flow)

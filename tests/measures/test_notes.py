@@ -5,11 +5,11 @@ from typing import Any
 import pytest
 
 from unjam.errors import InputError
-from unjam.measures.notes import MOST_KINDS, check_baseline, early_ends, notes_of_rows
+from unjam.measures.notes import MAX_WARNING_KINDS, check_baseline, count_early_ends, episode_notes
 
 
 def rows_of(count: int, **changes: Any) -> list[dict[str, Any]]:
-    usual = {"status": "completed", "reason": "", "teleports": 0, "backlog_veh": 0.0, "vehicles": 50}
+    usual = {"status": "completed", "reason": "", "teleports": 0, "insertion_backlog_veh": 0.0, "vehicles": 50}
     return [{**usual, "warnings": [], "seed": seed, **changes} for seed in range(count)]
 
 
@@ -19,14 +19,14 @@ def warning(kind: str, example: str, count: int = 1) -> dict[str, Any]:
 
 def test_complete_episodes_without_warnings_have_no_notes() -> None:
     failed = {"seed": 9, "status": "failed", "teleports": 0, "reason": "no", "warnings": []}
-    assert notes_of_rows({"human": rows_of(3), "pi": [*rows_of(2), failed]}) == []
+    assert episode_notes({"human": rows_of(3), "pi": [*rows_of(2), failed]}) == []
 
 
 def test_a_note_says_how_many_episodes_of_which_driver_ended_early_and_why() -> None:
     stopped = rows_of(1, status="teleports", reason="more than 0 teleports (max-num-teleports)")
     rows = [*rows_of(2), *rows_of(2, status="collision"), *stopped]
-    assert early_ends(rows) == {"collision": 2, "more than 0 teleports (max-num-teleports)": 1}
-    assert notes_of_rows({"human": rows_of(5), "pi": rows, "acc": stopped}) == [
+    assert count_early_ends(rows) == {"collision": 2, "more than 0 teleports (max-num-teleports)": 1}
+    assert episode_notes({"human": rows_of(5), "pi": rows, "acc": stopped}) == [
         "pi: 3 of 5 episodes ended early: collision (2), more than 0 teleports (max-num-teleports) (1); "
         "means are over complete episodes only",
         "acc: 1 of 1 episodes ended early: more than 0 teleports (max-num-teleports); "
@@ -38,51 +38,40 @@ def test_each_kind_of_warning_is_shown_once_with_its_count_and_missing_demand_fi
     stops = [warning("stop %", f"stop {number}", 3) for number in range(3)]
     lost = warning("Route file should be sorted by departure time, ignoring '%'!", "ignoring 'c'!")
     rows = {"human": rows_of(2, warnings=[stops[0], lost]), "pi": rows_of(1, warnings=[stops[1]])}
-    assert notes_of_rows(rows) == [
+    assert episode_notes(rows) == [
         "demand is missing, SUMO warns: ignoring 'c'! (2 warnings of this kind in 2 of 3 episodes)",
         "SUMO warns: stop 0 (9 warnings of this kind in 3 of 3 episodes)",
     ]
-    assert notes_of_rows({"human": rows_of(1, warnings=[warning("x", "x")])}) == ["SUMO warns: x"]
+    assert episode_notes({"human": rows_of(1, warnings=[warning("x", "x")])}) == ["SUMO warns: x"]
 
 
 def test_many_kinds_of_warnings_are_few_notes() -> None:
     kinds = [warning(f"kind {number}", f"kind {number}", 100 - number) for number in range(40)]
-    *shown, rest = notes_of_rows({"human": rows_of(1, warnings=kinds)})
-    assert len(shown) == MOST_KINDS
+    *shown, rest = episode_notes({"human": rows_of(1, warnings=kinds)})
+    assert len(shown) == MAX_WARNING_KINDS
     assert shown[0].startswith("SUMO warns: kind 0 ")
     assert rest == "SUMO warns of 30 other kinds of things, less often"
 
 
 @pytest.mark.parametrize(("backlog", "noted"), [(2.0, False), (10.0, True)])
 def test_vehicles_that_never_entered_are_noted(backlog: float, noted: bool) -> None:
-    notes = notes_of_rows({"human": rows_of(2, backlog_veh=backlog)})
+    notes = episode_notes({"human": rows_of(2, insertion_backlog_veh=backlog)})
     assert (
         notes
-        == ["human: 20 of 120 vehicles had not entered by the end: they wait in the insertion backlog"][
-            : int(noted)
-        ]
+        == ["human: 20 of 120 vehicles had not entered by the end: they wait in the insertion backlog"][: int(noted)]
     )
 
 
 def test_teleports_are_noted() -> None:
     note = "human: SUMO teleported or removed 6 vehicles that had stood for its time-to-teleport or collided"
-    assert notes_of_rows({"human": rows_of(2, teleports=3)}) == [note]
+    assert episode_notes({"human": rows_of(2, teleports=3)}) == [note]
 
 
 @pytest.mark.parametrize(
     ("early", "complete", "planned", "refused"),
-    [
-        (1, 19, 0, False),
-        (2, 18, 0, True),
-        (1, 1, 20, False),
-        (2, 0, 20, True),
-        (1, 1, 0, True),
-        (0, 2, 0, False),
-    ],
+    [(1, 19, 0, False), (2, 18, 0, True), (1, 1, 20, False), (2, 0, 20, True), (1, 1, 0, True), (0, 2, 0, False)],
 )
-def test_a_baseline_that_often_ends_early_is_refused(
-    early: int, complete: int, planned: int, refused: bool
-) -> None:
+def test_a_baseline_that_often_ends_early_is_refused(early: int, complete: int, planned: int, refused: bool) -> None:
     rows = [*rows_of(complete), *rows_of(early, status="teleports", reason="more than 0 teleports")]
     if not refused:
         check_baseline(rows, planned)

@@ -7,20 +7,20 @@ import pytest
 
 from tests.measures.test_effect import GOOD, between
 from unjam.measures.effect import (
-    LEAST_JUDGED,
+    MIN_VERDICT_SEEDS,
     AccResult,
-    Judged,
-    headline,
-    recommended,
-    seeds_for_verdict,
-    shown_beside,
+    ControllerResult,
+    assessment_headline,
+    plotted_result,
+    recommended_result,
+    required_seeds,
 )
 from unjam.measures.statistics import Estimate
 
 BEYOND = between(-3.0, -1.0)
-HELPS = Judged(0.05, "acc", GOOD, BEYOND)
-HELPS_MORE = Judged(0.2, "pi", replace(GOOD, travel_time=between(-12.0, -8.0)), BEYOND)
-QUICK_AND_WRONG = Judged(
+HELPS = ControllerResult(0.05, "acc", GOOD, BEYOND)
+HELPS_MORE = ControllerResult(0.2, "pi", replace(GOOD, travel_time=between(-12.0, -8.0)), BEYOND)
+QUICK_AND_WRONG = ControllerResult(
     0.1, "mine.py:bold", replace(GOOD, travel_time=between(-50, -40), flow=between(-90, -50)), BEYOND
 )
 ACC_HELPS = AccResult(0.2, GOOD)
@@ -28,7 +28,7 @@ ACC_CHANGES_NOTHING = AccResult(0.2, replace(GOOD, travel_time=between(-1.0, 1.0
 
 
 def test_what_passes_is_recommended_with_its_numbers() -> None:
-    assert HELPS.words == (
+    assert HELPS.summary == (
         "acc at a penetration rate of 5 %: recommended. Travel time -4.0 [-6.0, -2.0] s (-4.0 %), flow "
         "+10 [-10, +30] veh/h, fuel +0.0 [+0.0, +0.0] ml/km compared with the human baseline; travel time "
         "-2.0 [-3.0, -1.0] s compared with ACC vehicles alone; 20 test seeds."
@@ -36,7 +36,7 @@ def test_what_passes_is_recommended_with_its_numbers() -> None:
 
 
 def test_a_refusal_says_why() -> None:
-    assert QUICK_AND_WRONG.words == (
+    assert QUICK_AND_WRONG.summary == (
         "mine.py:bold at a penetration rate of 10 %: not recommended: flow is lower than that of the human "
         "baseline: -70 [-90, -50] veh/h."
     )
@@ -50,16 +50,14 @@ def test_a_refusal_says_why() -> None:
         (Estimate(nan, nan, nan, 0), "not shown to be shorter than with ACC vehicles alone"),
     ],
 )
-def test_a_gain_that_acc_vehicles_have_too_is_no_reason_for_a_controller(
-    beyond: Estimate, shown: str
-) -> None:
-    found = replace(HELPS, beyond_acc=beyond)
+def test_a_gain_that_acc_vehicles_have_too_is_no_reason_for_a_controller(beyond: Estimate, shown: str) -> None:
+    found = replace(HELPS, difference_to_acc=beyond)
     assert [shown in reason for reason in found.reasons] == [True]
-    assert recommended([found]) is None
+    assert recommended_result([found]) is None
 
 
 def test_what_a_controller_gains_beyond_acc_vehicles_must_matter() -> None:
-    found = replace(HELPS, beyond_acc=between(-0.4, -0.2))
+    found = replace(HELPS, difference_to_acc=between(-0.4, -0.2))
     assert found.reasons == [
         "travel time differs from that with ACC vehicles alone at this penetration rate by less than 0.5 %, "
         "which is too small to matter: -0.3 [-0.4, -0.2] s"
@@ -78,8 +76,8 @@ def test_acc_vehicles_that_change_too_little_neither_shorten_nor_lengthen(time: 
 
 def test_the_answer_is_the_largest_gain_among_those_that_pass() -> None:
     judged = [HELPS, QUICK_AND_WRONG, HELPS_MORE]
-    assert recommended(judged) == shown_beside(judged) == HELPS_MORE
-    assert headline(judged, [ACC_CHANGES_NOTHING]) == (
+    assert recommended_result(judged) == plotted_result(judged) == HELPS_MORE
+    assert assessment_headline(judged, [ACC_CHANGES_NOTHING]) == (
         "Recommended on this road: pi at a penetration rate of 20 %. Travel time -10.0 [-12.0, -8.0] s a "
         "vehicle (-10.0 %) compared with the human baseline, -2.0 [-3.0, -1.0] s compared with ACC vehicles "
         "alone. ACC vehicles alone are not shown to shorten travel time."
@@ -87,33 +85,32 @@ def test_the_answer_is_the_largest_gain_among_those_that_pass() -> None:
 
 
 def test_where_nothing_passes_nothing_is_recommended_and_the_quickest_is_shown() -> None:
-    judged = [QUICK_AND_WRONG, Judged(0.2, "pi", replace(GOOD, failed=1), BEYOND)]
-    assert recommended(judged) is None
-    assert headline(judged, [ACC_HELPS]) == (
+    judged = [QUICK_AND_WRONG, ControllerResult(0.2, "pi", replace(GOOD, failed=1), BEYOND)]
+    assert recommended_result(judged) is None
+    assert assessment_headline(judged, [ACC_HELPS]) == (
         "No controller is recommended on this road: none passes the rule. ACC vehicles alone shorten travel "
         "time: -4.0 [-6.0, -2.0] s (-4.0 %) at 20 %."
     )
-    assert shown_beside(judged) == QUICK_AND_WRONG
+    assert plotted_result(judged) == QUICK_AND_WRONG
 
 
 def test_without_a_tested_controller_nothing_is_recommended_or_shown() -> None:
-    assert shown_beside([]) is None
+    assert plotted_result([]) is None
     worse = AccResult(0.1, replace(GOOD, travel_time=between(1.0, 2.0)))
-    assert headline([], [worse, ACC_CHANGES_NOTHING]) == (
+    assert assessment_headline([], [worse, ACC_CHANGES_NOTHING]) == (
         "No controller is recommended on this road: none was tested, or all were set aside before the test. "
         "ACC vehicles alone lengthen travel time."
     )
 
 
 def test_without_a_verdict_the_words_say_how_wide_the_interval_is_and_what_is_missing() -> None:
-    open_one = replace(HELPS, beyond_acc=between(-5.0, 3.0), missing=300.0)
-    assert open_one.words.endswith(
-        "; no verdict yet: the interval is ±4.0 s, and a verdict needs about 300 more test seeds (900 "
-        "episodes)."
+    open_one = replace(HELPS, difference_to_acc=between(-5.0, 3.0), missing=300.0)
+    assert open_one.summary.endswith(
+        "; no verdict yet: the interval is ±4.0 s, and a verdict needs about 300 more test seeds (900 episodes)."
     )
-    assert headline([open_one], []).startswith("No controller is recommended on this road so far: ")
-    assert "too few for an interval" in replace(open_one, missing=inf).words
-    assert replace(ACC_CHANGES_NOTHING, missing=7.0).words.endswith("about 7 more test seeds (14 episodes).")
+    assert assessment_headline([open_one], []).startswith("No controller is recommended on this road so far: ")
+    assert "too few for an interval" in replace(open_one, missing=inf).summary
+    assert replace(ACC_CHANGES_NOTHING, missing=7.0).summary.endswith("about 7 more test seeds (14 episodes).")
 
 
 @pytest.mark.parametrize(
@@ -121,46 +118,44 @@ def test_without_a_verdict_the_words_say_how_wide_the_interval_is_and_what_is_mi
     [
         (-5.0, 3.0, 20, 0.1, 20 * 4.0**2),  # ±4 around -1: as wide as the mean with a quarter of the width
         (-5.0, 3.0, 20, 2.0, 20 * 2.0**2),  # narrow enough before it excludes zero
-        (-3.0, -1.0, 40, 0.1, LEAST_JUDGED),
-        (0.0, 0.0, 3, 0.1, LEAST_JUDGED),
+        (-3.0, -1.0, 40, 0.1, MIN_VERDICT_SEEDS),
+        (0.0, 0.0, 3, 0.1, MIN_VERDICT_SEEDS),
     ],
 )
 def test_seeds_for_a_verdict_follow_from_the_width(
     low: float, high: float, count: int, narrow: float, needed: float
 ) -> None:
-    assert seeds_for_verdict(between(low, high, count), narrow) == needed
-    assert seeds_for_verdict(Estimate(-1.0, nan, nan, 2), narrow) == inf
+    assert required_seeds(between(low, high, count), narrow) == needed
+    assert required_seeds(Estimate(-1.0, nan, nan, 2), narrow) == inf
 
 
 def test_only_with_properties_set_for_cavs_the_gain_is_split() -> None:
-    split = replace(ACC_HELPS, of_properties=between(-4.0, -2.0))
-    assert split.words.endswith("change -3.0 [-4.0, -2.0] s of travel time.")
-    assert "properties" not in ACC_HELPS.words
+    split = replace(ACC_HELPS, property_effect=between(-4.0, -2.0))
+    assert split.summary.endswith("change -3.0 [-4.0, -2.0] s of travel time.")
+    assert "properties" not in ACC_HELPS.summary
 
 
 def test_a_road_that_is_nearly_free_is_said_to_have_nothing_to_gain() -> None:
     free = [{"status": "completed", "travel_time": 103.2, "delay": 3.2} for _ in range(3)]
     nothing = "Nothing to gain here: the human baseline is within 4 % of free flow. No controller"
-    found = headline([QUICK_AND_WRONG], [ACC_HELPS], free)
+    found = assessment_headline([QUICK_AND_WRONG], [ACC_HELPS], free)
     assert found.startswith(nothing)
     assert "ACC" not in found
-    assert headline([HELPS], [ACC_CHANGES_NOTHING], free).startswith("Recommended on this road")
+    assert assessment_headline([HELPS], [ACC_CHANGES_NOTHING], free).startswith("Recommended on this road")
     for busy in ([{**row, "delay": 20.0} for row in free], [{**row, "delay": nan} for row in free], []):
-        assert headline([QUICK_AND_WRONG], [ACC_CHANGES_NOTHING], busy).startswith("No controller")
+        assert assessment_headline([QUICK_AND_WRONG], [ACC_CHANGES_NOTHING], busy).startswith("No controller")
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         (
-            {"baseline_teleports": 0.02},
+            {"baseline_teleport_share": 0.02},
             "nothing can be concluded: in the human baseline SUMO teleports or removes 2.0 %",
         ),
         ({"teleports": 3}, "3 more vehicles teleported or removed than without CAVs"),
     ],
 )
-def test_nothing_is_recommended_where_sumo_takes_vehicles_off_the_road(
-    changes: dict[str, float], words: str
-) -> None:
+def test_nothing_is_recommended_where_sumo_takes_vehicles_off_the_road(changes: dict[str, float], words: str) -> None:
     assert words in replace(HELPS, effect=replace(GOOD, **changes)).reasons[0]  # pyright: ignore[reportArgumentType]
-    assert not replace(HELPS, effect=replace(GOOD, baseline_teleports=0.01, teleports=-3)).reasons
+    assert not replace(HELPS, effect=replace(GOOD, baseline_teleport_share=0.01, teleports=-3)).reasons

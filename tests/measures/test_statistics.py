@@ -10,22 +10,22 @@ from hypothesis import strategies as st
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
-    LEAST,
+    MIN_INTERVAL_VALUES,
     Estimate,
-    around_ratio,
-    crossed_estimate,
-    digits_of,
+    display_digits,
     estimate,
-    estimate_of,
-    paired_by_training,
+    estimate_crossed,
+    format_difference,
+    gain_verdict,
+    is_bimodal,
+    linearized_ratio,
+    metric_estimate,
     paired_difference,
+    paired_differences,
     probability_of_improvement,
-    signed,
-    summarise,
-    two_modes,
-    verdict_on,
+    summarize,
 )
-from unjam.studies.results_file import read_part
+from unjam_paper.results_file import read_part
 
 COUNTS = (3, 5, 10, 20)
 REPEATS = 500
@@ -49,7 +49,7 @@ def test_intervals_of_ratios_cover_what_they_say(count: int) -> None:
     generator = np.random.default_rng(count)
     scales = 48.0 + 14.0 * generator.standard_normal((2 * REPEATS, count))
     values = 0.6 * scales + 9.0 * generator.standard_normal(scales.shape)
-    found = [estimate(around_ratio(*each).tolist()) for each in zip(values, scales, strict=True)]
+    found = [estimate(linearized_ratio(*each).tolist()) for each in zip(values, scales, strict=True)]
     assert 0.93 <= coverage(found, 0.6) <= 0.97
     assert found[0].mean == pytest.approx(values[0].mean() / scales[0].mean())
 
@@ -58,9 +58,7 @@ def returns_on_ring() -> dict[str, np.ndarray]:
     """The returns of each driver that was measured on the ring, a row per length of it."""
     found = read_part(DRIVABLE, "ring")
     return {
-        driver: np.array(
-            [[row["return"] for row in lengths[driver]["episodes"]] for lengths in found.values()]
-        )
+        driver: np.array([[row["return"] for row in lengths[driver]["episodes"]] for lengths in found.values()])
         for driver in found["220"]
     }
 
@@ -119,8 +117,8 @@ def test_an_interval_is_cut_at_what_is_possible() -> None:
     cut = estimate(values, bounds=(0.0, 1.0))
     assert (cut.low, cut.high) == (0.0, pytest.approx(estimate(values).high))
     rows = [{"collisions": value, "return": -value} for value in values]
-    assert estimate_of(rows, "collisions").low == 0.0
-    assert estimate_of(rows, "return").low < -0.9
+    assert metric_estimate(rows, "collisions").low == 0.0
+    assert metric_estimate(rows, "return").low < -0.9
 
 
 def test_a_trimmed_mean_leaves_the_ends_out() -> None:
@@ -145,10 +143,10 @@ def test_more_values_give_a_narrower_interval() -> None:
 
 
 def test_a_mean_that_would_be_rounded_away_gets_more_digits() -> None:
-    assert digits_of(estimate([0.0] * 23 + [1.0, 1.0]), 0) == 2
-    assert digits_of(estimate([0.0, 0.0]), 0) == 0
-    assert digits_of(estimate([1.0, 0.0]), 1) == 1
-    assert digits_of(estimate([]), 0) == 0
+    assert display_digits(estimate([0.0] * 23 + [1.0, 1.0]), 0) == 2
+    assert display_digits(estimate([0.0, 0.0]), 0) == 0
+    assert display_digits(estimate([1.0, 0.0]), 1) == 1
+    assert display_digits(estimate([]), 0) == 0
 
 
 def test_values_that_are_no_numbers_are_left_out_and_not_counted() -> None:
@@ -161,7 +159,7 @@ def test_one_value_or_two_have_no_interval_but_a_range(values: list[float], word
     found = estimate([*values, float("nan")])
     assert (found.mean, found.count) == (np.mean(values), len(values))
     assert np.isnan([found.low, found.high]).all()
-    assert signed(found) == words
+    assert format_difference(found) == words
 
 
 def test_equal_values_have_an_interval_of_no_width() -> None:
@@ -187,7 +185,7 @@ def test_interval_is_around_its_mean_and_knows_the_range(values: list[float]) ->
     found = estimate(values)
     slack = 1e-9 * (1 + max(map(abs, values)))
     assert (found.smallest, found.largest) == (min(values), max(values))
-    if len(values) >= LEAST:
+    if len(values) >= MIN_INTERVAL_VALUES:
         assert found.mean - found.low == pytest.approx(found.high - found.mean, abs=slack)
         assert found.low <= found.mean <= found.high
 
@@ -232,7 +230,7 @@ def test_a_failed_episode_takes_its_pair_out() -> None:
 
 def test_summary_has_an_estimate_of_every_metric() -> None:
     rows = [{"seed": seed, **dict.fromkeys(METRICS, float(seed))} for seed in range(4)]
-    found = summarise(rows)
+    found = summarize(rows)
     assert list(found) == list(METRICS)
     values = [0.0, 1.0, 2.0, 3.0]
     assert all(found[name] == estimate(values, bounds=METRICS[name].bounds) for name in METRICS)
@@ -247,34 +245,34 @@ def test_crossed_intervals_cover_what_they_say(trainings: int, between: float, s
         + shared * generator.standard_normal((repeats, 1, seeds))
         + generator.standard_normal((repeats, trainings, seeds))
     )
-    found = [crossed_estimate(table) for table in tables]
+    found = [estimate_crossed(table) for table in tables]
     covered = np.mean([each.low <= 0.0 <= each.high for each in found])
     assert 0.93 <= covered <= 0.97
 
 
 def test_a_crossed_interval_of_equal_numbers_is_a_point() -> None:
-    found = crossed_estimate(np.full((3, 4), 2.5))
+    found = estimate_crossed(np.full((3, 4), 2.5))
     assert (found.mean, found.low, found.high, found.count) == (2.5, 2.5, 2.5, 3)
 
 
 def test_trainings_of_two_modes_or_too_few_have_a_range_and_no_interval() -> None:
     seeds = np.random.default_rng(0).normal(0.0, 1.0, 20)
     modes = np.array([0.0, 1.0, 2.0, 80.0, 81.0])[:, None] + seeds
-    found = crossed_estimate(modes)
+    found = estimate_crossed(modes)
     assert np.isnan(found.low)
     assert np.isnan(found.high)
-    assert signed(found) == "+33 (-0 to +81)"
-    assert np.isnan(crossed_estimate(modes[:2]).low)
-    assert crossed_estimate(np.array([0.0, 10.0, 20.0, 30.0, 40.0])[:, None] + seeds).low < 20.0
+    assert format_difference(found) == "+33 (-0 to +81)"
+    assert np.isnan(estimate_crossed(modes[:2]).low)
+    assert estimate_crossed(np.array([0.0, 10.0, 20.0, 30.0, 40.0])[:, None] + seeds).low < 20.0
 
 
 @pytest.mark.parametrize("count", [4, 5, 8, 10, 20])
 def test_two_modes_are_seen_and_seldom_made_up(count: int) -> None:
     generator = np.random.default_rng(count)
     normal = generator.normal(0.0, 1.0, (REPEATS, count))
-    assert np.mean([two_modes(values) for values in normal]) < 0.03
+    assert np.mean([is_bimodal(values) for values in normal]) < 0.03
     apart = normal + 30.0 * (np.arange(count) >= count // 2)
-    assert np.mean([two_modes(values) for values in apart]) > 0.9
+    assert np.mean([is_bimodal(values) for values in apart]) > 0.9
 
 
 @pytest.mark.parametrize(
@@ -292,19 +290,19 @@ def test_two_modes_are_seen_and_seldom_made_up(count: int) -> None:
 def test_words_follow_from_an_interval_without_zero_and_ten_trainings(
     low: float, high: float, trainings: int, words: str
 ) -> None:
-    assert verdict_on(Estimate((low + high) / 2, low, high, 20), trainings) == words
+    assert gain_verdict(Estimate((low + high) / 2, low, high, 20), trainings) == words
 
 
 def test_two_modes_need_two_values_each() -> None:
-    assert not two_modes([0.0, 0.0, 0.0, 0.0, 6.0])
-    assert not two_modes([0.0, 0.0, 6.0])
-    assert not two_modes([1.0] * 5)
-    assert two_modes([0.0, 0.0, 0.0, 6.0, 6.0])
+    assert not is_bimodal([0.0, 0.0, 0.0, 0.0, 6.0])
+    assert not is_bimodal([0.0, 0.0, 6.0])
+    assert not is_bimodal([1.0] * 5)
+    assert is_bimodal([0.0, 0.0, 0.0, 6.0, 6.0])
 
 
 def test_differences_of_trainings_are_on_the_seeds_that_all_have_driven() -> None:
     runs = [rows_of(s1=3.0, s2=5.0, s3=1.0), rows_of(s2=6.0, s1=4.0, s3=float("nan"))]
-    found = paired_by_training(runs, rows_of(s1=1.0, s2=2.0, s3=0.0, s4=9.0), "return")
+    found = paired_differences(runs, rows_of(s1=1.0, s2=2.0, s3=0.0, s4=9.0), "return")
     assert found.tolist() == [[2.0, 3.0], [3.0, 4.0]]
 
 
@@ -350,10 +348,10 @@ def test_episodes_that_ended_early_are_not_averaged_with_complete_ones(status: s
     complete = {**dict.fromkeys(METRICS, 10.0), "status": "completed"}
     early = {**dict.fromkeys(METRICS, 2.0), "status": status, "seed": 2}
     rows, others = [{**complete, "seed": 1}, early], [{**complete, "seed": seed} for seed in (1, 2)]
-    counts = {name: estimate_of(rows, name).count for name in METRICS}
+    counts = {name: metric_estimate(rows, name).count for name in METRICS}
     assert counts["mean_speed"] == counts["travel_time"] == counts["fuel_ml_per_km"] == 1
-    assert estimate_of(rows, "mean_speed").mean == 10.0
-    assert counts["collisions"] == counts["cav_min_ttc"] == counts["people_max_braking"] == 2
+    assert metric_estimate(rows, "mean_speed").mean == 10.0
+    assert counts["collisions"] == counts["cav_min_ttc"] == counts["human_max_braking"] == 2
     assert counts["return"] == counts["return_eq16"] == (2 if status == "collision" else 1)
     assert paired_difference(rows, others, "travel_time").count == 1
-    assert paired_by_training([rows], others, "mean_speed").shape == (1, 1)
+    assert paired_differences([rows], others, "mean_speed").shape == (1, 1)

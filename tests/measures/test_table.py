@@ -5,9 +5,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from unjam.measures.metric_table import (
+    TableCell,
+    TableRow,
+    choose_baseline,
+    estimate_cell,
+    metric_table,
+    table_headings,
+)
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate, probability_of_improvement
-from unjam.measures.table import Cell, TableRow, baseline_of, cell_of, headings_of, table_of
 
 USUAL: dict[str, Any] = {"status": "completed", "reason": "", **dict.fromkeys(METRICS, 1.0)}
 
@@ -29,10 +36,8 @@ def rows_of(*returns: float) -> list[dict[str, Any]]:
         ({"pi": 1.0}, ""),
     ],
 )
-def test_beside_people_else_beside_the_expert_that_earns_most(
-    drivers: dict[str, float], baseline: str
-) -> None:
-    assert baseline_of({label: rows_of(value, value) for label, value in drivers.items()}) == baseline
+def test_beside_people_else_beside_the_expert_that_earns_most(drivers: dict[str, float], baseline: str) -> None:
+    assert choose_baseline({label: rows_of(value, value) for label, value in drivers.items()}) == baseline
 
 
 def row_named(table: list[TableRow], label: str) -> TableRow:
@@ -40,41 +45,41 @@ def row_named(table: list[TableRow], label: str) -> TableRow:
 
 
 def test_the_table_has_every_metric_of_every_driver_with_its_definition() -> None:
-    verdict, *table = table_of({"human": rows_of(1.0), "pi": rows_of(10.0, 20.0)}, "")
+    verdict, *table = metric_table({"human": rows_of(1.0), "pi": rows_of(10.0, 20.0)}, "")
     assert verdict.label == "could a car drive so?"
     assert [row.label for row in table] == [metric.label for metric in METRICS.values()]
     for row, metric in zip(table, METRICS.values(), strict=True):
-        assert row.about == " ".join((metric.function.__doc__ or "").split())
+        assert row.description == " ".join((metric.function.__doc__ or "").split())
         assert (row.unit, len(row.cells)) == (metric.unit, 2)
-    assert row_named(table, "return").cells == [Cell("1"), Cell("15", "(10 to 20)")]
+    assert row_named(table, "return").cells == [TableCell("1"), TableCell("15", "(10 to 20)")]
 
 
 def test_differences_are_paired_and_stand_in_columns_of_their_own() -> None:
     rows = {"idm": rows_of(8.0, 9.0, 10.0), "human": rows_of(1.0, 2.0, 4.0), "pi": rows_of(1.0, 1.0, 7.0)}
-    assert headings_of(rows, "human") == ["idm", "human", "pi", "idm \u2212 human", "pi \u2212 human"]
-    table = table_of(rows, "human")
+    assert table_headings(rows, "human") == ["idm", "human", "pi", "idm \u2212 human", "pi \u2212 human"]
+    table = metric_table(rows, "human")
     assert all(len(row.cells) == 5 for row in table)
     gain = row_named(table, "return").cells[3]
-    assert gain == cell_of(estimate([7.0, 7.0, 6.0]), 0, sign="+")
+    assert gain == estimate_cell(estimate([7.0, 7.0, 6.0]), 0, sign="+")
     assert (gain.mean, gain.interval) == ("+7", "[+5, +8]")
     better = row_named(table, "probability of improvement").cells
-    assert better[:3] == [Cell("")] * 3
+    assert better[:3] == [TableCell("")] * 3
     found = probability_of_improvement(np.array([[0.0, -1.0, 3.0]]))
-    assert better[4] == Cell("0.50", f"[{found.low:.2f}, {found.high:.2f}]")
+    assert better[4] == TableCell("0.50", f"[{found.low:.2f}, {found.high:.2f}]")
 
 
 def test_a_difference_of_few_pairs_says_of_how_many() -> None:
     never = {"time_to_dissolve": np.nan}
     alone = [row | {"time_to_dissolve": 100.0} for row in rows_of(1.0, 1.0, 1.0, 1.0)]
     pi = [row | ({"time_to_dissolve": 60.0 + k} if k < 3 else never) for k, row in enumerate(alone)]
-    table = table_of({"human": alone, "pi": pi}, "human")
+    table = metric_table({"human": alone, "pi": pi}, "human")
     gain = row_named(table, METRICS["time_to_dissolve"].label).cells[2]
     assert (gain.mean, gain.interval) == ("-39", "[-41, -37] 3 of 4")
 
 
 def test_a_cell_says_how_many_values_it_stands_for() -> None:
-    assert cell_of(estimate([1.0, 1.0]), 2, 2) == Cell("1.00")
-    assert cell_of(estimate([1.0, 3.0, np.nan]), 1, 3) == Cell("2.0", "(1.0 to 3.0) 2 of 3")
-    assert cell_of(estimate([1.0, np.nan]), 0, 2) == Cell("1", "1 of 2")
-    assert cell_of(estimate([np.nan]), 0, 1) == Cell("–")
-    assert str(cell_of(estimate([1.0, 2.0, 3.0]), 1)) == "2.0 [-0.5, 4.5]"
+    assert estimate_cell(estimate([1.0, 1.0]), 2, 2) == TableCell("1.00")
+    assert estimate_cell(estimate([1.0, 3.0, np.nan]), 1, 3) == TableCell("2.0", "(1.0 to 3.0) 2 of 3")
+    assert estimate_cell(estimate([1.0, np.nan]), 0, 2) == TableCell("1", "1 of 2")
+    assert estimate_cell(estimate([np.nan]), 0, 1) == TableCell("–")
+    assert str(estimate_cell(estimate([1.0, 2.0, 3.0]), 1)) == "2.0 [-0.5, 4.5]"

@@ -5,18 +5,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.errors import InputError
-from unjam.parameters import build
+from unjam.parameters import build_dataclass
 from unjam.physics.idm import (
     IDMParameters,
     desired_gap,
-    desired_speed_for,
+    desired_speed_from_acceleration,
     equilibrium_gap,
     equilibrium_speed,
     idm_acceleration,
 )
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios import Ring
-from unjam.worlds.sumo.files import files_of
+from unjam.worlds.sumo.inputs import sumo_inputs
 from unjam.worlds.sumo.simulation import Simulation
 
 speeds = st.floats(0.0, 29.0)
@@ -37,7 +37,7 @@ def test_reference_values_closing_in_and_falling_back() -> None:
 def test_with_the_desired_speed_for_an_acceleration_a_free_driver_accelerates_so(
     speed: float, acceleration: float
 ) -> None:
-    wanted = desired_speed_for(acceleration, speed + 0.1)
+    wanted = desired_speed_from_acceleration(acceleration, speed + 0.1)
     driver = IDMParameters(desired_speed=wanted)
     assert idm_acceleration(speed + 0.1, speed + 0.1, 1e9, driver) == pytest.approx(acceleration, abs=1e-9)
 
@@ -62,9 +62,7 @@ def test_equilibrium_speed_inverts_equilibrium_gap(gap: float) -> None:
 def test_ring_limits_are_the_papers() -> None:
     found = [equilibrium_speed(length / 22 - 5) for length in range(220, 280, 10)]
     np.testing.assert_allclose(found, [3.000, 3.454, 3.908, 4.362, 4.816, 5.269], atol=5e-4)
-    assert np.mean([equilibrium_speed(length / 22 - 5) for length in range(220, 271)]) == pytest.approx(
-        4.135, abs=5e-4
-    )
+    assert np.mean([equilibrium_speed(length / 22 - 5) for length in range(220, 271)]) == pytest.approx(4.135, abs=5e-4)
 
 
 def test_no_equilibrium_speed_below_the_standstill_gap() -> None:
@@ -79,11 +77,7 @@ def test_no_equilibrium_gap_beyond_the_desired_speed(speed: float) -> None:
 
 def test_one_definition_for_numpy_torch_and_numbers() -> None:
     generator = np.random.default_rng(0)
-    speed, leader, gap = (
-        generator.uniform(0, 15, 50),
-        generator.uniform(0, 15, 50),
-        generator.uniform(1, 60, 50),
-    )
+    speed, leader, gap = (generator.uniform(0, 15, 50), generator.uniform(0, 15, 50), generator.uniform(1, 60, 50))
     arrays = idm_acceleration(speed, leader, gap)
     tensors = idm_acceleration(torch.tensor(speed), torch.tensor(leader), torch.tensor(gap))
     numbers = [
@@ -101,14 +95,14 @@ def test_desired_gap_never_falls_below_the_standstill_gap() -> None:
 @pytest.mark.parametrize("name", ["desired_speed", "max_acceleration", "comfortable_deceleration"])
 def test_parameters_must_be_positive(name: str) -> None:
     with pytest.raises(InputError, match=f"{name}.*greater than 0"):
-        build(IDMParameters, {name: 0.0}, "idm")
+        build_dataclass(IDMParameters, {name: 0.0}, "idm")
 
 
 def test_equals_sumos_own_idm_in_every_step(simulation: Simulation) -> None:
     """All-human traffic without noise, with a start-up and its shock wave; one step ahead, to 1e-12."""
     ring = Ring(length=(230, 230))
     road = ring.draw(np.random.default_rng(0))
-    simulation.load(files_of(ring, road), 0.1, seed=1)
+    simulation.load(sumo_inputs(ring, road), 0.1, seed=1)
     positions = road.start_positions.copy()
     speeds = np.zeros(22)
     generator = np.random.default_rng(1)

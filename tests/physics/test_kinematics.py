@@ -7,9 +7,7 @@ from unjam.physics.kinematics import distance_driven, gap_on_loop, next_position
 
 
 @given(st.floats(0, 40), st.floats(-20, 20), st.floats(0.01, 1))
-def test_speed_changes_by_acceleration_and_never_turns_back(
-    speed: float, acceleration: float, step: float
-) -> None:
+def test_speed_changes_by_acceleration_and_never_turns_back(speed: float, acceleration: float, step: float) -> None:
     found = next_speed(speed, acceleration, step)
     assert found >= 0
     assert found == pytest.approx(max(0.0, speed + acceleration * step), abs=1e-12)

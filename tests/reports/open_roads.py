@@ -9,32 +9,32 @@ import numpy as np
 from tests.worlds.sumo.own_roads import game
 from unjam.controller import make_driver
 from unjam.drivers import Human, PISaturation
-from unjam.reports.results import PICTURED, Shown, shown_of
+from unjam.reports.results import PLOT_ARRAYS, PlotEpisode, to_plot_episode
 from unjam.scenarios import Merge, make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 
 
-def shown_from(episode: Episode, driver: str) -> Shown:
+def shown_from(episode: Episode, driver: str) -> PlotEpisode:
     """What a folder of results has of an episode."""
-    arrays = {name: getattr(episode, name).astype(np.float32) for name in PICTURED}
-    return replace(shown_of(driver, episode), **arrays)
+    arrays = {name: getattr(episode, name).astype(np.float32) for name in PLOT_ARRAYS}
+    return replace(to_plot_episode(driver, episode), **arrays)
 
 
 @cache
 def merge_episode(seconds: int = 100, driver: str = "pi") -> Episode:
     found = {"pi": PISaturation(), "human": Human()}[driver]
-    return run_episode(Merge(cav_share=0.2, horizon=seconds), found, (1,), full=True)
+    return run_episode(Merge(penetration_rate=0.2, horizon=seconds), found, (1,), record_details=True)
 
 
 @cache
 def ramp_episode(driver: str = "jam-ahead") -> Episode:
     """Half of the people on the motorway of two lanes are CAVs."""
-    changes = {"peak": (0.0, 90.0), "cav_share": 0.5, "horizon": 90}
-    return run_episode(make_scenario("on-ramp", changes), make_driver(driver, 1.0), (1,), full=True)
+    changes = {"peak": (0.0, 90.0), "penetration_rate": 0.5, "horizon": 90}
+    return run_episode(make_scenario("on-ramp", changes), make_driver(driver, 1.0), (1,), record_details=True)
 
 
 def own_episode(folder: Path, seconds: int = 60) -> Episode:
     """Some traffic on SUMO's game `ramp`."""
-    scenario = make_scenario(str(game(folder, "ramp")), {"cav_share": 0.3, "horizon": seconds * 5})
-    return run_episode(scenario, PISaturation(), (1,), full=True)
+    scenario = make_scenario(str(game(folder, "ramp")), {"penetration_rate": 0.3, "horizon": seconds * 5})
+    return run_episode(scenario, PISaturation(), (1,), record_details=True)

@@ -12,18 +12,18 @@ import pytest
 from tests.measures.test_effect import GOOD, between
 from unjam.errors import InputError
 from unjam.manifest import manifest
-from unjam.measures.effect import AccResult, Judged, headline, recommended
+from unjam.measures.effect import AccResult, ControllerResult, assessment_headline, recommended_result
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate
-from unjam.reports.assessment import ASSESSMENT_FILE, effects, render_assessment, write_assessment
+from unjam.reports.assessment import ASSESSMENT_FILE, effect_figure, render_assessment, write_assessment
 from unjam.scenarios import OnRamp, Ring, scenario_recipe
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode
 
 BEYOND = between(-3.0, -1.0)
-HELPS = Judged(0.1, "acc", GOOD, BEYOND)
+HELPS = ControllerResult(0.1, "acc", GOOD, BEYOND)
 WITH_ACC = [AccResult(0.1, GOOD), AccResult(0.2, GOOD)]
-HARMS = Judged(
+HARMS = ControllerResult(
     0.2,
     "idm:time_headway=1,max_acceleration=2.5,b=<2>",
     replace(GOOD, travel_time=between(3, 5), drivable="brakes with 9 m/s2"),
@@ -37,22 +37,28 @@ def episode(generator: np.random.Generator) -> Episode:
     return Episode((1,), "completed", vehicle_ids=("a", "b", "c"), speeds=speeds, positions=speeds.cumsum(0))
 
 
-def folder_of(folder: Path, judged: list[Judged]) -> Path:
+def folder_of(folder: Path, judged: list[ControllerResult]) -> Path:
     """A folder as `unjam assess` writes it, of made-up numbers."""
-    best, generator = recommended(judged), np.random.default_rng(0)
+    best, generator = recommended_result(judged), np.random.default_rng(0)
     tried = [
-        {"share": each.share, "driver": each.driver, "set_aside": "", "chosen": True, "effect": asdict(GOOD)}
+        {
+            "share": each.penetration_rate,
+            "driver": each.driver,
+            "rejection_reasons": "",
+            "chosen": True,
+            "effect": asdict(GOOD),
+        }
         for each in (HELPS, HARMS)
     ]
-    tried[0]["set_aside"] = "slower than people"
-    tried.append({**tried[0], "driver": "pi", "set_aside": "failed: no CAV", "effect": asdict(UNKNOWN)})
+    tried[0]["rejection_reasons"] = "slower than people"
+    tried.append({**tried[0], "driver": "pi", "rejection_reasons": "failed: no CAV", "effect": asdict(UNKNOWN)})
     people: dict[str, Any] = dict.fromkeys(METRICS, asdict(Estimate(78.5, 70.0, 80.0, 20)))
     document = {
         "scenario": "my & road.sumocfg",
-        "headline": headline(judged, WITH_ACC),
-        "recommended": best and {"share": best.share, "driver": best.driver},
-        "judged": [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in judged],
-        "acc": [{**asdict(each), "driver": "cruise", "words": each.words} for each in WITH_ACC],
+        "headline": assessment_headline(judged, WITH_ACC),
+        "recommended": best and {"share": best.penetration_rate, "driver": best.driver},
+        "judged": [{**asdict(each), "reasons": each.reasons, "words": each.summary} for each in judged],
+        "acc": [{**asdict(each), "driver": "cruise", "words": each.summary} for each in WITH_ACC],
         "tried": tried,
         "people": people,
         "road": {**scenario_recipe(Ring()), "cav_classes": ["passenger"]},
@@ -85,9 +91,9 @@ def cells_of(page: str, label: str) -> list[str]:
 
 
 def test_the_page_leads_with_the_words_of_the_rule(page: str) -> None:
-    assert headline([HELPS, HARMS], WITH_ACC) in page
-    assert WITH_ACC[1].words in page
-    assert HELPS.words in page
+    assert assessment_headline([HELPS, HARMS], WITH_ACC) in page
+    assert WITH_ACC[1].summary in page
+    assert HELPS.summary in page
     assert "b=&lt;2&gt; at a penetration rate of 20 %: not recommended: travel time is longer" in page
     assert "The CAVs are those recommended." in page
 
@@ -99,9 +105,7 @@ def test_the_page_says_that_cavs_have_accs_of_their_own_where_they_have(tmp_path
     found["road"] = {**scenario_recipe(OnRamp()), "cav_classes": ["passenger"]}
     (folder / ASSESSMENT_FILE).write_text(json.dumps(found, default=float).replace("NaN", "null"))
     said = " ".join(render_assessment(folder).split())
-    assert (
-        "Each has an ACC of its own that follows, with a time headway of 1.1 s and at most 2.5 m/s²" in said
-    )
+    assert "Each has an ACC of its own that follows, with a time headway of 1.1 s and at most 2.5 m/s²" in said
     assert "There is no safety filter." in said
 
 
@@ -144,13 +148,13 @@ def test_where_nothing_is_recommended_the_page_says_so_and_why(tmp_path: Path) -
 def test_without_a_tested_controller_the_page_has_the_acc_vehicles(tmp_path: Path) -> None:
     page = render_assessment(folder_of(tmp_path, []))
     assert cells_of(page, "recommended") == ["", "–", "–"]
-    assert WITH_ACC[0].words in page
+    assert WITH_ACC[0].summary in page
 
 
 def test_where_nobody_reached_the_end_there_is_still_a_picture() -> None:
-    judged = {"share": 0.1, "driver": "acc", "effect": {**vars(GOOD), "people_flow": 0.0}}
+    judged = {"share": 0.1, "driver": "acc", "effect": {**vars(GOOD), "baseline_flow": 0.0}}
     found = {"drivers": {"acc": {}}, "shares": [0.1], "tried": [], "acc": [], "judged": [judged]}
-    time, flow = effects(found).axes
+    time, flow = effect_figure(found).axes
     assert len(time.lines) > len([line for line in flow.lines if np.isfinite(line.get_ydata()).any()]) == 1
 
 

@@ -19,19 +19,19 @@ from PIL import Image
 
 from tests.reports.open_roads import merge_episode, own_episode, shown_from
 from unjam.reports.figures import (
-    LINES,
-    POINTS_IN_TIME,
-    colour_table,
+    LINE_COLORS,
+    MAX_PLOT_TIMES,
+    color_table,
     data_uri,
-    learning_curve,
-    over_time,
+    learning_curve_figure,
     png_bytes,
-    space_time,
     speed_field,
     speed_scale,
-    time_split,
+    time_series_figure,
+    training_time_figure,
+    trajectory_figure,
 )
-from unjam.reports.results import Shown
+from unjam.reports.results import PlotEpisode
 
 LENGTH = 120.0
 CAV_COLOUR = "#d7263d"
@@ -39,7 +39,7 @@ CAV_COLOUR = "#d7263d"
 
 def shown_of(
     driver: str = "pi", speed: float = 4.0, steps: int = 300, vehicles: int = 5, **changes: Any
-) -> Shown:
+) -> PlotEpisode:
     """Vehicles that drive around the ring at about `speed`: faster the later, and the further ahead."""
     speeds = speed + np.linspace(0, 1, steps + 1)[:, None] + 0.1 * np.arange(vehicles)
     positions = np.arange(vehicles) * LENGTH / vehicles + np.cumsum(speeds, axis=0) * 0.1
@@ -62,7 +62,7 @@ def shown_of(
         "lines": np.zeros((0, 2), np.float32),
         "places": np.zeros((0, 0, 3), np.float32),
     }
-    return Shown(driver=driver, **{**values, **changes})
+    return PlotEpisode(driver=driver, **{**values, **changes})
 
 
 def panels_of(figure: Figure) -> list[Axes]:
@@ -83,18 +83,18 @@ def drawn_lines(axes: Axes) -> list[Line2D]:
     return [line for line in axes.lines if len(np.asarray(line.get_xdata()))]
 
 
-def drivers(count: int) -> list[Shown]:
+def drivers(count: int) -> list[PlotEpisode]:
     return [shown_of(f"driver {number}", 2.0 + number) for number in range(count)]
 
 
 @pytest.mark.parametrize("count", [1, 4, 6, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5))])
 def test_space_time_has_a_panel_for_each_driver(count: int) -> None:
-    panels = panels_of(space_time(drivers(count)))
+    panels = panels_of(trajectory_figure(drivers(count)))
     assert [axes.get_title(loc="left") for axes in panels] == [f"driver {number}" for number in range(count)]
 
 
 def test_space_time_of_three_puts_one_panel_beside_the_other() -> None:
-    figure = space_time(drivers(3))
+    figure = trajectory_figure(drivers(3))
     figure.draw_without_rendering()
     places = [axes.get_position() for axes in panels_of(figure)]
     assert len({round(place.y0, 3) for place in places}) == 1
@@ -103,7 +103,7 @@ def test_space_time_of_three_puts_one_panel_beside_the_other() -> None:
 
 def test_space_time_colours_all_panels_on_one_scale() -> None:
     shown = drivers(3)
-    [*fields] = [field for axes in panels_of(space_time(shown)) for field in fields_of(axes)]
+    [*fields] = [field for axes in panels_of(trajectory_figure(shown)) for field in fields_of(axes)]
     assert len(fields) == 3
     fastest = np.ceil(max(episode.speeds.max() for episode in shown))
     assert {(field.norm.vmin, field.norm.vmax) for field in fields} == {(0.0, fastest)}
@@ -136,7 +136,7 @@ def test_paper_is_left_where_nobody_is_near_or_on_the_road() -> None:
 
 
 def test_no_stripes_of_paper_lie_between_the_vehicles_of_a_full_ring() -> None:
-    [panel] = panels_of(space_time([shown_of(vehicles=8)]))
+    [panel] = panels_of(trajectory_figure([shown_of(vehicles=8)]))
     [field] = fields_of(panel)
     speeds = field.get_array()
     assert speeds is not None
@@ -145,19 +145,19 @@ def test_no_stripes_of_paper_lie_between_the_vehicles_of_a_full_ring() -> None:
 
 @pytest.mark.parametrize("steps", [300, 5000])
 def test_space_time_draws_no_line_across_the_seam_of_the_ring(steps: int) -> None:
-    [panel] = panels_of(space_time([shown_of(steps=steps, speed=6.0)]))
+    [panel] = panels_of(trajectory_figure([shown_of(steps=steps, speed=6.0)]))
     for lines in lines_of(panel):
         segments = np.array(lines.get_segments())
         assert np.abs(np.diff(segments[:, :, 1], axis=1)).max() < LENGTH / 2
         assert segments[:, :, 1].min() >= 0
         assert segments[:, :, 1].max() <= LENGTH
-    [still] = panels_of(space_time([shown_of(steps=steps, speed=0.0)]))
+    [still] = panels_of(trajectory_figure([shown_of(steps=steps, speed=0.0)]))
     assert len(segments_of(panel)) < len(segments_of(still)), "the ring was gone around"
 
 
 def test_space_time_marks_the_cav_and_nobody_else() -> None:
     shown = shown_of(vehicles=6)
-    [panel] = panels_of(space_time([shown]))
+    [panel] = panels_of(trajectory_figure([shown]))
     marks = marks_of(panel)
     assert marks[0, 0, 1] == pytest.approx(shown.positions[0, 5] % LENGTH, abs=1e-3)
     assert len(marks) == unbroken(shown)[5]
@@ -166,51 +166,51 @@ def test_space_time_marks_the_cav_and_nobody_else() -> None:
 
 def test_space_time_marks_every_cav() -> None:
     shown = shown_of(cav_ids=["human_0", "cav_0"])
-    [panel] = panels_of(space_time([shown]))
-    assert len(shown.cavs) == 2
-    assert len(marks_of(panel)) == unbroken(shown)[list(shown.cavs)].sum()
+    [panel] = panels_of(trajectory_figure([shown]))
+    assert len(shown.cav_columns) == 2
+    assert len(marks_of(panel)) == unbroken(shown)[list(shown.cav_columns)].sum()
 
 
 def test_a_long_episode_is_thinned_out_and_a_short_one_is_not() -> None:
     def points(steps: int) -> int:
-        [panel] = panels_of(space_time([shown_of(steps=steps, speed=0.0, vehicles=2)]))
+        [panel] = panels_of(trajectory_figure([shown_of(steps=steps, speed=0.0, vehicles=2)]))
         return len(lines_of(panel)[0].get_segments())
 
     assert points(50) == 50
-    assert POINTS_IN_TIME * 0.9 < points(6000) < POINTS_IN_TIME * 2
+    assert MAX_PLOT_TIMES * 0.9 < points(6000) < MAX_PLOT_TIMES * 2
 
 
 def test_space_time_spans_the_episode_and_the_ring() -> None:
-    [panel] = panels_of(space_time([shown_of(steps=300)]))
+    [panel] = panels_of(trajectory_figure([shown_of(steps=300)]))
     assert panel.get_xlim() == pytest.approx((0, 30))
     assert panel.get_ylim() == pytest.approx((0, LENGTH))
 
 
 def test_space_time_of_episodes_of_different_length_shows_all_of_each() -> None:
     for shown in ([shown_of(), shown_of("crashed", steps=50)], [shown_of("crashed", steps=50), shown_of()]):
-        panels = panels_of(space_time(shown))
+        panels = panels_of(trajectory_figure(shown))
         assert all(panel.get_xlim() == pytest.approx((0, 30)) for panel in panels)
 
 
 def test_space_time_of_rings_of_different_length_shows_all_of_each() -> None:
     for shown in ([shown_of(), shown_of(loop_length=90.0)], [shown_of(loop_length=90.0), shown_of()]):
-        panels = panels_of(space_time(shown))
+        panels = panels_of(trajectory_figure(shown))
         assert all(panel.get_ylim() == pytest.approx((0, LENGTH)) for panel in panels)
 
 
 def test_over_time_has_a_line_of_each_driver_in_each_panel() -> None:
     shown = drivers(3)
-    panels = [drawn_lines(axes) for axes in panels_of(over_time(shown))]
+    panels = [drawn_lines(axes) for axes in panels_of(time_series_figure(shown))]
     for number, episode in enumerate(shown):
-        cav = episode.cavs[0]
+        cav = episode.cav_columns[0]
         expected = (episode.speeds[:, cav], episode.gaps[:, cav], episode.speeds.std(axis=1))
         for lines, values in zip(panels, expected, strict=True):
             np.testing.assert_allclose(np.asarray(lines[number].get_ydata()), values, rtol=1e-4)
-            assert lines[number].get_color() == LINES[number]
+            assert lines[number].get_color() == LINE_COLORS[number]
 
 
 def test_over_time_names_the_drivers_and_the_limit() -> None:
-    figure = over_time(drivers(2))
+    figure = time_series_figure(drivers(2))
     [legend] = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["driver 0", "driver 1", "limit"]
     limit = panels_of(figure)[0].lines[-1]
@@ -218,7 +218,7 @@ def test_over_time_names_the_drivers_and_the_limit() -> None:
 
 
 def row(number: int, validation: float | None = None, **changes: Any) -> dict[str, Any]:
-    usual = {"iteration": number, "actual_steps": 12_000 * number, "return_mean": 90.0 + number}
+    usual = {"iteration": number, "environment_steps": 12_000 * number, "return_mean": 90.0 + number}
     usual |= {"return_expert": 100.0, "return_validation": validation}
     return {**usual, "seconds": {"actual": 2.0, "update": 0.5}, **changes}
 
@@ -227,28 +227,23 @@ RUN = [row(1), row(2, 104.0), row(3), row(4, 108.0)]
 
 
 def test_learning_starts_at_step_zero_with_the_expert() -> None:
-    [axes] = panels_of(learning_curve({"ring-001": RUN}, {"pi": 100.0}))
+    [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}))
     training, validation, expert = axes.lines
     assert np.asarray(validation.get_xydata()).tolist() == [[0.0, 100.0], [24.0, 104.0], [48.0, 108.0]]
-    assert np.asarray(training.get_xydata()).tolist() == [
-        [12.0, 91.0],
-        [24.0, 92.0],
-        [36.0, 93.0],
-        [48.0, 94.0],
-    ]
+    assert np.asarray(training.get_xydata()).tolist() == [[12.0, 91.0], [24.0, 92.0], [36.0, 93.0], [48.0, 94.0]]
     assert expert.get_label() == "pi"
     assert set(np.asarray(expert.get_ydata())) == {100.0}
 
 
 def test_a_run_without_validation_still_shows_training() -> None:
     rows = [row(number, return_expert=None) for number in (1, 2)]
-    [axes] = panels_of(learning_curve({"ring-001": rows}, {}))
+    [axes] = panels_of(learning_curve_figure({"ring-001": rows}, {}))
     assert len(np.asarray(axes.lines[0].get_xydata())) == 2
     assert len(np.asarray(axes.lines[1].get_xydata())) == 0
 
 
 def test_several_runs_are_told_apart() -> None:
-    figure = learning_curve({"a": RUN, "b": RUN}, {"pi": 100.0})
+    figure = learning_curve_figure({"a": RUN, "b": RUN}, {"pi": 100.0})
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert [label.split(":")[0] for label in labels] == ["a", "a", "b", "b", "pi"]
     lines = panels_of(figure)[0].lines
@@ -256,18 +251,18 @@ def test_several_runs_are_told_apart() -> None:
 
 
 def test_no_run_is_left_out_however_many_there_are() -> None:
-    [axes] = panels_of(learning_curve({f"run-{number}": RUN for number in range(9)}, {}))
+    [axes] = panels_of(learning_curve_figure({f"run-{number}": RUN for number in range(9)}, {}))
     assert len(axes.lines) == 2 * 9
 
 
 def test_no_reference_is_left_out_however_many_there_are() -> None:
     references = {f"driver {number}": float(number) for number in range(7)}
-    [axes] = panels_of(learning_curve({"ring-001": RUN}, references))
+    [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, references))
     assert [line.get_label() for line in axes.lines[2:]] == list(references)
 
 
 def test_wall_time_is_divided_among_its_parts() -> None:
-    [axes] = panels_of(time_split(RUN))
+    [axes] = panels_of(training_time_figure(RUN))
     bars = [(bar.get_x(), bar.get_width()) for bar in axes.patches]  # pyright: ignore[reportAttributeAccessIssue]
     assert bars == [(0.0, 8.0), (8.0, 2.0)]
     labels = [text.get_text() for text in axes.figure.legends[0].get_texts()]
@@ -275,11 +270,9 @@ def test_wall_time_is_divided_among_its_parts() -> None:
 
 
 def test_colours_of_the_table_get_brighter_with_speed() -> None:
-    table = colour_table()
+    table = color_table()
     assert len(table) == 32
-    light = [
-        0.299 * int(code[1:3], 16) + 0.587 * int(code[3:5], 16) + 0.114 * int(code[5:], 16) for code in table
-    ]
+    light = [0.299 * int(code[1:3], 16) + 0.587 * int(code[3:5], 16) + 0.114 * int(code[5:], 16) for code in table]
     assert all(np.diff(light) > 0)
 
 
@@ -289,10 +282,10 @@ def content(uri: str) -> tuple[str, bytes]:
 
 
 FIGURES: Sequence[Callable[[], Figure]] = (
-    lambda: space_time(drivers(2)),
-    lambda: over_time(drivers(2)),
-    lambda: learning_curve({"ring-001": RUN}, {"pi": 100.0}),
-    lambda: time_split(RUN),
+    lambda: trajectory_figure(drivers(2)),
+    lambda: time_series_figure(drivers(2)),
+    lambda: learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}),
+    lambda: training_time_figure(RUN),
 )
 
 
@@ -300,13 +293,11 @@ FIGURES: Sequence[Callable[[], Figure]] = (
 @pytest.mark.parametrize("draw", FIGURES)
 def test_the_same_figure_gives_the_same_bytes(draw: Callable[[], Figure]) -> None:
     assert data_uri(draw()) == data_uri(draw())
-    assert data_uri(draw()) != data_uri(space_time(drivers(1)))
+    assert data_uri(draw()) != data_uri(trajectory_figure(drivers(1)))
 
 
 @pytest.mark.parametrize("draw", FIGURES)
-def test_letters_are_legible_at_the_least_width_that_the_page_gives_a_picture(
-    draw: Callable[[], Figure],
-) -> None:
+def test_letters_are_legible_at_the_least_width_that_the_page_gives_a_picture(draw: Callable[[], Figure]) -> None:
     figure, page = draw(), files("unjam.reports") / "page" / "report.css"
     figure.draw_without_rendering()
     [least] = re.findall(r"\.picture img {.*min-width: (\d+)px", page.read_text())
@@ -322,21 +313,21 @@ def in_the_cavs_colour(image: Image.Image) -> int:
 
 
 def test_a_png_has_the_cav_in_its_colour() -> None:
-    image = Image.open(io.BytesIO(png_bytes(space_time([shown_of()]))))
+    image = Image.open(io.BytesIO(png_bytes(trajectory_figure([shown_of()]))))
     assert image.format == "PNG"
     assert image.width > 1000
     assert in_the_cavs_colour(image) > 100
 
 
 def test_a_drawing_is_an_svg() -> None:
-    head, data = content(data_uri(time_split(RUN)))
+    head, data = content(data_uri(training_time_figure(RUN)))
     assert head == "data:image/svg+xml;base64"
     assert ElementTree.fromstring(data).tag == "{http://www.w3.org/2000/svg}svg"
 
 
 def test_vehicles_are_pixels_in_their_svg_with_the_cav_in_its_colour() -> None:
     shown = shown_of()
-    _, data = content(data_uri(space_time([shown])))
+    _, data = content(data_uri(trajectory_figure([shown])))
     images = [
         Image.open(io.BytesIO(base64.b64decode(found)))
         for found in re.findall(rb'data:image/png;base64,([^"]+)"', data)
@@ -348,7 +339,7 @@ def test_vehicles_are_pixels_in_their_svg_with_the_cav_in_its_colour() -> None:
     assert data.count(b"<path") < 500, "a line of a vehicle is no path"
 
 
-def unbroken(shown: Shown) -> np.ndarray:
+def unbroken(shown: PlotEpisode) -> np.ndarray:
     """How many of its steps each vehicle makes within the road, not across the seam, shape (N,)."""
     return (np.abs(np.diff(shown.positions % LENGTH, axis=0)) < LENGTH / 2).sum(axis=0)
 
@@ -368,7 +359,7 @@ def segments_of(axes: Axes) -> np.ndarray:
 @pytest.mark.parametrize("count", [1, 4, pytest.param(2, marks=pytest.mark.slow)])
 def test_space_time_of_the_merge_has_panels_of_highway_and_ramp(count: int) -> None:
     shown = [shown_from(merge_episode(), f"driver {number}") for number in range(count)]
-    figure = space_time(shown)
+    figure = trajectory_figure(shown)
     figure.draw_without_rendering()
     panels = panels_of(figure)
     assert len(panels) == 2 * count
@@ -388,7 +379,7 @@ def test_space_time_of_the_merge_has_panels_of_highway_and_ramp(count: int) -> N
 
 def test_each_vehicle_of_the_merge_is_on_one_panel_at_a_time() -> None:
     shown = shown_from(merge_episode(), "pi")
-    panels = panels_of(space_time([shown]))
+    panels = panels_of(trajectory_figure([shown]))
     drawn = sum(len(segments_of(axes)) for axes in panels)
     there = ~np.isnan(shown.positions)
     together = there[1:] & there[:-1]
@@ -400,15 +391,15 @@ def test_each_vehicle_of_the_merge_is_on_one_panel_at_a_time() -> None:
 
 def test_cavs_of_the_merge_are_marked(tmp_path: Path) -> None:
     shown = shown_from(merge_episode(), "pi")
-    main, ramp = panels_of(space_time([shown]))
-    there = ~np.isnan(shown.positions[:, list(shown.cavs)])
+    main, ramp = panels_of(trajectory_figure([shown]))
+    there = ~np.isnan(shown.positions[:, list(shown.cav_columns)])
     assert len(marks_of(main)) == (there[1:] & there[:-1]).sum() > 0
     assert len(marks_of(ramp)) == 0
 
 
 def test_space_time_of_your_own_network_shows_the_route(tmp_path: Path) -> None:
     shown = shown_from(own_episode(tmp_path), "pi")
-    (panel,) = panels_of(space_time([shown]))
+    (panel,) = panels_of(trajectory_figure([shown]))
     assert panel.get_ylabel() == "position along the road [m]"
     assert segments_of(panel)[..., 1].min() == pytest.approx(np.nanmin(shown.positions), abs=5)
     low, high = panel.get_ylim()
@@ -417,10 +408,10 @@ def test_space_time_of_your_own_network_shows_the_route(tmp_path: Path) -> None:
 
 def test_over_time_of_a_road_with_ends_shows_mean_speed_waves_and_who_waits() -> None:
     shown = [shown_from(merge_episode(driver=driver), driver) for driver in ("human", "pi")]
-    panels = panels_of(over_time(shown))
+    panels = panels_of(time_series_figure(shown))
     assert [axes.get_ylabel().split()[0] for axes in panels] == ["mean", "speed", "vehicles"]
     for number, episode in enumerate(shown):
-        expected = (np.nanmean(episode.speeds, 1), np.nanstd(episode.speeds, 1), episode.waiting)
+        expected = (np.nanmean(episode.speeds, 1), np.nanstd(episode.speeds, 1), episode.backlog)
         for axes, values in zip(panels, expected, strict=True):
             found = np.asarray(drawn_lines(axes)[number].get_ydata())
             np.testing.assert_allclose(found, values, rtol=1e-4)

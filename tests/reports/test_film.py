@@ -11,18 +11,18 @@ from PIL import Image, ImageSequence
 from tests.measures.test_metrics import episode_of
 from tests.reports.open_roads import merge_episode, own_episode
 from unjam.errors import DiskError, InputError
-from unjam.reports.film import (
-    CAV_COLOUR,
+from unjam.reports.video import (
+    CAV_PLOT_COLOR,
+    FRAME_SIZE,
     FRAMES_PER_SECOND,
-    SIZE,
-    check_format,
+    check_video_format,
     draw_road,
-    scenes,
+    episode_scenes,
     split_lines,
     write_video,
 )
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo.traffic import Scene
+from unjam.worlds.sumo.traffic import RoadScene
 
 SECONDS = 20.0
 
@@ -61,7 +61,7 @@ def test_a_film_has_frames_that_differ(tmp_path: Path, suffix: str) -> None:
     write_video(driven(), path, "pi", pace=40.0)
     frames = frames_of(path)
     assert len(frames) == SECONDS / 40.0 * FRAMES_PER_SECOND + 1
-    assert all(frame.shape == (SIZE, SIZE, 3) for frame in frames)
+    assert all(frame.shape == (FRAME_SIZE, FRAME_SIZE, 3) for frame in frames)
     for before, after in pairwise(frames):
         assert (before != after).any(axis=-1).sum() > 200
 
@@ -72,18 +72,16 @@ def test_a_film_can_be_an_mp4(tmp_path: Path) -> None:
     write_video(driven(), path, "pi", pace=40.0)
     reader: Iterator = ffmpeg.read_frames(str(path))
     about = next(reader)
-    frames = [np.frombuffer(data, np.uint8).reshape(SIZE, SIZE, 3) for data in reader]
-    assert about["size"] == (SIZE, SIZE)
+    frames = [np.frombuffer(data, np.uint8).reshape(FRAME_SIZE, FRAME_SIZE, 3) for data in reader]
+    assert about["size"] == (FRAME_SIZE, FRAME_SIZE)
     assert about["fps"] == FRAMES_PER_SECOND
     assert len(frames) == SECONDS / 40.0 * FRAMES_PER_SECOND + 1
     assert (frames[0] != frames[-1]).any()
-    assert near(frames[0], CAV_COLOUR) > 50
+    assert near(frames[0], CAV_PLOT_COLOR) > 50
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "pace", [1.0, 10.0, *(pytest.param(pace, marks=pytest.mark.slow) for pace in (3.0, 5.0))]
-)
+@pytest.mark.parametrize("pace", [1.0, 10.0, *(pytest.param(pace, marks=pytest.mark.slow) for pace in (3.0, 5.0))])
 def test_a_film_runs_as_many_times_as_fast_as_life_as_asked(tmp_path: Path, pace: float) -> None:
     path = tmp_path / "wave.gif"
     write_video(driven(seconds=pace * 0.8), path, "pi", pace)
@@ -105,17 +103,17 @@ def test_the_cav_is_where_it_should_be(tmp_path: Path) -> None:
     path = tmp_path / "wave.webp"
     write_video(driven(0.1), path, "pi")
     frame = frames_of(path)[0].astype(int)
-    wanted = [int(CAV_COLOUR[start : start + 2], 16) for start in (1, 3, 5)]
+    wanted = [int(CAV_PLOT_COLOR[start : start + 2], 16) for start in (1, 3, 5)]
     rows, columns = np.nonzero(np.abs(frame - wanted).max(axis=-1) < 40)
-    assert columns.mean() > SIZE * 0.85, "coordinate 0 of the ring is its rightmost point"
-    assert SIZE / 2 < rows.mean() < SIZE * 0.6, "its front is at 0 and its tail behind, that is below"
+    assert columns.mean() > FRAME_SIZE * 0.85, "coordinate 0 of the ring is its rightmost point"
+    assert FRAME_SIZE / 2 < rows.mean() < FRAME_SIZE * 0.6, "its front is at 0 and its tail behind, that is below"
 
 
 def test_vehicles_that_are_not_on_the_road_are_not_drawn(tmp_path: Path) -> None:
     episode = driven(0.1)
     episode.speeds[:, 0] = np.nan
     write_video(episode, tmp_path / "wave.webp", "pi")
-    assert near(frames_of(tmp_path / "wave.webp")[0], CAV_COLOUR) == 0
+    assert near(frames_of(tmp_path / "wave.webp")[0], CAV_PLOT_COLOR) == 0
 
 
 def test_an_episode_of_one_step_is_a_film_too(tmp_path: Path) -> None:
@@ -126,7 +124,7 @@ def test_an_episode_of_one_step_is_a_film_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["wave.avi", "wave", "gif", "wave.gif.txt"])
 def test_another_kind_of_file_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=r"allowed: a name that ends in \.gif, \.webp, \.mp4"):
-        check_format(Path(name))
+        check_video_format(Path(name))
     with pytest.raises(InputError, match="video:"):
         write_video(driven(), tmp_path / name, "pi")
     assert not (tmp_path / name).exists()
@@ -152,9 +150,7 @@ def test_a_film_of_the_merge_shows_who_is_there_at_each_moment(tmp_path: Path) -
     frames = frames_of(path)
     assert len(frames) == 1 + 20 // 5
     there = (~np.isnan(episode.speeds[::5])).sum(1)
-    vehicles = [
-        int((frame[150:].sum(-1) < 600).sum()) for frame in frames
-    ]  # below the words; lanes are light
+    vehicles = [int((frame[150:].sum(-1) < 600).sum()) for frame in frames]  # below the words; lanes are light
     assert np.corrcoef(there, vehicles)[0, 1] > 0.9
 
 
@@ -163,7 +159,7 @@ def episode(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return merge_episode() if request.param == "merge" else own_episode(tmp_path_factory.mktemp("own"))
 
 
-def picture(scene: Scene) -> np.ndarray:
+def picture(scene: RoadScene) -> np.ndarray:
     return np.asarray(draw_road(scene, 20.0, "words"))
 
 
@@ -175,19 +171,17 @@ def test_lines_are_split_where_there_is_none() -> None:
 
 @pytest.mark.long
 def test_a_moment_of_a_road_with_ends_shows_its_lanes_and_those_who_are_there(episode: Episode) -> None:
-    (scene,) = scenes(episode, [episode.steps])
+    (scene,) = episode_scenes(episode, [episode.control_steps])
     there = ~np.isnan(scene.speeds)
     assert 0 < there.sum() < len(there)
-    assert np.isfinite(scene.places[there]).all()
-    assert scene.cavs[there].sum() == len(
-        {each.vehicle for each in episode.trajectories if at_end(each, episode)}
-    )
+    assert np.isfinite(scene.poses[there]).all()
+    assert scene.is_cav[there].sum() == len({each.vehicle for each in episode.trajectories if at_end(each, episode)})
     full, empty = picture(scene), picture(scene._replace(speeds=np.full(len(there), np.nan)))
-    assert full.shape == (SIZE, SIZE, 3)
+    assert full.shape == (FRAME_SIZE, FRAME_SIZE, 3)
     changed = (full != empty).any(-1)
-    assert 10 * there.sum() < changed.sum() < 0.2 * SIZE**2
-    assert near(full, CAV_COLOUR) > 0
-    assert near(empty, CAV_COLOUR) == 0
+    assert 10 * there.sum() < changed.sum() < 0.2 * FRAME_SIZE**2
+    assert near(full, CAV_PLOT_COLOR) > 0
+    assert near(empty, CAV_PLOT_COLOR) == 0
 
 
 def at_end(trajectory: object, episode: Episode) -> bool:
@@ -196,9 +190,9 @@ def at_end(trajectory: object, episode: Episode) -> bool:
 
 
 def test_vehicles_lie_on_the_lanes(episode: Episode) -> None:
-    lines = episode.lines
-    for scene in scenes(episode, [0, episode.steps // 2, episode.steps]):
-        for x, y, _ in scene.places[~np.isnan(scene.speeds)]:
+    lines = episode.lane_lines
+    for scene in episode_scenes(episode, [0, episode.control_steps // 2, episode.control_steps]):
+        for x, y, _ in scene.poses[~np.isnan(scene.speeds)]:
             starts, ends = lines[:-1], lines[1:]
             along = ends - starts
             whole = ~np.isnan(along[:, 0]) & (np.abs(along).sum(1) > 0)
@@ -210,9 +204,9 @@ def test_vehicles_lie_on_the_lanes(episode: Episode) -> None:
 
 def test_pictures_of_an_empty_road_have_its_lanes_alone(tmp_path: Path) -> None:
     lines = np.array([[0.0, 0.0], [100.0, 0.0]])
-    scene = Scene(lines, np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool))
+    scene = RoadScene(lines, np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool))
     drawn = picture(scene)
-    middle = drawn[SIZE // 2 - 3 : SIZE // 2 + 3, 100:-100]
+    middle = drawn[FRAME_SIZE // 2 - 3 : FRAME_SIZE // 2 + 3, 100:-100]
     assert (middle != 255).any(-1).mean() > 0.5
 
 

@@ -16,8 +16,8 @@ from unjam import __version__
 from unjam.errors import DiskError, InputError
 from unjam.files import to_json
 from unjam.measures.metrics import METRICS, measure
-from unjam.reports.figures import learning_curve
-from unjam.reports.html import REPLAY_SECONDS, write_report
+from unjam.reports.figures import learning_curve_figure
+from unjam.reports.html import REPLAY_STEP, write_report_page
 from unjam.reports.results import read_results
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode, failed_episode
@@ -39,16 +39,9 @@ def results_in(folder: Path, *drivers: str, failing: int = 0, **about: Any) -> P
     for seed in range(failing):
         rows[drivers[-1]].append(measure(failed_episode((9, seed), "SUMO <cannot> start", "EpisodeError")))
     evaluation = Evaluation(rows, {name: found[0] for name, found in episodes.items()})
-    manifest = {
-        "unjam": __version__,
-        "python": "3.11.2",
-        "packages": {},
-        "started": "2026-01-02T03:04:05+00:00",
-    }
+    manifest = {"unjam": __version__, "python": "3.11.2", "packages": {}, "started": "2026-01-02T03:04:05+00:00"}
     manifest["command"] = ["unjam", "drive", "ring", "--driver", *drivers]
-    save_evaluation(
-        folder, evaluation, {"scenario": "ring", "reward": "released", "manifest": manifest, **about}
-    )
+    save_evaluation(folder, evaluation, {"scenario": "ring", "reward": "released", "manifest": manifest, **about})
     return folder
 
 
@@ -58,7 +51,7 @@ def run_in(folder: Path, scenario: str = "ring") -> Path:
     rows = [
         {
             "iteration": number,
-            "actual_steps": 12_000 * number,
+            "environment_steps": 12_000 * number,
             "return_mean": 90.0 + number,
             "return_expert": 100.0,
             "return_validation": 101.0 + number if number % 2 else None,
@@ -78,17 +71,17 @@ class Page(HTMLParser):
         super().__init__()
         self.tags: list[tuple[str, dict[str, str]]] = []
         self.texts: dict[str, list[str]] = {}
-        self._open = ""
+        self._open_simulations = ""
         self.feed(text)
         self.close()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, {name: value or "" for name, value in attrs}))
-        self._open = tag
+        self._open_simulations = tag
 
     def handle_data(self, data: str) -> None:
         if data.strip():
-            self.texts.setdefault(self._open, []).append(data.strip())
+            self.texts.setdefault(self._open_simulations, []).append(data.strip())
 
     def of(self, tag: str) -> list[dict[str, str]]:
         return [attributes for name, attributes in self.tags if name == tag]
@@ -108,7 +101,7 @@ class Page(HTMLParser):
 
 def page_of(*folders: Path) -> tuple[str, Page]:
     target = folders[0].parent / "page.html"
-    assert write_report(folders, target) == target
+    assert write_report_page(folders, target) == target
     text = target.read_text(encoding="utf-8")
     return text, Page(text)
 
@@ -177,10 +170,10 @@ def test_lines_of_the_learning_curve_are_the_drivers_that_do_not_learn(
 
     def spy(runs: dict[str, Any], references: dict[str, float]) -> Figure:
         drawn.append((list(runs), references))
-        return learning_curve(runs, references)
+        return learning_curve_figure(runs, references)
 
     monkeypatch.setattr("unjam.reports.html.learning_curve", spy)
-    write_report([run], tmp_path / "page.html")
+    write_report_page([run], tmp_path / "page.html")
     found = read_results(run)
     held_out = np.mean([row["return"] for row in found.rows["human"]])
     # The expert's line is where the curve starts: on the seeds of the validation.
@@ -208,14 +201,7 @@ def test_the_table_holds_the_means_of_the_rows(written: tuple[str, Page], run: P
 
 
 def test_names_of_drivers_are_text_whatever_they_hold(tmp_path: Path) -> None:
-    names = [
-        "<b>x",
-        "a&b",
-        '"quoted"',
-        "</script><script>document.title='x'</script>",
-        "<!--<script>",
-        "ünïcode",
-    ]
+    names = ["<b>x", "a&b", '"quoted"', "</script><script>document.title='x'</script>", "<!--<script>", "ünïcode"]
     text, page = page_of(results_in(tmp_path / "drive", *names))
     assert len(page.of("script")) == 3
     row = measure(driven(4.0, 0))
@@ -250,19 +236,17 @@ def numbers(data: list[dict[str, Any]], vehicles: int) -> np.ndarray:
     return unpacked({"vehicles": vehicles, "positions": data}, "positions")
 
 
-def test_the_replay_holds_the_positions_and_speeds_that_were_driven(
-    written: tuple[str, Page], run: Path
-) -> None:
-    replay, shown = written[1].replay, read_results(run).shown
+def test_the_replay_holds_the_positions_and_speeds_that_were_driven(written: tuple[str, Page], run: Path) -> None:
+    replay, shown = written[1].replay, read_results(run).plot_episodes
     assert [driver["name"] for driver in replay["drivers"]] == list(shown)
-    every = round(REPLAY_SECONDS / 0.1)
-    assert replay["step"] == pytest.approx(REPLAY_SECONDS)
+    every = round(REPLAY_STEP / 0.1)
+    assert replay["step"] == pytest.approx(REPLAY_STEP)
     for driver in replay["drivers"]:
         episode = shown[driver["name"]]
         np.testing.assert_allclose(numbers(driver["positions"], 6), episode.positions[::every], atol=0.01)
         np.testing.assert_allclose(numbers(driver["speeds"], 6), episode.speeds[::every], atol=0.001)
         assert replay["frames"] == len(episode.positions[::every])
-        assert driver["cavs"] == episode.cavs == [0]
+        assert driver["cavs"] == episode.cav_columns == [0]
         assert driver["loop_length"] == LENGTH
         np.testing.assert_allclose(driver["lines"], [episode.outline], atol=0.006)
     fastest = max(episode.speeds.max() for episode in shown.values())
@@ -284,9 +268,7 @@ def test_the_replay_is_not_cut_short_by_a_driver_that_crashed(tmp_path: Path) ->
 
 
 def test_the_replay_shows_roads_of_different_steps_at_the_same_times(tmp_path: Path) -> None:
-    coarse, fine = (
-        episode_of(np.full((round(4.0 / step) + 1, 3), 2.0), step=step, seed=(0,)) for step in (0.1, 0.05)
-    )
+    coarse, fine = (episode_of(np.full((round(4.0 / step) + 1, 3), 2.0), step=step, seed=(0,)) for step in (0.1, 0.05))
     replay = page_of(save_driven(tmp_path / "a", one=coarse, other=fine))[1].replay
     one, other = (numbers(driver["positions"], 3) for driver in replay["drivers"])
     np.testing.assert_allclose(one, other, atol=0.01)
@@ -341,18 +323,18 @@ def test_a_run_with_a_virtual_environment_shows_it(tmp_path: Path, written: tupl
 
 
 def test_the_same_results_give_the_same_page(tmp_path: Path, written: tuple[str, Page], run: Path) -> None:
-    write_report([run], tmp_path / "again.html")
+    write_report_page([run], tmp_path / "again.html")
     assert (tmp_path / "again.html").read_text(encoding="utf-8") == written[0]
 
 
 def test_a_folder_without_results_leaves_no_page(tmp_path: Path) -> None:
     good = results_in(tmp_path / "drive", "pi")
     with pytest.raises(InputError):
-        write_report([good, tmp_path], tmp_path / "page.html")
+        write_report_page([good, tmp_path], tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
 def test_a_page_that_cannot_be_written_gets_one_clear_line(tmp_path: Path) -> None:
     good = results_in(tmp_path / "drive", "pi")
     with pytest.raises(DiskError, match="cannot write"):
-        write_report([good], tmp_path / "nowhere" / "page.html")
+        write_report_page([good], tmp_path / "nowhere" / "page.html")

@@ -12,18 +12,18 @@ from matplotlib.figure import Figure
 
 from unjam.reports.figures import data_uri
 from unjam.reports.model import (
-    NUMBERS,
-    bound_of,
-    cells,
+    PREDICTED_QUANTITIES,
+    bound_summary,
+    error_cells,
+    error_figure,
+    error_headings,
     error_rows,
     error_text,
-    errors,
-    examples,
-    headings,
+    error_verdict,
+    example_figure,
     model_section,
-    trust,
-    trust_of,
-    verdict_of,
+    rollout_figure,
+    rollout_summary,
 )
 from unjam.reports.results import Results
 
@@ -40,27 +40,27 @@ def facts_of(**changes: Any) -> dict[str, Any]:
             "base": 0.1 * seconds if name != "speed" else 0.0 * seconds,
             "change": 0.2 * seconds,
         }
-        for name in NUMBERS
+        for name in PREDICTED_QUANTITIES
         if name != "reward"
     }
     ahead["speed"]["model"] = 1e-7 * seconds
     line = 5.0 + np.sin(seconds)
     example = {"actual": line, "members": [line + 0.1 * n for n in range(MEMBERS)], "base": line + 1.0}
     numbers = {"leader_gap": example, "leader_speed": example}
-    steps = {name: {"base": 0.02, "model": 0.01, "change": 0.03} for name in NUMBERS}
+    steps = {name: {"base": 0.02, "model": 0.01, "change": 0.03} for name in PREDICTED_QUANTITIES}
     steps["speed"] = {"base": 0.0, "model": 0.0, "change": 0.01}
     steps["follower_gap"] = {"base": 0.02, "model": 0.03, "change": 0.03}
     bins = {
         "at": [1.0, 2.0, 5.0],
         "decisions": [10, 10, 10],
-        "base": {name: [0.1, 0.2, 0.3] for name in NUMBERS},
-        "model": {name: [0.1, 0.1, 0.1] for name in NUMBERS},
+        "base": {name: [0.1, 0.2, 0.3] for name in PREDICTED_QUANTITIES},
+        "model": {name: [0.1, 0.1, 0.1] for name in PREDICTED_QUANTITIES},
     }
     facts = {
         "iteration": 3,
         "base": "idm",
         "members": MEMBERS,
-        "decision_step": 0.1,
+        "control_step": 0.1,
         "k_star": 12,
         "held_out": 1234,
         "one_step": steps,
@@ -74,7 +74,7 @@ def facts_of(**changes: Any) -> dict[str, Any]:
         "bound": {
             "eps_pi": 0.2,
             "eps_m": 0.1,
-            "largest_reward": 1.0,
+            "max_reward": 1.0,
             "largest_return": 1000.0,
             "k": [1, 10, 100],
             "C": [9000.0, 5000.0, 80000.0],
@@ -91,7 +91,7 @@ def progress_of(**virtual: Any) -> list[dict[str, Any]]:
     return [
         {
             "iteration": number,
-            "actual_steps": 12_000 * number,
+            "environment_steps": 12_000 * number,
             "return_mean": 90.0,
             "return_expert": 100.0,
             "return_validation": 101.0,
@@ -104,9 +104,9 @@ def progress_of(**virtual: Any) -> list[dict[str, Any]]:
 
 def test_the_table_has_each_number_now_and_later() -> None:
     facts = facts_of()
-    assert headings(facts)[:3] == ["change, 0.1 s", "IDM alone, 0.1 s", "model, 0.1 s"]
-    assert headings(facts)[-1] == "model, 10 s"
-    table = {row["number"]: cells(row) for row in error_rows(facts)}
+    assert error_headings(facts)[:3] == ["change, 0.1 s", "IDM alone, 0.1 s", "model, 0.1 s"]
+    assert error_headings(facts)[-1] == "model, 10 s"
+    table = {row["number"]: error_cells(row) for row in error_rows(facts)}
     assert table["leader's speed"] == ["0.03", "0.02", "0.01", "2", "1", "0.5"]
     assert table["own speed"] == ["0.01", "0", "0", "2", "0", "0"]
     assert table["reward"][3:] == ["–", "–", "–"]
@@ -120,10 +120,8 @@ def test_errors_have_two_digits(value: float | None, text: str) -> None:
 
 
 def test_the_verdict_names_what_is_better_and_what_is_worse() -> None:
-    first, later = verdict_of(facts_of()).split(". ")
-    assert first.startswith(
-        "One step ahead the model is less wrong than the base in leader's speed (by 50\u00a0%)"
-    )
+    first, later = error_verdict(facts_of()).split(". ")
+    assert first.startswith("One step ahead the model is less wrong than the base in leader's speed (by 50\u00a0%)")
     assert first.endswith("and more wrong in gap of the follower (by 50\u00a0%)")
     assert "own speed" not in first
     assert later.startswith("10 s ahead")
@@ -133,40 +131,40 @@ def test_the_verdict_names_what_is_better_and_what_is_worse() -> None:
 def test_a_base_that_knows_a_number_exactly_is_left_behind_by_no_share() -> None:
     facts = facts_of()
     facts["one_step"]["speed"] = {"base": 0.0, "model": 0.002, "change": 0.01}
-    assert f"more wrong in {NUMBERS['speed'][0]}, " in verdict_of(facts)
+    assert f"more wrong in {PREDICTED_QUANTITIES['speed'][0]}, " in error_verdict(facts)
 
 
 def test_a_model_that_is_its_base_is_as_wrong() -> None:
     facts = facts_of()
     for found in (*facts["one_step"].values(), *facts["replay"]["numbers"].values()):
         found["model"] = found["base"]
-    assert verdict_of(facts) == (
+    assert error_verdict(facts) == (
         "One step ahead the model is as wrong as its base. 10 s ahead the model is as wrong as its base."
     )
 
 
 def test_virtual_and_actual_returns_stand_side_by_side() -> None:
-    words = trust_of(progress_of())
+    words = rollout_summary(progress_of())
     assert "k* = 12" in words
     assert "earns 5.50 in the virtual environment, and earned 5.25 in the actual one" in words
 
 
 def test_without_rollouts_there_are_no_returns() -> None:
-    words = trust_of(progress_of(k_star=0, return_virtual=None))
+    words = rollout_summary(progress_of(k_star=0, return_virtual=None))
     assert "k* = 0" in words
     assert "earns" not in words
 
 
 def test_the_bound_is_called_what_it_is() -> None:
-    words = bound_of(facts_of())
+    words = bound_summary(facts_of())
     assert "from 9,000 (k = 1) over 5,000 (k = 10) to 80,000 (k = 100)" in words
     assert words.endswith("= 1,000: even at its best it is 5 times that, so it says nothing.")
 
 
 def test_a_bound_that_says_something_is_not_called_empty() -> None:
     bound = {**facts_of()["bound"], "C": [900.0, 250.0, 800.0]}
-    assert bound_of(facts_of(bound=bound)).endswith("at its best it is 0.25 of that.")
-    assert bound_of(facts_of(bound=None)) == ""
+    assert bound_summary(facts_of(bound=bound)).endswith("at its best it is 0.25 of that.")
+    assert bound_summary(facts_of(bound=None)) == ""
 
 
 def test_only_runs_with_a_virtual_environment_have_a_section() -> None:
@@ -178,14 +176,14 @@ def test_only_runs_with_a_virtual_environment_have_a_section() -> None:
     assert found is not None
     assert "nothing known but that nothing changes, plus an ensemble of 4 networks" in found["about"]
     assert "1,234 decisions" in found["about"]
-    assert [row["label"] for row in found["table"]] == [label for label, _ in NUMBERS.values()]
+    assert [row["label"] for row in found["table"]] == [label for label, _ in PREDICTED_QUANTITIES.values()]
 
 
 Draw = Callable[[], Figure]
 PICTURES: dict[str, tuple[Draw, int]] = {
-    "trust": (lambda: trust(progress_of(), facts_of()), 4),
-    "errors": (lambda: errors(facts_of()), 6),
-    "examples": (lambda: examples(facts_of()), 2 * EXAMPLES),
+    "trust": (lambda: rollout_figure(progress_of(), facts_of()), 4),
+    "errors": (lambda: error_figure(facts_of()), 6),
+    "examples": (lambda: example_figure(facts_of()), 2 * EXAMPLES),
 }
 
 
@@ -223,7 +221,7 @@ def test_no_text_of_a_panel_lies_on_that_of_another() -> None:
 
 
 def test_each_member_is_a_line_beside_what_happened() -> None:
-    figure = examples(facts_of())
+    figure = example_figure(facts_of())
     panels = titled(figure, "gap to the leader [m], from 10 s on")
     assert len(panels) == 1
     lines = panels[0].lines
@@ -234,35 +232,31 @@ def test_each_member_is_a_line_beside_what_happened() -> None:
 
 
 def test_errors_are_drawn_with_the_spread_and_where_rollouts_end() -> None:
-    (panel,) = titled(errors(facts_of()), "error: leader's speed [m/s]")
+    (panel,) = titled(error_figure(facts_of()), "error: leader's speed [m/s]")
     found = facts_of()["replay"]["numbers"]["leader_speed"]
     lines = drawn(panel)
-    for label, name in {
-        "model, a member": "model",
-        "spread of the members": "spread",
-        "IDM alone": "base",
-    }.items():
+    for label, name in {"model, a member": "model", "spread of the members": "spread", "IDM alone": "base"}.items():
         np.testing.assert_allclose(lines[label], found[name])
     (end,) = [line for line in panel.lines if "k*" in str(line.get_label())]
     assert list(np.asarray(end.get_xdata())) == pytest.approx([1.2, 1.2])
-    (panel,) = titled(errors(facts_of(k_star=0)), "error: leader's speed [m/s]")
+    (panel,) = titled(error_figure(facts_of(k_star=0)), "error: leader's speed [m/s]")
     assert not any("k*" in label for label in drawn(panel))
 
 
 def test_iterations_without_rollouts_leave_a_gap_in_the_returns() -> None:
     progress = progress_of()
     progress[0] = progress_of(return_virtual=None, return_actual=None)[0]
-    (panel,) = titled(trust(progress, facts_of()), "earned in k* decisions")
+    (panel,) = titled(rollout_figure(progress, facts_of()), "earned in k* decisions")
     np.testing.assert_array_equal(drawn(panel)["virtual"], [np.nan, 5.5, 5.5])
 
 
 def test_without_a_bound_its_panel_is_left_out() -> None:
     single = progress_of(eps_m_by_estimator={"unexplained": 0.1, "total_variation": None, "released": 0.2})
-    figure = trust(single, facts_of(bound=None))
+    figure = rollout_figure(single, facts_of(bound=None))
     assert [axes.get_visible() for axes in figure.axes] == [True, True, True, False]
 
 
 def test_the_base_is_called_by_its_name() -> None:
-    picture = data_uri(examples(facts_of(base="none")))
+    picture = data_uri(example_figure(facts_of(base="none")))
     text = base64.b64decode(picture.partition(",")[2]).decode()
     assert re.search("<!-- nothing changes -->", text)

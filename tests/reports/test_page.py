@@ -33,7 +33,7 @@ def slowly(size: tuple[int, int]) -> Any:
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam drive`."""
     folder = tmp_path_factory.mktemp("drive") / "results"
-    report = unjam.drive(driver=["human", "pi"], episodes=2, road=ROAD, workers=1, out=folder).report
+    report = unjam.drive(driver=["human", "pi"], episodes=2, scenario_options=ROAD, workers=1, out=folder).report
     assert report is not None
     return report
 
@@ -41,9 +41,9 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def merged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam drive merge`: vehicles come and go."""
-    road = {"horizon": 40, "cav_share": 0.3}
+    road = {"horizon": 40, "penetration_rate": 0.3}
     folder = tmp_path_factory.mktemp("merge") / "results"
-    report = unjam.drive("merge", ["human", "pi"], episodes=1, road=road, workers=1, out=folder).report
+    report = unjam.drive("merge", ["human", "pi"], episodes=1, scenario_options=road, workers=1, out=folder).report
     assert report is not None
     return report
 
@@ -56,15 +56,13 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "steps": 600,
         "workers": 1,
         "policy.hidden": (8,),
-        "trpo.batch_steps": 300,
-        "evaluation.every": 1,
+        "trpo.steps_per_iteration": 300,
+        "evaluation.validation_interval": 1,
         "evaluation.validation_episodes": 1,
         "evaluation.episodes": 2,
         "evaluation.baselines": ("human",),
     }
-    return unjam.train(
-        unjam.load_config(changes=changes), tmp_path_factory.mktemp("train") / "ring-001"
-    ).report
+    return unjam.train(unjam.load_config(changes=changes), tmp_path_factory.mktemp("train") / "ring-001").report
 
 
 @pytest.fixture(scope="module")
@@ -136,9 +134,7 @@ class Opener:
             if message.type in ("error", "warning"):
                 visit.errors.append(message.text)
 
-        context.route(
-            "**/*", lambda route: route.continue_() if route.request.url[:4] != "http" else refuse(route)
-        )
+        context.route("**/*", lambda route: route.continue_() if route.request.url[:4] != "http" else refuse(route))
         visit.page.on("request", watch)
         visit.page.on("console", listen)
         visit.page.on("pageerror", lambda error: visit.errors.append(str(error)))
@@ -186,9 +182,7 @@ def test_nothing_is_wider_than_the_screen(
     assert too_wide == []
 
 
-def test_a_picture_fills_a_laptop_and_stays_legible_on_a_phone_that_moves_it(
-    open_page: Opener, driven: Path
-) -> None:
+def test_a_picture_fills_a_laptop_and_stays_legible_on_a_phone_that_moves_it(open_page: Opener, driven: Path) -> None:
     sizes = """all => all.map(each => [each.clientWidth, each.scrollWidth, each.firstChild.clientWidth,
                  getComputedStyle(each, "::before").content.includes("swipe")])"""
     page = open_page(driven, LAPTOP).page
@@ -250,27 +244,21 @@ def test_play_lets_time_pass_and_pause_stops_it(open_page: Opener, driven: Path)
     assert (visit.time(), visit.canvases()) == (stopped, picture)
 
 
-def test_the_replay_stops_at_its_end_and_starts_again_from_the_beginning(
-    open_page: Opener, driven: Path
-) -> None:
+def test_the_replay_stops_at_its_end_and_starts_again_from_the_beginning(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     page, button = visit.page, visit.page.locator(".play")
     page.locator(".pace").select_option("30")
     button.click()
     page.wait_for_function("document.querySelector('.play').textContent === 'Play'")
     assert visit.time() == SECONDS
-    assert (
-        page.locator(".time").input_value() == page.locator(".time").get_attribute("max") == str(int(SECONDS))
-    )
+    assert page.locator(".time").input_value() == page.locator(".time").get_attribute("max") == str(int(SECONDS))
     page.locator(".pace").select_option("1")
     button.click()
     page.wait_for_function(f"parseFloat(document.querySelector('.clock').textContent) < {SECONDS}")
     assert visit.time() < SECONDS / 2
 
 
-def test_a_road_with_ends_is_played_from_its_first_vehicles_to_its_last(
-    open_page: Opener, merged: Path
-) -> None:
+def test_a_road_with_ends_is_played_from_its_first_vehicles_to_its_last(open_page: Opener, merged: Path) -> None:
     visit = open_page(merged)
     means = visit.page.locator("figcaption small")
     pictures, texts = [], []

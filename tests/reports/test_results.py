@@ -11,14 +11,14 @@ from unjam.drivers import Human, PISaturation
 from unjam.errors import InputError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import (
-    PICTURED,
+    PLOT_ARRAYS,
     Results,
-    command_to_repeat,
-    packed,
+    original_command,
+    pack_episode,
     read_progress,
     read_results,
-    shown_of,
-    unpacked,
+    to_plot_episode,
+    unpack_episode,
 )
 from unjam.scenarios import Ring, make_scenario
 from unjam.training.evaluate import DriveResult
@@ -30,7 +30,7 @@ ROAD = {"length": (120, 120), "vehicles": 8, "horizon": 150}
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> DriveResult:
     folder = tmp_path_factory.mktemp("drive") / "results"
-    return unjam.drive(driver=["human", "pi"], episodes=2, seed=3, road=ROAD, workers=1, out=folder)
+    return unjam.drive(driver=["human", "pi"], episodes=2, seed=3, scenario_options=ROAD, workers=1, out=folder)
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_what_is_not_a_number_stays_so(folder: Path) -> None:
 
 
 def test_the_shown_episode_is_the_one_of_the_first_seed(folder: Path) -> None:
-    found = read_results(folder).shown
+    found = read_results(folder).plot_episodes
     for name, driver in (("human", Human()), ("pi", PISaturation())):
         shown, episode = found[name], run_episode(Ring(**ROAD), driver, (3,))
         np.testing.assert_allclose(shown.speeds, episode.speeds, atol=1e-5)
@@ -66,20 +66,20 @@ def test_the_shown_episode_is_the_one_of_the_first_seed(folder: Path) -> None:
         np.testing.assert_allclose(shown.gaps, episode.gaps, atol=1e-3)
         np.testing.assert_allclose(shown.outline, episode.outline, atol=1e-3)
         assert shown.limit_speed == episode.limit_speed
-        assert shown.drawn == {"length": 120.0}
+        assert shown.drawn_values == {"length": 120.0}
 
 
 def test_the_shown_episode_knows_its_times_and_its_cavs(folder: Path) -> None:
-    shown = read_results(folder).shown["pi"]
+    shown = read_results(folder).plot_episodes["pi"]
     np.testing.assert_allclose(shown.times, np.linspace(0, 15, 151))
-    assert shown.cavs == [0]
+    assert shown.cav_columns == [0]
     assert shown.vehicle_ids[0] == "cav_0"
 
 
 def test_it_knows_what_it_is_about(folder: Path) -> None:
     found = read_results(folder)
-    assert (found.about["scenario"], found.about["reward"]) == ("ring", "released")
-    assert found.trained is None
+    assert (found.metadata["scenario"], found.metadata["reward"]) == ("ring", "released")
+    assert found.trained_label is None
     assert found.progress == []
     assert found.config == ""
 
@@ -96,8 +96,7 @@ def test_an_unfinished_run_is_told_how_to_go_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content",
-    ["", '{"rows": [', "\x00\x01", "[]", "{}", '{"rows": 3, "shown": []}', '{"rows": [{}], "shown": []}'],
+    "content", ["", '{"rows": [', "\x00\x01", "[]", "{}", '{"rows": 3, "shown": []}', '{"rows": [{}], "shown": []}']
 )
 def test_a_damaged_evaluation_gets_one_clear_line(folder: Path, content: str) -> None:
     (folder / "evaluation.json").write_text(content)
@@ -152,43 +151,38 @@ def results_made_by(*command: str) -> Results:
     ],
 )
 def test_the_command_to_repeat_can_be_pasted_into_a_shell(command: tuple[str, ...]) -> None:
-    line = command_to_repeat(results_made_by(*command))
+    line = original_command(results_made_by(*command))
     told = subprocess.run(["sh", "-c", f"printf '%s\\n' {line}"], capture_output=True, text=True, check=False)
     assert told.stdout.splitlines() == list(command)
 
 
-def test_a_training_that_went_on_is_repeated_by_its_first_command_with_its_last_budget(
-    tmp_path: Path,
-) -> None:
+def test_a_training_that_went_on_is_repeated_by_its_first_command_with_its_last_budget(tmp_path: Path) -> None:
     first = ["unjam", "train", "ring", "--steps", "400", "--set", "trpo.gamma=0.99"]
-    longer, again = (
-        ["unjam", "train", "--resume", "it", "--steps", "800"],
-        ["unjam", "train", "--resume", "it"],
-    )
+    longer, again = (["unjam", "train", "--resume", "it", "--steps", "800"], ["unjam", "train", "--resume", "it"])
     about = {"trained": "trained", "manifest": {"command": again}}
     lineage = [{"command": longer}, {"command": again}]
     (tmp_path / "manifest.json").write_text(json.dumps({"command": first, "lineage": lineage}))
-    found = command_to_repeat(Results(tmp_path, about, {}, {}))
+    found = original_command(Results(tmp_path, about, {}, {}))
     assert found == " ".join([*first, "--steps", "800"])
     (tmp_path / "manifest.json").write_text("{")
-    assert command_to_repeat(Results(tmp_path, about, {}, {})) == " ".join(again)
+    assert original_command(Results(tmp_path, about, {}, {})) == " ".join(again)
 
 
 def test_plain_words_of_the_command_are_left_as_they_are() -> None:
     command = ["unjam", "train", "ring", "--out", "runs/ring-001", "--set", "trpo.gamma=0.99"]
-    assert command_to_repeat(results_made_by(*command)) == " ".join(command)
-    assert command_to_repeat(results_made_by()) == ""
+    assert original_command(results_made_by(*command)) == " ".join(command)
+    assert original_command(results_made_by()) == ""
 
 
 def test_where_vehicles_come_and_go_the_gaps_are_not_stored() -> None:
-    merge = run_episode(make_scenario("merge", {"horizon": 40}), Human(), (0,), full=True)
-    shown = shown_of("human", merge)
-    small = packed(shown)
+    merge = run_episode(make_scenario("merge", {"horizon": 40}), Human(), (0,), record_details=True)
+    shown = to_plot_episode("human", merge)
+    small = pack_episode(shown)
     there = ~np.isnan(merge.speeds)
     assert small["speeds"].shape == (there.sum(),)
     assert small["places"].shape == (there.sum(), 3)
-    whole = unpacked(dict(small))
-    for name in PICTURED:
+    whole = unpack_episode(dict(small))
+    for name in PLOT_ARRAYS:
         np.testing.assert_array_equal(whole[name], getattr(shown, name).astype(np.float32))
-    ring = shown_of("human", run_episode(make_scenario("ring", {"horizon": 5}), Human(), (0,)))
-    assert "there" not in packed(ring)
+    ring = to_plot_episode("human", run_episode(make_scenario("ring", {"horizon": 5}), Human(), (0,)))
+    assert "there" not in pack_episode(ring)

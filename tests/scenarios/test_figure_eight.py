@@ -6,7 +6,7 @@ import pytest
 
 from unjam.errors import InputError
 from unjam.scenarios import SCENARIOS, FigureEight, make_scenario, scenario_from_recipe, scenario_recipe
-from unjam.scenarios.figure_eight import loop_length
+from unjam.scenarios.figure_eight import figure_eight_length
 from unjam.scenarios.road import ClosedRoad
 from unjam.worlds.sumo.networks import network_file
 
@@ -24,11 +24,7 @@ def drawn(radius: int, **changes: object) -> ClosedRoad:
 def test_lap_is_as_long_as_in_the_network_file(radius: int) -> None:
     tree = ElementTree.parse(network_file(drawn(radius).network))
     lanes = {lane.get("id"): float(lane.get("length", "nan")) for lane in tree.iter("lane")}
-    links = {
-        (link.get("from"), link.get("to")): link.get("via")
-        for link in tree.iter("connection")
-        if link.get("via")
-    }
+    links = {(link.get("from"), link.get("to")): link.get("via") for link in tree.iter("connection") if link.get("via")}
     length, crossings = 0.0, []
     for name, following in zip(ORDER, [*ORDER[1:], ORDER[0]], strict=True):
         length += lanes[f"{name}_0"]
@@ -41,12 +37,12 @@ def test_lap_is_as_long_as_in_the_network_file(radius: int) -> None:
 
 
 def test_edges_are_four_arms_and_two_arcs() -> None:
-    assert loop_length(30) == pytest.approx(4 * 30 + 3 * pi * 30 + 2 * 9.4, abs=0.7)
+    assert figure_eight_length(30) == pytest.approx(4 * 30 + 3 * pi * 30 + 2 * 9.4, abs=0.7)
 
 
 def test_radii_are_integers_from_the_whole_range() -> None:
     generator = np.random.default_rng(0)
-    radii = {FigureEight().draw(generator).drawn["radius"] for _ in range(200)}
+    radii = {FigureEight().draw(generator).drawn_values["radius"] for _ in range(200)}
     assert radii == {32, 33, 34, 35}
     assert SCENARIOS["figure-eight-30"].drawn_ranges == {"radius": (30, 30)}
 
@@ -68,7 +64,7 @@ def test_nobody_starts_on_the_crossing() -> None:
 
 def test_outline_is_the_lap() -> None:
     road = drawn(32)
-    coordinates, places = road.outline[:, 0], road.outline[:, 1:]
+    coordinates, places = road.center_line[:, 0], road.center_line[:, 1:]
     assert coordinates[0] == 0
     assert coordinates[-1] == road.loop_length
     assert np.all(np.diff(coordinates) > 0)
@@ -79,7 +75,7 @@ def test_outline_is_the_lap() -> None:
 
 @pytest.mark.parametrize(("radius", "limit"), [(32, 7.5), (33, 8.0), (34, 8.5), (35, 8.9)])
 def test_limit_is_near_what_a_queue_of_half_a_lap_allows(radius: int, limit: float) -> None:
-    assert FigureEight().limit(radius) == pytest.approx(limit, rel=0.03)
+    assert FigureEight().limit_speed(radius) == pytest.approx(limit, rel=0.03)
 
 
 def test_recipe_makes_the_same_scenario_again() -> None:

@@ -9,28 +9,28 @@ from hypothesis import strategies as st
 
 from unjam.errors import InputError
 from unjam.scenarios import Merge, make_scenario, scenario_from_recipe, scenario_recipe
-from unjam.scenarios.merge import ENTRANCE_WAY, JUNCTION_WAYS
-from unjam.scenarios.road import MergingRoad
-from unjam.worlds.sumo.files import files_of
+from unjam.scenarios.merge import ENTRANCE_LENGTH, JUNCTION_LENGTHS
+from unjam.scenarios.road import MergeRoad
+from unjam.worlds.sumo.inputs import sumo_inputs
 from unjam.worlds.sumo.networks import network_file
 
 
-def drawn(seed: int = 0, **changes: Any) -> MergingRoad:
+def drawn(seed: int = 0, **changes: Any) -> MergeRoad:
     return Merge(**changes).draw(np.random.default_rng(seed))
 
 
-def entries(road: MergingRoad) -> list[dict[str, str]]:
+def entries(road: MergeRoad) -> list[dict[str, str]]:
     """Attributes of the vehicles in SUMO's file, in their order."""
-    written = ElementTree.fromstring(files_of(Merge(), road).traffic)
+    written = ElementTree.fromstring(sumo_inputs(Merge(), road).traffic_xml)
     return [vehicle.attrib for vehicle in written.iter("vehicle")]
 
 
-def cavs(road: MergingRoad) -> list[int]:
+def cavs(road: MergeRoad) -> list[int]:
     """Which of the highway's vehicles are CAVs, sorted."""
     return sorted(int(name.removeprefix("cav_")) for name in road.cav_ids)
 
 
-def times_of(road: MergingRoad, pattern: str) -> list[float]:
+def times_of(road: MergeRoad, pattern: str) -> list[float]:
     return [float(entry["depart"]) for entry in entries(road) if re.fullmatch(pattern, entry["id"])]
 
 
@@ -58,7 +58,7 @@ def test_a_warmup_lasts_as_long_as_its_vehicles() -> None:
 
 def test_vehicles_enter_where_their_origin_says() -> None:
     road = drawn(standing=3)
-    highway, ramp = JUNCTION_WAYS
+    highway, ramp = JUNCTION_LENGTHS
     starts = {"from_inflow_highway": -(600.1 + highway), "from_highway": -(500 + highway)}
     starts |= {"from_inflow_ramp": -(200.1 + ramp)}
     for entry in entries(road):
@@ -74,15 +74,15 @@ def test_nobody_stands_where_none_shall() -> None:
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_a_share_is_drawn_for_each_vehicle_by_itself(seed: int, cav_share: float) -> None:
-    count = len(cavs(drawn(seed, cav_share=cav_share)))
+    count = len(cavs(drawn(seed, penetration_rate=cav_share)))
     spread = np.sqrt(333 * cav_share * (1 - cav_share))
     assert abs(count - 333 * cav_share) <= 5.5 * spread + 1e-9
 
 
 @pytest.mark.parametrize("spacing", ["random", "even"])
 def test_none_or_all_of_the_highways_vehicles_are_cavs(spacing: str) -> None:
-    assert cavs(drawn(cav_share=0.0, spacing=spacing)) == []
-    assert cavs(drawn(cav_share=1.0, spacing=spacing)) == list(range(333))
+    assert cavs(drawn(penetration_rate=0.0, spacing=spacing)) == []
+    assert cavs(drawn(penetration_rate=1.0, spacing=spacing)) == list(range(333))
 
 
 def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
@@ -92,7 +92,7 @@ def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
 
 @given(st.floats(0, 1))
 def test_even_spacing_spreads_the_share_evenly(cav_share: float) -> None:
-    found = cavs(drawn(cav_share=cav_share, spacing="even"))
+    found = cavs(drawn(penetration_rate=cav_share, spacing="even"))
     assert abs(len(found) - 333 * cav_share) <= 1.0
     assert len(np.unique(np.diff(found))) <= 2
 
@@ -111,9 +111,9 @@ def test_so_many_cavs_enter_in_the_first_half_as_were_asked_for(seed: int, count
 
 
 def test_cavs_have_names_that_were_announced() -> None:
-    some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"cav_share": 1.0}, {"inflow": 700.0}]
+    some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"penetration_rate": 1.0}, {"inflow": 700.0}]
     for changes in some:
-        assert drawn(**changes).cav_ids <= set(Merge(**changes).possible_cavs())
+        assert drawn(**changes).cav_ids <= set(Merge(**changes).possible_cav_ids())
 
 
 def test_ways_across_the_junction_are_those_of_the_network_file() -> None:
@@ -124,16 +124,16 @@ def test_ways_across_the_junction_are_those_of_the_network_file() -> None:
         for link in tree.iter("connection")
         if link.get("to") == "after" and link.get("via")
     }
-    np.testing.assert_allclose((via["highway"], via["ramp"]), JUNCTION_WAYS, atol=1e-6)
-    assert drawn().junctions == JUNCTION_WAYS
-    assert lanes[":highway_begin_0_0"] == lanes[":ramp_begin_0_0"] == ENTRANCE_WAY
+    np.testing.assert_allclose((via["highway"], via["ramp"]), JUNCTION_LENGTHS, atol=1e-6)
+    assert drawn().junction_lengths == JUNCTION_LENGTHS
+    assert lanes[":highway_begin_0_0"] == lanes[":ramp_begin_0_0"] == ENTRANCE_LENGTH
     edges = [lanes[f"{name}_0"] for name in ("inflow_highway", "highway", "after", "inflow_ramp", "ramp")]
     np.testing.assert_allclose(edges, [100.0, 500.0, 100.0, 100.0, 100.0], atol=1e-6)
 
 
 def plain_highway(flow: float, vehicles: int = 120, step: float = 0.2) -> float:
     """Mean speed of the last of many people on 724.6 m, all on one clock, Eq. 5-6 written down once more."""
-    length, every = 700.1 + JUNCTION_WAYS[0], round(3600.0 / flow / step)
+    length, every = 700.1 + JUNCTION_LENGTHS[0], round(3600.0 / flow / step)
     position, speed, taken = (np.full(vehicles, value) for value in (np.nan, 10.0, 0.0))
     clock = 0
     while not position[-1] >= length:
@@ -157,15 +157,15 @@ def test_limit_is_the_speed_of_people_whom_nothing_disturbs(flow: float) -> None
 
 
 def test_limit_is_about_twenty_and_falls_with_the_flow() -> None:
-    limits = [Merge(inflow=flow).limit() for flow in (200.0, 1000.0, 2000.0)]
+    limits = [Merge(inflow=flow).limit_speed() for flow in (200.0, 1000.0, 2000.0)]
     assert limits == sorted(limits, reverse=True)
     assert 20.0 < limits[-1] < limits[0] < 30.0
 
 
 def test_recipe_makes_the_same_scenario_again() -> None:
-    scenario = Merge(cavs=3, spacing="even", inflow=1500.0)
+    scenario = Merge(cavs=3, cav_spacing="even", inflow=1500.0)
     assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
-    assert scenario.part(1, 3) == scenario
+    assert scenario.stratum(1, 3) == scenario
 
 
 @pytest.mark.parametrize(
@@ -175,15 +175,12 @@ def test_recipe_makes_the_same_scenario_again() -> None:
         ({"standing": -1}, "standing"),
         ({"cavs": 167}, "cavs: 167 is not allowed; allowed: <= 166, who enter in the first half"),
         ({"cavs": 0}, "cavs"),
-        ({"cav_share": 1.1}, "cav_share: 1.1"),
-        ({"cav_share": -0.1}, "cav_share: -0.1"),
+        ({"penetration_rate": 1.1}, "cav_share: 1.1"),
+        ({"penetration_rate": -0.1}, "cav_share: -0.1"),
         ({"inflow": 0}, "inflow: 0"),
         ({"ramp_flow": -5}, "ramp_flow: -5"),
         ({"spacing": "odd"}, "'random' or 'even'"),
-        (
-            {"human_control": "native"},
-            "human_control: 'native' is not allowed on the merge; allowed: 'commanded'",
-        ),
+        ({"human_control": "native"}, "human_control: 'native' is not allowed on the merge; allowed: 'commanded'"),
         ({"length": (230, 230)}, "length: unknown name"),
     ],
 )

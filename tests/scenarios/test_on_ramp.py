@@ -17,10 +17,10 @@ def drawn(scenario: OnRamp = ROAD, seed: int = 0) -> MotorwayRoad:
 
 
 def test_a_larger_share_contains_the_smaller_and_changes_nobody_else() -> None:
-    few, many = drawn(replace(ROAD, cav_share=0.05)), drawn(replace(ROAD, cav_share=0.2))
+    few, many = drawn(replace(ROAD, penetration_rate=0.05)), drawn(replace(ROAD, penetration_rate=0.2))
     assert few.cav_ids < many.cav_ids
     assert few.entries == many.entries
-    assert few.kinds == many.kinds
+    assert few.vehicle_types == many.vehicle_types
     share = len(many.cav_ids) / len(many.entries)
     assert share == pytest.approx(0.2, abs=0.03)
     assert any(entry.route == "ramp" for entry in many.entries if entry.name in many.cav_ids)
@@ -37,12 +37,7 @@ def test_as_many_want_to_enter_as_the_demand_says() -> None:
             peak = (times >= begin) & (times < end)
             flows.setdefault((route, True), []).append(3600 * peak.sum() / (end - begin))
             flows.setdefault((route, False), []).append(3600 * (~peak).sum() / (2400 - (end - begin)))
-    expected = {
-        ("motorway", True): 3200,
-        ("ramp", True): 500,
-        ("motorway", False): 1800,
-        ("ramp", False): 250,
-    }
+    expected = {("motorway", True): 3200, ("ramp", True): 500, ("motorway", False): 1800, ("ramp", False): 250}
     for key, flow in expected.items():
         assert np.mean(flows[key]) == pytest.approx(flow, rel=0.05), key
 
@@ -59,13 +54,13 @@ def test_nobody_enters_a_lane_closer_behind_another_than_the_smallest_headway() 
 
 
 def test_people_differ_within_their_ranges() -> None:
-    people = list(drawn().kinds.values())
+    people = list(drawn().vehicle_types.values())
     assert len(people) == 200
     for values, (low, high) in (
         ([person.time_headway for person in people], (1.0, 1.8)),
         ([person.acceleration for person in people], (1.0, 1.5)),
         ([person.deceleration for person in people], (1.5, 2.0)),
-        ([person.gap for person in people], (2.0, 2.5)),
+        ([person.minimum_gap for person in people], (2.0, 2.5)),
         ([person.speed_factor for person in people], (0.8, 1.2)),
     ):
         assert low <= min(values) < max(values) <= high
@@ -76,7 +71,7 @@ def test_with_one_lane_and_with_a_steady_peak_it_has_names() -> None:
     one = make_scenario("on-ramp-1")
     assert isinstance(one, OnRamp)
     assert {entry.lane for entry in drawn(one).entries} == {0}
-    assert {lane.name for lane in drawn(one).lanes} >= {"motorway_0", "merging_1", "after_0"}
+    assert {lane.name for lane in drawn(one).edge_lanes} >= {"motorway_0", "merging_1", "after_0"}
     steady = make_scenario("on-ramp-steady")
     assert isinstance(steady, OnRamp)
     assert steady.peak == (300.0, 2400.0)
@@ -85,16 +80,13 @@ def test_with_one_lane_and_with_a_steady_peak_it_has_names() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"cav_share": 1.2}, "cav_share: 1.2"),
+        ({"penetration_rate": 1.2}, "cav_share: 1.2"),
         ({"lanes": 3}, "lanes: 3"),
-        (
-            {"time_headways": [1.8, 1.0]},
-            r"time_headways: \(1.8, 1\) is not allowed; allowed: 0 < low <= high",
-        ),
+        ({"time_headways": [1.8, 1.0]}, r"time_headways: \(1.8, 1\) is not allowed; allowed: 0 < low <= high"),
         ({"inflow": 9000}, "inflow: 9000 is not allowed; allowed: < 6545, by entry_headway"),
         ({"ramp_flow": 1800}, "ramp_flow: 1800 is not allowed; allowed: < 1800"),
         ({"human_control": "commanded"}, "human_control: 'commanded' is not allowed on the on-ramp"),
-        ({"roadside.loss": 1.0}, "roadside.loss: 1.0"),
+        ({"roadside.loss_rate": 1.0}, "roadside.loss_rate: 1.0"),
     ],
 )
 def test_what_is_not_possible_is_refused_in_one_line(changes: dict[str, object], message: str) -> None:

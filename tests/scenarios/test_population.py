@@ -11,12 +11,9 @@ from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.population import Population, read_population, write_population
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad
-from unjam.worlds.sumo.files import files_of
+from unjam.worlds.sumo.inputs import sumo_inputs
 
-DRIVERS = (
-    IDMParameters(time_headway=0.8, desired_speed=35.0),
-    IDMParameters(time_headway=1.6, minimum_gap=4.0),
-)
+DRIVERS = (IDMParameters(time_headway=0.8, desired_speed=35.0), IDMParameters(time_headway=1.6, minimum_gap=4.0))
 NETWORK = Network(((np.ones((3, 2)), np.zeros(2)), (np.full((2, 1), 0.01), np.zeros(1))), 0.5)
 
 
@@ -33,8 +30,8 @@ def test_what_is_written_is_read_again(tmp_path: Path, residual: Network | None)
     found = read_population(written(tmp_path, residual))
     assert (found.typical, found.drivers, found.limits) == (PAPER_IDM, DRIVERS, (-4.0, 2.0))
     assert [detail["name"] for detail in found.details] == ["a", "b"]
-    assert found.about == {"data": ["x.csv"]}
-    assert (found.fastest, found.quickest) == (35.0, 0.8)
+    assert found.metadata == {"data": ["x.csv"]}
+    assert (found.max_desired_speed, found.min_time_headway) == (35.0, 0.8)
     seen = np.array([[5.0, 1.0, 9.0]])
     assert (found.residual is None) == (residual is None)
     if found.residual is not None:
@@ -96,10 +93,10 @@ def test_a_road_draws_its_people_from_it(tmp_path: Path, name: str) -> None:
     assert scenario.humans == PAPER_IDM
     assert scenario.top_speed == 35.0
     roads = [scenario.draw(np.random.default_rng(seed)) for seed in (0, 0, 1)]
-    assert set(roads[0].people.values()) == set(DRIVERS)
-    assert roads[0].people == roads[1].people != roads[2].people
+    assert set(roads[0].human_parameters.values()) == set(DRIVERS)
+    assert roads[0].human_parameters == roads[1].human_parameters != roads[2].human_parameters
     assert isinstance(roads[0], BuiltRoad)
-    own_types = files_of(scenario, roads[0]).traffic.count('<vType id="of_')
+    own_types = sumo_inputs(scenario, roads[0]).traffic_xml.count('<vType id="of_')
     assert own_types == (22 if name == "ring" else 0)
 
 
@@ -109,29 +106,20 @@ def test_people_who_were_recorded_are_part_of_the_package(name: str, drivers: in
     assert len(found.drivers) == drivers
     assert {found.typical, *found.drivers} != {found.typical}
     assert scenario_changes(humans=name) == {"population": name}
-    assert (
-        f"{drivers} calibrated drivers of {name}"
-        in make_scenario("ring", {"population": name}).people_in_words
-    )
+    assert f"{drivers} calibrated drivers of {name}" in make_scenario("ring", {"population": name}).human_description
 
 
 def test_an_unknown_population_of_the_package_is_refused_with_those_that_are_there() -> None:
-    with pytest.raises(
-        InputError, match=r"'unjam:nobody' is not allowed; allowed: unjam:astazero, unjam:ngsim"
-    ):
+    with pytest.raises(InputError, match=r"'unjam:nobody' is not allowed; allowed: unjam:astazero, unjam:ngsim"):
         read_population("unjam:nobody")
 
 
-def test_on_a_motorway_people_follow_as_they_were_calibrated_and_want_to_drive_as_others_do(
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(
-        InputError, match="population: one with a residual network is not allowed on the on-ramp"
-    ):
+def test_on_a_motorway_people_follow_as_they_were_calibrated_and_want_to_drive_as_others_do(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="population: one with a residual network is not allowed on the on-ramp"):
         make_scenario("on-ramp", {"population": str(written(tmp_path, NETWORK))})
     road = make_scenario("on-ramp", {"population": str(written(tmp_path))}).draw(np.random.default_rng(0))
     assert isinstance(road, MotorwayRoad)
-    kinds = road.kinds
+    kinds = road.vehicle_types
     follows = {(one.time_headway, one.max_acceleration, one.comfortable_deceleration) for one in DRIVERS}
     assert {(one.time_headway, one.acceleration, one.deceleration) for one in kinds.values()} == follows
     assert {one.model for one in kinds.values()} == {"IDM"}
@@ -141,9 +129,9 @@ def test_on_a_motorway_people_follow_as_they_were_calibrated_and_want_to_drive_a
 def test_without_a_population_roads_are_as_they_were() -> None:
     scenario = make_scenario("ring")
     road = scenario.draw(np.random.default_rng(0))
-    assert road.people == {}
+    assert road.human_parameters == {}
     assert isinstance(road, BuiltRoad)
-    assert "insertionChecks" not in files_of(scenario, road).traffic
+    assert "insertionChecks" not in sumo_inputs(scenario, road).traffic_xml
 
 
 def test_a_residual_is_commanded(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def test_limit_is_the_equilibrium_speed_of_the_length() -> None:
 
 
 def test_parts_cover_the_range_without_overlap() -> None:
-    parts = [Ring().part(index, 4) for index in range(4)]
+    parts = [Ring().stratum(index, 4) for index in range(4)]
     assert parts[0].length[0] == 220
     assert parts[-1].length[1] == 270
     for before, after in itertools.pairwise(parts):
@@ -40,24 +40,20 @@ def test_parts_cover_the_range_without_overlap() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 8, 60])
 def test_parts_of_a_single_length_are_that_length(count: int) -> None:
-    assert {Ring(length=(230, 230)).part(index, count).length for index in range(count)} == {(230, 230)}
+    assert {Ring(length=(230, 230)).stratum(index, count).length for index in range(count)} == {(230, 230)}
 
 
 def test_draws_are_scaled_over_their_range() -> None:
     ring = Ring()
-    assert ring.drawn_scaled({"length": 220}) == (-1.0,)
-    assert ring.drawn_scaled({"length": 245}) == (0.0,)
-    assert ring.drawn_scaled({"length": 270}) == (1.0,)
-    assert np.isfinite(Ring(length=(230, 230)).drawn_scaled({"length": 230})).all()
+    assert ring.scale_drawn_values({"length": 220}) == (-1.0,)
+    assert ring.scale_drawn_values({"length": 245}) == (0.0,)
+    assert ring.scale_drawn_values({"length": 270}) == (1.0,)
+    assert np.isfinite(Ring(length=(230, 230)).scale_drawn_values({"length": 230})).all()
 
 
 def test_warmups_of_the_named_rings() -> None:
     rings = {name: scenario.warmup for name, scenario in SCENARIOS.items() if name.startswith("ring")}
-    assert rings == {
-        "ring": 0,
-        "ring-warm": 750,
-        "ring-jammed": 6000,
-    }
+    assert rings == {"ring": 0, "ring-warm": 750, "ring-jammed": 6000}
 
 
 def test_noise_is_flows_by_default_and_the_papers_on_request() -> None:

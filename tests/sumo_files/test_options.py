@@ -8,8 +8,8 @@ import pytest
 
 from tests.sumo_files.test_sumo_files import configuration
 from unjam.errors import InputError
-from unjam.sumo_files import REFUSED, kind_of_option, read_sumo_files
-from unjam.sumo_files.program import FILE_OPTIONS, sumo_name
+from unjam.sumo_files import REFUSED_OPTIONS, classify_option, read_sumo_files
+from unjam.sumo_files.reader_program import FILE_OPTIONS, canonical_option
 from unjam.worlds.sumo.networks import sumo_program
 
 VALUES = {"BOOL": "true", "INT": "1", "FLOAT": "1", "TIME": "1"}
@@ -41,7 +41,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, st
 def fate(name: str, kind: str) -> str:
     """What becomes of an option with a value that is not its default."""
     try:
-        return kind_of_option("mine.sumocfg", sumo_name(name), VALUES.get(kind, "some"))
+        return classify_option("mine.sumocfg", canonical_option(name), VALUES.get(kind, "some"))
     except InputError:
         return "refused"
 
@@ -57,11 +57,11 @@ def test_every_option_of_sumo_is_passed_or_refused_unless_it_changes_no_vehicle(
         harmless = group in ONLY_REPORTS or name in NO_EFFECT or device in DEVICES_THAT_WRITE
         found = fate(name, kind)
         fates.setdefault(found, set()).add(name)
-        if harmless and name not in REFUSED:
+        if harmless and name not in REFUSED_OPTIONS:
             assert found in ("not written", "ignored"), name
         else:
             assert found in ("passed", "replaced", "refused"), name
-    assert fates["refused"] == {*REFUSED}
+    assert fates["refused"] == {*REFUSED_OPTIONS}
     assert fates["replaced"] == {"seed", "random", "max-depart-delay"}
 
 
@@ -69,7 +69,7 @@ def test_other_names_of_an_option_have_its_fate(options: dict[str, tuple[str, st
     for name, (_, kind, others) in options.items():
         for other in others:
             if name in FILE_OPTIONS:
-                assert sumo_name(other) == name
+                assert canonical_option(other) == name
             else:
                 assert fate(other, kind) == fate(name, kind), other
 
@@ -77,20 +77,11 @@ def test_other_names_of_an_option_have_its_fate(options: dict[str, tuple[str, st
 @pytest.mark.parametrize(
     ("inside", "words"),
     [
-        (
-            '<load-state value="state.xml"/>',
-            "load-state: 'state.xml' is not allowed; allowed: no file, as episodes",
-        ),
+        ('<load-state value="state.xml"/>', "load-state: 'state.xml' is not allowed; allowed: no file, as episodes"),
         ('<astar.all-distances value="d"/>', "astar.all-distances: 'd' is not allowed; allowed: no file"),
-        (
-            '<device.fcd-replay.file value="d"/>',
-            "device.fcd-replay.files: 'd' is not allowed; allowed: no file",
-        ),
+        ('<device.fcd-replay.file value="d"/>', "device.fcd-replay.files: 'd' is not allowed; allowed: no file"),
         ('<phemlight-path value="mine"/>', "phemlight-path: 'mine' is not allowed; allowed: ./PHEMlight/"),
-        (
-            '<laterl-resolution value="1"/>',
-            "SUMO 1.28 has no such option; did you mean 'lateral-resolution'?",
-        ),
+        ('<laterl-resolution value="1"/>', "SUMO 1.28 has no such option; did you mean 'lateral-resolution'?"),
         ('<Begin value="1"/>', "Begin: SUMO 1.28 has no such option; did you mean 'begin'?"),
         ('<begin value="1"/><b value="1"/>', "b: is set twice"),
         ('<begin value="1" v="2"/>', "begin: is set twice"),
@@ -117,7 +108,7 @@ def test_what_sumo_would_refuse_or_unjam_cannot_do_is_told(inside: str, words: s
 )
 def test_options_at_their_defaults_change_nothing(inside: str, tmp_path: Path) -> None:
     found = read_sumo_files(configuration(tmp_path, inside))
-    assert (found.replaced, found.begin) == ((), 0.0)
+    assert (found.replaced_options, found.begin) == ((), 0.0)
 
 
 def test_files_of_a_configuration_may_name_variables_that_are_not_set(

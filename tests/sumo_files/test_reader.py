@@ -12,8 +12,8 @@ import pytest
 from tests.sumo_files.test_sumo_files import NETWORK, ROUTES, configuration
 from unjam import sandbox, sumo_files
 from unjam.errors import InputError
-from unjam.sumo_files import copy_harmless, read_lanes, read_sumo_files
 from unjam.sumo_files import program as reader
+from unjam.sumo_files import read_lanes, read_sumo_files, write_harmless_copy
 
 LAUGHS = "".join(f'<!ENTITY l{n} "{f"&l{n - 1};" * 10 if n else "lol"}">' for n in range(10))
 DEFINITIONS = {
@@ -69,10 +69,8 @@ def test_a_reader_that_is_lost_is_told(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_it_needs_pythons_own_library_alone(tmp_path: Path) -> None:
-    program = [sys.executable, "-I", "-S", sandbox.__file__, str(2**30), "60", "", str(sumo_files.PROGRAM)]
-    ran = subprocess.run(
-        [*program, "configuration", str(configuration(tmp_path))], capture_output=True, check=True
-    )
+    program = [sys.executable, "-I", "-S", sandbox.__file__, str(2**30), "60", "", str(sumo_files.READER_PROGRAM)]
+    ran = subprocess.run([*program, "configuration", str(configuration(tmp_path))], capture_output=True, check=True)
     assert json.loads(ran.stdout)["found"]["used_types"] == ["car"]
 
 
@@ -93,9 +91,9 @@ def test_lanes_that_are_none_are_refused(lane: str, tmp_path: Path) -> None:
 
 def test_in_this_process_it_answers_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = configuration(tmp_path, routes=ROUTES)
-    reader.main("configuration", str(path))
+    reader._main("configuration", str(path))
     assert json.loads(capsys.readouterr().out)["found"]["network"] == str(tmp_path / "road.net.xml")
-    reader.main("lanes", str(tmp_path / "none"))
+    reader._main("lanes", str(tmp_path / "none"))
     assert "there is no such file" in json.loads(capsys.readouterr().out)["broken"]
 
 
@@ -107,9 +105,7 @@ INCLUDES = {
     "each other": ({"road.rou.xml": ["b.xml"], "b.xml": ["./road.rou.xml"]}, "road.rou.xml: includes itself"),
     "what is no XML": ({"road.rou.xml": ["b.xml"], "b.xml": None}, "b.xml: cannot be read: no element found"),
     "more and more": (
-        {"road.rou.xml": ["1.xml"] * 9}
-        | {f"{n}.xml": [f"{n + 1}.xml"] * 9 for n in range(1, 9)}
-        | {"9.xml": []},
+        {"road.rou.xml": ["1.xml"] * 9} | {f"{n}.xml": [f"{n + 1}.xml"] * 9 for n in range(1, 9)} | {"9.xml": []},
         ".xml: includes more than 1000 files",
     ),
 }
@@ -136,12 +132,12 @@ def test_included_files_count_wherever_they_are_included(tmp_path: Path) -> None
     found = read_sumo_files(path)
     routes, types, more = (tmp_path / name for name in ("road.rou.xml", "deep/types.xml", "deep/more.xml"))
     assert found.used_types == {"a"}
-    assert found.dropped == ("edgeData",)
-    assert found.to_copy == {routes: (routes, types, more)}
+    assert found.dropped_items == ("edgeData",)
+    assert found.copy_sources == {routes: (routes, types, more)}
     assert found.sources == (path, tmp_path / "road.net.xml", routes, more, types)
     more.write_text('<x><vehicle id="w" type="b"/></x>')
     assert read_sumo_files(path).used_types == {"a", "b"}
-    copy_harmless(routes, tmp_path / "copy.xml")
+    write_harmless_copy(routes, tmp_path / "copy.xml")
     (copied,) = ElementTree.parse(tmp_path / "copy.xml").iter("vTypeDistribution")
     assert [each.tag for each in copied.iter()][1:] == ["routes", "vType", "x", "vehicle"]
 
@@ -153,7 +149,7 @@ def test_a_large_file_takes_no_memory_and_is_read_by_sumo_itself(
     monkeypatch.setattr(sumo_files, "LARGEST_MEMORY", 100 * 2**20)
     vehicle = '<vehicle id="v" type="car" depart="7.5" departLane="best"><route edges="a b"/></vehicle>\n'
     found = read_sumo_files(configuration(tmp_path, routes=f"<routes>{vehicle * 300_000}</routes>"))
-    assert (found.used_types, found.to_copy, found.first_departure) == ({"car"}, {}, 7.5)
+    assert (found.used_types, found.copy_sources, found.first_departure) == ({"car"}, {}, 7.5)
 
 
 @pytest.mark.parametrize(

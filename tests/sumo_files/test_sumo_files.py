@@ -54,7 +54,7 @@ def test_options_may_be_written_shortly_as_sumo_reads_them(tmp_path: Path) -> No
 
 
 def test_a_simulation_without_single_vehicles_is_refused(tmp_path: Path) -> None:
-    assert read_sumo_files(configuration(tmp_path, '<mesosim value="false"/>')).dropped == ()
+    assert read_sumo_files(configuration(tmp_path, '<mesosim value="false"/>')).dropped_items == ()
     with pytest.raises(InputError, match=r"road\.sumocfg: mesosim: true is not allowed; allowed: false"):
         read_sumo_files(configuration(tmp_path, '<mesosim value="true"/>'))
 
@@ -75,9 +75,7 @@ def test_what_a_configuration_does_not_say_is_as_sumo_has_it(tmp_path: Path) -> 
 def test_short_names_of_options_are_understood(tmp_path: Path) -> None:
     configuration(tmp_path)
     path = tmp_path / "short.sumocfg"
-    path.write_text(
-        '<configuration><net value="road.net.xml"/><routes value="road.rou.xml"/></configuration>'
-    )
+    path.write_text('<configuration><net value="road.net.xml"/><routes value="road.rou.xml"/></configuration>')
     assert read_sumo_files(path).used_types == {"car"}
 
 
@@ -158,8 +156,7 @@ def test_distributions_of_one_file_serve_the_vehicles_of_another(tmp_path: Path)
 
 def test_vehicles_without_a_type_may_be_a_distribution_too(tmp_path: Path) -> None:
     found = types_of(
-        tmp_path,
-        '<vTypeDistribution id="DEFAULT_VEHTYPE"><vType id="a"/></vTypeDistribution><trip id="1"/>',
+        tmp_path, '<vTypeDistribution id="DEFAULT_VEHTYPE"><vType id="a"/></vTypeDistribution><trip id="1"/>'
     )
     assert found.used_types == {"a"}
 
@@ -170,8 +167,7 @@ def test_compressed_files_are_read(tmp_path: Path) -> None:
         (tmp_path / f"{name}.gz").write_bytes(gzip.compress(content.encode()))
     path = tmp_path / "zipped.sumocfg"
     path.write_text(
-        '<configuration><net-file value="road.net.xml.gz"/><route-files value="road.rou.xml.gz"/>'
-        "</configuration>"
+        '<configuration><net-file value="road.net.xml.gz"/><route-files value="road.rou.xml.gz"/></configuration>'
     )
     assert read_sumo_files(path).used_types == {"car"}
 
@@ -190,12 +186,7 @@ BROKEN = {
     "empty network": ("", ROUTES, "", "road.net.xml: cannot be read"),
     "network that is no XML": ("plain words", ROUTES, "", "road.net.xml: cannot be read"),
     "routes that are no XML": (NETWORK, "<routes><vehicle", "", "road.rou.xml: cannot be read"),
-    "routes in an unknown encoding": (
-        NETWORK,
-        '<?xml version="1.0" encoding="klingon"?><routes/>',
-        "",
-        "read",
-    ),
+    "routes in an unknown encoding": (NETWORK, '<?xml version="1.0" encoding="klingon"?><routes/>', "", "read"),
     "no vehicles": (NETWORK, "<routes/>", "", "road.sumocfg: its route and additional files have no vehicle"),
     "configuration that is no XML": (NETWORK, ROUTES, "<configuration>", "road.sumocfg: cannot be read"),
 }
@@ -248,9 +239,7 @@ SNIPPETS = [*PIECES.replace("\n", "/").replace("_", " ").split("/"), "/>", "/"]
         st.tuples(st.integers(0, 90), st.binary(max_size=4)),
     ),
 )
-def test_whatever_files_hold_is_read_or_refused(
-    name: str, content: bytes | tuple[int, bytes], tmp_path: Path
-) -> None:
+def test_whatever_files_hold_is_read_or_refused(name: str, content: bytes | tuple[int, bytes], tmp_path: Path) -> None:
     path = configuration(tmp_path)
     (tmp_path / "road.rou.xml.gz").write_bytes(gzip.compress(ROUTES.encode()))
     if name.endswith("gz"):

@@ -48,14 +48,11 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 def unjam(tmp_path: Path, warm: Run) -> Run:
     """Runs `unjam` with arguments in an empty folder; as a new process where its surroundings differ.
 
-    Without `pictures` those of a report are left empty, where nobody looks at them; a new process draws them.
+    Without `snapshots` those of a report are left empty, where nobody looks at them; a new process draws them.
     """
 
     def run(
-        *arguments: object,
-        environment: Mapping[str, str] | None = None,
-        pictures: bool = True,
-        **options: Any,
+        *arguments: object, environment: Mapping[str, str] | None = None, pictures: bool = True, **options: Any
     ) -> subprocess.CompletedProcess[str]:
         words = [str(argument) for argument in arguments]
         if environment is None and not options:

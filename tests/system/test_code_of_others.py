@@ -10,12 +10,12 @@ from tests.system.conftest import Run
 from tests.system.test_wrong_inputs import one_line
 from tests.training.test_run import small_config
 from tests.worlds.sumo.own_roads import straight
-from unjam.cli import MAY_RUN_CODE
+from unjam.cli import CODE_RUNNING_COMMANDS
 from unjam.controller import controller_bytes
 from unjam.training.config import to_toml
-from unjam.training.folder import start_folder
+from unjam.training.run_folder import create_run_folder
 from unjam.training.train import train
-from unjam.trust import TRUSTED
+from unjam.trust import TRUSTED_VARIABLE
 
 DRIVER = "def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n"
 ROAD = ("ring", "--set", "horizon=20", "--set", "warmup=0")
@@ -44,7 +44,7 @@ VERBS = {
 def ran(tmp_path: Path) -> Path:
     """What appears when the code runs that the folder `run` names, which somebody else has made."""
     run, code, ran = tmp_path / "run", tmp_path / "run" / "code.py", tmp_path / "ran"
-    start_folder(run, small_config(expert=f"{code}:gentle", road__horizon=20))
+    create_run_folder(run, small_config(expert=f"{code}:gentle", road__horizon=20))
     (run / "best.toml").write_text((run / "config.toml").read_text())
     code.write_text(DRIVER)
     driver = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
@@ -80,7 +80,7 @@ def test_certify_goes_on_to_what_it_needs_where_the_code_is_trusted(unjam: Run, 
 
 
 def test_every_verb_that_can_be_told_so_knows_how_to_trust_code() -> None:
-    assert {words[0] for words in VERBS.values()} == {verb.__name__ for verb in MAY_RUN_CODE}
+    assert {words[0] for words in VERBS.values()} == {verb.__name__ for verb in CODE_RUNNING_COMMANDS}
 
 
 def test_code_that_ran_is_trusted_until_it_changes(unjam: Run, tmp_path: Path, ran: Path) -> None:
@@ -130,6 +130,6 @@ def test_own_code_runs_to_the_end_where_nothing_can_be_remembered(
     my_drivers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("UNJAM_STATE", str(my_drivers / "no folder"))
-    monkeypatch.setenv(TRUSTED, "")
+    monkeypatch.setenv(TRUSTED_VARIABLE, "")
     trained = train(small_config(expert=f"{my_drivers}:gentle", road__horizon=20), tmp_path / "run")
     assert trained.controller.is_file()

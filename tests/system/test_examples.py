@@ -14,13 +14,13 @@ from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
 from tests.worlds.sumo.own_roads import straight
-from unjam.controller import controller_bytes, shipped_file
-from unjam.controller.file import SAMPLE, replay, sample_bytes
+from unjam.controller import controller_bytes, packaged_file
+from unjam.controller.file import SAMPLE_PART, replay_states, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
-from unjam.drivers.local_state import LARGEST_GAP
-from unjam.drivers.registry import named_driver
+from unjam.drivers.local_state import MAX_OBSERVED_GAP
+from unjam.drivers.registry import driver_from_name
 from unjam.drivers.safety import SafetyFilter
-from unjam.drivers.wrappers import Filtered, Mixed, Remembering
+from unjam.drivers.wrappers import FilteredDriver, HistoryDriver, MixedDriver
 from unjam.worlds.sumo.networks import sumo_program
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -64,34 +64,32 @@ assert not {"unjam", "torch", "safetensors"} & set(sys.modules)
 
 def shipped(driver: Driver, path: Path, states: LocalState, limit: float = 1.0) -> Path:
     about = {"time_step": 0.1, "action_limit": 1.5}
-    path.write_bytes(controller_bytes(driver, about, {SAMPLE: sample_bytes(driver, states, limit)}))
+    path.write_bytes(controller_bytes(driver, about, {SAMPLE_PART: sample_bytes(driver, states, limit)}))
     return path
 
 
 @pytest.mark.long
 def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
-    drivers = [named_driver(name, 0.1) for name in EXPERTS if name.partition(":")[0] not in UNREAD]
+    drivers = [driver_from_name(name, 0.1) for name in EXPERTS if name.partition(":")[0] not in UNREAD]
     drivers += [
-        Pacer(varying=True, time_constant=1.0),
+        Pacer(use_tuned=True, time_constant=1.0),
         residual(PISaturation(), hold=10),
         residual(Pacer(lap_time=40.0), hold=3, outputs=2),
         residual(residual(residual(FollowerStopper(), 1, hold=3), 2), 3, hold=5),
-        residual(Remembering(PISaturation(), 0.1), hold=10),
-        residual(Filtered(PISaturation(), 1.0, SafetyFilter(), 0.1), hold=10),
-        residual(PISaturation(), hold=10, parts=("approach", "to_merge")),
-        Filtered(residual(PISaturation(), hold=10), 1.0, SafetyFilter(gap_error=0.5), 0.1),
-        Filtered(named_driver("constant:acceleration=1", 0.1), 1.5, SafetyFilter(time_headway=0.0), 0.1),
+        residual(HistoryDriver(PISaturation(), 0.1), hold=10),
+        residual(FilteredDriver(PISaturation(), 1.0, SafetyFilter(), 0.1), hold=10),
+        residual(PISaturation(), hold=10, parts=("approach", "distance_to_merge")),
+        FilteredDriver(residual(PISaturation(), hold=10), 1.0, SafetyFilter(gap_error=0.5), 0.1),
+        FilteredDriver(driver_from_name("constant:acceleration=1", 0.1), 1.5, SafetyFilter(time_gap=0.0), 0.1),
     ]
     states = perceived(700)
     paths = [shipped(driver, tmp_path / f"{number}.unjam", states) for number, driver in enumerate(drivers)]
     command = [sys.executable, "-I", "-c", WITHOUT_UNJAM, str(EXAMPLES), *map(str, paths)]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     for driver, line in zip(drivers, ran.stdout.splitlines(), strict=True):
-        limit = 6.0 if isinstance(driver, Filtered) else getattr(driver, "action_limit", 1.5)
+        limit = 6.0 if isinstance(driver, FilteredDriver) else getattr(driver, "action_limit", 1.5)
         found = np.array(line.strip("[]").split(","), float)
-        np.testing.assert_allclose(
-            found, replay(driver, states, limit), rtol=0, atol=1e-9, err_msg=str(driver)
-        )
+        np.testing.assert_allclose(found, replay_states(driver, states, limit), rtol=0, atol=1e-9, err_msg=str(driver))
 
 
 def compared(path: Path) -> subprocess.CompletedProcess[str]:
@@ -111,26 +109,24 @@ def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Pat
 
 
 def test_without_a_map_the_plain_reader_holds_back_for_reported_congestion_alone(tmp_path: Path) -> None:
-    states = perceived(700)._replace(to_merge=None)
-    driver = named_driver("jam-ahead", 1.0)
+    states = perceived(700)._replace(distance_to_merge=None)
+    driver = driver_from_name("jam-ahead", 1.0)
     path = shipped(driver, tmp_path / "it.unjam", states, limit=1.5)
-    wanted = replay(driver, states, 1.5)
+    wanted = replay_states(driver, states, 1.5)
     assert 0.1 < np.mean(wanted < 1.5) < 0.9
     ran = compared(path)
     assert (ran.returncode, ran.stderr) == (0, "")
 
 
 def test_the_plain_reader_says_what_it_cannot_read(tmp_path: Path) -> None:
-    asks = compared(shipped(named_driver("gap-maker", 0.1), tmp_path / "asks.unjam", perceived()))
+    asks = compared(shipped(driver_from_name("gap-maker", 0.1), tmp_path / "asks.unjam", perceived()))
     assert asks.stderr.endswith("ValueError: gap-maker is not read here; read it with unjam\n")
-    ran = compared(shipped(Mixed((PISaturation(), PISaturation())), tmp_path / "it.unjam", perceived()))
-    assert ran.stderr.endswith(
-        "ValueError: a driver of the kind mixed is not read here; read it with unjam\n"
-    )
+    ran = compared(shipped(MixedDriver((PISaturation(), PISaturation())), tmp_path / "it.unjam", perceived()))
+    assert ran.stderr.endswith("ValueError: a driver of the kind mixed is not read here; read it with unjam\n")
 
 
 def test_the_plain_reader_drives_by_what_has_no_sample_and_says_so() -> None:
-    ran = compared(shipped_file("ring-tuned"))
+    ran = compared(packaged_file("ring-tuned"))
     assert ran.returncode == 1
     assert "it can drive, but has no sample to compare with" in ran.stderr
     assert "Traceback" not in ran.stderr
@@ -147,7 +143,7 @@ drive(sumo, Controller(sys.argv[2]), "me")
 
 
 def test_a_controller_is_not_driven_in_longer_steps_than_its_filter_allows_for() -> None:
-    command = [sys.executable, "-c", STEP_OF_A_SECOND, str(EXAMPLES), str(shipped_file("ring-tuned"))]
+    command = [sys.executable, "-c", STEP_OF_A_SECOND, str(EXAMPLES), str(packaged_file("ring-tuned"))]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ran.returncode == 1
     assert ran.stderr.endswith("it decides every 0.1 s: start SUMO with --step-length 0.1\n")
@@ -155,14 +151,10 @@ def test_a_controller_is_not_driven_in_longer_steps_than_its_filter_allows_for()
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [
-        ("figure-eight-best", "pacer"),
-        ("on-ramp-tuned", "jam-ahead"),
-        ("best", "adaptive-acc|jam-ahead|pacer"),
-    ],
+    [("figure-eight-best", "pacer"), ("on-ramp-tuned", "jam-ahead"), ("best", "adaptive-acc|jam-ahead|pacer")],
 )
 def test_a_controller_that_looks_farther_than_the_client_tells_is_refused(name: str, words: str) -> None:
-    command = [sys.executable, "-c", STEP_OF_A_SECOND, str(EXAMPLES), str(shipped_file(name))]
+    command = [sys.executable, "-c", STEP_OF_A_SECOND, str(EXAMPLES), str(packaged_file(name))]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ran.returncode == 1
     assert re.search(f"looks at more than leader and follower: .*({words})|not read here", ran.stderr)
@@ -203,9 +195,7 @@ def test_the_client_drives_a_vehicle_of_a_running_sumo(tmp_path: Path) -> None:
     with subprocess.Popen(sumo, stdout=subprocess.DEVNULL) as running:
         try:
             client = [sys.executable, "traci_client.py", str(path), str(port), "me"]
-            ran = subprocess.run(
-                client, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
-            )
+            ran = subprocess.run(client, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
             assert ran.returncode == 0, ran.stderr
             running.wait(timeout=20)
         finally:
@@ -220,7 +210,7 @@ def test_the_client_drives_a_vehicle_of_a_running_sumo(tmp_path: Path) -> None:
     done = np.diff(states.speed) / 0.1
     assert np.ptp(done) > 0.5
     assert {"ahead", "behind"} <= rows[len(rows) // 2].keys()
-    np.testing.assert_allclose(done, replay(driver, states, 1.0)[:-1], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(done, replay_states(driver, states, 1.0)[:-1], rtol=0, atol=1e-5)
 
 
 def perceived_in(moment: dict[str | None, tuple[float, float]]) -> tuple[float, ...]:
@@ -230,6 +220,6 @@ def perceived_in(moment: dict[str | None, tuple[float, float]]) -> tuple[float, 
     for name, direction in (("ahead", 1.0), ("behind", -1.0)):
         place, pace = moment.get(name, (np.inf, 0.0))
         gap = abs(place - position) - 7.0
-        seen += [pace if gap < LARGEST_GAP else speed, min(gap, LARGEST_GAP)]
+        seen += [pace if gap < MAX_OBSERVED_GAP else speed, min(gap, MAX_OBSERVED_GAP)]
         assert (place - position) * direction > 7.0 or place == np.inf
     return speed, *seen, np.nan, np.nan

@@ -11,16 +11,13 @@ from tests.system.test_wrong_inputs import one_line
 from tests.test_processes import holder
 from tests.training.test_tasks import mixture
 from tests.worlds.sumo.own_roads import straight
-from unjam.controller.file import GRAPH
+from unjam.controller.file import GRAPH_PART
 from unjam.drivers import Constant
-from unjam.training.folder import start_folder
+from unjam.training.run_folder import create_run_folder
 
 
 def test_a_graph_that_wants_all_memory_is_refused_in_one_line(unjam: Run, tmp_path: Path) -> None:
-    helper, graph = (
-        pytest.importorskip("onnx").helper,
-        pytest.importorskip("tests.controller.test_graph").graph,
-    )
+    helper, graph = (pytest.importorskip("onnx").helper, pytest.importorskip("tests.controller.test_graph").graph)
     pytest.importorskip("onnxruntime")
 
     def bomb(model: Any) -> None:
@@ -34,7 +31,7 @@ def test_a_graph_that_wants_all_memory_is_refused_in_one_line(unjam: Run, tmp_pa
         del model.graph.node[:]
         model.graph.node.extend(nodes)
 
-    (tmp_path / "bomb.unjam").write_bytes(content_of(Constant(), 1.0, {GRAPH: graph(bomb)}))
+    (tmp_path / "bomb.unjam").write_bytes(content_of(Constant(), 1.0, {GRAPH_PART: graph(bomb)}))
     ran = unjam("verify", "bomb.unjam")
     assert (ran.returncode, ran.stdout) == (2, "")
     assert one_line(ran.stderr), ran.stderr
@@ -60,17 +57,15 @@ ON_ROAD = ("ring", "--set", "horizon=20")
 WRITERS = [
     ("drive", *ON_ROAD, "--driver", "pi", "--episodes", "1", "--out", "held"),
     ("tune", *ON_ROAD, "--steps", "10000", "--out", "held"),
-    ("search", "ring", "--set", "road.horizon=20", "--vary", "trpo.target_kl=0.1,0.2", "--out", "held"),
-    ("train", "ring", "--set", "road.horizon=20", "--steps", "100", "--out", "held"),
+    ("search", "ring", "--set", "scenario_options.horizon=20", "--vary", "trpo.target_kl=0.1,0.2", "--out", "held"),
+    ("train", "ring", "--set", "scenario_options.horizon=20", "--steps", "100", "--out", "held"),
     ("reproduce", "theory", "--out", "held"),
     ("assess", "straight.sumocfg", "-d", "acc", "--shares", "0.5", "--set", "horizon=20", "--out", "held"),
 ]
 
 
 @pytest.mark.parametrize("arguments", WRITERS, ids=lambda arguments: arguments[0])
-def test_two_of_a_verb_cannot_write_one_folder(
-    arguments: tuple[str, ...], unjam: Run, tmp_path: Path
-) -> None:
+def test_two_of_a_verb_cannot_write_one_folder(arguments: tuple[str, ...], unjam: Run, tmp_path: Path) -> None:
     straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
     held = tmp_path / "held"
     held.mkdir()
@@ -85,17 +80,13 @@ def test_two_of_a_verb_cannot_write_one_folder(
 
 @pytest.mark.parametrize(
     ("arguments", "held"),
-    [
-        (("model", "run"), "run"),
-        (("train", "--resume", "run"), "run"),
-        (("train", "--resume", "run"), "run/ring"),
-    ],
+    [(("model", "run"), "run"), (("train", "--resume", "run"), "run"), (("train", "--resume", "run"), "run/ring")],
     ids=["model", "train", "train, a road of several"],
 )
 def test_a_run_that_another_process_writes_is_left_alone(
     arguments: tuple[str, ...], held: str, unjam: Run, tmp_path: Path
 ) -> None:
-    start_folder(tmp_path / "run", mixture())
+    create_run_folder(tmp_path / "run", mixture())
     (tmp_path / "run" / "ring").mkdir()
     process = holder(tmp_path / held)
     ran = unjam(*arguments)

@@ -44,12 +44,10 @@ def test_ignored_demand_is_told_in_terminal_json_and_report(unjam: Run, tmp_path
         ("drive", "straight.sumocfg", "--cav-share", "0.1"),
         ("drive", "straight.sumocfg", "--cav-share", "0.1", "-d", "human", "--set", "horizon=120"),
         ("assess", "straight.sumocfg"),
-        ("train", "straight.sumocfg", "--set", "road.cav_share=0.5", "--steps", "100"),
+        ("train", "straight.sumocfg", "--set", "scenario_options.penetration_rate=0.5", "--steps", "100"),
     ],
 )
-def test_traffic_without_vehicles_is_one_clear_line(
-    words: tuple[str, ...], unjam: Run, tmp_path: Path
-) -> None:
+def test_traffic_without_vehicles_is_one_clear_line(words: tuple[str, ...], unjam: Run, tmp_path: Path) -> None:
     straight(tmp_path, LATE, step=0.5)
     ran = unjam(*words)
     assert (ran.returncode, ran.stdout) == (2, "")
@@ -58,10 +56,10 @@ def test_traffic_without_vehicles_is_one_clear_line(
 
 
 def test_the_advice_for_traffic_without_vehicles_helps_and_python_gets_it_too(tmp_path: Path) -> None:
-    file, how = str(straight(tmp_path, LATE, step=0.5)), {"cav_share": 0.5}
+    file, how = str(straight(tmp_path, LATE, step=0.5)), {"penetration_rate": 0.5}
     with pytest.raises(InputError, match=NONE_ENTERED):
-        package.drive(file, "human", 1, road=how, workers=1)
-    rows = package.drive(file, "human", 1, road={**how, "begin": 25200, "end": 25260}, workers=1).rows
+        package.drive(file, "human", 1, scenario_options=how, workers=1)
+    rows = package.drive(file, "human", 1, scenario_options={**how, "begin": 25200, "end": 25260}, workers=1).rows
     assert rows["human"][0]["vehicles"] >= 20
 
 
@@ -83,13 +81,11 @@ def test_overlaps_at_junctions_that_plain_sumo_ignores_end_no_baseline(unjam: Ru
     (few,), (half,) = (each["episodes"] for each in found)
     assert (few["status"], few["collisions"], few["steps"]) == ("completed", 0.0, 900)
     assert found[0]["ended_early"] == {}
-    traffic = ("vehicles", "mean_speed", "travel_time", "throughput_veh_per_h", "fuel_ml_per_km")
+    traffic = ("vehicles", "mean_speed", "travel_time", "outflow_veh_per_h", "fuel_ml_per_km")
     assert [few[name] for name in traffic] == [half[name] for name in traffic]
 
 
-def test_a_limit_of_teleports_ends_episodes_and_assess_refuses_such_a_baseline(
-    unjam: Run, tmp_path: Path
-) -> None:
+def test_a_limit_of_teleports_ends_episodes_and_assess_refuses_such_a_baseline(unjam: Run, tmp_path: Path) -> None:
     options = TELEPORTS + '<max-num-teleports value="0"/>'
     straight(tmp_path, STANDING, end=120.0, step=0.5, options=options)
     drive = ("drive", "straight.sumocfg", "--cav-share", 0.5, "-d", "human", "-n", 2)
@@ -107,9 +103,7 @@ def test_a_limit_of_teleports_ends_episodes_and_assess_refuses_such_a_baseline(
 
 
 @pytest.mark.long
-def test_contact_of_cavs_is_recorded_for_the_verdict_without_ending_the_episode(
-    unjam: Run, tmp_path: Path
-) -> None:
+def test_contact_of_cavs_is_recorded_for_the_verdict_without_ending_the_episode(unjam: Run, tmp_path: Path) -> None:
     two_way(tmp_path)
     drive = ("drive", "my.sumocfg", "--cav-share", 0.9, "-d", "acc", "-n", 2, "--no-report")
     found = document(unjam, *drive, "--set", "actuation=raw", "--set", "safety.active=false")
@@ -118,6 +112,6 @@ def test_contact_of_cavs_is_recorded_for_the_verdict_without_ending_the_episode(
     assert found["ended_early"] == {}
     assert sum(row["contacts"] for row in rows) > 0
     file, driver = str(tmp_path / "my.sumocfg"), make_driver("acc", 0.5)
-    changes = {"cav_share": 0.9, "actuation": "raw", "safety.active": False}
+    changes = {"penetration_rate": 0.9, "actuation": "raw", "safety.active": False}
     trained = run_episode(make_scenario(file, changes), driver, rows[0]["seed"])
     assert trained.status == "collision"

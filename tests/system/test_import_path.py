@@ -146,12 +146,7 @@ def test_children_of_a_program_import_nothing_from_its_folder(name: str, here: s
     root = str(Path(__file__).parents[2])
     environment = {**os.environ, "PYTHONPATH": root}
     done = subprocess.run(
-        [sys.executable, "program.py"],
-        cwd=planted,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, "program.py"], cwd=planted, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     check_nothing_ran(planted)

@@ -12,15 +12,20 @@ from typing import NamedTuple
 import pytest
 
 from tests.faults.links import KINDS, plant, state_of, with_temporary_names
-from tests.studies.test_field import table
+from tests.paper.test_field import table
 from tests.system.conftest import PLAIN, UNJAM, Run
 from tests.system.test_calibrate import CALIBRATE, PEOPLE, ROWS
 from tests.system.test_verbs import SMALL, TINY_RUN
 from tests.worlds.sumo.own_roads import straight
-from unjam.processes import LOCK
+from unjam.processes import LOCK_FILE
 
-ROAD = {"road.length": "[60,60]", "road.vehicles": 5, "road.horizon": 40, "virtual.virtual_ratio": 0}
-TRIAL = {**ROAD, "trpo.batch_steps": 160, "steps": 160, "evaluation.validation_episodes": 1}
+ROAD = {
+    "scenario_options.length": "[60,60]",
+    "scenario_options.vehicles": 5,
+    "scenario_options.horizon": 40,
+    "model.model_ratio": 0,
+}
+TRIAL = {**ROAD, "trpo.steps_per_iteration": 160, "steps": 160, "evaluation.validation_episodes": 1}
 SEARCH = ["search", "ring", *(word for key, value in TRIAL.items() for word in ("--set", f"{key}={value}"))]
 SEARCH += ["--vary", "trpo.target_kl=0.01,0.02", "--workers", "1", "--out", "searched"]
 TUNE = ["tune", "ring", "--length", "60", "--vehicles", "5", "--set", "horizon=20", "--expert", "pi"]
@@ -42,7 +47,7 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "train": Case([*TINY_RUN, "--steps", "160", "--set", "virtual.virtual_ratio=0", "--out", "new"], "new"),
+    "train": Case([*TINY_RUN, "--steps", "160", "--set", "model.model_ratio=0", "--out", "new"], "new"),
     "train on": Case(["train", "--resume", "run", "--steps", "320", "--tensorboard"], "run"),
     "train on, several roads": Case(["train", "--resume", "roads", "--steps", "640"], "roads"),
     "evaluate": Case(["evaluate", "run", "-n", "1", "--workers", "1"], "run"),
@@ -139,7 +144,7 @@ def plantings(written: dict[str, bool]) -> list[list[tuple[str, str]]]:
     deep = [name for name in files if "/" in name]
     deep_folders = [name for name in written if "/" in name and name not in files]
     return [
-        [(name, "hard link") for name in (*files, LOCK)],
+        [(name, "hard link") for name in (*files, LOCK_FILE)],
         list(zip(deep, cycle(SYMBOLIC), strict=False)),
         [(name, "a folder") for name in deep_folders if str(Path(name).parent) not in deep_folders],
         *([(name, kind)] for name, kind in zip(with_temporary_names(top), cycle(SYMBOLIC), strict=False)),
@@ -162,9 +167,7 @@ def test_no_verb_writes_through_a_link(verb: str, base: Path, tmp_path: Path, wa
 
 @pytest.mark.long
 @pytest.mark.parametrize("verb", NEVER_ENDS)
-def test_what_takes_hours_refuses_links_before_it_begins(
-    verb: str, base: Path, tmp_path: Path, warm: Run
-) -> None:
+def test_what_takes_hours_refuses_links_before_it_begins(verb: str, base: Path, tmp_path: Path, warm: Run) -> None:
     case, names = NEVER_ENDS[verb]
     for number, (name, kind) in enumerate(zip(with_temporary_names([*names]), cycle(SYMBOLIC), strict=False)):
         scene = Scene(base, tmp_path / str(number), case.folder)
@@ -188,9 +191,7 @@ def test_a_folder_may_be_reached_through_links(base: Path, tmp_path: Path, warm:
 
 CALL = re.compile(r"(?:\[pid +\d+\] )?(\w+)\((.*)\) += (-?\d+)(?:<(.*)>)?")
 QUOTED = re.compile(r'(AT_FDCWD|\d+)?(?:<([^>]*)>)?(?:, )?"((?:[^"\\]|\\.)*)"')
-CHANGES = (
-    "mkdir,mkdirat,rename,renameat,renameat2,unlink,unlinkat,rmdir,link,linkat,symlink,symlinkat,truncate"
-)
+CHANGES = "mkdir,mkdirat,rename,renameat,renameat2,unlink,unlinkat,rmdir,link,linkat,symlink,symlinkat,truncate"
 
 
 @pytest.mark.slow
@@ -199,26 +200,10 @@ CHANGES = (
 def test_whatever_a_verb_writes_it_names_from_an_open_folder(verb: str, base: Path, tmp_path: Path) -> None:
     """Also what other packages and programs write: each of the system's calls is looked at."""
     case, scene, log = CASES[verb], Scene(base, tmp_path, CASES[verb].folder), tmp_path / "log"
-    trace = [
-        "strace",
-        "-f",
-        "-qq",
-        "-y",
-        "-s",
-        "4096",
-        "-e",
-        f"trace=open,creat,openat,{CHANGES}",
-        "-o",
-        str(log),
-    ]
+    trace = ["strace", "-f", "-qq", "-y", "-s", "4096", "-e", f"trace=open,creat,openat,{CHANGES}", "-o", str(log)]
     environment = {**os.environ, **PLAIN}
     ran = subprocess.run(
-        [*trace, str(UNJAM), *case.words],
-        cwd=scene.place,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
+        [*trace, str(UNJAM), *case.words], cwd=scene.place, env=environment, capture_output=True, text=True, check=False
     )
     assert ran.returncode == 0, ran.stderr
     unsafe = [line for line in log.read_text().splitlines() if is_unsafe(line, scene.folder)]
@@ -235,9 +220,7 @@ def is_unsafe(line: str, folder: Path) -> bool:
         return False
     for number, at, name in QUOTED.findall(arguments):
         path = Path(at or "/", name)
-        if not (path.is_relative_to(folder) and path != folder) and not Path(opened or "/").is_relative_to(
-            folder
-        ):
+        if not (path.is_relative_to(folder) and path != folder) and not Path(opened or "/").is_relative_to(folder):
             continue
         if RANDOM.search(name) and "events.out.tfevents" in name:
             continue

@@ -21,11 +21,7 @@ def test_what_cells_made_is_kept_until_a_measured_file_or_code_changes(
     cells: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cells, "ROOT", tmp_path)
-    made_of = [
-        tmp_path / "results/ring.json",
-        tmp_path / "src/unjam/table.py",
-        tmp_path / "docs/tables.py",
-    ]
+    made_of = [tmp_path / "results/ring.json", tmp_path / "src/unjam/table.py", tmp_path / "docs/tables.py"]
     for path in made_of:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("1")
@@ -62,9 +58,7 @@ def test_every_picture_that_a_cell_draws_is_told_in_words() -> None:
     drawn = [
         (page.name, cell)
         for page in (ROOT / "docs").glob("*.md")
-        for cell in re.findall(
-            r"^```{code-cell} ipython3\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE
-        )
+        for cell in re.findall(r"^```{code-cell} ipython3\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE)
         if re.search(r"^(Image|draw)\(", cell, re.MULTILINE)
     ]
     assert len(drawn) > 20

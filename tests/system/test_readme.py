@@ -24,7 +24,9 @@ LESS = {
     "assess": shlex.split("--shares 0.5 -d acc -n 34 --set horizon=100"),
     "calibrate": shlex.split("--trials 2 --seeds 1"),
     "reproduce": ["--dry-run"],
-    "search": shlex.split("--trials 1 --steps 300 --set road.horizon=60 --set trpo.batch_steps=150"),
+    "search": shlex.split(
+        "--trials 1 --steps 300 --set scenario_options.horizon=60 --set trpo.steps_per_iteration=150"
+    ),
     "tune": shlex.split("--steps 8000 --set horizon=20"),
     "evaluate": ["--episodes", "1"],
     "watch": ["--set", "horizon=60"],

@@ -13,7 +13,7 @@ from tests.controller.test_signature import FORGED, NO_PRIVATE_KEYS, forge
 from tests.controller.test_verify import content_of
 from tests.system.conftest import ROOT, Run
 from tests.system.test_wrong_inputs import one_line
-from unjam.controller.file import WEIGHTS, pack_parts, unpack_parts
+from unjam.controller.file import WEIGHTS_PART, pack_parts, unpack_parts
 
 DRIVE = ("drive", "ring", "--set", "horizon=5", "--set", "warmup=0", "-n", "1", "--no-report", "--driver")
 
@@ -76,7 +76,7 @@ def test_no_reader_takes_a_forged_controller(verb: str, unjam: Run, tmp_path: Pa
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
     path = tmp_path / "it.unjam"
     parts = unpack_parts(path)
-    changed = {**parts, WEIGHTS: parts[WEIGHTS][:-1] + b"?"}
+    changed = {**parts, WEIGHTS_PART: parts[WEIGHTS_PART][:-1] + b"?"}
     words = {
         "drive": (*DRIVE, "it.unjam"),
         "verify": ("verify", "it.unjam"),
@@ -104,9 +104,7 @@ def test_what_another_has_signed_is_signed_again_on_demand_alone(unjam: Run, mak
     other = json.loads(unjam("keys", "other", "--json").stdout)["fingerprint"]
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
-    assert f"(it is signed by {maker}); or --replace" in refused(
-        unjam, "sign", "it.unjam", "--key", "other.key"
-    )
+    assert f"(it is signed by {maker}); or --replace" in refused(unjam, "sign", "it.unjam", "--key", "other.key")
     ran = unjam("sign", "it.unjam", "--key", "other.key", "--replace", "--json")
     assert json.loads(ran.stdout) == {"file": "it.unjam", "fingerprint": other, "replaced": maker}
     words = f"it is signed by another key, {other}; allowed: signed by 'maker.pub', {maker}"
@@ -115,9 +113,7 @@ def test_what_another_has_signed_is_signed_again_on_demand_alone(unjam: Run, mak
 
 def test_keys_are_made_once(unjam: Run, tmp_path: Path, maker: str) -> None:
     before = (tmp_path / "maker.key").read_bytes()
-    assert "name: 'maker' is not allowed; allowed: one of which there are no " in refused(
-        unjam, "keys", "maker"
-    )
+    assert "name: 'maker' is not allowed; allowed: one of which there are no " in refused(unjam, "keys", "maker")
     assert (tmp_path / "maker.key").read_bytes() == before
     assert stat.S_IMODE((tmp_path / "maker.key").stat().st_mode) == 0o600
     assert unjam("keys", "nowhere/maker").returncode == 74
@@ -129,9 +125,7 @@ def test_other_keys_are_refused(name: str, unjam: Run, tmp_path: Path) -> None:
     content, words = NO_PRIVATE_KEYS[name]
     (tmp_path / "other.key").write_bytes(content)
     before = (tmp_path / "it.unjam").read_bytes()
-    assert f"key: 'other.key' {words}; allowed: an Ed25519" in refused(
-        unjam, "sign", "it.unjam", "--key", "other.key"
-    )
+    assert f"key: 'other.key' {words}; allowed: an Ed25519" in refused(unjam, "sign", "it.unjam", "--key", "other.key")
     assert (tmp_path / "it.unjam").read_bytes() == before
     refused(unjam, "verify", "it.unjam", "--signer", "other.key")
     refused(unjam, "sign", ".", "--key", "maker.key")

@@ -13,16 +13,16 @@ import pytest
 from PIL import Image
 
 from tests.faults.processes import SETTINGS, TINY
-from tests.studies.test_field import table
+from tests.paper.test_field import table
 from tests.system.conftest import UNJAM, Run
 from tests.worlds.sumo.own_roads import game, straight
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=80"]
 TINY_RUN = [
-    *["train", "ring", "--length", "60", "--vehicles", "5", "--set", "road.horizon=80", "--workers", "1"],
-    *["--set", "trpo.batch_steps=160", "--set", "evaluation.episodes=2"],
+    *["train", "ring", "--length", "60", "--vehicles", "5", "--set", "scenario_options.horizon=80", "--workers", "1"],
+    *["--set", "trpo.steps_per_iteration=160", "--set", "evaluation.episodes=2"],
     *["--set", 'evaluation.baselines=["human"]'],
-    *["--set", "evaluation.validation_episodes=1", "--set", "evaluation.every=2"],
+    *["--set", "evaluation.validation_episodes=1", "--set", "evaluation.validation_interval=2"],
 ]
 
 METRICS_OF_THE_DESIGN = [
@@ -37,8 +37,8 @@ METRICS_OF_THE_DESIGN = [
     "collisions",
     "min_ttc",
     "fuel_ml_per_km",
-    "throughput_veh_per_h",
-    "backlog_veh",
+    "outflow_veh_per_h",
+    "insertion_backlog_veh",
     "shield_override_share",
     "speed_limit_ratio",
     "speed_limit_ratio_steady",
@@ -125,14 +125,12 @@ def test_drive_with_the_users_own_driver_and_reward(unjam: Run, my_drivers: Path
 
 @pytest.mark.slow
 def test_drive_on_the_merge_tells_of_flow_and_backlog(unjam: Run, tmp_path: Path) -> None:
-    found = document(
-        unjam("drive", "merge", "-d", "human", "-d", "pi", "-n", 1, "--set", "horizon=60", "--json")
-    )
+    found = document(unjam("drive", "merge", "-d", "human", "-d", "pi", "-n", 1, "--set", "horizon=60", "--json"))
     human, pi = (entry["episodes"][0] for entry in found["drivers"])
     assert set(METRICS_OF_THE_DESIGN) <= set(pi)
     assert (human["steps"], human["collisions"], pi["collisions"]) == (60, 0.0, 0.0)
-    assert human["throughput_veh_per_h"] > 0
-    assert min(human["backlog_veh"], pi["backlog_veh"]) >= 0
+    assert human["outflow_veh_per_h"] > 0
+    assert min(human["insertion_backlog_veh"], pi["insertion_backlog_veh"]) >= 0
     assert "Speed, waves and queues over time" in (tmp_path / found["drivers"][0]["report"]).read_text()
 
 
@@ -156,9 +154,7 @@ def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
     assert (share["scenario"], share["episodes"][0]["status"]) == (file, "completed")
     assert share["mean"]["mean_speed"] > 5
     assert (tmp_path / share["report"]).is_file()
-    types = document(
-        unjam("drive", file, "--cav-types", "truck,passenger", "-d", "idm", *common, "--no-report")
-    )
+    types = document(unjam("drive", file, "--cav-types", "truck,passenger", "-d", "idm", *common, "--no-report"))
     assert types["episodes"][0]["steps"] == 150
 
 
@@ -194,9 +190,7 @@ def test_assess_answers_in_words_in_json_and_on_a_page(unjam: Run, tmp_path: Pat
     ("question", "first_words"),
     [
         pytest.param(
-            (*QUESTION, "-n", "5000", "--precision", "1e-9"),
-            ("assessing", "an episode"),
-            marks=pytest.mark.slow,
+            (*QUESTION, "-n", "5000", "--precision", "1e-9"), ("assessing", "an episode"), marks=pytest.mark.slow
         ),
         (("drive", "ring", "-d", "pi", "-n", "5000"), ("driving",)),
     ],
@@ -262,24 +256,19 @@ def test_train_go_on_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert {"human", "pi", "trained"} == set(trained["drivers"])
     progress = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
-    assert [row["actual_steps"] for row in progress] == [160, 320]
+    assert [row["environment_steps"] for row in progress] == [160, 320]
 
     went_on = document(unjam("train", "--resume", "run", "--steps", 480, "--json"))
     assert went_on["folder"] == "run"
     progress = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
-    assert [row["actual_steps"] for row in progress] == [160, 320, 480]
+    assert [row["environment_steps"] for row in progress] == [160, 320, 480]
 
     assert "A trained residual on pi".lower() in (run / "report.html").read_text().lower()
     driven = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json", pictures=False))
     assert driven["episodes"][0]["status"] == "completed"
 
     shipped = document(unjam("export", "run", "--to", "ring.unjam", "--json"))
-    assert shipped == {
-        "file": "ring.unjam",
-        "onnx": None,
-        "driver": "pi + residual, filtered",
-        "decisions": 80,
-    }
+    assert shipped == {"file": "ring.unjam", "onnx": None, "driver": "pi + residual, filtered", "decisions": 80}
     said = document(unjam("verify", "ring.unjam", "--json"))
     status = {each["part"]: each["status"] for each in said["parts"]}
     assert said["ok"] is True
@@ -304,9 +293,7 @@ def test_a_trained_run_is_explained_compared_judged_anew_and_an_expert(unjam: Ru
     assert "bound C" in table
     assert "The virtual environment" in (tmp_path / "run" / "report.html").read_text()
 
-    on_top = document(
-        unjam(*TINY_RUN, "--steps", 160, "--expert", "run/controller.unjam", "--out", "second", "--json")
-    )
+    on_top = document(unjam(*TINY_RUN, "--steps", 160, "--expert", "run/controller.unjam", "--out", "second", "--json"))
     assert "pi + residual" in on_top["drivers"]
     both = document(unjam("report", "run", "second", "--out", "both.html", "--json"))
     assert (tmp_path / both["report"]).is_file()
@@ -367,9 +354,7 @@ def test_version(unjam: Run) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
-)
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 @pytest.mark.parametrize("road", ["ring", "figure-eight", "merge", "own-network"])
 def test_a_stopped_run_leaves_no_process_and_can_go_on(
     sign: signal.Signals, code: int, road: str, unjam: Run, tmp_path: Path
@@ -389,7 +374,7 @@ def test_a_stopped_run_leaves_no_process_and_can_go_on(
     assert "Traceback" not in words
     assert "go on with: unjam train --resume run --workers 1\n" in words
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
-    last = json.loads(progress.read_text().splitlines()[-1])["actual_steps"]
+    last = json.loads(progress.read_text().splitlines()[-1])["environment_steps"]
     assert unjam("train", "--resume", "run", "--steps", last + 1).returncode == 0
 
 
@@ -420,14 +405,9 @@ def test_calibrated_people_drive_on_a_road_and_judge_a_run_there(unjam: Run, tmp
     found = document(unjam("fit-drivers", "data.parquet", "--set", "calibration.generations=2", "--json"))
     assert (found["drivers"], found["population"]) == (2, "drivers.json")
     among = ["--humans", "drivers.json"]
-    people = [
-        document(unjam("drive", "ring", "-d", "human", "-n", 1, *SMALL, *each, "--json"))
-        for each in ([], among)
-    ]
+    people = [document(unjam("drive", "ring", "-d", "human", "-n", 1, *SMALL, *each, "--json")) for each in ([], among)]
     assert people[0]["mean"]["mean_speed"] != people[1]["mean"]["mean_speed"]
-    ran = unjam(
-        *TINY_RUN, "--steps", 160, "--out", "run", *among, "--set", "virtual.base=population", "--json"
-    )
+    ran = unjam(*TINY_RUN, "--steps", 160, "--out", "run", *among, "--set", "model.base=population", "--json")
     assert document(ran)["controller"] == "run/controller.unjam"
     refused = unjam("evaluate", "run", *among)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)

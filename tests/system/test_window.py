@@ -44,9 +44,7 @@ def test_watching_in_the_window_ends_by_itself_and_says_what_happened(unjam: Run
 
 
 @needs_display
-def test_what_the_window_shows_is_the_episode_of_that_seed(
-    display: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_window_shows_is_the_episode_of_that_seed(display: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DISPLAY", display)
     watched = watch_in_window(RING, PISaturation(), (4,), pace=1000.0)
     assert watched.speeds.tolist() == run_episode(RING, PISaturation(), (4,)).speeds.tolist()

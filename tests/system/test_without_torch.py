@@ -10,7 +10,7 @@ import pytest
 from tests.following.made_up import write_table
 from tests.system.conftest import PLAIN
 from tests.worlds.sumo.own_roads import straight
-from unjam.errors import TRAIN
+from unjam.errors import TRAIN_PACKAGES
 
 # Python runs a file of this name first, in workers too.
 SITE = """
@@ -29,16 +29,14 @@ sys.meta_path.insert(0, Without())
 def core(tmp_path: Path) -> dict[str, str]:
     """The environment of processes without torch."""
     (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(SITE.replace("{TRAIN}", repr(TRAIN)))
+    (tmp_path / "site" / "sitecustomize.py").write_text(SITE.replace("{TRAIN}", repr(TRAIN_PACKAGES)))
     paths = [str(tmp_path / "site"), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, **PLAIN, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def unjam(core: dict[str, str], folder: Path, command: str) -> "subprocess.CompletedProcess[str]":
     words = [sys.executable, "-m", "unjam", *command.split()]
-    return subprocess.run(
-        words, cwd=folder, env=core, capture_output=True, text=True, timeout=300, check=False
-    )
+    return subprocess.run(words, cwd=folder, env=core, capture_output=True, text=True, timeout=300, check=False)
 
 
 @pytest.mark.long
@@ -60,9 +58,7 @@ def test_what_does_not_learn_runs_without_torch(core: dict[str, str], tmp_path: 
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["train ring --preset demo", "reproduce table-2 --dry-run"])
-def test_what_learns_says_in_a_line_what_to_install(
-    core: dict[str, str], tmp_path: Path, command: str
-) -> None:
+def test_what_learns_says_in_a_line_what_to_install(core: dict[str, str], tmp_path: Path, command: str) -> None:
     ran = unjam(core, tmp_path, command)
     assert ran.returncode == 3, ran.stderr
     assert ran.stderr.splitlines()[-1].startswith("unjam: ")

@@ -13,7 +13,7 @@ from safetensors.numpy import save
 from tests.controller.test_verify import HELD
 from tests.system.conftest import UNJAM, Run
 from unjam.controller import controller_bytes
-from unjam.controller.file import WEIGHTS
+from unjam.controller.file import WEIGHTS_PART
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=60"]
 
@@ -64,10 +64,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "driver file that is missing": ("is not a file", ["drive ring --driver none.py:gentle"]),
     "driver that is not in the file": ("has no 'ghost'", ["drive ring --driver mine.py:ghost"]),
     "driver file with an error in it": ("SyntaxError", ["drive ring --driver torn.py:gentle"]),
-    "driver file that ends the program": (
-        "SystemExit when loading it",
-        ["drive ring --driver ends.py:gentle"],
-    ),
+    "driver file that ends the program": ("SystemExit when loading it", ["drive ring --driver ends.py:gentle"]),
     "reward file that ends the program": (
         "SystemExit when loading it",
         ["drive ring --driver pi --reward ends.py:gentle"],
@@ -75,10 +72,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "an episode without end": ("horizon: 1000000000", ["drive ring --driver pi --set horizon=1000000000"]),
     "two drivers in one window": ("driver: 'pi, acc'", ["watch ring -d pi -d acc --video film.gif"]),
     "report over another file": ("allowed: a file that ends in .html", ["report full --out mine.py"]),
-    "certificate over another file": (
-        "allowed: a file that ends in .html",
-        ["certify torn.unjam --out mine.py"],
-    ),
+    "certificate over another file": ("allowed: a file that ends in .html", ["certify torn.unjam --out mine.py"]),
     "emissions of an own network": (
         "emission_class: it is not allowed",
         ["drive good.sumocfg --driver pi --cav-share 0.5 --set emission_class=zero"],
@@ -87,10 +81,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "driver that cannot be made": ("no battery", ["drive ring --driver mine.py:Raises"]),
     "driver that answers NaN": ("step 0: acceleration", ["drive ring --driver mine.py:broken"]),
     "driver that answers too many": ("one for each CAV", ["drive ring --driver mine.py:short"]),
-    "driver that raises": (
-        "mine.py:raises: ValueError: lost the map (line",
-        ["drive ring --driver mine.py:raises"],
-    ),
+    "driver that raises": ("mine.py:raises: ValueError: lost the map (line", ["drive ring --driver mine.py:raises"]),
     "controller that is missing": ("does not exist", ["drive ring --driver none.unjam"]),
     "controller that is none": ("not a controller", ["drive ring --driver torn.unjam"]),
     "folder that is not empty": ("full' is not empty", ["drive ring --driver pi --out full"]),
@@ -111,8 +102,8 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         ["drive ring --length 230 --set length=240"],
     ),
     "what an option of a training says too": (
-        "--set road.length: it is not allowed beside the option for it",
-        ["train ring --length 230 --set road.length=240"],
+        "--set scenario_options.length: it is not allowed beside the option for it",
+        ["train ring --length 230 --set scenario_options.length=240"],
     ),
     "resuming with a preset": ("not allowed beside it", ["train --resume full --preset demo"]),
     "evaluating what is no run": ("not a run folder", ["evaluate full"]),
@@ -126,10 +117,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         "no CAV was on the road in 5 decisions",
         ["drive merge --driver pi --set cav_share=0 --set horizon=5"],
     ),
-    "share of CAVs on a road without one": (
-        "cav_share: unknown name",
-        ["drive ring --driver pi --cav-share 0.1"],
-    ),
+    "share of CAVs on a road without one": ("cav_share: unknown name", ["drive ring --driver pi --cav-share 0.1"]),
     "configuration that is missing": ("there is no such file", ["drive none.sumocfg --driver pi"]),
     "own network without CAVs": ("cav_share: 0.0", ["drive good.sumocfg --driver pi --cav-share 0"]),
     "type that nobody has": (
@@ -140,36 +128,24 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         "old.net.xml: the network has no version",
         ["drive old.sumocfg --driver pi --cav-share 0.5"],
     ),
-    "network that is torn": (
-        "torn.net.xml: cannot be read",
-        ["drive torn.sumocfg --driver pi --cav-share 0.5"],
-    ),
+    "network that is torn": ("torn.net.xml: cannot be read", ["drive torn.sumocfg --driver pi --cav-share 0.5"]),
     "training where nobody is a CAV": (
         "cav_share: 0.0",
-        ["train good.sumocfg --steps 10 --set road.cav_share=0"],
+        ["train good.sumocfg --steps 10 --set scenario_options.penetration_rate=0"],
     ),
     "assessing a road of the package": ("your own .sumocfg file", ["assess ring"]),
     "assessing what is missing": ("there is no such file", ["assess none.sumocfg"]),
     "shares that are words": ("shares: 'few'", ["assess good.sumocfg --shares few"]),
     "too large a share to assess": ("shares: 2.0", ["assess good.sumocfg --shares 0.1,2"]),
-    "too few episodes to assess": (
-        "episodes: 10 is not allowed; allowed: >= ",
-        ["assess good.sumocfg -n 10"],
-    ),
+    "too few episodes to assess": ("episodes: 10 is not allowed; allowed: >= ", ["assess good.sumocfg -n 10"]),
     "assessing in no time": ("minutes: 0.0", ["assess good.sumocfg --minutes 0"]),
     "assessing people as CAVs": ("driver: 'human'", ["assess good.sumocfg -d human"]),
-    "assessing into a folder that is not empty": (
-        "full' is not empty",
-        ["assess good.sumocfg --out full"],
-    ),
+    "assessing into a folder that is not empty": ("full' is not empty", ["assess good.sumocfg --out full"]),
     "calibrating a road of the package": (
         "scenario: 'ring' is not allowed; allowed: your own .sumocfg file",
         ["calibrate ring --detectors counts.csv"],
     ),
-    "calibrating without measurements": (
-        "'none.csv' is not a file",
-        ["calibrate good.sumocfg --detectors none.csv"],
-    ),
+    "calibrating without measurements": ("'none.csv' is not a file", ["calibrate good.sumocfg --detectors none.csv"]),
     "measurements that are words": (
         "counts.csv: line 2: flow_veh_per_h: 'many' is not allowed; allowed: a number >= 0",
         ["calibrate good.sumocfg --detectors counts.csv"],
@@ -216,12 +192,9 @@ def files(tmp_path: Path, my_drivers: Path) -> None:
     networks = {"good": '<net version="1.20"/>', "old": "<net/>", "torn": '<net version="1.20"><edge'}
     for name, network in networks.items():
         (tmp_path / f"{name}.net.xml").write_text(network)
-        (tmp_path / f"{name}.rou.xml").write_text(
-            '<routes><vType id="car"/><trip id="a" type="car"/></routes>'
-        )
+        (tmp_path / f"{name}.rou.xml").write_text('<routes><vType id="car"/><trip id="a" type="car"/></routes>')
         (tmp_path / f"{name}.sumocfg").write_text(
-            f'<configuration><net-file value="{name}.net.xml"/><route-files value="{name}.rou.xml"/>'
-            "</configuration>"
+            f'<configuration><net-file value="{name}.net.xml"/><route-files value="{name}.rou.xml"/></configuration>'
         )
     head = "edge,position,begin,end,flow_veh_per_h,speed"
     for name, row in {"counts": "a,1,0,60,many,20", "astray": "nowhere,1,0,60,900,20"}.items():
@@ -256,7 +229,7 @@ def test_wrong_input_gets_one_line_and_exit_code_2(name: str, unjam: Run, tmp_pa
 
 
 def with_weights_of(kind: type) -> bytes:
-    parts = {WEIGHTS: save({name: array.astype(kind) for name, array in HELD.arrays().items()})}
+    parts = {WEIGHTS_PART: save({name: array.astype(kind) for name, array in HELD.weights().items()})}
     return controller_bytes(HELD, {}, parts)
 
 
@@ -354,7 +327,15 @@ def test_disk_that_fills_up_in_training_leaves_a_whole_checkpoint(unjam: Run, tm
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (90_000, 90_000))
 
-    train = ["train", "ring", *SMALL[:4], "--set", "road.horizon=60", "--set", "trpo.batch_steps=120"]
+    train = [
+        "train",
+        "ring",
+        *SMALL[:4],
+        "--set",
+        "scenario_options.horizon=60",
+        "--set",
+        "trpo.steps_per_iteration=120",
+    ]
     train += ["--set", "evaluation.episodes=1", "--set", "evaluation.validation_episodes=1"]
     assert unjam(*train, "--steps", 240, "--out", "run").returncode == 0
     shutil.rmtree(tmp_path / "run" / "checkpoint" / "000001")

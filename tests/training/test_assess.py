@@ -12,15 +12,15 @@ from unjam.errors import InputError
 from unjam.reports.assessment import render_assessment
 from unjam.reports.results import read_results, read_rows
 from unjam.training.assess import (
-    CHOOSING,
-    DRIVERS_OF_OPEN_ROADS,
+    DEFAULT_CONTROLLERS,
+    SELECTION_FOLDER,
     Assessment,
-    Question,
+    AssessmentRequest,
     assess,
-    question,
+    make_request,
 )
-from unjam.training.choice import ACC, HUMAN, UNCHANGED_ACC, Option
-from unjam.worlds.workers import Workers
+from unjam.training.selection import ACC_DRIVER, HUMAN_BASELINE, UNCHANGED_ACC_DRIVER, Option
+from unjam.worlds.worker_pool import WorkerPool
 
 HELD = {"horizon": 150, "actuation": "shielded", "safety.active": True}
 """on so short a road an ACC of its own gains nothing"""
@@ -35,43 +35,43 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def asked(file: str) -> Question:
-    return question(file, [0.5], 40, 0.02, None, ["acc", "idm"], HELD)
+def asked(file: str) -> AssessmentRequest:
+    return make_request(file, [0.5], 40, 0.02, None, ["acc", "idm"], HELD)
 
 
 @pytest.fixture(scope="module")
-def answer(asked: Question, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Assessment]:
-    with Workers(2) as workers:
+def answer(asked: AssessmentRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Assessment]:
+    with WorkerPool(2) as workers:
         yield assess(asked, tmp_path_factory.mktemp("answer") / "out", workers)
 
 
 def test_a_question_has_all_penetration_rates_and_controllers_and_two_baselines(file: str) -> None:
-    usual = question(file, [0.2, 0.0, 0.1], 400, 0.02)
-    assert usual.shares == (0.1, 0.2)
-    assert len(usual.options) == 2 * len(DRIVERS_OF_OPEN_ROADS)
-    road, driver = usual.setup(HUMAN)
-    assert (road, driver.native) == (usual.road, True)
-    assert set(question(file, [0.1], 400, 0.02, None, ["cruise", "pi"]).drivers) == {"pi"}
-    road, driver = usual.setup(Option(0.2, "pi"))
-    assert road.cav_share == 0.2  # pyright: ignore[reportAttributeAccessIssue]
+    usual = make_request(file, [0.2, 0.0, 0.1], 400, 0.02)
+    assert usual.penetration_rates == (0.1, 0.2)
+    assert len(usual.options) == 2 * len(DEFAULT_CONTROLLERS)
+    road, driver = usual.make_setup(HUMAN_BASELINE)
+    assert (road, driver.is_native) == (usual.network, True)
+    assert set(make_request(file, [0.1], 400, 0.02, None, ["cruise", "pi"]).drivers) == {"pi"}
+    road, driver = usual.make_setup(Option(0.2, "pi"))
+    assert road.penetration_rate == 0.2  # pyright: ignore[reportAttributeAccessIssue]
     assert driver.name == "pi"
 
 
 def test_acc_vehicles_are_the_baseline_of_controllers_that_drive_without_an_acc_too(file: str) -> None:
-    road, driver = question(file, [0.1], 400, 0.02, None, ["pi"], HELD).setup(Option(0.1, ACC))
+    road, driver = make_request(file, [0.1], 400, 0.02, None, ["pi"], HELD).make_setup(Option(0.1, ACC_DRIVER))
     assert (road.actuation, road.safety.active, driver.name) == ("cruise", False, "cruise")
     assert (road.cruise.acceleration, road.cruise.deceleration) == (None, None)
 
 
 @pytest.mark.parametrize("name", ["acceleration", "deceleration", "keep_right", "overtake"])
 def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(name: str, file: str) -> None:
-    plain = question(file, [0.1], 400, 0.02, None, ["pi"], {"cruise.time_headway": 1.5})
-    assert not plain.sets_properties
-    found = question(file, [0.1], 400, 0.02, None, ["pi"], {f"cruise.{name}": 3.0, "cruise.gap": 2.5})
-    assert found.sets_properties
-    roads = [found.setup(Option(0.1, driver))[0].cruise for driver in (ACC, UNCHANGED_ACC)]
+    plain = make_request(file, [0.1], 400, 0.02, None, ["pi"], {"cruise.time_gap": 1.5})
+    assert not plain.has_acc_properties
+    found = make_request(file, [0.1], 400, 0.02, None, ["pi"], {f"cruise.{name}": 3.0, "cruise.minimum_gap": 2.5})
+    assert found.has_acc_properties
+    roads = [found.make_setup(Option(0.1, driver))[0].cruise for driver in (ACC_DRIVER, UNCHANGED_ACC_DRIVER)]
     assert [getattr(road, name) for road in roads] == [3.0, None]
-    assert [road.gap for road in roads] == [2.5, 2.5]
+    assert [road.minimum_gap for road in roads] == [2.5, 2.5]
 
 
 @pytest.mark.parametrize(
@@ -80,19 +80,13 @@ def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(nam
         ({"shares": [0.1, 1.2]}, "shares: 1.2 is not allowed; allowed: >= 0, <= 1"),
         ({"shares": [float("nan")]}, "shares: nan"),
         ({"shares": [0.0]}, "shares: '0' is not allowed; allowed: one above 0"),
-        (
-            {"episodes": 23},
-            "episodes: 23 is not allowed; allowed: >= 24 for 2 penetration rates and 3 control",
-        ),
+        ({"episodes": 23}, "episodes: 23 is not allowed; allowed: >= 24 for 2 penetration rates and 3 control"),
         ({"minutes": 0.0}, "minutes: 0.0"),
         ({"precision": 1.0}, "precision: 1.0"),
-        (
-            {"drivers": ["human"]},
-            "driver: 'human' is not allowed; allowed: the human baseline is driven anyway",
-        ),
+        ({"drivers": ["human"]}, "driver: 'human' is not allowed; allowed: the human baseline is driven anyway"),
         ({"drivers": ["pacer"]}, "driver: 'pacer' is not allowed; allowed: one that needs no closed road"),
         ({"drivers": ["ghost"]}, "driver: 'ghost'"),
-        ({"changes": {"cav_share": 0.5}}, "cav_share: it is not allowed here"),
+        ({"changes": {"penetration_rate": 0.5}}, "cav_share: it is not allowed here"),
         ({"changes": {"cavs": 1}}, "cavs: it is not allowed here"),
         ({"changes": {"penetration": 0.5}}, "penetration: it is not allowed here"),
         ({"changes": {"ghost": 1}}, "ghost: unknown name"),
@@ -100,38 +94,38 @@ def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(nam
 )
 def test_what_is_wrong_is_told_at_once(changes: dict[str, Any], words: str, file: str) -> None:
     with pytest.raises(InputError, match=words.replace("+", r"\+")):
-        question(file, **{"shares": [0.1, 0.2], "episodes": 400, "precision": 0.02, **changes})
+        make_request(file, **{"shares": [0.1, 0.2], "episodes": 400, "precision": 0.02, **changes})
 
 
 def test_a_road_of_the_package_is_refused() -> None:
     with pytest.raises(InputError, match=r"scenario: 'ring' is not allowed; allowed: your own .sumocfg file"):
-        question("ring", [0.1], 400, 0.02)
+        make_request("ring", [0.1], 400, 0.02)
 
 
 @pytest.mark.long
-def test_all_rows_are_kept_those_that_chose_apart(asked: Question, answer: Assessment) -> None:
+def test_all_rows_are_kept_those_that_chose_apart(asked: AssessmentRequest, answer: Assessment) -> None:
     folder = answer.page.parent
-    chose, judged = read_rows(folder / CHOOSING), read_rows(folder)
-    (found,) = answer.judged
+    chose, judged = read_rows(folder / SELECTION_FOLDER), read_rows(folder)
+    (found,) = answer.controller_results
     assert set(chose) == {"human", "acc, 50 %", "idm, 50 %"}
     assert set(judged) == {"human", "cruise, 50 %", f"{found.driver}, 50 %"}
     assert not {str(row["seed"]) for row in chose["human"]} & {str(row["seed"]) for row in judged["human"]}
     driven = sum(map(len, [*chose.values(), *judged.values()])) + 2
     assert answer.document["episodes"]["all"] == driven <= asked.episodes
     assert all(row["status"] == "completed" for rows in judged.values() for row in rows)
-    assert [*read_results(folder).shown] == ["human", f"{found.driver}, 50 %"]
+    assert [*read_results(folder).plot_episodes] == ["human", f"{found.driver}, 50 %"]
 
 
 def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Assessment) -> None:
     written = json.loads((answer.page.parent / "assessment.json").read_text())
     assert written == answer.document
-    (found,) = answer.judged
+    (found,) = answer.controller_results
     (said,) = written["judged"]
-    assert (said["driver"], said["reasons"], said["words"]) == (found.driver, found.reasons, found.words)
+    assert (said["driver"], said["reasons"], said["words"]) == (found.driver, found.reasons, found.summary)
     assert said["effect"]["travel_time"]["mean"] == found.effect.travel_time.mean
-    assert said["beyond_acc"]["mean"] == found.beyond_acc.mean
+    assert said["difference_to_acc"]["mean"] == found.difference_to_acc.mean
     (acc,) = written["acc"]
-    assert (acc["share"], acc["words"]) == (0.5, answer.acc[0].words)
+    assert (acc["share"], acc["words"]) == (0.5, answer.acc_results[0].summary)
     assert (written["recommended"] is None) == bool(found.reasons)
     assert written["people"]["travel_time"]["count"] == written["seeds"]["judging"] >= 5
     assert written["manifest"]["packages"]["libsumo"]
@@ -146,11 +140,11 @@ def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Asse
 
 @pytest.mark.long
 def test_the_answer_does_not_depend_on_the_number_of_workers(
-    asked: Question, answer: Assessment, tmp_path: Path
+    asked: AssessmentRequest, answer: Assessment, tmp_path: Path
 ) -> None:
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         again = assess(asked, tmp_path / "again", workers)
-    assert repr(again.judged) == repr(answer.judged)  # NaN, of what is not known, is not itself
+    assert repr(again.controller_results) == repr(answer.controller_results)  # NaN, of what is not known, is not itself
     assert again.document["tried"] == answer.document["tried"]
 
 
@@ -159,21 +153,19 @@ def test_the_answer_does_not_depend_on_the_number_of_workers(
     ['<vType id="own" sigma="0"/>', '<vType id="own" vClass="truck" accel="0.5" maxSpeed="18" sigma="0"/>'],
     ids=["drawn desired speeds", "weak engines"],
 )
-def test_where_only_the_properties_of_vehicles_could_gain_nothing_is_gained(
-    vehicle: str, tmp_path: Path
-) -> None:
+def test_where_only_the_properties_of_vehicles_could_gain_nothing_is_gained(vehicle: str, tmp_path: Path) -> None:
     file, changes = network(tmp_path, vehicle + SPARSE), {"cav_classes": ["passenger", "truck"]}
-    alone = question(file, [0.5], 12, 0.02, None, ["cruise"], changes)
-    with Workers(2) as workers:
+    alone = make_request(file, [0.5], 12, 0.02, None, ["cruise"], changes)
+    with WorkerPool(2) as workers:
         found = assess(alone, tmp_path / "out", workers)
     assert found.document["recommended"] is None
     assert found.document["headline"].startswith("Nothing to gain here: the human baseline is within")
-    assert found.acc[0].effect.travel_time.mean >= -0.1
+    assert found.acc_results[0].effect.travel_time.mean >= -0.1
 
 
 def test_seeds_without_a_cav_are_those_of_the_human_baseline(file: str, tmp_path: Path) -> None:
-    few = question(file, [0.06], 20, 0.02, None, ["acc"], HELD)
-    with Workers(2) as workers:
+    few = make_request(file, [0.06], 20, 0.02, None, ["acc"], HELD)
+    with WorkerPool(2) as workers:
         assess(few, tmp_path / "out", workers)
     people, acc, driven = read_rows(tmp_path / "out").values()
     for found in (acc, driven):
@@ -182,8 +174,8 @@ def test_seeds_without_a_cav_are_those_of_the_human_baseline(file: str, tmp_path
     assert any(one["travel_time"] == other["travel_time"] for one, other in pairs)
 
 
-def test_a_folder_with_something_in_it_is_left_alone(asked: Question, tmp_path: Path) -> None:
+def test_a_folder_with_something_in_it_is_left_alone(asked: AssessmentRequest, tmp_path: Path) -> None:
     (tmp_path / "precious.txt").write_text("keep me")
-    with Workers(1) as workers, pytest.raises(InputError, match="is not empty"):
+    with WorkerPool(1) as workers, pytest.raises(InputError, match="is not empty"):
         assess(asked, tmp_path, workers)
     assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]

@@ -10,18 +10,18 @@ import pytest
 
 from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import PISaturation
-from unjam.errors import InputError, LostError, UnjamError
-from unjam.measures.detectors import COLUMNS, agreement, detected
-from unjam.scenarios.own_network import OwnNetwork, own_network
+from unjam.errors import InputError, LostWorkerError, UnjamError
+from unjam.measures.detectors import DETECTOR_COLUMNS, aggregate_passages, compute_agreement
+from unjam.scenarios.user_network import UserNetwork, load_user_network
 from unjam.sumo_files import read_sumo_files
-from unjam.training.calibrate import CALIBRATION, CONFIGURATION, Calibrated, calibrate
-from unjam.training.corridor import VARIED, Corridor, changed_types, corridor, varied
-from unjam.training.seeds import held_out_seeds
-from unjam.training.space import Range
-from unjam.training.tried import ASKED, TRIED
+from unjam.training.calibrate import CALIBRATED_NETWORK_FILE, CALIBRATION_FILE, CalibrationResult, calibrate
+from unjam.training.corridor import FACTOR_RANGES, Corridor, load_corridor, parse_factor_space, scale_vehicle_types
+from unjam.training.search_space import NumericRange
+from unjam.training.seeds import make_test_seeds
+from unjam.training.trial_log import REQUEST_FILE, TRIALS_FILE
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.counting import Counting
-from unjam.worlds.sumo.detectors import Passage
+from unjam.worlds.sumo.detector_pool import DetectorPool
+from unjam.worlds.sumo.detectors import DetectorPassage
 
 INTERVAL = 60
 END = 240
@@ -39,16 +39,14 @@ def road(folder: Path, tau: float = 1.0, speed: float = 1.0, flow: float = FLOW_
 def measured(path: Path, file: Path, places: tuple[float, ...] = (200.0, 700.0)) -> Path:
     """A file of what detectors measure on a road, seed 12345."""
     rows = [
-        f"road,{position},{begin},{begin + INTERVAL},0,"
-        for position in places
-        for begin in range(0, END, INTERVAL)
+        f"road,{position},{begin},{begin + INTERVAL},0," for position in places for begin in range(0, END, INTERVAL)
     ]
-    head = ",".join(("edge", *COLUMNS))
+    head = ",".join(("edge", *DETECTOR_COLUMNS))
     file.write_text("\n".join([head, *rows]) + "\n")
-    asked = corridor(str(path), file)
-    with Counting(1) as counting:
+    asked = load_corridor(str(path), file)
+    with DetectorPool(1) as counting:
         (passed,) = counting.run(asked.scenario(path), [(12345,)], asked.loops)
-    flows, speeds = detected(asked.measured, asked.loops_of, passed)
+    flows, speeds = aggregate_passages(asked.measurements, asked.loop_numbers, passed)
     lines = [
         row.removesuffix("0,") + f"{flow:.1f},{'' if isnan(speed) else f'{speed:.3f}'}"
         for row, flow, speed in zip(rows, flows, speeds, strict=True)
@@ -62,33 +60,31 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Corridor:
     """A road whose people are quicker and more than those that were measured."""
     folder = tmp_path_factory.mktemp("roads")
     detectors = measured(road(folder / "true", 1.5, TRUE_SPEED, TRUE_FLOW), folder / "detectors.csv")
-    return corridor(str(road(folder / "mine")), detectors)
+    return load_corridor(str(road(folder / "mine")), detectors)
 
 
-SPACE = {"speedFactor": VARIED["speedFactor"], "flows": VARIED["flows"]}
+SPACE = {"speedFactor": FACTOR_RANGES["speedFactor"], "flows": FACTOR_RANGES["flows"]}
 TRIALS = 10
 
 
 @pytest.fixture(scope="module")
-def done(asked: Corridor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibrated]:
+def done(asked: Corridor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CalibrationResult]:
     """The folder of a calibration, and what it found."""
     folder = tmp_path_factory.mktemp("calibration")
-    with pytest.MonkeyPatch.context() as patched, Counting(2) as counting:
+    with pytest.MonkeyPatch.context() as patched, DetectorPool(2) as counting:
         patched.setattr("unjam.training.calibrate.JUDGED", 4)
-        return folder, calibrate(asked, folder, counting, SPACE, TRIALS, seeds=1)
+        return folder, calibrate(asked, folder, counting, SPACE, TRIALS, seeds_per_trial=1)
 
 
 @pytest.mark.long
-def test_a_calibrated_road_comes_nearer_to_its_detectors(
-    asked: Corridor, done: tuple[Path, Calibrated]
-) -> None:
+def test_a_calibrated_road_comes_nearer_to_its_detectors(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     folder, found = done
     estimates = found.estimates()
     for name in ("geh", "flow_rmse", "speed_rmse", "score"):
         assert estimates[name]["difference"].high < 0, name
     assert found.factors["speedFactor"] == pytest.approx(TRUE_SPEED, abs=0.06)
     assert found.factors["flows"] == pytest.approx(TRUE_FLOW / FLOW_NOW, abs=0.1)
-    written = json.loads((folder / CALIBRATION).read_text())
+    written = json.loads((folder / CALIBRATION_FILE).read_text())
     assert written["factors"] == found.factors
     assert written["manifest"]["starts"]
     assert written["trials"][0]["factors"] == {"speedFactor": 1.0, "flows": 1.0}
@@ -98,55 +94,57 @@ def test_a_calibrated_road_comes_nearer_to_its_detectors(
 
 @pytest.mark.long
 def test_what_is_written_is_a_network_that_measures_as_it_was_judged(
-    asked: Corridor, done: tuple[Path, Calibrated]
+    asked: Corridor, done: tuple[Path, CalibrationResult]
 ) -> None:
     folder, found = done
-    files = read_sumo_files(folder / CONFIGURATION)
+    files = read_sumo_files(folder / CALIBRATED_NETWORK_FILE)
     own = asked.files.types["person"]
     assert float(files.types["person"]["speedFactor"]) == pytest.approx(found.factors["speedFactor"])
     assert {**files.types["person"], "speedFactor": own["speedFactor"]} == own
-    with Counting(1) as counting:
-        (passed,) = counting.run(asked.scenario(folder / CONFIGURATION), held_out_seeds(1), asked.loops)
-    flows, speeds = detected(asked.measured, asked.loops_of, passed)
-    assert agreement(asked.measured, flows, speeds) == found.calibrated[0]
-    episode = run_episode(own_network(str(folder / CONFIGURATION), {"cav_share": 0.2}), PISaturation(), 1)
+    with DetectorPool(1) as counting:
+        (passed,) = counting.run(asked.scenario(folder / CALIBRATED_NETWORK_FILE), make_test_seeds(1), asked.loops)
+    flows, speeds = aggregate_passages(asked.measurements, asked.loop_numbers, passed)
+    assert compute_agreement(asked.measurements, flows, speeds) == found.calibrated[0]
+    episode = run_episode(
+        load_user_network(str(folder / CALIBRATED_NETWORK_FILE), {"penetration_rate": 0.2}), PISaturation(), 1
+    )
     assert episode.status == "completed"
 
 
 def test_a_calibration_that_was_stopped_goes_on_where_it_was(
-    asked: Corridor, done: tuple[Path, Calibrated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    asked: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, before = done
-    rows = (folder / TRIED).read_text().splitlines(keepends=True)
-    (tmp_path / ASKED).write_bytes((folder / ASKED).read_bytes())
-    (tmp_path / TRIED).write_text("".join(rows[:-1]) + rows[-1][:9])  # killed while it wrote
+    rows = (folder / TRIALS_FILE).read_text().splitlines(keepends=True)
+    (tmp_path / REQUEST_FILE).write_bytes((folder / REQUEST_FILE).read_bytes())
+    (tmp_path / TRIALS_FILE).write_text("".join(rows[:-1]) + rows[-1][:9])  # killed while it wrote
     monkeypatch.setattr("unjam.training.calibrate.JUDGED", 4)
     driven: list[int] = []
 
-    class Watched(Counting):
-        def run(self, scenario: OwnNetwork, seeds: Any, loops: Any) -> list[list[Passage]]:
+    class Watched(DetectorPool):
+        def run(self, scenario: UserNetwork, seeds: Any, loops: Any) -> list[list[DetectorPassage]]:
             driven.append(len(seeds))
             return super().run(scenario, seeds, loops)
 
     with Watched(2) as counting:
-        again = calibrate(asked, tmp_path, counting, SPACE, TRIALS, seeds=1)
+        again = calibrate(asked, tmp_path, counting, SPACE, TRIALS, seeds_per_trial=1)
     assert driven == [2, 4, 4]
     assert again.trials == before.trials
     assert (again.factors, again.calibrated) == (before.factors, before.calibrated)
 
 
-def test_the_folder_of_another_calibration_is_refused(asked: Corridor, done: tuple[Path, Calibrated]) -> None:
-    with Counting(1) as counting, pytest.raises(InputError, match="was made with other settings"):
-        calibrate(asked, done[0], counting, SPACE, TRIALS, seeds=2)
+def test_the_folder_of_another_calibration_is_refused(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
+    with DetectorPool(1) as counting, pytest.raises(InputError, match="was made with other settings"):
+        calibrate(asked, done[0], counting, SPACE, TRIALS, seeds_per_trial=2)
 
 
 def test_a_road_that_sumo_refuses_as_it_is_is_told(asked: Corridor, tmp_path: Path) -> None:
     path = road(tmp_path / "broken")
     demand = path.with_name("demand.rou.xml")
     demand.write_text(demand.read_text().replace('route="along"', 'route="astray"'))
-    broken = corridor(str(path), asked.detectors)
-    with Counting(1) as counting, pytest.raises(UnjamError, match=r"as it is: SUMO cannot start.*astray"):
-        calibrate(broken, tmp_path / "out", counting, SPACE, 2, seeds=1)
+    broken = load_corridor(str(path), asked.detectors)
+    with DetectorPool(1) as counting, pytest.raises(UnjamError, match=r"as it is: SUMO cannot start.*astray"):
+        calibrate(broken, tmp_path / "out", counting, SPACE, 2, seeds_per_trial=1)
 
 
 TYPES = (
@@ -161,91 +159,79 @@ EACH = "".join(
 
 def test_factors_multiply_what_each_passenger_type_says_or_sumo_has(tmp_path: Path) -> None:
     files = read_sumo_files(straight(tmp_path, TYPES + EACH))
-    assert changed_types(files, {"tau": 0.5, "speedFactor": 0.9, "accel": 1.0, "flows": 2.0}) == {
+    assert scale_vehicle_types(files, {"tau": 0.5, "speedFactor": 0.9, "accel": 1.0, "flows": 2.0}) == {
         "drawn": {"tau": "0.6", "speedFactor": "normc(0.9,0.09,0.45,1.35)"},
         "bare": {"tau": "0.5", "speedFactor": "0.9"},
         "quick": {"tau": "0.05", "speedFactor": "0.9"},  # not below the step
     }
-    assert changed_types(files, {"tau": 0.05})["bare"] == {"tau": "0.1"}
-    assert changed_types(files, {"tau": 1.0, "flows": 2.0}) == {}
+    assert scale_vehicle_types(files, {"tau": 0.05})["bare"] == {"tau": "0.1"}
+    assert scale_vehicle_types(files, {"tau": 1.0, "flows": 2.0}) == {}
 
 
 def test_an_attribute_that_is_no_number_is_told(tmp_path: Path) -> None:
     files = read_sumo_files(straight(tmp_path, TYPES.replace("1.2", "long") + EACH))
     with pytest.raises(InputError, match="vType drawn: tau: 'long' is not allowed; allowed: a number"):
-        changed_types(files, {"tau": 0.5})
+        scale_vehicle_types(files, {"tau": 0.5})
 
 
 @pytest.mark.parametrize(
     ("kind", "row", "words"),
     [
-        (
-            "edge",
-            "rood,5,0,60,1,1",
-            "edge: 'rood' is not allowed; allowed: one of road.net.xml; did you mean 'road'?",
-        ),
-        (
-            "lane",
-            "road_1,5,0,60,1,1",
-            "lane: 'road_1' is not allowed; allowed: one of road.net.xml; did you mean",
-        ),
+        ("edge", "rood,5,0,60,1,1", "edge: 'rood' is not allowed; allowed: one of road.net.xml; did you mean 'road'?"),
+        ("lane", "road_1,5,0,60,1,1", "lane: 'road_1' is not allowed; allowed: one of road.net.xml; did you mean"),
         ("edge", "road,5000,0,60,1,1", "edge road: position: 5000.0 is not allowed; allowed: <= 800 m"),
         ("edge", "road,5,300,360,1,1", "detectors.csv: no interval lies between 0 s and 240 s"),
     ],
 )
 def test_a_detector_that_is_not_on_the_road_is_told(kind: str, row: str, words: str, tmp_path: Path) -> None:
     file = tmp_path / "detectors.csv"
-    file.write_text(f"{kind},{','.join(COLUMNS)}\n{row}\n")
+    file.write_text(f"{kind},{','.join(DETECTOR_COLUMNS)}\n{row}\n")
     with pytest.raises(InputError) as error:
-        corridor(str(road(tmp_path / "road")), file)
+        load_corridor(str(road(tmp_path / "road")), file)
     assert words in str(error.value)
 
 
 def test_intervals_beside_the_time_that_is_driven_are_left_out(tmp_path: Path) -> None:
     file = tmp_path / "detectors.csv"
     rows = [f"road_0,5,{begin},{begin + 60},1,1" for begin in range(0, 360, 60)]
-    file.write_text("\n".join([f"lane,{','.join(COLUMNS)}", *rows]))
+    file.write_text("\n".join([f"lane,{','.join(DETECTOR_COLUMNS)}", *rows]))
     path = str(road(tmp_path / "road"))
-    asked = corridor(path, file)
-    assert (len(asked.measured), asked.left_out, asked.begin, asked.end) == (4, 2, 0.0, 240.0)
-    asked = corridor(path, file, 60.0, 200.0)
-    assert (len(asked.measured), asked.left_out, asked.begin, asked.end) == (2, 4, 60.0, 180.0)
+    asked = load_corridor(path, file)
+    assert (len(asked.measurements), asked.excluded_count, asked.begin, asked.end) == (4, 2, 0.0, 240.0)
+    asked = load_corridor(path, file, 60.0, 200.0)
+    assert (len(asked.measurements), asked.excluded_count, asked.begin, asked.end) == (2, 4, 60.0, 180.0)
     assert len(asked.loops) == 1
 
 
 def test_a_road_without_passenger_cars_is_refused(tmp_path: Path) -> None:
     lorries = '<vType id="lorry" vClass="truck"/><trip id="a" type="lorry" from="road" to="road" depart="0"/>'
     file = tmp_path / "detectors.csv"
-    file.write_text(f"edge,{','.join(COLUMNS)}\nroad,5,0,60,1,1\n")
+    file.write_text(f"edge,{','.join(DETECTOR_COLUMNS)}\nroad,5,0,60,1,1\n")
     with pytest.raises(InputError, match="no vehicle type is a passenger car; its types are lorry"):
-        corridor(str(straight(tmp_path, lorries)), file)
+        load_corridor(str(straight(tmp_path, lorries)), file)
 
 
 def test_what_is_varied_are_factors_by_known_names() -> None:
-    assert varied([]) == VARIED
-    assert varied(["tau=1..2"]) == {"tau": Range(1.0, 2.0)}
+    assert parse_factor_space([]) == FACTOR_RANGES
+    assert parse_factor_space(["tau=1..2"]) == {"tau": NumericRange(1.0, 2.0)}
     for text, words in (
         ("tua=1..2", "did you mean 'tau'"),
         ("tau=0..2", "factors > 0"),
         ("tau=0.5,1", "a range of factors"),
     ):
         with pytest.raises(InputError, match=words):
-            varied([text])
+            parse_factor_space([text])
 
 
 def test_an_end_that_is_asked_for_counts_where_it_begins_behind_that_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "detectors.csv"
-    file.write_text(f"edge,{','.join(COLUMNS)}\nroad,5,{END + 60},{END + 120},1,1\n")
-    found = corridor(str(road(tmp_path / "road")), file, END + 30, END + 150)
+    file.write_text(f"edge,{','.join(DETECTOR_COLUMNS)}\nroad,5,{END + 60},{END + 120},1,1\n")
+    found = load_corridor(str(road(tmp_path / "road")), file, END + 30, END + 150)
     assert (found.begin, found.end) == (END + 30, END + 120)
 
 
-def test_a_share_lies_between_none_and_all_and_errors_are_not_below_none(
-    done: tuple[Path, Calibrated],
-) -> None:
-    rows = [
-        replace(done[1].original[0], geh_below_5=share, geh=9.0 * share) for share in (1.0, 1.0, 0.9, 0.0)
-    ]
+def test_a_share_lies_between_none_and_all_and_errors_are_not_below_none(done: tuple[Path, CalibrationResult]) -> None:
+    rows = [replace(done[1].original[0], geh_below_5=share, geh=9.0 * share) for share in (1.0, 1.0, 0.9, 0.0)]
     found = replace(done[1], original=rows, calibrated=rows[::-1]).estimates()
     assert found["geh_below_5"]["original"].high == 1.0
     assert found["geh"]["original"].low == 0.0
@@ -253,12 +239,12 @@ def test_a_share_lies_between_none_and_all_and_errors_are_not_below_none(
 
 
 def test_a_process_that_was_lost_says_nothing_of_the_factors(
-    asked: Corridor, done: tuple[Path, Calibrated], tmp_path: Path
+    asked: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path
 ) -> None:
-    class Lost(Counting):
-        def run(self, scenario: OwnNetwork, seeds: Any, loops: Any) -> list[list[Passage]]:
-            raise LostError("SUMO was lost: its process ended with code -9")
+    class Lost(DetectorPool):
+        def run(self, scenario: UserNetwork, seeds: Any, loops: Any) -> list[list[DetectorPassage]]:
+            raise LostWorkerError("SUMO was lost: its process ended with code -9")
 
-    with Lost(1) as counting, pytest.raises(LostError):
-        calibrate(asked, tmp_path / "out", counting, SPACE, TRIALS, seeds=1)
-    assert not (tmp_path / "out" / TRIED).exists()
+    with Lost(1) as counting, pytest.raises(LostWorkerError):
+        calibrate(asked, tmp_path / "out", counting, SPACE, TRIALS, seeds_per_trial=1)
+    assert not (tmp_path / "out" / TRIALS_FILE).exists()

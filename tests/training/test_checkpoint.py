@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from unjam.errors import DiskError, InputError
 from unjam.training import folder as run_folder
-from unjam.training.folder import STATE, TENSORS, load_checkpoint, save_checkpoint
+from unjam.training.run_folder import CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE, load_checkpoint, save_checkpoint
 
 Content = tuple[dict[str, Any], dict[str, torch.Tensor]]
 
@@ -22,7 +22,7 @@ Content = tuple[dict[str, Any], dict[str, torch.Tensor]]
 def content_of(iteration: int) -> Content:
     state = {
         "iteration": iteration,
-        "actual_steps": 300 * iteration,
+        "environment_steps": 300 * iteration,
         "validation_best": 1 / 3,
         "expert_returns": [-1e9],
     }
@@ -79,9 +79,7 @@ def test_what_else_lies_in_the_folder_is_left_alone(tmp_path: Path) -> None:
     assert is_content(load_checkpoint(tmp_path), 3)
 
 
-def test_what_another_version_made_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_another_version_made_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_folder, "FORMAT", 1)
     save_all(tmp_path, 1)
     monkeypatch.undo()
@@ -101,29 +99,29 @@ def halve(path: Path) -> None:
 
 
 def edit_state(place: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    path = place / STATE
+    path = place / CHECKPOINT_STATE_FILE
     path.write_text(json.dumps(change(json.loads(path.read_text()))))
 
 
 DAMAGE: dict[str, Callable[[Path], object]] = {
-    "no state": lambda place: (place / STATE).unlink(),
-    "no tensors": lambda place: (place / TENSORS).unlink(),
+    "no state": lambda place: (place / CHECKPOINT_STATE_FILE).unlink(),
+    "no tensors": lambda place: (place / CHECKPOINT_TENSORS_FILE).unlink(),
     "nothing": lambda place: (shutil.rmtree(place), place.mkdir()),
-    "half a state": lambda place: halve(place / STATE),
-    "half the tensors": lambda place: halve(place / TENSORS),
-    "empty state": lambda place: (place / STATE).write_bytes(b""),
-    "empty tensors": lambda place: (place / TENSORS).write_bytes(b""),
-    "more than the tensors": lambda place: (place / TENSORS).open("ab").write(b"\0"),
-    "state of zeros": lambda place: (place / STATE).write_bytes(bytes(300)),
-    "state that is a list": lambda place: (place / STATE).write_text("[]"),
-    "state that is a number": lambda place: (place / STATE).write_text("3"),
-    "state that is null": lambda place: (place / STATE).write_text("null"),
-    "state without its hash": lambda place: edit_state(
-        place, lambda s: {k: s[k] for k in s if k != "sha256"}
-    ),
-    "state with another number": lambda place: edit_state(place, lambda s: {**s, "actual_steps": 601}),
+    "half a state": lambda place: halve(place / CHECKPOINT_STATE_FILE),
+    "half the tensors": lambda place: halve(place / CHECKPOINT_TENSORS_FILE),
+    "empty state": lambda place: (place / CHECKPOINT_STATE_FILE).write_bytes(b""),
+    "empty tensors": lambda place: (place / CHECKPOINT_TENSORS_FILE).write_bytes(b""),
+    "more than the tensors": lambda place: (place / CHECKPOINT_TENSORS_FILE).open("ab").write(b"\0"),
+    "state of zeros": lambda place: (place / CHECKPOINT_STATE_FILE).write_bytes(bytes(300)),
+    "state that is a list": lambda place: (place / CHECKPOINT_STATE_FILE).write_text("[]"),
+    "state that is a number": lambda place: (place / CHECKPOINT_STATE_FILE).write_text("3"),
+    "state that is null": lambda place: (place / CHECKPOINT_STATE_FILE).write_text("null"),
+    "state without its hash": lambda place: edit_state(place, lambda s: {k: s[k] for k in s if k != "sha256"}),
+    "state with another number": lambda place: edit_state(place, lambda s: {**s, "environment_steps": 601}),
     "hash that is none": lambda place: edit_state(place, lambda s: {**s, "sha256": None}),
-    "tensors of another iteration": lambda place: swap(place / TENSORS, place.parent / "000001" / TENSORS),
+    "tensors of another iteration": lambda place: swap(
+        place / CHECKPOINT_TENSORS_FILE, place.parent / "000001" / CHECKPOINT_TENSORS_FILE
+    ),
 }
 
 
@@ -147,11 +145,13 @@ def test_where_all_are_damaged_it_says_so(tmp_path: Path, name: str) -> None:
 @pytest.mark.long
 @settings(max_examples=60)
 @given(
-    part=st.sampled_from([STATE, TENSORS]), place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255)
+    part=st.sampled_from([CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE]),
+    place=st.floats(0, 1, exclude_max=True),
+    bits=st.integers(1, 255),
 )
-@example(part=STATE, place=0.0, bits=0x20)
-@example(part=TENSORS, place=0.0, bits=1)
-@example(part=TENSORS, place=0.999, bits=128)
+@example(part=CHECKPOINT_STATE_FILE, place=0.0, bits=0x20)
+@example(part=CHECKPOINT_TENSORS_FILE, place=0.0, bits=1)
+@example(part=CHECKPOINT_TENSORS_FILE, place=0.999, bits=128)
 def test_a_changed_byte_anywhere_never_changes_what_is_loaded(part: str, place: float, bits: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -162,12 +162,12 @@ def test_a_changed_byte_anywhere_never_changes_what_is_loaded(part: str, place: 
         path.write_bytes(content)
         found = load_checkpoint(folder)
     # A blank between two entries of the state says nothing, so a state with another one is still whole.
-    harmless = part == STATE and is_content(found, 2)
+    harmless = part == CHECKPOINT_STATE_FILE and is_content(found, 2)
     assert harmless or is_content(found, 1)
 
 
 @settings(max_examples=60)
-@given(part=st.sampled_from([STATE, TENSORS]), share=st.floats(0, 1, exclude_max=True))
+@given(part=st.sampled_from([CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE]), share=st.floats(0, 1, exclude_max=True))
 def test_a_file_cut_anywhere_is_noticed(part: str, share: float) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -180,7 +180,7 @@ def test_a_file_cut_anywhere_is_noticed(part: str, share: float) -> None:
 
 def test_a_damaged_one_is_written_anew(tmp_path: Path) -> None:
     save_all(tmp_path, 1, 2)
-    halve(tmp_path / "000002" / TENSORS)
+    halve(tmp_path / "000002" / CHECKPOINT_TENSORS_FILE)
     save_all(tmp_path, 2)
     assert is_content(load_checkpoint(tmp_path), 2)
 

@@ -8,30 +8,30 @@ import pytest
 
 from tests.measures.test_effect import USUAL
 from unjam.errors import InputError
-from unjam.measures.effect import LEAST_JUDGED
-from unjam.training.choice import (
-    ACC,
-    HUMAN,
-    LEAST_TESTED,
-    MOST_CHOOSING,
-    PART_CHOOSING,
-    UNCHANGED_ACC,
-    Budget,
-    Findings,
+from unjam.measures.effect import MIN_VERDICT_SEEDS
+from unjam.training.seeds import SELECTION_SEED, TEST_SEED
+from unjam.training.selection import (
+    ACC_DRIVER,
+    HUMAN_BASELINE,
+    MAX_SELECTION_SEEDS,
+    MIN_TEST_SEEDS,
+    SELECTION_BUDGET_FRACTION,
+    UNCHANGED_ACC_DRIVER,
+    EpisodeBudget,
+    EpisodeSeed,
     Option,
-    Rows,
-    Seed,
-    choose,
-    judge,
-    least_episodes,
+    OptionRows,
+    TestFindings,
+    compare_on_test_seeds,
+    min_episodes,
+    select_controllers,
 )
-from unjam.training.seeds import CHOOSE, JUDGE
 
 SHARES = (0.1, 0.2)
 IDM, PI = (Option(0.1, name) for name in ("idm", "pi"))
 IDM_MORE, PI_MORE = (Option(0.2, name) for name in ("idm", "pi"))
 OPTIONS = [IDM, PI, IDM_MORE, PI_MORE]
-BASELINE = Option(0.1, ACC)
+BASELINE = Option(0.1, ACC_DRIVER)
 Change = Callable[[np.random.Generator], dict[str, Any]]
 
 
@@ -43,21 +43,21 @@ class MadeUp:
     """Traffic without a simulator: human drivers take a random time on each seed, and CAVs change it."""
 
     def __init__(self, changes: dict[Option, Change], episodes: int = 1000, **budget: Any) -> None:
-        self.changes, self.driven = changes, list[tuple[Option, Seed]]()
-        self.budget = Budget(episodes, **budget)
+        self.changes, self.driven = changes, list[tuple[Option, EpisodeSeed]]()
+        self.budget = EpisodeBudget(episodes, **budget)
 
-    def __call__(self, options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
+    def __call__(self, options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
         self.driven += [(option, seed) for option in options for seed in seeds]
         self.budget.spend(len(options) * len(seeds))
         return {option: [self._row(option, seed) for seed in seeds] for option in options}
 
-    def _row(self, option: Option, seed: Seed) -> dict[str, Any]:
+    def _row(self, option: Option, seed: EpisodeSeed) -> dict[str, Any]:
         people = {**USUAL, "seed": list(seed), "travel_time": 100 + np.random.default_rng(seed).normal()}
         generator = np.random.default_rng((*seed, OPTIONS.index(option) if option in OPTIONS else 9))
         change = self.changes.get(option, lambda generator: {})(generator)
         return {**people, **change, "travel_time": people["travel_time"] + change.get("travel_time", 0.0)}
 
-    def seeds_of(self, option: Option) -> list[Seed]:
+    def seeds_of(self, option: Option) -> list[EpisodeSeed]:
         return [seed for each, seed in self.driven if each == option]
 
 
@@ -65,96 +65,96 @@ def shifted(mean: float, spread: float = 0.3, **changes: Any) -> Change:
     return lambda generator: {"travel_time": generator.normal(mean, spread), **changes}
 
 
-def run_judge(
-    drive: MadeUp, finalists: Sequence[Option], precision: float = 0.01, split: bool = False
-) -> Findings:
-    shares = tuple(dict.fromkeys(option.share for option in finalists)) or (0.1,)
-    return judge(finalists, shares, split, drive, drive.budget, precision, quiet)
+def run_judge(drive: MadeUp, finalists: Sequence[Option], precision: float = 0.01, split: bool = False) -> TestFindings:
+    shares = tuple(dict.fromkeys(option.penetration_rate for option in finalists)) or (0.1,)
+    return compare_on_test_seeds(finalists, shares, split, drive, drive.budget, precision, quiet)
 
 
 def test_the_best_of_each_penetration_rate_is_chosen_on_tuning_seeds() -> None:
     drive = MadeUp({IDM: shifted(-2), PI: shifted(-4), IDM_MORE: shifted(-3), PI_MORE: shifted(-1)})
-    found = choose(OPTIONS, drive, drive.budget, quiet)
+    found = select_controllers(OPTIONS, drive, drive.budget, quiet)
     assert found.finalists == [PI, IDM_MORE]
-    assert found.set_aside[IDM].startswith("behind pi (tuning seeds: ")
-    assert {seed[0] for _, seed in drive.driven} == {CHOOSE}
-    assert drive.seeds_of(HUMAN) == [(CHOOSE, number) for number in range(len(found.rows[HUMAN]))]
+    assert found.rejection_reasons[IDM].startswith("behind pi (tuning seeds: ")
+    assert {seed[0] for _, seed in drive.driven} == {SELECTION_SEED}
+    assert drive.seeds_of(HUMAN_BASELINE) == [
+        (SELECTION_SEED, number) for number in range(len(found.rows[HUMAN_BASELINE]))
+    ]
 
 
 def test_half_of_the_controllers_stop_after_each_round() -> None:
     many = [Option(0.1, name) for name in ("a", "b", "c", "d", "e")]
     drive = MadeUp({option: shifted(-number) for number, option in enumerate(many)})
-    found = choose(many, drive, drive.budget, quiet)
+    found = select_controllers(many, drive, drive.budget, quiet)
     assert found.finalists == [many[-1]]
-    counts = [len(drive.seeds_of(option)) for option in (*many, HUMAN)]
-    assert counts == [MOST_CHOOSING * rounds for rounds in (1, 1, 2, 3, 3, 3)]
+    counts = [len(drive.seeds_of(option)) for option in (*many, HUMAN_BASELINE)]
+    assert counts == [MAX_SELECTION_SEEDS * rounds for rounds in (1, 1, 2, 3, 3, 3)]
 
 
 def test_a_single_controller_costs_no_tuning_seeds() -> None:
     drive = MadeUp({})
-    assert choose([PI, IDM_MORE], drive, drive.budget, quiet).finalists == [PI, IDM_MORE]
+    assert select_controllers([PI, IDM_MORE], drive, drive.budget, quiet).finalists == [PI, IDM_MORE]
     assert not drive.driven
 
 
 def test_less_flow_is_a_loss_however_quick() -> None:
-    drive = MadeUp({IDM: shifted(-30, throughput_veh_per_h=1900.0), PI: shifted(-1)})
-    found = choose([IDM, PI], drive, drive.budget, quiet)
+    drive = MadeUp({IDM: shifted(-30, outflow_veh_per_h=1900.0), PI: shifted(-1)})
+    found = select_controllers([IDM, PI], drive, drive.budget, quiet)
     assert found.finalists == [PI]
-    assert found.set_aside[IDM].startswith("flow is lower than that of the human baseline")
+    assert found.rejection_reasons[IDM].startswith("flow is lower than that of the human baseline")
 
 
 def test_feasible_controllers_come_before_quick_ones() -> None:
     drive = MadeUp({IDM: shifted(-9, 20.0, min_headway=0.1), PI: shifted(0, 20.0)})
-    assert choose([IDM, PI], drive, drive.budget, quiet).finalists == [PI]
+    assert select_controllers([IDM, PI], drive, drive.budget, quiet).finalists == [PI]
 
 
 def test_an_option_that_fails_is_set_aside_with_the_reason() -> None:
     failed = {"status": "failed", "reason": "no CAV was on the road", "error": "InputError"}
     drive = MadeUp({IDM: lambda generator: failed, PI: shifted(-1)})
-    found = choose([IDM, PI], drive, drive.budget, quiet)
-    assert found.set_aside == {IDM: "failed: no CAV was on the road"}
+    found = select_controllers([IDM, PI], drive, drive.budget, quiet)
+    assert found.rejection_reasons == {IDM: "failed: no CAV was on the road"}
     assert found.finalists == [PI]
     drive.changes[PI] = lambda generator: failed
     with pytest.raises(InputError, match="no CAV was on the road"):
-        choose([IDM, PI], drive, drive.budget, quiet)
+        select_controllers([IDM, PI], drive, drive.budget, quiet)
 
 
 @pytest.mark.parametrize("drivers", [2, 5])
 @pytest.mark.parametrize("more", [0, 20, 200])
 def test_no_step_exceeds_its_part_of_the_budget(drivers: int, more: int) -> None:
-    episodes = least_episodes(2, drivers) + more
+    episodes = min_episodes(2, drivers) + more
     options = [Option(share, f"driver {number}") for share in SHARES for number in range(drivers)]
     drive = MadeUp({option: shifted(0.0, 40.0) for option in options}, episodes)
-    found = choose(options, drive, drive.budget, quiet)
-    assert [option.share for option in found.finalists] == [*SHARES]
-    assert drive.budget.spent <= max(PART_CHOOSING * episodes, 1 + len(options))
+    found = select_controllers(options, drive, drive.budget, quiet)
+    assert [option.penetration_rate for option in found.finalists] == [*SHARES]
+    assert drive.budget.used_episodes <= max(SELECTION_BUDGET_FRACTION * episodes, 1 + len(options))
     rows = run_judge(drive, found.finalists, 0.001).rows
-    assert drive.budget.spent == len(drive.driven) <= episodes
-    assert len(rows[HUMAN]) >= LEAST_TESTED
+    assert drive.budget.used_episodes == len(drive.driven) <= episodes
+    assert len(rows[HUMAN_BASELINE]) >= MIN_TEST_SEEDS
 
 
 def test_the_human_baseline_is_driven_once_a_seed_for_all_penetration_rates() -> None:
     drive = MadeUp({PI: shifted(-2.0), IDM_MORE: shifted(-3.0)})
     found = run_judge(drive, [PI, IDM_MORE])
-    assert {seed[0] for _, seed in drive.driven} == {JUDGE}
-    assert drive.seeds_of(HUMAN) == [(JUDGE, number) for number in range(len(found.rows[HUMAN]))]
-    assert [(each.share, each.driver) for each in found.judged] == [PI, IDM_MORE]
-    assert [each.share for each in found.acc] == [0.1, 0.2]
+    assert {seed[0] for _, seed in drive.driven} == {TEST_SEED}
+    assert drive.seeds_of(HUMAN_BASELINE) == [(TEST_SEED, number) for number in range(len(found.rows[HUMAN_BASELINE]))]
+    assert [(each.penetration_rate, each.driver) for each in found.controller_results] == [PI, IDM_MORE]
+    assert [each.penetration_rate for each in found.acc_results] == [0.1, 0.2]
 
 
 def test_what_gains_beyond_acc_vehicles_is_driven_until_its_interval_is_narrow() -> None:
     drive = MadeUp({PI: shifted(-6.0, 6.0), BASELINE: shifted(-2.0, 0.1)}, 4000)
-    (judged,) = run_judge(drive, [PI]).judged
+    (judged,) = run_judge(drive, [PI]).controller_results
     assert judged.reasons == []
-    assert judged.effect.width <= 0.01
-    assert LEAST_JUDGED < judged.beyond_acc.count < 1000
-    assert judged.beyond_acc.mean == pytest.approx(-4.0, abs=1.0)
+    assert judged.effect.relative_half_width <= 0.01
+    assert MIN_VERDICT_SEEDS < judged.difference_to_acc.count < 1000
+    assert judged.difference_to_acc.mean == pytest.approx(-4.0, abs=1.0)
 
 
 def test_the_same_gain_as_that_of_acc_vehicles_is_no_gain_of_the_controller() -> None:
     drive = MadeUp({PI: shifted(-5.0, 0.01), BASELINE: shifted(-5.5, 0.01)})
     found = run_judge(drive, [PI])
-    (judged,), (acc,) = found.judged, found.acc
+    (judged,), (acc,) = found.controller_results, found.acc_results
     assert acc.effect.travel_time.high < 0
     assert [reason.startswith("travel time is longer than with ACC") for reason in judged.reasons] == [True]
 
@@ -163,7 +163,7 @@ def test_the_same_gain_as_that_of_acc_vehicles_is_no_gain_of_the_controller() ->
     "change",
     [
         shifted(5.0),
-        shifted(-9.0, throughput_veh_per_h=1900.0),
+        shifted(-9.0, outflow_veh_per_h=1900.0),
         shifted(-9.0, min_headway=0.1),
         shifted(-0.01, 30.0),
         lambda generator: {"status": "failed", "reason": "lost", "error": "EpisodeError"},
@@ -171,64 +171,64 @@ def test_the_same_gain_as_that_of_acc_vehicles_is_no_gain_of_the_controller() ->
     ids=["slower", "less flow", "infeasible", "out of reach", "failed"],
 )
 def test_a_hopeless_controller_ends_early_and_leaves_the_budget_to_others(change: Change) -> None:
-    drive = MadeUp({PI: change, IDM_MORE: shifted(-6.0, 6.0), Option(0.2, ACC): shifted(0.0, 0.1)}, 800)
+    drive = MadeUp({PI: change, IDM_MORE: shifted(-6.0, 6.0), Option(0.2, ACC_DRIVER): shifted(0.0, 0.1)}, 800)
     found = run_judge(drive, [PI, IDM_MORE])
-    hopeless, good = found.judged
+    hopeless, good = found.controller_results
     assert hopeless.reasons
     assert good.reasons == []
-    assert len(drive.seeds_of(PI)) <= 2 * LEAST_JUDGED < len(drive.seeds_of(IDM_MORE))
-    assert len(drive.seeds_of(BASELINE)) <= 2 * LEAST_JUDGED
+    assert len(drive.seeds_of(PI)) <= 2 * MIN_VERDICT_SEEDS < len(drive.seeds_of(IDM_MORE))
+    assert len(drive.seeds_of(BASELINE)) <= 2 * MIN_VERDICT_SEEDS
 
 
 def test_a_small_budget_gets_an_answer_that_says_what_a_verdict_would_need() -> None:
     drive = MadeUp({PI: shifted(-1.0, 9.0)}, 12)
-    (judged,) = run_judge(drive, [PI], 0.001).judged
-    assert judged.beyond_acc.count == 4
-    assert judged.missing > 0
-    assert "no verdict yet: the interval is ±" in judged.words
+    (judged,) = run_judge(drive, [PI], 0.001).controller_results
+    assert judged.difference_to_acc.count == 4
+    assert judged.missing_seeds > 0
+    assert "no verdict yet: the interval is ±" in judged.summary
 
 
 def test_acc_vehicles_alone_are_tested_without_any_controller() -> None:
     found = run_judge(MadeUp({BASELINE: shifted(-3.0)}), [])
-    assert (found.judged, len(found.acc)) == ([], 1)
-    assert found.acc[0].effect.travel_time.high < 0
-    assert found.acc[0].of_properties is None
+    assert (found.controller_results, len(found.acc_results)) == ([], 1)
+    assert found.acc_results[0].effect.travel_time.high < 0
+    assert found.acc_results[0].property_effect is None
 
 
 def test_the_gain_of_properties_that_are_set_for_cavs_is_split_off() -> None:
-    unchanged = Option(0.1, UNCHANGED_ACC)
+    unchanged = Option(0.1, UNCHANGED_ACC_DRIVER)
     drive = MadeUp({BASELINE: shifted(-5.0), unchanged: shifted(-1.0)})
-    (acc,) = run_judge(drive, [PI], split=True).acc
-    assert acc.of_properties is not None
-    assert acc.of_properties.mean == pytest.approx(-4.0, abs=0.5)
+    (acc,) = run_judge(drive, [PI], split=True).acc_results
+    assert acc.property_effect is not None
+    assert acc.property_effect.mean == pytest.approx(-4.0, abs=0.5)
 
 
 def test_seeds_that_fit_into_the_time_follow_from_those_before() -> None:
     now = [0.0]
-    budget = Budget(1000, minutes=1.0, workers=4, clock=lambda: now[0])
-    assert budget.seeds(10) == 100
+    budget = EpisodeBudget(1000, minutes=1.0, workers=4, clock=lambda: now[0])
+    assert budget.affordable_seeds(10) == 100
     now[0] = 5.0
     budget.spend(1)  # alone: it took as long as four at once would
-    assert budget.seeds(4) == 11
-    assert budget.seeds(4, part=0.5) == 5
-    assert budget.seconds_for(8) == 10.0
+    assert budget.affordable_seeds(4) == 11
+    assert budget.affordable_seeds(4, fraction=0.5) == 5
+    assert budget.estimate_seconds(8) == 10.0
     now[0] = 59.0
-    assert budget.seeds(4) == 0
+    assert budget.affordable_seeds(4) == 0
 
 
 def test_each_round_is_told_in_a_line_with_the_time_that_is_left() -> None:
     lines: list[str] = []
     now = [0.0]
-    budget = Budget(40, clock=lambda: now[0])
+    budget = EpisodeBudget(40, clock=lambda: now[0])
     drive = MadeUp({PI: shifted(-1.0, 9.0)})
 
-    def timed(options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
+    def timed(options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
         found = drive(options, seeds)
         budget.spend(len(options) * len(seeds))
         now[0] += 10.0 * len(options) * len(seeds)
         return found
 
-    choose([IDM, PI], timed, budget, lines.append)
-    judge([PI], (0.1,), False, timed, budget, 0.001, lines.append)
+    select_controllers([IDM, PI], timed, budget, lines.append)
+    compare_on_test_seeds([PI], (0.1,), False, timed, budget, 0.001, lines.append)
     assert lines[0] == "tuning seeds: 5; 1 of 2 options left; at most 4 min more"
     assert lines[1].startswith("test seeds: 8; travel time known to ±")

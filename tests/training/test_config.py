@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from unjam.drivers import PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.errors import InputError
-from unjam.learners.settings import AGENTS, PolicySettings, TRPOSettings
-from unjam.parameters import changed
+from unjam.learners.settings import AGENT_NAMES, PolicySettings, TRPOSettings
+from unjam.parameters import merge_changes
 from unjam.training.config import EvaluationSettings, RunConfig, load_config, read_toml, to_toml
 from unjam.training.presets import PRESETS
-from unjam.training.seeds import JUDGE, VALIDATE
+from unjam.training.seeds import TEST_SEED, VALIDATION_SEED
 
 
 def written(folder: Path, text: str) -> Path:
@@ -37,18 +37,20 @@ def test_later_sources_go_before_earlier_ones(tmp_path: Path) -> None:
     assert made.trpo.gae_lambda == 0.7
     assert made.trpo.target_kl == PRESETS["paper"]["trpo"]["target_kl"]  # preset before defaults
     assert made.trpo.target_kl != TRPOSettings().target_kl
-    assert made.trpo.cg_steps == TRPOSettings().cg_steps
+    assert made.trpo.cg_max_steps == TRPOSettings().cg_max_steps
     assert made.preset == "paper"
 
 
 def test_a_change_of_one_key_leaves_the_rest_of_its_table() -> None:
     made = load_config(changes={"policy": {"hold": 3}, "policy.authority": 0.5, "road": {"vehicles": 20}})
-    assert made.policy == PolicySettings(hold=3, authority=0.5)
+    assert made.policy == PolicySettings(action_duration=3, authority=0.5)
     assert made.make_scenario().vehicles == 20  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_the_road_can_be_changed_key_by_key() -> None:
-    made = load_config(changes={"scenario": "ring-warm", "road.length": [230, 240], "road.horizon": 50})
+    made = load_config(
+        changes={"scenario": "ring-warm", "scenario_options.length": [230, 240], "scenario_options.horizon": 50}
+    )
     scenario = made.make_scenario()
     assert scenario.length == (230, 240)  # pyright: ignore[reportAttributeAccessIssue]
     assert (scenario.horizon, scenario.warmup) == (50, 750)
@@ -56,13 +58,13 @@ def test_the_road_can_be_changed_key_by_key() -> None:
 
 def test_presets_are_not_changed_by_their_use() -> None:
     before = load_config(preset="paper")
-    load_config(preset="paper", changes={"trpo.gamma": 0.5, "policy.hold": 9})
+    load_config(preset="paper", changes={"trpo.gamma": 0.5, "policy.action_duration": 9})
     assert load_config(preset="paper") == before
 
 
 def test_merging_changes_neither_side() -> None:
     values, changes = {"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 6}}
-    assert changed(values, changes) == {"a": {"b": 5, "c": 2}, "d": {"e": 6}}
+    assert merge_changes(values, changes) == {"a": {"b": 5, "c": 2}, "d": {"e": 6}}
     assert (values, changes) == ({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 6}})
 
 
@@ -70,12 +72,9 @@ def test_merging_changes_neither_side() -> None:
     ("changes", "words"),
     [
         ({"sed": 1}, "sed: unknown name; did you mean 'seed'?"),
-        ({"horizon": 100}, "horizon: unknown name; did you mean 'road.horizon'?"),
-        ({"length": 230}, "length: unknown name; did you mean 'road.length'?"),
-        (
-            {"evaluation.nope": 1},
-            "evaluation.nope: unknown name; allowed: baselines, converged, episodes, every",
-        ),
+        ({"horizon": 100}, "horizon: unknown name; did you mean 'scenario_options.horizon'?"),
+        ({"length": 230}, "length: unknown name; did you mean 'scenario_options.length'?"),
+        ({"evaluation.nope": 1}, "evaluation.nope: unknown name; allowed: baselines, converged, episodes, every"),
         ({"trpo.gama": 0.9}, "trpo.gama: unknown name"),
         ({"evaluation.evry": 1}, "evaluation.evry: unknown name"),
         ({"trpo.gamma": 1.5}, "trpo.gamma: 1.5 is not allowed; allowed: less than 1"),
@@ -83,8 +82,8 @@ def test_merging_changes_neither_side() -> None:
         ({"trpo": 3}, "trpo: 3 is not allowed"),
         ({"trpo.gamma.x": 3}, "trpo.gamma: {'x': 3} is not allowed"),
         ({"agent": "magic"}, "agent: 'magic' is not allowed; allowed: 'trpo', 'ppo', 'sac' or 'td3'"),
-        ({"ppo.clip": 2.0}, "ppo.clip: 2.0 is not allowed; allowed: less than 1"),
-        ({"sac.start": "slowly"}, "sac.start: 'slowly' is not allowed; allowed: 'expert' or 'uniform'"),
+        ({"ppo.clip_range": 2.0}, "ppo.clip_range: 2.0 is not allowed; allowed: less than 1"),
+        ({"sac.start_policy": "slowly"}, "sac.start_policy: 'slowly' is not allowed; allowed: 'expert' or 'uniform'"),
         ({"sac.gama": 0.9}, "sac.gama: unknown name"),
         ({"steps": 0}, "steps: 0 is not allowed"),
         ({"steps": 1.5}, "steps: 1.5 is not allowed"),
@@ -93,36 +92,36 @@ def test_merging_changes_neither_side() -> None:
         ({"workers": 0}, "workers: 0 is not allowed"),
         ({"scenario": ["ring"]}, "scenario: ['ring'] is not allowed"),
         ({"evaluation.episodes": 0}, "evaluation.episodes: 0 is not allowed"),
-        ({"evaluation.every": -1}, "evaluation.every: -1 is not allowed"),
+        ({"evaluation.validation_interval": -1}, "evaluation.validation_interval: -1 is not allowed"),
         ({"evaluation.baselines": "pi"}, "evaluation.baselines: 'pi' is not allowed"),
         ({"policy.hidden": 16}, "policy.hidden: 16 is not allowed; allowed: a list: [1, 2]"),
-        ({"policy.observe": ["stars"]}, "policy.observe.0: 'stars' is not allowed"),
+        ({"policy.inputs": ["stars"]}, "policy.observe.0: 'stars' is not allowed"),
         ({"scenario": "rong"}, "scenario: 'rong' is not allowed; allowed: ring, ring-warm, ring-jammed"),
         ({"road": {"lenght": [220, 230]}}, "scenario ring.lenght: unknown name"),
         ({"tasks": [{"weight": 0}]}, "tasks.0.weight: 0 is not allowed"),
         ({"tasks": [{"name": "../up"}]}, "tasks.0.name: '../up' is not allowed"),
         ({"tasks": [{"scenario": "rong"}]}, "scenario: 'rong' is not allowed"),
         ({"tasks": [{"road": {"lenght": 3}}]}, "scenario ring.lenght: unknown name"),
-        ({"road.vehicles": 1}, "scenario ring.vehicles: 1 is not allowed"),
-        ({"road.length": [250, 230]}, "scenario ring.length: 230 m is not allowed as the largest"),
+        ({"scenario_options.vehicles": 1}, "scenario ring.vehicles: 1 is not allowed"),
+        ({"scenario_options.length": [250, 230]}, "scenario ring.length: 230 m is not allowed as the largest"),
         (
             {"policy.exploration": "mirrored", "agent": "sac"},
             "policy.exploration: mirrored is not allowed; allowed: anew, for sac",
         ),
         (
-            {"policy.exploration": "mirrored", "virtual.model": "road"},
+            {"policy.exploration": "mirrored", "model.kind": "road"},
             "policy.exploration: mirrored is not allowed; allowed: anew, lasting, for what is imagined here",
         ),
         (
-            {"policy.afterwards": True},
-            "policy.afterwards: true is not allowed; allowed: false where rows are imagined",
+            {"policy.reward_after_exit": True},
+            "policy.reward_after_exit: true is not allowed; allowed: false where rows are imagined",
         ),
         (
-            {"policy.remember": True, "policy.observe": ["local"]},
-            "policy.remember: true is not allowed; allowed: false, where expert_memory is not observed",
+            {"policy.history_features": True, "policy.inputs": ["local"]},
+            "policy.history_features: true is not allowed; allowed: false, where expert_memory is not observed",
         ),
         (
-            {"road.simulation_step": 0.0333},
+            {"scenario_options.simulation_step": 0.0333},
             "scenario ring.simulation_step: 0.0333 is not allowed; allowed: a whole number of milliseconds",
         ),
         ({"scenario": "merge", "world": "batch"}, "world: batch is not allowed; allowed: sumo, for merge"),
@@ -131,12 +130,12 @@ def test_merging_changes_neither_side() -> None:
             "world: batch is not allowed; allowed: sumo, for figure-eight",
         ),
         (
-            {"evaluation.patience": 5, "evaluation.every": 0},
+            {"evaluation.patience": 5, "evaluation.validation_interval": 0},
             "evaluation.patience: it is not allowed without validations",
         ),
         (
-            {"virtual.model": "road", "virtual.device": "cuda"},
-            "virtual.device: cuda is not allowed; allowed: cpu, for whole roads",
+            {"model.kind": "road", "model.device": "cuda"},
+            "model.device: cuda is not allowed; allowed: cpu, for whole roads",
         ),
     ],
 )
@@ -147,7 +146,7 @@ def test_a_wrong_value_gets_one_line_that_begins_with_its_name(changes: dict[str
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("seed", [JUDGE, VALIDATE])
+@pytest.mark.parametrize("seed", [TEST_SEED, VALIDATION_SEED])
 def test_a_seed_that_would_train_on_the_judging_episodes_is_refused(seed: int) -> None:
     with pytest.raises(InputError, match="seed"):
         load_config(changes={"seed": seed})
@@ -194,13 +193,13 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize("preset", ["", *PRESETS])
 def test_the_toml_of_a_configuration_makes_it_again(tmp_path: Path, preset: str) -> None:
     made = load_config(
-        preset=preset, changes={"road.humans": {"time_headway": 1.3}, "expert": 'a "b" c.py:d'}
+        preset=preset, changes={"scenario_options.humans": {"time_headway": 1.3}, "expert": 'a "b" c.py:d'}
     )
     assert load_config(written(tmp_path, to_toml(made))) == made
 
 
 def test_the_toml_of_a_road_given_in_python_makes_it_again(tmp_path: Path) -> None:
-    made = load_config(changes={"road.length": (230, 240)})
+    made = load_config(changes={"scenario_options.length": (230, 240)})
     assert load_config(written(tmp_path, to_toml(made))) == made
 
 
@@ -218,7 +217,7 @@ TEXT = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])
             PolicySettings,
             hidden=st.lists(st.integers(1, 999), min_size=1).map(tuple),
             authority=st.floats(1e-300, 1e300),
-            learn_exploration=st.booleans(),
+            learn_exploration_std=st.booleans(),
         ),
         trpo=st.builds(TRPOSettings, gamma=st.floats(0, 1, exclude_min=True, exclude_max=True)),
         evaluation=st.builds(EvaluationSettings, baselines=st.lists(TEXT).map(tuple)),
@@ -230,23 +229,23 @@ def test_any_configuration_survives_being_written(made: RunConfig, tmp_path_fact
     assert load_config(path) == made
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("agent", AGENT_NAMES)
 def test_each_learner_has_its_own_settings(agent: str) -> None:
     made = load_config(changes={"agent": agent, f"{agent}.gamma": 0.7, f"{agent}.batch_steps": 77})
-    assert (made.learner.gamma, made.learner.batch_steps) == (0.7, 77)
+    assert (made.learner.gamma, made.learner.steps_per_iteration) == (0.7, 77)
     assert made.learner == getattr(made, agent)
 
 
 def test_every_key_is_written_out() -> None:
     text = to_toml(RunConfig())
-    for key in ("steps", "seed", "expert", "gamma", "critic_rate", "hold", "observe", "baselines", "preset"):
+    for key in ("steps", "seed", "expert", "gamma", "critic_learning_rate", "hold", "observe", "baselines", "preset"):
         assert f"\n{key} = " in f"\n{text}"
 
 
 def test_the_expert_is_made_as_named() -> None:
     assert load_config(changes={"expert": "none"}).make_expert() == Constant()
     assert load_config(changes={"expert": "pi:window=30"}).make_expert() == PISaturation(window=30)
-    slow = load_config(changes={"road.steps_per_decision": 5}).make_expert()
+    slow = load_config(changes={"scenario_options.steps_per_control_step": 5}).make_expert()
     assert slow == PISaturation(time_step=0.5)
 
 
@@ -255,12 +254,10 @@ def test_the_expert_is_made_as_named() -> None:
     [
         ({"scenario": "figure-eight"}, "scenario: 'figure-eight'"),
         ({"reward": "eq16"}, "reward: 'eq16'"),
-        ({"road.length": [230, 230]}, "road.length: [230, 230]"),
+        ({"scenario_options.length": [230, 230]}, "scenario_options.length: [230, 230]"),
     ],
 )
 def test_what_each_road_of_a_preset_says_otherwise_is_refused(changes: dict[str, Any], name: str) -> None:
-    with pytest.raises(
-        InputError, match=re.escape(f"{name} is not allowed; allowed: none with the preset rings")
-    ):
+    with pytest.raises(InputError, match=re.escape(f"{name} is not allowed; allowed: none with the preset rings")):
         load_config(None, "rings", changes)
-    assert load_config(None, "rings", {"road.horizon": 200}).make_tasks()[0].scenario.horizon == 200
+    assert load_config(None, "rings", {"scenario_options.horizon": 200}).make_tasks()[0].scenario.horizon == 200

@@ -18,7 +18,13 @@ from unjam.errors import DiskError
 from unjam.files import append_line, to_json
 from unjam.folders import Folder
 from unjam.training import folder as run_folder
-from unjam.training.folder import PROGRESS, continue_folder, last_state, save_checkpoint, start_folder
+from unjam.training.run_folder import (
+    PROGRESS_FILE,
+    create_run_folder,
+    restore_newest_checkpoint,
+    resume_run_folder,
+    save_checkpoint,
+)
 
 ITERATIONS = 4
 Moment = Literal["before", "half", "after"]
@@ -106,23 +112,21 @@ def no_manifest(monkeypatch: pytest.MonkeyPatch) -> None:
 def run(folder: Path) -> None:
     """What a training does to its folder: begun, or gone on with where it was begun before."""
     if (folder / "config.toml").is_file():
-        continue_folder(folder, small_config())
+        resume_run_folder(folder, small_config())
     else:
-        start_folder(folder, small_config())
-    found = last_state(folder, {folder})
+        create_run_folder(folder, small_config())
+    found = restore_newest_checkpoint(folder, {folder})
     state, tensors = found or ({"iteration": 0, "sum": 0}, {"weight": torch.zeros(2)})
     while state["iteration"] < ITERATIONS:
         number = state["iteration"] + 1
         state = {"iteration": number, "sum": state["sum"] + number}
         tensors = {"weight": tensors["weight"] * 2 + number}
-        append_line(folder / PROGRESS, to_json({**state, "return": 1 / 3}))
+        append_line(folder / PROGRESS_FILE, to_json({**state, "return": 1 / 3}))
         save_checkpoint(folder / "checkpoint", state, tensors)
 
 
 def content_of(folder: Path) -> Content:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
-    }
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def crash(folder: Path, at: int, moment: Moment, kill: bool) -> Disk:
@@ -140,7 +144,7 @@ def test_wherever_it_ends_it_goes_on_to_the_same_files(every: int, tmp_path: Pat
     total = crash(wanted_in, 0, "before", False).count
     wanted = content_of(wanted_in)
     assert total > 50
-    assert [json.loads(line)["iteration"] for line in wanted[PROGRESS].splitlines()] == [1, 2, 3, 4]
+    assert [json.loads(line)["iteration"] for line in wanted[PROGRESS_FILE].splitlines()] == [1, 2, 3, 4]
     moments: tuple[Moment, ...] = ("before", "half", "after")
     for kill in (True, False):
         for moment in moments:

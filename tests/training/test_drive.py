@@ -9,14 +9,14 @@ import pytest
 
 from unjam.drivers import IDM, LocalState, PISaturation, check_driver
 from unjam.drivers.driver import Driver, Memory
-from unjam.environments.single import RoadEnv
+from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError
 from unjam.files import to_json
 from unjam.measures.metrics import METRICS, measure
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
 from unjam.training.evaluate import DriveResult, drive, raise_failures
-from unjam.training.seeds import held_out_seeds
+from unjam.training.seeds import make_test_seeds
 from unjam.worlds.episode import run_episode
 
 ROAD: dict[str, Any] = {"length": (120, 130), "vehicles": 8, "horizon": 60}
@@ -26,7 +26,7 @@ ROAD: dict[str, Any] = {"length": (120, 130), "vehicles": 8, "horizon": 60}
 def compared(tmp_path_factory: pytest.TempPathFactory) -> DriveResult:
     """Two drivers on the same three episodes, written into a folder."""
     out = tmp_path_factory.mktemp("drives") / "new" / "folder"
-    return drive("ring", ["pi", IDM()], episodes=3, seed=4, road=ROAD, workers=1, out=out)
+    return drive("ring", ["pi", IDM()], episodes=3, seed=4, scenario_options=ROAD, worker_pool=1, out=out)
 
 
 def test_every_driver_has_a_row_for_every_seed(compared: DriveResult) -> None:
@@ -44,8 +44,8 @@ def test_a_row_measures_the_episode_of_its_seed(compared: DriveResult) -> None:
 
 
 def test_held_out_seeds_are_those_that_judge_trainings() -> None:
-    judged = drive("ring", "pi", episodes=2, road=ROAD, workers=1, held_out=True).rows["pi"]
-    again = [run_episode(Ring(**ROAD), PISaturation(), seed).trajectories[0] for seed in held_out_seeds(2)]
+    judged = drive("ring", "pi", episodes=2, scenario_options=ROAD, worker_pool=1, test_seeds=True).rows["pi"]
+    again = [run_episode(Ring(**ROAD), PISaturation(), seed).trajectories[0] for seed in make_test_seeds(2)]
     assert [row["return"] for row in judged] == [trajectory.reward.sum() for trajectory in again]
 
 
@@ -60,8 +60,8 @@ def test_what_was_driven_is_written_with_a_report(compared: DriveResult) -> None
     assert compared.report == compared.folder / "report.html"
     results = read_results(compared.folder)
     assert list(results.rows) == ["pi", "idm"]
-    assert results.about["reward"] == "released"
-    assert results.trained is None
+    assert results.metadata["reward"] == "released"
+    assert results.trained_label is None
 
 
 def test_the_mean_is_that_of_the_first_driver(compared: DriveResult) -> None:
@@ -89,20 +89,18 @@ def test_the_document_of_several_drivers_is_a_list_of_such(compared: DriveResult
 
 
 def test_the_document_of_one_driver_is_strict_json_with_null_for_nan() -> None:
-    result = drive("ring", "pi", episodes=1, road=ROAD, workers=1)
+    result = drive("ring", "pi", episodes=1, scenario_options=ROAD, worker_pool=1)
     document = json.loads(to_json(result.document()), parse_constant=lambda name: pytest.fail(name))
     assert document["driver"] == "pi"
     assert document["mean"]["mean_speed"] == result.mean["mean_speed"]
-    assert (
-        document["mean"]["time_to_dissolve"] is None
-    )  # 6 s are too short for traffic to be calm for a minute
+    assert document["mean"]["time_to_dissolve"] is None  # 6 s are too short for traffic to be calm for a minute
     assert document["interval"]["mean_speed"] == [None, None]  # one episode has no spread
     assert document["folder"] is None
 
 
 def test_without_out_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    result = drive("ring", "idm", episodes=1, road=ROAD, workers=1)
+    result = drive("ring", "idm", episodes=1, scenario_options=ROAD, worker_pool=1)
     assert (result.folder, result.report) == (None, None)
     assert not list(tmp_path.iterdir())
 
@@ -110,19 +108,24 @@ def test_without_out_nothing_is_written(tmp_path: Path, monkeypatch: pytest.Monk
 def test_no_temporary_file_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)  # where Python remembers what TMPDIR was
-    drive("ring", "idm", episodes=1, road=ROAD, workers=1)
+    drive("ring", "idm", episodes=1, scenario_options=ROAD, worker_pool=1)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_number_of_workers_changes_nothing(compared: DriveResult) -> None:
-    other = drive("ring", ["pi", "idm"], episodes=3, seed=4, road=ROAD, workers=2)
+    other = drive("ring", ["pi", "idm"], episodes=3, seed=4, scenario_options=ROAD, worker_pool=2)
     assert to_json(other.rows) == to_json(compared.rows)
 
 
 def test_progress_is_told_by_driver_and_episode() -> None:
     told: list[tuple[Any, int]] = []
     drive(
-        "ring", ["pi", "idm"], 1, road=ROAD, workers=1, progress=lambda key, steps: told.append((key, steps))
+        "ring",
+        ["pi", "idm"],
+        1,
+        scenario_options=ROAD,
+        worker_pool=1,
+        progress=lambda key, steps: told.append((key, steps)),
     )
     assert (("pi", 0), 60) in told
     assert (("idm", 0), 60) in told
@@ -130,15 +133,15 @@ def test_progress_is_told_by_driver_and_episode() -> None:
 
 def test_a_reward_of_the_users_own(my_drivers: Path, tmp_path: Path) -> None:
     name = f"{my_drivers}:calm"
-    result = drive("ring", "idm", 1, road=ROAD, reward=name, workers=1, out=tmp_path / "out")
+    result = drive("ring", "idm", 1, scenario_options=ROAD, reward=name, worker_pool=1, out=tmp_path / "out")
     (trajectory,) = run_episode(Ring(**ROAD), IDM(), (0,), name).trajectories
     assert result.rows["idm"][0]["return"] == trajectory.reward.sum()
-    assert read_results(tmp_path / "out").about["reward"] == name
+    assert read_results(tmp_path / "out").metadata["reward"] == name
 
 
 def test_a_driver_that_fails_has_rows_that_say_so_and_can_be_raised(my_drivers: Path, tmp_path: Path) -> None:
     bad = f"{my_drivers}:broken"
-    result = drive("ring", ["idm", bad], episodes=2, road=ROAD, workers=1, out=tmp_path / "out")
+    result = drive("ring", ["idm", bad], episodes=2, scenario_options=ROAD, worker_pool=1, out=tmp_path / "out")
     assert [row["status"] for row in result.rows[bad]] == ["failed", "failed"]
     assert [row["status"] for row in result.rows["idm"]] == ["completed", "completed"]
     assert (tmp_path / "out" / "report.html").is_file()
@@ -176,7 +179,9 @@ def follow(state: LocalState) -> Any:
 
 
 def test_functions_and_objects_of_the_program_drive_beside_the_others() -> None:
-    result = drive("ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, road=ROAD, workers=1)
+    result = drive(
+        "ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, scenario_options=ROAD, worker_pool=1
+    )
     assert list(result.rows) == ["follow", "Follows", "Follows (2)", "Stays", "idm"]
     raise_failures(result)
     rows = {label: [row["return"] for row in rows] for label, rows in result.rows.items()}
@@ -189,15 +194,15 @@ def test_functions_and_objects_of_the_program_drive_beside_the_others() -> None:
 
 def test_an_error_in_a_function_of_the_program_is_raised_as_it_is() -> None:
     with pytest.raises(ZeroDivisionError):
-        drive("ring", lambda state: 1 / 0, 1, road=ROAD, workers=1)
+        drive("ring", lambda state: 1 / 0, 1, scenario_options=ROAD, worker_pool=1)
 
 
 def test_it_drives_while_an_environment_is_open_and_warns() -> None:
     with closing(RoadEnv(**ROAD)) as environment:
         environment.reset(seed=0)
         with pytest.warns(UserWarning, match="runs in a process of its own"):
-            beside = drive("ring", follow, 1, road=ROAD, workers=1)
-    assert beside.mean["return"] == drive("ring", follow, 1, road=ROAD, workers=1).mean["return"]
+            beside = drive("ring", follow, 1, scenario_options=ROAD, worker_pool=1)
+    assert beside.mean["return"] == drive("ring", follow, 1, scenario_options=ROAD, worker_pool=1).mean["return"]
 
 
 def test_a_result_is_a_table_of_pandas_and_shows_itself_in_a_notebook(compared: DriveResult) -> None:
@@ -216,16 +221,16 @@ def test_a_result_is_a_table_of_pandas_and_shows_itself_in_a_notebook(compared: 
 @pytest.fixture
 def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
     """Tells whether a worker process was started."""
-    from unjam.worlds import workers
+    from unjam.worlds import worker_pool
 
     begun: list[object] = []
-    start = workers._Worker._start
+    start = worker_pool._Worker._start
 
     def noted(self: Any) -> Any:
         begun.append(self)
         return start(self)
 
-    monkeypatch.setattr(workers._Worker, "_start", noted)
+    monkeypatch.setattr(worker_pool._Worker, "_start", noted)
     return lambda: bool(begun)
 
 
@@ -268,14 +273,14 @@ def test_what_is_already_there_is_left_alone(tmp_path: Path, started: Callable[[
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("keep")
     with pytest.raises(InputError, match="out' is not empty; allowed: a new folder"):
-        drive("ring", "pi", 1, road=ROAD, out=tmp_path / "out")
+        drive("ring", "pi", 1, scenario_options=ROAD, out=tmp_path / "out")
     assert mine.read_text() == "keep"
     assert not started()
 
 
 def test_started_notices_a_worker(started: Callable[[], bool]) -> None:
     assert not started()
-    drive("ring", "idm", 1, road=ROAD, workers=1)
+    drive("ring", "idm", 1, scenario_options=ROAD, worker_pool=1)
     assert started()
 
 
@@ -283,11 +288,11 @@ def test_two_drivers_of_the_same_description_are_both_driven(my_drivers: Path) -
     from unjam.controller import make_driver
 
     drivers = [make_driver(f"{my_drivers}:Keeper:gain={gain}", 0.1) for gain in (0.1, 0.2)]
-    assert len(drive("ring", drivers, 1, road=ROAD, workers=1).rows) == 2
+    assert len(drive("ring", drivers, 1, scenario_options=ROAD, worker_pool=1).rows) == 2
 
 
 def test_a_drive_of_which_every_episode_failed_leaves_no_folder(tmp_path: Path, my_drivers: Path) -> None:
     road = {"horizon": 20}
-    result = drive("ring", f"{my_drivers}:broken", 1, road=road, workers=1, out=tmp_path / "drive")
+    result = drive("ring", f"{my_drivers}:broken", 1, scenario_options=road, worker_pool=1, out=tmp_path / "drive")
     assert (result.folder, result.report) == (None, None)
     assert not (tmp_path / "drive").exists()

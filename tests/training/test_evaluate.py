@@ -9,28 +9,28 @@ import pandas as pd
 import pytest
 
 from unjam.drivers import IDM, Driver, PISaturation
-from unjam.drivers.from_file import FileDriver
+from unjam.drivers.user_driver import FileDriver
 from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
 from unjam.training.evaluate import Evaluation, evaluate, raise_failure, save_evaluation
-from unjam.training.seeds import TUNE, VALIDATE, held_out_seeds, tuning_seeds
+from unjam.training.seeds import TUNING_SEED, VALIDATION_SEED, make_test_seeds, tuning_seeds
 from unjam.worlds.episode import run_episode
-from unjam.worlds.workers import Workers
+from unjam.worlds.worker_pool import WorkerPool
 
 RING = Ring(length=(120, 130), vehicles=8, horizon=60)
 SEEDS = [(7, 0), (7, 1), (7, 2)]
 
 
 @pytest.fixture(scope="module")
-def pool() -> Iterator[Workers]:
-    with Workers(1) as workers:
+def pool() -> Iterator[WorkerPool]:
+    with WorkerPool(1) as workers:
         yield workers
 
 
 @pytest.fixture(scope="module")
-def found(pool: Workers) -> Evaluation:
+def found(pool: WorkerPool) -> Evaluation:
     return evaluate(RING, {"mine": PISaturation(), "other": IDM()}, SEEDS, pool)
 
 
@@ -52,9 +52,9 @@ def test_a_row_measures_the_episode_of_its_driver_and_seed(found: Evaluation) ->
 
 
 def test_all_drivers_meet_the_same_traffic(found: Evaluation) -> None:
-    assert found.shown["mine"].drawn == found.shown["other"].drawn
-    assert found.shown["mine"].seed == found.shown["other"].seed == SEEDS[0]
-    assert not np.array_equal(found.shown["mine"].speeds, found.shown["other"].speeds)
+    assert found.plot_episodes["mine"].drawn_values == found.plot_episodes["other"].drawn_values
+    assert found.plot_episodes["mine"].seed == found.plot_episodes["other"].seed == SEEDS[0]
+    assert not np.array_equal(found.plot_episodes["mine"].speeds, found.plot_episodes["other"].speeds)
 
 
 def test_fuel_is_measured(found: Evaluation) -> None:
@@ -68,7 +68,7 @@ def test_means_are_over_the_seeds(found: Evaluation) -> None:
     assert found.means()["mine"]["return"] == pytest.approx(expected)
 
 
-def test_another_reward_changes_the_return_alone(found: Evaluation, pool: Workers) -> None:
+def test_another_reward_changes_the_return_alone(found: Evaluation, pool: WorkerPool) -> None:
     other = evaluate(RING, {"mine": PISaturation()}, SEEDS, pool, reward="eq16")
     for row, before in zip(other.rows["mine"], found.rows["mine"], strict=True):
         assert row["return"] == pytest.approx(before["return_eq16"])
@@ -76,20 +76,16 @@ def test_another_reward_changes_the_return_alone(found: Evaluation, pool: Worker
         assert row["mean_speed"] == before["mean_speed"]
 
 
-def test_progress_names_driver_and_episode(pool: Workers) -> None:
+def test_progress_names_driver_and_episode(pool: WorkerPool) -> None:
     told: list[tuple[tuple[str, int], int]] = []
     evaluate(
-        RING,
-        {"a": IDM(), "b": IDM()},
-        SEEDS[:2],
-        pool,
-        progress=lambda episode, steps: told.append((episode, steps)),
+        RING, {"a": IDM(), "b": IDM()}, SEEDS[:2], pool, progress=lambda episode, steps: told.append((episode, steps))
     )
     assert {episode for episode, steps in told if steps == 60} == {("a", 0), ("a", 1), ("b", 0), ("b", 1)}
 
 
 def test_a_driver_that_fails_has_rows_that_say_so_and_does_not_stop_the_others(
-    pool: Workers, my_drivers: Path
+    pool: WorkerPool, my_drivers: Path
 ) -> None:
     found = evaluate(RING, {"bad": FileDriver(my_drivers, "raises"), "good": IDM()}, SEEDS[:2], pool)
     assert [row["status"] for row in found.rows["bad"]] == ["failed", "failed"]
@@ -97,7 +93,7 @@ def test_a_driver_that_fails_has_rows_that_say_so_and_does_not_stop_the_others(
     assert all("lost the map" in row["reason"] for row in found.rows["bad"])
     assert all(math.isnan(row["return"]) for row in found.rows["bad"])
     assert [row["status"] for row in found.rows["good"]] == ["completed", "completed"]
-    assert list(found.shown) == ["good"]
+    assert list(found.plot_episodes) == ["good"]
     assert math.isnan(found.means()["bad"]["return"])
 
 
@@ -129,8 +125,8 @@ def numbers_of(seed: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def test_seeds_that_train_choose_and_judge_have_nothing_in_common() -> None:
-    judging = {numbers_of(seed) for seed in held_out_seeds(500)}
-    choosing = {numbers_of((VALIDATE, index)) for index in range(500)}
+    judging = {numbers_of(seed) for seed in make_test_seeds(500)}
+    choosing = {numbers_of((VALIDATION_SEED, index)) for index in range(500)}
     tuning = {numbers_of(seed) for seed in tuning_seeds(500)}
     training = {
         numbers_of((run, iteration, index))
@@ -141,11 +137,11 @@ def test_seeds_that_train_choose_and_judge_have_nothing_in_common() -> None:
     assert len(judging) == len(choosing) == len(tuning) == 500
     assert len(judging | choosing | tuning) == 1500
     assert training.isdisjoint(judging | choosing | tuning)
-    assert TUNE < VALIDATE + 500  # a seed that only counted up from one would meet the other
+    assert TUNING_SEED < VALIDATION_SEED + 500  # a seed that only counted up from one would meet the other
 
 
 def test_more_held_out_episodes_contain_the_fewer() -> None:
-    assert held_out_seeds(20)[:5] == held_out_seeds(5)
+    assert make_test_seeds(20)[:5] == make_test_seeds(5)
 
 
 def strict(text: str) -> Any:
@@ -158,9 +154,7 @@ def strict(text: str) -> Any:
 
 
 def test_a_saved_evaluation_can_be_read_again(found: Evaluation, tmp_path: Path) -> None:
-    save_evaluation(
-        tmp_path / "new", found, {"scenario": "ring", "reward": "released", "limit": float("inf")}
-    )
+    save_evaluation(tmp_path / "new", found, {"scenario": "ring", "reward": "released", "limit": float("inf")})
     assert {path.name for path in (tmp_path / "new").iterdir()} == {
         "evaluation.json",
         "episodes.parquet",
@@ -174,15 +168,13 @@ def test_a_saved_evaluation_can_be_read_again(found: Evaluation, tmp_path: Path)
     for label, rows in found.rows.items():
         for row, expected in zip(results.rows[label], rows, strict=True):
             for name in METRICS:
-                same = row[name] == expected[name] or (
-                    math.isnan(row[name]) and not math.isfinite(expected[name])
-                )
+                same = row[name] == expected[name] or (math.isnan(row[name]) and not math.isfinite(expected[name]))
                 assert same, name
-    for label, episode in found.shown.items():
-        np.testing.assert_array_equal(results.shown[label].positions, episode.positions.astype(np.float32))
-        np.testing.assert_array_equal(results.shown[label].outline, episode.outline.astype(np.float32))
-        assert results.shown[label].drawn == episode.drawn
-        assert tuple(results.shown[label].cav_ids) == episode.cav_ids
+    for label, episode in found.plot_episodes.items():
+        np.testing.assert_array_equal(results.plot_episodes[label].positions, episode.positions.astype(np.float32))
+        np.testing.assert_array_equal(results.plot_episodes[label].outline, episode.outline.astype(np.float32))
+        assert results.plot_episodes[label].drawn_values == episode.drawn_values
+        assert tuple(results.plot_episodes[label].cav_ids) == episode.cav_ids
 
 
 def test_the_table_has_the_rows(found: Evaluation, tmp_path: Path) -> None:
@@ -195,21 +187,17 @@ def test_the_table_has_the_rows(found: Evaluation, tmp_path: Path) -> None:
     )
 
 
-def test_an_evaluation_in_which_all_failed_can_be_saved(
-    pool: Workers, my_drivers: Path, tmp_path: Path
-) -> None:
+def test_an_evaluation_in_which_all_failed_can_be_saved(pool: WorkerPool, my_drivers: Path, tmp_path: Path) -> None:
     found = evaluate(RING, {"bad": FileDriver(my_drivers, "broken")}, SEEDS[:1], pool)
     save_evaluation(tmp_path, found, {})
     (row,) = strict((tmp_path / "evaluation.json").read_text())["rows"]
     assert (row["status"], row["return"]) == ("failed", None)
-    assert read_results(tmp_path).shown == {}
+    assert read_results(tmp_path).plot_episodes == {}
     assert pd.read_parquet(tmp_path / "episodes.parquet")["status"].tolist() == ["failed"]
 
 
-def test_a_new_evaluation_takes_the_place_of_the_old(
-    found: Evaluation, tmp_path: Path, pool: Workers
-) -> None:
+def test_a_new_evaluation_takes_the_place_of_the_old(found: Evaluation, tmp_path: Path, pool: WorkerPool) -> None:
     save_evaluation(tmp_path, found, {})
     save_evaluation(tmp_path, evaluate(RING, {"one": IDM()}, SEEDS[:1], pool), {})
     assert list(read_results(tmp_path).rows) == ["one"]
-    assert list(read_results(tmp_path).shown) == ["one"]
+    assert list(read_results(tmp_path).plot_episodes) == ["one"]

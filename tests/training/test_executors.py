@@ -16,7 +16,7 @@ from unjam.errors import MissingPartError, UnjamError
 from unjam.reports.results import read_progress
 from unjam.training import executors
 from unjam.training.config import RunConfig
-from unjam.training.executors import CommandLine, Processes, run_all, training_command
+from unjam.training.executors import CommandLine, LocalExecutor, run_all, training_command
 
 FAST = small_config(evaluation__every=0, evaluation__episodes=1, evaluation__baselines=[])
 
@@ -43,10 +43,10 @@ def test_one_failure_does_not_stop_the_others(tmp_path: Path) -> None:
 
 def test_what_was_begun_is_gone_on_with(tmp_path: Path) -> None:
     command = command_of(tmp_path)
-    assert command.line()[4:6] == ["train", "--config"]
+    assert command.argv()[4:6] == ["train", "--config"]
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.toml").touch()
-    assert command.line()[4:6] == ["train", "--resume"]
+    assert command.argv()[4:6] == ["train", "--resume"]
 
 
 def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,17 +60,13 @@ def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(CommandLine, "line", lambda self: [sys.executable, str(script), *self.words])
     for times, code in ((2, 0), (3, 0), (9, -9)):
         counted = tmp_path / f"{times}"
-        assert Processes().run(CommandLine([str(counted), str(times)], tmp_path / "log")) == code
-        assert len(counted.read_text()) == min(times, executors.ATTEMPTS)
+        assert LocalExecutor().run(CommandLine([str(counted), str(times)], tmp_path / "log")) == code
+        assert len(counted.read_text()) == min(times, executors.MAX_ATTEMPTS)
 
 
-def test_a_stop_ends_what_runs_and_starts_nothing_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        CommandLine, "line", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"]
-    )
-    processes, codes = Processes(), []
+def test_a_stop_ends_what_runs_and_starts_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CommandLine, "line", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"])
+    processes, codes = LocalExecutor(), []
     thread = threading.Thread(target=lambda: codes.append(processes.run(CommandLine([], tmp_path / "log"))))
     thread.start()
     while not processes._running:
@@ -107,8 +103,7 @@ def test_a_cluster_ends_with_the_bytes_of_this_machine(tmp_path: Path, cluster: 
     hashes = []
     for executor in ("local", "ray"):
         commands = {
-            name: command_of(tmp_path / executor / name, config)
-            for name, config in zip(names, configs, strict=True)
+            name: command_of(tmp_path / executor / name, config) for name, config in zip(names, configs, strict=True)
         }
         run_all(commands, 2, executor, lambda line: None)
         hashes.append([hash_of(tmp_path / executor / name) for name in names])
@@ -138,7 +133,7 @@ def test_a_training_whose_machine_is_lost_goes_on_elsewhere(tmp_path: Path, clus
     assert not thread.is_alive()
     assert failures == []
     for name in commands:
-        assert read_progress(tmp_path / name / "run")[-1]["actual_steps"] == 6000
+        assert read_progress(tmp_path / name / "run")[-1]["environment_steps"] == 6000
         assert (tmp_path / name / "run" / "report.html").is_file()
     started = [
         [line for line in (tmp_path / name / "log").read_text().splitlines() if line.startswith("$ ")]

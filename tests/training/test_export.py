@@ -7,17 +7,25 @@ import pytest
 
 from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
-from unjam.controller import load_controller, shipped_file
-from unjam.controller.file import GRAPH, LONGEST_SAMPLE, MANIFEST, SAMPLE, WEIGHTS, read_sample, unpack_parts
+from unjam.controller import load_controller, packaged_file
+from unjam.controller.file import (
+    GRAPH_PART,
+    MANIFEST_PART,
+    MAX_SAMPLE_STEPS,
+    SAMPLE_PART,
+    WEIGHTS_PART,
+    read_sample,
+    unpack_parts,
+)
 from unjam.drivers import PISaturation, ResidualDriver
-from unjam.drivers.wrappers import Filtered
+from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
 from unjam.training.export import export_controller
 from unjam.training.train import train
 
 
 def manifest_of(path: Path) -> dict[str, Any]:
-    return json.loads(unpack_parts(path)[MANIFEST])
+    return json.loads(unpack_parts(path)[MANIFEST_PART])
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +44,13 @@ def exported(run: Path) -> Path:
 @pytest.mark.long
 def test_it_is_the_runs_controller_that_is_exported(run: Path, exported: Path) -> None:
     made, kept = load_controller(exported), load_controller(run)
-    assert isinstance(made, Filtered)
+    assert isinstance(made, FilteredDriver)
     made = made.driver
     assert isinstance(made, ResidualDriver)
     assert isinstance(kept, ResidualDriver)
     for ours, theirs in zip(made.network.layers, kept.network.layers, strict=True):
         np.testing.assert_array_equal(ours[0], theirs[0])
-    assert unpack_parts(exported).keys() == {MANIFEST, WEIGHTS, SAMPLE}
+    assert unpack_parts(exported).keys() == {MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART}
 
 
 def test_its_manifest_says_where_it_comes_from_and_how_good_it_is(run: Path, exported: Path) -> None:
@@ -60,7 +68,7 @@ def test_its_manifest_says_where_it_comes_from_and_how_good_it_is(run: Path, exp
 
 
 def test_the_sample_is_what_a_cav_perceived_in_an_episode(exported: Path) -> None:
-    states, answers = read_sample(unpack_parts(exported)[SAMPLE])
+    states, answers = read_sample(unpack_parts(exported)[SAMPLE_PART])
     assert len(answers) == 100  # the horizon of the run
     np.testing.assert_allclose(np.diff(states.speed), 0.1 * answers[:-1], atol=1e-6)
     assert set(states.loop_length) <= set(range(120, 131))
@@ -78,7 +86,7 @@ def test_a_driver_by_itself_gets_step_and_bounds_of_its_road(tmp_path: Path) -> 
     assert load_controller(done.file) == PISaturation(window=30, time_step=1.0)
     said = manifest_of(done.file)
     assert (said["time_step"], said["action"]["high"]) == (1.0, 1.0)
-    assert done.decisions <= LONGEST_SAMPLE
+    assert done.sample_steps <= MAX_SAMPLE_STEPS
     again = export_controller(done.file, tmp_path / "again.unjam", scenario="merge")
     assert load_controller(again.file) == load_controller(done.file)
 
@@ -89,7 +97,7 @@ def test_with_a_graph_it_is_in_the_file_and_beside_it(run: Path, tmp_path: Path)
     pytest.importorskip("onnxruntime")
     done = export_controller(run, tmp_path / "ring.unjam", onnx=True)
     assert done.graph == tmp_path / "ring.onnx"
-    assert (tmp_path / "ring.onnx").read_bytes() == unpack_parts(done.file)[GRAPH]
+    assert (tmp_path / "ring.onnx").read_bytes() == unpack_parts(done.file)[GRAPH_PART]
 
 
 @pytest.mark.parametrize(
@@ -116,9 +124,7 @@ def test_what_cannot_be_exported_is_refused(
     assert not Path(to).exists()
 
 
-def test_a_file_that_does_not_verify_leaves_the_one_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_does_not_verify_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     to = tmp_path / "pi.unjam"
     export_controller("pi", to, scenario="ring")
     before = to.read_bytes()
@@ -149,9 +155,9 @@ def test_no_graph_is_drawn_of_a_driver_that_looks_at_what_its_road_does_not_tell
 
 
 def test_a_controllers_file_keeps_its_road_and_origin(tmp_path: Path) -> None:
-    shipped = manifest_of(shipped_file("figure-eight-tuned"))
+    shipped = manifest_of(packaged_file("figure-eight-tuned"))
     again = manifest_of(export_controller("unjam:figure-eight-tuned", tmp_path / "again.unjam").file)
     for name in ("scenario", "tuned", "expert", "versions"):
         assert again[name] == shipped[name]
-    states, _ = read_sample(unpack_parts(tmp_path / "again.unjam")[SAMPLE])
-    assert len(states.speed) == LONGEST_SAMPLE
+    states, _ = read_sample(unpack_parts(tmp_path / "again.unjam")[SAMPLE_PART])
+    assert len(states.speed) == MAX_SAMPLE_STEPS

@@ -3,9 +3,9 @@
 import pytest
 
 from unjam.scenarios.ring import Ring
-from unjam.training.family import FAMILY, GROUPS, roads_of
+from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
 
-SEEN, HELD_OUT = roads_of("everywhere", "seen"), roads_of("everywhere", "combination", "axis")
+SEEN, HELD_OUT = family_scenarios("everywhere", "seen"), family_scenarios("everywhere", "combination", "axis")
 
 
 def test_no_road_that_is_held_out_is_seen() -> None:
@@ -23,12 +23,12 @@ def test_each_held_out_axis_lies_beyond_what_is_seen() -> None:
     assert all(road.cavs < 5 for road in rings)
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", ROAD_GROUPS)
 def test_every_group_has_roads_of_both_kinds(group: str) -> None:
-    assert roads_of(group, "seen")
-    assert roads_of(group, "combination", "axis")
+    assert family_scenarios(group, "seen")
+    assert family_scenarios(group, "combination", "axis")
 
 
 def test_rings_are_shared_where_six_in_a_hundred_are_cavs() -> None:
-    assert list(roads_of("shared-rings", "seen")) == ["ring-33-growing-3-cavs", "ring-66-grown-4-cavs"]
-    assert list(roads_of("shared-rings", "combination", "axis")) == ["ring-44-grown-5-cavs"]
+    assert list(family_scenarios("shared-rings", "seen")) == ["ring-33-growing-3-cavs", "ring-66-grown-4-cavs"]
+    assert list(family_scenarios("shared-rings", "combination", "axis")) == ["ring-44-grown-5-cavs"]

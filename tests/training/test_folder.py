@@ -9,12 +9,12 @@ from tests.training.test_run import STEPS, small_config
 from tests.worlds.sumo.own_roads import straight
 from unjam.errors import InputError
 from unjam.training.config import load_config
-from unjam.training.folder import check_possible, continue_folder, read_config, start_folder
+from unjam.training.run_folder import check_config, create_run_folder, read_config, resume_run_folder
 from unjam.training.train import train
 
 
 def test_an_empty_folder_may_be_there(tmp_path: Path) -> None:
-    start_folder(tmp_path, small_config())
+    create_run_folder(tmp_path, small_config())
     assert read_config(tmp_path) == small_config()
 
 
@@ -39,27 +39,27 @@ def test_what_cannot_work_is_told_before_anything_is_written(tmp_path: Path, cha
 
 
 def test_rows_are_not_imagined_where_a_cav_is_told_more_than_they_know(tmp_path: Path) -> None:
-    assert load_config(changes={"scenario": "on-ramp"}).virtual.virtual_ratio == 0.0
-    assert load_config(changes={"scenario": "on-ramp", "virtual.model": "road"}).virtual.virtual_ratio > 0.0
+    assert load_config(changes={"scenario": "on-ramp"}).model.model_ratio == 0.0
+    assert load_config(changes={"scenario": "on-ramp", "model.kind": "road"}).model.model_ratio > 0.0
     with pytest.raises(InputError, match="not allowed on on-ramp, where CAVs have an ACC"):
-        check_possible(load_config(changes={"scenario": "on-ramp", "virtual.virtual_ratio": 5.0}))
+        check_config(load_config(changes={"scenario": "on-ramp", "model.model_ratio": 5.0}))
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
-    asked = {"scenario": str(file), "road.cav_share": 0.5, "expert": "jam-ahead"}
+    asked = {"scenario": str(file), "scenario_options.penetration_rate": 0.5, "expert": "jam-ahead"}
     with pytest.raises(InputError, match=r"jam-ahead and the network ask for .*lane_speeds"):
-        check_possible(load_config(changes=asked))
-    check_possible(load_config(changes={**asked, "expert": "acc"}))
+        check_config(load_config(changes=asked))
+    check_config(load_config(changes={**asked, "expert": "acc"}))
 
 
 def test_the_simulator_is_no_expert() -> None:
     with pytest.raises(InputError, match=r"expert: 'human' is not allowed; .* idm drives like people"):
-        check_possible(load_config(changes={"expert": "human"}))
+        check_config(load_config(changes={"expert": "human"}))
 
 
 def test_vehicles_on_a_network_of_ones_own_know_no_position(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
-    changes = {"scenario": str(file), "road.cav_types": ["car"], "policy.observe": ["route_position"]}
+    changes = {"scenario": str(file), "scenario_options.cav_types": ["car"], "policy.inputs": ["route_position"]}
     with pytest.raises(InputError, match="'route_position' is not allowed on a network of one's own"):
-        check_possible(load_config(changes=changes))
+        check_config(load_config(changes=changes))
 
 
 @pytest.mark.parametrize("content", [{}, {"notes.txt": "mine"}])
@@ -79,15 +79,15 @@ def test_only_a_run_can_be_resumed(tmp_path: Path, content: dict[str, str]) -> N
         {"expert": "idm"},
         {"reward": "eq16"},
         {"trpo.gamma": 0.9},
-        {"policy.hold": 5},
-        {"road.length": [120, 131]},
-        {"evaluation.every": 2},
+        {"policy.action_duration": 5},
+        {"scenario_options.length": [120, 131]},
+        {"evaluation.validation_interval": 2},
         {"scenario": "ring-warm"},
     ],
     ids=str,
 )
 def test_what_a_run_is_cannot_change_when_it_goes_on(tmp_path: Path, changes: dict[str, Any]) -> None:
-    start_folder(tmp_path, small_config())
+    create_run_folder(tmp_path, small_config())
     before = (tmp_path / "config.toml").read_bytes()
     changed = load_config(tmp_path / "config.toml", changes={"steps": 900, **changes})
     with pytest.raises(InputError, match="only steps and workers may change"):
@@ -96,32 +96,32 @@ def test_what_a_run_is_cannot_change_when_it_goes_on(tmp_path: Path, changes: di
 
 
 def test_budget_and_workers_may_change_when_a_run_goes_on(tmp_path: Path) -> None:
-    start_folder(tmp_path, small_config())
+    create_run_folder(tmp_path, small_config())
     changed = replace(small_config(), steps=9 * STEPS, workers=7)
-    continue_folder(tmp_path, changed)
+    resume_run_folder(tmp_path, changed)
     assert read_config(tmp_path) == changed
 
 
 def test_a_run_that_gave_up_takes_no_more_steps(tmp_path: Path) -> None:
     config = small_config(evaluation__every=1, evaluation__patience=2)
-    start_folder(tmp_path, config)
+    create_run_folder(tmp_path, config)
     rows = [{"iteration": n, "return_expert": 5.0, "return_validation": 4.0} for n in (1, 2, 3)]
     (tmp_path / "progress.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    continue_folder(tmp_path, config)
+    resume_run_folder(tmp_path, config)
     with pytest.raises(InputError, match=rf"^steps: {9 * STEPS} is not allowed: evaluation.patience"):
-        continue_folder(tmp_path, replace(config, steps=9 * STEPS))
+        resume_run_folder(tmp_path, replace(config, steps=9 * STEPS))
     assert read_config(tmp_path) == config
 
 
 @pytest.mark.parametrize("words", ['title = "mine"\n', "[[tasks]]\nname = 'ring'\n"])
 def test_a_run_beside_a_strangers_config_goes_on(words: str, tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text(words)
-    start_folder(tmp_path / "ring", small_config())
-    continue_folder(tmp_path / "ring", small_config())
+    create_run_folder(tmp_path / "ring", small_config())
+    resume_run_folder(tmp_path / "ring", small_config())
 
 
 def test_a_run_whose_road_was_given_in_python_goes_on(tmp_path: Path) -> None:
     config = small_config(road__length=(120, 130))
-    start_folder(tmp_path, config)
-    continue_folder(tmp_path, config)
+    create_run_folder(tmp_path, config)
+    resume_run_folder(tmp_path, config)
     assert read_config(tmp_path).make_scenario() == config.make_scenario()

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from unjam.errors import UnjamError
-from unjam.training.generators import exclusive_generators
+from unjam.training.random_state import exclusive_random_state
 
 
 def test_a_training_leaves_generators_and_threads_of_its_process_as_they_were() -> None:
@@ -12,7 +12,7 @@ def test_a_training_leaves_generators_and_threads_of_its_process_as_they_were() 
     threads, expected = torch.get_num_threads(), (torch.rand(2).tolist(), np.random.rand(2).tolist())
     torch.manual_seed(3)
     np.random.seed(3)
-    with exclusive_generators():
+    with exclusive_random_state():
         torch.manual_seed(8)
         np.random.seed(8)
         torch.set_num_threads(threads + 1)
@@ -23,5 +23,5 @@ def test_a_training_leaves_generators_and_threads_of_its_process_as_they_were() 
 def test_a_second_training_in_the_same_process_is_refused() -> None:
     refused = pytest.raises(UnjamError, match="another training runs in this process")
     for _ in range(2):
-        with exclusive_generators(), refused, exclusive_generators():
+        with exclusive_random_state(), refused, exclusive_random_state():
             raise AssertionError

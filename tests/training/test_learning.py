@@ -7,28 +7,28 @@ import pytest
 
 from tests.training.test_run import learn_with
 from unjam.training.config import load_config
-from unjam.worlds.workers import Workers
+from unjam.worlds.worker_pool import WorkerPool
 
 LITTLE_RING: dict[str, Any] = {
     "scenario": "ring",
-    "road.length": [110, 130],
-    "road.vehicles": 10,
-    "road.horizon": 600,
+    "scenario_options.length": [110, 130],
+    "scenario_options.vehicles": 10,
+    "scenario_options.horizon": 600,
     "expert": "none",
     "policy.exploration_std": 0.3,
-    "virtual.virtual_ratio": 2.0,
-    "evaluation.every": 4,
+    "model.model_ratio": 2.0,
+    "evaluation.validation_interval": 4,
     "workers": 1,
 }
 QUICK: dict[str, dict[str, Any]] = {
-    "trpo": {"trpo.batch_steps": 3000, "steps": 48_000},
-    "ppo": {"ppo.batch_steps": 3000, "ppo.epochs": 40, "steps": 36_000},
+    "trpo": {"trpo.steps_per_iteration": 3000, "steps": 48_000},
+    "ppo": {"ppo.steps_per_iteration": 3000, "ppo.epochs": 40, "steps": 36_000},
     "sac": {
-        **{"sac.batch_steps": 3000, "sac.start_steps": 3000, "sac.updates_per_step": 0.3},
+        **{"sac.steps_per_iteration": 3000, "sac.learning_starts": 3000, "sac.gradient_steps_per_step": 0.3},
         **{"sac.temperature": 0.2, "steps": 24_000},
     },
     "td3": {
-        **{"td3.batch_steps": 3000, "td3.start_steps": 3000, "td3.updates_per_step": 0.3},
+        **{"td3.steps_per_iteration": 3000, "td3.learning_starts": 3000, "td3.gradient_steps_per_step": 0.3},
         **{"td3.tau": 0.03, "steps": 24_000},
     },
 }
@@ -43,8 +43,8 @@ TARGET = 100.0
 def test_a_network_alone_learns_to_drive_on_a_little_ring(agent: str, tmp_path: Path) -> None:
     config = load_config(changes={**LITTLE_RING, "agent": agent, **QUICK[agent]})
     rows: list[dict[str, Any]] = []
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config, rows.append)
     assert rows[0]["return_expert"] < STANDING
     assert max(row["return_validation"] or 0.0 for row in rows) > TARGET
-    assert sum(row["virtual_steps"] for row in rows) > 0
+    assert sum(row["model_steps"] for row in rows) > 0

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from tests.training.test_run import STEPS, learn_with, small_config
 from unjam.errors import InputError
 from unjam.files import to_json
-from unjam.reports.model import wave_rows, waves
+from unjam.reports.model import wave_figure, wave_rows
 from unjam.reports.results import MODEL_FILE, read_progress
 from unjam.training import model_facts
 from unjam.training.config import RunConfig
-from unjam.training.folder import read_config
-from unjam.training.model_facts import decisions_ahead, measure_model, newest_model_facts
-from unjam.worlds.workers import Workers
+from unjam.training.model_facts import measure_model, replay_length, update_model_facts
+from unjam.training.run_folder import read_config
+from unjam.worlds.worker_pool import WorkerPool
 
 CONFIG = small_config(virtual__virtual_ratio=1.0, virtual__epochs=4, virtual__members=3, steps=2 * STEPS)
 NUMBERS = ["speed", "leader_speed", "follower_speed", "leader_gap", "follower_gap"]
@@ -27,7 +27,7 @@ NUMBERS = ["speed", "leader_speed", "follower_speed", "leader_gap", "follower_ga
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two iterations of three episodes, 100 decisions each; episodes 0, 2 and 5 are held out."""
     folder = tmp_path_factory.mktemp("runs") / "with-model"
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, folder, CONFIG)
     return folder
 
@@ -61,12 +61,12 @@ def test_replays_go_over_half_of_a_stay(facts: dict[str, Any]) -> None:
     for found in replay["numbers"].values():
         assert {len(values) for values in found.values()} == {len(replay["seconds"])}
     assert max(replay["numbers"]["speed"]["base"]) < 1e-4
-    assert 0 < replay["starts"] <= model_facts.STARTS
+    assert 0 < replay["starts"] <= model_facts.MAX_REPLAYS
 
 
 def test_examples_begin_where_they_were_recorded(facts: dict[str, Any]) -> None:
     examples = facts["replay"]["examples"]
-    assert len(examples) == model_facts.EXAMPLES
+    assert len(examples) == model_facts.EXAMPLE_COUNT
     for example in examples:
         for found in example["numbers"].values():
             assert len(found["members"]) == 3
@@ -74,14 +74,12 @@ def test_examples_begin_where_they_were_recorded(facts: dict[str, Any]) -> None:
             assert {len(line) for line in (found["actual"], found["base"], *found["members"])} == {50}
 
 
-def test_the_bound_is_that_of_the_run(
-    run: Path, facts: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bound_is_that_of_the_run(run: Path, facts: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     newest = read_progress(run)[-1]
     monkeypatch.setattr(model_facts, "LENGTHS", (newest["k_star"],))
     found = measure_model(run, CONFIG)["bound"]
     assert found["C"][0] == pytest.approx(newest["virtual"]["bound"], rel=1e-3)
-    assert facts["bound"]["largest_return"] > found["largest_reward"]
+    assert facts["bound"]["largest_return"] > found["max_reward"]
     assert facts["k_star"] == newest["k_star"]
 
 
@@ -99,18 +97,16 @@ def test_facts_are_small_and_the_same_each_time(run: Path, facts: dict[str, Any]
 
 
 @pytest.mark.parametrize("kept", [None, "{", "[]", '{"iteration": 1}'])
-def test_missing_damaged_and_old_facts_are_measured_anew(
-    kept: str | None, run: Path, facts: dict[str, Any]
-) -> None:
+def test_missing_damaged_and_old_facts_are_measured_anew(kept: str | None, run: Path, facts: dict[str, Any]) -> None:
     (run / MODEL_FILE).unlink(missing_ok=True)
     if kept is not None:
         (run / MODEL_FILE).write_text(kept)
-    assert newest_model_facts(run, CONFIG) == json.loads(json.dumps(facts))
+    assert update_model_facts(run, CONFIG) == json.loads(json.dumps(facts))
 
 
 def test_newest_facts_are_read(run: Path) -> None:
     (run / MODEL_FILE).write_text('{"iteration": 2, "base": "told"}')
-    assert newest_model_facts(run, CONFIG)["base"] == "told"
+    assert update_model_facts(run, CONFIG)["base"] == "told"
 
 
 def without_virtual() -> RunConfig:
@@ -119,46 +115,44 @@ def without_virtual() -> RunConfig:
 
 def test_a_run_without_a_virtual_environment_says_so(run: Path) -> None:
     with pytest.raises(InputError, match="has no virtual environment"):
-        newest_model_facts(run, without_virtual())
+        update_model_facts(run, without_virtual())
 
 
 def test_a_run_that_has_only_begun_says_so(run: Path, tmp_path: Path) -> None:
     shutil.copy(run / "config.toml", tmp_path)
     with pytest.raises(InputError, match="has no checkpoint yet"):
-        newest_model_facts(tmp_path, read_config(tmp_path))
+        update_model_facts(tmp_path, read_config(tmp_path))
 
 
 @given(st.lists(st.integers(1, 5000), min_size=1, max_size=50))
 def test_at_least_half_of_the_stays_are_long_enough_to_be_replayed(stays: list[int]) -> None:
-    ahead = decisions_ahead(stays)
-    assert 1 <= ahead <= model_facts.LONGEST
+    ahead = replay_length(stays)
+    assert 1 <= ahead <= model_facts.MAX_REPLAY_STEPS
     assert np.mean([stay >= ahead for stay in stays]) >= 0.5
 
 
 def test_a_run_that_imagines_whole_roads_shows_waves(tmp_path: Path) -> None:
     changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__base": "none"}
     config = small_config(**changes, virtual__members=2, steps=STEPS)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = json.loads(to_json(measure_model(tmp_path / "run", config)))
     shapes = [np.shape(found["waves"]["recorded"][name]) for name in ("speeds", "positions")]
     assert shapes == [(10, 8)] * 2  # a moment a second, for ten seconds
     assert found["step"] == pytest.approx(1.0)
     assert len(found["waves"]["recorded"]["cavs"]) == 1
-    titles = [axes.get_title(loc="left") or axes.get_title() for axes in waves(found).axes[:3]]
+    titles = [axes.get_title(loc="left") or axes.get_title() for axes in wave_figure(found).axes[:3]]
     assert titles == ["recorded", "imagined", "nothing changes"]
-    assert newest_model_facts(tmp_path / "run", config) == found
+    assert update_model_facts(tmp_path / "run", config) == found
     rows = dict(wave_rows(found))
     speeds = np.array(found["waves"]["imagined"]["speeds"])
     speeds = speeds[len(speeds) // 2 :]
-    assert rows["imagined"] == [
-        f"{n:.2f}" for n in (speeds.mean(), speeds.std(1).mean(), speeds.min(1).mean())
-    ]
+    assert rows["imagined"] == [f"{n:.2f}" for n in (speeds.mean(), speeds.std(1).mean(), speeds.min(1).mean())]
 
 
 RAMP: dict[str, Any] = {
     "scenario": "on-ramp",
-    "road": {"horizon": 30, "cav_share": 0.5, "peak": [0, 30]},
+    "road": {"horizon": 30, "penetration_rate": 0.5, "peak": [0, 30]},
     "expert": "jam-ahead",
     "world": "batch",
     "policy__observe": ["local"],
@@ -174,7 +168,7 @@ RAMP: dict[str, Any] = {
 def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str, tmp_path: Path) -> None:
     changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2, **RAMP}
     config = small_config(**{**changes, "world": world}, steps=STEPS)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = json.loads(to_json(measure_model(tmp_path / "run", config)))
     assert found["step"] == pytest.approx(10.0)
@@ -185,7 +179,7 @@ def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str,
     alike = 0.0 if world == "batch" else 0.1  # SUMO lets some enter a second sooner or later than the batch
     assert came["recorded"] == pytest.approx(came["base"], rel=alike)
     assert not np.array_equal(roads["recorded"], roads["base"], equal_nan=True)  # who misjudge anew
-    drawn = waves(found)
+    drawn = wave_figure(found)
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in drawn.axes]
     assert [title for title in titles if title] == ["recorded", "imagined", "IDM alone"]
     assert {axes.get_ylabel() for axes in drawn.axes} >= {f"{name}\n[m]" for name in found["lane_names"]}
@@ -202,7 +196,7 @@ def test_a_run_that_imagines_whole_roads_goes_on_as_if_it_had_not_been_stopped(
     for stops in ([2 * STEPS], [STEPS, 2 * STEPS]):
         folder = tmp_path / str(len(stops))
         for steps in stops:
-            with Workers(1) as workers:
+            with WorkerPool(1) as workers:
                 learn_with(workers, folder, small_config(**changes, steps=steps), resume=steps != stops[0])
         ends.append([row["virtual"]["return_virtual"] for row in read_progress(folder)])
     assert ends[0] == ends[1]

@@ -36,22 +36,22 @@ def test_a_preset_changes_what_it_names_and_nothing_else(name: str) -> None:
 
 def test_the_demo_of_a_first_visit_begins_with_a_wave_and_ends_within_a_minute() -> None:
     made = load_config(preset="demo", changes={"scenario": "ring-jammed"})
-    assert (made.scenario, made.world, made.steps) == ("ring-jammed", "batch", 288_000)
+    assert (made.scenario, made.simulator, made.steps) == ("ring-jammed", "batch", 288_000)
     assert made.evaluation.baselines[0] == "human"
-    assert load_config(preset="demo").world == "sumo"
+    assert load_config(preset="demo").simulator == "sumo"
 
 
 def test_to_the_letter_is_the_papers_preset_without_what_we_added() -> None:
     paper, exact = load_config(preset="paper"), load_config(preset="paper-exact")
-    assert (exact.steps, exact.trpo, exact.virtual.kappa) == (4_000_000, paper.trpo, paper.virtual.kappa)
-    virtual = exact.virtual
-    assert (virtual.members, virtual.fall_back, virtual.noise, virtual.error) == (
+    assert (exact.steps, exact.trpo, exact.model.kappa) == (4_000_000, paper.trpo, paper.model.kappa)
+    virtual = exact.model
+    assert (virtual.members, virtual.fallback_to_base, virtual.add_noise, virtual.error_estimator) == (
         1,
         False,
         False,
         "transitions",
     )
-    assert (exact.policy.begin_at_expert, exact.evaluation.every, exact.evaluation.converged) == (
+    assert (exact.policy.zero_init, exact.evaluation.validation_interval, exact.evaluation.convergence_window) == (
         False,
         0,
         50,
@@ -62,13 +62,19 @@ def test_the_papers_preset_has_the_papers_numbers() -> None:
     made = load_config(preset="paper")
     assert (made.trpo.gamma, made.trpo.gae_lambda, made.trpo.target_kl) == (0.995, 0.97, 0.01)
     ppo, sac = made.ppo, made.sac
-    assert (ppo.gamma, ppo.epochs, ppo.clip, ppo.actor_rate, ppo.critic_rate) == (0.99, 80, 0.2, 3e-4, 1e-3)
-    assert (ppo.batch_steps, ppo.minibatches) == (6000, 1)
-    assert (sac.gamma, sac.tau, sac.rate, sac.temperature) == (0.99, 5e-3, 3e-4, 0.2)
-    assert (sac.start_steps, sac.start, sac.batch) == (10_000, "uniform", 256)
+    assert (ppo.gamma, ppo.epochs, ppo.clip_range, ppo.actor_learning_rate, ppo.critic_learning_rate) == (
+        0.99,
+        80,
+        0.2,
+        3e-4,
+        1e-3,
+    )
+    assert (ppo.steps_per_iteration, ppo.minibatches) == (6000, 1)
+    assert (sac.gamma, sac.tau, sac.learning_rate, sac.temperature) == (0.99, 5e-3, 3e-4, 0.2)
+    assert (sac.learning_starts, sac.start_policy, sac.batch_size) == (10_000, "uniform", 256)
     assert (sac.learn_temperature, sac.reward_scale) == (False, 1.0)
-    assert (made.trpo.batch_steps, made.policy.hidden, made.policy.exploration_std) == (6000, (64, 64), 1.0)
-    assert made.policy.observe == ("local",)
-    assert made.policy.decisions_held(0.1) == 1
-    assert not made.spread
+    assert (made.trpo.steps_per_iteration, made.policy.hidden, made.policy.exploration_std) == (6000, (64, 64), 1.0)
+    assert made.policy.inputs == ("local",)
+    assert made.policy.action_repeat(0.1) == 1
+    assert not made.stratified
     assert made.make_expert() == PISaturation(time_constant=0)

@@ -15,14 +15,20 @@ from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.errors import InputError
-from unjam.learners.algorithm_1 import Collected
+from unjam.learners.algorithm_1 import TaskEpisodes
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config
-from unjam.training.folder import TENSORS, continue_folder, load_checkpoint, save_checkpoint, start_folder
-from unjam.training.seeds import JUDGE, VALIDATE
-from unjam.training.train import OnIteration, Trainer
+from unjam.training.run_folder import (
+    CHECKPOINT_TENSORS_FILE,
+    create_run_folder,
+    load_checkpoint,
+    resume_run_folder,
+    save_checkpoint,
+)
+from unjam.training.seeds import TEST_SEED, VALIDATION_SEED
+from unjam.training.train import IterationCallback, Trainer
 from unjam.worlds.record import Episode
-from unjam.worlds.workers import Workers
+from unjam.worlds.worker_pool import WorkerPool
 
 torch.set_num_threads(1)  # as a training does
 
@@ -35,10 +41,10 @@ def small_config(**changes: Any) -> RunConfig:
     small = {
         "road": {"length": [120, 130], "vehicles": 8, "horizon": 100},
         "policy": {"hidden": [8]},
-        "trpo": {"batch_steps": STEPS, "critic_epochs": 2, "critic_batch": 16},
+        "trpo": {"batch_steps": STEPS, "critic_epochs": 2, "critic_batch_size": 16},
         "ppo": {"batch_steps": STEPS, "epochs": 3},
-        "sac": {"batch_steps": STEPS, "start_steps": 400, "updates_per_step": 0.02, "batch": 8},
-        "td3": {"batch_steps": STEPS, "start_steps": 400, "updates_per_step": 0.02, "batch": 8},
+        "sac": {"batch_steps": STEPS, "learning_starts": 400, "gradient_steps_per_step": 0.02, "batch": 8},
+        "td3": {"batch_steps": STEPS, "learning_starts": 400, "gradient_steps_per_step": 0.02, "batch": 8},
         "evaluation": {"every": 1, "validation_episodes": 2, "episodes": 2, "baselines": ["human"]},
         "steps": 2 * STEPS,
         "workers": 1,
@@ -50,7 +56,7 @@ class Stop(Exception):
     """Stands for whatever ends a run in the middle."""
 
 
-def stop_after(iterations: int) -> OnIteration:
+def stop_after(iterations: int) -> IterationCallback:
     def stop(row: dict[str, Any]) -> None:
         if row["iteration"] == iterations:
             raise Stop
@@ -59,17 +65,17 @@ def stop_after(iterations: int) -> OnIteration:
 
 
 def learn_with(
-    workers: Workers,
+    workers: WorkerPool,
     folder: Path,
     config: RunConfig,
-    on_iteration: OnIteration | None = None,
+    on_iteration: IterationCallback | None = None,
     resume: bool = False,
 ) -> Trainer:
     """Train without the final judgement and the report."""
     if resume:
-        continue_folder(folder, config)
+        resume_run_folder(folder, config)
     else:
-        start_folder(folder, config)
+        create_run_folder(folder, config)
     run = Trainer(folder, config, workers, on_iteration)
     run.train()
     return run
@@ -80,7 +86,7 @@ def collected(monkeypatch: pytest.MonkeyPatch) -> list[Episode]:
     episodes: list[Episode] = []
     collect = Trainer.collect
 
-    def kept(self: Trainer, network: Network, iteration: int) -> Collected:
+    def kept(self: Trainer, network: Network, iteration: int) -> TaskEpisodes:
         driven = collect(self, network, iteration)
         episodes.extend(episode for of_task in driven for episode in of_task)
         return driven
@@ -95,7 +101,7 @@ Learn = Callable[..., Trainer]
 @pytest.fixture(scope="module")
 def learn() -> Iterator[Learn]:
     """`learn_with` a worker that all tests of this file share."""
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         yield partial(learn_with, workers)
 
 
@@ -129,15 +135,14 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory, learn: Learn) -> Pat
 def test_progress_has_a_row_per_iteration_that_counts_actual_steps(uninterrupted: Path) -> None:
     rows = progress(uninterrupted)
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
-    assert [row["actual_steps"] for row in rows] == [300, 600, 900, 1200]
-    assert all(row["virtual_steps"] >= row["actual_steps"] for row in rows if row["k_star"] >= 10)
+    assert [row["environment_steps"] for row in rows] == [300, 600, 900, 1200]
+    assert all(row["model_steps"] >= row["environment_steps"] for row in rows if row["k_star"] >= 10)
 
 
 def test_a_row_of_progress_is_whole(uninterrupted: Path) -> None:
     for row in read_progress(uninterrupted):
         numbers = [
-            row[name]
-            for name in ("return_mean", "return_expert", "return_validation", "mean_speed", "mean_abs_accel")
+            row[name] for name in ("return_mean", "return_expert", "return_validation", "mean_speed", "mean_abs_accel")
         ]
         assert np.isfinite(numbers).all()
         assert set(row["seconds"]) == {"actual", "fit", "imagine", "update", "validation"}
@@ -150,14 +155,12 @@ def test_a_row_of_progress_is_whole(uninterrupted: Path) -> None:
 
 def test_steps_are_rounded_up_to_whole_episodes_and_whole_iterations(tmp_path: Path, learn: Learn) -> None:
     run = learn(tmp_path / "run", small_config(trpo__batch_steps=101, steps=201))
-    assert [row["actual_steps"] for row in progress(tmp_path / "run")] == [200, 400]
-    assert run.training.actual_steps == 400
+    assert [row["environment_steps"] for row in progress(tmp_path / "run")] == [200, 400]
+    assert run.training.environment_steps == 400
 
 
 @pytest.mark.long
-def test_the_same_configuration_repeats_to_the_last_bit(
-    uninterrupted: Path, tmp_path: Path, learn: Learn
-) -> None:
+def test_the_same_configuration_repeats_to_the_last_bit(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "again", small_config(steps=4 * STEPS))
     assert outcome(tmp_path / "again") == outcome(uninterrupted)
 
@@ -169,7 +172,7 @@ def test_another_seed_is_another_run(uninterrupted: Path, tmp_path: Path, learn:
 
 @pytest.mark.long
 def test_the_number_of_workers_changes_nothing(uninterrupted: Path, tmp_path: Path) -> None:
-    with Workers(2) as two:
+    with WorkerPool(2) as two:
         learn_with(two, tmp_path / "two", small_config(steps=4 * STEPS, workers=2))
     assert outcome(tmp_path / "two") == outcome(uninterrupted)
 
@@ -189,9 +192,7 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ppo", "sac", "td3"])
-def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(
-    tmp_path: Path, agent: str, learn: Learn
-) -> None:
+def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(tmp_path: Path, agent: str, learn: Learn) -> None:
     config = small_config(agent=agent, steps=4 * STEPS, policy__hidden=[8, 8])
     learn(tmp_path / "one go", config)
     for iterations in (1, 3):
@@ -208,7 +209,7 @@ def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, le
         rows = progress(tmp_path / agent)
         assert rows[0]["return_expert"] == progress(uninterrupted)[0]["return_expert"]
         assert key in rows[1]["learner"]
-        assert [row["actual_steps"] for row in rows] == [STEPS, 2 * STEPS]
+        assert [row["environment_steps"] for row in rows] == [STEPS, 2 * STEPS]
         loaded = load_controller(tmp_path / agent)
         assert isinstance(loaded, ResidualDriver)
         assert loaded.network.squashes_noise is (agent == "sac")
@@ -239,7 +240,7 @@ def test_a_run_that_goes_on_with_a_larger_budget_ends_as_one_in_one_go(
 def test_a_run_does_not_go_back_to_fewer_steps_than_are_made(tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "run", small_config(steps=2 * STEPS))
     with pytest.raises(InputError, match=f"steps: {STEPS} is not allowed; allowed: >= {2 * STEPS}, which"):
-        continue_folder(tmp_path / "run", small_config(steps=STEPS))
+        resume_run_folder(tmp_path / "run", small_config(steps=STEPS))
 
 
 @pytest.mark.slow
@@ -270,7 +271,9 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(
 
 DAMAGE: dict[str, Callable[[Path], object]] = {
     "killed before the checkpoint": lambda folder: shutil.rmtree(folder / "checkpoint" / "000003"),
-    "damaged checkpoint": lambda folder: (folder / "checkpoint" / "000003" / TENSORS).write_bytes(b"lost"),
+    "damaged checkpoint": lambda folder: (folder / "checkpoint" / "000003" / CHECKPOINT_TENSORS_FILE).write_bytes(
+        b"lost"
+    ),
     "line cut short": lambda folder: (folder / "progress.jsonl").open("a").write('{"iteration": 4, "actu'),
 }
 KILLED, *OTHERS = DAMAGE
@@ -298,12 +301,10 @@ def test_the_controller_is_the_best_on_the_validation_seeds(uninterrupted: Path)
     best = max(rows, key=lambda row: row["return_validation"])
     expected = best["iteration"] if best["return_validation"] > best["return_expert"] else 0
     assert controller_manifest(uninterrupted)["iteration"] == expected
-    assert controller_manifest(uninterrupted)["actual_steps"] == expected * STEPS
+    assert controller_manifest(uninterrupted)["environment_steps"] == expected * STEPS
 
 
-def test_a_controller_from_before_a_stop_stays_where_nothing_later_beats_it(
-    tmp_path: Path, learn: Learn
-) -> None:
+def test_a_controller_from_before_a_stop_stays_where_nothing_later_beats_it(tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path, small_config(steps=STEPS))
     before = (tmp_path / "controller.unjam").read_bytes()
     found = load_checkpoint(tmp_path / "checkpoint")
@@ -354,12 +355,10 @@ def test_validates_now_and_then_and_at_the_end(tmp_path: Path, learn: Learn) -> 
 def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
     tmp_path: Path, spread: bool, learn: Learn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = small_config(
-        spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0
-    )
+    config = small_config(spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0)
     episodes = collected(monkeypatch)
     learn(tmp_path / "run", config)
-    lengths = [episode.drawn["length"] for episode in episodes]
+    lengths = [episode.drawn_values["length"] for episode in episodes]
     assert (sorted(lengths) == list(range(120, 131))) is spread
     assert set(lengths) <= set(range(120, 131))
 
@@ -372,7 +371,7 @@ def test_every_training_episode_has_a_seed_of_its_own_that_never_judges(
     seeds = [episode.seed for episode in episodes]
     assert len(seeds) == len(set(seeds)) == 6
     assert {seed[0] for seed in seeds} == {5}
-    assert not {JUDGE, VALIDATE} & {number for seed in seeds for number in seed}
+    assert not {TEST_SEED, VALIDATION_SEED} & {number for seed in seeds for number in seed}
 
 
 def test_training_explores_and_validation_does_not(
@@ -382,14 +381,12 @@ def test_training_explores_and_validation_does_not(
     run = learn(tmp_path / "run", small_config(policy__exploration_std=0.3))
     (trajectory,) = episodes[-1].trajectories
     assert np.std(trajectory.residual) > 0.1
-    again = run.drivers(run.training.learner.network())
-    assert run.returns_of(again) == [progress(tmp_path / "run")[-1]["return_validation"]]
+    again = run.make_drivers(run.training.learner.network())
+    assert run.validation_returns(again) == [progress(tmp_path / "run")[-1]["return_validation"]]
 
 
 @pytest.mark.parametrize("name", ["broken", "short", "raises"])
-def test_an_expert_at_fault_is_told_at_once(
-    tmp_path: Path, my_drivers: Path, learn: Learn, name: str
-) -> None:
+def test_an_expert_at_fault_is_told_at_once(tmp_path: Path, my_drivers: Path, learn: Learn, name: str) -> None:
     with pytest.raises(InputError) as caught:
         learn(tmp_path / "run", small_config(expert=f"{my_drivers}:{name}"))
     assert "\n" not in str(caught.value)

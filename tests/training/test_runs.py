@@ -8,16 +8,16 @@ import unjam
 from unjam.errors import InputError
 from unjam.files import append_line, to_json
 from unjam.measures.metrics import METRICS
-from unjam.processes import owned
+from unjam.processes import lock_folder
 from unjam.training.config import RunConfig, load_config
-from unjam.training.folder import start_folder
-from unjam.training.runs import differences, read_run, remove_run
+from unjam.training.run_folder import create_run_folder
+from unjam.training.runs import config_differences, read_run, remove_run
 
 
 def made(folder: Path, config: RunConfig, done: int, gain: float | None = None) -> Path:
     """A run folder that has come so far, judged with such a gain."""
-    start_folder(folder, config)
-    append_line(folder / "progress.jsonl", to_json({"iteration": 1, "actual_steps": done}))
+    create_run_folder(folder, config)
+    append_line(folder / "progress.jsonl", to_json({"iteration": 1, "environment_steps": done}))
     if gain is not None:
         rows = [
             {"driver": driver, "seed": [1, seed], **dict.fromkeys(METRICS, 0.0), "return": earned + seed}
@@ -43,7 +43,7 @@ def under(tmp_path: Path) -> Path:
 
 
 def test_runs_are_listed_with_how_far_they_are(under: Path) -> None:
-    with owned(under / "merge-001"):
+    with lock_folder(under / "merge-001"):
         found = {run.name: run for run in unjam.list_runs(under)}
     assert {name: (run.state, run.steps) for name, run in found.items()} == {
         "ring-001": ("finished", 1000),
@@ -59,11 +59,11 @@ def test_runs_are_listed_with_how_far_they_are(under: Path) -> None:
 
 def test_only_settings_that_differ_are_told(under: Path) -> None:
     runs = [read_run(under / name) for name in ("ring-001", "deep/ring-002")]
-    assert differences(runs) == {"seed": [0, 3], "road.cavs": [None, 2]}
+    assert config_differences(runs) == {"seed": [0, 3], "scenario_options.cavs": [None, 2]}
 
 
 def test_a_run_is_removed_and_nothing_else(under: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with owned(under / "ring-001"), pytest.raises(InputError, match="written by another process"):
+    with lock_folder(under / "ring-001"), pytest.raises(InputError, match="written by another process"):
         remove_run(under / "ring-001")
     for other in (under / "notes", under):
         with pytest.raises(InputError):

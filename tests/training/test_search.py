@@ -12,46 +12,45 @@ from tests.training.test_run import small_config
 from unjam.errors import InputError, MissingPartError, UnjamError
 from unjam.files import to_json
 from unjam.training.config import load_config, to_toml
-from unjam.training.executors import CommandLine, Processes
+from unjam.training.executors import CommandLine, LocalExecutor
 from unjam.training.search import (
-    JOURNAL,
-    Trial,
-    check_space,
+    JOURNAL_FILE,
+    SearchTrial,
+    check_search_space,
+    describe_trial,
     search,
     trial_config,
     validation_gain,
-    words_of_trial,
 )
-from unjam.training.space import Choice, Range, space_of
+from unjam.training.search_space import Categorical, NumericRange, parse_search_space
 
 BASE = small_config(evaluation__every=1)
-SPACE = space_of(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch=8,16", "trpo.critic_epochs=1..9"])
+SPACE = parse_search_space(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch_size=8,16", "trpo.critic_epochs=1..9"])
 
 
 def test_ranges_and_choices_are_read() -> None:
-    assert space_of(["trpo.gamma=0.9..0.99", "a=1..8", "b=1e-3..1:log", "expert=pi,bcm", "c=true,1,2.5"]) == {
-        "trpo.gamma": Range(0.9, 0.99),
-        "a": Range(1, 8),
-        "b": Range(0.001, 1, log=True),
-        "expert": Choice(("pi", "bcm")),
-        "c": Choice((True, 1, 2.5)),
+    assert parse_search_space(["trpo.gamma=0.9..0.99", "a=1..8", "b=1e-3..1:log", "expert=pi,bcm", "c=true,1,2.5"]) == {
+        "trpo.gamma": NumericRange(0.9, 0.99),
+        "a": NumericRange(1, 8),
+        "b": NumericRange(0.001, 1, log=True),
+        "expert": Categorical(("pi", "bcm")),
+        "c": Categorical((True, 1, 2.5)),
     }
-    assert Range(1, 8).whole
-    assert not Range(1, 8.0).whole
+    assert NumericRange(1, 8).is_integer
+    assert not NumericRange(1, 8.0).is_integer
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["a", "=1..2", "a=", "a=2..1", "a=1..1", "a=0..1:log", "a=x..y", "a=1..2..3", "a=0..inf", "a=true..2"],
+    "text", ["a", "=1..2", "a=", "a=2..1", "a=1..1", "a=0..1:log", "a=x..y", "a=1..2..3", "a=0..inf", "a=true..2"]
 )
 def test_what_is_no_range_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(InputError, match=r"^vary: .* is not allowed; allowed: [^\n]*$"):
-        space_of([text])
+        parse_search_space([text])
 
 
 def test_nothing_to_vary_is_refused() -> None:
     with pytest.raises(InputError, match="at least one key is needed"):
-        space_of([])
+        parse_search_space([])
 
 
 @pytest.mark.parametrize(
@@ -63,17 +62,15 @@ def test_nothing_to_vary_is_refused() -> None:
         ({"evaluation__every": 0}, "trpo.gamma=0.9..0.99", "judged by validations"),
     ],
 )
-def test_what_cannot_work_is_told_before_anything_is_trained(
-    changes: dict[str, Any], text: str, words: str
-) -> None:
+def test_what_cannot_work_is_told_before_anything_is_trained(changes: dict[str, Any], text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        check_space(small_config(**{"evaluation__every": 1, **changes}), space_of([text]))
+        check_search_space(small_config(**{"evaluation__every": 1, **changes}), parse_search_space([text]))
 
 
 def test_a_trial_differs_from_the_base_in_its_values_alone() -> None:
-    changed = trial_config(BASE, {"trpo.gamma": 0.5, "road.vehicles": 7})
-    assert (changed.trpo.gamma, changed.make_scenario().possible_cavs()) == (0.5, ("cav_0",))
-    assert trial_config(changed, {"trpo.gamma": BASE.trpo.gamma, "road.vehicles": 8}) == BASE
+    changed = trial_config(BASE, {"trpo.gamma": 0.5, "scenario_options.vehicles": 7})
+    assert (changed.trpo.gamma, changed.make_scenario().possible_cav_ids()) == (0.5, ("cav_0",))
+    assert trial_config(changed, {"trpo.gamma": BASE.trpo.gamma, "scenario_options.vehicles": 8}) == BASE
 
 
 def test_a_training_is_worth_its_best_validation_beyond_its_expert(tmp_path: Path) -> None:
@@ -101,10 +98,8 @@ def test_a_training_is_worth_its_best_validation_beyond_its_expert(tmp_path: Pat
         (None, None, "trial 3: failed: agent=ppo"),
     ],
 )
-def test_a_trial_says_what_its_last_checkpoint_earns(
-    gain: float | None, last: float | None, words: str
-) -> None:
-    assert words_of_trial(Trial(3, {"agent": "ppo"}, Path("trials/3"), gain, last)) == words
+def test_a_trial_says_what_its_last_checkpoint_earns(gain: float | None, last: float | None, words: str) -> None:
+    assert describe_trial(SearchTrial(3, {"agent": "ppo"}, Path("trials/3"), gain, last)) == words
 
 
 EARNS = {"constant": 100.0}
@@ -124,8 +119,8 @@ class Trainings:
             raise KeyboardInterrupt
         if self.failing:
             return 2
-        config = load_config(Path(command.line()[6]))
-        folder = Path(command.words[-1])
+        config = load_config(Path(command.argv()[6]))
+        folder = Path(command.arguments[-1])
         folder.mkdir(parents=True)
         worth = -abs(math.log10(config.trpo.target_kl) + 2)
         expert = EARNS.get(config.expert, 0.0)
@@ -138,7 +133,7 @@ class Trainings:
 @pytest.fixture
 def trainings(monkeypatch: pytest.MonkeyPatch) -> Trainings:
     made = Trainings()
-    monkeypatch.setattr(Processes, "run", lambda self, command: made(command))
+    monkeypatch.setattr(LocalExecutor, "run", lambda self, command: made(command))
     return made
 
 
@@ -163,7 +158,7 @@ def test_the_best_comes_first_and_is_there_to_be_trained_with(tmp_path: Path, tr
 def test_values_are_within_their_ranges(tmp_path: Path, trainings: Trainings) -> None:
     for trial in search(BASE, SPACE, 12, tmp_path, 3):
         assert 0.001 <= trial.values["trpo.target_kl"] <= 0.1
-        assert trial.values["trpo.critic_batch"] in (8, 16)
+        assert trial.values["trpo.critic_batch_size"] in (8, 16)
         assert isinstance(trial.values["trpo.critic_epochs"], int)
         assert 1 <= trial.values["trpo.critic_epochs"] <= 9
 
@@ -187,31 +182,27 @@ def test_a_search_goes_on_with_more_trials_but_not_with_others(tmp_path: Path, t
     assert len(search(BASE, SPACE, 5, tmp_path, 1)) == 5
     assert len(trainings.done) == 5
     with pytest.raises(InputError, match="is of other ranges"):
-        search(BASE, space_of(["trpo.target_kl=0.001..0.2"]), 6, tmp_path, 1)
+        search(BASE, parse_search_space(["trpo.target_kl=0.001..0.2"]), 6, tmp_path, 1)
     with pytest.raises(InputError, match="is of another configuration"):
         search(small_config(seed=1), SPACE, 6, tmp_path, 1)
 
 
 def test_values_that_nobody_offered_are_not_tried(tmp_path: Path, trainings: Trainings) -> None:
-    optuna, space = pytest.importorskip("optuna"), space_of(["expert=pi,bcm"])
+    optuna, space = pytest.importorskip("optuna"), parse_search_space(["expert=pi,bcm"])
     (tmp_path / "config.toml").write_text(to_toml(BASE))
-    backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL))
+    backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL_FILE))
     study = optuna.create_study(study_name="search", storage=optuna.storages.JournalStorage(backend))
     study.ask({"expert": optuna.distributions.CategoricalDistribution(["code.py:of_others"])})
-    with pytest.raises(
-        InputError, match=r"^out: expert: 'code\.py:of_others' in journal\.log was not offered"
-    ):
+    with pytest.raises(InputError, match=r"^out: expert: 'code\.py:of_others' in journal\.log was not offered"):
         search(BASE, space, 3, tmp_path, 1)
     assert trainings.done == []
 
 
 @pytest.mark.parametrize("state", ["WAITING", "COMPLETE"])
-def test_a_stored_trial_that_no_search_began_is_refused(
-    state: str, tmp_path: Path, trainings: Trainings
-) -> None:
+def test_a_stored_trial_that_no_search_began_is_refused(state: str, tmp_path: Path, trainings: Trainings) -> None:
     optuna = pytest.importorskip("optuna")
     (tmp_path / "config.toml").write_text(to_toml(BASE))
-    backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL))
+    backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL_FILE))
     study = optuna.create_study(study_name="search", storage=optuna.storages.JournalStorage(backend))
     named = {"expert": optuna.distributions.CategoricalDistribution(["code.py:of_others"])}
     params = {"expert": "code.py:of_others"} if state == "COMPLETE" else {}
@@ -227,7 +218,7 @@ def test_a_stored_trial_that_no_search_began_is_refused(
 
 def test_a_journal_that_a_crash_has_cut_short_goes_on_and_has_no_link(tmp_path: Path) -> None:
     journal = pytest.importorskip("unjam.training.journal").Journal
-    path, entries = tmp_path / JOURNAL, [{"op_code": 0, "value": [float("nan")]}, {"op_code": 1}]
+    path, entries = tmp_path / JOURNAL_FILE, [{"op_code": 0, "value": [float("nan")]}, {"op_code": 1}]
     journal(path).append_logs(entries)
     with path.open("a") as file:
         file.write('{"op_code": 2')
@@ -235,7 +226,7 @@ def test_a_journal_that_a_crash_has_cut_short_goes_on_and_has_no_link(tmp_path: 
     again.append_logs([{"op_code": 3}])
     assert [entry["op_code"] for entry in again.read_logs(0)] == [0, 1, 3]
     assert [entry["op_code"] for entry in journal(path).read_logs(1)] == [1, 3]
-    assert [each.name for each in tmp_path.iterdir()] == [JOURNAL]
+    assert [each.name for each in tmp_path.iterdir()] == [JOURNAL_FILE]
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -249,7 +240,7 @@ def test_a_search_of_which_all_fails_says_so(tmp_path: Path, trainings: Training
     trainings.failing = True
     told: list[str] = []
     with pytest.raises(UnjamError, match="all 3 trainings failed; what they said is in"):
-        search(BASE, SPACE, 3, tmp_path, 2, on_line=told.append)
+        search(BASE, SPACE, 3, tmp_path, 2, on_message=told.append)
     assert all(line.endswith("failed") for line in told)
 
 
@@ -268,10 +259,8 @@ def test_real_trainings_are_searched(tmp_path: Path) -> None:
         assert (trial.folder / "report.html").is_file()
 
 
-def test_among_several_experts_that_wins_whose_controller_earns_most(
-    tmp_path: Path, trainings: Trainings
-) -> None:
-    space = space_of(["expert=constant,pi", "trpo.target_kl=0.001..0.1:log"])
+def test_among_several_experts_that_wins_whose_controller_earns_most(tmp_path: Path, trainings: Trainings) -> None:
+    space = parse_search_space(["expert=constant,pi", "trpo.target_kl=0.001..0.1:log"])
     best, *_ = search(BASE, space, 12, tmp_path / "search", 1)
     assert best.values["expert"] == "constant"
     worth = -abs(math.log10(best.values["trpo.target_kl"]) + 2)

@@ -7,9 +7,9 @@ import torch
 from unjam.drivers import PISaturation
 from unjam.drivers.check import check_driver
 from unjam.errors import MissingPartError
-from unjam.training import batch_speed, speed
-from unjam.training.batch_speed import measure_batches, neural_driver
-from unjam.training.speed import measure_speed
+from unjam.training import batch_benchmark, benchmark
+from unjam.training.batch_benchmark import benchmark_batches, make_benchmark_driver
+from unjam.training.benchmark import benchmark_episodes
 
 RATES = ("bare_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_step_steps_per_s")
 
@@ -17,11 +17,11 @@ RATES = ("bare_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measures less, and so less exactly."""
-    monkeypatch.setattr(speed, "TRACI_STEPS", 50)
-    monkeypatch.setattr(speed, "VIRTUAL", {"long": (500, 20), "short": (50, 10)})
-    monkeypatch.setattr(speed, "SIZES", {22: 200, 66: 100})
-    monkeypatch.setattr(speed, "BATCH", 2200)
-    monkeypatch.setattr(batch_speed, "DECISIONS", 20)
+    monkeypatch.setattr(benchmark, "TRACI_STEPS", 50)
+    monkeypatch.setattr(benchmark, "VIRTUAL", {"long": (500, 20), "short": (50, 10)})
+    monkeypatch.setattr(benchmark, "SIZES", {22: 200, 66: 100})
+    monkeypatch.setattr(benchmark, "BATCH", 2200)
+    monkeypatch.setattr(batch_benchmark, "DECISIONS", 20)
 
 
 @pytest.fixture(autouse=True)
@@ -37,10 +37,10 @@ def cores() -> Iterator[None]:
 
 @pytest.mark.parametrize("hold", [1, 10])
 def test_the_driver_that_is_timed_keeps_the_contract(hold: int) -> None:
-    driver = neural_driver(hold)
+    driver = make_benchmark_driver(hold)
     check_driver(driver)
     assert driver.expert == PISaturation()
-    assert driver.hold == hold
+    assert driver.action_repeat == hold
     assert [weight.shape for weight, _ in driver.network.layers] == [(5, 64), (64, 64), (64, 1)]
 
 
@@ -49,18 +49,14 @@ def test_the_driver_that_is_timed_keeps_the_contract(hold: int) -> None:
 def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_not_use() -> None:
     told: list[str] = []
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
-    found = measure_speed(1, told.append)
+    found = benchmark_episodes(1, told.append)
     assert found["rounds"] == 1
     assert min(found[name] for name in RATES) > 0
     assert found["over_bare"] == pytest.approx(found["episode_steps_per_s"] / found["bare_steps_per_s"])
-    assert found["over_bare_every_step"] == pytest.approx(
-        found["every_step_steps_per_s"] / found["bare_steps_per_s"]
-    )
+    assert found["over_bare_every_step"] == pytest.approx(found["every_step_steps_per_s"] / found["bare_steps_per_s"])
     assert found["over_traci"] > 2.0
     for rollouts in found["virtual"].values():
-        assert rollouts["over_actual"] == pytest.approx(
-            rollouts["steps_per_s"] / found["episode_steps_per_s"]
-        )
+        assert rollouts["over_actual"] == pytest.approx(rollouts["steps_per_s"] / found["episode_steps_per_s"])
     assert found["virtual"]["long"]["over_actual"] > 2.0
     batch = found["batch"]
     assert batch["rings"] == 100
@@ -78,21 +74,19 @@ def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_no
 def test_batches_of_growing_size_are_measured_with_people_who_have_networks_and_without(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(batch_speed, "DECISIONS", 3)
-    monkeypatch.setattr(batch_speed, "RINGS", {"cpu": (2, 5)})
+    monkeypatch.setattr(batch_benchmark, "DECISIONS", 3)
+    monkeypatch.setattr(batch_benchmark, "RINGS", {"cpu": (2, 5)})
     told: list[str] = []
-    found = measure_batches("cpu", told.append)
+    found = benchmark_batches("cpu", told.append)
     assert found["device"] == "one core"
     assert list(found["batches"]) == ["people by IDM", "by IDM and networks"]
     for rates in found["batches"].values():
         assert [entry["rings"] for entry in rates] == [2, 5]
-        assert all(
-            entry["vehicle_steps_per_s"] == pytest.approx(22 * entry["steps_per_s"]) for entry in rates
-        )
+        assert all(entry["vehicle_steps_per_s"] == pytest.approx(22 * entry["steps_per_s"]) for entry in rates)
     assert len(told) == 4
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU")
 def test_batches_on_a_graphics_card_that_is_not_there_are_refused() -> None:
     with pytest.raises(MissingPartError, match="device: cuda is not there; use cpu"):
-        measure_batches("cuda")
+        benchmark_batches("cuda")

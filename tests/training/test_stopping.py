@@ -7,11 +7,11 @@ import pytest
 
 from tests.training.test_run import STEPS, controller_manifest, learn_with, outcome, small_config
 from unjam.errors import MissingPartError
-from unjam.reports.results import read_progress, validations_of
-from unjam.training.stopping import gave_up, has_converged
-from unjam.training.tensorboard import FOLDER, tensorboard_into
+from unjam.reports.results import read_progress, validation_gains
+from unjam.training.early_stopping import has_converged, is_out_of_patience
+from unjam.training.tensorboard import TENSORBOARD_FOLDER, tensorboard_writer
 from unjam.training.train import Trainer
-from unjam.worlds.workers import Workers
+from unjam.worlds.worker_pool import WorkerPool
 
 
 @pytest.mark.parametrize(
@@ -27,14 +27,12 @@ from unjam.worlds.workers import Workers
         ([12.0, 11.5, 11.9], 0, False),
     ],
 )
-def test_patience_counts_validations_since_the_best(
-    validations: list[float | None], patience: int, over: bool
-) -> None:
+def test_patience_counts_validations_since_the_best(validations: list[float | None], patience: int, over: bool) -> None:
     rows = [
         {"iteration": number, "return_validation": value, "return_expert": 11.0}
         for number, value in enumerate(validations, 1)
     ]
-    assert gave_up(small_config(evaluation__patience=patience), rows) is over
+    assert is_out_of_patience(small_config(evaluation__patience=patience), rows) is over
 
 
 @pytest.mark.parametrize(
@@ -55,7 +53,7 @@ def test_converged_is_who_earns_no_more_than_before(returns: list[float], span: 
 
 def test_the_policy_that_has_converged_is_the_controller(tmp_path: Path) -> None:
     config = small_config(steps=20 * STEPS, evaluation__every=0, evaluation__converged=1)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     returns = [row["return_mean"] for row in read_progress(tmp_path / "run")]
     assert returns[-1] <= returns[-2]
@@ -66,21 +64,21 @@ def test_the_validation_of_what_has_converged_is_in_its_progress_and_judges_a_tr
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     returns = iter([5.0, 7.5])  # of the expert, and where it ends: before any validation was due
-    monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
+    monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
     config = small_config(steps=20 * STEPS, evaluation__every=50, evaluation__converged=1)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = [row["return_validation"] for row in read_progress(tmp_path / "run")]
     assert found == [None] * (len(found) - 1) + [7.5]
-    assert validations_of(read_progress(tmp_path / "run")) == (2.5, 2.5)
+    assert validation_gains(read_progress(tmp_path / "run")) == (2.5, 2.5)
 
 
 @pytest.mark.long
 def test_training_ends_where_patience_is_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     returns = iter([5.0, 6.0, 5.5, 5.8, 9.0])
-    monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
+    monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
     config = small_config(steps=20 * STEPS, evaluation__patience=2)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = [row["return_validation"] for row in read_progress(tmp_path / "run")]
     assert found == [6.0, 5.5, 5.8]
@@ -91,9 +89,9 @@ def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     returns = iter([5.0, 4.0, 6.0])  # of the expert, after two iterations, and where it ends
-    monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
+    monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
     config = small_config(steps=20 * STEPS, evaluation__every=2)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config, lambda row: row["iteration"] < 3)
     assert [row["return_validation"] for row in read_progress(tmp_path / "run")] == [None, 4.0, None]
     assert controller_manifest(tmp_path / "run")["iteration"] == 3
@@ -102,7 +100,7 @@ def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
 @pytest.mark.long
 def test_what_a_callback_ended_goes_on_as_if_it_never_had(tmp_path: Path) -> None:
     config = small_config(steps=2 * STEPS, evaluation__every=2)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "stopped", config, lambda row: False)
         learn_with(workers, tmp_path / "stopped", config, resume=True)
         learn_with(workers, tmp_path / "one go", config)
@@ -111,11 +109,11 @@ def test_what_a_callback_ended_goes_on_as_if_it_never_had(tmp_path: Path) -> Non
 
 def test_tensorboard_has_every_number_at_its_actual_step(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    write = tensorboard_into(str(tmp_path))
+    write = tensorboard_writer(str(tmp_path))
     for step in (300, 600):
-        row: dict[str, Any] = {"iteration": step // 300, "actual_steps": step, "return_mean": step / 10}
+        row: dict[str, Any] = {"iteration": step // 300, "environment_steps": step, "return_mean": step / 10}
         write({**row, "return_validation": None, "learner": {"kl": 0.5}, "seconds": {"actual": 1}})
-    board = events.EventAccumulator(str(tmp_path / FOLDER))
+    board = events.EventAccumulator(str(tmp_path / TENSORBOARD_FOLDER))
     board.Reload()
     assert set(board.Tags()["scalars"]) == {"return_mean", "learner/kl", "seconds/actual"}
     assert [(event.step, event.value) for event in board.Scalars("return_mean")] == [(300, 30.0), (600, 60.0)]
@@ -126,7 +124,7 @@ def test_without_tensorboard_a_line_says_so_before_anything_is_trained(
 ) -> None:
     monkeypatch.setattr("unjam.training.tensorboard.find_spec", lambda name: None)
     with pytest.raises(MissingPartError, match=r"pip install 'unjam\[train\]'"):
-        tensorboard_into(tmp_path)
+        tensorboard_writer(tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -135,13 +133,13 @@ def test_who_has_converged_or_given_up_stays_so_when_it_is_resumed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     returns = iter([5.0, 6.0, 5.5, 5.8, 9.0, 9.5])
-    monkeypatch.setattr(Trainer, "returns_of", lambda *given: [next(returns)])
+    monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
     for name, settings in (
         ("gave up", {"evaluation__patience": 2}),
         ("converged", {"evaluation__every": 0, "evaluation__converged": 1}),
     ):
         config, folder = small_config(steps=20 * STEPS, **settings), tmp_path / name
-        with Workers(1) as workers:
+        with WorkerPool(1) as workers:
             learn_with(workers, folder, config)
             before = outcome(folder), len(read_progress(folder))
             learn_with(workers, folder, config, resume=True)
@@ -152,4 +150,4 @@ def test_a_validation_at_an_end_that_a_longer_run_would_not_make_counts_for_no_p
     rows = [{"iteration": number, "return_expert": 10.0} for number in range(1, 5)]
     for row, found in zip(rows, (None, 12.0, 11.0, 11.5), strict=True):
         row["return_validation"] = found  # pyright: ignore[reportArgumentType]
-    assert not gave_up(small_config(evaluation__every=2, evaluation__patience=2), rows)
+    assert not is_out_of_patience(small_config(evaluation__every=2, evaluation__patience=2), rows)

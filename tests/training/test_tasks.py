@@ -12,13 +12,13 @@ from tests.training.test_run import Stop, collected, learn_with, outcome, progre
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
-from unjam.learners.algorithm_1 import actual_experience
-from unjam.learners.settings import AGENTS
+from unjam.learners.algorithm_1 import environment_experience
+from unjam.learners.settings import AGENT_NAMES
 from unjam.reports.results import read_progress
-from unjam.training.config import RunConfig, load_config, steps_to_train, to_toml
-from unjam.training.folder import check_possible, read_config
+from unjam.training.config import RunConfig, load_config, planned_steps, to_toml
+from unjam.training.run_folder import check_config, read_config
 from unjam.training.train import Trainer, train
-from unjam.worlds.workers import Workers
+from unjam.worlds.worker_pool import WorkerPool
 
 torch.set_num_threads(1)  # as a training does
 
@@ -33,19 +33,22 @@ def mixture(**changes: Any) -> RunConfig:
 
 
 def test_steps_are_those_of_whole_iterations() -> None:
-    assert steps_to_train(load_config(changes={"steps": 10})) == 12_000
-    assert steps_to_train(load_config(changes={"steps": 24_000})) == 24_000
+    assert planned_steps(load_config(changes={"steps": 10})) == 12_000
+    assert planned_steps(load_config(changes={"steps": 24_000})) == 24_000
     assert (
-        steps_to_train(load_config(changes={"steps": 5, "road.horizon": 80, "trpo.batch_steps": 100})) == 160
+        planned_steps(
+            load_config(changes={"steps": 5, "scenario_options.horizon": 80, "trpo.steps_per_iteration": 100})
+        )
+        == 160
     )
 
 
 def test_what_a_task_leaves_out_is_the_runs_own() -> None:
     config = mixture(expert="pi:window=30", reward="eq16", tasks=[*MIXTURE, {"scenario": "ring-warm"}, {}])
-    roads = config.roads()
+    roads = config.task_configs()
     assert list(roads) == ["ring", "short", "ring-warm", "ring-2"]
     assert {road.expert for road in roads.values()} == {"pi:window=30"}
-    assert roads["short"].road == {"length": [90, 100], "vehicles": 6, "horizon": 100}
+    assert roads["short"].scenario_options == {"length": [90, 100], "vehicles": 6, "horizon": 100}
     tasks = config.make_tasks()
     assert [task.weight for task in tasks] == [2.0, 1.0, 1.0, 1.0]
     assert [task.reward for task in tasks] == ["eq16"] * 4
@@ -54,7 +57,7 @@ def test_what_a_task_leaves_out_is_the_runs_own() -> None:
 
 def test_one_road_is_a_list_of_one() -> None:
     config = small_config()
-    assert config.roads() == {"": config}
+    assert config.task_configs() == {"": config}
     (task,) = config.make_tasks()
     assert (task.scenario, task.expert, task.name) == (config.make_scenario(), PISaturation(), "")
 
@@ -67,43 +70,38 @@ def test_a_mixture_survives_being_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("task", "words"),
     [
-        (
-            {"expert": "follower-stopper"},
-            "tasks: on ring-2 the network would see something else than on ring",
-        ),
+        ({"expert": "follower-stopper"}, "tasks: on ring-2 the network would see something else than on ring"),
         ({"expert": "magic"}, "driver: 'magic'"),
         ({"reward": "magic"}, "reward: 'magic'"),
     ],
 )
 def test_roads_that_do_not_go_together_are_refused_in_one_line(task: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError) as caught:
-        check_possible(mixture(tasks=[{}, task]))
+        check_config(mixture(tasks=[{}, task]))
     assert str(caught.value).startswith(words)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "agent", [pytest.param(name, marks=pytest.mark.slow) if name != "td3" else name for name in AGENTS]
+    "agent", [pytest.param(name, marks=pytest.mark.slow) if name != "td3" else name for name in AGENT_NAMES]
 )
 def test_a_mixture_that_was_stopped_ends_as_if_it_had_not_been(
     agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, places = mixture(agent=agent), [tmp_path / "one go", tmp_path / "run"]
     episodes = collected(monkeypatch)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, places[0], config)
         # 300 steps by weight: two episodes of the first road and one of the other, each with its own seed.
-        drawn = [(episode.seed, episode.drawn["length"]) for episode in episodes]
+        drawn = [(episode.seed, episode.drawn_values["length"]) for episode in episodes]
         assert [seed for seed, _ in drawn] == [(0, i, n) for i in (1, 2) for n in range(3)]
         assert [length > 110 for _, length in drawn] == [True, True, False] * 2
         with pytest.raises(Stop):
             learn_with(workers, places[1], config, stop_after(1))
         learn_with(workers, places[1], config, resume=True)
     for road in ("ring", "short"):
-        found = [
-            (progress(place / road), (place / road / "controller.unjam").read_bytes()) for place in places
-        ]
+        found = [(progress(place / road), (place / road / "controller.unjam").read_bytes()) for place in places]
         assert found[0] == found[1]
     found = [outcome_of(place) for place in places]
     assert found[0] == found[1]
@@ -116,7 +114,7 @@ def outcome_of(folder: Path) -> tuple[Any, ...]:
 
 
 def test_progress_is_of_all_roads_and_of_each(tmp_path: Path) -> None:
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", mixture())
     for number, row in enumerate(progress(tmp_path / "run")):
         assert list(row["tasks"]) == ["ring", "short"]
@@ -129,18 +127,18 @@ def test_progress_is_of_all_roads_and_of_each(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("sees_road", [True, False])
 def test_the_critic_sees_which_road_it_is_and_what_that_has_drawn(tmp_path: Path, sees_road: bool) -> None:
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         trainer = Trainer(tmp_path, mixture(policy__critic_sees_road=sees_road), workers)
         training = trainer.training
         episodes = trainer.collect(training.learner.network(), 1)
-        rows = actual_experience(training, episodes)
+        rows = environment_experience(training, episodes)
     beside = rows.observations[:, training.learner.spec.inputs :]
     assert training.learner.sb3.observation_space.shape == rows.observations.shape[1:]
     if not sees_road:
         assert beside.shape[1] == 0
         return
     scaled = [
-        task.scenario.drawn_scaled(driven[-1].drawn)[0]
+        task.scenario.scale_drawn_values(driven[-1].drawn_values)[0]
         for task, driven in zip(training.tasks, episodes, strict=True)
     ]
     np.testing.assert_allclose(beside[0, 1:], [0.0, 1.0, 0.0])
@@ -154,16 +152,16 @@ def test_the_critic_sees_which_road_it_is_and_what_that_has_drawn(tmp_path: Path
 def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
     result = train(mixture(), tmp_path / "run")
     assert (result.rows, result.gain) == ({}, None)
-    assert list(result.roads) == ["ring", "short"]
-    for name, road in result.roads.items():
+    assert list(result.tasks) == ["ring", "short"]
+    for name, road in result.tasks.items():
         assert road.folder == tmp_path / "run" / name
         assert list(road.rows) == ["human", "pi", "trained"]
         assert road.gain is not None
-        assert read_config(road.folder) == mixture().roads()[name]
+        assert read_config(road.folder) == mixture().task_configs()[name]
         assert json.loads((road.folder / "evaluation.json").read_text())["scenario"] == "ring"
         with pytest.raises(InputError, match="is one road of a run of several"):
             train(read_config(road.folder), road.folder, resume=True)
-    networks = [load_controller(road.controller) for road in result.roads.values()]
+    networks = [load_controller(road.controller) for road in result.tasks.values()]
     first, second = (driver.network.layers for driver in networks if isinstance(driver, ResidualDriver))
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one[0], other[0])
@@ -173,20 +171,18 @@ def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("agent", "exploration"), [("trpo", "anew"), ("trpo", "mirrored"), ("ppo", "mirrored")]
-)
+@pytest.mark.parametrize(("agent", "exploration"), [("trpo", "anew"), ("trpo", "mirrored"), ("ppo", "mirrored")])
 def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, tmp_path: Path) -> None:
     mixture = {"tasks": [{"road": {"length": [120, 125]}}, {"road": {"vehicles": 7}, "name": "fewer"}]}
     runs = {}
     for world in ("sumo", "batch"):
-        with Workers(1) as workers:
+        with WorkerPool(1) as workers:
             how = {"world": world, "agent": agent, "policy.exploration": exploration}
-            how |= {"virtual.virtual_ratio": 0.0} if exploration == "mirrored" else {}
+            how |= {"model.model_ratio": 0.0} if exploration == "mirrored" else {}
             learn_with(workers, tmp_path / world, small_config(**mixture, **how))
         runs[world] = read_progress(tmp_path / world)
     for one, other in zip(runs["sumo"], runs["batch"], strict=True):
-        assert one["actual_steps"] == other["actual_steps"]
+        assert one["environment_steps"] == other["environment_steps"]
         for name in ("return_mean", "return_validation", "return_expert", "mean_speed"):
             # Rounding differs, and learning in single precision makes more of it.
             learned = name == "return_validation" or one["iteration"] > 1
@@ -196,11 +192,11 @@ def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, t
 def test_roads_that_cannot_be_batched_are_driven_in_sumo_beside_those_that_can(tmp_path: Path) -> None:
     ring = {"length": [120, 130], "vehicles": 8}
     tasks = [{"road": ring}, {"scenario": "figure-eight", "road": EIGHT}, {"road": ring, "name": "other"}]
-    small = {"tasks": tasks, "road": {"horizon": 100}, "trpo.batch_steps": 300, "policy.hidden": [8]}
+    small = {"tasks": tasks, "road": {"horizon": 100}, "trpo.steps_per_iteration": 300, "policy.hidden": [8]}
     folders = {world: tmp_path / world for world in ("sumo", "batch")}
     driven = {}
     for world, folder in folders.items():
-        with Workers(1) as workers:
+        with WorkerPool(1) as workers:
             trainer = Trainer(folder, load_config(changes=small | {"world": world}), workers)
             driven[world] = trainer.collect(trainer.training.learner.network(), 1)
     for one, other in zip(driven["sumo"], driven["batch"], strict=True):
@@ -218,10 +214,10 @@ def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(
     def validated(trainer: Trainer, drivers: Any) -> list[float]:
         return [1.0, 1.0 if trainer.training.iteration else 1e6]  # the expert's were better
 
-    monkeypatch.setattr(Trainer, "returns_of", validated)
+    monkeypatch.setattr(Trainer, "validation_returns", validated)
     config = mixture(sampling="regret", tasks=[{}, SHORT], trpo__batch_steps=600, steps=1800)
     places = [tmp_path / "one go", tmp_path / "run"]
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, places[0], config)
         with pytest.raises(Stop):
             learn_with(workers, places[1], config, stop_after(2))
@@ -233,21 +229,17 @@ def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(
     assert [row["episodes"] for row in one] == [6, 7, 7]
 
 
-@pytest.mark.parametrize(
-    "changes", [{"tasks": []}, {"evaluation__every": 0}], ids=["one road", "no validation"]
-)
+@pytest.mark.parametrize("changes", [{"tasks": []}, {"evaluation__every": 0}], ids=["one road", "no validation"])
 def test_sampling_by_regret_wants_several_roads_that_are_validated(changes: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="sampling: regret is not allowed; allowed: weights"):
         mixture(sampling="regret", **changes)
 
 
 def test_a_network_acts_within_the_narrowest_limits_of_its_roads(tmp_path: Path) -> None:
-    config = mixture(
-        tasks=[{"road": {"action_limit": 2.0}}, {"road": {"action_limit": 0.5}, "name": "gentle"}]
-    )
-    with Workers(1) as workers:
+    config = mixture(tasks=[{"road": {"action_limit": 2.0}}, {"road": {"action_limit": 0.5}, "name": "gentle"}])
+    with WorkerPool(1) as workers:
         trainer = Trainer(tmp_path, config, workers)
-        strong, gentle = trainer.drivers(trainer.training.learner.network())
+        strong, gentle = trainer.make_drivers(trainer.training.learner.network())
     assert isinstance(strong, ResidualDriver)
     assert isinstance(gentle, ResidualDriver)
     assert (strong.action_limit, gentle.action_limit) == (2.0, 0.5)

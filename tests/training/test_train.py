@@ -18,12 +18,12 @@ from unjam.errors import InputError, UnjamError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_progress, read_results
 from unjam.training.config import RunConfig
-from unjam.training.evaluate import gain_of
-from unjam.training.folder import read_config
-from unjam.training.seeds import held_out_seeds
+from unjam.training.evaluate import test_gain
+from unjam.training.run_folder import read_config
+from unjam.training.seeds import make_test_seeds
 from unjam.training.train import TrainResult, train
 from unjam.worlds.episode import run_episode
-from unjam.worlds.workers import Workers
+from unjam.worlds.worker_pool import WorkerPool
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
 
@@ -56,10 +56,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     judged: list[tuple[tuple[str, int], int]] = []
     with empty_pictures():
         result = train(
-            config,
-            folder,
-            on_iteration=shown.append,
-            progress=lambda episode, steps: judged.append((episode, steps)),
+            config, folder, on_iteration=shown.append, progress=lambda episode, steps: judged.append((episode, steps))
         )
     return Trained(config, result, shown, judged)
 
@@ -80,14 +77,14 @@ def test_the_folder_says_how_it_was_made(trained: Trained) -> None:
 
 def test_what_is_shown_is_what_progress_holds(trained: Trained) -> None:
     assert trained.shown == read_progress(trained.result.folder)
-    assert [row["actual_steps"] for row in trained.shown] == [STEPS, 2 * STEPS]
+    assert [row["environment_steps"] for row in trained.shown] == [STEPS, 2 * STEPS]
 
 
 def test_every_driver_is_judged_on_the_held_out_seeds(trained: Trained) -> None:
     rows = trained.result.rows
     assert list(rows) == ["human", "pi", "trained"]
     for found in rows.values():
-        assert [tuple(row["seed"]) for row in found] == held_out_seeds(2)
+        assert [tuple(row["seed"]) for row in found] == make_test_seeds(2)
         assert {row["status"] for row in found} == {"completed"}
         assert {row["steps"] for row in found} == {100}
 
@@ -99,16 +96,14 @@ def test_progress_of_the_judgement_is_told(trained: Trained) -> None:
 
 def test_the_controller_earns_what_the_evaluation_says(trained: Trained) -> None:
     scenario, driver = trained.config.make_scenario(), load_controller(trained.result.controller)
-    for seed, row in zip(held_out_seeds(2), trained.result.rows["trained"], strict=True):
+    for seed, row in zip(make_test_seeds(2), trained.result.rows["trained"], strict=True):
         (trajectory,) = run_episode(scenario, driver, seed).trajectories
         assert trajectory.reward.sum() == row["return"]
 
 
 def test_the_gain_is_the_mean_difference_to_the_expert_on_the_same_seeds(trained: Trained) -> None:
     rows = trained.result.rows
-    differences = [
-        ours["return"] - theirs["return"] for ours, theirs in zip(rows["trained"], rows["pi"], strict=True)
-    ]
+    differences = [ours["return"] - theirs["return"] for ours, theirs in zip(rows["trained"], rows["pi"], strict=True)]
     assert trained.result.gain is not None
     assert trained.result.gain.mean == pytest.approx(np.mean(differences))
     assert trained.result.gain.count == 2
@@ -117,25 +112,23 @@ def test_the_gain_is_the_mean_difference_to_the_expert_on_the_same_seeds(trained
 
 def test_the_evaluation_of_a_folder_is_that_of_the_result(trained: Trained) -> None:
     results = read_results(trained.result.folder)
-    about = results.about
+    about = results.metadata
     assert (about["scenario"], about["reward"], about["expert"]) == ("ring", "released", "pi")
-    assert results.trained == "trained"
+    assert results.trained_label == "trained"
     for driver, rows in trained.result.rows.items():
         for found, expected in zip(results.rows[driver], rows, strict=True):
             for name in METRICS:
                 assert found[name] == pytest.approx(expected[name], rel=0, abs=0, nan_ok=True), name
     table = pd.read_parquet(trained.result.folder / "episodes.parquet")
     assert table.groupby("driver").size().to_dict() == {"human": 2, "pi": 2, "trained": 2}
-    assert table["return"].tolist() == [
-        row["return"] for rows in trained.result.rows.values() for row in rows
-    ]
+    assert table["return"].tolist() == [row["return"] for rows in trained.result.rows.values() for row in rows]
 
 
 def test_the_shown_episode_is_the_first_of_each_driver(trained: Trained) -> None:
-    shown = read_results(trained.result.folder).shown
+    shown = read_results(trained.result.folder).plot_episodes
     assert list(shown) == ["human", "pi", "trained"]
     expected = run_episode(
-        trained.config.make_scenario(), load_controller(trained.result.controller), held_out_seeds(1)[0]
+        trained.config.make_scenario(), load_controller(trained.result.controller), make_test_seeds(1)[0]
     )
     np.testing.assert_array_equal(shown["trained"].speeds, expected.speeds.astype(np.float32))
     assert shown["trained"].speeds.shape == (101, 8)
@@ -153,7 +146,7 @@ def test_a_finished_run_goes_on_with_a_larger_budget(trained: Trained, tmp_path:
     folder, longer = tmp_path / "run", replace(trained.config, steps=3 * STEPS)
     shutil.copytree(trained.result.folder, folder)
     result = train(longer, folder, resume=True)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "one go", longer)
     assert outcome(folder) == outcome(tmp_path / "one go")
     assert read_config(folder) == longer
@@ -179,8 +172,8 @@ def test_a_network_learns_without_an_expert(tmp_path: Path) -> None:
     assert isinstance(loaded, ResidualDriver)
     assert loaded.expert == Constant()
     (trajectory,) = run_episode(config.make_scenario(), loaded, (0,)).trajectories
-    assert not trajectory.expert.any()
-    assert trajectory.applied.any()
+    assert not trajectory.expert_acceleration.any()
+    assert trajectory.applied_acceleration.any()
     assert result.report.is_file()
 
 
@@ -206,6 +199,6 @@ def test_the_gain_is_that_over_an_expert_with_parameters() -> None:
         expert: [{"seed": (1, 0), "return": 5.0}, {"seed": (1, 1), "return": 6.0}],
         "trained": [{"seed": (1, 1), "return": 9.0}, {"seed": (1, 0), "return": 6.0}],
     }
-    gain = gain_of(config, rows)
+    gain = test_gain(config, rows)
     assert gain is not None
     assert gain.mean == pytest.approx(2.0)

@@ -10,44 +10,50 @@ import pytest
 
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation
-from unjam.drivers.registry import named_driver
+from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError
-from unjam.measures.drivable import drivable_in_all
-from unjam.measures.gain import MEAN_GAIN, MOST, WORST
+from unjam.measures.feasibility import overall_feasibility
+from unjam.measures.gain import MAX_GAIN, MEAN_GAIN, MIN_GAIN
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.on_ramp import ON_RAMP
 from unjam.training import tune as tuning
-from unjam.training.seeds import TUNE, tuning_seeds
-from unjam.training.space import Choice, Range, Space, space_around, space_asked
-from unjam.training.tried import TRIED
-from unjam.training.tune import EPISODES, FINALISTS, OF_EACH, TUNED, tune
+from unjam.training.search_space import (
+    Categorical,
+    NumericRange,
+    SearchSpace,
+    default_search_space,
+    expert_search_space,
+)
+from unjam.training.seeds import TUNING_SEED, tuning_seeds
+from unjam.training.trial_log import TRIALS_FILE
+from unjam.training.tune import TUNING_EPISODES, TUNING_EPISODES_PER_ROAD, TUNING_FILE, TUNING_FINALISTS, tune
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 SMALL = Ring(horizon=60)
-FINAL = (FINALISTS + 1) * 2 * EPISODES * 60
-STEPS = FINAL + 4 * EPISODES * 60
-RAMP_SPACE: Space = {"margin": Range(-4.0, 4.0)}
-SPACE = {"catch_up_speed": Range(0.5, 3.0), "safe_gap_rule": Choice(("constant", "closing"))}
+FINAL = (TUNING_FINALISTS + 1) * 2 * TUNING_EPISODES * 60
+STEPS = FINAL + 4 * TUNING_EPISODES * 60
+RAMP_SPACE: SearchSpace = {"margin": NumericRange(-4.0, 4.0)}
+SPACE = {"catch_up_speed": NumericRange(0.5, 3.0), "safe_gap_rule": Categorical(("constant", "closing"))}
 
 
 @pytest.mark.long
 def test_a_tuned_expert_is_written_and_no_worse_than_it_was(tmp_path: Path) -> None:
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         lines: list[str] = []
-        found = tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path, workers, on_line=lines.append)
-    assert found.actual_steps <= STEPS
-    assert len(found.settings) == len(lines) == 4
+        found = tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path, workers, on_message=lines.append)
+    assert found.environment_steps <= STEPS
+    assert len(found.trials) == len(lines) == 4
     assert found.best.score is not None
     assert found.default.score is not None
     assert found.best.score >= found.default.score
     driver = load_controller(found.file)
     assert isinstance(driver, PISaturation)
     assert found.best.values.items() <= vars(driver).items()
-    written = json.loads((tmp_path / TUNED).read_text())
+    written = json.loads((tmp_path / TUNING_FILE).read_text())
     assert written["best"]["driver"] == found.best.driver
     assert len(written["settings"]) == 4
 
@@ -56,17 +62,15 @@ def test_a_tuned_expert_is_written_and_no_worse_than_it_was(tmp_path: Path) -> N
 def test_the_same_seed_tries_the_same_settings_whoever_drives(tmp_path: Path) -> None:
     tried = []
     for count in (1, 2):
-        with Workers(count) as workers:
+        with WorkerPool(count) as workers:
             (folder := tmp_path / str(count)).mkdir()
-            tried.append(tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).settings)
+            tried.append(tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).trials)
     assert tried[0] == tried[1]
 
 
 @pytest.mark.long
-def test_a_tuning_that_was_stopped_goes_on_where_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with Workers(1) as workers:
+def test_a_tuning_that_was_stopped_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with WorkerPool(1) as workers:
         whole = tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path / "whole", workers)
         folder, lines, driven = tmp_path / "stopped", list[str](), list[int]()
 
@@ -76,17 +80,21 @@ def test_a_tuning_that_was_stopped_goes_on_where_it_was(
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers, on_line=stop)
-        run = Workers.run_each
+            tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers, on_message=stop)
+        run = WorkerPool.run_and_map
         monkeypatch.setattr(
-            Workers, "run_each", lambda pool, tasks, keep: driven.append(len(tasks)) or run(pool, tasks, keep)
+            WorkerPool, "run_and_map", lambda pool, tasks, keep: driven.append(len(tasks)) or run(pool, tasks, keep)
         )
-        with (folder / TRIED).open("a") as file:
+        with (folder / TRIALS_FILE).open("a") as file:
             file.write('{"first": 0, "driver": "cut sho')
         found = tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers)
-        assert (found.settings, found.best, found.default) == (whole.settings, whole.best, whole.default)
-        assert driven == [EPISODES, EPISODES, (FINALISTS - 1 + 1) * 2 * EPISODES]  # the last two, finalists
-        assert len(json.loads((folder / TUNED).read_text())["manifest"]["starts"]) == 2
+        assert (found.trials, found.best, found.default) == (whole.trials, whole.best, whole.default)
+        assert driven == [
+            TUNING_EPISODES,
+            TUNING_EPISODES,
+            (TUNING_FINALISTS - 1 + 1) * 2 * TUNING_EPISODES,
+        ]  # the last two, finalists
+        assert len(json.loads((folder / TUNING_FILE).read_text())["manifest"]["starts"]) == 2
         with pytest.raises(InputError, match="was made with other settings"):
             tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers, seed=1)
     assert tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).best == whole.best  # nobody drives
@@ -94,25 +102,25 @@ def test_a_tuning_that_was_stopped_goes_on_where_it_was(
 
 @pytest.mark.long
 def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simulation: Simulation) -> None:
-    steps = FINAL + 10 * EPISODES * 60
-    with Workers(1) as workers:
+    steps = FINAL + 10 * TUNING_EPISODES * 60
+    with WorkerPool(1) as workers:
         found = tune({"ring": SMALL}, "pi", SPACE, steps, tmp_path, workers, screen=True)
-    assert (found.actual_steps, found.imagined_steps) == (FINAL, 10 * EPISODES * 60)
-    assert len(found.settings) == 10
-    for setting in (found.settings[1], found.settings[9]):  # of two batches
-        driver = named_driver(setting.driver, 0.1)
+    assert (found.environment_steps, found.batch_steps) == (FINAL, 10 * TUNING_EPISODES * 60)
+    assert len(found.trials) == 10
+    for setting in (found.trials[1], found.trials[9]):  # of two batches
+        driver = driver_from_name(setting.driver, 0.1)
         rows = [
-            measure(run_episode(SMALL.part(part, EPISODES), driver, seed, simulation=simulation))
-            for part, seed in enumerate(tuning_seeds(EPISODES))
+            measure(run_episode(SMALL.stratum(part, TUNING_EPISODES), driver, seed, simulation=simulation))
+            for part, seed in enumerate(tuning_seeds(TUNING_EPISODES))
         ]
         assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-9)
-        assert setting.verdict == drivable_in_all(rows)
-    written = json.loads((tmp_path / TUNED).read_text())
-    assert written["imagined_steps"] == found.imagined_steps
+        assert setting.verdict == overall_feasibility(rows)
+    written = json.loads((tmp_path / TUNING_FILE).read_text())
+    assert written["batch_steps"] == found.batch_steps
 
 
 def test_roads_that_cannot_be_stepped_in_a_batch_are_not_screened(tmp_path: Path) -> None:
-    with Workers(1) as workers, pytest.raises(InputError, match=r"screen: .*no ring"):
+    with WorkerPool(1) as workers, pytest.raises(InputError, match=r"screen: .*no ring"):
         tune({"merge": Merge()}, "pi", SPACE, 10**9, tmp_path, workers, screen=True)
 
 
@@ -122,70 +130,67 @@ def test_on_ramps_are_screened_in_batches_where_each_setting_has_roads_of_its_ow
 ) -> None:
     monkeypatch.setattr("unjam.training.tune.EPISODES", 2)
     monkeypatch.setattr("unjam.training.tune.FINALISTS", 1)
-    road = replace(ON_RAMP, horizon=60, cav_share=0.5)
-    with Workers(1) as workers:
+    road = replace(ON_RAMP, horizon=60, penetration_rate=0.5)
+    with WorkerPool(1) as workers:
         found = tune({"on-ramp": road}, "jam-ahead", RAMP_SPACE, (8 + 4) * 60, tmp_path, workers, screen=None)
-    assert (found.actual_steps, found.imagined_steps) == (8 * 60, 2 * 2 * 60)
-    for setting in found.settings:
-        driver = named_driver(setting.driver, 1.0)
-        tasks = [EpisodeTask(road.part(part, 2), driver, seed) for part, seed in enumerate(tuning_seeds(2))]
-        rows = [measure(episode) for episode in run_batches(tasks, statistical=True)]
+    assert (found.environment_steps, found.batch_steps) == (8 * 60, 2 * 2 * 60)
+    for setting in found.trials:
+        driver = driver_from_name(setting.driver, 1.0)
+        tasks = [EpisodeTask(road.stratum(part, 2), driver, seed) for part, seed in enumerate(tuning_seeds(2))]
+        rows = [measure(episode) for episode in run_batches(tasks, allow_statistical=True)]
         assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-12)
 
 
 def test_too_few_steps_are_refused_before_anything_is_driven(tmp_path: Path) -> None:
-    with (
-        Workers(1) as workers,
-        pytest.raises(InputError, match=f"steps: {FINAL} is not allowed; allowed: >= "),
-    ):
+    with WorkerPool(1) as workers, pytest.raises(InputError, match=f"steps: {FINAL} is not allowed; allowed: >= "):
         tune({"ring": SMALL}, "pi", SPACE, FINAL, tmp_path, workers)
 
 
 def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:
-    space = space_around("pi", 0.1)
-    assert space["catch_up_speed"] == Range(0.25, 4.0, log=True)
-    assert space["safe_gap_rule"] == Choice(("constant", "closing"))
+    space = default_search_space("pi", 0.1)
+    assert space["catch_up_speed"] == NumericRange(0.25, 4.0, log=True)
+    assert space["safe_gap_rule"] == Categorical(("constant", "closing"))
     assert "time_step" not in space
-    assert space_around("pacer", 0.1)["varying"] == Choice((False, True))
-    first = space_around("jam-ahead", 1.0)["first"]  # zero by default
-    assert first == Range(0, 4)
-    assert isinstance(first, Range)
-    assert first.whole
+    assert default_search_space("pacer", 0.1)["varying"] == Categorical((False, True))
+    first = default_search_space("jam-ahead", 1.0)["first"]  # zero by default
+    assert first == NumericRange(0, 4)
+    assert isinstance(first, NumericRange)
+    assert first.is_integer
     for name in ("human", "nobody"):
         with pytest.raises(InputError):
-            space_around(name, 0.1)
+            default_search_space(name, 0.1)
 
 
 def test_whole_ends_of_a_parameter_that_is_none_are_no_integers() -> None:
     asked = ["gathering_speed=1..3", "varying=true,false"]
-    space = space_asked(asked, space_around("pacer", 0.1))
-    assert space == {"gathering_speed": Range(1.0, 3.0), "varying": Choice((True, False))}
+    space = expert_search_space(asked, default_search_space("pacer", 0.1))
+    assert space == {"gathering_speed": NumericRange(1.0, 3.0), "varying": Categorical((True, False))}
     first, speed = (
-        space_asked(["first=1..3"], space_around("jam-ahead", 1.0))["first"],
+        expert_search_space(["first=1..3"], default_search_space("jam-ahead", 1.0))["first"],
         space["gathering_speed"],
     )
-    assert isinstance(first, Range)
-    assert isinstance(speed, Range)
-    assert (first.whole, speed.whole) == (True, False)
+    assert isinstance(first, NumericRange)
+    assert isinstance(speed, NumericRange)
+    assert (first.is_integer, speed.is_integer) == (True, False)
 
 
 def test_finalists_meet_seeds_that_no_setting_was_tried_on() -> None:
-    assert not set(tuning_seeds(EPISODES)) & set(tuning_seeds(2 * EPISODES, EPISODES))
-    assert {first for first, _ in tuning_seeds(3)} == {TUNE}
+    assert not set(tuning_seeds(TUNING_EPISODES)) & set(tuning_seeds(2 * TUNING_EPISODES, TUNING_EPISODES))
+    assert {first for first, _ in tuning_seeds(3)} == {TUNING_SEED}
 
 
 @pytest.mark.long
 def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tmp_path: Path) -> None:
     roads = {"short": SMALL, "full": Ring(horizon=80, length=(200, 210))}
-    each = OF_EACH * (60 + 80)
-    steps = each * ((FINALISTS + 1) * 2 + 3) + 2 * each
-    with Workers(1) as workers:
+    each = TUNING_EPISODES_PER_ROAD * (60 + 80)
+    steps = each * ((TUNING_FINALISTS + 1) * 2 + 3) + 2 * each
+    with WorkerPool(1) as workers:
         found = tune(roads, "pi", SPACE, steps, tmp_path, workers)
-    unused = (FINALISTS - 2) * 2 * each  # two settings were tried, so no more than two are finalists
-    assert (len(found.settings), found.actual_steps) == (2, steps - unused)
-    assert all(one.score is not None and WORST <= one.score <= MOST for one in found.settings)
+    unused = (TUNING_FINALISTS - 2) * 2 * each  # two settings were tried, so no more than two are finalists
+    assert (len(found.trials), found.environment_steps) == (2, steps - unused)
+    assert all(one.score is not None and MIN_GAIN <= one.score <= MAX_GAIN for one in found.trials)
     assert found.best.verdict.startswith("worst on ")
-    written = json.loads((tmp_path / TUNED).read_text())
+    written = json.loads((tmp_path / TUNING_FILE).read_text())
     assert written["reward"] == MEAN_GAIN
     assert set(written["scenario"]) == set(roads)
 
@@ -193,22 +198,25 @@ def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tm
 @pytest.mark.long
 def test_of_roads_of_all_kinds_those_are_screened_that_a_batch_can_step(tmp_path: Path) -> None:
     roads = {"ring": SMALL, "eight": FigureEight(horizon=80)}
-    each = OF_EACH * (60 + 80)
-    final = each * ((FINALISTS + 1) * 2 + 3)
-    with Workers(1) as workers:
+    each = TUNING_EPISODES_PER_ROAD * (60 + 80)
+    final = each * ((TUNING_FINALISTS + 1) * 2 + 3)
+    with WorkerPool(1) as workers:
         found, driven = (
             tune(roads, "pi", SPACE, final + 2 * each, tmp_path / str(screen), workers, screen=screen)
             for screen in (True, False)
         )
-    final -= (FINALISTS - 2) * 2 * each  # two settings were tried, so no more than two are finalists
-    assert (found.actual_steps, found.imagined_steps) == (final + 2 * OF_EACH * 80, 2 * OF_EACH * 60)
-    assert (driven.actual_steps, driven.imagined_steps) == (final + 2 * each, 0)
-    assert [one.score for one in found.settings] == pytest.approx([one.score for one in driven.settings])
+    final -= (TUNING_FINALISTS - 2) * 2 * each  # two settings were tried, so no more than two are finalists
+    assert (found.environment_steps, found.batch_steps) == (
+        final + 2 * TUNING_EPISODES_PER_ROAD * 80,
+        2 * TUNING_EPISODES_PER_ROAD * 60,
+    )
+    assert (driven.environment_steps, driven.batch_steps) == (final + 2 * each, 0)
+    assert [one.score for one in found.trials] == pytest.approx([one.score for one in driven.trials])
 
 
 def test_what_is_no_parameter_of_the_expert_is_not_varied(tmp_path: Path) -> None:
-    with Workers(1) as workers, pytest.raises(InputError, match="vary: 'catch_up' is not allowed"):
-        tune({"ring": SMALL}, "pi", {"catch_up": Range(0.5, 3.0)}, STEPS, tmp_path, workers)
+    with WorkerPool(1) as workers, pytest.raises(InputError, match="vary: 'catch_up' is not allowed"):
+        tune({"ring": SMALL}, "pi", {"catch_up": NumericRange(0.5, 3.0)}, STEPS, tmp_path, workers)
 
 
 @pytest.mark.long
@@ -216,7 +224,7 @@ def test_a_reward_whose_file_has_changed_is_another_tuning(tmp_path: Path) -> No
     file = tmp_path / "mine.py"
     text = "import numpy as np\ndef calm(outcome): return {{'speed': {} * outcome.speeds.mean(-1)}}\n"
     file.write_text(text.format(1))
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         arguments = {"ring": SMALL}, "pi", SPACE, STEPS, tmp_path / "tuned", workers, f"{file}:calm"
         tune(*arguments)
         file.write_text(text.format(-1000))
@@ -228,16 +236,18 @@ def test_finalists_are_different_settings_and_none_is_driven_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     driven: list[str] = []
-    actual = tuning._driven
+    actual = tuning._run_drivers
 
     def noted(roads: Any, drivers: Any, *rest: Any) -> Any:
         driven.extend(f"{rest[0]} {driver}" for driver in drivers)
         return actual(roads, drivers, *rest)
 
     monkeypatch.setattr(tuning, "_driven", noted)
-    two: Space = {"safe_gap_rule": Choice(("constant", "closing"))}
-    with Workers(1) as workers:
+    two: SearchSpace = {"safe_gap_rule": Categorical(("constant", "closing"))}
+    with WorkerPool(1) as workers:
         found = tune({"ring": SMALL}, "pi", two, STEPS, tmp_path, workers)
-    assert len(found.settings) == 4
+    assert len(found.trials) == 4
     assert len(driven) == len(set(driven)) <= 2 + 3
-    assert found.actual_steps == sum(60 * (EPISODES if each[0] == "0" else 2 * EPISODES) for each in driven)
+    assert found.environment_steps == sum(
+        60 * (TUNING_EPISODES if each[0] == "0" else 2 * TUNING_EPISODES) for each in driven
+    )

@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.worlds import audit
-from unjam.worlds.audit import Audit, BrakingLog, Pair, brakings, following, is_recovering
+from unjam.worlds.audit import Audit, BrakingLog, Pair, braking_statistics, following_statistics, is_recovering
 
 
 def test_brakings_are_counted_beyond_each_limit_and_rounding_is_none() -> None:
-    found = brakings([[1.0, -3.5, -3.6], [-4.5 - 1e-9, -4.6, -12.0]])
-    assert (found.hardest, found.beyond, found.moments) == (12.0, (4, 2, 1), 6)
-    assert brakings([0.5, 1.0]).hardest == 0.0
-    assert brakings([]).moments == 0
+    found = braking_statistics([[1.0, -3.5, -3.6], [-4.5 - 1e-9, -4.6, -12.0]])
+    assert (found.max_braking, found.exceedances, found.samples) == (12.0, (4, 2, 1), 6)
+    assert braking_statistics([0.5, 1.0]).max_braking == 0.0
+    assert braking_statistics([]).samples == 0
 
 
 def column(*values: float) -> np.ndarray:
@@ -21,17 +21,17 @@ def column(*values: float) -> np.ndarray:
 
 
 def test_headway_counts_while_a_car_moves_and_ttc_while_it_closes_in() -> None:
-    found = following(column(0.5, 4.0, 8.0), column(0.5, 4.0, 4.0), column(0.1, 2.0, 12.0), 0.1)
-    assert found.headway == pytest.approx(0.5)
-    assert found.time_to_collision == pytest.approx(3.0)
-    assert found.needed_braking == pytest.approx(16.0 / 24.0)
-    assert found.share_short == pytest.approx(0.5)
+    found = following_statistics(column(0.5, 4.0, 8.0), column(0.5, 4.0, 4.0), column(0.1, 2.0, 12.0), 0.1)
+    assert found.min_time_gap == pytest.approx(0.5)
+    assert found.min_time_to_collision == pytest.approx(3.0)
+    assert found.max_required_braking == pytest.approx(16.0 / 24.0)
+    assert found.share_short_time_gap == pytest.approx(0.5)
 
 
 def test_a_recovering_cav_counts_for_the_time_to_collision_and_not_for_time_gaps() -> None:
     speeds, ahead, gaps = column(10.0, 10.0), column(9.0, 10.0), column(5.0, 12.0)
-    found = following(speeds, ahead, gaps, 0.1, recovering=column(1.0, 0.0))
-    assert (found.headway, found.share_short, found.time_to_collision) == (1.2, 0.0, 5.0)
+    found = following_statistics(speeds, ahead, gaps, 0.1, recovering=column(1.0, 0.0))
+    assert (found.headway, found.share_short_time_gap, found.min_time_to_collision) == (1.2, 0.0, 5.0)
 
 
 OPENING, CLOSING = Pair(10.0, 10.5, 6.0), Pair(10.0, 9.5, 5.4)
@@ -63,36 +63,34 @@ def test_recovery_is_a_short_time_gap_that_opens_since_a_cut_in(
 
 def test_jerk_is_the_change_of_acceleration_over_time() -> None:
     speeds = column(5.0, 5.1, 5.1, 5.0)
-    assert following(speeds, speeds, speeds * 3.0, 0.1).jerk == pytest.approx(10.0)
+    assert following_statistics(speeds, speeds, speeds * 3.0, 0.1).max_jerk == pytest.approx(10.0)
 
 
 def test_contact_is_no_time_to_collision_at_all() -> None:
-    assert following(column(5.0, 5.0), column(5.0, 6.0), column(1.0, -0.1), 0.1).time_to_collision == 0.0
+    assert following_statistics(column(5.0, 5.0), column(5.0, 6.0), column(1.0, -0.1), 0.1).min_time_to_collision == 0.0
 
 
 def test_a_car_that_is_not_there_is_not_judged() -> None:
-    there = following(column(5.0, np.nan), column(4.0, np.nan), column(10.0, np.nan), 0.1)
-    assert (there.headway, there.time_to_collision, there.jerk) == (2.0, 10.0, 0.0)
+    there = following_statistics(column(5.0, np.nan), column(4.0, np.nan), column(10.0, np.nan), 0.1)
+    assert (there.min_time_gap, there.min_time_to_collision, there.max_jerk) == (2.0, 10.0, 0.0)
     nobody = np.zeros((4, 0))
-    assert following(nobody, nobody, nobody, 0.1) == Audit().following
+    assert following_statistics(nobody, nobody, nobody, 0.1) == Audit().following
 
 
 def test_an_override_near_a_crossing_is_put_down_to_the_right_of_way() -> None:
     overridden, near = np.array([1, 1, 0, 0], bool), np.array([0, 1, 1, 0], bool)
     still = np.ones((4, 1))
-    found = following(still, still, still, 0.1, overridden, near)
-    assert (found.overridden, found.yielded) == (0.25, 0.25)
+    found = following_statistics(still, still, still, 0.1, overridden, near)
+    assert (found.override_share, found.yield_share) == (0.25, 0.25)
 
 
 @given(st.lists(st.lists(st.tuples(st.floats(-9, 3), st.integers(0, 2)), max_size=6), max_size=30))
-def test_brakings_counted_step_by_step_are_those_of_all_steps_together(
-    steps: list[list[tuple[float, int]]],
-) -> None:
+def test_brakings_counted_step_by_step_are_those_of_all_steps_together(steps: list[list[tuple[float, int]]]) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(audit, "NOTED_AT_ONCE", 4)
+        patch.setattr(audit, "BRAKING_BLOCK_STEPS", 4)
         log = BrakingLog(0.5)
         for step in steps:
-            log.note(np.array([change for change, _ in step]), np.array([kind for _, kind in step], np.uint8))
+            log.add(np.array([change for change, _ in step]), np.array([kind for _, kind in step], np.uint8))
     for kind in range(3):
         changes = [change for step in steps for change, whose in step if whose == kind]
-        assert log.of(kind) == brakings(np.array(changes) / 0.5)
+        assert log.statistics(kind) == braking_statistics(np.array(changes) / 0.5)

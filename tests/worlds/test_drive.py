@@ -9,88 +9,88 @@ from tests.conftest import random_network
 from tests.mock_world import MockWorld
 from unjam.drivers import IDM, Human, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.command import Command, Limits
-from unjam.drivers.wrappers import Impaired, Mixed
+from unjam.drivers.wrappers import ImpairedDriver, MixedDriver
 from unjam.errors import InputError
-from unjam.worlds.drive import Drive, drive
+from unjam.worlds.drive import DriveLoop, drive_world
 from unjam.worlds.world import RecordedWorld
 
 PI = PISaturation()
-RESIDUAL = ResidualDriver(PI, random_network(), 1.0, hold=4)
+RESIDUAL = ResidualDriver(PI, random_network(), 1.0, action_repeat=4)
 
 
 def test_it_drives_until_the_world_has_ended() -> None:
-    applied, driven = drive(MockWorld(decisions=25), PI)
+    applied, driven = drive_world(MockWorld(decisions=25), PI)
     assert applied.shape == (25, 3)
     assert driven.decisions == []
 
 
 def test_a_single_cav_in_plain_numbers_drives_as_one_row_does() -> None:
-    rows, _ = drive(MockWorld(rows=1), RESIDUAL)
-    plain, _ = drive(MockWorld(rows=1, single=True), RESIDUAL)
+    rows, _ = drive_world(MockWorld(rows=1), RESIDUAL)
+    plain, _ = drive_world(MockWorld(rows=1, single=True), RESIDUAL)
     np.testing.assert_allclose(plain, rows, atol=1e-12)
 
 
 def test_it_keeps_what_was_decided_and_what_would_be_seen_at_the_end() -> None:
     world = MockWorld()
-    applied, driven = drive(world, RESIDUAL)
+    applied, driven = drive_world(world, RESIDUAL)
     experts, residuals, seen = (np.array(part) for part in zip(*driven.decisions, strict=True))
     np.testing.assert_allclose(applied, (experts + residuals).clip(-1.0, 1.0))
     assert seen.shape == (40, 3, 5)
     assert driven.last_observation is not None
     np.testing.assert_allclose(driven.last_observation[:, 0], world.perceive().speed / 10.0)
-    assert len(driven.memories) == 3
-    assert driven.hold == 4
+    assert len(driven.initial_memories) == 3
+    assert driven.action_repeat == 4
 
 
 def test_it_explores_only_when_asked_to() -> None:
-    calm, _ = drive(MockWorld(), RESIDUAL)
-    again, _ = drive(MockWorld(), RESIDUAL)
+    calm, _ = drive_world(MockWorld(), RESIDUAL)
+    again, _ = drive_world(MockWorld(), RESIDUAL)
     np.testing.assert_array_equal(calm, again)
-    assert not np.array_equal(calm, drive(MockWorld(), RESIDUAL, explore=True)[0])
+    assert not np.array_equal(calm, drive_world(MockWorld(), RESIDUAL, explore=True)[0])
 
 
 def test_noise_that_lasts_is_the_same_in_all_decisions_and_counts_the_other_way_too() -> None:
     lasting = replace(RESIDUAL, network=replace(random_network(), lasts=True), action_limit=100.0)
-    told = [drive(MockWorld(decisions=4), lasting, explore)[0] for explore in (0.0, 1.0, -1.0)]
-    (calm, one, other), again = told, drive(MockWorld(decisions=4), lasting, 1.0)[0]
+    told = [drive_world(MockWorld(decisions=4), lasting, explore)[0] for explore in (0.0, 1.0, -1.0)]
+    (calm, one, other), again = told, drive_world(MockWorld(decisions=4), lasting, 1.0)[0]
     np.testing.assert_array_equal(one, again)
     np.testing.assert_allclose(one[0] - calm[0], calm[0] - other[0], atol=1e-12)
     assert np.abs(one[0] - calm[0]).min() > 0.01
 
 
-@pytest.mark.parametrize("driver", [PI, RESIDUAL, Mixed((PI, IDM())), Impaired(PI, delay=0.3)])
-def test_memory_goes_with_the_vehicle_where_some_leave_and_others_enter(driver: Mixed) -> None:
+@pytest.mark.parametrize("driver", [PI, RESIDUAL, MixedDriver((PI, IDM())), ImpairedDriver(PI, delay=0.3)])
+def test_memory_goes_with_the_vehicle_where_some_leave_and_others_enter(driver: MixedDriver) -> None:
     world = MockWorld(turnover=5)
-    driving = Drive(world, driver)
+    driving = DriveLoop(world, driver)
     for _ in driving:
         assert np.asarray(world.perceive().speed).shape == (3,)
     assert world.entered == 3 + 40 // 5
-    assert len(driving.memories) == world.entered
+    assert len(driving.initial_memories) == world.entered
 
 
 def test_a_newcomer_remembers_nothing() -> None:
-    driving = Drive(MockWorld(turnover=5), PI)
+    driving = DriveLoop(MockWorld(turnover=5), PI)
     seen = [driving.memory["seen"].tolist() for _ in driving]
     assert seen[3:6] == [[4, 4, 4], [5, 5, 0], [6, 6, 1]]
 
 
 def test_where_the_simulator_drives_nobody_is_asked() -> None:
-    assert list(Drive(MockWorld(decisions=3), Human())) == [None] * 3
+    assert list(DriveLoop(MockWorld(decisions=3), Human())) == [None] * 3
 
 
 def test_progress_is_told_now_and_then() -> None:
     told: list[int] = []
-    drive(MockWorld(decisions=25), PI, on_progress=told.append)
+    drive_world(MockWorld(decisions=25), PI, on_progress=told.append)
     assert told == [10, 20]
 
 
 def test_it_goes_on_from_a_memory() -> None:
     states = LocalState(*(np.full((6, 2), value) for value in (4.0, 5.0, 10.0, 3.0, 8.0, 20.0, 250.0)))
-    whole = drive(RecordedWorld(states, Limits(-1.0, 1.0)), PI)
-    first = Drive(RecordedWorld(states.at(slice(2)), Limits(-1.0, 1.0)), PI)
+    whole = drive_world(RecordedWorld(states, Limits(-1.0, 1.0)), PI)
+    first = DriveLoop(RecordedWorld(states.select(slice(2)), Limits(-1.0, 1.0)), PI)
     assert len(list(first)) == 2
-    rest = RecordedWorld(states.at(slice(2, None)), Limits(-1.0, 1.0))
-    np.testing.assert_array_equal(drive(rest, PI, memory=first.memory), whole[2:])
+    rest = RecordedWorld(states.select(slice(2, None)), Limits(-1.0, 1.0))
+    np.testing.assert_array_equal(drive_world(rest, PI, memory=first.memory), whole[2:])
 
 
 def test_a_recording_names_the_row_that_is_driven_wrongly() -> None:

@@ -9,19 +9,10 @@ import pytest
 from tests.conftest import random_network
 from tests.worlds.sumo.own_roads import straight
 from tests.worlds.test_record import fingerprint
-from unjam.drivers import (
-    IDM,
-    Constant,
-    Driver,
-    FollowerStopper,
-    Human,
-    LocalState,
-    PISaturation,
-    ResidualDriver,
-)
-from unjam.drivers.from_file import FileDriver
-from unjam.drivers.observation import local_vector
+from unjam.drivers import IDM, Constant, Driver, FollowerStopper, Human, LocalState, PISaturation, ResidualDriver
+from unjam.drivers.observation import local_observation
 from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.user_driver import FileDriver
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
@@ -40,7 +31,7 @@ def drives_badly(simulation: Simulation) -> None:
 
 def another_road(simulation: Simulation) -> None:
     ring = Ring(length=(130, 140), vehicles=11, cavs=3, warmup=77, horizon=50, simulation_step=0.2)
-    run_episode(ring, RESIDUAL, (9,), explore=True, full=True, simulation=simulation)
+    run_episode(ring, RESIDUAL, (9,), explore=True, record_details=True, simulation=simulation)
 
 
 def stops_in_the_middle(simulation: Simulation) -> None:
@@ -70,7 +61,7 @@ def uses_up_random_numbers(simulation: Simulation) -> None:
     [
         (RING, PISaturation()),
         (replace(RING, warmup=120), RESIDUAL),
-        (replace(RING, cavs=2, steps_per_decision=2), FollowerStopper()),
+        (replace(RING, cavs=2, steps_per_control_step=2), FollowerStopper()),
         (replace(RING, warmup=50, actuation="flow"), Human()),
     ],
 )
@@ -111,32 +102,36 @@ def test_other_seeds_give_other_roads_and_other_noise(simulation: Simulation) ->
 def test_the_same_seed_is_the_same_traffic_for_every_driver(simulation: Simulation) -> None:
     ring = replace(RING, warmup=100, horizon=1)
     found = [
-        run_episode(ring, driver, (4,), simulation=simulation)
-        for driver in (IDM(), Human(), Constant(1.0), RESIDUAL)
+        run_episode(ring, driver, (4,), simulation=simulation) for driver in (IDM(), Human(), Constant(1.0), RESIDUAL)
     ]
     assert len({episode.speeds[0].tobytes() for episode in found}) == 1
-    assert len({str(episode.drawn) for episode in found}) == 1
+    assert len({str(episode.drawn_values) for episode in found}) == 1
 
 
 @pytest.mark.parametrize(("warmup", "held", "hold", "cavs"), [(0, 1, 1, 1), (30, 5, 1, 2), (0, 1, 7, 3)])
 def test_all_that_is_recorded_has_a_row_for_each_decision_and_one_for_the_end(
     warmup: int, held: int, hold: int, cavs: int, simulation: Simulation
 ) -> None:
-    ring = replace(RING, horizon=60, warmup=warmup, steps_per_decision=held, cavs=cavs)
+    ring = replace(RING, horizon=60, warmup=warmup, steps_per_control_step=held, cavs=cavs)
     driver = replace(RESIDUAL, hold=hold)
     episode = run_episode(ring, driver, (0,), simulation=simulation)
-    assert episode.steps == 60
+    assert episode.control_steps == 60
     for array in (episode.speeds, episode.positions, episode.gaps):
         assert array.shape == (61, 22)
         assert np.isfinite(array).all()
     for trajectory in episode.trajectories:
-        assert trajectory.start == 0
+        assert trajectory.start_step == 0
         assert {values.shape for values in trajectory.states if values is not None} == {(61,)}
         assert trajectory.observations.shape == (-(-60 // hold) + 1, 5)
-        once = (trajectory.expert, trajectory.residual, trajectory.applied, trajectory.shield)
+        once = (
+            trajectory.expert_acceleration,
+            trajectory.residual,
+            trajectory.applied_acceleration,
+            trajectory.shield_braking,
+        )
         assert {values.shape for values in once} == {(60,)}
-        assert {values.shape for values in trajectory.terms.values()} == {(60,)}
-        assert trajectory.hold == hold
+        assert {values.shape for values in trajectory.reward_terms.values()} == {(60,)}
+        assert trajectory.action_repeat == hold
         assert not trajectory.terminated
     assert (episode.status, episode.collisions, episode.warmup) == ("completed", 0, warmup)
 
@@ -163,14 +158,14 @@ def test_each_trajectory_is_that_of_its_vehicle(cavs: int, simulation: Simulatio
         along = episode.positions[:, place] % episode.loop_length
         np.testing.assert_allclose(states.route_position, along, atol=1e-9)
         np.testing.assert_array_equal(states.loop_length, episode.loop_length)
-        np.testing.assert_array_equal(trajectory.applied, push)
-        np.testing.assert_array_equal(trajectory.expert, push)
+        np.testing.assert_array_equal(trajectory.applied_acceleration, push)
+        np.testing.assert_array_equal(trajectory.expert_acceleration, push)
         assert not trajectory.residual.any()
 
 
 def test_what_the_seed_drew_is_written_down(simulation: Simulation) -> None:
     episode = run_episode(RING, IDM(), (5,), simulation=simulation)
-    assert episode.drawn == {"length": episode.loop_length}
+    assert episode.drawn_values == {"length": episode.loop_length}
     assert 220 <= episode.loop_length <= 270
     assert 3.0 <= episode.limit_speed <= 5.27
     np.testing.assert_allclose(episode.positions[0], np.arange(22) * episode.loop_length / 22, atol=1e-9)
@@ -180,23 +175,21 @@ def test_what_the_seed_drew_is_written_down(simulation: Simulation) -> None:
 @pytest.mark.parametrize("cavs", [1, 2])
 @pytest.mark.parametrize("hold", [1, 7])
 @pytest.mark.parametrize("expert", [PISaturation(time_constant=0), IDM()])
-def test_a_residual_drivers_record_adds_up(
-    cavs: int, hold: int, expert: Driver, simulation: Simulation
-) -> None:
+def test_a_residual_drivers_record_adds_up(cavs: int, hold: int, expert: Driver, simulation: Simulation) -> None:
     ring = replace(RING, cavs=cavs, horizon=500, warmup=50)
-    driver = ResidualDriver(expert, random_network(), 0.5, hold=hold)
+    driver = ResidualDriver(expert, random_network(), 0.5, action_repeat=hold)
     calm, explored = (
         run_episode(ring, driver, (0,), explore=explore, simulation=simulation) for explore in (False, True)
     )
     for episode in (calm, explored):
         for trajectory in episode.trajectories:
-            total = np.clip(trajectory.expert + trajectory.residual, -0.5, 0.5)
-            np.testing.assert_array_equal(trajectory.applied, total)
-            assert np.abs(trajectory.expert).max() <= 0.5
-            seen = local_vector(trajectory.states.at(slice(None, None, hold)))
+            total = np.clip(trajectory.expert_acceleration + trajectory.residual, -0.5, 0.5)
+            np.testing.assert_array_equal(trajectory.applied_acceleration, total)
+            assert np.abs(trajectory.expert_acceleration).max() <= 0.5
+            seen = local_observation(trajectory.states.select(slice(None, None, hold)))
             looks = len(trajectory.observations) - 1
             np.testing.assert_allclose(trajectory.observations[:-1], seen[:looks], atol=1e-12)
-            end = local_vector(trajectory.states.at(slice(-1, None)))
+            end = local_observation(trajectory.states.select(slice(-1, None)))
             np.testing.assert_allclose(trajectory.observations[-1:], end, atol=1e-12)
     for trajectory in calm.trajectories:
         wanted = driver.network(trajectory.observations[:-1])
@@ -213,7 +206,7 @@ def test_exploration_adds_noise_of_the_networks_spread(cavs: int, hold: int, sim
     episode = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
     noises = []
     for trajectory in episode.trajectories:
-        chosen, _ = trajectory.choices
+        chosen, _ = trajectory.actions_and_rewards
         np.testing.assert_array_equal(trajectory.residual, np.repeat(chosen, hold))
         noises.append(chosen - driver.network(trajectory.observations[:-1]))
         assert noises[-1].std() == pytest.approx(0.2, rel=0.06)
@@ -229,9 +222,7 @@ def test_exploration_follows_the_seed_and_leaves_the_traffics_noise_alone(simula
     still = run_episode(ring, mute, (0,), simulation=simulation)
     explored = run_episode(ring, mute, (0,), explore=True, simulation=simulation)
     np.testing.assert_array_equal(explored.speeds, still.speeds)
-    first, second = (
-        run_episode(ring, RESIDUAL, (seed,), explore=True, simulation=simulation) for seed in (0, 1)
-    )
+    first, second = (run_episode(ring, RESIDUAL, (seed,), explore=True, simulation=simulation) for seed in (0, 1))
     noises = [
         trajectory.residual - RESIDUAL.network(trajectory.observations[:-1])
         for trajectory in (first.trajectories[0], second.trajectories[0])
@@ -243,7 +234,7 @@ def test_of_a_driver_without_a_network_the_expert_is_all(simulation: Simulation)
     driver = PISaturation(time_constant=0)
     episode = run_episode(RING, driver, (0,), explore=True, simulation=simulation)
     trajectory = episode.trajectories[0]
-    np.testing.assert_array_equal(trajectory.expert, trajectory.applied)
+    np.testing.assert_array_equal(trajectory.expert_acceleration, trajectory.applied_acceleration)
     assert not trajectory.residual.any()
     assert trajectory.observations.shape == (1, 0)
     still = run_episode(RING, driver, (0,), simulation=simulation)
@@ -252,7 +243,7 @@ def test_of_a_driver_without_a_network_the_expert_is_all(simulation: Simulation)
 
 def test_fuel_is_recorded_only_when_asked_for_and_changes_nothing_else(simulation: Simulation) -> None:
     without = run_episode(RING, IDM(), (0,), simulation=simulation)
-    episode = run_episode(RING, IDM(), (0,), full=True, simulation=simulation)
+    episode = run_episode(RING, IDM(), (0,), record_details=True, simulation=simulation)
     assert without.fuel.shape == (0, 0)
     assert episode.fuel.shape == (300, 22)
     assert (episode.fuel >= 0.0).all()
@@ -265,7 +256,7 @@ def test_fuel_is_recorded_only_when_asked_for_and_changes_nothing_else(simulatio
 def test_fuel_depends_on_the_emission_class(simulation: Simulation) -> None:
     van = replace(RING, emission_class="HBEFA4/LCV_diesel_N1-III_Euro-6ab")
     car, other = (
-        run_episode(scenario, IDM(), (0,), full=True, simulation=simulation).fuel.mean()
+        run_episode(scenario, IDM(), (0,), record_details=True, simulation=simulation).fuel.mean()
         for scenario in (RING, van)
     )
     assert other > 1.1 * car
@@ -274,20 +265,20 @@ def test_fuel_depends_on_the_emission_class(simulation: Simulation) -> None:
 def test_the_reward_is_the_scenarios_own_where_none_is_named(simulation: Simulation) -> None:
     episode = run_episode(RING, PISaturation(), (0,), simulation=simulation)
     trajectory = episode.trajectories[0]
-    assert set(trajectory.terms) == {"speed", "acceleration"}
-    np.testing.assert_allclose(trajectory.terms["speed"], 0.2 * episode.speeds[1:].mean(1), atol=1e-12)
-    np.testing.assert_allclose(trajectory.terms["acceleration"], -4.0 * np.abs(trajectory.applied))
+    assert set(trajectory.reward_terms) == {"speed", "acceleration"}
+    np.testing.assert_allclose(trajectory.reward_terms["speed"], 0.2 * episode.speeds[1:].mean(1), atol=1e-12)
+    np.testing.assert_allclose(trajectory.reward_terms["acceleration"], -4.0 * np.abs(trajectory.applied_acceleration))
 
 
 def test_a_named_reward_and_ones_own_are_used(my_drivers: Path, simulation: Simulation) -> None:
     ring = replace(UNFILTERED, cavs=2)
     found = run_episode(ring, Constant(0.2), (0,), "eq16", simulation=simulation).trajectories
-    assert set(found[0].terms) == {"speed", "headway", "acceleration"}
+    assert set(found[0].reward_terms) == {"speed", "headway", "acceleration"}
     episode = run_episode(ring, Constant(0.2), (0,), f"{my_drivers}:calm", simulation=simulation)
     for trajectory in episode.trajectories:
-        assert set(trajectory.terms) == {"speed", "push"}
-        np.testing.assert_allclose(trajectory.terms["speed"], episode.speeds[1:].mean(1))
-        np.testing.assert_allclose(trajectory.terms["push"], -0.4)
+        assert set(trajectory.reward_terms) == {"speed", "push"}
+        np.testing.assert_allclose(trajectory.reward_terms["speed"], episode.speeds[1:].mean(1))
+        np.testing.assert_allclose(trajectory.reward_terms["push"], -0.4)
 
 
 def test_the_headways_of_a_reward_are_those_after_each_step(simulation: Simulation) -> None:
@@ -295,8 +286,8 @@ def test_the_headways_of_a_reward_are_those_after_each_step(simulation: Simulati
     trajectory = episode.trajectories[0]
     gap, speed = trajectory.states.leader_gap[1:], trajectory.states.speed[1:]
     expected = [-0.1 * max(1.0 - g / max(v, 1e-3), 0.0) for g, v in zip(gap, speed, strict=True)]
-    np.testing.assert_allclose(trajectory.terms["headway"], expected, atol=1e-12)
-    assert trajectory.terms["headway"].min() < 0.0
+    np.testing.assert_allclose(trajectory.reward_terms["headway"], expected, atol=1e-12)
+    assert trajectory.reward_terms["headway"].min() < 0.0
 
 
 BAD_REWARDS = """
@@ -340,7 +331,7 @@ def test_a_reward_may_answer_in_lists_of_whole_numbers(tmp_path: Path, simulatio
     file = tmp_path / "rewards.py"
     file.write_text(BAD_REWARDS)
     episode = run_episode(RING, IDM(), (0,), f"{file}:listed", simulation=simulation)
-    assert episode.trajectories[0].terms["speed"].dtype == np.float64
+    assert episode.trajectories[0].reward_terms["speed"].dtype == np.float64
 
 
 def test_an_unknown_reward_is_refused_before_anything_runs() -> None:
@@ -351,7 +342,7 @@ def test_an_unknown_reward_is_refused_before_anything_runs() -> None:
 def test_progress_is_told_during_warm_up_and_episode(simulation: Simulation) -> None:
     told: list[int] = []
     ring = replace(RING, warmup=1200, horizon=2600)
-    run_episode(ring, IDM(), (0,), simulation=simulation, progress=told.append)
+    run_episode(ring, IDM(), (0,), simulation=simulation, on_progress=told.append)
     assert told == sorted(told)
     assert told.count(0) >= 2
     assert 2000 < told[-1] <= 2600
@@ -360,15 +351,15 @@ def test_progress_is_told_during_warm_up_and_episode(simulation: Simulation) -> 
 
 def test_a_trajectory_begins_with_what_its_expert_remembered_of_the_warmup(simulation: Simulation) -> None:
     warm = Ring(length=(230, 230), vehicles=8, horizon=20, warmup=30)
-    driver = ResidualDriver(PISaturation(), random_network(), 1.0, hold=5)
+    driver = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=5)
     trajectory = run_episode(warm, driver, (3,), simulation=simulation).trajectories[0]
-    assert set(trajectory.memory) == {"window", "total", "seen", "command"}
-    assert trajectory.memory["seen"] == 30
-    memory = {name: values[None] for name, values in trajectory.memory.items()}
+    assert set(trajectory.initial_memory) == {"window", "total", "seen", "command"}
+    assert trajectory.initial_memory["seen"] == 30
+    memory = {name: values[None] for name, values in trajectory.initial_memory.items()}
     for step in range(20):
-        seen = trajectory.states.at(slice(step, step + 1))
+        seen = trajectory.states.select(slice(step, step + 1))
         expert, memory = driver.expert.act(seen, memory)
-        assert np.clip(expert[0], -1.0, 1.0) == pytest.approx(trajectory.expert[step], abs=1e-12)
+        assert np.clip(expert[0], -1.0, 1.0) == pytest.approx(trajectory.expert_acceleration[step], abs=1e-12)
 
 
 def insists(state: LocalState) -> np.ndarray:
@@ -388,7 +379,7 @@ def test_a_driver_cannot_change_how_it_is_measured(road: str, simulation: Simula
         flow = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
         road = str(straight(tmp_path, flow, length=300.0))
     closed = road in ("ring", "figure-eight")
-    share = {"cavs": 2, "warmup": 0} if closed else {"cav_share": 0.5}
+    share = {"cavs": 2, "warmup": 0} if closed else {"penetration_rate": 0.5}
     scenario = make_scenario(road, {**share, "horizon": 30})
 
     def honest(state: LocalState) -> np.ndarray:

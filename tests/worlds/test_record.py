@@ -53,12 +53,15 @@ def test_fingerprints_differ_in_the_last_bit_of_any_array() -> None:
         (replace(RING, warmup=30), Human()),
         (replace(RING, actuation="raw", safety=SafetyFilter(active=False)), Constant(1.0)),
         (replace(RING, cavs=3), PISaturation()),
-        (replace(RING, cavs=2, steps_per_decision=2), ResidualDriver(IDM(), random_network(), 1.0, hold=4)),
+        (
+            replace(RING, cavs=2, steps_per_control_step=2),
+            ResidualDriver(IDM(), random_network(), 1.0, action_repeat=4),
+        ),
     ],
 )
 def test_an_episode_arrives_as_it_was_sent(scenario: Ring, driver: Driver, simulation: Simulation) -> None:
     episode = run_episode(
-        scenario, driver, (1, 2), explore=True, full=scenario.cavs == 3, simulation=simulation
+        scenario, driver, (1, 2), explore=True, record_details=scenario.cavs == 3, simulation=simulation
     )
     assert len(episode.trajectories) == scenario.cavs
     assert fingerprint(travelled(episode)) == fingerprint(episode)
@@ -70,7 +73,7 @@ def test_numbers_that_json_does_not_know_arrive() -> None:
         status="completed",
         speeds=np.array([[np.nan, np.inf, -0.0]]),
         limit_speed=float("inf"),
-        drawn={"length": float("nan")},
+        drawn_values={"length": float("nan")},
     )
     assert fingerprint(travelled(episode)) == fingerprint(episode)
 
@@ -79,21 +82,21 @@ def test_a_failed_episode_arrives_with_its_reason() -> None:
     episode = failed_episode((3, 4), "lost the map: 'Straße'\nline 2", "InputError")
     arrived = travelled(episode)
     assert fingerprint(arrived) == fingerprint(episode)
-    assert (arrived.status, arrived.ok, arrived.steps) == ("failed", False, 0)
+    assert (arrived.status, arrived.has_run, arrived.control_steps) == ("failed", False, 0)
     assert (arrived.seed, arrived.error) == ((3, 4), "InputError")
 
 
 def test_only_a_failed_episode_is_not_ok() -> None:
-    found = {status: Episode(seed=(0,), status=status).ok for status in ("completed", "collision", "failed")}
+    found = {status: Episode(seed=(0,), status=status).has_run for status in ("completed", "collision", "failed")}
     assert found == {"completed": True, "collision": True, "failed": False}
 
 
 def test_what_a_held_residual_earned_is_the_sum_over_its_decisions(simulation: Simulation) -> None:
-    driver = ResidualDriver(IDM(), random_network(), 1.0, hold=7)
+    driver = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=7)
     trajectory: Trajectory = run_episode(RING, driver, (0,), simulation=simulation).trajectories[0]
-    reward = trajectory.terms["speed"] + trajectory.terms["acceleration"]
+    reward = trajectory.reward_terms["speed"] + trajectory.reward_terms["acceleration"]
     np.testing.assert_array_equal(trajectory.reward, reward)
-    residuals, earned = trajectory.choices
+    residuals, earned = trajectory.actions_and_rewards
     assert len(residuals) == len(earned) == 9  # 8 whole holds and one of 4 decisions
     for look in range(9):
         held = slice(7 * look, 7 * (look + 1))

@@ -11,13 +11,13 @@ from hypothesis.extra import numpy as hnp
 
 from unjam.errors import InputError
 from unjam.worlds.reward import (
-    AFTER_CRASH,
-    LEAST_AFTER_CRASH,
+    CRASH_CLOSURE_STEPS,
+    MIN_CRASH_BACKLOG,
     REWARDS,
     Outcome,
     make_reward,
-    released,
-    time_headway,
+    released_reward,
+    time_gap,
 )
 
 
@@ -66,21 +66,18 @@ def total(terms: dict[str, Any]) -> Any:
 def test_released_gives_what_the_authors_code_gives(
     speeds: list[float], accelerations: list[float], expected: float
 ) -> None:
-    assert total(released(one(speeds, accelerations)))[0] == pytest.approx(expected, abs=1e-12)
+    assert total(released_reward(one(speeds, accelerations)))[0] == pytest.approx(expected, abs=1e-12)
 
 
 def test_released_gives_nothing_for_a_crash() -> None:
-    terms = released(one([3.0, 4.0], [0.7], crashed=True))
-    assert {name: values.tolist() for name, values in terms.items()} == {
-        "speed": [0.0],
-        "acceleration": [0.0],
-    }
+    terms = released_reward(one([3.0, 4.0], [0.7], crashed=True))
+    assert {name: values.tolist() for name, values in terms.items()} == {"speed": [0.0], "acceleration": [0.0]}
 
 
 @given(outcomes())
 def test_released_is_four_times_mean_speed_over_twenty_less_four_times_mean_effort(outcome: Outcome) -> None:
-    found = total(released(outcome))
-    for row, crashed in enumerate(outcome.crashed):
+    found = total(released_reward(outcome))
+    for row, crashed in enumerate(outcome.has_crashed):
         effort = [abs(push) for push in there(outcome.accelerations[row])]
         expected = 4.0 * mean(there(outcome.speeds[row])) / 20.0 - 4.0 * mean(effort)
         assert found[row] == pytest.approx(0.0 if crashed else expected, abs=1e-9)
@@ -91,11 +88,11 @@ def test_released_merge_is_one_less_the_distance_from_twenty_and_lacking_headway
     for numbers in (outcome, Outcome(*(torch.from_numpy(values) for values in outcome))):
         terms = REWARDS["released-merge"](numbers)
         assert set(terms) == {"speed", "headway", "floor"}
-        for row, crashed in enumerate(outcome.crashed):
+        for row, crashed in enumerate(outcome.has_crashed):
             speeds = there(outcome.speeds[row])
             missed = math.hypot(*(20.0 - speed for speed in speeds))
             wanted = math.hypot(*(20.0 for _ in speeds))
-            lacking = sum(min(time - 1.0, 0.0) for time in there(outcome.headways[row]))
+            lacking = sum(min(time - 1.0, 0.0) for time in there(outcome.time_gaps[row]))
             expected = max(1.0 - missed / wanted + 0.1 * lacking, 0.0) if speeds and not crashed else 0.0
             assert float(total(terms)[row]) == pytest.approx(expected, abs=1e-9)
             assert float(terms["headway"][row]) == pytest.approx(0.0 if crashed else 0.1 * lacking, abs=1e-9)
@@ -113,22 +110,18 @@ def test_released_merge_is_one_less_the_distance_from_twenty_and_lacking_headway
         ([np.nan, np.nan], [np.nan], False, 0.0),
     ],
 )
-def test_released_merge_by_hand(
-    speeds: list[float], headways: list[float], crashed: bool, expected: float
-) -> None:
-    outcome = Outcome(
-        np.array([speeds]), np.zeros((1, 1)), np.array([headways]), np.array([crashed]), np.zeros(1)
-    )
+def test_released_merge_by_hand(speeds: list[float], headways: list[float], crashed: bool, expected: float) -> None:
+    outcome = Outcome(np.array([speeds]), np.zeros((1, 1)), np.array([headways]), np.array([crashed]), np.zeros(1))
     assert total(REWARDS["released-merge"](outcome))[0] == pytest.approx(expected)
 
 
 @given(outcomes(), st.sampled_from(["eq16", "eq16-as-printed"]))
 def test_equation_16_term_by_term(outcome: Outcome, name: str) -> None:
     terms = REWARDS[name](outcome)
-    for row in range(len(outcome.crashed)):
+    for row in range(len(outcome.has_crashed)):
         average = mean(there(outcome.speeds[row]))
         speed = max(30.0 - abs(30.0 - average), 0.0) if name == "eq16" else max(30.0 - average, 0.0)
-        headway = -0.1 * sum(max(1.0 - time, 0.0) for time in there(outcome.headways[row]))
+        headway = -0.1 * sum(max(1.0 - time, 0.0) for time in there(outcome.time_gaps[row]))
         acceleration = -0.1 * sum(abs(push) for push in there(outcome.accelerations[row]))
         expected = {"speed": speed, "headway": headway, "acceleration": acceleration}
         assert {key: values[row] for key, values in terms.items()} == pytest.approx(expected, abs=1e-9)
@@ -143,13 +136,13 @@ def test_equation_16_pays_for_speed_and_as_printed_for_standing() -> None:
 @given(outcomes(), st.sampled_from(sorted(REWARDS)))
 def test_vehicles_that_are_not_on_the_road_are_left_out(outcome: Outcome, name: str) -> None:
     found = REWARDS[name](outcome)
-    for row in range(len(outcome.crashed)):
+    for row in range(len(outcome.has_crashed)):
         alone = Outcome(*(values[row : row + 1] for values in outcome))
         on_road = ~np.isnan(alone.accelerations[0])
         present = alone._replace(
             speeds=alone.speeds[:, ~np.isnan(alone.speeds[0])],
             accelerations=alone.accelerations[:, on_road],
-            headways=alone.headways[:, on_road],
+            headways=alone.time_gaps[:, on_road],
         )
         for term, values in REWARDS[name](present).items():
             assert values[0] == pytest.approx(found[term][row], abs=1e-12)
@@ -168,9 +161,9 @@ def test_tensors_earn_what_arrays_earn(outcome: Outcome, name: str) -> None:
 @given(outcomes())
 def test_travel_time_counts_who_is_there_and_who_waits(outcome: Outcome) -> None:
     found = REWARDS["travel-time"](outcome)["travel"]
-    for row, waiting in enumerate(outcome.waiting.tolist()):
+    for row, waiting in enumerate(outcome.backlog.tolist()):
         count = len(there(outcome.speeds[row])) + waiting
-        closed = AFTER_CRASH * max(count, LEAST_AFTER_CRASH) if outcome.crashed[row] else 0
+        closed = CRASH_CLOSURE_STEPS * max(count, MIN_CRASH_BACKLOG) if outcome.has_crashed[row] else 0
         assert found[row] == pytest.approx(-(count + closed) / 100.0)
 
 
@@ -178,7 +171,7 @@ def test_the_sooner_a_road_is_closed_by_a_crash_the_less_is_earned() -> None:
     coming = np.minimum(np.arange(2400), 150)  # one a decision enters, up to a jam of 150
     without = -coming.sum() / 100.0
     crashed = [
-        -coming[: end + 1].sum() / 100.0 - AFTER_CRASH * max(int(coming[end]), LEAST_AFTER_CRASH) / 100.0
+        -coming[: end + 1].sum() / 100.0 - CRASH_CLOSURE_STEPS * max(int(coming[end]), MIN_CRASH_BACKLOG) / 100.0
         for end in (10, 60, 90, 600, 2399)
     ]
     assert max(crashed) < without
@@ -188,7 +181,7 @@ def test_the_sooner_a_road_is_closed_by_a_crash_the_less_is_earned() -> None:
 def test_power_is_flow_times_mean_speed_in_units_of_thirty_vehicles_at_twenty(outcome: Outcome) -> None:
     for numbers in (outcome, Outcome(*(torch.from_numpy(values) for values in outcome))):
         terms = REWARDS["power"](numbers)
-        for row, crashed in enumerate(outcome.crashed):
+        for row, crashed in enumerate(outcome.has_crashed):
             speeds = there(outcome.speeds[row])
             expected = 0.0 if crashed else sum(speeds) / 600.0 * mean(speeds) / 20.0
             assert float(total(terms)[row]) == pytest.approx(expected, abs=1e-9)
@@ -196,8 +189,7 @@ def test_power_is_flow_times_mean_speed_in_units_of_thirty_vehicles_at_twenty(ou
 
 def test_power_prefers_free_flow_to_a_jam_of_the_same_flow_and_to_an_empty_road() -> None:
     free, jammed, empty = (
-        float(total(REWARDS["power"](one(speeds, [0.0])))[0])
-        for speeds in ([20.0] * 30, [10.0] * 60, [20.0] * 3)
+        float(total(REWARDS["power"](one(speeds, [0.0])))[0]) for speeds in ([20.0] * 30, [10.0] * 60, [20.0] * 3)
     )
     assert free == pytest.approx(1.0)
     assert jammed == pytest.approx(0.5)
@@ -206,14 +198,14 @@ def test_power_prefers_free_flow_to_a_jam_of_the_same_flow_and_to_an_empty_road(
 
 def test_a_headway_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> None:
     gaps, speeds = np.array([10.0, 10.0, 3.0, 0.0]), np.array([5.0, 0.0, 1e-12, 2.0])
-    np.testing.assert_allclose(time_headway(gaps, speeds), [2.0, 1e4, 3e3, 0.0])
-    found = time_headway(torch.from_numpy(gaps), torch.from_numpy(speeds))
+    np.testing.assert_allclose(time_gap(gaps, speeds), [2.0, 1e4, 3e3, 0.0])
+    found = time_gap(torch.from_numpy(gaps), torch.from_numpy(speeds))
     np.testing.assert_allclose(found.numpy(), [2.0, 1e4, 3e3, 0.0])
 
 
 def test_rewards_are_found_by_name() -> None:
     assert set(REWARDS) == {"released", "released-merge", "eq16", "eq16-as-printed", "power", "travel-time"}
-    assert make_reward("released") is released
+    assert make_reward("released") is released_reward
 
 
 def test_ones_own_reward_comes_from_a_file(my_drivers: Path) -> None:
@@ -225,10 +217,7 @@ def test_ones_own_reward_comes_from_a_file(my_drivers: Path) -> None:
         np.zeros(2),
     )
     terms = make_reward(f"{my_drivers}:calm")(outcome)
-    assert {name: values.tolist() for name, values in terms.items()} == {
-        "speed": [2.0, 3.0],
-        "push": [-2.0, -0.5],
-    }
+    assert {name: values.tolist() for name, values in terms.items()} == {"speed": [2.0, 3.0], "push": [-2.0, -0.5]}
 
 
 def test_a_reward_that_is_one_array_is_one_term(tmp_path: Path) -> None:

@@ -16,17 +16,17 @@ from tests.conftest import random_network
 from tests.worlds.sumo.own_roads import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
-from unjam.drivers.from_file import FileDriver
 from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.user_driver import FileDriver
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 SHORT = Ring(horizon=60)
 CRASHING = Ring(horizon=500, actuation="raw", safety=SafetyFilter(active=False))
 LONG = Ring(horizon=15_000)  # more than half a second: long enough to be disturbed
-RESIDUAL = ResidualDriver(PISaturation(), random_network(), 1.0, hold=3)
+RESIDUAL = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=3)
 
 DRIVERS = """
 import os, sys, time
@@ -92,8 +92,8 @@ def drivers(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def workers() -> Iterator[Workers]:
-    with Workers(1) as pool:
+def workers() -> Iterator[WorkerPool]:
+    with WorkerPool(1) as pool:
         yield pool
 
 
@@ -102,9 +102,9 @@ def undisturbed() -> list[Any]:
     return [fingerprint(run_episode(LONG, PISaturation(), (seed,))) for seed in range(2)]
 
 
-def processes(workers: Workers) -> list[int]:
+def processes(workers: WorkerPool) -> list[int]:
     """Process numbers of the workers that are running."""
-    running = [worker._process for worker in workers._all]
+    running = [worker._process for worker in workers._workers]
     return [process.pid for process in running if process is not None]
 
 
@@ -125,10 +125,10 @@ def has_ended(process: int) -> bool:
 def tasks_of_all_kinds(my_drivers: Path) -> list[EpisodeTask]:
     return [
         EpisodeTask(replace(SHORT, horizon=900), PISaturation(), (0,)),
-        EpisodeTask(SHORT, Human(), (1, 2), full=True),
+        EpisodeTask(SHORT, Human(), (1, 2), record_details=True),
         EpisodeTask(replace(SHORT, warmup=40, cavs=2), RESIDUAL, (2,), "eq16", explore=True),
         EpisodeTask(CRASHING, Constant(1.0), (3,)),
-        EpisodeTask(replace(SHORT, steps_per_decision=5), FileDriver(my_drivers, "gentle"), (4,)),
+        EpisodeTask(replace(SHORT, steps_per_control_step=5), FileDriver(my_drivers, "gentle"), (4,)),
         EpisodeTask(SHORT, FileDriver(my_drivers, "Keeper", {"gain": 0.2}), (5,), f"{my_drivers}:calm"),
     ]
 
@@ -138,10 +138,10 @@ def tasks_of_all_kinds(my_drivers: Path) -> list[EpisodeTask]:
 def test_any_number_of_workers_gives_the_bytes_of_this_process(count: int, my_drivers: Path) -> None:
     tasks = tasks_of_all_kinds(my_drivers)
     expected = [
-        run_episode(task.scenario, task.driver, task.seed, task.reward, task.explore, task.full)
+        run_episode(task.scenario, task.driver, task.seed, task.reward, task.explore, task.record_details)
         for task in tasks
     ]
-    with Workers(count) as workers:
+    with WorkerPool(count) as workers:
         first, again = workers.run(tasks), workers.run(tasks)
     for found in (first, again):
         assert [fingerprint(episode) for episode in found] == [fingerprint(episode) for episode in expected]
@@ -151,27 +151,27 @@ def test_any_number_of_workers_gives_the_bytes_of_this_process(count: int, my_dr
 def test_episodes_come_in_the_order_of_their_tasks_and_not_of_their_ends() -> None:
     horizons = [6000, 10, 3000, 20, 30, 1000, 40]
     tasks = [EpisodeTask(Ring(horizon=horizon), IDM(), (seed,)) for seed, horizon in enumerate(horizons)]
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         found = workers.run(tasks)
-    assert [(episode.steps, episode.seed) for episode in found] == [
+    assert [(episode.control_steps, episode.seed) for episode in found] == [
         (horizon, (seed,)) for seed, horizon in enumerate(horizons)
     ]
 
 
 def test_nothing_to_do_is_done_at_once() -> None:
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         assert workers.run([]) == []
         assert processes(workers) == []
 
 
 def test_one_task_after_the_other_starts_one_process() -> None:
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         for seed in range(2):
             workers.run([EpisodeTask(SHORT, IDM(), (seed,))])
         assert len(processes(workers)) == 1
 
 
-def test_a_worker_goes_on_with_the_next_task(workers: Workers) -> None:
+def test_a_worker_goes_on_with_the_next_task(workers: WorkerPool) -> None:
     workers.run([EpisodeTask(SHORT, IDM(), (0,))])
     first = processes(workers)
     workers.run([EpisodeTask(SHORT, IDM(), (seed,)) for seed in range(5)])
@@ -181,7 +181,7 @@ def test_a_worker_goes_on_with_the_next_task(workers: Workers) -> None:
 
 def test_progress_is_told_for_each_task() -> None:
     told: list[tuple[int, int]] = []
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         workers.run(
             [EpisodeTask(LONG, IDM(), (0,)), EpisodeTask(SHORT, IDM(), (1,))],
             lambda task, steps: told.append((task, steps)),
@@ -193,16 +193,13 @@ def test_progress_is_told_for_each_task() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     "how",
-    [
-        signal.SIGKILL,
-        *(pytest.param(other, marks=pytest.mark.slow) for other in (signal.SIGSEGV, signal.SIGSTOP)),
-    ],
+    [signal.SIGKILL, *(pytest.param(other, marks=pytest.mark.slow) for other in (signal.SIGSEGV, signal.SIGSTOP))],
 )
 def test_an_episode_whose_worker_is_lost_is_repeated_to_the_same_bytes(
     how: signal.Signals, undisturbed: list[Any]
 ) -> None:
     disturbed: list[int] = []
-    with Workers(1, silence=3.0) as workers:
+    with WorkerPool(1, timeout=3.0) as workers:
 
         def disturb(task: int, steps: int) -> None:
             if not disturbed and 0 < steps < LONG.horizon:
@@ -222,7 +219,7 @@ def test_an_episode_whose_worker_is_lost_is_repeated_to_the_same_bytes(
 def test_losing_worker_after_worker_changes_nothing(undisturbed: list[Any]) -> None:
     killed: list[int] = []
     one_at_a_time = threading.Lock()
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
 
         def kill_two(task: int, steps: int) -> None:
             with one_at_a_time:
@@ -235,7 +232,7 @@ def test_losing_worker_after_worker_changes_nothing(undisturbed: list[Any]) -> N
     assert [fingerprint(episode) for episode in found] == undisturbed
 
 
-def test_an_idle_worker_that_is_lost_is_replaced(workers: Workers) -> None:
+def test_an_idle_worker_that_is_lost_is_replaced(workers: WorkerPool) -> None:
     task = EpisodeTask(SHORT, IDM(), (0,))
     (expected,) = workers.run([task])
     (process,) = processes(workers)
@@ -248,7 +245,7 @@ def test_an_idle_worker_that_is_lost_is_replaced(workers: Workers) -> None:
 @pytest.mark.slow
 def test_a_worker_stopped_while_idle_is_noticed_also_by_a_task_larger_than_the_pipe() -> None:
     large = ResidualDriver(IDM(), random_network(size=200), 1.0)
-    with Workers(1, silence=3.0) as workers, ThreadPoolExecutor(1) as thread:
+    with WorkerPool(1, timeout=3.0) as workers, ThreadPoolExecutor(1) as thread:
         workers.run([EpisodeTask(SHORT, IDM(), (0,))])
         (process,) = processes(workers)
         os.kill(process, signal.SIGSTOP)
@@ -264,7 +261,7 @@ def test_a_worker_stopped_while_idle_is_noticed_also_by_a_task_larger_than_the_p
 def test_a_driver_that_always_kills_its_process_fails_alone_after_three_attempts(drivers: Path) -> None:
     good = [EpisodeTask(SHORT, IDM(), (seed,)) for seed in range(4)]
     bad = EpisodeTask(SHORT, FileDriver(drivers, "kills_its_process"), (7, 8))
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         first, second, failed, *rest = workers.run([*good[:2], bad, *good[2:]])
     assert (failed.status, failed.seed, failed.error) == ("failed", (7, 8), "EpisodeError")
     assert failed.reason == "3 workers were lost on it: killed by signal 9"
@@ -273,9 +270,7 @@ def test_a_driver_that_always_kills_its_process_fails_alone_after_three_attempts
 
 
 @pytest.mark.slow
-def test_as_many_workers_are_lost_as_attempts_are_allowed(
-    drivers: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_as_many_workers_are_lost_as_attempts_are_allowed(drivers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[subprocess.Popen[bytes]] = []
     popen: Any = subprocess.Popen
 
@@ -285,7 +280,7 @@ def test_as_many_workers_are_lost_as_attempts_are_allowed(
 
     monkeypatch.setattr(subprocess, "Popen", count)
     bad = EpisodeTask(SHORT, FileDriver(drivers, "kills_its_process"), (0,))
-    with Workers(1, attempts=2) as workers:
+    with WorkerPool(1, max_attempts=2) as workers:
         (failed,) = workers.run([bad])
         assert failed.reason.startswith("2 workers were lost on it")
         assert len(started) == 2
@@ -298,10 +293,8 @@ def test_as_many_workers_are_lost_as_attempts_are_allowed(
     ("name", "error", "words"),
     [("leaves", "InputError", "SystemExit: 5"), ("leaves_at_once", "EpisodeError", "ended with code 5")],
 )
-def test_a_driver_that_leaves_is_told_with_its_exit_code(
-    name: str, error: str, words: str, drivers: Path
-) -> None:
-    with Workers(1, attempts=1) as workers:
+def test_a_driver_that_leaves_is_told_with_its_exit_code(name: str, error: str, words: str, drivers: Path) -> None:
+    with WorkerPool(1, max_attempts=1) as workers:
         (failed,) = workers.run([EpisodeTask(SHORT, FileDriver(drivers, name), (0,))])
     assert (failed.status, failed.error) == ("failed", error)
     assert words in failed.reason
@@ -309,7 +302,7 @@ def test_a_driver_that_leaves_is_told_with_its_exit_code(
 
 def test_a_driver_that_hangs_is_ended(drivers: Path) -> None:
     hangs = FileDriver(drivers, "StaysBeforeItsFirstStep")
-    with Workers(1, silence=2.0, attempts=1) as workers:
+    with WorkerPool(1, timeout=2.0, max_attempts=1) as workers:
         (failed,) = workers.run([EpisodeTask(SHORT, hangs, (0,))])
         assert processes(workers) == []
     assert (failed.status, failed.error) == ("failed", "EpisodeError")
@@ -319,7 +312,7 @@ def test_a_driver_that_hangs_is_ended(drivers: Path) -> None:
 @pytest.mark.slow
 def test_a_driver_that_thinks_long_does_not_count_as_hung(drivers: Path) -> None:
     slow = EpisodeTask(replace(SHORT, horizon=110), FileDriver(drivers, "thinks_long"), (0,))
-    with Workers(1, silence=2.0, attempts=1) as workers:
+    with WorkerPool(1, timeout=2.0, max_attempts=1) as workers:
         workers.run([EpisodeTask(SHORT, IDM(), (0,))])  # so that no time goes into starting it
         (found,) = workers.run([slow])
     assert (found.status, found.reason) == ("completed", "")
@@ -334,7 +327,7 @@ def test_a_driver_that_thinks_long_does_not_count_as_hung(drivers: Path) -> None
     ],
 )
 def test_a_driver_that_fails_is_told_in_its_own_words_and_the_worker_goes_on(
-    name: str, error: str, words: str, my_drivers: Path, workers: Workers
+    name: str, error: str, words: str, my_drivers: Path, workers: WorkerPool
 ) -> None:
     good = EpisodeTask(SHORT, IDM(), (0,))
     (expected,) = workers.run([good])
@@ -347,9 +340,7 @@ def test_a_driver_that_fails_is_told_in_its_own_words_and_the_worker_goes_on(
     assert processes(workers) == process
 
 
-def test_an_end_of_file_in_the_users_code_is_not_the_end_of_the_worker(
-    drivers: Path, workers: Workers
-) -> None:
+def test_an_end_of_file_in_the_users_code_is_not_the_end_of_the_worker(drivers: Path, workers: WorkerPool) -> None:
     workers.run([EpisodeTask(SHORT, IDM(), (0,))])
     process = processes(workers)
     (failed,) = workers.run([EpisodeTask(SHORT, FileDriver(drivers, "ReadsAnEmptyFile"), (0,))])
@@ -358,7 +349,7 @@ def test_an_end_of_file_in_the_users_code_is_not_the_end_of_the_worker(
     assert processes(workers) == process
 
 
-def test_a_road_that_sumo_refuses_fails_in_sumos_words_and_the_worker_goes_on(workers: Workers) -> None:
+def test_a_road_that_sumo_refuses_fails_in_sumos_words_and_the_worker_goes_on(workers: WorkerPool) -> None:
     good = EpisodeTask(SHORT, IDM(), (0,))
     bad = EpisodeTask(replace(SHORT, emission_class="coal"), IDM(), (5,))
     _, failed, found = workers.run([good, bad, good])
@@ -381,24 +372,22 @@ def test_every_task_has_an_episode_whatever_happens(my_drivers: Path, drivers: P
             ]
         )
     ]
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         found = workers.run(tasks)
     assert [episode.seed for episode in found] == [task.seed for task in tasks]
-    assert [episode.ok for episode in found] == [False, True, False, False, True, False]
-    assert all(episode.reason for episode in found if not episode.ok)
+    assert [episode.has_run for episode in found] == [False, True, False, False, True, False]
+    assert all(episode.reason for episode in found if not episode.has_run)
 
 
-def test_what_a_driver_prints_does_not_disturb_the_answers(drivers: Path, workers: Workers) -> None:
-    talking, silent = workers.run(
-        [EpisodeTask(SHORT, FileDriver(drivers, name), (0,)) for name in ("talks", "steady")]
-    )
+def test_what_a_driver_prints_does_not_disturb_the_answers(drivers: Path, workers: WorkerPool) -> None:
+    talking, silent = workers.run([EpisodeTask(SHORT, FileDriver(drivers, name), (0,)) for name in ("talks", "steady")])
     assert talking.status == "completed"
     assert fingerprint(talking) == fingerprint(silent)
 
 
 def test_a_worker_whose_answer_cannot_be_read_counts_as_lost(drivers: Path) -> None:
     bad = EpisodeTask(SHORT, FileDriver(drivers, "writes_everywhere"), (0,))
-    with Workers(1, silence=3.0, attempts=1) as workers, ThreadPoolExecutor(1) as thread:
+    with WorkerPool(1, timeout=3.0, max_attempts=1) as workers, ThreadPoolExecutor(1) as thread:
         run = thread.submit(workers.run, [bad])
         try:
             (failed,) = run.result(timeout=20.0)
@@ -413,12 +402,12 @@ def test_a_driver_that_cannot_travel_is_refused_with_the_way_out() -> None:
         def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
             return state.speed * 0.0, memory
 
-    with Workers(1) as workers, pytest.raises(InputError, match=r"'Mine' is not allowed.*path\.py:name"):
+    with WorkerPool(1) as workers, pytest.raises(InputError, match=r"'Mine' is not allowed.*path\.py:name"):
         workers.run([EpisodeTask(SHORT, Mine(), (0,))])
 
 
 def test_closing_leaves_no_process_and_may_be_done_twice() -> None:
-    workers = Workers(2)
+    workers = WorkerPool(2)
     workers.run([EpisodeTask(Ring(horizon=2000), IDM(), (seed,)) for seed in range(4)])
     running = processes(workers)
     assert len(running) == 2
@@ -429,7 +418,7 @@ def test_closing_leaves_no_process_and_may_be_done_twice() -> None:
 
 
 def test_workers_that_were_never_used_can_be_closed() -> None:
-    workers = Workers(3)
+    workers = WorkerPool(3)
     workers.close()
     workers.close()
 
@@ -438,7 +427,7 @@ def test_an_error_inside_the_block_leaves_no_process() -> None:
     running: list[int] = []
 
     def fail() -> None:
-        with Workers(1) as workers:
+        with WorkerPool(1) as workers:
             workers.run([EpisodeTask(SHORT, IDM(), (0,))])
             running.extend(processes(workers))
             raise ZeroDivisionError
@@ -449,7 +438,7 @@ def test_an_error_inside_the_block_leaves_no_process() -> None:
     assert not is_running(running[0])
 
 
-def when_running(workers: Workers, then: Callable[[], None]) -> tuple[threading.Thread, list[Any]]:
+def when_running(workers: WorkerPool, then: Callable[[], None]) -> tuple[threading.Thread, list[Any]]:
     """Run long episodes in a thread, and do something once they run."""
     found: list[Any] = []
     runs = threading.Event()
@@ -469,7 +458,7 @@ def when_running(workers: Workers, then: Callable[[], None]) -> tuple[threading.
 
 
 def test_closing_while_episodes_run_ends_them_and_leaves_no_process() -> None:
-    workers = Workers(2)
+    workers = WorkerPool(2)
     running: list[int] = []
 
     def close() -> None:
@@ -497,7 +486,7 @@ def test_closing_while_a_worker_starts_leaves_no_process(monkeypatch: pytest.Mon
         return started[-1]
 
     monkeypatch.setattr(subprocess, "Popen", start_slowly)
-    workers = Workers(1)
+    workers = WorkerPool(1)
     thread = threading.Thread(target=workers.run, args=([EpisodeTask(SHORT, IDM(), (0,))],), daemon=True)
     thread.start()
     assert starts.wait(20.0)
@@ -514,7 +503,7 @@ def test_closing_while_a_worker_starts_leaves_no_process(monkeypatch: pytest.Mon
 
 def test_an_error_in_the_progress_report_ends_the_run_and_leaves_no_process() -> None:
     running: list[int] = []
-    workers = Workers(2)
+    workers = WorkerPool(2)
 
     def fail(task: int, steps: int) -> None:
         running.extend(processes(workers))
@@ -531,8 +520,8 @@ def test_workers_end_when_the_process_that_wants_them_is_gone() -> None:
         "import os, signal\n"
         "from unjam.drivers import IDM\n"
         "from unjam.scenarios import Ring\n"
-        "from unjam.worlds.workers import EpisodeTask, Workers\n"
-        "workers = Workers(1)\n"
+        "from unjam.worlds.worker_pool import EpisodeTask, Workers\n"
+        "workers = WorkerPool(1)\n"
         "workers.run([EpisodeTask(Ring(horizon=10), IDM(), (0,))])\n"
         "print(workers._all[0]._process.pid, flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
@@ -552,21 +541,19 @@ def test_a_worker_imports_no_torch() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_a_residual_driver_runs_without_torch(drivers: Path, workers: Workers) -> None:
+def test_a_residual_driver_runs_without_torch(drivers: Path, workers: WorkerPool) -> None:
     expert = FileDriver(drivers, "finds_torch")
     driver = ResidualDriver(expert, random_network(), 1.0)
     (episode,) = workers.run([EpisodeTask(SHORT, driver, (0,), explore=True)])
-    assert set(episode.trajectories[0].expert) == {-0.5}
+    assert set(episode.trajectories[0].expert_acceleration) == {-0.5}
 
 
-def test_on_a_network_of_the_users_own_a_worker_may_not_fill_the_machine(
-    drivers: Path, tmp_path: Path
-) -> None:
+def test_on_a_network_of_the_users_own_a_worker_may_not_fill_the_machine(drivers: Path, tmp_path: Path) -> None:
     path = straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
     road = make_scenario(str(path), {"cav_types": ["car"], "horizon": 5})
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         free, limited = workers.run(
             [EpisodeTask(scenario, FileDriver(drivers, "is_limited"), (0,)) for scenario in (SHORT, road)]
         )
-    assert set(free.trajectories[0].applied) == {-0.5}
-    assert set(limited.trajectories[0].applied) == {0.5}
+    assert set(free.trajectories[0].applied_acceleration) == {-0.5}
+    assert set(limited.trajectories[0].applied_acceleration) == {0.5}

@@ -15,21 +15,21 @@ from unjam.cli.options import (
     ScenarioSettingsOption,
     SeedOption,
     WorkersOption,
-    assignments,
+    merge_settings,
+    network_changes,
     new_folder,
-    people_changes,
+    parse_settings,
     scenario_changes,
-    together,
     with_options,
 )
 from unjam.cli.output import (
-    after_drive,
-    aside,
     console,
-    counting_steps,
+    err_console,
     print_json,
     print_metrics,
     print_notes,
+    report_steps,
+    suggest_after_drive,
 )
 from unjam.errors import InputError, MissingPartError
 from unjam.processes import has_display
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from unjam.drivers.driver import Driver
     from unjam.scenarios.scenario import Scenario
     from unjam.worlds.record import Episode
-from unjam.errors import wrong
+from unjam.errors import invalid_value
 
 
 @with_options(changes=scenario_changes)
-def drive(
+def drive_command(
     *,
     scenario: ScenarioArgument,
     driver: Annotated[
@@ -58,7 +58,7 @@ def drive(
     ] = None,
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Number of episodes.")] = 5,
     seed: SeedOption = 0,
-    held_out: Annotated[
+    test_seeds: Annotated[
         bool, typer.Option("--held-out", help="On the seeds that judge trainings, instead of --seed.")
     ] = False,
     changes: dict[str, Any],
@@ -87,47 +87,46 @@ def drive(
 
       unjam drive ring -d pi -d runs/ring-001 --held-out --episodes 20
     """
-    from unjam.controller import BEST
-    from unjam.measures.effect import beside_people
+    from unjam.controller import DEFAULT_DRIVER
+    from unjam.measures.effect import effects_by_driver
     from unjam.scenarios import make_scenario
-    from unjam.scenarios.own_network import WITH_OWN_ACC
+    from unjam.scenarios.user_network import ACC_SETTINGS
     from unjam.training.evaluate import drive as run
     from unjam.training.evaluate import raise_failures
 
-    changes = together(changes, assignments(settings))
+    changes = merge_settings(changes, parse_settings(settings))
     if out is not None and not report:
         raise InputError("out: it is not allowed with --no-report, which writes nothing")
     if not driver:
-        driver = ["human", BEST]
-        changes = (WITH_OWN_ACC if scenario.endswith(".sumocfg") else {}) | changes
+        driver = ["human", DEFAULT_DRIVER]
+        changes = (ACC_SETTINGS if scenario.endswith(".sumocfg") else {}) | changes
     total = make_scenario(scenario, changes).horizon * episodes * len(driver)
     folder = new_folder(out, f"drive-{Path(scenario).stem}") if report else None
-    with counting_steps(f"driving {Path(scenario).name}", total) as steps:
-        result = run(scenario, driver, episodes, seed, changes, reward, workers, folder, steps, held_out)
+    with report_steps(f"driving {Path(scenario).name}", total) as steps:
+        result = run(scenario, driver, episodes, seed, changes, reward, workers, folder, steps, test_seeds)
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
         print_metrics(result.rows)
-        for label, effect in beside_people(result.rows).items():
+        for label, effect in effects_by_driver(result.rows).items():
             if (count := effect.flow.count) == 0:
                 continue
             seeds = f"{count} paired seed{'' if count == 1 else 's'}"
-            words = f"{label} beside people alone, {seeds}: {effect.words}"
+            words = f"{label} beside people alone, {seeds}: {effect.summary}"
             console.print(words, soft_wrap=True)
         print_notes(result.notes)
         if result.report is not None:
-            aside.print(f"report: {result.report}")
-        after_drive(scenario, driver, changes, reward)
+            err_console.print(f"report: {result.report}")
+        suggest_after_drive(scenario, driver, changes, reward)
     raise_failures(result)
 
 
 @with_options(changes=scenario_changes)
-def watch(
+def watch_command(
     *,
     scenario: ScenarioArgument,
     drivers: Annotated[
-        list[str],
-        typer.Option("--driver", "-d", help="One, as in drive; a run folder shows its trained controller."),
+        list[str], typer.Option("--driver", "-d", help="One, as in drive; a run folder shows its trained controller.")
     ],
     seed: SeedOption = 0,
     video: Annotated[
@@ -147,33 +146,33 @@ def watch(
       unjam watch ring-jammed --driver runs/ring-001 --video wave.mp4
     """
     from unjam.controller import make_driver
-    from unjam.controller.domain import notes_on_controllers
-    from unjam.files import check_folder
+    from unjam.controller.domain import controller_notes
+    from unjam.files import check_parent_folder
     from unjam.measures.metrics import measure
-    from unjam.measures.notes import notes_of_rows
-    from unjam.reports.film import check_format, write_video
+    from unjam.measures.notes import episode_notes
+    from unjam.reports.video import check_video_format, write_video
     from unjam.scenarios import make_scenario, scenario_recipe
     from unjam.training.evaluate import raise_failure
-    from unjam.worlds.workers import EpisodeTask, Workers
+    from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
     if len(drivers) > 1:
-        raise wrong("driver", ", ".join(drivers), "one")
+        raise invalid_value("driver", ", ".join(drivers), "one")
     (driver,) = drivers
-    road = make_scenario(scenario, together(changes, assignments(settings)))
-    driven = make_driver(driver, road.decision_step)
-    print_notes(notes_on_controllers(scenario_recipe(road), [driver], {}))
+    road = make_scenario(scenario, merge_settings(changes, parse_settings(settings)))
+    driven = make_driver(driver, road.control_step)
+    print_notes(controller_notes(scenario_recipe(road), [driver], {}))
     if video is None:
         episode = watch_in_window(road, driven, (seed,), pace)
     else:
-        check_format(video)
-        check_folder(video)
-        aside.print("driving")
-        with Workers(1) as workers:
-            episode = workers.run([EpisodeTask(road, driven, (seed,), full=True)])[0]
+        check_video_format(video)
+        check_parent_folder(video)
+        err_console.print("driving")
+        with WorkerPool(1) as workers:
+            episode = workers.run([EpisodeTask(road, driven, (seed,), record_details=True)])[0]
     row = measure(episode)
-    print_notes(notes_of_rows({driver: [row]}))
-    if episode.ok and video is not None:
-        aside.print("drawing")
+    print_notes(episode_notes({driver: [row]}))
+    if episode.has_run and video is not None:
+        err_console.print("drawing")
         write_video(episode, video, driver, pace)
     if json:
         film = str(video) if video else None
@@ -193,17 +192,15 @@ def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int],
     from unjam.worlds.sumo.simulation import Simulation
 
     if not has_display():
-        raise MissingPartError(
-            "watch: no display; write a film: --video FILE, or use xvfb-run unjam watch ..."
-        )
+        raise MissingPartError("watch: no display; write a film: --video FILE, or use xvfb-run unjam watch ...")
     delay = 1000.0 / pace  # [ms] for a second of simulation, however many steps it has
     options = ("--start", "true", "--quit-on-end", "true", "--delay", str(delay))
     with Simulation("gui", gui_options=options) as window:
         return run_episode(scenario, driver, seed, simulation=window)
 
 
-@with_options(changes=people_changes)
-def assess(
+@with_options(changes=network_changes)
+def assess_command(
     *,
     scenario: Annotated[str, typer.Argument(help="Your own .sumocfg file.", metavar="FILE")],
     driver: Annotated[
@@ -215,7 +212,7 @@ def assess(
             show_default="unjam:best, follower-stopper, pi",
         ),
     ] = None,
-    shares: Annotated[
+    penetration_rates: Annotated[
         str, typer.Option(help="Penetration rates among the vehicles of --cav-classes.")
     ] = "0.02,0.05,0.1,0.2",
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Episodes in all, at most.")] = 400,
@@ -248,32 +245,32 @@ def assess(
 
       unjam assess my.sumocfg -d runs/my-001 --shares 0.1 --begin 28800 --end 32400 --json
     """
-    from unjam.training.assess import DRIVERS_OF_OPEN_ROADS, question
+    from unjam.training.assess import DEFAULT_CONTROLLERS, make_request
     from unjam.training.assess import assess as run
-    from unjam.training.folder import new_and_owned
-    from unjam.worlds.workers import Workers
+    from unjam.training.run_folder import lock_new_folder
+    from unjam.worlds.worker_pool import WorkerPool
 
-    drivers, changes = driver or DRIVERS_OF_OPEN_ROADS, together(changes, assignments(settings))
-    asked = question(scenario, _shares(shares), episodes, precision, minutes, drivers, changes)
+    drivers, changes = driver or DEFAULT_CONTROLLERS, merge_settings(changes, parse_settings(settings))
+    asked = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)
     folder = new_folder(out, f"assess-{Path(scenario).stem}")
-    total = asked.road.horizon * episodes
-    counting = counting_steps("assessing, at most", total)
-    with new_and_owned(folder), counting as steps, Workers(workers) as pool:
-        found = run(asked, folder, pool, steps, (lambda line: None) if json else aside.print)
+    total = asked.network.horizon * episodes
+    counting = report_steps("assessing, at most", total)
+    with lock_new_folder(folder), counting as steps, WorkerPool(workers) as pool:
+        found = run(asked, folder, pool, steps, (lambda line: None) if json else err_console.print)
     if json:
         print_json({**found.document, "folder": str(folder), "report": str(found.page)})
         return
     console.print(found.document["headline"], soft_wrap=True, markup=False)
-    for each in (*found.judged, *found.acc):
-        console.print(f"- {each.words}", soft_wrap=True, markup=False)
+    for each in (*found.controller_results, *found.acc_results):
+        console.print(f"- {each.summary}", soft_wrap=True, markup=False)
     for note in found.document["notes"]:
-        aside.print(note, soft_wrap=True, markup=False)
-    aside.print(f"report: {found.page}", soft_wrap=True, markup=False)
+        err_console.print(note, soft_wrap=True, markup=False)
+    err_console.print(f"report: {found.page}", soft_wrap=True, markup=False)
 
 
-def _shares(text: str) -> list[float]:
+def _parse_rates(text: str) -> list[float]:
     """Return the numbers of a list like 0.02,0.1."""
     try:
         return [float(word) for word in text.split(",")]
     except ValueError:
-        raise wrong("shares", text, "numbers from 0 to 1, like 0.02,0.1") from None
+        raise invalid_value("shares", text, "numbers from 0 to 1, like 0.02,0.1") from None

@@ -11,21 +11,18 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from unjam.errors import InputError, wrong, wrong_name
-from unjam.files import SHIPPED
-from unjam.learners.settings import AGENTS
+from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.files import PACKAGED_PREFIX
+from unjam.learners.settings import AGENT_NAMES
 from unjam.parameters import parse_assignments
 from unjam.training.executors import EXECUTORS, Executor
-from unjam.trust import FLAG, trusting_code
+from unjam.trust import TRUST_CODE_OPTION, trusting_code
 
 ScenarioArgument = Annotated[
     str, typer.Argument(help="A scenario's name (`unjam scenarios` lists them), or your own .sumocfg file.")
 ]
 RewardOption = Annotated[
-    str,
-    typer.Option(
-        "--reward", help="Reward by name, or your own: path.py:name.", show_default="the scenario's"
-    ),
+    str, typer.Option("--reward", help="Reward by name, or your own: path.py:name.", show_default="the scenario's")
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed.")]
 ScenarioSettingsOption = Annotated[
@@ -34,7 +31,7 @@ ScenarioSettingsOption = Annotated[
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=1, help="Worker processes; the result does not depend on it.")
 ]
-TrainingsOption = Annotated[int, typer.Option("--workers", min=1, help="Trainings at once.")]
+TrainingWorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Trainings at once.")]
 ExecutorOption = Annotated[str, typer.Option(help="local, or ray: a cluster that shares the folder.")]
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder for the results.", show_default="a new one under runs/")
@@ -43,8 +40,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON documen
 HumansOption = Annotated[
     str | None,
     typer.Option(
-        "--humans",
-        help="The people on the road: a file of `unjam fit-drivers`, unjam:ngsim or unjam:astazero.",
+        "--humans", help="The people on the road: a file of `unjam fit-drivers`, unjam:ngsim or unjam:astazero."
     ),
 ]
 CavClassesOption = Annotated[
@@ -68,53 +64,49 @@ def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]]
     """
     members = {name: inspect.signature(group).parameters for name, group in groups.items()}
 
-    def give(verb: Callable[..., None]) -> Callable[..., None]:
-        @wraps(verb)
-        def called(**given: Any) -> None:
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @wraps(command)
+        def wrapper(**arguments: Any) -> None:
             for name, group in groups.items():
-                given[name] = group(**{option: given.pop(option) for option in members[name]})
-            verb(**given)
+                arguments[name] = group(**{option: arguments.pop(option) for option in members[name]})
+            command(**arguments)
 
         options = [
             option.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for name, parameter in inspect.signature(verb).parameters.items()
+            for name, parameter in inspect.signature(command).parameters.items()
             for option in members.get(name, {name: parameter}).values()
         ]
-        called.__signature__ = inspect.Signature(options)  # pyright: ignore[reportAttributeAccessIssue]
-        return called
+        wrapper.__signature__ = inspect.Signature(options)  # pyright: ignore[reportAttributeAccessIssue]
+        return wrapper
 
-    return give
+    return decorate
 
 
-def with_trust(verb: Callable[..., None]) -> Callable[..., None]:
+def with_trust_option(command: Callable[..., None]) -> Callable[..., None]:
     """Give a verb the option with which it runs the Python code that folders of others name."""
-    option = Annotated[bool, typer.Option(FLAG, help="Run Python code that a folder names.")]
-    signature = inspect.signature(verb)
+    option = Annotated[bool, typer.Option(TRUST_CODE_OPTION, help="Run Python code that a folder names.")]
+    signature = inspect.signature(command)
     added = inspect.Parameter("trust_code", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
 
-    @wraps(verb)
-    def called(*, trust_code: bool, **given: Any) -> None:
+    @wraps(command)
+    def wrapper(*, trust_code: bool, **arguments: Any) -> None:
         with trusting_code() if trust_code else nullcontext():
-            verb(**given)
+            command(**arguments)
 
     parameters = [*signature.parameters.values(), added]
-    called.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]
-    return called
+    wrapper.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]
+    return wrapper
 
 
 def scenario_changes(
-    length: Annotated[
-        str | None, typer.Option(help="Length of the ring [m]: one, or a range like 220-270.")
-    ] = None,
+    length: Annotated[str | None, typer.Option(help="Length of the ring [m]: one, or a range like 220-270.")] = None,
     radius: Annotated[
         str | None, typer.Option(help="Radius of the figure eight [m]: one, or a range like 32-35.")
     ] = None,
     vehicles: Annotated[int | None, typer.Option(help="Number of vehicles.")] = None,
     cavs: Annotated[int | None, typer.Option(help="Number of CAVs among them.")] = None,
-    warmup: Annotated[
-        int | None, typer.Option(help="All-human simulation steps before the CAVs take over.")
-    ] = None,
-    cav_share: Annotated[float | None, typer.Option(help="Share of CAVs, on roads with ends.")] = None,
+    warmup: Annotated[int | None, typer.Option(help="All-human simulation steps before the CAVs take over.")] = None,
+    penetration_rate: Annotated[float | None, typer.Option(help="Share of CAVs, on roads with ends.")] = None,
     cav_types: Annotated[
         str | None, typer.Option(help="Vehicle types that are CAVs, on your own network: car,truck.")
     ] = None,
@@ -130,70 +122,63 @@ def scenario_changes(
         "vehicles": vehicles,
         "cavs": cavs,
         "warmup": warmup,
-        "cav_share": cav_share,
+        "penetration_rate": penetration_rate,
         "cav_types": cav_types.split(",") if cav_types else None,
     }
     return {
         **{name: value for name, value in asked.items() if value is not None},
-        **people_changes(cav_classes, begin, end, humans),
+        **network_changes(cav_classes, begin, end, humans),
     }
 
 
-def people_changes(
-    cav_classes: CavClassesOption = None,
-    begin: BeginOption = None,
-    end: EndOption = None,
-    humans: HumansOption = None,
+def network_changes(
+    cav_classes: CavClassesOption = None, begin: BeginOption = None, end: EndOption = None, humans: HumansOption = None
 ) -> dict[str, Any]:
     """Return the changes to a network of the user's own: eligible vehicles, time, human drivers."""
-    file = humans if humans is None or humans.startswith(SHIPPED) else str(Path(humans).absolute())
+    file = humans if humans is None or humans.startswith(PACKAGED_PREFIX) else str(Path(humans).absolute())
     classes = cav_classes.split(",") if cav_classes else None
     asked = {"cav_classes": classes, "begin": begin, "end": end, "population": file}
     return {name: value for name, value in asked.items() if value is not None}
 
 
-class AskedRun(NamedTuple):
+class TrainingOptions(NamedTuple):
     """What the options of a training ask for."""
 
     preset: str
-    file: Path | None
-    flags: dict[str, Any]
+    config: Path | None
+    options: dict[str, Any]
     """keys of the configuration that have an option of their own, where it was given"""
     settings: dict[str, Any]
     """what `--set` says"""
 
 
-def asked_run(
+def training_options(
     scenario: Annotated[
         str | None, typer.Argument(help="Name of the scenario; the configuration's if left out.")
     ] = None,
     preset: Annotated[
         str,
-        typer.Option(
-            help="Where to start: demo, quick, best, rings, shared-rings, everywhere, paper, paper-exact."
-        ),
+        typer.Option(help="Where to start: demo, quick, best, rings, shared-rings, everywhere, paper, paper-exact."),
     ] = "",
     config: Annotated[Path | None, typer.Option(help="TOML file with any keys of the configuration.")] = None,
     settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995."),
+        list[str] | None, typer.Option("--set", help="Any key of the configuration: key=value, trpo.gamma=0.995.")
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Actual simulator steps to train for.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
-    agent: Annotated[str | None, typer.Option(help=f"Learner: {', '.join(AGENTS)}.")] = None,
+    agent: Annotated[str | None, typer.Option(help=f"Learner: {', '.join(AGENT_NAMES)}.")] = None,
     expert: Annotated[
-        str | None,
-        typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert."),
+        str | None, typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert.")
     ] = None,
     reward: RewardOption = "",
-) -> AskedRun:
+) -> TrainingOptions:
     """Return what the options of a training ask for."""
     flags = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
     given = {key: value for key, value in {**flags, "reward": reward or None}.items() if value is not None}
-    return AskedRun(preset, config, given, assignments(settings))
+    return TrainingOptions(preset, config, given, parse_settings(settings))
 
 
-LONGEST_NUMBER = 10
+MAX_NUMBER_DIGITS = 10
 """digits that a length or radius may have"""
 
 
@@ -202,13 +187,13 @@ def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     parts = text.split("-")
-    if len(parts) > 2 or not all(part.strip().isdecimal() and len(part) < LONGEST_NUMBER for part in parts):
-        raise wrong(name, text, "metres, like 230 or 220-270")
+    if len(parts) > 2 or not all(part.strip().isdecimal() and len(part) < MAX_NUMBER_DIGITS for part in parts):
+        raise invalid_value(name, text, "metres, like 230 or 220-270")
     return int(parts[0]), int(parts[-1])
 
 
-def assignments(texts: list[str] | None, option: str = "--set") -> dict[str, Any]:
-    """Return what options like `--set key=value` say; `option` is named where one is wrong."""
+def parse_settings(texts: list[str] | None, option: str = "--set") -> dict[str, Any]:
+    """Return what options like `--set key=value` say; `traffic_option` is named where one is wrong."""
     return parse_assignments(texts or [], option)
 
 
@@ -221,14 +206,14 @@ def new_folder(out: Path | None, name: str) -> Path:
     return next(folder for folder in folders if not os.path.lexists(folder))
 
 
-def executor_named(name: str) -> Executor:
+def find_executor(name: str) -> Executor:
     """Return where trainings run; raise `InputError` where there is no such executor."""
     if name not in EXECUTORS:
-        raise wrong_name("executor", name, EXECUTORS)
+        raise unknown_name("executor", name, EXECUTORS)
     return name
 
 
-def together(options: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
+def merge_settings(options: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
     """Return what options and `--set` ask for; raise `InputError` where both ask for the same."""
     if twice := options.keys() & settings.keys():
         raise InputError(f"--set {min(twice)}: it is not allowed beside the option for it")

@@ -8,22 +8,22 @@ from typing import Annotated, Any
 import typer
 
 from unjam.cli.options import JsonOption
-from unjam.cli.output import aside, console, new_table, print_json, say_next
+from unjam.cli.output import console, err_console, new_table, print_json, print_next_command
 from unjam.errors import InputError
 
-UnderOption = Annotated[Path, typer.Option("--under", help="The folder that holds the runs.")]
-NamesArgument = Annotated[
+RunsFolderOption = Annotated[Path, typer.Option("--under", help="The folder that holds the runs.")]
+RunNamesArgument = Annotated[
     list[str], typer.Argument(help="Names of runs, as listed, or their folders.", metavar="NAME...")
 ]
-RUNS = Path("runs")
+DEFAULT_RUNS_FOLDER = Path("runs")
 
-runs = typer.Typer(name="runs", rich_markup_mode="markdown")
+runs_app = typer.Typer(name="runs", rich_markup_mode="markdown")
 
 
-@runs.callback(invoke_without_command=True)
-def list_them(
+@runs_app.callback(invoke_without_command=True)
+def list_runs_command(
     context: typer.Context,
-    under: UnderOption = RUNS,
+    folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     scenario: Annotated[str, typer.Option(help="Only those that train on this scenario.")] = "",
     json: JsonOption = False,
 ) -> None:
@@ -42,50 +42,52 @@ def list_them(
       unjam runs remove ring-001
     """
     if context.invoked_subcommand is not None:
-        if under != RUNS or scenario or json:
+        if folder != DEFAULT_RUNS_FOLDER or scenario or json:
             allowed = f"behind it, as in unjam runs {context.invoked_subcommand} --under studies"
             raise InputError(f"runs: options are not allowed before the command; allowed: {allowed}")
         return
     from unjam.training.runs import list_runs
 
-    found = list_runs(under, scenario) if under != RUNS or under.is_dir() else []
+    found = list_runs(folder, scenario) if folder != DEFAULT_RUNS_FOLDER or folder.is_dir() else []
     if json:
         print_json([run.document() for run in found])
         return
     if not found:
         of = f" of {scenario}" if scenario else ""
-        aside.print(f"no runs{of} in {under}; begin one: unjam train ring --preset demo")
+        err_console.print(f"no runs{of} in {folder}; begin one: unjam train ring --preset demo")
         return
     table = new_table(("run", "scenario", "preset", "state"), ("steps", "beyond the expert"))
     for run in found:
         steps = f"{run.steps:,}" if run.state == "finished" else f"{run.steps:,} of {run.config.steps:,}"
-        for number, (road, config) in enumerate(run.config.roads().items()):
+        for number, (road, config) in enumerate(run.config.task_configs().items()):
             about = ("", "", "") if number else (run.config.preset or "–", run.state, steps)
             name = f"  {road}" if number else run.name
-            table.add_row(name, Path(config.scenario).name, *about, _gain_words(run.gains[road]))
+            table.add_row(name, Path(config.scenario).name, *about, _gain_text(run.gains[road]))
     console.print(table)
 
 
-def _gain_words(gain: Any) -> str:
-    from unjam.measures.statistics import signed
+def _gain_text(gain: Any) -> str:
+    from unjam.measures.statistics import format_difference
 
-    return signed(gain) if gain else "–"
+    return format_difference(gain) if gain else "–"
 
 
-@runs.command()
-def compare(names: NamesArgument, under: UnderOption = RUNS, json: JsonOption = False) -> None:
+@runs_app.command()
+def compare_command(
+    names: RunNamesArgument, folder: RunsFolderOption = DEFAULT_RUNS_FOLDER, json: JsonOption = False
+) -> None:
     """Compare runs: what each reached, and the settings in which they differ.
 
     Example:
 
       unjam runs compare ring-001 ring-002
     """
-    from unjam.training.runs import differences
+    from unjam.training.runs import config_differences
 
     if len(names) < 2:
         raise InputError("compare: one run is not allowed; allowed: two or more")
-    found = _read(names, under)
-    settings = differences(found)
+    found = _find_runs(names, folder)
+    settings = config_differences(found)
     if json:
         print_json({"runs": [run.document() for run in found], "settings": settings})
         return
@@ -95,19 +97,19 @@ def compare(names: NamesArgument, under: UnderOption = RUNS, json: JsonOption = 
     roads = dict.fromkeys(road for run in found for road in run.gains)
     for road in roads:
         label = f"beyond the expert, {road}" if road else "beyond the expert"
-        table.add_row(label, *(_gain_words(run.gains.get(road)) for run in found))
+        table.add_row(label, *(_gain_text(run.gains.get(road)) for run in found))
     for name, values in settings.items():
         table.add_row(name, *("–" if value is None else str(value) for value in values))
     console.print(table)
     if not settings:
         console.print("their settings are the same")
-    say_next("on one page", "report", *(run.folder for run in found), "--out", "compared.html")
+    print_next_command("on one page", "report", *(run.folder for run in found), "--out", "compared.html")
 
 
-@runs.command()
-def progress(
+@runs_app.command()
+def progress_command(
     name: Annotated[str, typer.Argument(help="Name of a run, as listed, or its folder.")],
-    under: UnderOption = RUNS,
+    folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     json: JsonOption = False,
 ) -> None:
     """Print a run's progress as CSV: a row per iteration; names of what is within others have dots.
@@ -120,7 +122,7 @@ def progress(
 
     from unjam.reports.results import read_progress
 
-    (run,) = _read([name], under)
+    (run,) = _find_runs([name], folder)
     rows = read_progress(run.folder)
     if json:
         print_json(rows)
@@ -128,10 +130,10 @@ def progress(
         pd.json_normalize(rows).to_csv(sys.stdout, index=False)
 
 
-@runs.command()
-def remove(
-    names: NamesArgument,
-    under: UnderOption = RUNS,
+@runs_app.command()
+def remove_command(
+    names: RunNamesArgument,
+    folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -145,7 +147,7 @@ def remove(
     """
     from unjam.training.runs import remove_run
 
-    found = _read(names, under)
+    found = _find_runs(names, folder)
     for run in found:
         if run.state == "running":
             raise InputError(f"run: {str(run.folder)!r} is being trained; allowed: runs that have ended")
@@ -156,13 +158,13 @@ def remove(
         question = f"Remove {run.folder} ({run.state}, {run.steps:,} steps, {size:.0f} MB)?"
         if yes or typer.confirm(question):
             remove_run(run.folder)
-            aside.print(f"removed {run.folder}")
+            err_console.print(f"removed {run.folder}")
     if json:
         print_json({"removed": [str(run.folder) for run in found]})
 
 
-def _read(names: Sequence[str], under: Path) -> list[Any]:
+def _find_runs(names: Sequence[str], folder: Path) -> list[Any]:
     from unjam.training.runs import find_run, read_run
 
-    found = (read_run(find_run(name, under), name) for name in names)
+    found = (read_run(find_run(name, folder), name) for name in names)
     return list({run.folder.resolve(): run for run in found}.values())

@@ -1,4 +1,4 @@
-"""Who made a controller: `unjam keys` makes a pair of keys, `sign` signs with the private one."""
+"""Who made a controller: `unjam keys` makes a pair of keys, `sign_command` signs with the private one."""
 
 import os
 from pathlib import Path
@@ -7,13 +7,12 @@ from typing import Annotated
 import typer
 
 from unjam.cli.options import JsonOption
-from unjam.cli.output import aside, console, print_json
-from unjam.errors import wrong
+from unjam.cli.output import console, err_console, print_json
+from unjam.errors import invalid_value
 
 
-def keys(
-    name: Annotated[Path, typer.Argument(help="What the names of both files begin with.")],
-    json: JsonOption = False,
+def keys_command(
+    name: Annotated[Path, typer.Argument(help="What the names of both files begin with.")], json: JsonOption = False
 ) -> None:
     """Make keys to sign controllers with: NAME.key, which you keep for yourself, and NAME.pub for others.
 
@@ -35,7 +34,7 @@ def keys(
     console.print(f"{made.public}: for who verifies; fingerprint {made.fingerprint}", soft_wrap=True)
 
 
-def sign(
+def sign_command(
     file: Annotated[Path, typer.Argument(help="A .unjam file; it gets the signature.")],
     key: Annotated[Path, typer.Option(help="Private key (.key) of `unjam keys`.")],
     replace: Annotated[
@@ -58,11 +57,11 @@ def sign(
     from unjam.controller.signature import fingerprint_of, read_private_key
 
     if os.path.isdir(file):
-        raise wrong("file", str(file), "a .unjam file")
+        raise invalid_value("file", str(file), "a .unjam file")
     private, controller = read_private_key(key), read_controller(file)
     fingerprint, before = fingerprint_of(private.public_key()), controller.signed_by
     if before not in (None, fingerprint) and not replace:
-        raise wrong(
+        raise invalid_value(
             "file", str(file), f"one that nobody else has signed (it is signed by {before}); or --replace"
         )
     add_signature(file, controller, private)
@@ -71,4 +70,4 @@ def sign(
         return
     console.print(f"{file}: signed by {fingerprint}", soft_wrap=True)
     if os.name == "posix" and key.stat().st_mode & 0o077:
-        aside.print(f"note: others on this machine may use {key}: chmod 600", soft_wrap=True)
+        err_console.print(f"note: others on this machine may use {key}: chmod 600", soft_wrap=True)

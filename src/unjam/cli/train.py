@@ -9,54 +9,53 @@ import typer
 
 from unjam.cli.options import (
     DEFAULT_WORKERS,
-    AskedRun,
     ExecutorOption,
     JsonOption,
     OutOption,
-    TrainingsOption,
+    TrainingOptions,
+    TrainingWorkersOption,
     WorkersOption,
-    asked_run,
-    executor_named,
+    find_executor,
+    merge_settings,
     new_folder,
     scenario_changes,
-    together,
+    training_options,
     with_options,
 )
 from unjam.cli.output import (
-    Counted,
-    after_training,
-    aside,
+    ProgressReporter,
     console,
+    err_console,
     print_json,
     print_metrics,
+    print_next_command,
     print_notes,
-    resumable,
-    say_next,
+    suggest_after_training,
+    suggest_resume,
 )
 from unjam.errors import InputError
 from unjam.files import make_folder
-from unjam.processes import owned
+from unjam.processes import lock_folder
 
 if TYPE_CHECKING:
     from unjam.training.config import RunConfig
 
-LINE_EVERY = 5
+PROGRESS_LINE_INTERVAL = 5
 """iterations between two plain lines of progress where there is no terminal"""
-MUCH_MORE = 1.1
+STEP_OVERRUN_RATIO = 1.1
 """times the steps that were asked for, from which more are told of"""
-JUDGING = "evaluating on held-out seeds"
+EVALUATION_LABEL = "evaluating on held-out seeds"
 
 
-@with_options(asked=asked_run, road=scenario_changes)
-def train(
+@with_options(asked=training_options, road=scenario_changes)
+def train_command(
     *,
-    asked: AskedRun,
+    options: TrainingOptions,
     road: dict[str, Any],
     workers: WorkersOption = DEFAULT_WORKERS,
     out: OutOption = None,
     resume: Annotated[
-        Path | None,
-        typer.Option(help="Go on with this run: after a stop, or with more --steps after its end."),
+        Path | None, typer.Option(help="Go on with this run: after a stop, or with more --steps after its end.")
     ] = None,
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Write curves for: tensorboard --logdir FOLDER.")
@@ -84,111 +83,115 @@ def train(
       unjam train --resume runs/ring-001 --steps 2000000
     """
     from unjam.training.config import load_config
-    from unjam.training.folder import check_possible, read_config
+    from unjam.training.run_folder import check_config, read_config
 
-    settings = dict(asked.settings)
+    settings = dict(options.settings)
     if "out" in settings:
         out = Path(str(settings.pop("out")))
-    changes = {**asked.flags, **{f"road.{key}": value for key, value in road.items()}}
-    changes = {"workers": workers, **together(changes, settings)}
+    changes = {**options.options, **{f"road.{key}": value for key, value in road.items()}}
+    changes = {"workers": workers, **merge_settings(changes, settings)}
     if resume is not None:
-        if out is not None or asked.preset or asked.file is not None:
+        if out is not None or options.preset or options.config is not None:
             raise InputError("resume: --out, --preset and --config are not allowed beside it")
         before = read_config(resume)
         config = load_config(resume / "config.toml", changes={"steps": before.steps, **changes})
         folder = resume
     else:
-        config = load_config(asked.file, asked.preset, changes)
+        config = load_config(options.config, options.preset, changes)
         folder = new_folder(out, config.scenario)
-    check_possible(config)
-    from unjam.measures.notes import notes_of_rows
+    check_config(config)
+    from unjam.measures.notes import episode_notes
     from unjam.reports.results import (  # and torch: seconds that nobody waits for a wrong word
         read_progress,
         read_results,
     )
-    from unjam.reports.story import lead_of
-    from unjam.training.config import steps_to_train
+    from unjam.reports.summary import main_finding
+    from unjam.training.config import planned_steps
+    from unjam.training.early_stopping import should_stop_early
     from unjam.training.evaluate import Evaluation
-    from unjam.training.stopping import ends_early
-    from unjam.training.tensorboard import tensorboard_into
+    from unjam.training.tensorboard import tensorboard_writer
     from unjam.training.train import train as run
 
-    if resume is None and (steps := steps_to_train(config)) > MUCH_MORE * config.steps:
-        aside.print(f"note: iterations are whole: {steps:,} steps will be trained, not {config.steps:,}")
-    board = tensorboard_into(folder) if tensorboard else None
-    progress = nullcontext() if json else _Progress(config, folder)
-    with resumable(folder, workers), progress as shown:
+    if resume is None and (steps := planned_steps(config)) > STEP_OVERRUN_RATIO * config.steps:
+        err_console.print(f"note: iterations are whole: {steps:,} steps will be trained, not {config.steps:,}")
+    board = tensorboard_writer(folder) if tensorboard else None
+    progress = nullcontext() if json else _TrainingProgress(config, folder)
+    with suggest_resume(folder, workers), progress as shown:
 
-        def row_written(row: dict[str, Any]) -> None:
-            for tell in (board, shown and shown.iteration):
+        def on_row(row: dict[str, Any]) -> None:
+            for tell in (board, shown and shown.show_iteration):
                 if tell:
                     tell(row)
 
-        result = run(config, folder, resume is not None, row_written, shown and shown.judging)
+        result = run(config, folder, resume is not None, on_row, shown and shown.show_evaluation)
 
-    def facts(of: Any) -> dict[str, Any]:
-        files = {"folder": str(of.folder), "controller": str(of.controller), "report": str(result.report)}
-        gain = asdict(of.gain) if of.gain else None
-        means = Evaluation(of.rows, {}).means()
-        return {**files, "gain": gain, "drivers": means, "notes": notes_of_rows(of.rows)}
+    def result_facts(trained_run: Any) -> dict[str, Any]:
+        files = {
+            "folder": str(trained_run.folder),
+            "controller": str(trained_run.controller),
+            "report": str(result.report),
+        }
+        gain = asdict(trained_run.gain) if trained_run.gain else None
+        means = Evaluation(trained_run.rows, {}).means()
+        return {**files, "gain": gain, "drivers": means, "notes": episode_notes(trained_run.rows)}
 
     if json:
-        roads = {name: facts(road) for name, road in result.roads.items()}
-        print_json({**facts(result), "roads": roads} if roads else facts(result))
+        roads = {name: result_facts(road) for name, road in result.tasks.items()}
+        print_json({**result_facts(result), "roads": roads} if roads else result_facts(result))
         return
-    for name, of in (result.roads or {"": result}).items():
+    for name, of in (result.tasks or {"": result}).items():
         if name:
             console.print(f"{name}:")
         print_metrics(of.rows)
         judged = read_results(of.folder)
-        console.print(lead_of(judged), soft_wrap=True)
-        print_notes(judged.about["notes"])
-        aside.print(f"controller: {of.controller}")
-        steps = max(config.steps, judged.progress[-1]["actual_steps"])
-        over = ends_early(config, read_progress(result.folder))
-        after_training(of.folder, of.gain, steps, result.folder, over)
-    aside.print(f"report: {result.report}")
+        console.print(main_finding(judged), soft_wrap=True)
+        print_notes(judged.metadata["notes"])
+        err_console.print(f"controller: {of.controller}")
+        steps = max(config.steps, judged.progress[-1]["environment_steps"])
+        over = should_stop_early(config, read_progress(result.folder))
+        suggest_after_training(of.folder, of.gain, steps, result.folder, over)
+    err_console.print(f"report: {result.report}")
 
 
-class _Progress(Counted):
+class _TrainingProgress(ProgressReporter):
     """Progress of training: a bar with the newest returns on a terminal, plain lines elsewhere."""
 
     def __init__(self, config: "RunConfig", folder: Path) -> None:
         super().__init__(f"training into {folder}", "steps", config.steps)
         self._config, self._folder = config, folder
         self._steps = config.steps
-        self._validated, self._worst = "-", ""
-        self._judged: dict[tuple[str, int], int] = {}
-        self._to_judge = 0
+        self._validation_text, self._worst_road = "-", ""
+        self._evaluated_steps: dict[tuple[str, int], int] = {}
+        self._evaluation_total = 0
 
-    def iteration(self, row: dict[str, Any]) -> None:
+    def show_iteration(self, row: dict[str, Any]) -> None:
         """Show a row of progress."""
         if row["return_validation"] is not None:
-            self._validated = f"{row['return_validation']:.0f}"
-            self._worst = _worst_of(row.get("tasks", {}))
+            self._validation_text = f"{row['return_validation']:.0f}"
+            self._worst_road = _worst_road_text(row.get("tasks", {}))
         expert = f"expert {row['return_expert']:.0f}"
-        words = f"return {row['return_mean']:.0f}, validation {self._validated} ({expert}{self._worst})"
-        steps = row["actual_steps"]
+        words = f"return {row['return_mean']:.0f}, validation {self._validation_text} ({expert}{self._worst_road})"
+        steps = row["environment_steps"]
         self._bar.update(self._task, completed=steps, description=words)
-        if self._plain and (row["iteration"] % LINE_EVERY == 1 or steps >= self._steps):
-            aside.print(f"iteration {row['iteration']}: {steps:,} of {self._steps:,} steps, {words}")
+        if self._is_plain and (row["iteration"] % PROGRESS_LINE_INTERVAL == 1 or steps >= self._steps):
+            err_console.print(f"iteration {row['iteration']}: {steps:,} of {self._steps:,} steps, {words}")
 
-    def judging(self, episode: tuple[str, int], steps: int) -> None:
+    def show_evaluation(self, episode: tuple[str, int], steps: int) -> None:
         """Show how far the judgement is that follows the training."""
-        from unjam.training.evaluate import steps_to_judge
+        from unjam.training.evaluate import evaluation_steps
 
-        if not self._judged:
-            roads = self._config.roads().items()
-            self._to_judge = sum(steps_to_judge(road, self._folder / name) for name, road in roads)
-            self._label = JUDGING
-            self._bar.reset(self._task, description=JUDGING, total=self._to_judge)
-            if self._plain:
-                aside.print(JUDGING)
-        self._judged[episode] = steps
-        self(sum(self._judged.values()), self._to_judge)
+        if not self._evaluated_steps:
+            roads = self._config.task_configs().items()
+            self._evaluation_total = sum(evaluation_steps(road, self._folder / name) for name, road in roads)
+            self._label = EVALUATION_LABEL
+            self._bar.reset(self._task, description=EVALUATION_LABEL, total=self._evaluation_total)
+            if self._is_plain:
+                err_console.print(EVALUATION_LABEL)
+        self._evaluated_steps[episode] = steps
+        self(sum(self._evaluated_steps.values()), self._evaluation_total)
 
 
-def _worst_of(roads: dict[str, dict[str, Any]]) -> str:
+def _worst_road_text(roads: dict[str, dict[str, Any]]) -> str:
     """Return in words on which of several roads a validation is least beyond the expert; nothing of one."""
     beyond = {road: row["return_validation"] - row["return_expert"] for road, row in roads.items()}
     if not beyond:
@@ -197,16 +200,15 @@ def _worst_of(roads: dict[str, dict[str, Any]]) -> str:
     return f"; least beyond it on {worst}: {beyond[worst]:+.0f}"
 
 
-@with_options(asked=asked_run)
-def search(
+@with_options(asked=training_options)
+def search_command(
     *,
     vary: Annotated[
-        list[str] | None,
-        typer.Option(help="What is varied: key=low..high, key=low..high:log, or key=a,b,c."),
+        list[str] | None, typer.Option(help="What is varied: key=low..high, key=low..high:log, or key=a,b,c.")
     ] = None,
     trials: Annotated[int, typer.Option(min=1, help="Trainings in all.")] = 20,
-    asked: AskedRun,
-    workers: TrainingsOption = DEFAULT_WORKERS,
+    options: TrainingOptions,
+    workers: TrainingWorkersOption = DEFAULT_WORKERS,
     executor: ExecutorOption = "local",
     out: OutOption = None,
     json: JsonOption = False,
@@ -225,40 +227,39 @@ def search(
       unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/it
     """
     from unjam.training.config import load_config
-    from unjam.training.search import BEST, check_space, words_of_trial
+    from unjam.training.search import BEST_CONFIG_FILE, check_search_space, describe_trial
     from unjam.training.search import search as run
-    from unjam.training.space import space_of
+    from unjam.training.search_space import parse_search_space
 
-    base, space = load_config(asked.file, asked.preset, asked.flags | asked.settings), space_of(vary or [])
-    runner = executor_named(executor)
+    base, space = (
+        load_config(options.config, options.preset, options.options | options.settings),
+        parse_search_space(vary or []),
+    )
+    runner = find_executor(executor)
     base = replace(base, workers=1)
-    check_space(base, space)
+    check_search_space(base, space)
     folder = new_folder(out, f"search-{Path(base.scenario).stem}")
     make_folder(folder)
-    with owned(folder):
-        found = run(
-            base, space, trials, folder, workers, runner, (lambda line: None) if json else aside.print
-        )
-    best = folder / BEST
+    with lock_folder(folder):
+        found = run(base, space, trials, folder, workers, runner, (lambda line: None) if json else err_console.print)
+    best = folder / BEST_CONFIG_FILE
     if json:
-        rows = [
-            {"trial": one.number, "gain": one.gain, "last": one.last, "values": one.values} for one in found
-        ]
+        rows = [{"trial": one.number, "gain": one.gain, "last": one.last_gain, "values": one.values} for one in found]
         print_json({"folder": str(folder), "best": str(best), "trials": rows})
         return
     for one in found[:5]:
-        console.print(words_of_trial(one))
+        console.print(describe_trial(one))
     untrained = sum(one.gain is not None and one.gain <= 0 for one in found)
     console.print(f"{untrained} of {len(found)} trainings kept the untrained network")
-    say_next("train with the best", "train", "--config", best)
+    print_next_command("train with the best", "train", "--config", best)
 
 
-def reproduce(
+def reproduce_command(
     studies: Annotated[
         list[str], typer.Argument(help="Names of studies: table-1, figure-4 ..., or all.", metavar="STUDY...")
     ],
     seeds: Annotated[int, typer.Option(min=1, help="Trainings of each variant.")] = 3,
-    workers: TrainingsOption = DEFAULT_WORKERS,
+    workers: TrainingWorkersOption = DEFAULT_WORKERS,
     executor: ExecutorOption = "local",
     out: Annotated[Path, typer.Option(help="Folder of all studies; what is there already is used.")] = Path(
         "runs/reproduce"
@@ -280,29 +281,29 @@ def reproduce(
 
       unjam reproduce table-1 --executor ray --workers 64 --out /shared/unjam
     """
-    runner = executor_named(executor)
-    from unjam.studies.reproduce import make_plan
-    from unjam.studies.reproduce import reproduce as run
-    from unjam.studies.study import StudyFolder
+    runner = find_executor(executor)
+    from unjam_paper.reproduce import make_plan
+    from unjam_paper.reproduce import run_plan as run
+    from unjam_paper.study import StudyFolder
 
     plan = make_plan(studies, seeds, StudyFolder(out))
     minutes = plan.seconds(workers) / 60.0
     names = [planned.name for planned in plan.runs]
     if dry_run and json:
-        print_json({"missing": names, "finished": plan.finished, "drives": plan.roads, "minutes": minutes})
+        print_json({"missing": names, "finished": plan.finished_count, "drives": plan.roads, "minutes": minutes})
         return
     if dry_run:
         for name in names:
             console.print(name)
     takes = f"{minutes / 60.0:.1f} hours" if minutes > 90 else f"{max(1.0, minutes):.0f} minutes"
-    aside.print(
-        f"{len(names)} trainings to make, {plan.finished} there already; about {takes} with {workers} at once"
+    err_console.print(
+        f"{len(names)} trainings to make, {plan.finished_count} there already; about {takes} with {workers} at once"
     )
     if dry_run:
         return
     make_folder(out)
-    with owned(out):
-        folders = [str(folder) for folder in run(plan, workers, runner, aside.print)]
+    with lock_folder(out):
+        folders = [str(folder) for folder in run(plan, workers, runner, err_console.print)]
     if json:
         print_json({"folders": folders})
         return

@@ -15,21 +15,21 @@ from unjam.cli.options import (
     ScenarioSettingsOption,
     SeedOption,
     WorkersOption,
-    assignments,
+    merge_settings,
     new_folder,
+    parse_settings,
     scenario_changes,
-    together,
     with_options,
 )
-from unjam.cli.output import as_options, aside, console, print_json, say_next
-from unjam.errors import InputError, wrong
+from unjam.cli.output import console, err_console, print_json, print_next_command, setting_options
+from unjam.errors import InputError, invalid_value
 
-SEEDS_BELOW = 2**32
+SEED_LIMIT = 2**32
 """what proposes settings takes no larger ones"""
 
 
 @with_options(road=scenario_changes)
-def tune(
+def tune_command(
     *,
     scenario: ScenarioArgument,
     expert: Annotated[str, typer.Option("--expert", help="Name of the expert, as in unjam drivers.")] = "pi",
@@ -68,44 +68,42 @@ def tune(
       unjam tune rings --expert pi         (also shared-rings, figure-eights, motorways, or everywhere)
     """
     from unjam.scenarios import make_scenario
-    from unjam.training.family import FAMILY, GROUPS, roads_of
-    from unjam.training.folder import new_and_owned
-    from unjam.training.space import space_around, space_asked
-    from unjam.training.tried import ASKED
+    from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
+    from unjam.training.run_folder import lock_new_folder
+    from unjam.training.search_space import default_search_space, expert_search_space
+    from unjam.training.trial_log import REQUEST_FILE
     from unjam.training.tune import tune as run
     from unjam.worlds.reward import make_reward
-    from unjam.worlds.workers import Workers
+    from unjam.worlds.worker_pool import WorkerPool
 
-    if seed >= SEEDS_BELOW:
-        raise wrong("seed", seed, f"less than {SEEDS_BELOW}")
-    changes = together(road, assignments(settings))
-    if scenario in GROUPS:
+    if seed >= SEED_LIMIT:
+        raise invalid_value("seed", seed, f"less than {SEED_LIMIT}")
+    changes = merge_settings(road, parse_settings(settings))
+    if scenario in ROAD_GROUPS:
         if changes or reward:
             raise InputError(f"scenario: with {scenario} neither changes nor a reward are allowed")
-        roads = roads_of(scenario, "seen")
+        roads = family_scenarios(scenario, "seen")
     else:
         roads = {scenario: make_scenario(scenario, changes)}
     made = next(iter(roads.values()))
     make_reward(reward or made.reward)
-    around = space_around(expert, made.decision_step)
-    space = space_asked(vary, around) if vary else around
+    around = default_search_space(expert, made.control_step)
+    space = expert_search_space(vary, around) if vary else around
     folder = new_folder(out, f"tune-{Path(scenario).stem}")
-    with new_and_owned(folder, or_with=ASKED), Workers(workers) as pool:
+    with lock_new_folder(folder, resumable_file=REQUEST_FILE), WorkerPool(workers) as pool:
         found = run(
             *(roads, expert, space, steps, folder, pool, reward, seed),
-            (lambda line: None) if json else aside.print,
+            (lambda line: None) if json else err_console.print,
             screen,
         )
     best, default = found.best, found.default
-    steps_of = {"actual_steps": found.actual_steps, "imagined_steps": found.imagined_steps}
+    steps_of = {"environment_steps": found.environment_steps, "batch_steps": found.batch_steps}
     if json:
         print_json({"file": str(found.file), "best": asdict(best), "default": asdict(default), **steps_of})
         return
-    console.print(f"{found.actual_steps:,} actual steps, {found.imagined_steps:,} imagined")
+    console.print(f"{found.environment_steps:,} actual steps, {found.batch_steps:,} imagined")
     before = default.verdict if default.score is None else f"{default.score:.4g}"
-    console.print(
-        f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {before}", soft_wrap=True
-    )
-    on = FAMILY[next(iter(roads))].scenario if scenario in GROUPS else scenario
-    options = as_options(changes, reward=reward)
-    say_next("drive with it", "drive", on, "--driver", found.file, "--held-out", *options)
+    console.print(f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {before}", soft_wrap=True)
+    on = FAMILY[next(iter(roads))].scenario if scenario in ROAD_GROUPS else scenario
+    options = setting_options(changes, reward=reward)
+    print_next_command("drive with it", "drive", on, "--driver", found.file, "--held-out", *options)

@@ -10,35 +10,35 @@ import re
 from importlib.resources import files
 from pathlib import Path
 
-from unjam.controller.file import SUFFIX, controller_bytes, hash_of, load_controller
+from unjam.controller.file import SUFFIX, controller_bytes, load_controller, sha256_of
 from unjam.drivers.driver import Driver
-from unjam.drivers.from_file import is_file_reference
-from unjam.drivers.registry import DRIVERS, named_driver
-from unjam.drivers.wrappers import Mixed
-from unjam.errors import wrong, wrong_name
-from unjam.files import SHIPPED
+from unjam.drivers.registry import DRIVERS, driver_from_name
+from unjam.drivers.user_driver import is_file_reference
+from unjam.drivers.wrappers import MixedDriver
+from unjam.errors import invalid_value, unknown_name
+from unjam.files import PACKAGED_PREFIX
 
 __all__ = [
-    "BEST",
-    "SHIPPED",
+    "DEFAULT_DRIVER",
+    "PACKAGED_PREFIX",
     "SUFFIX",
     "controller_bytes",
     "load_controller",
     "make_driver",
     "make_expert",
-    "shipped_file",
-    "shipped_names",
+    "packaged_file",
+    "packaged_names",
 ]
 
-BEST = "unjam:best"
+DEFAULT_DRIVER = "unjam:best"
 """who drives where nobody is named: the controller for every road"""
-SHIPPED_FOLDER = Path(str(files("unjam") / "controllers"))
+PACKAGED_FOLDER = Path(str(files("unjam") / "controllers"))
 
-_SEVERAL = re.compile(r"\+(?=[^\W\d]|[./~])")
+_MIXTURE_SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")
 """between two drivers of a mixture; not the + of 1e+5"""
 
 
-def make_driver(text: str, time_step: float) -> Driver:
+def make_driver(name: str, time_step: float) -> Driver:
     """Return the driver that `text` names.
 
     Args:
@@ -50,54 +50,56 @@ def make_driver(text: str, time_step: float) -> Driver:
     Raises:
         InputError: there is no such driver, or a parameter is wrong.
     """
-    is_one = os.path.exists(text) or os.path.exists(text.rpartition(":")[0])
-    parts = [] if is_one else _SEVERAL.split(text)
+    is_one = os.path.exists(name) or os.path.exists(name.rpartition(":")[0])
+    parts = [] if is_one else _MIXTURE_SEPARATOR.split(name)
     if len(parts) > 1:
-        return Mixed(tuple(make_driver(part, time_step) for part in parts))
-    if text.startswith(SHIPPED):
-        return load_controller(shipped_file(text.removeprefix(SHIPPED)))
-    is_folder = os.path.isdir(text)  # whatever it is called, it is no file with code
-    named = text.partition(":")[0] in DRIVERS or (is_file_reference(text) and not is_folder)
-    if not named and (text.endswith(SUFFIX) or is_folder):
-        return load_controller(text)
-    return named_driver(text, time_step)
+        return MixedDriver(tuple(make_driver(part, time_step) for part in parts))
+    if name.startswith(PACKAGED_PREFIX):
+        return load_controller(packaged_file(name.removeprefix(PACKAGED_PREFIX)))
+    is_folder = os.path.isdir(name)  # whatever it is called, it is no file with code
+    named = name.partition(":")[0] in DRIVERS or (is_file_reference(name) and not is_folder)
+    if not named and (name.endswith(SUFFIX) or is_folder):
+        return load_controller(name)
+    return driver_from_name(name, time_step)
 
 
-def make_expert(text: str, time_step: float) -> Driver:
+def make_expert(name: str, time_step: float) -> Driver:
     """Return the driver that `text` names, for something to be added to it; arguments as `make_driver`.
 
     Raises:
         InputError: there is no such driver, or the simulator itself drives it.
     """
-    driver = make_driver(text, time_step)
-    if driver.native:
-        raise wrong("expert", text, "drivers that unjam asks; idm drives like people")
+    driver = make_driver(name, time_step)
+    if driver.is_native:
+        raise invalid_value("expert", name, "drivers that unjam asks; idm drives like people")
     return driver
 
 
-def file_of(text: str) -> Path | None:
+def controller_path(driver_name: str) -> Path | None:
     """Return the controller's file that a driver's name stands for; None where it is none."""
-    path = Path(text)
-    if text.startswith(SHIPPED):
-        path = shipped_file(text.removeprefix(SHIPPED))
-    elif os.path.isdir(text):
+    path = Path(driver_name)
+    if driver_name.startswith(PACKAGED_PREFIX):
+        path = packaged_file(driver_name.removeprefix(PACKAGED_PREFIX))
+    elif os.path.isdir(driver_name):
         path = path / f"controller{SUFFIX}"
     return path if path.suffix == SUFFIX and os.path.isfile(path) else None
 
 
-def hash_of_controller(text: str) -> str | None:
+def controller_hash(driver_name: str) -> str | None:
     """Return the SHA-256 of the controller's file that a driver's name stands for; None where it is none."""
-    path = file_of(text)
-    return None if path is None else hash_of(path.read_bytes())
+    path = controller_path(driver_name)
+    return None if path is None else sha256_of(path.read_bytes())
 
 
-def shipped_names() -> list[str]:
+def packaged_names() -> list[str]:
     """Return the names of the controllers that are part of the package: `ring-best`."""
-    return sorted(path.stem for path in SHIPPED_FOLDER.glob(f"*{SUFFIX}"))
+    return sorted(path.stem for path in PACKAGED_FOLDER.glob(f"*{SUFFIX}"))
 
 
-def shipped_file(name: str) -> Path:
+def packaged_file(name: str) -> Path:
     """Return the file of a shipped controller; raise `InputError` where there is none of that name."""
-    if name not in shipped_names():
-        raise wrong_name("driver", f"{SHIPPED}{name}", [f"{SHIPPED}{known}" for known in shipped_names()])
-    return SHIPPED_FOLDER / f"{name}{SUFFIX}"
+    if name not in packaged_names():
+        raise unknown_name(
+            "driver", f"{PACKAGED_PREFIX}{name}", [f"{PACKAGED_PREFIX}{known}" for known in packaged_names()]
+        )
+    return PACKAGED_FOLDER / f"{name}{SUFFIX}"

@@ -13,40 +13,40 @@ import numpy as np
 from safetensors.numpy import load, save
 
 from unjam import __version__
-from unjam.controller.manifest import FORMAT, description, read_manifest
+from unjam.controller.manifest import MANIFEST_FORMAT, driver_interface, read_manifest
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
-from unjam.drivers.local_state import COLUMNS, EVERYWHERE, LocalState
-from unjam.drivers.registry import code_of, driver_from_recipe, recipe_of
-from unjam.errors import InputError, wrong
-from unjam.files import NONE_OF_OURS, to_json, write_whole
+from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, LocalState
+from unjam.drivers.registry import driver_from_recipe, driver_recipe, user_code_recipes
+from unjam.errors import InputError, invalid_value
+from unjam.files import UNREADABLE_ERRORS, atomic_write, to_json
 from unjam.physics.arrays import Floats
 from unjam.trust import check_trusted
 from unjam.user_code import read_code
-from unjam.worlds.drive import drive
+from unjam.worlds.drive import drive_world
 from unjam.worlds.world import RecordedWorld
 
 if TYPE_CHECKING:
     from unjam.controller.signature import Ed25519PrivateKey
 
 SUFFIX = ".unjam"
-MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
-SAMPLE, GRAPH, CERTIFICATE = "sample.safetensors", "controller.onnx", "certificate.json"
-SIGNATURE = "signature.json"
-PARTS = (MANIFEST, WEIGHTS, SAMPLE, GRAPH, CERTIFICATE, SIGNATURE)
+MANIFEST_PART, WEIGHTS_PART = "manifest.json", "weights.safetensors"
+SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART = "sample.safetensors", "controller.onnx", "certificate.json"
+SIGNATURE_PART = "signature.json"
+ARCHIVE_PARTS = (MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART, SIGNATURE_PART)
 """all that an archive may hold; sample and graph are there where it was exported, the certificate where it
 was certified, the signature where it was signed: in this order then"""
-LARGEST_PART = 64 * 2**20
+MAX_PART_BYTES = 64 * 2**20
 """bytes of one part"""
-LARGEST_TEXTS = {MANIFEST: 2**20, CERTIFICATE: 2**20, SIGNATURE: 10_000}
+MAX_JSON_BYTES = {MANIFEST_PART: 2**20, CERTIFICATE_PART: 2**20, SIGNATURE_PART: 10_000}
 """bytes of parts in JSON, which takes many times its size to be read"""
-LONGEST_SAMPLE = 1000
+MAX_SAMPLE_STEPS = 1000
 """decisions in a recorded sample"""
 
-UNIX = 3
+ZIP_SYSTEM_UNIX = 3
 """of the systems that an archive can name"""
 
-ANSWER = "acceleration"
+ACTION_NAME = "acceleration"
 """the answer's name in a sample and in a graph"""
 
 
@@ -62,22 +62,22 @@ class Controller:
     """fingerprint of the key that signed it; None where nobody did"""
 
 
-def controller_bytes(driver: Driver, about: dict[str, Any], parts: dict[str, bytes] | None = None) -> bytes:
+def controller_bytes(driver: Driver, metadata: dict[str, Any], parts: dict[str, bytes] | None = None) -> bytes:
     """Return the content of a `.unjam` file.
 
     `about` says where it comes from, for its manifest; its `action_limit` [m/s2] is what the road allows.
     """
-    recipe, arrays = recipe_of(driver)
-    parts = {WEIGHTS: save(arrays), **(parts or {})}
+    recipe, arrays = driver_recipe(driver)
+    parts = {WEIGHTS_PART: save(arrays), **(parts or {})}
     manifest = {
-        "format": FORMAT,
+        "format": MANIFEST_FORMAT,
         "unjam": __version__,
         "driver": recipe,
-        **description(driver, about.get("action_limit")),
-        **about,
-        "sha256": {name: hash_of(part) for name, part in parts.items()},
+        **driver_interface(driver, metadata.get("action_limit")),
+        **metadata,
+        "sha256": {name: sha256_of(part) for name, part in parts.items()},
     }
-    return pack_parts({MANIFEST: to_json(manifest, indent=1).encode(), **parts})
+    return pack_parts({MANIFEST_PART: to_json(manifest, indent=1).encode(), **parts})
 
 
 def add_certificate(file: Path, controller: Controller, certificate: dict[str, Any]) -> None:
@@ -87,10 +87,10 @@ def add_certificate(file: Path, controller: Controller, certificate: dict[str, A
         InputError: it is signed: it would no longer be what was signed.
     """
     check_unsigned(controller)
-    parts = {**controller.parts, CERTIFICATE: to_json(certificate, indent=1).encode()}
-    del parts[MANIFEST]
-    manifest = {**controller.manifest, "sha256": {name: hash_of(part) for name, part in parts.items()}}
-    write_whole(file, pack_parts({MANIFEST: to_json(manifest, indent=1).encode(), **parts}))
+    parts = {**controller.parts, CERTIFICATE_PART: to_json(certificate, indent=1).encode()}
+    del parts[MANIFEST_PART]
+    manifest = {**controller.manifest, "sha256": {name: sha256_of(part) for name, part in parts.items()}}
+    atomic_write(file, pack_parts({MANIFEST_PART: to_json(manifest, indent=1).encode(), **parts}))
 
 
 def check_unsigned(controller: Controller) -> None:
@@ -104,8 +104,10 @@ def add_signature(file: Path, controller: Controller, key: "Ed25519PrivateKey") 
     """Write a controller's file once more, signed with `key` and by nobody else."""
     from unjam.controller.signature import signature_of
 
-    parts = {name: controller.parts[name] for name in PARTS if name in controller.parts.keys() - {SIGNATURE}}
-    write_whole(file, pack_parts({**parts, SIGNATURE: signature_of(parts, key)}))
+    parts = {
+        name: controller.parts[name] for name in ARCHIVE_PARTS if name in controller.parts.keys() - {SIGNATURE_PART}
+    }
+    atomic_write(file, pack_parts({**parts, SIGNATURE_PART: signature_of(parts, key)}))
 
 
 def load_controller(path: Path | str) -> Driver:
@@ -128,17 +130,17 @@ def read_controller(path: Path | str) -> Controller:
         raise InputError(f"controller: {str(file)!r} does not exist")
     try:
         parts = unpack_parts(file)
-        manifest = read_manifest(file.name, parts[MANIFEST])
+        manifest = read_manifest(file.name, parts[MANIFEST_PART])
         _check_hashes(file.name, manifest["sha256"], parts)
-        signed_by = _signed_by(file, parts) if SIGNATURE in parts else None
+        signed_by = _check_signature(file, parts) if SIGNATURE_PART in parts else None
         _check_code(file.name, manifest["driver"], path.is_dir())
-        arrays = load(parts[WEIGHTS])
+        arrays = load(parts[WEIGHTS_PART])
         driver = driver_from_recipe(manifest["driver"], arrays)
-        unknown = arrays.keys() - recipe_of(driver)[1].keys()
+        unknown = arrays.keys() - driver_recipe(driver)[1].keys()
         if unknown:
             raise InputError(f"controller {file.name}: weights {min(unknown)!r} belong to no network")
         return Controller(driver, manifest, parts, signed_by)
-    except NONE_OF_OURS as error:
+    except UNREADABLE_ERRORS as error:
         raise InputError(f"controller {file.name}: not a controller: {error}") from None
 
 
@@ -148,12 +150,12 @@ def controller_file(path: Path | str) -> Path:
     return path / f"controller{SUFFIX}" if path.is_dir() else path
 
 
-def hash_of(part: bytes) -> str:
+def sha256_of(part: bytes) -> str:
     """Return the SHA-256 of a part, as the manifest names it."""
     return hashlib.sha256(part).hexdigest()
 
 
-def hash_of_file(path: Path) -> str:
+def sha256_of_file(path: Path) -> str:
     """Return the SHA-256 of a file, of which never more than a block is in memory."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -164,30 +166,30 @@ def _check_hashes(name: str, hashes: dict[str, str], parts: dict[str, bytes]) ->
 
     The signature, which is over the manifest, has none there.
     """
-    if hashes.keys() != parts.keys() - {MANIFEST, SIGNATURE}:
+    if hashes.keys() != parts.keys() - {MANIFEST_PART, SIGNATURE_PART}:
         raise InputError(f"controller {name}: damaged: its parts are not those that it names")
     for part, content in parts.items():
-        if part in hashes and hash_of(content) != hashes[part]:
+        if part in hashes and sha256_of(content) != hashes[part]:
             raise InputError(f"controller {name}: damaged: {part} does not have the hash that it names")
 
 
-def _signed_by(file: Path, parts: dict[str, bytes]) -> str:
+def _check_signature(file: Path, parts: dict[str, bytes]) -> str:
     """Return the fingerprint of the key that signed `parts`; raise `InputError` where that does not fit."""
-    from unjam.controller.signature import forged, signer_of  # which takes its time, and few need
+    from unjam.controller.signature import forged_error, signer_of  # which takes its time, and few need
 
-    ordered = {name: parts[name] for name in PARTS if name in parts}
-    signed = {name: part for name, part in ordered.items() if name != SIGNATURE}
-    fingerprint = signer_of(file.name, signed, parts[SIGNATURE])
+    ordered = {name: parts[name] for name in ARCHIVE_PARTS if name in parts}
+    signed = {name: part for name, part in ordered.items() if name != SIGNATURE_PART}
+    fingerprint = signer_of(file.name, signed, parts[SIGNATURE_PART])
     if file.read_bytes() != pack_parts(ordered):  # an archive has room for more than its parts
-        raise forged(file.name)
+        raise forged_error(file.name)
     return fingerprint
 
 
-def _check_code(name: str, recipe: Any, in_folder: bool) -> None:
+def _check_code(name: str, recipe: Any, is_in_folder: bool) -> None:
     """Raise `InputError` where a driver is Python code that a stranger may have named, or has changed."""
-    for found in code_of(recipe):
+    for found in user_code_recipes(recipe):
         code = Path(found["path"]).resolve()
-        if not in_folder:
+        if not is_in_folder:
             alone = "a file by itself may not run; use the run folder"
             raise InputError(f"controller {name}: part of it is Python code ({code.name}), which {alone}")
         if code.is_file() and read_code(code).sha256 != found["sha256"]:
@@ -202,7 +204,7 @@ def pack_parts(parts: dict[str, bytes]) -> bytes:
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
         for name, part in parts.items():
             entry = zipfile.ZipInfo(name)  # of a fixed date
-            entry.create_system = UNIX  # on any system
+            entry.create_system = ZIP_SYSTEM_UNIX  # on any system
             archive.writestr(entry, part)
     return content.getvalue()
 
@@ -214,7 +216,7 @@ def unpack_parts(file: Path) -> dict[str, bytes]:
         InputError: it holds what no controller has: an unknown, second, compressed or too large part, a link.
         zipfile.BadZipFile, OSError, EOFError, RuntimeError: it is not an archive, or damaged.
     """
-    size, largest = file.stat().st_size, len(PARTS) * LARGEST_PART
+    size, largest = file.stat().st_size, len(ARCHIVE_PARTS) * MAX_PART_BYTES
     if size > largest:
         raise InputError(f"controller {file.name}: {size} bytes; allowed: at most {largest}")
     parts: dict[str, bytes] = {}
@@ -222,35 +224,35 @@ def unpack_parts(file: Path) -> dict[str, bytes]:
         for entry in archive.infolist():
             if entry.filename in parts:
                 raise InputError(f"controller {file.name}: has {entry.filename} twice")
-            if reason := _what_is_wrong(entry):
+            if reason := _entry_error(entry):
                 raise InputError(f"controller {file.name}: part {entry.filename!r} {reason}")
             parts[entry.filename] = archive.read(entry)
-    for name in (MANIFEST, WEIGHTS):
+    for name in (MANIFEST_PART, WEIGHTS_PART):
         if name not in parts:
             raise InputError(f"controller {file.name}: not a controller: it has no {name}")
     return parts
 
 
-def _what_is_wrong(entry: zipfile.ZipInfo) -> str:
+def _entry_error(entry: zipfile.ZipInfo) -> str:
     """Return why an entry is not let in; empty where it is."""
-    if entry.filename not in PARTS:
-        return f"is unknown; allowed: {', '.join(PARTS)}"
+    if entry.filename not in ARCHIVE_PARTS:
+        return f"is unknown; allowed: {', '.join(ARCHIVE_PARTS)}"
     if stat.S_ISLNK(entry.external_attr >> 16):
         return "is a link"
     stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
     if not stored or entry.flag_bits & 1:
         return "is compressed or encrypted; allowed: neither"
-    largest = LARGEST_TEXTS.get(entry.filename, LARGEST_PART)
+    largest = MAX_JSON_BYTES.get(entry.filename, MAX_PART_BYTES)
     if entry.file_size > largest:
         return f"has {entry.file_size} bytes; allowed: at most {largest}"
     return ""
 
 
-def sample_bytes(driver: Driver, states: LocalState, limit: float) -> bytes:
+def sample_bytes(driver: Driver, states: LocalState, action_limit: float) -> bytes:
     """Return the part of an archive with `states`, arrays of shape (T,), and the answers of `driver`."""
     seen = {name: values for name, values in states._asdict().items() if values is not None}
     arrays = {name: np.array(values, np.float64) for name, values in seen.items()}
-    return save({**arrays, ANSWER: replay(driver, states, limit)})
+    return save({**arrays, ACTION_NAME: replay_states(driver, states, action_limit)})
 
 
 def read_sample(part: bytes) -> tuple[LocalState, Floats]:
@@ -258,30 +260,30 @@ def read_sample(part: bytes) -> tuple[LocalState, Floats]:
 
     Raises:
         InputError: an array is missing, unknown, of another shape or type, or an acceleration is not finite;
-            or there are no decisions, or more than `LONGEST_SAMPLE`.
+            or there are no decisions, or more than `MAX_SAMPLE_STEPS`.
     """
     arrays: dict[str, Any] = load(part)
-    needed, known = {*EVERYWHERE, ANSWER}, {*LocalState._fields, ANSWER}
+    needed, known = {*COMMON_FIELDS, ACTION_NAME}, {*LocalState._fields, ACTION_NAME}
     unfit = (needed - arrays.keys()) | (arrays.keys() - known)
     if unfit:
         first = min(unfit)
         raise InputError(f"sample: {first!r} is {'missing' if first in needed else 'unknown'}")
-    answers = arrays.pop(ANSWER)
-    for name, values in {**arrays, ANSWER: answers}.items():
-        shape = (len(values), COLUMNS[name]) if name in COLUMNS else answers.shape
+    answers = arrays.pop(ACTION_NAME)
+    for name, values in {**arrays, ACTION_NAME: answers}.items():
+        shape = (len(values), FIELD_SIZES[name]) if name in FIELD_SIZES else answers.shape
         if values.ndim != len(shape) or values.shape != shape or values.dtype != np.float64:
             raise InputError(f"sample: {name!r} has shape {values.shape} of {values.dtype}; allowed: numbers")
-    if not 1 <= len(answers) <= LONGEST_SAMPLE:
-        raise wrong("sample: decisions", len(answers), f"1 to {LONGEST_SAMPLE}")
+    if not 1 <= len(answers) <= MAX_SAMPLE_STEPS:
+        raise invalid_value("sample: decisions", len(answers), f"1 to {MAX_SAMPLE_STEPS}")
     if not np.isfinite(answers).all():
         raise InputError("sample: a recorded acceleration is not finite")
     return LocalState(**arrays), answers
 
 
-def replay(driver: Driver, states: LocalState, limit: float) -> Floats:
+def replay_states(driver: Driver, states: LocalState, action_limit: float) -> Floats:
     """Return what a driver answers when it perceives `states` one after the other, from its first memory.
 
     States are of one CAV, arrays of shape (T,), as the answers are: within `limit` [m/s2].
     """
-    world = RecordedWorld(states.at(np.s_[:, None]), Limits.symmetric(limit))
-    return drive(world, driver).ravel()
+    world = RecordedWorld(states.select(np.s_[:, None]), Limits.symmetric(action_limit))
+    return drive_world(world, driver).ravel()

@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from unjam.controller.file import ANSWER
+from unjam.controller.file import ACTION_NAME
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
-from unjam.errors import InputError, MissingPartError, wrong
+from unjam.errors import InputError, MissingPartError, invalid_value
 from unjam.physics.arrays import Floats
 from unjam.tree import leaves
 
-OPSET = 20
+ONNX_OPSET = 20
 """version of ONNX's operators"""
-IR_VERSIONS = range(10, 14)
+ONNX_IR_VERSIONS = range(10, 14)
 """versions of ONNX's format in which a graph of this opset is written"""
-OPERATORS: dict[str, dict[str, str]] = {
+ALLOWED_OPERATORS: dict[str, dict[str, str]] = {
     **{
         name: {}
         for name in (
@@ -45,7 +45,7 @@ OPERATORS: dict[str, dict[str, str]] = {
     "Transpose": {"perm": "ints"},
 }
 """all operators of a graph: arithmetic, without subgraphs; with the field that each attribute is in"""
-FIELDS = {
+ALLOWED_FIELDS = {
     "ModelProto": {"ir_version", "producer_name", "producer_version", "opset_import", "graph"},
     "OperatorSetIdProto": {"domain", "version"},
     "GraphProto": {"name", "node", "initializer", "input", "output", "value_info"},
@@ -60,15 +60,15 @@ FIELDS = {
     "Dimension": {"dim_param", "dim_value"},
 }
 """all fields that a graph's messages may set: no function, subgraph, sparse or external tensor, metadata"""
-BATCH_ROUNDING = 1e-9
+BATCH_TOLERANCE = 1e-9
 """by how much equal rows may differ [m/s2]: matrix products of another size are rounded otherwise"""
 
 
 def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
     """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
     remembered = [name for name, _ in leaves(driver.initial_memory(1))]
-    inputs = [*driver.perceives, *(f"memory.{name}" for name in remembered)]
-    return inputs, [ANSWER, *(f"next.{name}" for name in remembered)]
+    inputs = [*driver.input_fields, *(f"memory.{name}" for name in remembered)]
+    return inputs, [ACTION_NAME, *(f"next.{name}" for name in remembered)]
 
 
 def check_graph(part: bytes, driver: Driver) -> None:
@@ -77,7 +77,7 @@ def check_graph(part: bytes, driver: Driver) -> None:
     Raises:
         MissingPartError: onnx is not installed.
     """
-    onnx = needed("onnx")
+    onnx = require_package("onnx")
     try:
         model = onnx.load_model_from_string(part)
     except Exception as error:  # protobuf's own kinds of error
@@ -86,11 +86,11 @@ def check_graph(part: bytes, driver: Driver) -> None:
     model.DiscardUnknownFields()
     if model.ByteSize() != len(part):
         raise InputError("graph: it holds bytes that ONNX does not know; allowed: what `unjam export` writes")
-    if model.ir_version not in IR_VERSIONS:
-        raise wrong("graph: ir_version", model.ir_version, f"{IR_VERSIONS[0]} to {IR_VERSIONS[-1]}")
+    if model.ir_version not in ONNX_IR_VERSIONS:
+        raise invalid_value("graph: ir_version", model.ir_version, f"{ONNX_IR_VERSIONS[0]} to {ONNX_IR_VERSIONS[-1]}")
     imported = [(each.domain, each.version) for each in model.opset_import]
-    if imported != [("", OPSET)]:
-        raise wrong("graph: opset_import", imported, f"{[('', OPSET)]}")
+    if imported != [("", ONNX_OPSET)]:
+        raise invalid_value("graph: opset_import", imported, f"{[('', ONNX_OPSET)]}")
     graph, wanted = model.graph, graph_names(driver)
     found = [value.name for value in graph.input], [value.name for value in graph.output]
     if found != wanted:
@@ -99,7 +99,7 @@ def check_graph(part: bytes, driver: Driver) -> None:
     if kinds != {onnx.TensorProto.DOUBLE}:
         raise InputError("graph: inputs and outputs of another type are not allowed; allowed: float64")
     if fixed := {each.name for each in graph.initializer} & {*found[0]}:
-        raise wrong("graph: initializer", min(fixed), "constants, not inputs")
+        raise invalid_value("graph: initializer", min(fixed), "constants, not inputs")
     for node in graph.node:
         _check_node(node, onnx.AttributeProto)
 
@@ -108,8 +108,8 @@ def _check_fields(message: Any) -> None:
     """Raise `InputError` where a message, or one nested in it, sets a field that no graph of ours has."""
     kind = message.DESCRIPTOR.name
     for each, value in message.ListFields():
-        if each.name not in FIELDS.get(kind, ()):
-            allowed = ", ".join(sorted(FIELDS.get(kind, ()))) or "nothing of this kind"
+        if each.name not in ALLOWED_FIELDS.get(kind, ()):
+            allowed = ", ".join(sorted(ALLOWED_FIELDS.get(kind, ()))) or "nothing of this kind"
             raise InputError(f"graph: {kind}.{each.name} is not allowed; allowed: {allowed}")
         if each.message_type is not None:
             for inner in (value,) if hasattr(value, "ListFields") else value:
@@ -118,19 +118,19 @@ def _check_fields(message: Any) -> None:
 
 def _check_node(node: Any, types: Any) -> None:
     """Raise `InputError` unless a node is an operator of the list with attributes of the list."""
-    if node.domain or node.op_type not in OPERATORS:
+    if node.domain or node.op_type not in ALLOWED_OPERATORS:
         operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
         raise InputError(f"graph: operator {operator!r} is not allowed; allowed: arithmetic")
-    allowed, seen = OPERATORS[node.op_type], set[str]()
+    allowed, seen = ALLOWED_OPERATORS[node.op_type], set[str]()
     types_of = {"i": types.INT, "f": types.FLOAT, "s": types.STRING, "t": types.TENSOR, "ints": types.INTS}
     for attribute in node.attribute:
         held = allowed.get(attribute.name)
         fields = {each.name for each, _ in attribute.ListFields()}
         if held is None or attribute.name in seen or fields != {"name", "type", held}:
             names = ", ".join(allowed) or "none"
-            raise wrong(f"graph: attribute of {node.op_type}", attribute.name, f"{names}, each once")
+            raise invalid_value(f"graph: attribute of {node.op_type}", attribute.name, f"{names}, each once")
         if attribute.type != types_of[held]:
-            raise wrong(f"graph: type of {node.op_type}.{attribute.name}", attribute.type, types_of[held])
+            raise invalid_value(f"graph: type of {node.op_type}.{attribute.name}", attribute.type, types_of[held])
         seen.add(attribute.name)
 
 
@@ -144,7 +144,7 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
         InputError: onnxruntime refuses it, or CAVs that perceive the same get other answers.
         MissingPartError: onnxruntime is not installed.
     """
-    runtime = needed("onnxruntime")
+    runtime = require_package("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
@@ -153,12 +153,12 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
     try:
         session = runtime.InferenceSession(part, options, providers=["CPUExecutionProvider"])
         for step in range(len(answers)):
-            now = states.at(np.full(rows, step))
-            seen = [getattr(now, name) for name in driver.perceives]
+            now = states.select(np.full(rows, step))
+            seen = [getattr(now, name) for name in driver.input_fields]
             acceleration, *memory = session.run(None, dict(zip(inputs, [*seen, *memory], strict=True)))
             answers[step] = acceleration[0]
             alike &= np.shape(acceleration) == (rows,)
-            alike &= bool(np.all(np.abs(acceleration - answers[step]) <= BATCH_ROUNDING))
+            alike &= bool(np.all(np.abs(acceleration - answers[step]) <= BATCH_TOLERANCE))
     except Exception as error:  # the runtime's own kinds of error
         raise InputError(f"graph: cannot be run: {error}") from None
     if not alike:
@@ -166,7 +166,7 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
     return answers
 
 
-def needed(name: str) -> Any:
+def require_package(name: str) -> Any:
     """Return a package that only graphs need; raise `MissingPartError` where it is not installed."""
     try:
         return import_module(name)

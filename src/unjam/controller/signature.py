@@ -11,8 +11,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from unjam.errors import InputError, MissingPartError, wrong
-from unjam.files import check_folder, remove, to_json, write_new
+from unjam.errors import InputError, MissingPartError, invalid_value
+from unjam.files import check_parent_folder, remove, to_json, write_new_file
 
 try:
     from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -26,25 +26,25 @@ try:
         load_pem_public_key,
     )
 except ImportError:
-    needs = "cryptography is not installed; signatures need it"
-    raise MissingPartError(f"{needs}: pip install cryptography") from None
+    _MISSING_PACKAGE = "cryptography is not installed; signatures need it"
+    raise MissingPartError(f"{_MISSING_PACKAGE}: pip install cryptography") from None
 
-PRIVATE, PUBLIC = ".key", ".pub"
+PRIVATE_SUFFIX, PUBLIC_SUFFIX = ".key", ".pub"
 """what the names of key files end in"""
-PRIVATE_KEY = "an Ed25519 private key in PEM without a password, as `unjam keys` writes it"
-PUBLIC_KEY = "an Ed25519 public key in PEM, as `unjam keys` writes it"
-ITS_OWNERS, EVERYBODYS = 0o600, 0o644
+PRIVATE_KEY_DESCRIPTION = "an Ed25519 private key in PEM without a password, as `unjam keys` writes it"
+PUBLIC_KEY_DESCRIPTION = "an Ed25519 public key in PEM, as `unjam keys` writes it"
+PRIVATE_FILE_MODE, PUBLIC_FILE_MODE = 0o600, 0o644
 """who may read a file"""
-LARGEST_KEY = 10_000
+MAX_KEY_BYTES = 10_000
 """bytes of a key's file"""
 FIELD_PRIME = 2**255 - 19
 GROUP_ORDER = 2**252 + 27742317777372353535851937790883648493
 _ORDER_8 = 0x05FC536D880238B13933C6D305ACDFD5F098EFF289F4C345B027B2C28F95E826
-SMALL_ORDER = {0, 1, FIELD_PRIME - 1, _ORDER_8, FIELD_PRIME - _ORDER_8}
+SMALL_ORDER_POINTS = {0, 1, FIELD_PRIME - 1, _ORDER_8, FIELD_PRIME - _ORDER_8}
 """y coordinates of the eight points whose order divides 8: with such a key one signature fits any message.
 Source: RFC 8032, section 5.1; Chalkias et al. 2020, Taming the many EdDSAs"""
-WEAK = "a weak Ed25519 key, for which signatures can be forged,"
-SIGNED = "unjam controller, signature 1"
+WEAK_KEY_TEXT = "a weak Ed25519 key, for which signatures can be forged,"
+SIGNATURE_HEADER = "unjam controller, signature 1"
 """the first line of what is signed: nothing else that is signed with the same key can be taken for it"""
 
 
@@ -65,19 +65,19 @@ def make_keys(name: Path) -> KeyPair:
         DiskError: they cannot be written; neither is there then.
     """
     if not name.name:
-        raise wrong("name", str(name), "what the names of two new files begin with")
-    private, public = (name.with_name(name.name + ending) for ending in (PRIVATE, PUBLIC))
-    check_folder(private)
+        raise invalid_value("name", str(name), "what the names of two new files begin with")
+    private, public = (name.with_name(name.name + ending) for ending in (PRIVATE_SUFFIX, PUBLIC_SUFFIX))
+    check_parent_folder(private)
     for file in (private, public):
         if os.path.lexists(file):
-            raise wrong("name", str(name), f"one of which there are no keys yet: {str(file)!r} exists")
+            raise invalid_value("name", str(name), f"one of which there are no keys yet: {str(file)!r} exists")
     key = Ed25519PrivateKey.generate()
     known = key.public_key()
     secret = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    write_new(private, secret, ITS_OWNERS)
+    write_new_file(private, secret, PRIVATE_FILE_MODE)
     try:
         shown = known.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
-        write_new(public, shown, EVERYBODYS)
+        write_new_file(public, shown, PUBLIC_FILE_MODE)
     except BaseException:
         remove(private)
         raise
@@ -86,38 +86,38 @@ def make_keys(name: Path) -> KeyPair:
 
 def read_private_key(file: Path) -> Ed25519PrivateKey:
     """Return the key of a file; raise `InputError` where it is no Ed25519 private key in PEM."""
-    content = _key_bytes("key", file, PRIVATE_KEY)
+    content = _read_key_file("key", file, PRIVATE_KEY_DESCRIPTION)
     try:
         key = load_pem_private_key(content, None)
     except TypeError:  # it wants a password
-        raise InputError(f"key: {str(file)!r} is encrypted; allowed: {PRIVATE_KEY}") from None
+        raise InputError(f"key: {str(file)!r} is encrypted; allowed: {PRIVATE_KEY_DESCRIPTION}") from None
     except (ValueError, UnsupportedAlgorithm):
-        raise wrong("key", str(file), PRIVATE_KEY) from None
+        raise invalid_value("key", str(file), PRIVATE_KEY_DESCRIPTION) from None
     if not isinstance(key, Ed25519PrivateKey):
-        raise wrong("key", str(file), PRIVATE_KEY)
-    if is_weak(key.public_key().public_bytes_raw()):
-        raise InputError(f"key: {str(file)!r}: {WEAK} is not allowed; allowed: {PRIVATE_KEY}")
+        raise invalid_value("key", str(file), PRIVATE_KEY_DESCRIPTION)
+    if is_weak_point(key.public_key().public_bytes_raw()):
+        raise InputError(f"key: {str(file)!r}: {WEAK_KEY_TEXT} is not allowed; allowed: {PRIVATE_KEY_DESCRIPTION}")
     return key
 
 
 def read_public_key(file: Path) -> str:
     """Return the fingerprint of a file's key; raise `InputError` where it is no Ed25519 public key in PEM."""
-    content = _key_bytes("signer", file, PUBLIC_KEY)
+    content = _read_key_file("signer", file, PUBLIC_KEY_DESCRIPTION)
     try:
         key = load_pem_public_key(content)
     except (ValueError, UnsupportedAlgorithm):
-        raise wrong("signer", str(file), PUBLIC_KEY) from None
+        raise invalid_value("signer", str(file), PUBLIC_KEY_DESCRIPTION) from None
     if not isinstance(key, Ed25519PublicKey):
-        raise wrong("signer", str(file), PUBLIC_KEY)
-    if is_weak(key.public_bytes_raw()):
-        raise InputError(f"signer: {str(file)!r}: {WEAK} is not allowed; allowed: {PUBLIC_KEY}")
+        raise invalid_value("signer", str(file), PUBLIC_KEY_DESCRIPTION)
+    if is_weak_point(key.public_bytes_raw()):
+        raise InputError(f"signer: {str(file)!r}: {WEAK_KEY_TEXT} is not allowed; allowed: {PUBLIC_KEY_DESCRIPTION}")
     return fingerprint_of(key)
 
 
-def is_weak(point: bytes) -> bool:
+def is_weak_point(point: bytes) -> bool:
     """Return whether the encoding of a point is not canonical, or the point is of small order."""
     y = int.from_bytes(point, "little") & (2**255 - 1)  # without the sign of x
-    return y >= FIELD_PRIME or y in SMALL_ORDER
+    return y >= FIELD_PRIME or y in SMALL_ORDER_POINTS
 
 
 def fingerprint_of(key: Ed25519PublicKey) -> str:
@@ -129,7 +129,7 @@ def signature_of(parts: dict[str, bytes], key: Ed25519PrivateKey) -> bytes:
     """Return the part of an archive that says who signed its other `parts`; the same for the same of both."""
     known = key.public_key()
     raw = known.public_bytes_raw()
-    return _written(known, raw, key.sign(_message(parts, raw)))
+    return _signature_json(known, raw, key.sign(_signed_message(parts, raw)))
 
 
 def signer_of(name: str, parts: dict[str, bytes], part: bytes) -> str:
@@ -146,38 +146,38 @@ def signer_of(name: str, parts: dict[str, bytes], part: bytes) -> str:
         key = Ed25519PublicKey.from_public_bytes(raw)
     except (ValueError, LookupError, TypeError, RecursionError):
         raise none_of_ours from None
-    if part != _written(key, raw, signature):  # something else stands there too
+    if part != _signature_json(key, raw, signature):  # something else stands there too
         raise none_of_ours
-    if is_weak(raw):
-        raise InputError(f"controller {name}: it is signed by {WEAK} which is not allowed")
-    if is_weak(signature[:32]) or int.from_bytes(signature[32:], "little") >= GROUP_ORDER:
-        raise forged(name)
+    if is_weak_point(raw):
+        raise InputError(f"controller {name}: it is signed by {WEAK_KEY_TEXT} which is not allowed")
+    if is_weak_point(signature[:32]) or int.from_bytes(signature[32:], "little") >= GROUP_ORDER:
+        raise forged_error(name)
     try:
-        key.verify(signature, _message(parts, raw))
+        key.verify(signature, _signed_message(parts, raw))
     except InvalidSignature:
-        raise forged(name) from None
+        raise forged_error(name) from None
     return fingerprint_of(key)
 
 
-def forged(name: str) -> InputError:
+def forged_error(name: str) -> InputError:
     """Return the error for a controller that is whole, but not what was signed."""
     return InputError(f"controller {name}: forged: it was changed after it was signed")
 
 
-def _message(parts: dict[str, bytes], raw: bytes) -> bytes:
+def _signed_message(parts: dict[str, bytes], public_key: bytes) -> bytes:
     hashes = [f"{hashlib.sha256(part).hexdigest()}  {name}" for name, part in sorted(parts.items())]
-    return "".join(f"{line}\n" for line in (SIGNED, f"public key {raw.hex()}", *hashes)).encode()
+    return "".join(f"{line}\n" for line in (SIGNATURE_HEADER, f"public key {public_key.hex()}", *hashes)).encode()
 
 
-def _written(key: Ed25519PublicKey, raw: bytes, signature: bytes) -> bytes:
-    said = {"fingerprint": fingerprint_of(key), "public_key": raw.hex(), "signature": signature.hex()}
+def _signature_json(key: Ed25519PublicKey, public_key: bytes, signature: bytes) -> bytes:
+    said = {"fingerprint": fingerprint_of(key), "public_key": public_key.hex(), "signature": signature.hex()}
     return to_json({"algorithm": "Ed25519", **said}, indent=1).encode()
 
 
-def _key_bytes(field: str, file: Path, allowed: str) -> bytes:
+def _read_key_file(field: str, file: Path, allowed: str) -> bytes:
     """Return the content of a key's file; a pipe or a device is not waited for."""
     if not os.path.exists(file):
         raise InputError(f"{field}: {str(file)!r} does not exist; allowed: {allowed}")
-    if not os.path.isfile(file) or os.path.getsize(file) > LARGEST_KEY:
-        raise wrong(field, str(file), allowed)
+    if not os.path.isfile(file) or os.path.getsize(file) > MAX_KEY_BYTES:
+        raise invalid_value(field, str(file), allowed)
     return file.read_bytes()

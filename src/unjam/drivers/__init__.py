@@ -5,12 +5,12 @@ from unjam.drivers.check import check_driver
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory
 from unjam.drivers.follower_stopper import FollowerStopper
-from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.registry import DRIVERS
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
+from unjam.drivers.user_driver import DriverLike, as_driver
 
 __all__ = [
     "ACC",

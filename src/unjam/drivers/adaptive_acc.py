@@ -6,19 +6,19 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Formula, Memory
-from unjam.drivers.local_state import LARGEST_GAP, SPEED_SCALE, LocalState, Observed
-from unjam.parameters import STRICT, NotNegative, Positive
-from unjam.physics.arrays import Array, at_least, namespace, stack_columns
-from unjam.physics.idm import IDMParameters, IDMRows, idm_acceleration
+from unjam.drivers.driver import FormulaDriver, Memory
+from unjam.drivers.local_state import MAX_OBSERVED_GAP, SPEED_SCALE, LocalState, ScaledInput
+from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.physics.arrays import Array, clamp_min, namespace, stack_columns
+from unjam.physics.idm import IDMArrays, IDMParameters, idm_acceleration
 
-SMALLEST_GAP = 0.01
+_MIN_GAP = 0.01
 """[m]; the intelligent driver model divides by the gap"""
-NO_LEADER = 1e6
+NO_LEADER_GAP = 1e6
 """gap that holds nobody back [m]"""
 
 
-class Strategy(NamedTuple):
+class DrivingStrategy(NamedTuple):
     """What a state of traffic multiplies the time headway, the acceleration and the braking by."""
 
     time_headway: float
@@ -26,18 +26,18 @@ class Strategy(NamedTuple):
     deceleration: float
 
 
-COMFORTABLE = Strategy(1.0, 1.0, 1.0)
+FREE_ROAD_STRATEGY = DrivingStrategy(1.0, 1.0, 1.0)
 """on a free road, and within a jam"""
-APPROACHING = Strategy(1.0, 1.0, 0.7)
+JAM_TAIL_STRATEGY = DrivingStrategy(1.0, 1.0, 0.7)
 """a jam's tail: brakes early, for the safety of those behind"""
-BOTTLENECK = Strategy(0.7, 1.5, 1.0)
+BOTTLENECK_STRATEGY = DrivingStrategy(0.7, 1.5, 1.0)
 """near where a ramp joins"""
-LEAVING = Strategy(0.5, 2.0, 1.0)
+JAM_HEAD_STRATEGY = DrivingStrategy(0.5, 2.0, 1.0)
 """a jam's head: what leaves it sooner lets it shrink"""
 
 
 @dataclass(frozen=True, config=STRICT)
-class AdaptiveACC(IDMParameters, Formula):
+class AdaptiveACC(IDMParameters, FormulaDriver):
     """Follows as the intelligent driver model with a headway and an acceleration that fit the traffic around.
 
     It brakes early at a jam's tail, accelerates briskly out of its head, and keeps smaller gaps there and
@@ -48,10 +48,10 @@ class AdaptiveACC(IDMParameters, Formula):
     """
 
     name: ClassVar[str] = "adaptive-acc"
-    told: ClassVar[tuple[str, ...]] = ("allowed_speed", "to_merge")
-    observed_memory: ClassVar[tuple[Observed, ...]] = (
-        Observed("mean own speed", SPEED_SCALE, "m/s"),
-        Observed("it leaves a jam", 1.0, ""),
+    required_fields: ClassVar[tuple[str, ...]] = ("allowed_speed", "distance_to_merge")
+    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
+        ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
+        ScaledInput("it leaves a jam", 1.0, ""),
     )
 
     time_headway: Positive = 1.5
@@ -64,13 +64,13 @@ class AdaptiveACC(IDMParameters, Formula):
     """a mean speed above it is a free road's [m/s]"""
     jam_speed: Positive = 11.1
     """a mean speed below it is a jam's [m/s]"""
-    front: Positive = 2.8
+    jam_front_speed_change: Positive = 2.8
     """change of speed against its mean that tells a jam's tail or head [m/s]"""
-    averaging: Positive = 5.0
+    averaging_time: Positive = 5.0
     """time over which the own speed is averaged [s]"""
-    before: NotNegative = 300.0
+    upstream_distance: NonNegative = 300.0
     """how far before a ramp joins the bottleneck begins [m]"""
-    behind: NotNegative = 300.0
+    downstream_distance: NonNegative = 300.0
     """how far behind it it ends [m]"""
     time_step: Positive = 0.1
     """time between two decisions [s]; set by the road"""
@@ -84,35 +84,41 @@ class AdaptiveACC(IDMParameters, Formula):
         speed, last = state.speed, memory["mean"]
         xp = namespace(speed)
         last = xp.where(xp.isnan(last), speed, last)
-        mean = last + (1.0 - exp(-self.time_step / self.averaging)) * (speed - last)
-        approaches, faster = speed - mean < -self.front, speed - mean > self.front
+        mean = last + (1.0 - exp(-self.time_step / self.averaging_time)) * (speed - last)
+        approaches, faster = speed - mean < -self.jam_front_speed_change, speed - mean > self.jam_front_speed_change
         ends = approaches | (mean > self.free_speed) | (mean < self.jam_speed)
         leaves = xp.where(faster, speed * 0.0 + 1.0, xp.where(ends, speed * 0.0, memory["leaves"]))
 
         near = speed < 0.0
-        if state.to_merge is not None:
-            near = (state.to_merge < self.before) & (state.to_merge > -self.behind)
-        factors = [speed * 0.0 + factor for factor in COMFORTABLE]
-        for holds, strategy in ((approaches, APPROACHING), (near, BOTTLENECK), (leaves > 0.0, LEAVING)):
-            factors = [
-                xp.where(holds, speed * 0.0 + new, old) for new, old in zip(strategy, factors, strict=True)
-            ]
-        return self._follow(state, *factors), {"mean": mean, "leaves": leaves}
+        if state.distance_to_merge is not None:
+            near = (state.distance_to_merge < self.upstream_distance) & (
+                state.distance_to_merge > -self.downstream_distance
+            )
+        factors = [speed * 0.0 + factor for factor in FREE_ROAD_STRATEGY]
+        for holds, strategy in (
+            (approaches, JAM_TAIL_STRATEGY),
+            (near, BOTTLENECK_STRATEGY),
+            (leaves > 0.0, JAM_HEAD_STRATEGY),
+        ):
+            factors = [xp.where(holds, speed * 0.0 + new, old) for new, old in zip(strategy, factors, strict=True)]
+        return self._idm_acceleration(state, *factors), {"mean": mean, "leaves": leaves}
 
-    def _follow(self, state: LocalState, headway: Array, acceleration: Array, braking: Array) -> Array:
+    def _idm_acceleration(
+        self, state: LocalState, time_headway_factor: Array, acceleration_factor: Array, deceleration_factor: Array
+    ) -> Array:
         """Return the model's acceleration with three of its parameters multiplied."""
         speed = state.speed
         xp, wanted = namespace(speed), state.allowed_speed
-        parameters = IDMRows(
+        parameters = IDMArrays(
             desired_speed=speed * 0.0 + self.desired_speed if wanted is None else wanted,
-            time_headway=self.time_headway * headway,
-            max_acceleration=self.max_acceleration * acceleration,
-            comfortable_deceleration=self.comfortable_deceleration * braking,
+            time_headway=self.time_headway * time_headway_factor,
+            max_acceleration=self.max_acceleration * acceleration_factor,
+            comfortable_deceleration=self.comfortable_deceleration * deceleration_factor,
             exponent=self.exponent,
             minimum_gap=self.minimum_gap,
         )
-        gap = at_least(state.leader_gap, SMALLEST_GAP)
-        gap = xp.where(gap < LARGEST_GAP, gap, gap * 0.0 + NO_LEADER)
+        gap = clamp_min(state.leader_gap, _MIN_GAP)
+        gap = xp.where(gap < MAX_OBSERVED_GAP, gap, gap * 0.0 + NO_LEADER_GAP)
         return idm_acceleration(speed, state.leader_speed, gap, parameters)
 
     def memory_features(self, memory: Memory) -> Array:

@@ -7,18 +7,18 @@ import numpy as np
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Formula, Memory
+from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import LocalState
-from unjam.parameters import STRICT, NotNegative, Positive
-from unjam.physics.arrays import Array, at_least, clip, namespace
+from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.physics.arrays import Array, clamp_min, clip, namespace
 from unjam.physics.idm import IDMParameters, idm_acceleration
 
-SMALLEST_GAP = 0.01
+_MIN_GAP = 0.01
 """[m]; the intelligent driver model divides by the gap"""
 
 
 @dataclass(frozen=True, config=STRICT)
-class IDM(IDMParameters, Formula):
+class IDM(IDMParameters, FormulaDriver):
     """A CAV that follows like an ideal human driver, without noise and within the action limit.
 
     Source: Treiber, Hennecke, Helbing 2000; paper Eq. 5-6 with the parameters of Table B1.
@@ -28,19 +28,19 @@ class IDM(IDMParameters, Formula):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the IDM acceleration; nothing is remembered."""
-        gap = at_least(state.leader_gap, SMALLEST_GAP)
+        gap = clamp_min(state.leader_gap, _MIN_GAP)
         return idm_acceleration(state.speed, state.leader_speed, gap, self), memory
 
 
 @dataclass(frozen=True, config=STRICT)
-class Human(Formula):
+class Human(FormulaDriver):
     """Nobody automated: the vehicle stays one of the road's human drivers, with their noise.
 
     With this driver the traffic is all-human. It is the simulator that drives.
     """
 
     name: ClassVar[str] = "human"
-    native: ClassVar[bool] = True
+    is_native: ClassVar[bool] = True
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what the paper's IDM would do; the simulator does not ask."""
@@ -48,7 +48,7 @@ class Human(Formula):
 
 
 @dataclass(frozen=True, config=STRICT)
-class OVM(Formula):
+class OVM(FormulaDriver):
     """Relaxes to an optimal speed that depends on the gap, and to the leader's speed.
 
     Source: Bando et al. 1995, Phys. Rev. E 51:1035, with relative speed; defaults as Flow's `OVMController`.
@@ -56,19 +56,19 @@ class OVM(Formula):
 
     name: ClassVar[str] = "ovm"
 
-    gap_gain: NotNegative = 1.0
+    gap_gain: NonNegative = 1.0
     """alpha [1/s]"""
-    speed_gain: NotNegative = 1.0
+    speed_gain: NonNegative = 1.0
     """beta [1/s]"""
-    stop_gap: NotNegative = 2.0
+    stop_gap: NonNegative = 2.0
     """h_st: gap below which the optimal speed is zero [m]"""
     go_gap: Positive = 15.0
     """h_go: gap from which on it is the largest [m]"""
-    largest_speed: Positive = 30.0
+    max_speed: Positive = 30.0
     """v_max [m/s]"""
 
     @model_validator(mode="after")
-    def _in_order(self) -> "OVM":
+    def _check_gap_order(self) -> "OVM":
         if self.go_gap <= self.stop_gap:
             allowed = f"> stop_gap, {self.stop_gap:g}"
             raise ValueError(f"go_gap: {self.go_gap:g} is not allowed; allowed: {allowed}")
@@ -77,13 +77,13 @@ class OVM(Formula):
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the optimal speed; nothing is remembered."""
         share = clip((state.leader_gap - self.stop_gap) / (self.go_gap - self.stop_gap), 0.0, 1.0)
-        optimal = self.largest_speed / 2.0 * (1.0 - namespace(share).cos(pi * share))
+        optimal = self.max_speed / 2.0 * (1.0 - namespace(share).cos(pi * share))
         acceleration = self.gap_gain * (optimal - state.speed)
         return acceleration + self.speed_gain * (state.leader_speed - state.speed), memory
 
 
 @dataclass(frozen=True, config=STRICT)
-class BCM(Formula):
+class BCM(FormulaDriver):
     """Steers towards equal gaps and equal relative speeds ahead and behind, and towards a desired speed.
 
     Where all drive so, waves cannot grow; one among people is another matter.
@@ -92,13 +92,13 @@ class BCM(Formula):
 
     name: ClassVar[str] = "bcm"
 
-    gap_gain: NotNegative = 1.0
+    gap_gain: NonNegative = 1.0
     """k_d [1/s2]"""
-    speed_gain: NotNegative = 1.0
+    speed_gain: NonNegative = 1.0
     """k_v [1/s]"""
-    desired_speed_gain: NotNegative = 1.0
+    desired_speed_gain: NonNegative = 1.0
     """k_c [1/s]"""
-    desired_speed: NotNegative = 8.0
+    desired_speed: NonNegative = 8.0
     """[m/s]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
@@ -114,7 +114,7 @@ class BCM(Formula):
 
 
 @dataclass(frozen=True, config=STRICT)
-class ACC(Formula):
+class ACC(FormulaDriver):
     """Keeps a constant time gap to the leader, and never drives faster than its set speed.
 
     The defaults are those fitted to production cars. Source: Milanés and Shladover 2014, Transp. Res. C
@@ -125,27 +125,27 @@ class ACC(Formula):
 
     time_gap: Positive = 1.1
     """wanted gap over own speed [s]"""
-    standstill_gap: NotNegative = 2.0
+    standstill_gap: NonNegative = 2.0
     """wanted gap of a standing vehicle [m]"""
     set_speed: Positive = 30.0
     """speed on a free road [m/s]"""
-    gap_gain: NotNegative = 0.23
+    gap_gain: NonNegative = 0.23
     """acceleration for each metre of gap too much [1/s2]"""
-    speed_gain: NotNegative = 0.07
+    speed_gain: NonNegative = 0.07
     """acceleration for each m/s that the leader is faster [1/s]"""
-    free_gain: NotNegative = 0.4
+    set_speed_gain: NonNegative = 0.4
     """acceleration for each m/s below the set speed [1/s]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the smaller of following and free driving; nothing is remembered."""
         excess = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
         following = self.gap_gain * excess + self.speed_gain * (state.leader_speed - state.speed)
-        free = self.free_gain * (self.set_speed - state.speed)
+        free = self.set_speed_gain * (self.set_speed - state.speed)
         return namespace(state.speed).minimum(following, free), memory
 
 
 @dataclass(frozen=True, config=STRICT)
-class LACC(Formula):
+class LACC(FormulaDriver):
     """Linear adaptive cruise control whose acceleration follows its command with a lag.
 
     Source: Rajamani 2012, Vehicle Dynamics and Control, chapter 6; the defaults are those of Flow's
@@ -154,13 +154,13 @@ class LACC(Formula):
 
     name: ClassVar[str] = "lacc"
 
-    gap_gain: NotNegative = 0.3
+    gap_gain: NonNegative = 0.3
     """k_1 [1/s2]"""
-    speed_gain: NotNegative = 0.4
+    speed_gain: NonNegative = 0.4
     """k_2 [1/s]"""
-    time_gap: NotNegative = 1.0
+    time_gap: NonNegative = 1.0
     """h [s]"""
-    standstill_gap: NotNegative = 5.0
+    standstill_gap: NonNegative = 5.0
     """wanted gap of a standing vehicle [m]"""
     lag: Positive = 0.1
     """tau: time after which the acceleration has come near the command [s]"""
@@ -181,7 +181,7 @@ class LACC(Formula):
 
 
 @dataclass(frozen=True, config=STRICT)
-class Constant(Formula):
+class Constant(FormulaDriver):
     """Asks for the same acceleration in every step; only the shield keeps it from the car ahead."""
 
     name: ClassVar[str] = "constant"

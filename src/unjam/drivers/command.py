@@ -20,7 +20,7 @@ class Command(NamedTuple):
 
     acceleration: Array
     """[m/s2]"""
-    time_headway: Array | None = None
+    time_gap: Array | None = None
     """that their own ACCs shall keep to leaders, on roads that have such ACCs [s], shape (n,); NaN, or None
     for all: as long as they would by themselves"""
 
@@ -33,7 +33,7 @@ class Limits(NamedTuple):
     highest: float
     """[m/s2]"""
 
-    def keep(self, acceleration: Array) -> Array:
+    def clip(self, acceleration: Array) -> Array:
         """Return accelerations within the limits, of the same shape; NaN stays NaN."""
         return clip(acceleration, self.lowest, self.highest)
 
@@ -43,19 +43,19 @@ class Limits(NamedTuple):
         return cls(-limit, limit)
 
 
-def as_rows(answer: Any, rows: int, where: str, what: str = "acceleration") -> NDArray[np.float64]:
+def answer_as_array(answer: Any, rows: int, context: str, quantity: str = "acceleration") -> NDArray[np.float64]:
     """Return what a driver answered as an array; raise `InputError` unless it is `rows` numbers."""
     try:
         array = np.asarray(answer, np.float64)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: {what} is not numbers: {answer!r}") from None
+        raise InputError(f"{context}: {quantity} is not numbers: {answer!r}") from None
     if array.shape != (rows,):
         allowed = f"({rows},), one for each CAV"
-        raise InputError(f"{where}: {what} has shape {array.shape}; allowed: {allowed}")
+        raise InputError(f"{context}: {quantity} has shape {array.shape}; allowed: {allowed}")
     return array
 
 
-def accelerations_of_many(command: Command | None, limits: Limits, rows: int, step: int) -> Array:
+def batch_commanded_accelerations(command: Command | None, limits: Limits, rows: int, step: int) -> Array:
     """Return what the vehicles of many roads are told, within the limits, shape (rows,) [m/s2].
 
     Raises:
@@ -64,10 +64,10 @@ def accelerations_of_many(command: Command | None, limits: Limits, rows: int, st
     found: Any = () if command is None else command.acceleration
     if np.shape(found) != (rows,) or not bool(namespace(found).isfinite(found).all()):
         raise InputError(f"driver: step {step}: not {rows} accelerations that are finite")
-    return limits.keep(found)
+    return limits.clip(found)
 
 
-def accelerations(command: Command | None, limits: Limits, names: Sequence[str], step: int) -> list[float]:
+def commanded_accelerations(command: Command | None, limits: Limits, names: Sequence[str], step: int) -> list[float]:
     """Return what the vehicles `names` are told, within the limits, as plain floats [m/s2].
 
     An acceleration is a number, or one for each vehicle; None is right for no vehicle. Messages name `step`.
@@ -79,26 +79,26 @@ def accelerations(command: Command | None, limits: Limits, names: Sequence[str],
     rows = len(names)
     one = type(found) is float and rows == 1
     if one and isfinite(found):  # in every step of a simulator: be quick
-        return [limits.keep(found)]
+        return [limits.clip(found)]
     where = f"driver: step {step}"
-    values = as_rows([found] if one else found, rows, where)
+    values = answer_as_array([found] if one else found, rows, where)
     if not all(map(isfinite, values.tolist())):  # quicker than NumPy where vehicles are few
         first = int(np.isfinite(values).argmin())
         raise InputError(f"{where}: acceleration of {names[first]} is {values[first]}; allowed: finite")
-    return limits.keep(values).tolist()
+    return limits.clip(values).tolist()
 
 
-def time_headways(command: Command | None, least: float, names: Sequence[str], step: int) -> list[float]:
+def commanded_time_gaps(command: Command | None, min_time_gap: float, names: Sequence[str], step: int) -> list[float]:
     """Return the time headways that the vehicles `names` shall keep [s]: none below `least`, their ACCs' own.
 
     Raises:
         InputError: one is infinite, or there are not as many as vehicles.
     """
-    wanted = None if command is None else command.time_headway
+    wanted = None if command is None else command.time_gap
     if wanted is None:
-        return [least] * len(names)
+        return [min_time_gap] * len(names)
     where = f"driver: step {step}"
-    found = np.fmax(as_rows(wanted, len(names), where, "time headway"), least)  # NaN gives way
+    found = np.fmax(answer_as_array(wanted, len(names), where, "time headway"), min_time_gap)  # NaN gives way
     if not np.isfinite(found).all():
         first = int(np.isfinite(found).argmin())
         wrong = f"time headway of {names[first]} is {found[first]}"

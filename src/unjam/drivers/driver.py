@@ -8,9 +8,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from unjam.drivers.command import Command, Limits
-from unjam.drivers.local_state import EVERYWHERE, LocalState, Observed
+from unjam.drivers.local_state import COMMON_FIELDS, LocalState, ScaledInput
 from unjam.physics.arrays import Array
-from unjam.tree import Arrays, mapped
+from unjam.tree import Arrays, map_leaves
 
 Memory = dict[str, Any]
 """What a driver remembers from one decision to the next: arrays whose first axis is the CAV's row, by name. A
@@ -19,7 +19,7 @@ driver that holds another one keeps that one's memory within its own."""
 Recipe = dict[str, Any]
 """What a driver is made from, as JSON; the weights of its networks travel beside it as arrays."""
 
-Noise = Callable[[], Array]
+NoiseSampler = Callable[[], Array]
 """answers standard normal noise, one number for each row, for one look of a network"""
 
 
@@ -53,33 +53,33 @@ class Driver:
     name: ClassVar[str] = ""
     """what `--driver` calls it; empty where it cannot be named"""
 
-    plain_numbers: ClassVar[bool] = False
-    """True where `act` also takes a single CAV in plain numbers (see `single_row` for its memory): it then
+    accepts_floats: ClassVar[bool] = False
+    """True where `act` also takes a single CAV in plain numbers (see `scalar_memory` for its memory): it then
     answers a float, several times faster than with arrays of one row."""
 
-    tensors: ClassVar[bool] = False
+    accepts_tensors: ClassVar[bool] = False
     """True where `act` also takes torch tensors, as in the virtual environment; otherwise it is asked there
     through NumPy, which is slower."""
 
     needs_loop: ClassVar[bool] = False
     """True where it must know its place on a closed road"""
 
-    told: ClassVar[tuple[str, ...]] = ()
+    required_fields: ClassVar[tuple[str, ...]] = ()
     """fields of a `LocalState` that it looks at and that only some roads offer"""
 
-    sees: ClassVar[tuple[str, ...]] = ()
+    policy_inputs: ClassVar[tuple[str, ...]] = ()
     """features that networks in it see, whatever the road: by name"""
 
-    observed_memory: ClassVar[tuple[Observed, ...]] = ()
+    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
     """what `memory_features` are, in order"""
 
-    native: ClassVar[bool] = False
+    is_native: ClassVar[bool] = False
     """True where the simulator itself drives (a human driver): `act` is then not asked."""
 
-    hold: int = 1
+    action_repeat: int = 1
     """decisions for which one residual is held"""
 
-    lasting_noise: int = 0
+    episode_noise_size: int = 0
     """how many numbers it explores with that stay as they are all episode long; 0: a new one each time"""
 
     limits: Limits | None = None
@@ -87,14 +87,14 @@ class Driver:
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of `n` CAVs before their first step: NumPy arrays of shape (n, ...)."""
-        return {name: held.initial_memory(n) for name, held in self.inner.items()}
+        return {name: held.initial_memory(n) for name, held in self.inner_drivers.items()}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` as if the driver had watched `history` before it took over.
 
         Called once, where a warm-up came before. `history` holds arrays of shape (n, steps), oldest first.
         """
-        return memory | {name: held.recall(memory[name], history) for name, held in self.inner.items()}
+        return memory | {name: held.recall(memory[name], history) for name, held in self.inner_drivers.items()}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the wanted acceleration [m/s2], shape (n,), and the memory after this step.
@@ -103,13 +103,13 @@ class Driver:
         """
         raise NotImplementedError
 
-    def decide(self, state: LocalState, memory: Memory, noise: Noise | None = None) -> Decision:
+    def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
         """Return the decision taken apart; with `noise`, what was learned explores."""
         acceleration, after = self.act(state, memory)
-        command = Command(acceleration, self.time_headways(state, memory))
+        command = Command(acceleration, self.time_gaps(state, memory))
         return Decision(command, acceleration, 0.0, None, after)
 
-    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+    def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time headways that its cars' own ACCs shall keep now, as a `Command` has them."""
         return None
 
@@ -124,25 +124,27 @@ class Driver:
     # What a driver says of itself: to the registry, to workers, to the file that is shipped.
 
     @property
-    def inner(self) -> dict[str, "Driver"]:
+    def inner_drivers(self) -> dict[str, "Driver"]:
         """The drivers that it holds, by the names of their memories, which prefix their networks' weights."""
         return {}
 
     @property
-    def shown(self) -> tuple[Observed, ...] | None:
+    def network_inputs(self) -> tuple[ScaledInput, ...] | None:
         """What its own network sees, in order; None without one."""
         return None
 
     @property
-    def perceives(self) -> tuple[str, ...]:
+    def input_fields(self) -> tuple[str, ...]:
         """The fields of a `LocalState` that it is given."""
-        asked = {*EVERYWHERE, *self.told}.union(*(held.perceives for held in self.inner.values()))
+        asked = {*COMMON_FIELDS, *self.required_fields}.union(
+            *(held.input_fields for held in self.inner_drivers.values())
+        )
         return tuple(name for name in LocalState._fields if name in asked)
 
     @property
-    def asks(self) -> frozenset[str]:
+    def measured_fields(self) -> frozenset[str]:
         """The fields of a `LocalState` that a road measures for it: what it and those it holds perceive."""
-        return frozenset(self.perceives).union(*(held.asks for held in self.inner.values()))
+        return frozenset(self.input_fields).union(*(held.measured_fields for held in self.inner_drivers.values()))
 
     def describe(self) -> str:
         """Return it in a few words: its name and the parameters that differ from the defaults."""
@@ -150,46 +152,42 @@ class Driver:
             return type(self).__name__
         default = {field.name: field.default for field in fields(self)}  # pyright: ignore[reportArgumentType]
         parameters = self.recipe()["parameters"]
-        changed = {
-            key: value for key, value in parameters.items() if value != default[key] and key != "time_step"
-        }
-        return labelled(self.name, changed)
+        changed = {key: value for key, value in parameters.items() if value != default[key] and key != "time_step"}
+        return label_with_parameters(self.name, changed)
 
     def recipe(self) -> Recipe:
-        """Return what it is made from; its networks' weights are `arrays`."""
+        """Return what it is made from; its networks' weights are `weights`."""
         parameters = asdict(self) if is_dataclass(self) else {}
         own = vars(type(self)).get("name", "")  # not that of a class which it inherits from
         return {"kind": "named", "name": own, "parameters": parameters}
 
-    def arrays(self) -> Arrays:
+    def weights(self) -> Arrays:
         """Return the weights of its networks, those of the drivers that it holds with their prefix."""
         return {
-            f"{name}.{key}": array
-            for name, held in self.inner.items()
-            for key, array in held.arrays().items()
+            f"{name}.{key}": array for name, held in self.inner_drivers.items() for key, array in held.weights().items()
         }
 
 
-class Formula(Driver):
+class FormulaDriver(Driver):
     """A driver that is written once for arrays, tensors and plain numbers (see `unjam.physics.arrays`)."""
 
-    plain_numbers: ClassVar[bool] = True
-    tensors: ClassVar[bool] = True
+    accepts_floats: ClassVar[bool] = True
+    accepts_tensors: ClassVar[bool] = True
 
 
-def labelled(name: str, parameters: dict[str, Any]) -> str:
+def label_with_parameters(name: str, parameters: dict[str, Any]) -> str:
     """Return `name:key=value,key=value`; the name alone where there are no parameters."""
     values = ",".join(f"{key}={value}" for key, value in parameters.items())
     return f"{name}:{values}" if values else name
 
 
-def single_row(memory: Memory) -> Memory:
+def scalar_memory(memory: Memory) -> Memory:
     """Return the memory of one CAV in plain numbers: floats, and Python's own arrays of them."""
-    return mapped(lambda rows: rows[0].item() if rows.ndim == 1 else array("d", rows[0]), memory)
+    return map_leaves(lambda rows: rows[0].item() if rows.ndim == 1 else array("d", rows[0]), memory)
 
 
-def carried(memory: Memory, kept: Any, newcomers: Memory, new: int) -> Memory:
-    """Return the rows `kept` of a memory and, behind them, the last `new` of `newcomers`."""
-    if not new:
-        return mapped(lambda rows: rows[kept], memory)
-    return mapped(lambda rows, fresh: np.concatenate([rows[kept], fresh[-new:]]), memory, newcomers)
+def carry_over_memory(memory: Memory, kept_rows: Any, new_memory: Memory, new_count: int) -> Memory:
+    """Return the rows `remaining_rows` of a memory and, behind them, the last `new` of `newcomers`."""
+    if not new_count:
+        return map_leaves(lambda rows: rows[kept_rows], memory)
+    return map_leaves(lambda rows, fresh: np.concatenate([rows[kept_rows], fresh[-new_count:]]), memory, new_memory)

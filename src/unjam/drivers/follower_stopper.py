@@ -5,15 +5,15 @@ from typing import ClassVar
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Formula, Memory
+from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.speed_history import empty_window, fill, mean_speed, slide
-from unjam.parameters import STRICT, NotNegative, Positive
+from unjam.drivers.speed_history import empty_window, fill_window, slide_window, window_mean_speed
+from unjam.parameters import STRICT, NonNegative, Positive
 from unjam.physics.arrays import Array, clip, namespace
 
 
 @dataclass(frozen=True, config=STRICT)
-class FollowerStopper(Formula):
+class FollowerStopper(FormulaDriver):
     """Drives at the desired speed while the gap allows it, and below it in three regions of the gap.
 
     In the field the desired speed was set from outside, as an estimate of the speed of traffic. By default
@@ -24,7 +24,7 @@ class FollowerStopper(Formula):
 
     name: ClassVar[str] = "follower-stopper"
 
-    desired_speed: NotNegative | None = None
+    desired_speed: NonNegative | None = None
     """U [m/s]; None: mean speed of the leader over the window"""
     window: Positive = 38.0
     """time over which the leader's speed is averaged [s]"""
@@ -32,13 +32,13 @@ class FollowerStopper(Formula):
     """borders of the three regions at equal speeds [m]"""
     decelerations: tuple[Positive, Positive, Positive] = (1.5, 1.0, 0.5)
     """how fast the borders grow when closing in [m/s2]"""
-    time_constant: NotNegative = 0.0
+    time_constant: NonNegative = 0.0
     """time over which the wanted speed is reached [s]; 0: one time step"""
     time_step: Positive = 0.1
     """time between two decisions [s]; set by the road"""
 
     @model_validator(mode="after")
-    def _in_order(self) -> "FollowerStopper":
+    def _check_gap_order(self) -> "FollowerStopper":
         stop, follow, free = self.gaps
         if not stop < follow < free:
             raise ValueError(f"gaps: {list(self.gaps)} is not allowed; allowed: each larger than the last")
@@ -50,13 +50,13 @@ class FollowerStopper(Formula):
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` with the leader's speeds of the warm-up in its window."""
-        return fill(memory, history.leader_speed)
+        return fill_window(memory, history.leader_speed)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed, and the new memory."""
         xp = namespace(state.speed)
-        window = slide(memory, state.leader_speed)
-        mean = mean_speed(window)
+        window = slide_window(memory, state.leader_speed)
+        mean = window_mean_speed(window)
         desired = mean if self.desired_speed is None else mean * 0.0 + self.desired_speed
 
         closing = xp.minimum(state.leader_speed - state.speed, state.speed * 0.0)

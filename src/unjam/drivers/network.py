@@ -32,21 +32,21 @@ class Network:
     """largest residual acceleration [m/s2]"""
     exploration_std: float = 0.0
     """standard deviation of the exploration noise [m/s2], where the network does not give it"""
-    lasts: bool = False
+    episode_noise: bool = False
     """whether noise changes what the last hidden layer is weighed with, and the bias; `exploration_std` is
     then that of each of them"""
     squashes_noise: bool = field(init=False)
     """whether the network gives its noise's log standard deviation, and adds the noise before the tanh"""
-    _hidden: tuple[Floats, ...] = field(init=False, repr=False, compare=False)
-    _last: Floats = field(init=False, repr=False, compare=False)
-    _residual: Floats = field(init=False, repr=False, compare=False)
+    _hidden_weights: tuple[Floats, ...] = field(init=False, repr=False, compare=False)
+    _last_weights: Floats = field(init=False, repr=False, compare=False)
+    _residual_weights: Floats = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         *hidden, last = _fold_biases(self.layers)
         object.__setattr__(self, "squashes_noise", self.layers[-1][1].shape == (2,))
-        object.__setattr__(self, "_hidden", tuple(hidden))
-        object.__setattr__(self, "_last", last)
-        object.__setattr__(self, "_residual", np.ascontiguousarray(last[:, 0]))
+        object.__setattr__(self, "_hidden_weights", tuple(hidden))
+        object.__setattr__(self, "_last_weights", last)
+        object.__setattr__(self, "_residual_weights", np.ascontiguousarray(last[:, 0]))
 
     def __call__(self, observation: Any) -> Any:
         """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple.
@@ -54,9 +54,9 @@ class Network:
         Torch tensors are answered with tensors, in their own precision and on their own device.
         """
         if isinstance(observation, tuple):
-            return self.authority * math.tanh(self._outputs(observation, self._residual))
+            return self.authority * math.tanh(self._outputs_on_arrays(observation, self._residual_weights))
         if isinstance(observation, np.ndarray):
-            return self.authority * np.tanh(self._outputs(observation, self._residual))
+            return self.authority * np.tanh(self._outputs_on_arrays(observation, self._residual_weights))
         return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
 
     def explore(self, observation: Any, noise: Any) -> Any:
@@ -66,13 +66,13 @@ class Network:
         last hidden layer and one for the bias, shape (n, units + 1), or (units + 1,) for a tuple. Source:
         generalised state-dependent exploration, Raffin et al. 2022, CoRL, which leaves the bias out.
         """
-        if self.lasts:
-            shift = self.exploration_std * (self._units(observation) * noise).sum(-1)
+        if self.episode_noise:
+            shift = self.exploration_std * (self._hidden_units(observation) * noise).sum(-1)
             return self(observation) + (float(shift) if isinstance(observation, tuple) else shift)
         if not self.squashes_noise:
             return self(observation) + self.exploration_std * noise
         if isinstance(observation, (tuple, np.ndarray)):
-            mean, log_std = self._outputs(observation, self._last[:, :2]).T
+            mean, log_std = self._outputs_on_arrays(observation, self._last_weights[:, :2]).T
         else:
             mean, log_std = self._outputs_on_tensors(observation).T
         xp = np if isinstance(observation, tuple) else namespace(observation)
@@ -81,51 +81,51 @@ class Network:
 
     def _outputs_on_tensors(self, observation: Array) -> Array:
         """Return the last layer's outputs, shape (n, outputs)."""
-        hidden = self._units_of_tensors(observation)
-        weight, bias = _like(hidden, self.layers[-1])
+        hidden = self._hidden_units_of_tensors(observation)
+        weight, bias = _as_tensors_like(hidden, self.layers[-1])
         return namespace(hidden).addmm(bias, hidden, weight)
 
-    def _units_of_tensors(self, observation: Array) -> Array:
+    def _hidden_units_of_tensors(self, observation: Array) -> Array:
         """Return the last hidden layer, shape (n, units)."""
         hidden = observation
         for layer in self.layers[:-1]:
-            weight, bias = _like(hidden, layer)
+            weight, bias = _as_tensors_like(hidden, layer)
             hidden = namespace(hidden).addmm(bias, hidden, weight).relu_()
         return hidden
 
-    def _units(self, observation: Any) -> Any:
+    def _hidden_units(self, observation: Any) -> Any:
         """Return the last hidden layer and a one, shape (n, units + 1), or (units + 1,) for a tuple."""
         if isinstance(observation, (tuple, np.ndarray)):
-            return self._folded_units(observation)
-        return with_one(self._units_of_tensors(observation))
+            return self._hidden_units_of_arrays(observation)
+        return append_ones(self._hidden_units_of_tensors(observation))
 
-    def _outputs(self, observation: Any, last: Floats) -> Any:
+    def _outputs_on_arrays(self, observation: Any, last_weights: Floats) -> Any:
         """Return what the weights `last` make of the last hidden layer."""
-        return self._folded_units(observation).dot(last)
+        return self._hidden_units_of_arrays(observation).dot(last_weights)
 
-    def _folded_units(self, observation: Any) -> Floats:
+    def _hidden_units_of_arrays(self, observation: Any) -> Floats:
         """Return the last hidden layer, with one unit more that is always 1."""
         if isinstance(observation, tuple):
             hidden = np.array((*observation, 1.0))
         else:
             hidden = np.hstack([observation, np.ones((len(observation), 1))])
-        for weight in self._hidden:
+        for weight in self._hidden_weights:
             hidden = hidden.dot(weight)
             np.maximum(hidden, 0.0, out=hidden)
         return hidden
 
     @property
-    def inputs(self) -> int:
+    def input_size(self) -> int:
         """How many numbers the network sees."""
         return self.layers[0][0].shape[0]
 
     @property
-    def noise_numbers(self) -> int:
+    def episode_noise_size(self) -> int:
         """How many numbers it explores with that stay as they are; 0: a new one each time."""
-        return self.layers[-1][0].shape[0] + 1 if self.lasts else 0
+        return self.layers[-1][0].shape[0] + 1 if self.episode_noise else 0
 
 
-def with_one(units: Array) -> Array:
+def append_ones(units: Array) -> Array:
     """Return a layer of tensors with one unit more, which is always 1."""
     return namespace(units).cat([units, units.new_ones((len(units), 1))], -1)
 
@@ -144,13 +144,13 @@ def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...
     return tuple(folded)
 
 
-def _like(tensor: Any, layer: tuple[Floats, Floats]) -> Any:
+def _as_tensors_like(tensor: Any, layer: tuple[Floats, Floats]) -> Any:
     """Return weight and bias as tensors of the precision and on the device of another."""
     return (namespace(tensor).as_tensor(part, dtype=tensor.dtype, device=tensor.device) for part in layer)
 
 
-def network_arrays(network: Network) -> dict[str, Floats]:
-    """Return the weights of a network under the names that `network_from_arrays` reads."""
+def network_weights(network: Network) -> dict[str, Floats]:
+    """Return the weights of a network under the names that `network_from_weights` reads."""
     arrays = {}
     for index, (weight, bias) in enumerate(network.layers):
         arrays[f"{index}.weight"] = weight
@@ -158,13 +158,13 @@ def network_arrays(network: Network) -> dict[str, Floats]:
     return arrays
 
 
-def network_from_arrays(
-    arrays: dict[str, Floats], authority: float, exploration_std: float, lasts: bool = False
+def network_from_weights(
+    weights: dict[str, Floats], authority: float, exploration_std: float, episode_noise: bool = False
 ) -> Network:
-    """Return the network whose weights `network_arrays` wrote; raise `InputError` where they do not fit."""
+    """Return the network whose weights `network_weights` wrote; raise `InputError` where they do not fit."""
     layers: list[tuple[Floats, Floats]] = []
-    for index in range(sum(name.endswith(".weight") for name in arrays)):
-        weight, bias = arrays.get(f"{index}.weight"), arrays.get(f"{index}.bias")
+    for index in range(sum(name.endswith(".weight") for name in weights)):
+        weight, bias = weights.get(f"{index}.weight"), weights.get(f"{index}.bias")
         if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[1:]:
             raise InputError(f"network layer {index}: weight and bias do not fit together")
         if layers and layers[-1][0].shape[1] != weight.shape[0]:
@@ -173,12 +173,10 @@ def network_from_arrays(
                 f"allowed: {layers[-1][0].shape[1]}, the outputs of the layer before"
             )
         if not (np.issubdtype(weight.dtype, np.floating) and np.issubdtype(bias.dtype, np.floating)):
-            raise InputError(
-                f"network layer {index}: weights are {weight.dtype}, {bias.dtype}; allowed: floats"
-            )
+            raise InputError(f"network layer {index}: weights are {weight.dtype}, {bias.dtype}; allowed: floats")
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"network layer {index}: a weight is not finite")
         layers.append((np.asarray(weight, np.float64), np.asarray(bias, np.float64)))
     if not layers or layers[-1][0].shape[1] not in (1, 2):
         raise InputError("network: the last layer must have one output, or two with that of its noise")
-    return Network(tuple(layers), authority, exploration_std, lasts)
+    return Network(tuple(layers), authority, exploration_std, episode_noise)

@@ -6,15 +6,15 @@ import numpy as np
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Formula, Memory
-from unjam.drivers.local_state import SPEED_SCALE, LocalState, Observed
-from unjam.drivers.speed_history import empty_window, fill, mean_speed, slide
-from unjam.parameters import STRICT, NotNegative, Positive
-from unjam.physics.arrays import Array, at_least, clip, namespace, stack_columns
+from unjam.drivers.driver import FormulaDriver, Memory
+from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
+from unjam.drivers.speed_history import empty_window, fill_window, slide_window, window_mean_speed
+from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.physics.arrays import Array, clamp_min, clip, namespace, stack_columns
 
 
 @dataclass(frozen=True, config=STRICT)
-class PISaturation(Formula):
+class PISaturation(FormulaDriver):
     """Drives at the mean of its own speed, a little faster behind a large gap, and yields when close.
 
     The defaults are Table B2 of the paper, but for `time_constant`. The paper divides the wanted change of
@@ -25,24 +25,24 @@ class PISaturation(Formula):
     """
 
     name: ClassVar[str] = "pi"
-    observed_memory: ClassVar[tuple[Observed, ...]] = (
-        Observed("mean own speed", SPEED_SCALE, "m/s"),
-        Observed("commanded speed", SPEED_SCALE, "m/s"),
+    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
+        ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
+        ScaledInput("commanded speed", SPEED_SCALE, "m/s"),
     )
 
     window: Positive = 38.0
     """time over which the own speed is averaged [s]"""
-    catch_up_speed: NotNegative = 1.0
+    catch_up_speed: NonNegative = 1.0
     """v_c: speed beyond the mean where the gap is large [m/s]"""
-    gap_lower: NotNegative = 7.0
+    gap_lower: NonNegative = 7.0
     """s_l: from this gap on it speeds up [m]"""
     gap_upper: Positive = 30.0
     """s_u: from this gap on it drives the whole `catch_up_speed` faster [m]"""
-    safe_gap: NotNegative = 4.0
+    safe_gap: NonNegative = 4.0
     """dx_s: below this gap it follows the leader's speed [m]"""
     safe_gap_rule: Literal["constant", "closing"] = "constant"
-    """`constant` as the paper; `closing`: max(2 s (v_lead - v), safe_gap), as Stern et al. and Flow"""
-    time_constant: NotNegative = 3.0
+    """`constant` as the paper; `is_merging`: max(2 s (v_lead - v), safe_gap), as Stern et al. and Flow"""
+    time_constant: NonNegative = 3.0
     """time over which the wanted speed is reached [s]; 0: one time step, as the paper"""
     first_command: Literal["own-speed", "zero"] = "own-speed"
     """commanded speed before the first step; Flow starts from zero"""
@@ -50,11 +50,9 @@ class PISaturation(Formula):
     """time between two decisions [s]; set by the road"""
 
     @model_validator(mode="after")
-    def _in_order(self) -> "PISaturation":
+    def _check_gap_order(self) -> "PISaturation":
         if self.gap_upper <= self.gap_lower:
-            raise ValueError(
-                f"gap_upper: {self.gap_upper:g} is not allowed; allowed: > gap_lower, {self.gap_lower:g}"
-            )
+            raise ValueError(f"gap_upper: {self.gap_upper:g} is not allowed; allowed: > gap_lower, {self.gap_lower:g}")
         return self
 
     def initial_memory(self, n: int) -> Memory:
@@ -64,23 +62,23 @@ class PISaturation(Formula):
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` with the own speeds of the warm-up in its window."""
-        return {**memory, **fill(memory, history.speed)}
+        return {**memory, **fill_window(memory, history.speed)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
-        window = slide(memory, state.speed)
-        acceleration, command = self._towards(mean_speed(window), state, memory["command"])
+        window = slide_window(memory, state.speed)
+        acceleration, command = self._acceleration_and_command(window_mean_speed(window), state, memory["command"])
         return acceleration, {**window, "command": command}
 
-    def _towards(self, mean: Array, state: LocalState, last: Array) -> tuple[Array, Array]:
+    def _acceleration_and_command(self, mean: Array, state: LocalState, last_command: Array) -> tuple[Array, Array]:
         """Return the acceleration and the commanded speed that a mean and the `last` command lead to."""
         xp = namespace(state.speed)
-        command = xp.where(xp.isnan(last), state.speed, last)
+        command = xp.where(xp.isnan(last_command), state.speed, last_command)
         room = (state.leader_gap - self.gap_lower) / (self.gap_upper - self.gap_lower)
         target = mean + self.catch_up_speed * clip(room, 0.0, 1.0)
         safe_gap = self.safe_gap
         if self.safe_gap_rule == "closing":
-            safe_gap = at_least(2.0 * (state.leader_speed - state.speed), self.safe_gap)
+            safe_gap = clamp_min(2.0 * (state.leader_speed - state.speed), self.safe_gap)
         alpha = clip((state.leader_gap - safe_gap) / 2.0, 0.0, 1.0)
         beta = 1.0 - 0.5 * alpha
         command = beta * (alpha * target + (1.0 - alpha) * state.leader_speed) + (1.0 - beta) * command
@@ -89,7 +87,7 @@ class PISaturation(Formula):
 
     def memory_features(self, memory: Memory) -> Array:
         """Return the mean own speed and the commanded speed, scaled, shape (n, 2)."""
-        mean = mean_speed(memory)
+        mean = window_mean_speed(memory)
         return stack_columns((mean / SPEED_SCALE, memory["command"] / SPEED_SCALE))
 
 
@@ -104,13 +102,13 @@ class PIFromGap(PISaturation):
 
     name: ClassVar[str] = "pi-from-gap"
 
-    people_headway: Positive = 1.0
+    human_time_headway: Positive = 1.0
     """time headway that people keep [s]"""
-    people_gap: NotNegative = 2.0
+    human_standstill_gap: NonNegative = 2.0
     """gap of people who stand [m]"""
-    fading: Positive = 40.0
+    fade_time: Positive = 40.0
     """time in which the first speed fades from the mean [s]"""
-    watched_share: NotNegative = 1.0
+    history_factor: NonNegative = 1.0
     """share of the mean speed that was watched before, with which it begins in traffic"""
 
     def initial_memory(self, n: int) -> Memory:
@@ -120,16 +118,16 @@ class PIFromGap(PISaturation):
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` with the own speeds of the warm-up in its window, and where it begins then."""
         recalled = super().recall(memory, history)
-        return {**recalled, "first": self.watched_share * mean_speed(recalled)}
+        return {**recalled, "first": self.history_factor * window_mean_speed(recalled)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
         xp = namespace(state.speed)
-        allowed = at_least((state.leader_gap - self.people_gap) / self.people_headway, 0.0)
+        allowed = clamp_min((state.leader_gap - self.human_standstill_gap) / self.human_time_headway, 0.0)
         first = xp.where(xp.isnan(memory["first"]), allowed, memory["first"])
-        window = slide(memory, state.speed)
-        left = clip(1.0 - memory["moments"] * (self.time_step / self.fading), 0.0, 1.0)
-        mean = mean_speed(window)
-        acceleration, command = self._towards(mean + left * (first - mean), state, memory["command"])
+        window = slide_window(memory, state.speed)
+        left = clip(1.0 - memory["moments"] * (self.time_step / self.fade_time), 0.0, 1.0)
+        mean = window_mean_speed(window)
+        acceleration, command = self._acceleration_and_command(mean + left * (first - mean), state, memory["command"])
         begun = {"first": first, "moments": memory["moments"] + 1.0}
         return acceleration, {**window, "command": command, **begun}

@@ -10,45 +10,45 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Formula, Memory
-from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState, Observed, lap_angle
-from unjam.parameters import STRICT, NotNegative, Positive
-from unjam.physics.arrays import Array, as_column, at_least, namespace
+from unjam.drivers.driver import FormulaDriver, Memory
+from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState, ScaledInput, lap_angle
+from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.physics.arrays import Array, as_column, clamp_min, namespace
 
 Harmonics = tuple[float, ...]
-Share = Annotated[float, Field(ge=0, lt=1)]
-GATHERED, BROKEN = 0.5, 0.45
+LapFraction = Annotated[float, Field(ge=0, lt=1)]
+GATHERED_LAP_FRACTION, BROKEN_LAP_FRACTION = 0.5, 0.45
 """shares of the lap that are free ahead: once all have gathered behind, and when their queue is broken"""
-SLOWEST_PACE = 1.0
+MIN_PACE = 1.0
 """[m/s]: whoever stands still never gathers anybody"""
-SEEN = 60.0
+MAX_JAM_DISTANCE = 60.0
 """a jam farther away is not yet waited for [m]"""
-NOBODY = 99.0
+FREE_ROAD_GAP = 99.0
 """gap from which on there is no leader [m]"""
-OVERRUN = 50.0
+MAX_OVERRUN = 50.0
 """[m] beyond `last_position`, where it waits no longer"""
-FREELY = 100.0
+UNBOUNDED_ACCELERATION = 100.0
 """acceleration that no ACC has: nothing holds it back [m/s2]"""
-REPORTED = 0.5
+MIN_REPORTED_CONGESTION = 0.5
 """from which on a smoothed report says that a section is congested"""
 
-Section = Annotated[int, Field(ge=0, lt=SECTIONS_AHEAD)]
+SectionIndex = Annotated[int, Field(ge=0, lt=SECTIONS_AHEAD)]
 
 
-def _tuned(harmonics: Harmonics, gain: float, wanted_gap: float) -> dict[str, Any]:
+def _tuned_pacer(harmonics: Harmonics, gap_gain: float, target_gap: float) -> dict[str, Any]:
     """Return the fields of a tuned pacer; all gather until half the lap is free."""
-    gathering = {"gathering_gap": GATHERED, "regathering_gap": BROKEN}
-    return {"harmonics": harmonics, "gain": gain, "wanted_gap": wanted_gap, **gathering}
+    gathering = {"gathering_gap": GATHERED_LAP_FRACTION, "regathering_gap": BROKEN_LAP_FRACTION}
+    return {"harmonics": harmonics, "gap_gain": gap_gain, "target_gap": target_gap, **gathering}
 
 
-TUNED: dict[float, dict[str, Any]] = {
-    422.2: _tuned((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
-    449.0: _tuned((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
-    462.5: _tuned((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
-    475.9: _tuned((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
-    489.3: _tuned((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
+TUNED_PACERS: dict[float, dict[str, Any]] = {
+    422.2: _tuned_pacer((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
+    449.0: _tuned_pacer((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
+    462.5: _tuned_pacer((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
+    475.9: _tuned_pacer((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
+    489.3: _tuned_pacer((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
 }
-"""what `varying` uses, by the length of the lap [m], found by results/experts/tune_pacer.py.
+"""what `use_tuned` uses, by the length of the lap [m], found by results/experts/tune_pacer.py.
 
 Of the figure eight with radii 30, 32, 33, 34 and 35 m; at 34 m 0.1 m/s slower than what the search found,
 which broke on one seed of ten.
@@ -56,7 +56,7 @@ which broke on one seed of ten.
 
 
 @dataclass(frozen=True, config=STRICT)
-class Pacer(Formula):
+class Pacer(FormulaDriver):
     """Waits until all have gathered behind it, then leads them round at a pace that they can keep together.
 
     On the figure eight a queue that is longer than half a lap meets its own tail at the crossing. Driven
@@ -66,35 +66,33 @@ class Pacer(Formula):
 
     name: ClassVar[str] = "pacer"
     needs_loop: ClassVar[bool] = True
-    observed_memory: ClassVar[tuple[Observed, ...]] = (Observed("all have gathered", 1.0, ""),)
+    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("all have gathered", 1.0, ""),)
 
     lap_time: Positive = 69.0
     """time for a lap [s]: 6.5 m/s at a radius of 32 m, 7.1 m/s at 35 m"""
     harmonics: Annotated[Harmonics, Field(max_length=9)] = ()
     """(V, a1, b1, a2, b2, ...) [m/s] instead of `lap_time`: pace V + a1 cos x + b1 sin x + a2 cos 2x + ...,
     where x is the place on the lap, 0 to 2 pi from its start"""
-    gain: NotNegative = 0.0
-    """how much faster it drives for each metre of free road ahead beyond `wanted_gap` [1/s], and slower for
+    gap_gain: NonNegative = 0.0
+    """how much faster it drives for each metre of free road ahead beyond `target_gap` [1/s], and slower for
     each that lacks: a queue that has grown long may close up"""
-    wanted_gap: Share = 0.5
+    target_gap: LapFraction = 0.5
     """share of the lap that is free ahead at the pace itself"""
-    varying: bool = False
+    use_tuned: bool = False
     """whether to use, instead of all this, what was found for the figure eight of the nearest radius"""
-    gathering_speed: NotNegative = 2.0
+    gathering_speed: NonNegative = 2.0
     """speed while the others gather behind [m/s]"""
-    gathering_gap: Share = 0.4
+    gathering_gap: LapFraction = 0.4
     """share of the lap that must be free ahead before the pace begins"""
-    regathering_gap: Share = 0.0
+    regathering_gap: LapFraction = 0.0
     """share of the lap below which the queue counts as broken, and the others gather anew"""
     time_constant: Positive = 0.1
     """time over which the wanted speed is reached [s]"""
 
     @model_validator(mode="after")
-    def _in_pairs(self) -> "Pacer":
+    def _check_harmonics(self) -> "Pacer":
         if len(self.harmonics) % 2 == 0 and self.harmonics:
-            raise ValueError(
-                f"harmonics: {self.harmonics} is not allowed; allowed: an odd count, (V, a1, b1, ...)"
-            )
+            raise ValueError(f"harmonics: {self.harmonics} is not allowed; allowed: an odd count, (V, a1, b1, ...)")
         return self
 
     def initial_memory(self, n: int) -> Memory:
@@ -103,39 +101,39 @@ class Pacer(Formula):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the pace, and whether all have gathered by now."""
-        if not self.varying:
-            return self._lead(state, memory)
+        if not self.use_tuned:
+            return self._lead_queue(state, memory)
         loop = state.loop_length
         xp = namespace(loop)
         acceleration, gathered, nearest = loop * 0.0, loop * 0.0, loop * 0.0 + float("inf")
-        for lap in self._needed(loop):
-            found, after = self._tuned[lap].act(state, memory)
+        for lap in self._nearest_laps(loop):
+            found, after = self._tuned_pacers[lap].act(state, memory)
             closer = abs(loop - lap) < nearest
             acceleration = xp.where(closer, found, acceleration)
             gathered = xp.where(closer, after["gathered"], gathered)
             nearest = xp.where(closer, abs(loop - lap), nearest)
         return acceleration, {"gathered": gathered}
 
-    def _needed(self, loop: Array) -> Iterable[float]:
+    def _nearest_laps(self, loop_length: Array) -> Iterable[float]:
         """Return the laps of those pacers that drive somebody; of tensors, which may be traced, all."""
-        if isinstance(loop, float):
-            return [min(self._tuned, key=lambda lap: abs(loop - lap))]
-        if not isinstance(loop, np.ndarray):
-            return self._tuned
-        laps = np.array([*self._tuned])
-        return laps[sorted(set(abs(laps[:, None] - loop).argmin(0).tolist()))].tolist()
+        if isinstance(loop_length, float):
+            return [min(self._tuned_pacers, key=lambda lap: abs(loop_length - lap))]
+        if not isinstance(loop_length, np.ndarray):
+            return self._tuned_pacers
+        laps = np.array([*self._tuned_pacers])
+        return laps[sorted(set(abs(laps[:, None] - loop_length).argmin(0).tolist()))].tolist()
 
     @cached_property
-    def _tuned(self) -> dict[float, "Pacer"]:
-        return {lap: replace(self, varying=False, **values) for lap, values in TUNED.items()}
+    def _tuned_pacers(self) -> dict[float, "Pacer"]:
+        return {lap: replace(self, varying=False, **values) for lap, values in TUNED_PACERS.items()}
 
-    def _lead(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+    def _lead_queue(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         loop, free = state.loop_length, state.leader_gap
         xp = namespace(state.speed)
         ready, broken = free >= self.gathering_gap * loop, free < self.regathering_gap * loop
         gathered = xp.where(ready, free * 0.0 + 1.0, xp.where(broken, free * 0.0, memory["gathered"]))
-        pace = self._pace(state) + self.gain * (free - self.wanted_gap * loop)
-        pace = at_least(pace, SLOWEST_PACE)
+        pace = self._pace(state) + self.gap_gain * (free - self.target_gap * loop)
+        pace = clamp_min(pace, MIN_PACE)
         wanted = xp.where(gathered > 0.0, pace, free * 0.0 + self.gathering_speed)
         return (wanted - state.speed) / self.time_constant, {"gathered": gathered}
 
@@ -157,7 +155,7 @@ class Pacer(Formula):
 
 
 @dataclass(frozen=True, config=STRICT)
-class JamAbsorber(Formula):
+class JamAbsorber(FormulaDriver):
     """Follows its leader linearly; where that one is caught in a jam, it crawls until there is room ahead.
 
     While it crawls less arrives at the bottleneck than leaves it, and the jam ahead of it dissolves; those
@@ -167,29 +165,29 @@ class JamAbsorber(Formula):
     """
 
     name: ClassVar[str] = "jam-absorber"
-    observed_memory: ClassVar[tuple[Observed, ...]] = (Observed("it waits for a jam to go", 1.0, ""),)
+    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("it waits for a jam to go", 1.0, ""),)
 
-    jam_speed: NotNegative = 10.0
+    jam_speed: NonNegative = 10.0
     """a leader slower than this is caught in a jam [m/s]"""
-    crawling_speed: NotNegative = 3.5
+    crawl_speed: NonNegative = 3.5
     """speed while it waits [m/s]"""
-    room: Positive = 22.0
+    release_gap: Positive = 22.0
     """gap at which it may go on [m], where the leader is fast enough"""
-    going_speed: NotNegative = 8.3
+    release_speed: NonNegative = 8.3
     """what is fast enough [m/s]"""
     first_position: float = -580.0
     """along the road, from where it may begin to wait [m]"""
     last_position: float = -270.0
     """up to where it may begin to wait [m]"""
-    gap_gain: NotNegative = 0.25
+    gap_gain: NonNegative = 0.25
     """acceleration for each metre of gap too much [1/s2]"""
-    speed_gain: NotNegative = 1.2
+    speed_gain: NonNegative = 1.2
     """acceleration for each m/s that the leader is faster [1/s]"""
-    time_gap: NotNegative = 1.4
+    time_gap: NonNegative = 1.4
     """wanted gap over own speed [s]"""
-    standstill_gap: NotNegative = 4.0
+    standstill_gap: NonNegative = 4.0
     """wanted gap of a standing vehicle [m]"""
-    push: NotNegative = 0.0
+    extra_acceleration: NonNegative = 0.0
     """acceleration besides [m/s2]; without a `gap_gain` it so closes up as far as the shield lets it"""
 
     def initial_memory(self, n: int) -> Memory:
@@ -201,14 +199,14 @@ class JamAbsorber(Formula):
         xp, zero = namespace(state.speed), state.speed * 0.0
         place, gap, ahead = state.route_position, state.leader_gap, state.leader_speed
         within = (place > self.first_position) & (place < self.last_position)
-        jam = within & (ahead < self.jam_speed) & (gap < SEEN)
+        jam = within & (ahead < self.jam_speed) & (gap < MAX_JAM_DISTANCE)
         waits = xp.where(jam, zero + 1.0, memory["waits"])
-        gone = ((gap >= self.room) & (ahead >= self.going_speed)) | (gap >= NOBODY)
-        too_far = place > self.last_position + OVERRUN
+        gone = ((gap >= self.release_gap) & (ahead >= self.release_speed)) | (gap >= FREE_ROAD_GAP)
+        too_far = place > self.last_position + MAX_OVERRUN
         waits = xp.where(gone | too_far, zero, waits)
         excess = gap - self.standstill_gap - self.time_gap * state.speed
-        follow = self.gap_gain * excess + self.speed_gain * (ahead - state.speed) + self.push
-        crawl = xp.minimum(self.crawling_speed - state.speed, follow)
+        follow = self.gap_gain * excess + self.speed_gain * (ahead - state.speed) + self.extra_acceleration
+        crawl = xp.minimum(self.crawl_speed - state.speed, follow)
         return xp.where(waits > 0.0, crawl, follow), {"waits": waits}
 
     def memory_features(self, memory: Memory) -> Array:
@@ -217,10 +215,10 @@ class JamAbsorber(Formula):
 
 
 @dataclass(frozen=True, config=STRICT)
-class Cruise(Formula):
+class Cruise(FormulaDriver):
     """Never holds the car back: where it has its own ACC, that one drives.
 
-    What the ACC is like is the road's to say (`cruise.time_headway`, `cruise.acceleration`). Without an ACC
+    What the ACC is like is the road's to say (`cruise.time_gap`, `cruise.acceleration`). Without an ACC
     it accelerates as hard as it may.
     """
 
@@ -228,11 +226,11 @@ class Cruise(Formula):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return an acceleration beyond what any ACC wants; nothing is remembered."""
-        return state.speed * 0.0 + FREELY, memory
+        return state.speed * 0.0 + UNBOUNDED_ACCELERATION, memory
 
 
 @dataclass(frozen=True, config=STRICT)
-class JamAhead(Formula):
+class JamAhead(FormulaDriver):
     """Upstream of a ramp or a jam, drives no faster than its own lane does a few hundred metres ahead.
 
     So it arrives at the tail of a jam hardly faster than the jam moves, keeps room for those who merge, and
@@ -245,53 +243,61 @@ class JamAhead(Formula):
     """
 
     name: ClassVar[str] = "jam-ahead"
-    plain_numbers: ClassVar[bool] = False
-    told: ClassVar[tuple[str, ...]] = ("allowed_speed", "to_merge", "lane_speeds", "road_speeds", "cav_share")
+    accepts_floats: ClassVar[bool] = False
+    required_fields: ClassVar[tuple[str, ...]] = (
+        "allowed_speed",
+        "distance_to_merge",
+        "lane_speeds",
+        "road_speeds",
+        "penetration_rate",
+    )
 
-    first: Section = 0
+    first_section: SectionIndex = 0
     """first section ahead that counts, of 100 m each; 0 is the one that it is in"""
-    last: Section = 4
+    last_section: SectionIndex = 4
     """last section ahead that counts"""
-    margin: float = -2.0
+    speed_margin: float = -2.0
     """how much faster than the mean ahead it may drive where CAVs are few [m/s]"""
-    margin_by_share: float = 20.0
+    margin_by_penetration: float = 20.0
     """what more it may, times the share of CAVs [m/s]: where they are many, the mean ahead is that of others
     who hold back, and each would be slower than the next"""
-    lowest: NotNegative = 5.0
+    min_speed: NonNegative = 5.0
     """it is never held back below this [m/s]"""
-    slowing: Positive = 1.5
+    max_deceleration: Positive = 1.5
     """largest braking for the sake of the cap [m/s2]"""
     all_lanes: bool = False
     """whether the mean is that of all lanes of the main road"""
     time_constant: Positive = 3.0
     """time over which the cap is reached [s]"""
-    jam: Positive = 0.75
+    jam_speed_ratio: Positive = 0.75
     """share of what is allowed that the mean ahead must be below, too, where no map says where ramps join"""
 
     @model_validator(mode="after")
-    def _in_order(self) -> "JamAhead":
-        if self.last < self.first:
-            raise ValueError(f"last: {self.last} is not allowed; allowed: >= first, {self.first}")
+    def _check_section_order(self) -> "JamAhead":
+        if self.last_section < self.first_section:
+            raise ValueError(f"last: {self.last_section} is not allowed; allowed: >= first, {self.first_section}")
         return self
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the cap, beyond any ACC's where there is none."""
         speeds = state.road_speeds if self.all_lanes else state.lane_speeds
-        free = state.speed * 0.0 + FREELY
+        free = state.speed * 0.0 + UNBOUNDED_ACCELERATION
         if speeds is None:
             return free, memory
-        ahead = speeds[..., self.first : self.last + 1].mean(-1)
+        ahead = speeds[..., self.first_section : self.last_section + 1].mean(-1)
         xp = namespace(free)
-        share = 0.0 if state.cav_share is None else state.cav_share
-        wanted = ahead + self.margin + self.margin_by_share * share
-        cap = xp.minimum(at_least(wanted, self.lowest), state.allowed_speed)
-        towards = at_least((cap - state.speed) / self.time_constant, -self.slowing)
-        if state.to_merge is not None:
-            return xp.where(state.to_merge > 0.0, towards, free), memory
+        share = 0.0 if state.penetration_rate is None else state.penetration_rate
+        wanted = ahead + self.speed_margin + self.margin_by_penetration * share
+        cap = xp.minimum(clamp_min(wanted, self.min_speed), state.allowed_speed)
+        towards = clamp_min((cap - state.speed) / self.time_constant, -self.max_deceleration)
+        if state.distance_to_merge is not None:
+            return xp.where(state.distance_to_merge > 0.0, towards, free), memory
         if state.congestion is None:
             return free, memory
-        congested = (state.congestion[..., self.first : self.last + 1] >= REPORTED).any(-1)
-        return xp.where(congested & (ahead < self.jam * state.allowed_speed), towards, free), memory
+        congested = (state.congestion[..., self.first_section : self.last_section + 1] >= MIN_REPORTED_CONGESTION).any(
+            -1
+        )
+        return xp.where(congested & (ahead < self.jam_speed_ratio * state.allowed_speed), towards, free), memory
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -304,23 +310,27 @@ class GapMaker(JamAhead):
     """
 
     name: ClassVar[str] = "gap-maker"
-    told: ClassVar[tuple[str, ...]] = (*JamAhead.told, "beside_gaps")
+    required_fields: ClassVar[tuple[str, ...]] = (*JamAhead.required_fields, "adjacent_gaps")
 
-    room: Positive = 2.0
+    merge_time_gap: Positive = 2.0
     """time headway while it makes room [s]"""
-    before: NotNegative = 300.0
+    upstream_distance: NonNegative = 300.0
     """how far before a ramp joins it begins [m]"""
-    behind: NotNegative = 0.0
+    downstream_distance: NonNegative = 0.0
     """how far behind it it ends [m]: there the ramp's lane runs beside the road"""
-    near: Positive = 40.0
+    max_neighbor_gap: Positive = 40.0
     """gap to somebody on the right, ahead or behind, for whom it makes room [m]"""
 
-    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+    def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time headway of those who make room [s], NaN for the others."""
-        if state.beside_gaps is None or state.to_merge is None:
+        if state.adjacent_gaps is None or state.distance_to_merge is None:
             return None
-        xp, beside = namespace(state.speed), state.beside_gaps[..., 2:]
-        somebody = (beside < self.near).any(-1)
-        makes = somebody & (state.to_merge > -self.behind) & (state.to_merge < self.before)
+        xp, beside = namespace(state.speed), state.adjacent_gaps[..., 2:]
+        somebody = (beside < self.max_neighbor_gap).any(-1)
+        makes = (
+            somebody
+            & (state.distance_to_merge > -self.downstream_distance)
+            & (state.distance_to_merge < self.upstream_distance)
+        )
         zero = state.speed * 0.0
-        return xp.where(makes, zero + self.room, zero + nan)
+        return xp.where(makes, zero + self.merge_time_gap, zero + nan)

@@ -12,12 +12,12 @@ from typing import NamedTuple
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, NotNegative, Positive
-from unjam.physics.arrays import Array, at_least, at_most
-from unjam.physics.kinematics import speed_to_stop_within, stopping_distance
+from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.physics.arrays import Array, clamp_max, clamp_min
+from unjam.physics.kinematics import max_speed_to_stop, stopping_distance
 
 
-class Underway(NamedTuple):
+class ActuatorState(NamedTuple):
     """What a car is doing and what it has been told already; arrays of shape (n,), or plain numbers."""
 
     acceleration: Array
@@ -33,45 +33,45 @@ class Actuator:
     Cars that drivers' aids steer: lag 0.2 to 0.5 s, delay 0.05 to 0.5 s.
     """
 
-    delay: NotNegative = 0.0
+    delay: NonNegative = 0.0
     """time after which a command arrives, rounded to whole simulation steps [s]"""
-    lag: NotNegative = 0.0
+    lag: NonNegative = 0.0
     """time constant with which the acceleration follows [s]"""
 
     @property
-    def instant(self) -> bool:
+    def is_instant(self) -> bool:
         """Whether it does at once what it is told."""
         return self.delay == 0.0 == self.lag
 
-    def start(self, like: Array, step: float) -> Underway:
+    def initial_state(self, like: Array, step: float) -> ActuatorState:
         """Return that nothing is done and nothing on its way, for cars like those of `like`."""
-        return Underway(0.0 * like, (0.0 * like,) * round(self.delay / step))
+        return ActuatorState(0.0 * like, (0.0 * like,) * round(self.delay / step))
 
-    def obey(self, told: Array, speed: Array, underway: Underway, step: float) -> Underway:
+    def apply_command(self, command: Array, speed: Array, state: ActuatorState, step: float) -> ActuatorState:
         """Return what is under way once a car was told something: its acceleration holds for this step.
 
         Brakes do not push backwards: a car that stands has no acceleration.
         """
-        arriving, *pending = *underway.pending, told
-        left = self._left(step)
-        acceleration = underway.acceleration * left + arriving * (1.0 - left)
-        return Underway(at_least(acceleration, -speed / step), tuple(pending))
+        arriving, *pending = *state.pending, command
+        left = self._lag_decay(step)
+        acceleration = state.acceleration * left + arriving * (1.0 - left)
+        return ActuatorState(clamp_min(acceleration, -speed / step), tuple(pending))
 
-    def equivalent_speed(self, speed: Array, underway: Underway, braking: float, step: float) -> Array:
+    def equivalent_speed(self, speed: Array, state: ActuatorState, braking: float, step: float) -> Array:
         """Return the speed z of a car without lag that drives at least as far under any commands [m/s].
 
         z = v + T (a + `braking`) with T = h r / (1 - r), where r is what one step of length h leaves of the
         difference to a command. Whatever is commanded, a step makes z + h u of it: as if there was no lag.
         """
-        left = self._left(step)
-        return speed + step * left / (1.0 - left) * (underway.acceleration + braking)
+        left = self._lag_decay(step)
+        return speed + step * left / (1.0 - left) * (state.acceleration + braking)
 
-    def _left(self, step: float) -> float:
+    def _lag_decay(self, step: float) -> float:
         """Return which share of the difference to a command one step leaves."""
         return exp(-step / self.lag) if self.lag else 0.0
 
 
-class Ahead(NamedTuple):
+class FollowingState(NamedTuple):
     """What a car knows of itself and of the vehicle ahead: arrays of shape (n,), or plain numbers."""
 
     speed: Array
@@ -82,7 +82,7 @@ class Ahead(NamedTuple):
     """own front bumper to the leader's rear bumper; infinite where nobody is ahead [m]"""
 
 
-FAR = 1e6
+MAX_LEADER_GAP = 1e6
 """so far ahead nobody matters; formulas that count steps need a number that is finite [m]"""
 
 
@@ -100,38 +100,34 @@ class SafetyFilter:
     """the car's own brakes, b_min [m/s2]"""
     leader_braking: Positive = 6.0
     """hardest braking of anybody ahead, b_max, at least `braking` [m/s2]"""
-    standstill_gap: NotNegative = 1.0
+    standstill_gap: NonNegative = 1.0
     """gap that is left where both stand [m]"""
-    time_headway: NotNegative = 1.0
+    time_gap: NonNegative = 1.0
     """the floor, beside the standstill gap: smallest time headway behind who brakes with at most
-    `headway_braking` [s]; 0: none"""
-    headway_braking: Positive = 4.5
+    `time_gap_braking` [s]; 0: none"""
+    time_gap_braking: Positive = 4.5
     """braking with which the floor is kept, at most `braking` [m/s2]"""
-    gap_error: NotNegative = 0.0
+    gap_error: NonNegative = 0.0
     """largest error of the sensed gap [m]"""
-    speed_error: NotNegative = 0.0
+    speed_error: NonNegative = 0.0
     """largest error of the leader's sensed speed [m/s]"""
 
     @model_validator(mode="after")
-    def _brakes_fit(self) -> "SafetyFilter":
+    def _check_braking(self) -> "SafetyFilter":
         own = self.braking
         if self.leader_braking < own:  # else the gap may be smallest before both stand
-            raise ValueError(
-                f"leader_braking: {self.leader_braking:g} is not allowed; allowed: >= braking, {own:g}"
-            )
-        if self.headway_braking > own:
-            raise ValueError(
-                f"headway_braking: {self.headway_braking:g} is not allowed; allowed: <= braking, {own:g}"
-            )
+            raise ValueError(f"leader_braking: {self.leader_braking:g} is not allowed; allowed: >= braking, {own:g}")
+        if self.time_gap_braking > own:
+            raise ValueError(f"headway_braking: {self.time_gap_braking:g} is not allowed; allowed: <= braking, {own:g}")
         return self
 
-    def keep(
+    def limit(
         self,
-        wanted: Array,
-        ahead: Ahead,
+        acceleration: Array,
+        state: FollowingState,
         step: float,
         actuator: Actuator | None = None,
-        underway: Underway | None = None,
+        actuator_state: ActuatorState | None = None,
     ) -> Array:
         """Return what may be commanded of the acceleration that is wanted [m/s2], of its shape.
 
@@ -139,51 +135,55 @@ class SafetyFilter:
         one, `underway` is what it does already.
         """
         if not self.active:
-            return wanted
-        if type(wanted) is float and underway is None and self._is_free(wanted, ahead, step):
-            return wanted
-        return at_most(wanted, self.highest(ahead, step, actuator, underway))
+            return acceleration
+        if type(acceleration) is float and actuator_state is None and self._is_clearly_safe(acceleration, state, step):
+            return acceleration
+        return clamp_max(acceleration, self.max_acceleration(state, step, actuator, actuator_state))
 
-    def highest(
-        self, ahead: Ahead, step: float, actuator: Actuator | None = None, underway: Underway | None = None
+    def max_acceleration(
+        self,
+        state: FollowingState,
+        step: float,
+        actuator: Actuator | None = None,
+        actuator_state: ActuatorState | None = None,
     ) -> Array:
         """Return the highest acceleration that may be commanded; where none may, the hardest braking."""
-        leader = at_least(ahead.leader_speed - self.speed_error, 0.0)
-        room = at_most(ahead.gap, FAR) - (self.gap_error + self.standstill_gap)
-        speed, arrives = ahead.speed, 0
-        if actuator is not None and underway is not None:
-            standing = actuator.equivalent_speed(0.0 * speed, Underway(0.0 * speed), self.braking, step)
-            speed = actuator.equivalent_speed(speed, underway, self.braking, step)
-            for command in underway.pending:
-                speed = at_least(speed + command * step, standing)
+        leader = clamp_min(state.leader_speed - self.speed_error, 0.0)
+        room = clamp_max(state.gap, MAX_LEADER_GAP) - (self.gap_error + self.standstill_gap)
+        speed, arrives = state.speed, 0
+        if actuator is not None and actuator_state is not None:
+            standing = actuator.equivalent_speed(0.0 * speed, ActuatorState(0.0 * speed), self.braking, step)
+            speed = actuator.equivalent_speed(speed, actuator_state, self.braking, step)
+            for command in actuator_state.pending:
+                speed = clamp_min(speed + command * step, standing)
                 room = room - speed * step
-            arrives = len(underway.pending)
+            arrives = len(actuator_state.pending)
         end = room + stopping_distance(leader, self.leader_braking, step)
-        allowed = speed_to_stop_within(end, self.braking, step)
-        if self.time_headway:
-            allowed = at_most(allowed, self._highest_on_floor(leader, room, arrives, step))
-        return at_least((allowed - speed) / step, -self.braking)
+        allowed = max_speed_to_stop(end, self.braking, step)
+        if self.time_gap:
+            allowed = clamp_max(allowed, self._max_speed_for_time_gap(leader, room, arrives, step))
+        return clamp_min((allowed - speed) / step, -self.braking)
 
-    def _highest_on_floor(self, leader: Array, room: Array, arrives: int, step: float) -> Array:
-        """Return the highest speed at which the floor is kept while both brake with `headway_braking`.
+    def _max_speed_for_time_gap(self, leader_speed: Array, gap: Array, delay_steps: int, step: float) -> Array:
+        """Return the highest speed at which the floor is kept while both brake with `time_gap_braking`.
 
         A command takes `arrives` steps to arrive; `room` is the gap less what the car drives meanwhile and
         less what is left where both stand.
         """
-        braking, headway = self.headway_braking, self.time_headway
-        later = at_least(leader - braking * step * (arrives + 1.0), 0.0)
-        end = room + stopping_distance(leader, braking, step)
+        braking, headway = self.time_gap_braking, self.time_gap
+        later = clamp_min(leader_speed - braking * step * (delay_steps + 1.0), 0.0)
+        end = gap + stopping_distance(leader_speed, braking, step)
         near = (end - stopping_distance(later, braking, step)) / (headway + step)
         # Closing in faster than this, the headway is smallest at some later speed.
         matters = later + headway * braking
-        far = speed_to_stop_within(end - braking * (headway + step / 2.0) ** 2 / 2.0, braking, step)
-        return at_most(near, at_least(far, matters))
+        far = max_speed_to_stop(end - braking * (headway + step / 2.0) ** 2 / 2.0, braking, step)
+        return clamp_max(near, clamp_min(far, matters))
 
-    def _is_free(self, wanted: float, ahead: Ahead, step: float) -> bool:
+    def _is_clearly_safe(self, acceleration: float, state: FollowingState, step: float) -> bool:
         """Return whether `wanted` surely may pass: bounds that cost a float a third of the formulas."""
-        speed, leader, gap = ahead
-        braking, headway = self.headway_braking, self.time_headway
-        leader, speed = leader - self.speed_error, speed + wanted * step
+        speed, leader, gap = state
+        braking, headway = self.time_gap_braking, self.time_gap
+        leader, speed = leader - self.speed_error, speed + acceleration * step
         room = gap - (self.gap_error + self.standstill_gap)
         later = leader - braking * step
         if later < 0.0 or speed < 0.0 or speed - later > headway * braking:
@@ -196,25 +196,25 @@ class SafetyFilter:
         )
 
 
-class Cars:
+class CAVActuation:
     """CAVs by name; what each is told passes its filter, and is then obeyed as late as its actuator is."""
 
     def __init__(self, safety: SafetyFilter, actuator: Actuator, step: float) -> None:
         """Take what all cars have; `step` is that of simulation [s]."""
-        self._keep, self._actuator, self._step = safety.keep, actuator, step
-        self._late = not actuator.instant
-        self._underway: dict[str, Underway] = {}
+        self._limit, self._actuator, self._step = safety.limit, actuator, step
+        self._has_lag = not actuator.is_instant
+        self._states: dict[str, ActuatorState] = {}
 
-    def carry_out(self, name: str, wanted: Array, ahead: Ahead) -> tuple[Array, Array]:
+    def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return what a car is told of the acceleration that is wanted, and what it does in this step [m/s2].
 
         Once in each simulation step; all numbers are plain, or arrays of cars that share the name.
         """
-        if not self._late:
-            told = self._keep(wanted, ahead, self._step)
+        if not self._has_lag:
+            told = self._limit(acceleration, state, self._step)
             return told, told
-        underway = self._underway.get(name) or self._actuator.start(ahead.speed, self._step)
-        told = self._keep(wanted, ahead, self._step, self._actuator, underway)
-        underway = self._actuator.obey(told, ahead.speed, underway, self._step)
-        self._underway[name] = underway
+        underway = self._states.get(name) or self._actuator.initial_state(state.speed, self._step)
+        told = self._limit(acceleration, state, self._step, self._actuator, underway)
+        underway = self._actuator.apply_command(told, state.speed, underway, self._step)
+        self._states[name] = underway
         return told, underway.acceleration

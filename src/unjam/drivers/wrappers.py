@@ -9,78 +9,78 @@ import numpy as np
 
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory, Recipe
-from unjam.drivers.local_state import SPEED_SCALE, LocalState, Observed
-from unjam.drivers.safety import Ahead, SafetyFilter
-from unjam.drivers.sensors import SMALLEST_SEEN_GAP
+from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
+from unjam.drivers.safety import FollowingState, SafetyFilter
+from unjam.drivers.sensors import MIN_SENSED_GAP
 from unjam.errors import InputError
-from unjam.parameters import NotNegative, Positive
-from unjam.physics.arrays import Array, at_least, join_columns, namespace, square_root, stack_columns
+from unjam.parameters import NonNegative, Positive
+from unjam.physics.arrays import Array, clamp_min, join_columns, namespace, square_root, stack_columns
 
-KIND = "kind"
+DRIVER_INDEX_KEY = "kind"
 """name in the memory of a mixture: which driver a CAV has"""
-INNER, AGE, SENT = "inner", "age", "sent"
+INNER_KEY, STEP_KEY, PENDING_KEY = "inner", "age", "sent"
 """names in the memory of a wrapper: the other driver's own; of an impaired one besides: decisions made so
 far; what was said and not yet done"""
-SPANS = (10.0, 40.0, 160.0)
+AVERAGING_TIMES = (10.0, 40.0, 160.0)
 """time constants of the means [s]: within a wave, of a wave, of several"""
-SPREAD_SCALE, ROOM_SCALE = 2.0, 20.0
+SPEED_STD_SCALE, MEAN_GAP_SCALE = 2.0, 20.0
 """of the spread of speeds [m/s] and of the mean gap [m], before a network sees them"""
-WATCHED = "watched"
+HISTORY_STEPS_KEY = "watched"
 """name in the memory: moments that were watched"""
-SPEED, SQUARE, ROOM = "speed", "square", "room"
+MEAN_SPEED_KEY, MEAN_SQUARE_KEY, MEAN_GAP_KEY = "speed", "square", "room"
 """names of the means in the memory, by their span"""
 
 
-class Wrapper(Driver):
+class CompositeDriver(Driver):
     """A driver that drives by those which it holds."""
 
     @property
-    def tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def accepts_tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether all that it holds take tensors."""
-        return all(held.tensors for held in self.inner.values())
+        return all(held.accepts_tensors for held in self.inner_drivers.values())
 
     @property
     def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether one that it holds must know its place on a closed road."""
-        return any(held.needs_loop for held in self.inner.values())
+        return any(held.needs_loop for held in self.inner_drivers.values())
 
     @property
-    def sees(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def policy_inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What networks in those that it holds see."""
-        return tuple(name for held in self.inner.values() for name in held.sees)
+        return tuple(name for held in self.inner_drivers.values() for name in held.policy_inputs)
 
 
-class Around(Wrapper):
+class DriverWrapper(CompositeDriver):
     """A driver around one other."""
 
     driver: Driver
 
     @property
-    def plain_numbers(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the other driver takes plain numbers."""
-        return self.driver.plain_numbers
+        return self.driver.accepts_floats
 
     @property
-    def inner(self) -> dict[str, Driver]:
+    def inner_drivers(self) -> dict[str, Driver]:
         """The other driver."""
-        return {INNER: self.driver}
+        return {INNER_KEY: self.driver}
 
     @property
-    def observed_memory(self) -> tuple[Observed, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What the other driver's are."""
-        return self.driver.observed_memory
+        return self.driver.memory_inputs
 
-    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+    def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return those of the other driver."""
-        return self.driver.time_headways(state, memory[INNER])
+        return self.driver.time_gaps(state, memory[INNER_KEY])
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the other driver's."""
-        return self.driver.memory_features(memory[INNER])
+        return self.driver.memory_features(memory[INNER_KEY])
 
 
 @dataclass(frozen=True)
-class Mixed(Wrapper):
+class MixedDriver(CompositeDriver):
     """Gives the CAVs different drivers: the first CAV has the first driver, the next the next, and so on.
 
     After the last driver it begins anew; where CAVs come and go, they are counted as they enter.
@@ -90,35 +90,35 @@ class Mixed(Wrapper):
 
     def __post_init__(self) -> None:
         """Raise `InputError` where one of them is the simulator itself."""
-        if any(driver.native for driver in self.drivers):
+        if any(driver.is_native for driver in self.drivers):
             raise InputError("driver: 'human' is not allowed among several; idm drives like people")
 
     @property
-    def inner(self) -> dict[str, Driver]:
+    def inner_drivers(self) -> dict[str, Driver]:
         """All of them, by their number."""
         return {str(number): driver for number, driver in enumerate(self.drivers)}
 
     def initial_memory(self, n: int) -> Memory:
         """Return which driver each CAV has, and what all drivers would remember of it."""
-        return {KIND: np.arange(n, dtype=np.float64) % len(self.drivers), **super().initial_memory(n)}
+        return {DRIVER_INDEX_KEY: np.arange(n, dtype=np.float64) % len(self.drivers), **super().initial_memory(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration that each CAV's own driver wants, and the new memory."""
         after, chosen = dict(memory), None
-        for number, (key, driver) in enumerate(self.inner.items()):
+        for number, (key, driver) in enumerate(self.inner_drivers.items()):
             wanted, after[key] = driver.act(state, memory[key])
-            mine = memory[KIND] == number
+            mine = memory[DRIVER_INDEX_KEY] == number
             chosen = wanted if chosen is None else namespace(wanted).where(mine, wanted, chosen)
         return chosen, after
 
-    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+    def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return for each CAV that of its own driver."""
         chosen = None
-        for number, (key, driver) in enumerate(self.inner.items()):
-            wanted = driver.time_headways(state, memory[key])
+        for number, (key, driver) in enumerate(self.inner_drivers.items()):
+            wanted = driver.time_gaps(state, memory[key])
             if wanted is not None:
                 others = np.nan if chosen is None else chosen
-                chosen = np.where(memory[KIND] == number, wanted, others)
+                chosen = np.where(memory[DRIVER_INDEX_KEY] == number, wanted, others)
         return chosen
 
     def describe(self) -> str:
@@ -131,16 +131,16 @@ class Mixed(Wrapper):
 
 
 @dataclass(frozen=True)
-class Impaired(Around):
+class ImpairedDriver(DriverWrapper):
     """Passes what it sees, with noise, to another driver, and hands on what that one said a while ago."""
 
-    tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
-    plain_numbers: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
+    accepts_tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
+    accepts_floats: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
 
     driver: Driver
-    delay: NotNegative = 0.0
+    delay: NonNegative = 0.0
     """time after which a command is carried out, rounded to whole decisions [s]"""
-    gap_noise: NotNegative = 0.0
+    gap_noise: NonNegative = 0.0
     """standard deviation of both gaps, anew in every decision [m]"""
     time_step: float = 0.1
     """time between two decisions [s]"""
@@ -148,24 +148,24 @@ class Impaired(Around):
     def initial_memory(self, n: int) -> Memory:
         """Return that of the other driver, that nothing was said yet, and that no decision was made."""
         late = round(self.delay / self.time_step)
-        return {**super().initial_memory(n), AGE: np.zeros(n), SENT: np.zeros((n, late))}
+        return {**super().initial_memory(n), STEP_KEY: np.zeros(n), PENDING_KEY: np.zeros((n, late))}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what was said `delay` ago, and remember what is said now."""
-        said, after = self.driver.act(self._seen(state, memory[AGE]), memory[INNER])
-        sent = np.concatenate([memory[SENT], np.asarray(said)[:, None]], axis=1)
-        return sent[:, 0], {INNER: after, AGE: memory[AGE] + 1.0, SENT: sent[:, 1:]}
+        said, after = self.driver.act(self._add_gap_noise(state, memory[STEP_KEY]), memory[INNER_KEY])
+        sent = np.concatenate([memory[PENDING_KEY], np.asarray(said)[:, None]], axis=1)
+        return sent[:, 0], {INNER_KEY: after, STEP_KEY: memory[STEP_KEY] + 1.0, PENDING_KEY: sent[:, 1:]}
 
-    def _seen(self, state: LocalState, age: Array) -> LocalState:
-        if self.gap_noise == 0.0 or not len(age):
+    def _add_gap_noise(self, state: LocalState, step: Array) -> LocalState:
+        if self.gap_noise == 0.0 or not len(step):
             return state
         # A driver's answer must not depend on who drives beside it: what it sees is the seed.
-        rows = np.stack([age, state.speed, state.leader_gap, state.follower_gap], -1)
+        rows = np.stack([step, state.speed, state.leader_gap, state.follower_gap], -1)
         noise = [np.random.default_rng(row.view(np.uint64).tolist()).normal(size=2) for row in rows]
         ahead, behind = self.gap_noise * np.array(noise).T
         return state._replace(
-            leader_gap=np.maximum(state.leader_gap + ahead, SMALLEST_SEEN_GAP),
-            follower_gap=np.maximum(state.follower_gap + behind, SMALLEST_SEEN_GAP),
+            leader_gap=np.maximum(state.leader_gap + ahead, MIN_SENSED_GAP),
+            follower_gap=np.maximum(state.follower_gap + behind, MIN_SENSED_GAP),
         )
 
     def describe(self) -> str:
@@ -181,7 +181,7 @@ class Impaired(Around):
 
 
 @dataclass(frozen=True)
-class Filtered(Around):
+class FilteredDriver(DriverWrapper):
     """Another driver with the limits and the safety filter of a road, for a car that has none of its own.
 
     A controller is shipped so: what drives elsewhere is what was proven, of a car that obeys at once. Where
@@ -201,14 +201,16 @@ class Filtered(Around):
         return Limits(-max(self.action_limit, self.safety.braking), self.action_limit)
 
     @cached_property
-    def _asked(self) -> Limits:
+    def _driver_limits(self) -> Limits:
         """Within which the driver may ask."""
         return Limits.symmetric(self.action_limit)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what the filter lets pass of what the other driver wants, and the new memory."""
-        wanted, after = self.driver.act(state, memory[INNER])
-        return self.safety.keep(self._asked.keep(wanted), Ahead(*state[:3]), self.time_step), {INNER: after}
+        wanted, after = self.driver.act(state, memory[INNER_KEY])
+        return self.safety.limit(self._driver_limits.clip(wanted), FollowingState(*state[:3]), self.time_step), {
+            INNER_KEY: after
+        }
 
     def describe(self) -> str:
         """Return the other driver, and that it is filtered."""
@@ -221,7 +223,7 @@ class Filtered(Around):
 
 
 @dataclass(frozen=True)
-class Remembering(Around):
+class HistoryDriver(DriverWrapper):
     """Drives as another driver does, and remembers means of its own speed, its square, and its gap.
 
     Until a span has passed, its mean is that of all that was watched.
@@ -232,46 +234,50 @@ class Remembering(Around):
     """time between two decisions [s]"""
 
     @property
-    def observed_memory(self) -> tuple[Observed, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What the other driver's are, and its own."""
-        mine: list[Observed] = []
-        for span in SPANS:
+        mine: list[ScaledInput] = []
+        for span in AVERAGING_TIMES:
             mine += [
-                Observed(f"own mean speed over {span:g} s", SPEED_SCALE, "m/s"),
-                Observed(f"spread of own speed over {span:g} s", SPREAD_SCALE, "m/s"),
-                Observed(f"mean gap over {span:g} s", ROOM_SCALE, "m"),
+                ScaledInput(f"own mean speed over {span:g} s", SPEED_SCALE, "m/s"),
+                ScaledInput(f"spread of own speed over {span:g} s", SPEED_STD_SCALE, "m/s"),
+                ScaledInput(f"mean gap over {span:g} s", MEAN_GAP_SCALE, "m"),
             ]
-        return (*self.driver.observed_memory, *mine)
+        return (*self.driver.memory_inputs, *mine)
 
     @cached_property
-    def _fading(self) -> tuple[tuple[float, float], ...]:
+    def _step_weights(self) -> tuple[tuple[float, float], ...]:
         """Spans, and what a step weighs in their means."""
-        return tuple((span, 1.0 - exp(-self.time_step / span)) for span in SPANS)
+        return tuple((span, 1.0 - exp(-self.time_step / span)) for span in AVERAGING_TIMES)
 
     def initial_memory(self, n: int) -> Memory:
         """Return that of the other driver, and that nothing was watched yet."""
-        means = {f"{name}_{span:g}": np.zeros(n) for span in SPANS for name in (SPEED, SQUARE, ROOM)}
-        return {**super().initial_memory(n), WATCHED: np.zeros(n), **means}
+        means = {
+            f"{name}_{span:g}": np.zeros(n)
+            for span in AVERAGING_TIMES
+            for name in (MEAN_SPEED_KEY, MEAN_SQUARE_KEY, MEAN_GAP_KEY)
+        }
+        return {**super().initial_memory(n), HISTORY_STEPS_KEY: np.zeros(n), **means}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` as if both had watched `history`."""
         memory = super().recall(memory, history)
         for moment in range(history.speed.shape[1]):
-            memory = self._watch(memory, history.speed[:, moment], history.leader_gap[:, moment])
+            memory = self._update_means(memory, history.speed[:, moment], history.leader_gap[:, moment])
         return memory
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return what the other driver wants, and the new memory."""
-        wanted, after = self.driver.act(state, memory[INNER])
-        return wanted, {**self._watch(memory, state.speed, state.leader_gap), INNER: after}
+        wanted, after = self.driver.act(state, memory[INNER_KEY])
+        return wanted, {**self._update_means(memory, state.speed, state.leader_gap), INNER_KEY: after}
 
-    def _watch(self, memory: Memory, speed: Array, gap: Array) -> Memory:
+    def _update_means(self, memory: Memory, speed: Array, gap: Array) -> Memory:
         xp, after = namespace(speed), dict(memory)
-        after[WATCHED] = memory[WATCHED] + 1.0
-        early = 1.0 / after[WATCHED]
-        for span, fading in self._fading:
+        after[HISTORY_STEPS_KEY] = memory[HISTORY_STEPS_KEY] + 1.0
+        early = 1.0 / after[HISTORY_STEPS_KEY]
+        for span, fading in self._step_weights:
             weight = xp.where(early > fading, early, early * 0.0 + fading)
-            for name, now in ((SPEED, speed), (SQUARE, speed * speed), (ROOM, gap)):
+            for name, now in ((MEAN_SPEED_KEY, speed), (MEAN_SQUARE_KEY, speed * speed), (MEAN_GAP_KEY, gap)):
                 before = memory[f"{name}_{span:g}"]
                 after[f"{name}_{span:g}"] = before + weight * (now - before)
         return after
@@ -279,12 +285,14 @@ class Remembering(Around):
     def memory_features(self, memory: Memory) -> Array:
         """Return the other driver's features, and for each span mean speed, its spread and the mean gap."""
         columns: list[Array] = []
-        for span in SPANS:
-            speed, square, room = (memory[f"{name}_{span:g}"] for name in (SPEED, SQUARE, ROOM))
-            spread = square_root(at_least(square - speed * speed, 0.0) + 1e-9)  # never the root of zero
-            columns += [speed / SPEED_SCALE, spread / SPREAD_SCALE, room / ROOM_SCALE]
+        for span in AVERAGING_TIMES:
+            speed, square, room = (
+                memory[f"{name}_{span:g}"] for name in (MEAN_SPEED_KEY, MEAN_SQUARE_KEY, MEAN_GAP_KEY)
+            )
+            spread = square_root(clamp_min(square - speed * speed, 0.0) + 1e-9)  # never the root of zero
+            columns += [speed / SPEED_SCALE, spread / SPEED_STD_SCALE, room / MEAN_GAP_SCALE]
         mine = stack_columns(tuple(columns))
-        others = self.driver.memory_features(memory[INNER])
+        others = self.driver.memory_features(memory[INNER_KEY])
         return mine if others is None else join_columns([others, mine])
 
     def describe(self) -> str:

@@ -2,7 +2,7 @@
 
 from gymnasium.envs.registration import register, registry
 
-ARGUMENTS_OF = {
+ENVIRONMENT_ARGUMENTS = {
     "unjam/Ring-v0": {"scenario": "ring"},
     "unjam/FigureEight-v0": {"scenario": "figure-eight"},
     "unjam/Merge-v0": {"scenario": "merge", "cavs": 1},
@@ -12,8 +12,8 @@ ARGUMENTS_OF = {
 """what each environment that Gymnasium makes by name is made of"""
 
 
-def register_all() -> None:
+def register_environments() -> None:
     """Tell Gymnasium of the environments; they are imported when one is made."""
-    for name, arguments in ARGUMENTS_OF.items():
+    for name, arguments in ENVIRONMENT_ARGUMENTS.items():
         if name not in registry:
-            register(name, "unjam.environments.single:RoadEnv", kwargs=arguments)
+            register(name, "unjam.environments.gymnasium_env:RoadEnv", kwargs=arguments)

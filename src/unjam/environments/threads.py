@@ -27,12 +27,12 @@ class CopyableLock:
         return type(self), ()
 
 
-def one_thread_at_a_time(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+def synchronized(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
     """Return a method of an environment for which a second thread waits until the first has returned."""
 
     @wraps(method)
-    def call(self: S, /, *arguments: P.args, **named: P.kwargs) -> T:
+    def call(self: S, /, *arguments: P.args, **keywords: P.kwargs) -> T:
         with self._road.lock:  # pyright: ignore[reportAttributeAccessIssue]
-            return method(self, *arguments, **named)
+            return method(self, *arguments, **keywords)
 
     return call

@@ -14,27 +14,33 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.network import Network
-from unjam.errors import InputError, wrong, wrong_name
-from unjam.files import check_folder
-from unjam.following.calibration import SEARCHED, Calibrated, CalibrationSettings, calibrate, calibrate_each
-from unjam.following.loaders import Reading, read_pairs
-from unjam.following.pairs import Pair, of_split, split_by_trajectory
+from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.files import check_parent_folder
+from unjam.following.calibration import (
+    CALIBRATED_PARAMETERS,
+    CalibratedIDM,
+    CalibrationSettings,
+    calibrate_groups,
+    calibrate_idm,
+)
+from unjam.following.loaders import ReadOptions, read_pairs
+from unjam.following.pairs import Pair, pairs_in_splits, split_by_driver
 from unjam.following.settings import MultiStepSettings
 from unjam.manifest import manifest
-from unjam.parameters import STRICT, Count, CountOrNone, build, nested
+from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclass, nest_keys
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population
 
-OnProgress = Callable[[int, int], object]
-VALIDATION_SHARE = 0.2
+DriverProgress = Callable[[int, int], object]
+RESIDUAL_VALIDATION_SHARE = 0.2
 """share of the drivers who decide whether a residual is better than none"""
-FEWEST = 5
+MIN_RESIDUAL_DRIVERS = 5
 """drivers that a residual needs: one of them judges"""
-SAME_UNIT = (0.5, 2.0)
+UNIT_RATIO_LIMITS = (0.5, 2.0)
 """share of the difference of speeds by which gaps change, if both are in metres: one, but for noise"""
-SUSPICIOUS = 3
+MIN_SUSPICIOUS_PARAMETERS = 3
 """parameters at the end of what was searched from which the units, or the data, are doubted"""
-FILTERS = ("kind", "split", "driver")
+PAIR_FILTERS = ("kind", "split", "driver")
 """what trajectories can be chosen by"""
 
 
@@ -43,16 +49,16 @@ class FitDriversSettings:
     """How a population is calibrated."""
 
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
-    own: Annotated[tuple[str, ...], Field(min_length=1)] = ("time_headway",)
+    individual: Annotated[tuple[str, ...], Field(min_length=1)] = ("time_headway",)
     """parameters of the IDM that each driver has for itself; the others are those that suit all. On NGSIM,
     with half a minute of each driver, own headways predict the next half better than one IDM for all, and
     all parameters own far worse"""
-    turns: Count = 3
+    rounds: PositiveInt = 3
     """how often what is common and what is own are calibrated"""
     residual: bool = False
     """whether a network learns what all drivers do beside their own IDM, from simulated driving"""
     multi_step: MultiStepSettings = field(default_factory=MultiStepSettings)
-    seed: CountOrNone = 0
+    seed: NonNegativeInt = 0
 
 
 @plain_dataclass(frozen=True)
@@ -60,18 +66,18 @@ class FittedDrivers:
     """A population, and what it was made from."""
 
     population: Population
-    words: list[str]
+    notes: list[str]
     """what was read and what was not"""
 
     def facts(self) -> dict[str, Any]:
         """Return what matters about it, as JSON."""
         population = self.population
-        fit = {key: value for key, value in population.about["fit"].items() if key != "settings"}
-        return {"drivers": len(population.drivers), "spread": population.spread(), **fit}
+        fit = {key: value for key, value in population.metadata["fit"].items() if key != "settings"}
+        return {"drivers": len(population.drivers), "spread": population.parameter_statistics(), **fit}
 
-    def verdict(self) -> list[str]:
+    def report_lines(self) -> list[str]:
         """Return in words how near the drivers come to the recorded gaps."""
-        fit, details = self.population.about["fit"], self.population.details
+        fit, details = self.population.metadata["fit"], self.population.details
         errors, seconds = np.array([[one["gap_error"], one["seconds"]] for one in details]).T
         own = np.sqrt(np.average(np.square(errors), weights=seconds))
         lines = [
@@ -79,9 +85,9 @@ class FittedDrivers:
             f"one IDM for all {fit['together']['gap_error']:.2f} m, each driver's own {own:.2f} m"
         ]
         unknown = fit["together"]["bounds"]
-        if len(unknown) >= SUSPICIOUS:
+        if len(unknown) >= MIN_SUSPICIOUS_PARAMETERS:
             lines.append(
-                f"warning: {len(unknown)} of {len(SEARCHED)} parameters lie at the end of what was searched "
+                f"warning: {len(unknown)} of {len(CALIBRATED_PARAMETERS)} parameters lie at the end of what was searched "
                 f"({', '.join(unknown)}): these are no people; are speeds in m/s and gaps in m?"
             )
         collided = sum(one["collided"] > 0 for one in details)
@@ -94,15 +100,15 @@ class FittedDrivers:
         return lines
 
 
-def fit_from_files(
+def fit_drivers_from_files(
     files: Sequence[Path],
-    changes: dict[str, Any],
+    overrides: dict[str, Any],
     format: str = "",
-    cut_bad: bool = False,
-    driver: tuple[str, ...] = (),
-    only: dict[str, str] | None = None,
+    drop_bad_rows: bool = False,
+    driver_columns: tuple[str, ...] = (),
+    filters: dict[str, str] | None = None,
     out: Path | None = None,
-    on_progress: OnProgress = lambda done, drivers: None,
+    on_progress: DriverProgress = lambda done, drivers: None,
 ) -> FittedDrivers:
     """Return the population of the drivers in files.
 
@@ -122,52 +128,50 @@ def fit_from_files(
     """
     if out is not None:
         if out.suffix != ".json":
-            raise wrong("out", str(out), "a .json file")
-        check_folder(out)
-    settings = build(FitDriversSettings, nested(changes), "")
+            raise invalid_value("out", str(out), "a .json file")
+        check_parent_folder(out)
+    settings = build_dataclass(FitDriversSettings, nest_keys(overrides), "")
     pairs: list[Pair] = []
     words = []
-    prefixes = _prefixes(files)
+    prefixes = _name_prefixes(files)
     for file, prefix in zip(files, prefixes, strict=True):
-        found = read_pairs(file, format, Reading(cut_bad=cut_bad, driver=driver))
-        words += [f"{file.name}: {line}" for line in found.words()]
+        found = read_pairs(file, format, ReadOptions(drop_bad_rows=drop_bad_rows, driver_columns=driver_columns))
+        words += [f"{file.name}: {line}" for line in found.summary_lines()]
         pairs += [replace(pair, name=prefix + pair.name, driver=prefix + pair.driver) for pair in found.pairs]
-    for name, value in (only or {}).items():
-        if name not in FILTERS:
-            raise wrong_name("only", name, FILTERS)
+    for name, value in (filters or {}).items():
+        if name not in PAIR_FILTERS:
+            raise unknown_name("only", name, PAIR_FILTERS)
         there = sorted({str(getattr(pair, name)) for pair in pairs} - {""})
         pairs = [pair for pair in pairs if getattr(pair, name) == value]
         if not pairs:
-            raise InputError(
-                f"only: no trajectory has {name} {value!r}; there are: {', '.join(there) or 'none'}"
-            )
-    words += doubts_about_units(pairs)
+            raise InputError(f"only: no trajectory has {name} {value!r}; there are: {', '.join(there) or 'none'}")
+    words += unit_warnings(pairs)
     population = fit_drivers(pairs, settings, on_progress)
     made = manifest()
     # It is given away: no folder of this machine is named.
     made["command"] = [Path(word).name if "/" in word else word for word in made["command"]]
-    about = {"data": [file.name for file in files], "only": only or {}, "manifest": made}
-    return FittedDrivers(replace(population, about={**population.about, **about}), words)
+    about = {"data": [file.name for file in files], "only": filters or {}, "manifest": made}
+    return FittedDrivers(replace(population, about={**population.metadata, **about}), words)
 
 
-def _prefixes(files: Sequence[Path]) -> list[str]:
+def _name_prefixes(files: Sequence[Path]) -> list[str]:
     """Return what names of drivers begin with in each file: those of two files are different people."""
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
-            raise wrong("data", str(file), "each file once")
+            raise invalid_value("data", str(file), "each file once")
     stems = [file.stem for file in files]
     if len(set(stems)) < len(stems):
         stems = [f"{number}-{stem}" for number, stem in enumerate(stems, 1)]
     return [f"{stem}-" for stem in stems] if len(files) > 1 else [""]
 
 
-def doubts_about_units(pairs: Sequence[Pair]) -> list[str]:
+def unit_warnings(pairs: Sequence[Pair]) -> list[str]:
     """Return a line where gaps change otherwise than the speeds say: the two have not the same unit."""
     differences = [pair.leader_speed - pair.speed for pair in pairs]
     closing = np.concatenate([(each[1:] + each[:-1]) / 2.0 for each in differences])
     change = np.concatenate([np.diff(pair.gap) / pair.step for pair in pairs])
     share = float(closing @ change / max(closing @ closing, 1e-9))
-    low, high = SAME_UNIT
+    low, high = UNIT_RATIO_LIMITS
     if low <= share <= high or not closing.any():
         return []
     return [
@@ -179,7 +183,7 @@ def doubts_about_units(pairs: Sequence[Pair]) -> list[str]:
 def fit_drivers(
     pairs: Sequence[Pair],
     settings: FitDriversSettings | None = None,
-    on_progress: OnProgress = lambda done, drivers: None,
+    on_progress: DriverProgress = lambda done, drivers: None,
 ) -> Population:
     """Return the population of all drivers in `pairs`.
 
@@ -196,32 +200,29 @@ def fit_drivers(
         InputError: too few drivers for a residual, or different time steps.
     """
     settings = settings or FitDriversSettings()
-    for name in settings.own:
-        if name not in SEARCHED:
-            raise wrong_name("own", name, SEARCHED)
+    for name in settings.individual:
+        if name not in CALIBRATED_PARAMETERS:
+            raise unknown_name("individual", name, CALIBRATED_PARAMETERS)
     names = list(dict.fromkeys(pair.driver for pair in pairs))
-    if settings.residual and len(names) < FEWEST:
-        raise wrong("drivers", len(names), f">= {FEWEST} for a residual")
-    calibration = replace(settings.calibration, kept_headway=(0.0, 0.0))  # each has its own
-    together = calibrate(pairs, calibration)
-    typical, found = _levels(pairs, names, replace(settings, calibration=calibration), on_progress)
-    residual, learned = _residual(pairs, found, settings) if settings.residual else (None, {})
+    if settings.residual and len(names) < MIN_RESIDUAL_DRIVERS:
+        raise invalid_value("drivers", len(names), f">= {MIN_RESIDUAL_DRIVERS} for a residual")
+    calibration = replace(settings.calibration, initial_headway_weight=(0.0, 0.0))  # each has its own
+    together = calibrate_idm(pairs, calibration)
+    typical, found = _calibrate_in_rounds(pairs, names, replace(settings, calibration=calibration), on_progress)
+    residual, learned = _fit_residual(pairs, found, settings) if settings.residual else (None, {})
     return Population(
         typical=typical,
         drivers=tuple(one.parameters for one in found.values()),
         limits=calibration.limits,
         residual=residual,
-        details=tuple({"name": name, **_detail(one)} for name, one in found.items()),
-        about={"fit": {"settings": asdict(settings), "together": _detail(together), **learned}},
+        details=tuple({"name": name, **_calibration_details(one)} for name, one in found.items()),
+        metadata={"fit": {"settings": asdict(settings), "together": _calibration_details(together), **learned}},
     )
 
 
-def _levels(
-    pairs: Sequence[Pair],
-    names: Sequence[str],
-    settings: FitDriversSettings,
-    on_progress: OnProgress,
-) -> tuple[IDMParameters, dict[str, Calibrated]]:
+def _calibrate_in_rounds(
+    pairs: Sequence[Pair], names: Sequence[str], settings: FitDriversSettings, on_progress: DriverProgress
+) -> tuple[IDMParameters, dict[str, CalibratedIDM]]:
     """Return what drivers have in common, and each driver's own, each calibrated given the other in turn.
 
     One IDM for people who keep different distances is too soft: it must not react to gaps that are just the
@@ -229,42 +230,42 @@ def _levels(
     which one IDM suits all of them.
     """
     groups = [[pair for pair in pairs if pair.driver == name] for name in names]
-    each_its_own = "time_headway" in settings.own
-    shared = replace(settings.calibration, kept_headway=(0.0, 1.0)) if each_its_own else settings.calibration
-    typical, found = calibrate(pairs, shared).parameters, {}
-    for turn in range(settings.turns):
+    each_its_own = "time_headway" in settings.individual
+    shared = replace(settings.calibration, initial_headway_weight=(0.0, 1.0)) if each_its_own else settings.calibration
+    typical, found = calibrate_idm(pairs, shared).parameters, {}
+    for turn in range(settings.rounds):
         if turn:
             own = [found[pair.driver].parameters.time_headway / typical.time_headway for pair in pairs]
-            typical = calibrate(pairs, settings.calibration, own).parameters
-        each = calibrate_each(
-            groups, typical, settings.own, settings.calibration, lambda done: on_progress(done, len(names))
+            typical = calibrate_idm(pairs, settings.calibration, own).parameters
+        each = calibrate_groups(
+            groups, typical, settings.individual, settings.calibration, lambda done: on_progress(done, len(names))
         )
         found = dict(zip(names, each, strict=True))
     if each_its_own:  # so far it is a unit for the others': any would do
-        (one,) = calibrate_each([pairs], typical, ["time_headway"], settings.calibration)
+        (one,) = calibrate_groups([pairs], typical, ["time_headway"], settings.calibration)
         typical = one.parameters
     return typical, found
 
 
-def _residual(
-    pairs: Sequence[Pair], found: dict[str, Calibrated], settings: FitDriversSettings
+def _fit_residual(
+    pairs: Sequence[Pair], calibrated: dict[str, CalibratedIDM], settings: FitDriversSettings
 ) -> tuple[Network | None, dict[str, Any]]:
     """Return the residual, None where it is of no use, and how it did."""
-    from unjam.following.networks import Known, fit_multi_step  # and torch, which IDMs do without
+    from unjam.following.networks import CalibratedPairs, fit_multi_step  # and torch, which IDMs do without
 
-    chosen = split_by_trajectory(pairs, (1.0 - VALIDATION_SHARE, VALIDATION_SHARE, 0.0), settings.seed)
+    chosen = split_by_driver(pairs, (1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0), settings.seed)
     known, validation = (
-        Known(part, [found[pair.driver].parameters for pair in part])
-        for part in (of_split(chosen, "train"), of_split(chosen, "validation"))
+        CalibratedPairs(part, [calibrated[pair.driver].parameters for pair in part])
+        for part in (pairs_in_splits(chosen, "train"), pairs_in_splits(chosen, "validation"))
     )
-    fitted = fit_multi_step(
-        known, validation, settings.calibration.limits, settings.multi_step, settings.seed
-    )
-    better = min(fitted.validation) < fitted.validation[0]
-    facts = {"residual_gap_errors": fitted.validation, "residual_is_better": better}
-    return fitted.network.as_driver() if better else None, facts
+    fitted = fit_multi_step(known, validation, settings.calibration.limits, settings.multi_step, settings.seed)
+    better = min(fitted.validation_errors) < fitted.validation_errors[0]
+    facts = {"residual_gap_errors": fitted.validation_errors, "residual_is_better": better}
+    return fitted.network.to_numpy_network() if better else None, facts
 
 
-def _detail(found: Calibrated) -> dict[str, Any]:
+def _calibration_details(calibrated: CalibratedIDM) -> dict[str, Any]:
     """Return what is known of a driver beside the parameters."""
-    return {key: value for key, value in asdict(found).items() if key not in ("parameters", "kept_headway")}
+    return {
+        key: value for key, value in asdict(calibrated).items() if key not in ("parameters", "initial_headway_weight")
+    }

@@ -10,55 +10,55 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from unjam.errors import InputError, wrong_name
-from unjam.following.pairs import BadRow, Pair, Reading, Recorded
+from unjam.errors import InputError, unknown_name
+from unjam.following.pairs import BadRow, Pair, ReadOptions, ReadResult
 
-COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
+PAIR_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
 """what every row must have: [s], [m/s], [m/s], [m]"""
-OPTIONAL = ("driver", "kind", "split")
-ALIASES = {"t": "time", "v_foll": "speed", "v_lead": "leader_speed"}
+OPTIONAL_COLUMNS = ("driver", "kind", "split")
+COLUMN_ALIASES = {"t": "time", "v_foll": "speed", "v_lead": "leader_speed"}
 """other names under which a plain table may have a column"""
-ALLOWED = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.0)}
+VALUE_LIMITS = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.0)}
 """what a vehicle on a road can do; beyond it the units are wrong, or the row is"""
-ROUGHNESS = 0.01
+TIME_STEP_TOLERANCE = 0.01
 """by how much moments may be unevenly spaced, relative to the time step"""
-FOOT = 0.3048
+METERS_PER_FOOT = 0.3048
 """[m]"""
-VEHICLE_LENGTHS = (3.0, 8.0)
+MEDIAN_LENGTH_LIMITS = (3.0, 8.0)
 """within which the median length of vehicles lies, if the units are right [m]"""
 
-NGSIM = {
+NGSIM_COLUMNS = {
     **{"vehicle_id": "vehicle", "global_time": "time", "local_y": "front", "v_length": "length"},
     **{"v_vel": "speed", "lane_id": "lane", "preceding": "leader"},
 }
 """our names of the columns of the public NGSIM file (US DOT), by its own in small letters"""
-RECONSTRUCTED = {
+RECONSTRUCTED_COLUMNS = {
     **{"vehicleid": "vehicle", "frameid": "time", "laneid": "lane", "localy": "front"},
     **{"meanspeed": "speed", "vehiclelength": "length", "leaderid": "leader"},
 }
 """of those of the reconstructed NGSIM I-80 (Montanino and Punzo 2015), by letters alone"""
-HIGHD = {
+HIGHD_COLUMNS = {
     **{"id": "vehicle", "frame": "time", "x": "front", "width": "length", "xVelocity": "speed"},
     **{"laneId": "lane", "precedingId": "leader"},
 }
 """of those of the tracks of highD (Krajewski et al. 2018)"""
-HIGHD_RATE = 25.0
+HIGHD_FRAME_RATE = 25.0
 """frames of highD per second"""
-GONE = 60.0
+MAX_VEHICLE_ABSENCE = 60.0
 """who was not seen for longer is somebody else with the same number [s]"""
-FCD = {
+FCD_COLUMNS = {
     **{"timestep_time": "time", "vehicle_speed": "speed"},
     **{"vehicle_leaderSpeed": "leader_speed", "vehicle_leaderGap": "gap"},
 }
 """of those of SUMO's FCD output as CSV, which has leaders with --fcd-output.max-leader-distance"""
-RECONSTRUCTED_ORDER = (
+RECONSTRUCTED_COLUMN_ORDER = (
     *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
     *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
 )
 """columns of its files, which have no header"""
 
 
-def read_pairs(path: Path, format: str = "", reading: Reading | None = None) -> Recorded:
+def read_pairs(path: Path, format: str = "", options: ReadOptions | None = None) -> ReadResult:
     """Return the trajectories of a file.
 
     Args:
@@ -69,68 +69,68 @@ def read_pairs(path: Path, format: str = "", reading: Reading | None = None) -> 
     Raises:
         InputError: the file is missing or of another format, its units are wrong, or a row is bad.
     """
-    if format and format not in FORMATS:
-        raise wrong_name("format", format, FORMATS)
-    frame = _read(path)
-    return FORMATS[format or _told_format(frame)](frame, path, reading or Reading())
+    if format and format not in PAIR_FORMATS:
+        raise unknown_name("format", format, PAIR_FORMATS)
+    frame = _read_frame(path)
+    return PAIR_FORMATS[format or _detect_format(frame)](frame, path, options or ReadOptions())
 
 
-def _table(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+def _read_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of a plain table with the columns COLUMNS, and OPTIONAL if there are such."""
-    frame = frame.rename(columns={other: name for other, name in ALIASES.items() if name not in frame})
-    _check_columns(frame, COLUMNS, path)
-    for name, columns in (("driver", reading.driver), ("kind", reading.kind)):
+    frame = frame.rename(columns={other: name for other, name in COLUMN_ALIASES.items() if name not in frame})
+    _check_columns(frame, PAIR_COLUMNS, path)
+    for name, columns in (("driver", options.driver_columns), ("kind", options.kind_columns)):
         if columns and name not in frame:
             _check_columns(frame, columns, path)
-            frame[name] = _joined(frame, columns)
-    return _trajectories(_numbers(frame, COLUMNS[1:]), path, reading)
+            frame[name] = _join_columns(frame, columns)
+    return _split_trajectories(_to_numeric(frame, PAIR_COLUMNS[1:]), path, options)
 
 
-def _ngsim(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+def _read_ngsim(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of the public NGSIM file, which is in feet and milliseconds."""
     frame = frame.rename(columns=str.lower)
     place = frame["location"].astype(str) if "location" in frame else ""
-    vehicles = _columns(frame, NGSIM, path)
-    lengths = {name: vehicles[name] * FOOT for name in ("front", "speed", "length")}
+    vehicles = _select_columns(frame, NGSIM_COLUMNS, path)
+    lengths = {name: vehicles[name] * METERS_PER_FOOT for name in ("front", "speed", "length")}
     vehicles = vehicles.assign(place=place, time=vehicles["time"] / 1000.0, **lengths)
-    return _behind_leaders(vehicles, path, reading)
+    return _pairs_from_vehicles(vehicles, path, options)
 
 
-def _reconstructed(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+def _read_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of the reconstructed NGSIM I-80, in metres and tenths of a second."""
-    vehicles = _columns(frame.rename(columns=_plain), RECONSTRUCTED, path)
+    vehicles = _select_columns(frame.rename(columns=_alphanumeric), RECONSTRUCTED_COLUMNS, path)
     vehicles = vehicles.assign(place=path.stem, time=vehicles["time"] / 10.0)
-    return _behind_leaders(vehicles, path, reading)
+    return _pairs_from_vehicles(vehicles, path, options)
 
 
-def _highd(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+def _read_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of a file of highD, in which x is the left end of a vehicle's box.
 
     On one of the two carriageways all drive towards smaller x: there places count the other way.
     """
-    vehicles = _columns(frame, HIGHD, path)
+    vehicles = _select_columns(frame, HIGHD_COLUMNS, path)
     # Of a whole lane: who stands has no direction.
     onwards = vehicles.groupby("lane")["speed"].transform("sum").to_numpy() >= 0
     front = (vehicles["front"] + vehicles["length"]).where(onwards, -vehicles["front"])
-    moving = {"front": front, "speed": vehicles["speed"].abs(), "time": vehicles["time"] / HIGHD_RATE}
-    return _behind_leaders(vehicles.assign(place=path.stem, **moving), path, reading)
+    moving = {"front": front, "speed": vehicles["speed"].abs(), "time": vehicles["time"] / HIGHD_FRAME_RATE}
+    return _pairs_from_vehicles(vehicles.assign(place=path.stem, **moving), path, options)
 
 
-def _fcd(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+def _read_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of SUMO's FCD output: a vehicle behind one leader in one lane is a pair."""
     told = ("vehicle_id", "vehicle_leaderID", "vehicle_lane")
-    vehicles = _columns(frame, FCD, path)
+    vehicles = _select_columns(frame, FCD_COLUMNS, path)
     _check_columns(frame, told, path)
     alone = vehicles["gap"] < 0
     vehicles = vehicles.assign(
-        pair=_joined(frame, told), driver=frame["vehicle_id"].astype(str), kind="simulated"
+        pair=_join_columns(frame, told), driver=frame["vehicle_id"].astype(str), kind="simulated"
     )
-    return _trajectories(vehicles.loc[~alone], path, reading, {"nobody ahead": int(np.count_nonzero(alone))})
+    return _split_trajectories(vehicles.loc[~alone], path, options, {"nobody ahead": int(np.count_nonzero(alone))})
 
 
-def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+def _pairs_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of a table of single vehicles, each of which names its leader."""
-    low, high = VEHICLE_LENGTHS
+    low, high = MEDIAN_LENGTH_LIMITS
     typical = float(np.nanmedian(vehicles["length"]))
     if not low <= typical <= high:
         raise InputError(
@@ -144,27 +144,27 @@ def _behind_leaders(vehicles: pd.DataFrame, path: Path, reading: Reading) -> Rec
     alone = vehicles["front_ahead"].isna() & vehicles["front"].notna()
     vehicles = vehicles.loc[~alone]
     frame = vehicles.assign(
-        pair=_joined(vehicles, ("place", "vehicle", "leader", "lane")),
-        driver=_joined(vehicles.assign(anew=_anew(vehicles)), ("place", "vehicle", "anew")).str.rstrip("-"),
+        pair=_join_columns(vehicles, ("place", "vehicle", "leader", "lane")),
+        driver=_join_columns(
+            vehicles.assign(anew=_reused_number_suffix(vehicles)), ("place", "vehicle", "anew")
+        ).str.rstrip("-"),
         kind="human",
         leader_speed=vehicles["speed_ahead"],
         gap=vehicles["front_ahead"] - vehicles["length_ahead"] - vehicles["front"],
     )
-    return _trajectories(
-        frame, path, reading, {"nobody ahead, or not recorded": int(np.count_nonzero(alone))}
-    )
+    return _split_trajectories(frame, path, options, {"nobody ahead, or not recorded": int(np.count_nonzero(alone))})
 
 
-def _anew(vehicles: pd.DataFrame) -> pd.Series:
+def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
     """Return "2" for the second with a number, and so on: NGSIM's begin anew every quarter of an hour."""
     ordered = vehicles.sort_values(by="time", kind="stable")
     who = [ordered["place"], ordered["vehicle"]]
-    longer = ordered["time"].groupby(who, dropna=False).diff() > GONE
+    longer = ordered["time"].groupby(who, dropna=False).diff() > MAX_VEHICLE_ABSENCE
     before = longer.groupby(who, dropna=False).cumsum().to_numpy(int)
     return pd.Series(np.where(before > 0, (before + 1).astype(str), ""), ordered.index)
 
 
-def _openacc(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
+def _read_openacc(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of an OpenACC file (JRC): a platoon, each vehicle behind the one before it."""
     numbers = sorted(int(name[3:]) for name in frame.columns if re.fullmatch(r"IVS\d+", name))
     if not numbers:
@@ -173,7 +173,7 @@ def _openacc(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
     parts = []
     for number in numbers:
         speeds = {f"Speed{number}": "leader_speed", f"Speed{number + 1}": "speed"}
-        part = _columns(frame, {"Time": "time", **speeds, f"IVS{number}": "gap"}, path)
+        part = _select_columns(frame, {"Time": "time", **speeds, f"IVS{number}": "gap"}, path)
         driver = f"Driver{number + 1}"
         kind = frame[driver].astype(str) if driver in frame else pd.Series("", frame.index)
         # Who takes over in mid-way is another driver.
@@ -181,20 +181,20 @@ def _openacc(frame: pd.DataFrame, path: Path, reading: Reading) -> Recorded:
         name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
         who = name + marks if len(set(kind)) > 1 else name
         parts.append(part.assign(pair=f"{path.stem}-{number + 1}" + marks, driver=who, kind=kind))
-    return _trajectories(pd.concat(parts), path, reading)
+    return _split_trajectories(pd.concat(parts), path, options)
 
 
-FORMATS: dict[str, Callable[[pd.DataFrame, Path, Reading], Recorded]] = {
-    "table": _table,
-    "ngsim": _ngsim,
-    "ngsim-reconstructed": _reconstructed,
-    "openacc": _openacc,
-    "highd": _highd,
-    "fcd": _fcd,
+PAIR_FORMATS: dict[str, Callable[[pd.DataFrame, Path, ReadOptions], ReadResult]] = {
+    "table": _read_table,
+    "ngsim": _read_ngsim,
+    "ngsim-reconstructed": _read_reconstructed,
+    "openacc": _read_openacc,
+    "highd": _read_highd,
+    "fcd": _read_fcd,
 }
 
 
-def _read(path: Path) -> pd.DataFrame:
+def _read_frame(path: Path) -> pd.DataFrame:
     """Return a file's table with a column `line`; its `attrs` are what lines above its header say."""
     if not path.is_file():
         raise InputError(f"data: {str(path)!r} does not exist")
@@ -203,8 +203,8 @@ def _read(path: Path) -> pd.DataFrame:
         if path.suffix == ".parquet":
             frame = pd.read_parquet(path)
         else:
-            header, about = _header(path)
-            bare = {"names": list(RECONSTRUCTED_ORDER), "header": None} if header < 0 else {}
+            header, about = _find_header(path)
+            bare = {"names": list(RECONSTRUCTED_COLUMN_ORDER), "header": None} if header < 0 else {}
             with open(path, encoding="utf-8-sig") as file:
                 mark = ";" if file.readline().startswith("timestep_") else ","  # SUMO's, and everybody's
             frame = pd.read_csv(path, sep=mark, skiprows=max(0, header), skipinitialspace=True, **bare)
@@ -215,13 +215,13 @@ def _read(path: Path) -> pd.DataFrame:
     return frame
 
 
-def _header(path: Path) -> tuple[int, dict[Hashable, str]]:
+def _find_header(path: Path) -> tuple[int, dict[Hashable, str]]:
     """Return how many lines lie above a CSV file's header (-1: it has none), and what these say."""
     with open(path, encoding="utf-8-sig") as file:
         lines = [file.readline().strip() for _ in range(20)]
     first = lines[0].split(",")
     numbers = all(re.fullmatch(r"\s*-?[\d.eE+-]+", cell) for cell in first)
-    if numbers and len(first) == len(RECONSTRUCTED_ORDER):
+    if numbers and len(first) == len(RECONSTRUCTED_COLUMN_ORDER):
         return -1, {}
     for number, line in enumerate(lines):
         if re.match(r"time\s*,\s*speed1\b", line, re.IGNORECASE):
@@ -230,37 +230,37 @@ def _header(path: Path) -> tuple[int, dict[Hashable, str]]:
     return 0, {}
 
 
-def _told_format(frame: pd.DataFrame) -> str:
+def _detect_format(frame: pd.DataFrame) -> str:
     names = set(map(str, frame.columns))
-    if NGSIM.keys() <= {name.lower() for name in names}:
+    if NGSIM_COLUMNS.keys() <= {name.lower() for name in names}:
         return "ngsim"
-    if RECONSTRUCTED.keys() <= set(map(_plain, names)):
+    if RECONSTRUCTED_COLUMNS.keys() <= set(map(_alphanumeric, names)):
         return "ngsim-reconstructed"
-    for name, columns in (("highd", HIGHD), ("fcd", {"timestep_time", "vehicle_id"})):
+    for name, columns in (("highd", HIGHD_COLUMNS), ("fcd", {"timestep_time", "vehicle_id"})):
         if names >= set(columns):
             return name
     return "openacc" if {"Speed1", "IVS1"} <= names else "table"
 
 
-def _plain(name: str) -> str:
+def _alphanumeric(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
-def _columns(frame: pd.DataFrame, named: dict[str, str], path: Path) -> pd.DataFrame:
+def _select_columns(frame: pd.DataFrame, new_names: dict[str, str], path: Path) -> pd.DataFrame:
     """Return some columns of a file as numbers, and `line`, by our names."""
-    _check_columns(frame, named, path)
-    return _numbers(frame.loc[:, ["line", *named]], named).rename(columns=named)
+    _check_columns(frame, new_names, path)
+    return _to_numeric(frame.loc[:, ["line", *new_names]], new_names).rename(columns=new_names)
 
 
-def _check_columns(frame: pd.DataFrame, wanted: Iterable[str], path: Path) -> None:
-    missing = [name for name in wanted if name not in frame]
+def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> None:
+    missing = [name for name in required if name not in frame]
     if missing:
         there = ", ".join(str(name) for name in frame.columns if name != "line")
-        needed = ", ".join(wanted)
+        needed = ", ".join(required)
         raise InputError(f"{path.name}: no column {missing[0]!r}; it has: {there}; needed: {needed}")
 
 
-def _joined(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
+def _join_columns(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
     """Return the words of some columns joined, row by row; of the rows that are alike only once."""
     alike = frame.groupby(list(columns), sort=False, observed=True, dropna=False).ngroup()
     first = frame[list(columns)].loc[~alike.duplicated()]
@@ -268,14 +268,14 @@ def _joined(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
     return pd.Series(np.array(words, object)[alike.to_numpy()], frame.index)
 
 
-def _numbers(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
+def _to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     """Return the table with these columns as numbers; what is none becomes NaN, and so a bad row."""
     return frame.assign(**{name: pd.to_numeric(frame[name], errors="coerce") for name in names})
 
 
-def _trajectories(
-    frame: pd.DataFrame, path: Path, reading: Reading, left_out: dict[str, int] | None = None
-) -> Recorded:
+def _split_trajectories(
+    frame: pd.DataFrame, path: Path, options: ReadOptions, skipped_rows: dict[str, int] | None = None
+) -> ReadResult:
     """Return the trajectories of a table with the columns `line`, COLUMNS and OPTIONAL, SI units.
 
     A trajectory is a run of evenly spaced rows of one pair; where a moment is missing, another begins. Rows
@@ -284,43 +284,43 @@ def _trajectories(
     Raises:
         InputError: a row is bad, or nothing is left.
     """
-    (wrong, bad), left_out = _bad_rows(frame), left_out or {}
-    if bad and not reading.cut_bad:
+    (wrong, bad), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
+    if bad and not options.drop_bad_rows:
         more = f" ({len(bad)} bad rows)" if len(bad) > 1 else ""
-        raise InputError(f"{path.name}: line {bad[0].line}: {bad[0].why}{more}; --cut-bad leaves them out")
+        raise InputError(f"{path.name}: line {bad[0].line}: {bad[0].reason}{more}; --cut-bad leaves them out")
     good = frame.loc[~wrong].sort_values(by=["pair", "time"], kind="stable")
     passed = good.groupby("pair", sort=False, dropna=False)["time"].diff()
     if passed.isna().all():
         raise InputError("time: no pair has two rows")
     step = round(float(passed.median()), 4)  # times in single precision are no better
-    begins = ~((passed - step).abs() <= ROUGHNESS * step)
+    begins = ~((passed - step).abs() <= TIME_STEP_TOLERANCE * step)
     pairs, parts, short = list[Pair](), dict[str, int](), 0
     for _, rows in good.groupby(begins.cumsum(), sort=False):
-        if (len(rows) - 1) * step < reading.shortest or len(rows) < 2:
+        if (len(rows) - 1) * step < options.min_seconds or len(rows) < 2:
             short += len(rows)
             continue
         pair = str(rows["pair"].iloc[0])
-        speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in COLUMNS[2:])
-        said = {name: rows[name].head(1).dropna() for name in OPTIONAL if name in rows}
-        driver, kind, split = ("".join(map(str, said.get(name, ()))) for name in OPTIONAL)
+        speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in PAIR_COLUMNS[2:])
+        said = {name: rows[name].head(1).dropna() for name in OPTIONAL_COLUMNS if name in rows}
+        driver, kind, split = ("".join(map(str, said.get(name, ()))) for name in OPTIONAL_COLUMNS)
         parts[pair] = parts.get(pair, 0) + 1
         name = pair if parts[pair] == 1 else f"{pair}/{parts[pair]}"
         pairs.append(Pair(name, driver or pair, step, speed, leader_speed, gap, kind, split))
     if not pairs:
-        raise InputError(f"{path.name}: no trajectory lasts {reading.shortest:g} s")
-    why = {**left_out, f"trajectories shorter than {reading.shortest:g} s": short}
-    return Recorded(pairs, len(frame) + sum(left_out.values()), bad, why)
+        raise InputError(f"{path.name}: no trajectory lasts {options.min_seconds:g} s")
+    why = {**skipped_rows, f"trajectories shorter than {options.min_seconds:g} s": short}
+    return ReadResult(pairs, len(frame) + sum(skipped_rows.values()), bad, why)
 
 
-def _bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, list[BadRow]]:
+def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, list[BadRow]]:
     """Return which rows cannot be used, shape (rows,), and their lines, each once."""
     found: dict[int, str] = {}
     bad = np.zeros(len(frame), bool)
-    for name in COLUMNS[1:]:
+    for name in PAIR_COLUMNS[1:]:
         values = frame[name].to_numpy(np.float64)
-        low, high = ALLOWED.get(name, (-np.inf, np.inf))
+        low, high = VALUE_LIMITS.get(name, (-np.inf, np.inf))
         wrong = ~np.isfinite(values) | (values < low) | (values > high)
-        allowed = f"{low:g} to {high:g}" if name in ALLOWED else "finite"
+        allowed = f"{low:g} to {high:g}" if name in VALUE_LIMITS else "finite"
         bad |= wrong
         for line, value in zip(frame["line"][wrong], values[wrong], strict=True):
             found.setdefault(int(line), f"{name}: {value:g} is not allowed; allowed: {allowed}")

@@ -8,19 +8,19 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.local_state import LARGEST_GAP, LocalState
-from unjam.errors import wrong
+from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
+from unjam.errors import invalid_value
 from unjam.physics.arrays import Floats
 from unjam.physics.kinematics import distance_driven, next_position
 
 SPLITS = ("train", "validation", "test")
-DRIVEN = ("speed", "leader_speed", "gap", "leader_path")
+SEGMENT_FIELDS = ("speed", "leader_speed", "gap", "leader_path")
 """of a `Pair`, what stretches have side by side"""
-SHORTEST = 20.0
+MIN_PAIR_SECONDS = 20.0
 """drives behind a CAV that are shorter tell too little [s]"""
-LONGEST_JUMP = 0.5
+MAX_GAP_JUMP = 0.5
 """change of the gap in a decision that speeds do not explain, beyond which another vehicle is behind [m]"""
-LISTED = 5
+MAX_LISTED_ROWS = 5
 """bad rows that a message names"""
 
 
@@ -72,7 +72,7 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class FollowingSamples:
     """Single moments, without what came before; n of them."""
 
     speed: Floats
@@ -85,26 +85,28 @@ class Moments:
         return len(self.speed)
 
     @property
-    def seen(self) -> tuple[Floats, Floats, Floats]:
+    def inputs(self) -> tuple[Floats, Floats, Floats]:
         """What a driver sees: own speed, leader's speed and gap."""
         return self.speed, self.leader_speed, self.gap
 
-    def some(self, chosen: NDArray[np.int64]) -> "Moments":
+    def select(self, indices: NDArray[np.int64]) -> "FollowingSamples":
         """Return the chosen moments."""
-        return Moments(*(values[chosen] for values in vars(self).values()))
+        return FollowingSamples(*(values[indices] for values in vars(self).values()))
 
 
-def moments_of(pairs: Sequence[Pair]) -> Moments:
+def following_samples(pairs: Sequence[Pair]) -> FollowingSamples:
     """Return all moments of `pairs` but the last of each, one after the other."""
 
-    def joined(name: str) -> Floats:
+    def concatenate(name: str) -> Floats:
         return np.concatenate([getattr(pair, name)[: len(pair.acceleration)] for pair in pairs])
 
-    return Moments(joined("speed"), joined("leader_speed"), joined("gap"), joined("acceleration"))
+    return FollowingSamples(
+        concatenate("speed"), concatenate("leader_speed"), concatenate("gap"), concatenate("acceleration")
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Stretches:
+class Segments:
     """Trajectories side by side, of up to T moments; the first index is time. n stretches."""
 
     speed: Floats = field(repr=False)
@@ -113,17 +115,17 @@ class Stretches:
     gap: Floats = field(repr=False)
     leader_path: Floats = field(repr=False)
     """of `Pair`"""
-    present: NDArray[np.bool_] = field(repr=False)
+    is_present: NDArray[np.bool_] = field(repr=False)
     """whether the stretch lasts that long, shape (T, n)"""
     step: float
     """[s]"""
-    owner: NDArray[np.int64] = field(repr=False)
+    pair_index: NDArray[np.int64] = field(repr=False)
     """which pair each stretch is of, shape (n,)"""
 
     @cached_property
-    def moments(self) -> NDArray[np.int64]:
+    def sample_counts(self) -> NDArray[np.int64]:
         """Moments of each stretch but the first, shape (n,)."""
-        return self.present[1:].sum(0)
+        return self.is_present[1:].sum(0)
 
     @property
     def start(self) -> tuple[Floats, Floats]:
@@ -135,14 +137,14 @@ class Stretches:
         """Speeds and paths of the leaders, shape (T, n)."""
         return self.leader_speed, self.leader_path
 
-    def some(self, chosen: NDArray[np.int64]) -> "Stretches":
+    def select(self, indices: NDArray[np.int64]) -> "Segments":
         """Return the chosen stretches, as long as the longest of them."""
-        long = int(self.present[:, chosen].sum(0).max())
-        cut = {name: getattr(self, name)[:long, chosen] for name in (*DRIVEN, "present")}
-        return replace(self, **cut, owner=self.owner[chosen])
+        long = int(self.is_present[:, indices].sum(0).max())
+        cut = {name: getattr(self, name)[:long, indices] for name in (*SEGMENT_FIELDS, "is_present")}
+        return replace(self, **cut, owner=self.pair_index[indices])
 
 
-def stretches_of(pairs: Sequence[Pair], seconds: float | None = None) -> Stretches:
+def make_segments(pairs: Sequence[Pair], segment_seconds: float | None = None) -> Segments:
     """Return `pairs` side by side, cut into stretches of `seconds`, the last of each as long as it is.
 
     None: each pair whole. What is left at an end and shorter than two moments is not there.
@@ -152,34 +154,34 @@ def stretches_of(pairs: Sequence[Pair], seconds: float | None = None) -> Stretch
     """
     steps = {pair.step for pair in pairs}
     if len(steps) != 1:
-        raise wrong("time step", sorted(steps), "one and the same in all trajectories [s]")
+        raise invalid_value("time step", sorted(steps), "one and the same in all trajectories [s]")
     (step,) = steps
     parts: list[Pair] = []
     owner: list[int] = []
     for number, pair in enumerate(pairs):
-        length = len(pair.speed) if seconds is None else round(seconds / step) + 1
+        length = len(pair.speed) if segment_seconds is None else round(segment_seconds / step) + 1
         for first in range(0, len(pair.speed) - 1, max(1, length - 1)):
             parts.append(pair.part(first, first + length))
             owner.append(number)
     lengths = np.array([len(part.speed) for part in parts])
     longest = int(lengths.max())
 
-    def side_by_side(name: str) -> Floats:
+    def stack(name: str) -> Floats:
         columns = [getattr(part, name) for part in parts]
         return np.stack([np.pad(column, (0, longest - len(column)), mode="edge") for column in columns], 1)
 
-    return Stretches(
-        **{name: side_by_side(name) for name in DRIVEN},
-        present=np.arange(longest)[:, None] < lengths,
+    return Segments(
+        **{name: stack(name) for name in SEGMENT_FIELDS},
+        is_present=np.arange(longest)[:, None] < lengths,
         step=step,
-        owner=np.array(owner),
+        pair_index=np.array(owner),
     )
 
 
-def split_by_trajectory(pairs: Sequence[Pair], shares: Sequence[float], seed: int) -> list[Pair]:
+def split_by_driver(pairs: Sequence[Pair], shares: Sequence[float], seed: int) -> list[Pair]:
     """Return `pairs` with `split` set to train, validation or test; all pairs of a driver go together.
 
-    `shares` are those of training, validation and test in the number of drivers; they add up to one.
+    `penetration_rates` are those of training, validation and test in the number of drivers; they add up to one.
     """
     drivers = sorted({pair.driver for pair in pairs})
     order = np.random.default_rng(seed).permutation(len(drivers))
@@ -189,12 +191,14 @@ def split_by_trajectory(pairs: Sequence[Pair], shares: Sequence[float], seed: in
     return [replace(pair, split=split[pair.driver]) for pair in pairs]
 
 
-def of_split(pairs: Sequence[Pair], *names: str) -> list[Pair]:
+def pairs_in_splits(pairs: Sequence[Pair], *splits: str) -> list[Pair]:
     """Return the pairs of these parts of the split."""
-    return [pair for pair in pairs if pair.split in names]
+    return [pair for pair in pairs if pair.split in splits]
 
 
-def people_behind(recordings: Iterable[LocalState], step: float, steps: int = 1) -> list[Pair]:
+def pairs_behind_cavs(
+    recordings: Iterable[LocalState], control_step: float, steps_per_control_step: int = 1
+) -> list[Pair]:
     """Return the drives of those who followed a CAV, each of the same vehicle throughout.
 
     `recordings` are what CAVs perceived, each of shape (T,), a decision every `step` [s], of so many `steps`
@@ -202,35 +206,35 @@ def people_behind(recordings: Iterable[LocalState], step: float, steps: int = 1)
     """
     pairs = []
     for number, states in enumerate(recordings):
-        largest = np.where(np.isnan(states.loop_length), LARGEST_GAP, states.loop_length)
+        largest = np.where(np.isnan(states.loop_length), MAX_OBSERVED_GAP, states.loop_length)
         nobody = states.follower_gap >= largest
         ahead, behind = (
-            distance_driven(speed[:-1], speed[1:], step / steps, steps)
+            distance_driven(speed[:-1], speed[1:], control_step / steps_per_control_step, steps_per_control_step)
             for speed in (states.speed, states.follower_speed)
         )
         expected = states.follower_gap[:-1] + ahead - behind
-        other = np.abs(states.follower_gap[1:] - expected) > LONGEST_JUMP
+        other = np.abs(states.follower_gap[1:] - expected) > MAX_GAP_JUMP
         ends = np.flatnonzero(np.r_[True, other | nobody[1:] | nobody[:-1], True])
         for first, last in pairwise(ends):
-            if (last - first) * step >= SHORTEST:
+            if (last - first) * control_step >= MIN_PAIR_SECONDS:
                 seen = (states.follower_speed, states.speed, states.follower_gap)
                 own, leader, gap = (np.asarray(values[first:last], np.float64) for values in seen)
                 name = f"{number}-{first}"
-                pairs.append(Pair(name, name, step, own, leader, gap))
+                pairs.append(Pair(name, name, control_step, own, leader, gap))
     return pairs
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadOptions:
     """How a file is read."""
 
-    cut_bad: bool = False
+    drop_bad_rows: bool = False
     """whether bad rows are cut out, and end their trajectory, instead of refused"""
-    shortest: float = 20.0
+    min_seconds: float = 20.0
     """trajectories shorter than that are left out, and counted [s]"""
-    driver: tuple[str, ...] = ()
+    driver_columns: tuple[str, ...] = ()
     """plain tables: columns that together name the driver, where `driver` is not one"""
-    kind: tuple[str, ...] = ()
+    kind_columns: tuple[str, ...] = ()
     """plain tables: columns that together name the kind of driver, where `kind` is not one"""
 
 
@@ -240,27 +244,27 @@ class BadRow:
 
     line: int
     """in the file, its header being line 1"""
-    why: str
+    reason: str
 
 
 @dataclass(frozen=True)
-class Recorded:
+class ReadResult:
     """What a file holds."""
 
     pairs: list[Pair] = field(repr=False)
     rows: int
     """in the file"""
-    bad: list[BadRow]
+    bad_rows: list[BadRow]
     """rows that were cut out, with what was wrong"""
-    left_out: dict[str, int]
+    skipped_rows: dict[str, int]
     """rows that are not wrong but of no use, by reason"""
 
-    def words(self) -> list[str]:
+    def summary_lines(self) -> list[str]:
         """Return lines that say what was read and what was not."""
         moments = sum(len(pair.speed) for pair in self.pairs)
         lines = [f"{len(self.pairs)} trajectories with {moments:,} of {self.rows:,} rows"]
-        lines += [f"left out: {count:,} rows: {why}" for why, count in self.left_out.items() if count]
-        lines += [f"cut out: line {row.line}: {row.why}" for row in self.bad[:LISTED]]
-        if len(self.bad) > LISTED:
-            lines.append(f"cut out: {len(self.bad) - LISTED} more bad rows")
+        lines += [f"left out: {count:,} rows: {why}" for why, count in self.skipped_rows.items() if count]
+        lines += [f"cut out: line {row.line}: {row.reason}" for row in self.bad_rows[:MAX_LISTED_ROWS]]
+        if len(self.bad_rows) > MAX_LISTED_ROWS:
+            lines.append(f"cut out: {len(self.bad_rows) - MAX_LISTED_ROWS} more bad rows")
         return lines

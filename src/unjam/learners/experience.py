@@ -35,7 +35,7 @@ class Experience:
     """whether a collision ended it, shape (trajectories,); otherwise it was cut and is bootstrapped"""
 
     @property
-    def lasts(self) -> NDArray[np.intp]:
+    def last_rows(self) -> NDArray[np.intp]:
         """Last row of each trajectory, shape (trajectories,)."""
         return np.append(self.starts[1:], len(self.rewards)) - 1
 
@@ -44,23 +44,23 @@ class Experience:
         """What was seen after each row, of the shape of `observations`."""
         after = np.empty_like(self.observations)
         after[:-1] = self.observations[1:]
-        after[self.lasts] = self.last_observations
+        after[self.last_rows] = self.last_observations
         return after
 
 
-def experience_of(
+def make_experience(
     trajectories: Sequence[Trajectory],
     critic_inputs: Sequence[Sequence[float]] | Float64,
-    afterwards: Sequence[float | None] | None = None,
+    returns_after_exit: Sequence[float | None] | None = None,
 ) -> Experience:
     """Return the experience of trajectories.
 
     `critic_inputs` has, for each, what the critic alone sees; `afterwards` what was earned after its end,
     discounted to its last choice: it then is no cut. None: the value of where it ended stands for that.
     """
-    choices = [trajectory.choices for trajectory in trajectories]
+    choices = [trajectory.actions_and_rewards for trajectory in trajectories]
     ended = [trajectory.terminated for trajectory in trajectories]
-    for number, more in enumerate(afterwards or ()):
+    for number, more in enumerate(returns_after_exit or ()):
         if more is not None:
             choices[number][1][-1] += more
             ended[number] = True
@@ -79,11 +79,9 @@ def experience_of(
     )
 
 
-def join(parts: Sequence[Experience]) -> Experience:
+def join_experience(parts: Sequence[Experience]) -> Experience:
     """Return the experience of all parts, one behind the other: actual and virtual ones, say."""
-    joined = {
-        each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Experience)
-    }
+    joined = {each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Experience)}
     before = np.cumsum([0, *(len(part.rewards) for part in parts[:-1])])
     joined["starts"] += np.repeat(before, [len(part.starts) for part in parts])
     return Experience(**joined)
@@ -102,7 +100,7 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
     values, log_probs, _ = policy.evaluate_actions(seen, torch.as_tensor(actions))
     last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
     rewards = rows.rewards.astype(np.float32)
-    rewards[rows.lasts] += buffer.gamma * np.where(rows.terminated, 0.0, last_values).astype(np.float32)
+    rewards[rows.last_rows] += buffer.gamma * np.where(rows.terminated, 0.0, last_values).astype(np.float32)
 
     buffer.buffer_size = len(rewards)
     buffer.reset()
@@ -123,7 +121,7 @@ def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: floa
     ended. SB3 keeps actions as shares of their bounds, here of the `authority` [m/s2].
     """
     done = np.zeros(len(rewards), np.float32)
-    done[rows.lasts] = rows.terminated
+    done[rows.last_rows] = rows.terminated
     places = (buffer.pos + np.arange(len(rewards))) % buffer.buffer_size
     buffer.observations[places, 0] = rows.observations
     buffer.next_observations[places, 0] = rows.next_observations
@@ -138,42 +136,42 @@ def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: floa
 class MixedReplayBuffer(ReplayBuffer):
     """SB3's replay buffer of actual rows; while it has virtual ones too, a batch is made of both."""
 
-    def __init__(self, *arguments: Any, **named: Any) -> None:
-        super().__init__(*arguments, **named)
-        self._virtual: ReplayBuffer | None = None
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._model_buffer: ReplayBuffer | None = None
         self.real_ratio = 1.0
         """share of actual rows in a batch"""
 
-    def begin_virtual(self, rows: int) -> ReplayBuffer:
+    def new_model_buffer(self, rows: int) -> ReplayBuffer:
         """Return an empty buffer for so many virtual rows, in place of the one before."""
         spaces = self.observation_space, self.action_space
-        self._virtual = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
-        return self._virtual
+        self._model_buffer = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
+        return self._model_buffer
 
-    def forget_virtual(self) -> None:
+    def drop_model_buffer(self) -> None:
         """Sample actual rows alone from now on."""
-        self._virtual = None
+        self._model_buffer = None
 
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
         """Return a random batch."""
-        if self._virtual is None:
+        if self._model_buffer is None:
             return super().sample(batch_size, env)
         real = round(self.real_ratio * batch_size)
         parts = [super().sample(real)] if real else []
         if real < batch_size:
-            parts.append(self._virtual.sample(batch_size - real))
+            parts.append(self._model_buffer.sample(batch_size - real))
         joined = [torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)]
         return ReplayBufferSamples(*joined)
 
 
-def shifted_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
+def shift_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
     """Return the rewards less `offset`, shape (rows,), so that the same policies are the best ones.
 
     What follows a row is then worth less by offset / (1 - gamma), wherever it is; after a collision, where
     nothing follows, the last reward is less by what is missing.
     """
     rewards = rows.rewards - offset
-    rewards[rows.lasts] -= np.where(rows.terminated, offset * gamma / (1.0 - gamma), 0.0)
+    rewards[rows.last_rows] -= np.where(rows.terminated, offset * gamma / (1.0 - gamma), 0.0)
     return rewards
 
 
@@ -183,7 +181,7 @@ def discounted_returns(rows: Experience, gamma: float) -> Float64:
     The end of a cut trajectory counts as if it went on at its mean reward.
     """
     returns = np.empty(len(rows.rewards))
-    for first, last, terminated in zip(rows.starts, rows.lasts, rows.terminated, strict=True):
+    for first, last, terminated in zip(rows.starts, rows.last_rows, rows.terminated, strict=True):
         earned = rows.rewards[first : last + 1]
         later = 0.0 if terminated else float(earned.mean()) / (1.0 - gamma)
         for row in range(last, first - 1, -1):

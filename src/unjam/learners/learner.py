@@ -45,12 +45,12 @@ class AgentSpec:
 class Update(NamedTuple):
     """What one update learns from."""
 
-    actual: Experience | None
+    environment_rows: Experience | None
     """of this iteration; None in the updates of an iteration after its first"""
-    virtual: Experience | None
+    model_rows: Experience | None
     share: float
     """of all that the iteration's updates do"""
-    actual_steps: int
+    environment_steps: int
     """of all iterations so far"""
 
 
@@ -67,15 +67,15 @@ class Learner:
         spec: AgentSpec,
         algorithm: type[BaseAlgorithm],
         policy: type[BasePolicy],
-        policy_arguments: dict[str, Any] | None = None,
-        **arguments: Any,
+        policy_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
     ) -> None:
         """Make SB3's algorithm with its own `arguments`."""
         authority = spec.policy.authority * spec.action_limit
         env = gymnasium.Env[np.ndarray, np.ndarray]()  # SB3 asks for its spaces; nobody steps it
         env.observation_space, env.action_space = policy_spaces(spec.inputs, spec.critic_inputs, authority)
         self.spec = spec
-        self.gamma = arguments["gamma"]
+        self.gamma = kwargs["gamma"]
         self.sb3 = algorithm(
             policy=policy,
             env=env,
@@ -83,11 +83,11 @@ class Learner:
                 "settings": spec.policy,
                 "inputs": spec.inputs,
                 "action_limit": spec.action_limit,
-                **(policy_arguments or {}),
+                **(policy_kwargs or {}),
             },
             seed=spec.seed,
             device="cpu",
-            **arguments,
+            **kwargs,
         )
         self.sb3.set_logger(Logger(None, []))
 
@@ -95,18 +95,18 @@ class Learner:
         """Return the policy's NumPy twin."""
         return self.sb3.policy.network()
 
-    def exploring_network(self, actual_steps: int) -> Network:
+    def exploring_network(self, environment_steps: int) -> Network:
         """Return the network that drives, exploring, after so many actual steps."""
         return self.network()
 
-    def learns(self, actual_steps: int) -> bool:
+    def is_learning(self, environment_steps: int) -> bool:
         """Whether updates change the policy after so many actual steps; before, nothing is imagined."""
         return True
 
-    def measure_units(self, actual: Experience) -> None:
+    def set_value_scale(self, environment_rows: Experience) -> None:
         """Take the units of returns from the first iteration's actual rows."""
 
-    def gaussians(self, observations: Tensor) -> Normal:
+    def residual_distribution(self, observations: Tensor) -> Normal:
         """Return the distribution of the residual at n observations, before any squashing, shape (n,)."""
         raise NotImplementedError
 
@@ -124,9 +124,7 @@ class Learner:
             if not parameter.isfinite().all():
                 raise UnjamError(f"learner: {name} is not finite in iteration {iteration}")
             if name == "log_std" and not parameter.exp().all():
-                raise UnjamError(
-                    f"learner: exploration has ended in iteration {iteration}: a smaller step helps"
-                )
+                raise UnjamError(f"learner: exploration has ended in iteration {iteration}: a smaller step helps")
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all that it must keep to go on exactly where it stopped, as plain numbers and tensors.
@@ -145,29 +143,29 @@ class Learner:
     def restore(self, counters: dict[str, Any], tensors: Tensors) -> None:
         """Put a learner made from the same configuration into what `state` returned."""
         parts = self.sb3.get_parameters()
-        self.sb3.set_parameters({part: _state_of(part, state, tensors) for part, state in parts.items()})
+        self.sb3.set_parameters({part: _restored_state(part, state, tensors) for part, state in parts.items()})
         self.sb3._n_updates = counters["updates"]
 
 
 def make_learner(settings: LearnerSettings, spec: AgentSpec) -> Learner:
     """Return a new learner of the kind that its settings name."""
-    module, _, name = settings.learner.partition(":")
+    module, _, name = settings.learner_class.partition(":")
     return getattr(import_module(module), name)(spec, settings)
 
 
-def _state_of(part: str, fresh: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
+def _restored_state(part: str, initial_state: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
     """Return the kept state of a part of a learner in the form of torch; `fresh` is that of a new one."""
-    kept = under(f"{part}/", tensors)
-    if "param_groups" not in fresh:
+    kept = tensors_with_prefix(f"{part}/", tensors)
+    if "param_groups" not in initial_state:
         return kept
     entries: dict[int, Tensors] = {}
     for name, tensor in kept.items():
         index, _, key = name.partition("/")
         entries.setdefault(int(index), {})[key] = tensor
-    return {"state": entries, "param_groups": fresh["param_groups"]}
+    return {"state": entries, "param_groups": initial_state["param_groups"]}
 
 
-def under(prefix: str, tensors: Tensors) -> Tensors:
+def tensors_with_prefix(prefix: str, tensors: Tensors) -> Tensors:
     """Return copies of those tensors whose names begin with `prefix`, without it."""
     return {name.removeprefix(prefix): t.clone() for name, t in tensors.items() if name.startswith(prefix)}
 
@@ -187,21 +185,21 @@ def policy_spaces(inputs: int, critic_inputs: int, authority: float) -> tuple[sp
 def network_layers(module: nn.Module) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Return weight and bias of each linear layer as a `Network` takes them: float64 copies, inputs first."""
 
-    def array(tensor: Tensor) -> np.ndarray:
+    def to_array(tensor: Tensor) -> np.ndarray:
         return tensor.detach().cpu().numpy().astype(np.float64)
 
     linear = [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
-    return tuple((array(layer.weight).T.copy(), array(layer.bias)) for layer in linear)
+    return tuple((to_array(layer.weight).T.copy(), to_array(layer.bias)) for layer in linear)
 
 
-def policy_distance(one: Normal, other: Normal) -> Tensor:
+def policy_distance(p: Normal, q: Normal) -> Tensor:
     """Return the total variation between Gaussians, row by row, shape (n,), in [0, 1].
 
     Half the integral of |p - q|: between the places where the densities cross, the difference of the
     probabilities. It is the same after any squashing that keeps the order.
     """
-    one, other = (Normal(each.mean.double(), each.stddev.double()) for each in (one, other))
-    m, s, n, t = one.mean, one.stddev, other.mean, other.stddev
+    p, q = (Normal(each.mean.double(), each.stddev.double()) for each in (p, q))
+    m, s, n, t = p.mean, p.stddev, q.mean, q.stddev
     # p = q where (x-m)^2/s^2 - (x-n)^2/t^2 + 2 log(s/t) = 0
     a = 1 / s**2 - 1 / t**2
     b = 2 * (n / t**2 - m / s**2)
@@ -210,6 +208,6 @@ def policy_distance(one: Normal, other: Normal) -> Tensor:
     root = square_root((b**2 - 4 * a * c).clip(0))
     # Of equal widths they cross once, half-way.
     low, high = ((-b + sign * root) / (2 * torch.where(same, torch.ones_like(a), a)) for sign in (-1, 1))
-    between = ((one.cdf(high) - one.cdf(low)) - (other.cdf(high) - other.cdf(low))).abs()
+    between = ((p.cdf(high) - p.cdf(low)) - (q.cdf(high) - q.cdf(low))).abs()
     once = torch.erf((m - n).abs() / (2 * 2**0.5 * s))
     return torch.where(same, once, between)

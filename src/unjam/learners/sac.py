@@ -15,14 +15,14 @@ from torch.distributions import Normal
 
 from unjam.adam import Adam
 from unjam.drivers.network import Network
-from unjam.learners.experience import Experience, MixedReplayBuffer, add_to_replay_buffer, shifted_rewards
+from unjam.learners.experience import Experience, MixedReplayBuffer, add_to_replay_buffer, shift_rewards
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, network_layers
 from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings
 
 UNIFORM_STD = 0.85
 """standard deviation of normal noise whose tanh is uniform in [-1, 1] to one per cent"""
-REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
-REPLAY_PLACE = ("pos", "full")
+REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones")
+REPLAY_POSITION = ("pos", "full")
 """where the next row goes, and whether the buffer is full"""
 
 
@@ -31,7 +31,7 @@ def uniform_network(inputs: int, authority: float) -> Network:
     return Network(((np.zeros((inputs, 2)), np.array([0.0, math.log(UNIFORM_STD)])),), authority)
 
 
-class ActorView(BaseFeaturesExtractor):
+class ActorInputExtractor(BaseFeaturesExtractor):
     """What the actor sees: the first numbers of an observation; the critic alone sees the others."""
 
     def forward(self, observations: Tensor) -> Tensor:
@@ -39,7 +39,7 @@ class ActorView(BaseFeaturesExtractor):
         return observations[:, : self.features_dim]
 
 
-class NormalisedReLU(nn.Module):
+class NormalizedReLU(nn.Module):
     """Layer normalisation, then ReLU: keeps critics from promising much where there is no data.
 
     Source: Ball et al. 2023, Efficient online reinforcement learning with offline data.
@@ -50,35 +50,29 @@ class NormalisedReLU(nn.Module):
         return torch.relu(nn.functional.layer_norm(features, features.shape[-1:]))
 
 
-class OffPolicyResidual(BasePolicy):
+class OffPolicyResidualMixin(BasePolicy):
     """What the policies of off-policy learners share; stands before one of SB3's with a pair of critics."""
 
     critic_kwargs: dict[str, Any]
     reward_offset: Tensor
     """what rewards are shifted by"""
 
-    def __init__(
-        self, *arguments: Any, settings: PolicySettings, inputs: int, action_limit: float, **named: Any
-    ) -> None:
+    def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
         self.settings = settings
         self.inputs = inputs
         self.authority = settings.authority * action_limit
         super().__init__(
-            *arguments,
-            net_arch=list(settings.hidden),
-            optimizer_class=Adam,
-            optimizer_kwargs={"fused": True},
-            **named,
+            *args, net_arch=list(settings.hidden), optimizer_class=Adam, optimizer_kwargs={"fused": True}, **kwargs
         )
         self.register_buffer("reward_offset", torch.zeros((), dtype=torch.float64))
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         """Return a pair of critics, which see all and normalise their hidden layers."""
-        self.critic_kwargs["activation_fn"] = NormalisedReLU
+        self.critic_kwargs["activation_fn"] = NormalizedReLU
         return super().make_critic(features_extractor)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-class SquashedResidualPolicy(OffPolicyResidual, SACPolicy):
+class SquashedResidualPolicy(OffPolicyResidualMixin, SACPolicy):
     """SB3's policy of soft actor-critic with a residual that is zero at the start, with a little noise.
 
     The last layer of the actor starts at zero but for the size of the noise, `exploration_std`; unless the
@@ -87,10 +81,10 @@ class SquashedResidualPolicy(OffPolicyResidual, SACPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """Return the actor, which sees the first `inputs` numbers."""
-        actor = super().make_actor(ActorView(self.observation_space, self.inputs))
+        actor = super().make_actor(ActorInputExtractor(self.observation_space, self.inputs))
         first_std = self.settings.exploration_std / self.settings.authority
         known = ((actor.mu, 0.0), (actor.log_std, math.log(first_std)))
-        for layer, bias in known[0 if self.settings.begin_at_expert else 1 :]:
+        for layer, bias in known[0 if self.settings.zero_init else 1 :]:
             linear = cast(nn.Linear, layer)
             nn.init.zeros_(linear.weight)
             nn.init.constant_(linear.bias, bias)
@@ -104,7 +98,7 @@ class SquashedResidualPolicy(OffPolicyResidual, SACPolicy):
         return Network((*hidden, last), self.authority)
 
 
-class OffPolicy(Learner):
+class OffPolicyLearner(Learner):
     """What learners share that learn from earlier iterations too, out of a replay buffer."""
 
     def __init__(
@@ -113,83 +107,85 @@ class OffPolicy(Learner):
         settings: OffPolicySettings,
         algorithm: type[Any],
         policy: type[BasePolicy],
-        **arguments: Any,
+        **kwargs: Any,
     ) -> None:
         """Make SB3's algorithm with what its settings share and its own `arguments`."""
         super().__init__(
             spec,
             algorithm,
             policy,
-            learning_rate=settings.rate,
+            learning_rate=settings.learning_rate,
             replay_buffer_class=MixedReplayBuffer,
-            buffer_size=settings.buffer_rows,
+            buffer_size=settings.buffer_size,
             learning_starts=0,  # see learn
-            batch_size=settings.batch,
+            batch_size=settings.batch_size,
             tau=settings.tau,
             gamma=settings.gamma,
             replay_buffer_kwargs={"handle_timeout_termination": False},  # a cut is no end in our rows
-            **arguments,
+            **kwargs,
         )
         self.settings = settings
         self.buffer: MixedReplayBuffer = self.sb3.replay_buffer
-        self._owed = 0
+        self._due_gradient_steps = 0
 
-    def exploring_network(self, actual_steps: int) -> Network:
+    def exploring_network(self, environment_steps: int) -> Network:
         """Return the policy's twin; before the first update, what the settings say."""
-        if not self.learns(actual_steps) and self.settings.start == "uniform":
+        if not self.is_learning(environment_steps) and self.settings.start_policy == "uniform":
             return uniform_network(self.spec.inputs, self.sb3.policy.authority)
         return self.network()
 
-    def learns(self, actual_steps: int) -> bool:
+    def is_learning(self, environment_steps: int) -> bool:
         """Whether the start is over: before it, nothing is learned."""
-        return actual_steps >= self.settings.start_steps
+        return environment_steps >= self.settings.learning_starts
 
-    def measure_units(self, actual: Experience) -> None:
+    def set_value_scale(self, environment_rows: Experience) -> None:
         """Shift rewards by the mean of actual rows."""
-        if self.spec.policy.normalise_value:
-            self.sb3.policy.reward_offset.fill_(actual.rewards.mean())
+        if self.spec.policy.normalize_value:
+            self.sb3.policy.reward_offset.fill_(environment_rows.rewards.mean())
 
     def learn(self, update: Update) -> None:
         """Add actual rows to the replay buffer, and update actor and critics from it and virtual rows."""
-        if update.actual is not None:
+        if update.environment_rows is not None:
             # Those of the start are made up for at its end: before it drives, the policy has seen them.
-            self._owed = round(update.actual_steps * self.settings.updates_per_step) - self.sb3._n_updates
-            self.fill(self.buffer, update.actual)
-        if update.virtual is not None:
-            self.fill(self.buffer.begin_virtual(len(update.virtual.rewards)), update.virtual)
-            self.buffer.real_ratio = 0.0 if update.actual is None else self.settings.real_ratio
-        if self.learns(update.actual_steps):
-            steps = max(1, round(self._owed * update.share))
-            self.sb3.train(gradient_steps=steps, batch_size=self.settings.batch)
-        self.buffer.forget_virtual()
+            self._due_gradient_steps = (
+                round(update.environment_steps * self.settings.gradient_steps_per_step) - self.sb3._n_updates
+            )
+            self.add_rows(self.buffer, update.environment_rows)
+        if update.model_rows is not None:
+            self.add_rows(self.buffer.new_model_buffer(len(update.model_rows.rewards)), update.model_rows)
+            self.buffer.real_ratio = 0.0 if update.environment_rows is None else self.settings.real_ratio
+        if self.is_learning(update.environment_steps):
+            steps = max(1, round(self._due_gradient_steps * update.share))
+            self.sb3.train(gradient_steps=steps, batch_size=self.settings.batch_size)
+        self.buffer.drop_model_buffer()
 
-    def fill(self, buffer: ReplayBuffer, rows: Experience) -> None:
+    def add_rows(self, buffer: ReplayBuffer, rows: Experience) -> None:
         """Add rows to a replay buffer, their rewards shifted and scaled."""
         policy = self.sb3.policy
-        rewards = shifted_rewards(rows, policy.reward_offset.item(), self.gamma)
+        rewards = shift_rewards(rows, policy.reward_offset.item(), self.gamma)
         add_to_replay_buffer(buffer, rows, policy.authority, rewards * self.settings.reward_scale)
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all that it must keep to go on, the replay buffer too."""
         counters, tensors = super().state()
-        counters |= {name: getattr(self.buffer, name) for name in REPLAY_PLACE}
-        return counters, tensors | self._tensors_in_place()
+        counters |= {name: getattr(self.buffer, name) for name in REPLAY_POSITION}
+        return counters, tensors | self._shared_tensors()
 
     def restore(self, counters: dict[str, Any], tensors: Tensors) -> None:
         """Put a learner made from the same configuration into what `state` returned."""
         super().restore(counters, tensors)
-        for name in REPLAY_PLACE:
+        for name in REPLAY_POSITION:
             setattr(self.buffer, name, counters[name])
-        for name, tensor in self._tensors_in_place().items():
+        for name, tensor in self._shared_tensors().items():
             tensor.detach().copy_(tensors[name])
 
-    def _tensors_in_place(self) -> Tensors:
+    def _shared_tensors(self) -> Tensors:
         """Return what SB3 does not name among its parameters, as tensors that share the learner's memory."""
         filled = self.buffer.size()
-        return {f"replay/{name}": torch.from_numpy(getattr(self.buffer, name)[:filled]) for name in REPLAY}
+        return {f"replay/{name}": torch.from_numpy(getattr(self.buffer, name)[:filled]) for name in REPLAY_ARRAYS}
 
 
-class SAC(OffPolicy):
+class SAC(OffPolicyLearner):
     """Soft actor-critic from whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: SACSettings) -> None:
@@ -204,12 +200,12 @@ class SAC(OffPolicy):
         )
 
     @torch.no_grad()
-    def gaussians(self, observations: Tensor) -> Normal:
+    def residual_distribution(self, observations: Tensor) -> Normal:
         """Return mean and standard deviation of the residual before the tanh."""
         mean, log_std, _ = self.sb3.actor.get_action_dist_params(observations)
         return Normal(mean.squeeze(1), log_std.squeeze(1).exp())
 
-    def _tensors_in_place(self) -> Tensors:
+    def _shared_tensors(self) -> Tensors:
         """Return the filled part of the replay buffer and, where it is learned, the temperature."""
         learned = {} if self.sb3.log_ent_coef is None else {"log_ent_coef": self.sb3.log_ent_coef}
-        return super()._tensors_in_place() | learned
+        return super()._shared_tensors() | learned

@@ -1,6 +1,6 @@
 """What decides how an agent learns. Free of torch, so that a wrong value is refused at once.
 
-A learner is a file that makes it, and here its settings, which name it, and their place in `Agents`.
+A learner is a file that makes it, and here its settings, which name it, and their place in `AgentSettings`.
 """
 
 from dataclasses import field
@@ -10,78 +10,74 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.observation import FeatureName
-from unjam.parameters import STRICT, Count, CountOrNone, NotNegative, Positive, Several
+from unjam.parameters import STRICT, IntAboveOne, NonNegative, NonNegativeInt, Positive, PositiveInt
 
 Discount = Annotated[float, Field(gt=0, lt=1)]
-Share = Annotated[float, Field(ge=0, le=1)]
+UnitInterval = Annotated[float, Field(ge=0, le=1)]
 
 
 @dataclass(frozen=True, config=STRICT)
 class PolicySettings:
     """The residual network and how it explores."""
 
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
+    hidden: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (64, 64)
     """units of the hidden layers, of the policy and of the value network"""
-    observe: Annotated[tuple[FeatureName, ...], Field(min_length=1)] = (
-        "local",
-        "expert_acceleration",
-        "expert_memory",
-    )
+    inputs: Annotated[tuple[FeatureName, ...], Field(min_length=1)] = ("local", "expert_acceleration", "expert_memory")
     """what the network sees; the paper's network sees `local` alone, and cannot know what PI will do"""
-    begin_at_expert: bool = True
+    zero_init: bool = True
     """whether the untrained network adds nothing, so that the full policy begins as exactly the expert, or
     what its random weights happen to answer, as the paper's"""
-    remember: bool = False
+    history_features: bool = False
     """whether what the network sees of the expert's memory has means of the own past besides: speed, its
     spread, and gap, over ten seconds to some minutes"""
     authority: Positive = 1.0
     """largest residual, as a share of the action limit"""
     exploration_std: Positive = 0.1
     """standard deviation of the exploration noise at the start, as a share of the action limit"""
-    learn_exploration: bool = True
+    learn_exploration_std: bool = True
     """whether the standard deviation is learned, or stays what it is at the start (sac always learns it)"""
     exploration: Literal["anew", "lasting", "mirrored"] = "anew"
-    """`anew`: noise for each look of a CAV. `lasting`: one change of what the last hidden layer is weighed
+    """`anew`: noise for each look of a CAV. `episode_noise`: one change of what the last hidden layer is weighed
     with, of which `exploration_std` is that of each weight, for all CAVs all episode long: what many do for
     minutes shows in what everybody gains, where single commands vanish in people's noise (trpo and ppo; it
     is not learned; after Raffin et al. 2022, CoRL). `mirrored`: likewise, and each episode has another of the
     same people in which the change is opposite (after Salimans et al. 2017, arXiv:1703.03864)"""
-    afterwards: bool = False
+    reward_after_exit: bool = False
     """whether a CAV also earns what is earned once it has left a road with ends, and the value network sees
     when it came: where all earn the same, a jam that it has prevented shows when it is gone. Not where
     rows are imagined, whose moments do not know what follows"""
-    hold: NotNegative = 1.0
+    action_duration: NonNegative = 1.0
     """how long one residual is held [s], rounded to whole decisions, at least one: over a second noise adds
     up to a change of speed instead of cancelling itself"""
-    critic_sees_road: bool = True
+    privileged_critic: bool = True
     """whether the value network also sees what the episode has drawn (the ring's length); without it, it
     takes a large gap for a longer and faster ring, and the policy learns to fall back"""
-    normalise_value: bool = True
+    normalize_value: bool = True
     """scale the value network by the returns of the first iteration (sac: shift by its mean reward): one that
     starts at zero needs tens of iterations to reach values of 150"""
 
     @property
-    def lasts(self) -> bool:
+    def episode_noise(self) -> bool:
         """Whether exploration stays as it is all episode long."""
         return self.exploration != "anew"
 
     @property
-    def explores(self) -> list[float]:
+    def exploration_signs(self) -> list[float]:
         """By how much exploration counts in episodes that are alike but for that."""
         return [1.0, -1.0] if self.exploration == "mirrored" else [1.0]
 
-    def decisions_held(self, decision_step: float) -> int:
-        """Return for how many decisions a residual is held where one takes `decision_step` seconds."""
-        return max(1, round(self.hold / decision_step))
+    def action_repeat(self, control_step: float) -> int:
+        """Return for how many decisions a residual is held where one takes `control_step` seconds."""
+        return max(1, round(self.action_duration / control_step))
 
 
 @dataclass(frozen=True, config=STRICT)
 class LearnerSettings:
     """What every learner has."""
 
-    learner: ClassVar[str]
+    learner_class: ClassVar[str]
     """who is made of them: `module:class`"""
-    batch_steps: Count = 12_000
+    steps_per_iteration: PositiveInt = 12_000
     """actual steps in an iteration, rounded up to whole episodes"""
     gamma: Discount = 0.99
     """discount from one choice of the network to the next"""
@@ -91,53 +87,53 @@ class LearnerSettings:
 class TRPOSettings(LearnerSettings):
     """Trust region policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
 
-    learner: ClassVar[str] = "unjam.learners.trpo_ppo:TRPO"
-    gae_lambda: Share = 0.97
+    learner_class: ClassVar[str] = "unjam.learners.trpo_ppo:TRPO"
+    gae_lambda: UnitInterval = 0.97
     target_kl: Positive = 0.03
     cg_damping: Positive = 0.1
-    cg_steps: Count = 15
-    critic_epochs: Count = 10
-    critic_batch: Several = 250
-    critic_rate: Positive = 1e-3
-    value_l2: NotNegative = 1e-3
+    cg_max_steps: PositiveInt = 15
+    critic_epochs: PositiveInt = 10
+    critic_batch_size: IntAboveOne = 250
+    critic_learning_rate: Positive = 1e-3
+    critic_weight_decay: NonNegative = 1e-3
 
 
 @dataclass(frozen=True, config=STRICT)
 class PPOSettings(LearnerSettings):
     """Proximal policy optimisation; its defaults are the values of Table B3, but for larger iterations."""
 
-    learner: ClassVar[str] = "unjam.learners.trpo_ppo:PPO"
-    gae_lambda: Share = 0.97
-    clip: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    learner_class: ClassVar[str] = "unjam.learners.trpo_ppo:PPO"
+    gae_lambda: UnitInterval = 0.97
+    clip_range: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """how far the ratio of new to old probability may move an update"""
-    epochs: Count = 80
-    minibatches: Count = 1
+    epochs: PositiveInt = 80
+    minibatches: PositiveInt = 1
     """parts of an iteration's rows, each a gradient step in each epoch; 1: full batches"""
-    actor_rate: Positive = 3e-4
-    critic_rate: Positive = 1e-3
+    actor_learning_rate: Positive = 3e-4
+    critic_learning_rate: Positive = 1e-3
 
 
 @dataclass(frozen=True, config=STRICT)
 class OffPolicySettings(LearnerSettings):
     """What learners share that learn from earlier iterations too."""
 
-    batch_steps: Count = 6_000
+    steps_per_iteration: PositiveInt = 6_000
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
     """share by which the target networks move towards the learned ones in a gradient step"""
-    rate: Positive = 3e-4
+    learning_rate: Positive = 3e-4
     reward_scale: Positive = 0.1
     """factor of what is earned from one choice to the next: the temperature is weighed against it"""
-    batch: Count = 256
-    updates_per_step: Positive = 0.25
+    batch_size: PositiveInt = 256
+    gradient_steps_per_step: Positive = 0.25
     """gradient steps per actual step, those of the start included"""
-    start_steps: CountOrNone = 10_000
+    learning_starts: NonNegativeInt = 10_000
     """actual steps before the first gradient step"""
-    start: Literal["expert", "uniform"] = "expert"
+    start_policy: Literal["expert", "uniform"] = "expert"
     """how these are driven: `expert`, with the little noise of `policy.exploration_std`; `uniform` residuals
     over the whole authority"""
-    real_ratio: Share = 0.5
+    real_ratio: UnitInterval = 0.5
     """share of actual rows in a batch, where there are virtual ones"""
-    buffer_rows: Count = 200_000
+    buffer_size: PositiveInt = 200_000
     """newest rows, one per choice, that are learned from"""
 
 
@@ -145,7 +141,7 @@ class OffPolicySettings(LearnerSettings):
 class SACSettings(OffPolicySettings):
     """Soft actor-critic; the preset `paper` has the values of Table B4 where these differ."""
 
-    learner: ClassVar[str] = "unjam.learners.sac:SAC"
+    learner_class: ClassVar[str] = "unjam.learners.sac:SAC"
     temperature: Positive = 0.05
     """weight of the policy's entropy, in units of scaled rewards; with the paper's 0.2 the noise alone costs
     a quarter of the return on the ring, and what is learned from such driving fails on short rings"""
@@ -159,25 +155,25 @@ class SACSettings(OffPolicySettings):
 class TD3Settings(OffPolicySettings):
     """Twin delayed deep deterministic policy gradient; the values of Fujimoto et al. 2018 where they fit."""
 
-    learner: ClassVar[str] = "unjam.learners.td3:TD3"
-    rate: Positive = 1e-3
-    policy_delay: Count = 2
+    learner_class: ClassVar[str] = "unjam.learners.td3:TD3"
+    learning_rate: Positive = 1e-3
+    policy_delay: PositiveInt = 2
     """gradient steps of the critics for one of the policy and of the target networks"""
-    target_noise: NotNegative = 0.2
+    target_noise: NonNegative = 0.2
     """standard deviation of the noise that smooths the target policy, as a share of the authority"""
-    target_noise_clip: NotNegative = 0.5
+    target_noise_clip: NonNegative = 0.5
     """largest such noise, as a share of the authority"""
 
 
-Agent = Literal["trpo", "ppo", "sac", "td3"]
-AGENTS: tuple[Agent, ...] = get_args(Agent)
+AgentName = Literal["trpo", "ppo", "sac", "td3"]
+AGENT_NAMES: tuple[AgentName, ...] = get_args(AgentName)
 
 
 @dataclass(frozen=True, config=STRICT)
-class Agents:
+class AgentSettings:
     """Who learns, and the settings of every learner in the table of its name."""
 
-    agent: Agent = "trpo"
+    agent: AgentName = "trpo"
     """who learns; its settings are in the table of its name"""
     trpo: TRPOSettings = field(default_factory=TRPOSettings)
     ppo: PPOSettings = field(default_factory=PPOSettings)

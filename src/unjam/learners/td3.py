@@ -14,18 +14,18 @@ from torch.distributions import Normal
 
 from unjam.drivers.network import Network
 from unjam.learners.learner import AgentSpec, network_layers
-from unjam.learners.sac import ActorView, OffPolicy, OffPolicyResidual
+from unjam.learners.sac import ActorInputExtractor, OffPolicyLearner, OffPolicyResidualMixin
 from unjam.learners.settings import TD3Settings
 
 
-class DeterministicResidualPolicy(OffPolicyResidual, TD3Policy):
+class DeterministicResidualPolicy(OffPolicyResidualMixin, TD3Policy):
     """SB3's policy of TD3 with a residual that is zero at the start, if wanted: the actor's last layer is."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """Return the actor, which sees the first `inputs` numbers."""
-        actor = super().make_actor(ActorView(self.observation_space, self.inputs))
+        actor = super().make_actor(ActorInputExtractor(self.observation_space, self.inputs))
         last = cast(nn.Linear, actor.mu[-2])  # before the tanh
-        if self.settings.begin_at_expert:
+        if self.settings.zero_init:
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
         return actor
@@ -40,7 +40,7 @@ class DeterministicResidualPolicy(OffPolicyResidual, TD3Policy):
         return Network(network_layers(self.actor.mu), self.authority, self.exploration_std)
 
 
-class TD3(OffPolicy):
+class TD3(OffPolicyLearner):
     """Twin delayed deep deterministic policy gradient from whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: TD3Settings) -> None:
@@ -55,7 +55,7 @@ class TD3(OffPolicy):
         )
 
     @torch.no_grad()
-    def gaussians(self, observations: Tensor) -> Normal:
+    def residual_distribution(self, observations: Tensor) -> Normal:
         """Return the residual and the standard deviation of its exploration noise [m/s2]."""
         policy = self.sb3.policy
         mean = policy.authority * policy.actor(observations).squeeze(1)

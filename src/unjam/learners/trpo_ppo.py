@@ -13,12 +13,12 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from unjam.adam import Adam
-from unjam.drivers.network import Network, with_one
-from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join
+from unjam.drivers.network import Network, append_ones
+from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join_experience
 from unjam.learners.learner import AgentSpec, Learner, Update, network_layers
 from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
 
-SIZED_LATER = 2
+PLACEHOLDER_SIZE = 2
 """stands for the size of rollout buffer and batch until an iteration says how many rows it has"""
 
 
@@ -48,7 +48,7 @@ class ScaledValue(nn.Module):
         return self.scale[0] + self.scale[1] * self.linear(features)
 
 
-class ActorAndCritic(nn.Module):
+class ActorCriticExtractor(nn.Module):
     """Hidden layers of both networks; the critic may see more than the actor.
 
     SB3 hands both the same vector: what the actor sees, then what the critic alone sees.
@@ -82,35 +82,30 @@ class ResidualPolicy(ActorCriticPolicy):
     the settings want it as torch draws it.
     """
 
-    def __init__(
-        self, *arguments: Any, settings: PolicySettings, inputs: int, action_limit: float, **named: Any
-    ) -> None:
+    def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
         self.settings = settings
         self.inputs = inputs
         self.authority = settings.authority * action_limit
-        named |= {
-            "log_std_init": math.log(settings.exploration_std * action_limit),
-            "use_sde": settings.lasts,
-        }
-        super().__init__(*arguments, optimizer_class=Adam, **named)
+        kwargs |= {"log_std_init": math.log(settings.exploration_std * action_limit), "use_sde": settings.episode_noise}
+        super().__init__(*args, optimizer_class=Adam, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
         critic_inputs = self.features_dim - self.inputs
-        self.mlp_extractor = ActorAndCritic(self.inputs, critic_inputs, self.settings.hidden)  # pyright: ignore[reportAttributeAccessIssue]
+        self.mlp_extractor = ActorCriticExtractor(self.inputs, critic_inputs, self.settings.hidden)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
         last = nn.Linear(self.mlp_extractor.latent_dim_pi, 1)
-        if self.settings.begin_at_expert:
+        if self.settings.zero_init:
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
         self.action_net = nn.Sequential(last, BoundedTanh(self.authority))
         self.value_net = ScaledValue(self.mlp_extractor.latent_dim_vf)  # pyright: ignore[reportAttributeAccessIssue]
         nn.init.orthogonal_(self.value_net.linear.weight)
         nn.init.zeros_(self.value_net.linear.bias)
-        if self.settings.lasts or not self.settings.learn_exploration:
+        if self.settings.episode_noise or not self.settings.learn_exploration_std:
             log_std = self.log_std.detach()
-            if self.settings.lasts:
+            if self.settings.episode_noise:
                 log_std = torch.cat([log_std, log_std[:1]])  # the bias
             del self.log_std
             self.register_buffer("log_std", log_std)
@@ -122,12 +117,12 @@ class ResidualPolicy(ActorCriticPolicy):
         Without it, next to nothing is tried where all units are at rest, and to move there is so improbable
         that no step of TRPO's line search passes.
         """
-        if not self.settings.lasts:
+        if not self.settings.episode_noise:
             return super()._get_action_dist_from_latent(latent_pi)
         mean = self.action_net(latent_pi)
-        return self.action_dist.proba_distribution(mean, self.log_std, with_one(latent_pi))  # pyright: ignore[reportCallIssue]
+        return self.action_dist.proba_distribution(mean, self.log_std, append_ones(latent_pi))  # pyright: ignore[reportCallIssue]
 
-    def set_rates(self, actor: float, critic: float) -> None:
+    def set_learning_rates(self, actor: float, critic: float) -> None:
         """Give actor and critic learning rates of their own, in a new optimiser."""
         groups: dict[bool, list[nn.Parameter]] = {False: [], True: []}
         for name, parameter in self.named_parameters():
@@ -146,35 +141,37 @@ class ResidualPolicy(ActorCriticPolicy):
         """Return the NumPy twin: the same residual to 1e-6, and the same exploration noise."""
         layers = network_layers(nn.Sequential(self.mlp_extractor.policy_net, self.action_net))  # pyright: ignore[reportArgumentType]
         std = float(torch.exp(self.log_std.detach()).flatten()[0].item())
-        return Network(layers, self.authority, std, self.settings.lasts)
+        return Network(layers, self.authority, std, self.settings.episode_noise)
 
 
-class OnPolicy(Learner):
+class OnPolicyLearner(Learner):
     """What learners share that learn from the rows of the current policy alone."""
 
-    def measure_units(self, actual: Experience) -> None:
+    def set_value_scale(self, environment_rows: Experience) -> None:
         """Scale the value head by the returns of actual rows."""
-        if self.spec.policy.normalise_value:
-            returns = discounted_returns(actual, self.gamma)
+        if self.spec.policy.normalize_value:
+            returns = discounted_returns(environment_rows, self.gamma)
             self.sb3.policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
 
     @torch.no_grad()
-    def gaussians(self, observations: Tensor) -> Normal:
+    def residual_distribution(self, observations: Tensor) -> Normal:
         """Return mean and standard deviation of the residual."""
         normal = cast(Normal, self.sb3.policy.get_distribution(observations).distribution)
         return Normal(normal.mean.squeeze(1), normal.stddev.squeeze(1))
 
     def learn(self, update: Update) -> None:
         """Update policy and value network with actual and virtual rows together."""
-        self.fill(join([part for part in (update.actual, update.virtual) if part is not None]))
+        self.fill_buffer(
+            join_experience([part for part in (update.environment_rows, update.model_rows) if part is not None])
+        )
         self.sb3.train()
 
-    def fill(self, rows: Experience) -> None:
+    def fill_buffer(self, rows: Experience) -> None:
         """Put rows into the rollout buffer, in place of those before."""
         fill_rollout_buffer(self.sb3.rollout_buffer, self.sb3.policy, rows)
 
 
-class TRPO(OnPolicy):
+class TRPO(OnPolicyLearner):
     """Trust region policy optimisation from whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: TRPOSettings) -> None:
@@ -183,47 +180,47 @@ class TRPO(OnPolicy):
             sb3_contrib.TRPO,
             ResidualPolicy,
             # SB3 drops its own eps when given arguments for the optimiser. Fused: see `unjam.kernels`.
-            {"optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.value_l2, "fused": True}},
-            learning_rate=settings.critic_rate,
-            n_steps=settings.critic_batch,  # the buffer takes the size of the episodes
-            batch_size=settings.critic_batch,
+            {"optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.critic_weight_decay, "fused": True}},
+            learning_rate=settings.critic_learning_rate,
+            n_steps=settings.critic_batch_size,  # the buffer takes the size of the episodes
+            batch_size=settings.critic_batch_size,
             gamma=settings.gamma,
             gae_lambda=settings.gae_lambda,
             target_kl=settings.target_kl,
             cg_damping=settings.cg_damping,
-            cg_max_steps=settings.cg_steps,
+            cg_max_steps=settings.cg_max_steps,
             n_critic_updates=settings.critic_epochs,
         )
 
 
-class PPO(OnPolicy):
+class PPO(OnPolicyLearner):
     """Proximal policy optimisation from whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: PPOSettings) -> None:
         super().__init__(
             spec,
-            TwoRatesPPO,
+            SeparateRatesPPO,
             ResidualPolicy,
-            n_steps=SIZED_LATER,
-            batch_size=SIZED_LATER,
+            n_steps=PLACEHOLDER_SIZE,
+            batch_size=PLACEHOLDER_SIZE,
             n_epochs=settings.epochs,
             gamma=settings.gamma,
             gae_lambda=settings.gae_lambda,
-            clip_range=settings.clip,
+            clip_range=settings.clip_range,
             # SB3 clips the gradients of actor and critic together; they share no weight, and the critic's
             # gradient, in the units of returns, would leave nothing of the actor's.
             max_grad_norm=math.inf,
         )
         self._minibatches = settings.minibatches
-        self.sb3.policy.set_rates(settings.actor_rate, settings.critic_rate)
+        self.sb3.policy.set_learning_rates(settings.actor_learning_rate, settings.critic_learning_rate)
 
-    def fill(self, rows: Experience) -> None:
+    def fill_buffer(self, rows: Experience) -> None:
         """Put rows into the rollout buffer, and say how many of them make a minibatch."""
-        super().fill(rows)
+        super().fill_buffer(rows)
         self.sb3.batch_size = math.ceil(len(rows.rewards) / self._minibatches)
 
 
-class TwoRatesPPO(stable_baselines3.PPO):
+class SeparateRatesPPO(stable_baselines3.PPO):
     """SB3's PPO, with the rates of the policy's optimiser left as they are."""
 
     def _update_learning_rate(self, optimizers: Any) -> None:

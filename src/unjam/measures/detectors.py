@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from unjam.errors import InputError, wrong
+from unjam.errors import InputError, invalid_value
 from unjam.physics.arrays import Floats
-from unjam.worlds.sumo.detectors import Passage
+from unjam.worlds.sumo.detectors import DetectorPassage
 
-COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
+DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """of a file of measurements, beside `edge` or `lane`"""
-GOOD_GEH = 5.0
+GEH_LIMIT = 5.0
 """a flow counts as met below this"""
-SAME_PASSAGE = 10.0
+SAME_PASSAGE_SECONDS = 10.0
 """time within which who comes over loops of the same edge again only changes lanes [s]"""
 
 
@@ -70,11 +70,11 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
             reader = csv.DictReader(file)
             given = reader.fieldnames or ()
             kinds = [kind for kind in ("edge", "lane") if kind in given]
-            missing = [name for name in COLUMNS if name not in given]
+            missing = [name for name in DETECTOR_COLUMNS if name not in given]
             if len(kinds) != 1 or missing:
-                allowed = f"edge or lane, {', '.join(COLUMNS)}"
-                raise wrong(f"{path.name}: columns", ", ".join(given), allowed)
-            rows = [_measurement(path.name, reader.line_num, kinds[0], row) for row in reader]
+                allowed = f"edge or lane, {', '.join(DETECTOR_COLUMNS)}"
+                raise invalid_value(f"{path.name}: columns", ", ".join(given), allowed)
+            rows = [_parse_measurement(path.name, reader.line_num, kinds[0], row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise InputError(f"detectors: {str(path)!r} cannot be read: {why}") from None
@@ -83,29 +83,29 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
     return kinds[0], rows
 
 
-def _measurement(file: str, line: int, kind: str, row: dict[str, str | None]) -> Measurement:
+def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | None]) -> Measurement:
     where = f"{file}: line {line}"
     place = (row[kind] or "").strip()
     if not place:
-        raise wrong(f"{where}: {kind}", place, f"the id of one {kind}")
+        raise invalid_value(f"{where}: {kind}", place, f"the id of one {kind}")
     values = []
-    for name in COLUMNS:
+    for name in DETECTOR_COLUMNS:
         text = (row[name] or "").strip()
         try:
             value = nan if name == "speed" and not text else float(text)
         except ValueError:
-            raise wrong(f"{where}: {name}", text, "a number >= 0") from None
+            raise invalid_value(f"{where}: {name}", text, "a number >= 0") from None
         if text and not (isfinite(value) and value >= 0):
-            raise wrong(f"{where}: {name}", text, "a number >= 0")
+            raise invalid_value(f"{where}: {name}", text, "a number >= 0")
         values.append(value)
     found = Measurement(place, *values)
     if found.end <= found.begin:
-        raise wrong(f"{where}: end", found.end, f"after begin, {found.begin:g} s")
+        raise invalid_value(f"{where}: end", found.end, f"after begin, {found.begin:g} s")
     return found
 
 
-def detected(
-    measured: Sequence[Measurement], loops: Sequence[Sequence[int]], passed: Sequence[Passage]
+def aggregate_passages(
+    measurements: Sequence[Measurement], loops: Sequence[Sequence[int]], passages: Sequence[DetectorPassage]
 ) -> tuple[Floats, Floats]:
     """Return the flow [veh/h] and the mean speed [m/s] that each detector would have measured.
 
@@ -117,14 +117,14 @@ def detected(
     Returns:
         Two arrays in the order of `measured`; the speed is NaN where nobody passed who tells one.
     """
-    by_loop: defaultdict[int, list[Passage]] = defaultdict(list)
-    for passage in passed:
+    by_loop: defaultdict[int, list[DetectorPassage]] = defaultdict(list)
+    for passage in passages:
         by_loop[passage.loop].append(passage)
     known: dict[tuple[int, ...], Floats] = {}
-    flows, speeds = np.full((2, len(measured)), np.nan)
-    for number, (row, places) in enumerate(zip(measured, map(tuple, loops), strict=True)):
+    flows, speeds = np.full((2, len(measurements)), np.nan)
+    for number, (row, places) in enumerate(zip(measurements, map(tuple, loops), strict=True)):
         if places not in known:
-            known[places] = _once([passage for place in places for passage in by_loop[place]])
+            known[places] = _unique_passages([passage for place in places for passage in by_loop[place]])
         times, found = known[places]
         first, last = np.searchsorted(times, (row.begin, row.end))
         flows[number] = (last - first) * 3600 / (row.end - row.begin)
@@ -134,16 +134,16 @@ def detected(
     return flows, speeds
 
 
-def _once(passed: Sequence[Passage]) -> Floats:
+def _unique_passages(passages: Sequence[DetectorPassage]) -> Floats:
     """Return times and speeds of passages in the order of time, each vehicle's once, shape (2, n).
 
     Of passages that are one the first counts, with the speed of the first that tells one.
     """
     before: dict[str, tuple[float, int]] = {}
     kept: list[tuple[float, float]] = []
-    for passage in sorted(passed, key=lambda one: one.time):
+    for passage in sorted(passages, key=lambda one: one.time):
         last, row = before.get(passage.vehicle, (-np.inf, len(kept)))
-        if passage.time - last > SAME_PASSAGE:
+        if passage.time - last > SAME_PASSAGE_SECONDS:
             row = len(kept)
             kept.append((passage.time, passage.speed))
         elif isnan(kept[row][1]):
@@ -161,18 +161,18 @@ def geh(simulated: Floats, measured: Floats) -> Floats:
     return np.sqrt(2 * (simulated - measured) ** 2 / np.where(both > 0, both, 1.0))
 
 
-def agreement(measured: Sequence[Measurement], flows: Floats, speeds: Floats) -> Agreement:
+def compute_agreement(measurements: Sequence[Measurement], flows: Floats, speeds: Floats) -> Agreement:
     """Return how near simulated flows [veh/h] and speeds [m/s] are to what was measured, in the same order.
 
     Where nobody passed the simulated speed is NaN and counts as 0: traffic that stands still is not forgiven.
     """
-    counted = np.array([row.flow for row in measured])
-    wanted = np.array([row.speed for row in measured])
+    counted = np.array([row.flow for row in measurements])
+    wanted = np.array([row.speed for row in measurements])
     errors = geh(flows, counted)
     known = np.isfinite(wanted)
     missed = np.nan_to_num(speeds[known]) - wanted[known]
     speed_rmse = float(np.sqrt(np.mean(missed**2))) if known.any() else nan
     typical = float(np.mean(wanted[known])) if known.any() else 0.0
-    score = float(np.mean(errors)) / GOOD_GEH + (speed_rmse / typical if typical else 0.0)
+    score = float(np.mean(errors)) / GEH_LIMIT + (speed_rmse / typical if typical else 0.0)
     flow_rmse = float(np.sqrt(np.mean((flows - counted) ** 2)))
-    return Agreement(float(np.mean(errors)), float(np.mean(errors < GOOD_GEH)), flow_rmse, speed_rmse, score)
+    return Agreement(float(np.mean(errors)), float(np.mean(errors < GEH_LIMIT)), flow_rmse, speed_rmse, score)

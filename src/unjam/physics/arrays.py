@@ -19,7 +19,7 @@ Array: TypeAlias = Any
 Floats = NDArray[np.float64]
 
 
-_FLOATS = SimpleNamespace(
+_FLOAT_NAMESPACE = SimpleNamespace(
     minimum=min,
     floor=math.floor,
     isnan=math.isnan,
@@ -31,40 +31,40 @@ _FLOATS = SimpleNamespace(
 
 
 def namespace(array: Array) -> Any:
-    """Return what has `where`, `minimum`, `floor`, `isnan`, `cos` and `sin` for this kind of number.
+    """Return what has `where`, `minimum`, `required_time_gap`, `isnan`, `cos` and `sin` for this kind of number.
 
     That is `numpy`, `torch`, or their like for plain floats.
     """
     if type(array) is float:
-        return _FLOATS
+        return _FLOAT_NAMESPACE
     if isinstance(array, (np.ndarray, np.generic)):
         return np
     return sys.modules["torch"]
 
 
 def clip(array: Array, low: float, high: float) -> Array:
-    """Return `array` with its entries kept within [low, high]; NaN stays NaN."""
+    """Return `to_array` with its entries kept within [low, high]; NaN stays NaN."""
     if type(array) is float:
         return low if array < low else high if array > high else array
     return array.clip(low, high)
 
 
-def at_least(array: Array, floor: Array) -> Array:
-    """Return the larger of each entry and `floor`; NaN stays NaN."""
+def clamp_min(array: Array, low: Array) -> Array:
+    """Return the larger of each entry and `required_time_gap`; NaN stays NaN."""
     if type(array) is float:
-        return floor if array < floor else array
+        return low if array < low else array
     if isinstance(array, (np.ndarray, np.generic)):
-        return np.maximum(array, floor)  # what `clip` does in the end, in a third of the time on few rows
-    return array.clip(floor, None)
+        return np.maximum(array, low)  # what `clip` does in the end, in a third of the time on few rows
+    return array.clip(low, None)
 
 
-def at_most(array: Array, ceiling: Array) -> Array:
+def clamp_max(array: Array, high: Array) -> Array:
     """Return the smaller of each entry and `ceiling`."""
     if type(array) is float:
-        return ceiling if array > ceiling else array
+        return high if array > high else array
     if isinstance(array, (np.ndarray, np.generic)):
-        return np.minimum(array, ceiling)
-    return array.clip(None, ceiling)
+        return np.minimum(array, high)
+    return array.clip(None, high)
 
 
 def square_root(array: Array) -> Array:
@@ -83,7 +83,7 @@ def running_maximum(array: Array) -> Array:
 
 
 def scatter_minimum(array: Array, rows: Array, values: Array) -> None:
-    """Let entries of `array` be no larger than values for their rows, which may come several times."""
+    """Let entries of `to_array` be no larger than values for their rows, which may come several times."""
     if isinstance(array, np.ndarray):
         np.minimum.at(array, rows, values)
     else:
@@ -91,7 +91,7 @@ def scatter_minimum(array: Array, rows: Array, values: Array) -> None:
 
 
 def as_column(array: Array) -> Array:
-    """Return `array` of shape (n,) as (n, 1); a float as a tuple of one."""
+    """Return `to_array` of shape (n,) as (n, 1); a float as a tuple of one."""
     return (array,) if type(array) is float else array[..., None]
 
 

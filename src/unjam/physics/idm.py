@@ -9,7 +9,7 @@ import numpy as np
 from pydantic.dataclasses import dataclass
 
 from unjam.parameters import STRICT, Positive
-from unjam.physics.arrays import Array, at_least, square_root
+from unjam.physics.arrays import Array, clamp_min, square_root
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -30,17 +30,17 @@ class IDMParameters:
     """s0 [m], bumper to bumper at standstill"""
 
     @cached_property
-    def braking(self) -> float:
+    def interaction_scale(self) -> float:
         """2 sqrt(a b) of Eq. 6 [m/s2]; kept, for a simulator asks for it in every step."""
-        return twice_root(self.max_acceleration, self.comfortable_deceleration)
+        return _twice_geometric_mean(self.max_acceleration, self.comfortable_deceleration)
 
 
-def twice_root(one: Array, other: Array) -> Array:
+def _twice_geometric_mean(first: Array, second: Array) -> Array:
     """Return twice the geometric mean of both."""
-    return 2.0 * square_root(one * other)
+    return 2.0 * square_root(first * second)
 
 
-class IDMRows(NamedTuple):
+class IDMArrays(NamedTuple):
     """The parameters of many drivers at once: as `IDMParameters`, arrays that broadcast with the states."""
 
     desired_speed: Array
@@ -51,23 +51,23 @@ class IDMRows(NamedTuple):
     minimum_gap: Array
 
     @property
-    def braking(self) -> Array:
+    def interaction_scale(self) -> Array:
         """2 sqrt(a b) of Eq. 6 [m/s2]."""
-        return twice_root(self.max_acceleration, self.comfortable_deceleration)
+        return _twice_geometric_mean(self.max_acceleration, self.comfortable_deceleration)
 
 
 PAPER_IDM = IDMParameters()
-PARAMETER_NAMES = IDMRows._fields
-HALVINGS = 60
+IDM_PARAMETER_NAMES = IDMArrays._fields
+BISECTION_STEPS = 60
 """of the interval in which the equilibrium speed lies: to the last bit"""
 
 
-def parameter_rows(drivers: Sequence[IDMParameters]) -> IDMRows:
+def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
     """Return the parameters of `drivers` as arrays of shape (drivers,)."""
-    return IDMRows(**{name: np.array([getattr(one, name) for one in drivers]) for name in PARAMETER_NAMES})
+    return IDMArrays(**{name: np.array([getattr(one, name) for one in drivers]) for name in IDM_PARAMETER_NAMES})
 
 
-def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | IDMRows = PAPER_IDM) -> Array:
+def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM) -> Array:
     """Return the gap s* that a driver wants at this speed and approach rate (Eq. 6).
 
     Args:
@@ -79,10 +79,10 @@ def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | 
         Desired bumper-to-bumper gap [m], same shape.
     """
     p = parameters
-    return p.minimum_gap + at_least(speed * p.time_headway + speed * approach_rate / p.braking, 0.0)
+    return p.minimum_gap + clamp_min(speed * p.time_headway + speed * approach_rate / p.interaction_scale, 0.0)
 
 
-def by_squaring(base: Array, exponent: Array) -> Array:
+def fast_power(base: Array, exponent: Array) -> Array:
     """Return `base` to the power of `exponent`; to the fourth by squaring twice, equal but for rounding.
 
     On many float32 tensors that takes a fiftieth of the time of a power.
@@ -97,7 +97,7 @@ def idm_acceleration(
     speed: Array,
     leader_speed: Array,
     gap: Array,
-    parameters: IDMParameters | IDMRows = PAPER_IDM,
+    parameters: IDMParameters | IDMArrays = PAPER_IDM,
     power: Callable[[Array, Array], Array] = pow,
 ) -> Array:
     """Return the acceleration of a driver behind a leader (Eq. 5).
@@ -107,7 +107,7 @@ def idm_acceleration(
         leader_speed: speed of the vehicle ahead [m/s], same shape.
         gap: bumper-to-bumper distance [m], same shape; positive (the model divides by it).
         parameters: of the driver, or of the driver of each row.
-        power: how powers are taken: exactly, or `by_squaring`.
+        power: how powers are taken: exactly, or `fast_power`.
 
     Returns:
         Acceleration [m/s2], same shape; unbounded below as the gap closes.
@@ -118,8 +118,8 @@ def idm_acceleration(
     return p.max_acceleration * (1.0 - free_road - interaction)
 
 
-def desired_speed_for(
-    acceleration: Array, speed: Array, parameters: IDMParameters | IDMRows = PAPER_IDM
+def desired_speed_from_acceleration(
+    acceleration: Array, speed: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM
 ) -> Array:
     """Return the desired speed v0 with which a driver accelerates so where nobody is ahead [m/s].
 
@@ -148,7 +148,7 @@ def equilibrium_speed(gap: float, parameters: IDMParameters = PAPER_IDM) -> floa
         return 0.0
     low, high = 0.0, parameters.desired_speed
     # Halving by hand: importing scipy's root finder would cost a worker half a second at its start.
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         middle = (low + high) / 2.0
         if equilibrium_gap(middle, parameters) < gap:
             low = middle

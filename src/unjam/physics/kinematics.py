@@ -1,6 +1,6 @@
 """How a vehicle moves in one step, and until it stands: exactly as SUMO moves it."""
 
-from unjam.physics.arrays import Array, at_least, namespace, square_root
+from unjam.physics.arrays import Array, clamp_min, namespace, square_root
 
 
 def next_speed(speed: Array, acceleration: Array, time_step: float) -> Array:
@@ -9,7 +9,7 @@ def next_speed(speed: Array, acceleration: Array, time_step: float) -> Array:
     Shapes: any, broadcast together. Units: m/s, m/s2, s.
     Source: SUMO's Euler update, https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
     """
-    return at_least(speed + acceleration * time_step, 0.0)
+    return clamp_min(speed + acceleration * time_step, 0.0)
 
 
 def next_position(position: Array, new_speed: Array, time_step: float) -> Array:
@@ -39,7 +39,7 @@ def gap_on_loop(position: Array, leader_position: Array, loop_length: Array, lea
     return (leader_position - position) % loop_length - leader_length
 
 
-def stopping_distance(speed: Array, braking: Array, step: float) -> Array:
+def stopping_distance(speed: Array, braking: Array, time_step: float) -> Array:
     """Return how far a vehicle drives that brakes with `braking` from the next step on [m].
 
     With v_j = max(0, v - j b h) after j steps of length h that is h (v_1 + v_2 + ...), of which the n = floor
@@ -49,12 +49,12 @@ def stopping_distance(speed: Array, braking: Array, step: float) -> Array:
     Shapes: any. Units: m/s, m/s2, s.
     Source: SUMO's Euler update, https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
     """
-    change = braking * step
+    change = braking * time_step
     steps = namespace(speed).floor(speed / change)
-    return step * steps * (speed - change * (steps + 1.0) / 2.0)
+    return time_step * steps * (speed - change * (steps + 1.0) / 2.0)
 
 
-def speed_to_stop_within(distance: Array, braking: float, step: float) -> Array:
+def max_speed_to_stop(distance: Array, braking: float, time_step: float) -> Array:
     """Return the highest speed after this step from which a vehicle still stands within `distance` [m/s].
 
     It drives one step at the answer v and then brakes: v h + `stopping_distance`(v) = `distance`, which is
@@ -62,7 +62,7 @@ def speed_to_stop_within(distance: Array, braking: float, step: float) -> Array:
 
     Shapes: any. Units: m, m/s2, s.
     """
-    change = braking * step
-    room = at_least(distance, 0.0) / step
+    change = braking * time_step
+    room = clamp_min(distance, 0.0) / time_step
     steps = namespace(room).floor((square_root(1.0 + 8.0 * room / change) - 1.0) / 2.0)
     return (room + change * steps * (steps + 1.0) / 2.0) / (steps + 1.0)

@@ -16,56 +16,56 @@ from matplotlib.colors import Normalize, to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from unjam.reports.results import Shown, seconds_by_part
+from unjam.reports.results import PlotEpisode, seconds_by_part
 
-SPEED_COLOURS = "viridis"
+SPEED_COLORMAP = "viridis"
 """slow is dark, fast is bright: also without colour vision, and in print"""
-INK, MUTED, GRID = "#1f2933", "#697586", "#e4e7eb"
-CAV_COLOUR = "#d7263d"
-LINES = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#1a202c", "#00a3c4"]
+TEXT_COLOR, MUTED_COLOR, GRID_COLOR = "#1f2933", "#697586", "#e4e7eb"
+CAV_PLOT_COLOR = "#d7263d"
+LINE_COLORS = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#1a202c", "#00a3c4"]
 """of drivers, in the order in which they are shown"""
-WIDTH = 10.5
+FIGURE_WIDTH = 10.5
 """of a figure of the page [inch]: its letters are legible from 760 pixels on, the least that it gets there"""
-LONGEST_LABEL = 34
+MAX_LABEL_LENGTH = 34
 """letters of a driver's label in a picture"""
 DPI = 130
 """pixels per inch of what is drawn in pixels"""
-POINTS_IN_TIME = 600
+MAX_PLOT_TIMES = 600
 """moments that a picture shows of an episode"""
-PLACES = 250
+SPEED_FIELD_POSITIONS = 250
 """places along the road at which a picture shows a speed"""
-NEAR, NEAR_SECONDS = 10.0, 1.4
+FILL_DISTANCE, FILL_SECONDS = 10.0, 1.4
 """how far from a vehicle a picture shows its speed: metres, and seconds of driving"""
-PEOPLE_LINE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
-CAV_LINE: dict[str, Any] = {"colors": CAV_COLOUR, "linewidths": 1.6}
+HUMAN_LINE_STYLE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
+CAV_LINE_STYLE: dict[str, Any] = {"colors": CAV_PLOT_COLOR, "linewidths": 1.6}
 
-STYLE: dict[Any, Any] = {
+PLOT_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "text.usetex": False,  # the working folder may hold a matplotlibrc, and LaTeX runs what that says
-    "axes.edgecolor": MUTED,
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
+    "axes.edgecolor": MUTED_COLOR,
+    "axes.labelcolor": TEXT_COLOR,
+    "axes.titlecolor": TEXT_COLOR,
     "axes.titlelocation": "left",
     "axes.titlesize": 9,
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "grid.color": GRID,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
+    "grid.color": GRID_COLOR,
+    "xtick.color": MUTED_COLOR,
+    "ytick.color": MUTED_COLOR,
     "legend.frameon": False,
     "figure.facecolor": "white",
 }
 
 
-def short(label: str) -> str:
+def short_label(label: str) -> str:
     """Return a driver's label as far as a title has room: parameters that were tuned are many."""
-    return label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
+    return label if len(label) <= MAX_LABEL_LENGTH else f"{label[: MAX_LABEL_LENGTH - 1]}…"
 
 
-def new_figure(height: float, width: float = WIDTH) -> Figure:
+def new_figure(height: float, width: float = FIGURE_WIDTH) -> Figure:
     """Return an empty figure of so many inches; as wide as the page where nothing is said."""
     return Figure(figsize=(width, height), layout="constrained", dpi=DPI)
 
@@ -77,20 +77,20 @@ def data_uri(figure: Figure) -> str:
         figure.savefig(content, format="svg", dpi=DPI, metadata={"Date": None})
     drawing = re.sub(
         rb'(?<=data:image/png;base64,)[^"]+',
-        lambda found: base64.b64encode(_few_colours(base64.b64decode(found[0]))),
+        lambda found: base64.b64encode(_reduce_colors(base64.b64decode(found[0]))),
         content.getvalue(),
     )
     return f"data:image/svg+xml;base64,{base64.b64encode(drawing).decode()}"
 
 
-def png_bytes(figure: Figure, dpi: int = DPI, small: bool = True) -> bytes:
+def png_bytes(figure: Figure, dpi: int = DPI, reduce_colors: bool = True) -> bytes:
     """Return a figure as a PNG, a `small` one of 256 colours."""
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=dpi)
-    return _few_colours(content.getvalue()) if small else content.getvalue()
+    return _reduce_colors(content.getvalue()) if reduce_colors else content.getvalue()
 
 
-def _few_colours(png: bytes) -> bytes:
+def _reduce_colors(png: bytes) -> bytes:
     """Return a picture on white in 256 colours: a sixth of the size.
 
     Maximum coverage keeps colours that are rare: the CAV's, and the fastest.
@@ -102,40 +102,40 @@ def _few_colours(png: bytes) -> bytes:
     return small.getvalue()
 
 
-def speed_scale(shown: Sequence[Shown]) -> Normalize:
+def speed_scale(episodes: Sequence[PlotEpisode]) -> Normalize:
     """Return one scale of speed for all pictures of these episodes."""
-    fastest = max(float(np.nanmax(episode.speeds, initial=0.0)) for episode in shown)
+    fastest = max(float(np.nanmax(episode.speeds, initial=0.0)) for episode in episodes)
     return Normalize(0.0, max(1.0, np.ceil(fastest)))
 
 
-@rc_context(STYLE)
-def space_time(shown: Sequence[Shown]) -> Figure:
+@rc_context(PLOT_STYLE)
+def trajectory_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """Draw where every vehicle is at every time, and the speed there; a panel per driver, all on one scale.
 
     A stop-and-go wave is a dark band that runs against the direction of travel. Where the road crosses itself
     is shaded. Of a merging road the ramp has a panel of its own below the main road's; of your own network
     the route that is driven most is shown.
     """
-    branches = list(dict.fromkeys(branch for episode in shown for branch in episode.branches)) or [""]
-    count, parts = len(shown), len(branches)
+    branches = list(dict.fromkeys(branch for episode in episodes for branch in episode.branches)) or [""]
+    count, parts = len(episodes), len(branches)
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
     figure = new_figure((3.1 + 0.9 * (parts - 1)) * rows + 0.3)
     heights = [3.0, *[1.0] * (parts - 1)] * rows
     panels = figure.subplots(rows * parts, columns, sharex=True, squeeze=False, height_ratios=heights)
-    scale = speed_scale(shown)
-    longest = max(episode.times[-1] for episode in shown)
+    scale = speed_scale(episodes)
+    longest = max(episode.times[-1] for episode in episodes)
     for part, branch in enumerate(branches):
-        positions = [_on_branch(episode, branch, main=part == 0) for episode in shown]
-        extent = _extent(shown, positions)
-        for number, episode in enumerate(shown):
+        positions = [_branch_positions(episode, branch, is_main=part == 0) for episode in episodes]
+        extent = _position_range(episodes, positions)
+        for number, episode in enumerate(episodes):
             row, column = divmod(number, columns)
             axes = panels[row * parts + part, column]
-            _trajectories(axes, episode, positions[number], extent, scale)
+            _draw_trajectories(axes, episode, positions[number], extent, scale)
             axes.set_xlim(0, longest)
             axes.set_ylim(*extent)
             if part == 0:
-                axes.set_title(short(episode.driver), fontsize=10)
+                axes.set_title(short_label(episode.driver), fontsize=10)
             if column == 0:
                 axes.set_ylabel(f"{branch} [m]" if branch else "position along the road [m]")
             if part == parts - 1 and number + columns >= count:
@@ -143,18 +143,18 @@ def space_time(shown: Sequence[Shown]) -> Figure:
                 axes.tick_params(labelbottom=True)
     for axes in panels.flat:
         axes.set_visible(bool(axes.collections))
-    add_speed_bar(figure, panels, scale)
+    add_speed_colorbar(figure, panels, scale)
     return figure
 
 
-def add_speed_bar(figure: Figure, panels: np.ndarray, scale: Normalize) -> None:
+def add_speed_colorbar(figure: Figure, panels: np.ndarray, scale: Normalize) -> None:
     """Draw beside all panels which colour is which speed."""
-    bar = figure.colorbar(ScalarMappable(scale, SPEED_COLOURS), ax=panels, shrink=0.8, pad=0.02, aspect=30)
+    bar = figure.colorbar(ScalarMappable(scale, SPEED_COLORMAP), ax=panels, shrink=0.8, pad=0.02, aspect=30)
     bar.set_label("speed [m/s]")
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
 
 
-def _on_branch(episode: Shown, branch: str, main: bool) -> np.ndarray:
+def _branch_positions(episode: PlotEpisode, branch: str, is_main: bool) -> np.ndarray:
     """Return the positions of the vehicles while they are on a branch, shape (T + 1, N); NaN elsewhere.
 
     Who comes from another branch is on the main one from where both meet.
@@ -163,34 +163,34 @@ def _on_branch(episode: Shown, branch: str, main: bool) -> np.ndarray:
         return episode.positions
     own = np.array(episode.branches) == branch
     past = episode.positions >= 0
-    return np.where(own | past if main else own & ~past, episode.positions, np.nan)
+    return np.where(own | past if is_main else own & ~past, episode.positions, np.nan)
 
 
-def _extent(shown: Sequence[Shown], positions: Sequence[np.ndarray]) -> tuple[float, float]:
+def _position_range(episodes: Sequence[PlotEpisode], positions: Sequence[np.ndarray]) -> tuple[float, float]:
     """Return the first and the last coordinate that a panel shows [m]."""
-    if all(episode.closed for episode in shown):
-        return 0.0, max(episode.loop_length for episode in shown)
+    if all(episode.is_closed for episode in episodes):
+        return 0.0, max(episode.loop_length for episode in episodes)
     there = np.concatenate([each[~np.isnan(each)] for each in positions])
     return (float(there.min()), float(there.max())) if there.size else (0.0, 1.0)
 
 
-def _trajectories(
-    axes: Axes, episode: Shown, positions: np.ndarray, extent: tuple[float, float], scale: Normalize
+def _draw_trajectories(
+    axes: Axes, episode: PlotEpisode, positions: np.ndarray, extent: tuple[float, float], scale: Normalize
 ) -> None:
-    every = max(1, len(episode.times) // POINTS_IN_TIME)
+    every = max(1, len(episode.times) // MAX_PLOT_TIMES)
     times, positions, speeds = (each[::every] for each in (episode.times, positions, episode.speeds))
     axes.grid(False)
     for start, end in episode.crossings:
-        axes.axhspan(start, end, color=INK, alpha=0.15, lw=0, zorder=1.5, rasterized=True)
-    loop_length, places = 0.0, np.linspace(*extent, PLACES)
-    if episode.closed:
+        axes.axhspan(start, end, color=TEXT_COLOR, alpha=0.15, lw=0, zorder=1.5, rasterized=True)
+    loop_length, places = 0.0, np.linspace(*extent, SPEED_FIELD_POSITIONS)
+    if episode.is_closed:
         loop_length = episode.loop_length
-        positions, places = positions % loop_length, np.linspace(0.0, loop_length, PLACES)
-    seam, width = loop_length / 2 or np.inf, 1.0 if episode.closed else 0.5  # many come and go
+        positions, places = positions % loop_length, np.linspace(0.0, loop_length, SPEED_FIELD_POSITIONS)
+    seam, width = loop_length / 2 or np.inf, 1.0 if episode.is_closed else 0.5  # many come and go
     field = speed_field(positions, speeds, places, loop_length)
-    axes.pcolormesh(times, places, field, cmap=SPEED_COLOURS, norm=scale, rasterized=True)
-    is_cav = np.isin(np.arange(speeds.shape[1]), episode.cavs)
-    for driven, style in ((~is_cav, PEOPLE_LINE), (is_cav, CAV_LINE)):
+    axes.pcolormesh(times, places, field, cmap=SPEED_COLORMAP, norm=scale, rasterized=True)
+    is_cav = np.isin(np.arange(speeds.shape[1]), episode.cav_columns)
+    for driven, style in ((~is_cav, HUMAN_LINE_STYLE), (is_cav, CAV_LINE_STYLE)):
         position = positions[:, driven].T
         points = np.stack([np.broadcast_to(times, position.shape), position], axis=-1)
         keep = np.abs(np.diff(position)) < seam  # not across the seam of the road, nor where nobody is
@@ -199,9 +199,7 @@ def _trajectories(
         axes.add_collection(LineCollection(segments, rasterized=True, **style))
 
 
-def speed_field(
-    positions: np.ndarray, speeds: np.ndarray, places: np.ndarray, loop_length: float
-) -> np.ndarray:
+def speed_field(positions: np.ndarray, speeds: np.ndarray, grid: np.ndarray, loop_length: float) -> np.ndarray:
     """Return the speed along the road at each moment [m/s], shape (places, moments).
 
     Between two vehicles it goes from the one's to the other's; it is NaN where nobody is near. Lines alone
@@ -213,7 +211,7 @@ def speed_field(
         places: where it is asked for [m], ascending.
         loop_length: of a closed road [m]; 0: it has ends.
     """
-    field = np.full((len(places), len(positions)), np.nan)
+    field = np.full((len(grid), len(positions)), np.nan)
     for moment, (where, fast) in enumerate(zip(positions, speeds, strict=True)):
         there = np.flatnonzero(~np.isnan(where))
         if not len(there):
@@ -223,16 +221,16 @@ def speed_field(
         if loop_length:  # it goes on at both ends
             where = np.concatenate([where - loop_length, where, where + loop_length])
             fast = np.tile(fast, 3)
-        behind = (np.searchsorted(where, places) - 1).clip(min=0)
+        behind = (np.searchsorted(where, grid) - 1).clip(min=0)
         ahead = (behind + 1).clip(max=len(where) - 1)
-        nearest = np.where(np.abs(places - where[behind]) < np.abs(places - where[ahead]), behind, ahead)
-        near = np.abs(places - where[nearest]) <= NEAR + NEAR_SECONDS * fast[nearest]
-        field[near, moment] = np.interp(places, where, fast)[near]
+        nearest = np.where(np.abs(grid - where[behind]) < np.abs(grid - where[ahead]), behind, ahead)
+        near = np.abs(grid - where[nearest]) <= FILL_DISTANCE + FILL_SECONDS * fast[nearest]
+        field[near, moment] = np.interp(grid, where, fast)[near]
     return field
 
 
-@rc_context(STYLE)
-def over_time(shown: Sequence[Shown]) -> Figure:
+@rc_context(PLOT_STYLE)
+def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """Draw three quantities over time, a line per driver.
 
     Of closed roads the CAV's speed and gap, and the std of speed across all vehicles; of roads with ends the
@@ -240,16 +238,16 @@ def over_time(shown: Sequence[Shown]) -> Figure:
     """
     figure = new_figure(6.2)
     panels = figure.subplots(3, 1, sharex=True)
-    closed = all(episode.closed for episode in shown)
-    for episode, colour in zip(shown, LINES, strict=False):
-        every = max(1, len(episode.times) // POINTS_IN_TIME)
-        for axes, (label, values) in zip(panels, _three_of(episode, closed).items(), strict=True):
+    closed = all(episode.is_closed for episode in episodes)
+    for episode, colour in zip(episodes, LINE_COLORS, strict=False):
+        every = max(1, len(episode.times) // MAX_PLOT_TIMES)
+        for axes, (label, values) in zip(panels, _time_series(episode, closed).items(), strict=True):
             axes.plot(episode.times[::every], values[::every], color=colour, lw=1.2)
             axes.set_ylabel(label)
-        panels[0].plot([], [], color=colour, lw=1.2, label=short(episode.driver))
-    limit = shown[0].limit_speed
+        panels[0].plot([], [], color=colour, lw=1.2, label=short_label(episode.driver))
+    limit = episodes[0].limit_speed
     if np.isfinite(limit):
-        panels[0].axhline(limit, color=INK, lw=0.8, ls=":", label="limit")
+        panels[0].axhline(limit, color=TEXT_COLOR, lw=0.8, ls=":", label="limit")
     for axes in panels:
         axes.set_ylim(bottom=0)
     panels[-1].set_xlabel("time [s]")
@@ -258,24 +256,24 @@ def over_time(shown: Sequence[Shown]) -> Figure:
     return figure
 
 
-def _three_of(episode: Shown, closed: bool) -> dict[str, np.ndarray]:
-    """Return what `over_time` draws of an episode, by label; each of shape (T + 1,)."""
+def _time_series(episode: PlotEpisode, is_closed: bool) -> dict[str, np.ndarray]:
+    """Return what `time_series_figure` draws of an episode, by label; each of shape (T + 1,)."""
     there = np.where(np.isnan(episode.speeds).all(axis=1, keepdims=True), 0.0, episode.speeds)
     waves = {"speed std across\nvehicles [m/s]": np.nanstd(there, axis=1)}
-    if closed:
-        cav = episode.cavs[0]
+    if is_closed:
+        cav = episode.cav_columns[0]
         return {"CAV's speed [m/s]": episode.speeds[:, cav], "CAV's gap [m]": episode.gaps[:, cav], **waves}
-    waiting = episode.waiting if len(episode.waiting) else np.zeros(len(there))
+    waiting = episode.backlog if len(episode.backlog) else np.zeros(len(there))
     return {"mean speed [m/s]": np.nanmean(there, axis=1), **waves, "vehicles waiting\nto enter": waiting}
 
 
-@rc_context(STYLE)
-def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, float]) -> Figure:
+@rc_context(PLOT_STYLE)
+def learning_curve_figure(runs: dict[str, list[dict[str, Any]]], references: dict[str, float]) -> Figure:
     """Draw return against actual steps: of each run by its label, and of drivers that do not learn."""
     figure = new_figure(3.8)
     axes = figure.subplots()
-    for (label, rows), colour in zip(runs.items(), cycle(LINES[2:]), strict=False):
-        steps = np.array([row["actual_steps"] for row in rows]) / 1000
+    for (label, rows), colour in zip(runs.items(), cycle(LINE_COLORS[2:]), strict=False):
+        steps = np.array([row["environment_steps"] for row in rows]) / 1000
         prefix = f"{label}: " if len(runs) > 1 else ""
         training, label = [row["return_mean"] for row in rows], f"{prefix}training, with exploration"
         axes.plot(steps, training, color=colour, lw=1, alpha=0.45, label=label)
@@ -286,7 +284,7 @@ def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, 
         axes.plot(*points.T, color=colour, lw=1.8, marker="o", ms=3.5, label=label)
     styles = cycle(("--", ":", "-.", (0, (1, 3))))
     for (label, value), style in zip(references.items(), styles, strict=False):
-        axes.axhline(value, color=INK, lw=1.1, ls=style, label=label)
+        axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=label)
     axes.set_xlabel("actual simulator steps [thousands]")
     axes.set_ylabel("return of an episode")
     axes.margins(x=0.01, y=0.06)
@@ -294,8 +292,8 @@ def learning_curve(runs: dict[str, list[dict[str, Any]]], references: dict[str, 
     return figure
 
 
-@rc_context(STYLE)
-def time_split(progress: Sequence[dict[str, Any]]) -> Figure:
+@rc_context(PLOT_STYLE)
+def training_time_figure(progress: Sequence[dict[str, Any]]) -> Figure:
     """Draw how the wall time of training divides among its parts."""
     totals = {f"{part} {seconds:.0f} s": seconds for part, seconds in seconds_by_part(progress).items()}
     figure = stacked_bars({"": totals}, "wall time [s]", height=1.5)
@@ -306,13 +304,13 @@ def time_split(progress: Sequence[dict[str, Any]]) -> Figure:
     return figure
 
 
-@rc_context(STYLE)
+@rc_context(PLOT_STYLE)
 def stacked_bars(bars: dict[str, dict[str, float]], label: str, height: float) -> Figure:
     """Draw a bar per name, its parts end to end; the same part has the same colour in all."""
     figure = new_figure(height)
     axes, left = figure.subplots(), np.zeros(len(bars))
     parts = dict.fromkeys(part for bar in bars.values() for part in bar)
-    for part, colour in zip(parts, LINES, strict=False):
+    for part, colour in zip(parts, LINE_COLORS, strict=False):
         widths = np.array([bar.get(part, 0.0) for bar in bars.values()])
         axes.barh(list(bars), widths, left=left, color=colour, label=part)
         left = left + widths
@@ -321,6 +319,6 @@ def stacked_bars(bars: dict[str, dict[str, float]], label: str, height: float) -
     return figure
 
 
-def colour_table() -> list[str]:
+def color_table() -> list[str]:
     """Return the colours of speed as hex codes, slowest first: for pictures that matplotlib does not draw."""
-    return [to_hex(colour) for colour in colormaps[SPEED_COLOURS](np.linspace(0, 1, 32))]
+    return [to_hex(colour) for colour in colormaps[SPEED_COLORMAP](np.linspace(0, 1, 32))]

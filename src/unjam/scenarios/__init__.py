@@ -3,16 +3,16 @@
 from dataclasses import asdict
 from typing import Any
 
-from unjam.errors import wrong_name
-from unjam.parameters import build, changed, nested
+from unjam.errors import unknown_name
+from unjam.parameters import build_dataclass, merge_changes, nest_keys
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
-from unjam.scenarios.on_ramp import ON_RAMPS, OnRamp
-from unjam.scenarios.own_network import OwnNetwork, own_network
+from unjam.scenarios.on_ramp import ON_RAMP_SCENARIOS, OnRamp
 from unjam.scenarios.population import read_population
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.user_network import UserNetwork, load_user_network
 
 __all__ = ["SCENARIOS", "FigureEight", "Merge", "OnRamp", "Ring", "Road", "Scenario", "make_scenario"]
 
@@ -23,14 +23,14 @@ SCENARIOS: dict[str, Scenario] = {
     "figure-eight": FigureEight(),
     "figure-eight-30": FigureEight(radius=(30, 30)),
     "merge": Merge(),
-    **ON_RAMPS,
+    **ON_RAMP_SCENARIOS,
 }
 
-EXAMPLE_SHARE = 0.1
+EXAMPLE_PENETRATION_RATE = 0.1
 """share of CAVs where a network of the user's own stands as an example"""
-NAMED_BEFORE = {"people": "human_control", "penetration": "cav_share"}
+OLD_PARAMETER_NAMES = {"people": "human_control", "penetration": "penetration_rate"}
 """what parameters are called now, by what they were called"""
-KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp, OwnNetwork)}
+SCENARIO_KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp, UserNetwork)}
 """All kinds of road, by their title."""
 
 
@@ -42,30 +42,30 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     Raises:
         InputError: unknown scenario or parameter, or a value out of range.
     """
-    changes = nested(_named_as_now(changes or {}))
+    changes = nest_keys(_current_names(changes or {}))
     if name.endswith(".sumocfg"):
-        return own_network(name, changes)
+        return load_user_network(name, changes)
     if name not in SCENARIOS:
-        raise wrong_name("scenario", name, [*SCENARIOS, "a .sumocfg file"])
+        raise unknown_name("scenario", name, [*SCENARIOS, "a .sumocfg file"])
     scenario = SCENARIOS[name]
     if not changes:
         return scenario
     if changes.get("population"):
-        changes = {**_of_population(str(changes["population"])), **changes}
-    return build(type(scenario), changed(asdict(scenario), changes), f"scenario {name}")
+        changes = {**_population_changes(str(changes["population"])), **changes}
+    return build_dataclass(type(scenario), merge_changes(asdict(scenario), changes), f"scenario {name}")
 
 
-def example_of(name: str) -> Scenario:
+def example_scenario(name: str) -> Scenario:
     """Return a scenario as it is listed and sampled: with some CAVs on a network of the user's own."""
-    return make_scenario(name, {"cav_share": EXAMPLE_SHARE} if name.endswith(".sumocfg") else None)
+    return make_scenario(name, {"penetration_rate": EXAMPLE_PENETRATION_RATE} if name.endswith(".sumocfg") else None)
 
 
-def _named_as_now(values: dict[str, Any]) -> dict[str, Any]:
+def _current_names(values: dict[str, Any]) -> dict[str, Any]:
     """Return parameters of a scenario by the names that they have now; older files say others."""
-    return {NAMED_BEFORE.get(key, key): value for key, value in values.items()}
+    return {OLD_PARAMETER_NAMES.get(key, key): value for key, value in values.items()}
 
 
-def _of_population(file: str) -> dict[str, Any]:
+def _population_changes(file: str) -> dict[str, Any]:
     """Return what else changes with a population: who is typical, and who computes how people drive."""
     population = read_population(file)
     commanded = {"human_control": "commanded"} if population.residual else {}
@@ -80,4 +80,4 @@ def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
 def scenario_from_recipe(recipe: dict[str, Any]) -> Scenario:
     """Return the scenario that `scenario_recipe` wrote down."""
     values = {key: value for key, value in recipe.items() if key != "kind"}
-    return build(KINDS[recipe["kind"]], _named_as_now(values), "scenario")
+    return build_dataclass(SCENARIO_KINDS[recipe["kind"]], _current_names(values), "scenario")

@@ -8,35 +8,25 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.roadside import Roadside
+from unjam.drivers.roadside import RoadsideSettings
 from unjam.drivers.safety import SafetyFilter
-from unjam.parameters import STRICT, Count, NotNegative, Positive
-from unjam.scenarios.road import (
-    Connection,
-    Edge,
-    Entry,
-    Lane,
-    MotorwayRoad,
-    Node,
-    Person,
-    RoadNetwork,
-    Route,
-)
+from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt
+from unjam.scenarios.road import Connection, Edge, EdgeLane, Entry, MotorwayRoad, Node, RoadNetwork, Route, VehicleType
 from unjam.scenarios.scenario import Actuation, Scenario
 
-BEFORE, MERGING, AFTER, RAMP = 2000.0, 300.0, 700.0, 400.0
+UPSTREAM_LENGTH, MERGING_LENGTH, DOWNSTREAM_LENGTH, RAMP_LENGTH = 2000.0, 300.0, 700.0, 400.0
 """lengths of the motorway before the ramp's lane runs beside it, with it, behind it, and of the ramp [m]"""
-MOTORWAY_SPEED, RAMP_SPEED = 27.78, 22.22
+MOTORWAY_SPEED_LIMIT, RAMP_SPEED_LIMIT = 27.78, 22.22
 """what they allow [m/s]"""
 RAMP_ENTRY_SPEED = 15.0
 """[m/s]"""
-RAMP_HEADWAY = 2.0
+MIN_RAMP_HEADWAY = 2.0
 """smallest time between two vehicles that want to enter the ramp [s]"""
-FREE_TIME = {1: 113.0, 2: 106.6}
+FREE_FLOW_TIMES = {1: 113.0, 2: 106.6}
 """mean travel time of people alone without a peak, by lanes, of six seeds [s]"""
-KINDS = 200
+HUMAN_TYPE_COUNT = 200
 """how many different people there are"""
-APART = 60.0
+RAMP_OFFSET = 60.0
 """of the nodes where motorway and ramp begin [m]"""
 
 Arrival = tuple[float, str, int, float | Literal["last"]]
@@ -54,31 +44,31 @@ class OnRamp(Scenario):
 
     title: ClassVar[str] = "on-ramp"
     reward: ClassVar[str] = "travel-time"
-    closed: ClassVar[bool] = False
-    tells: ClassVar[tuple[str, ...]] = (
-        *("allowed_speed", "to_merge", "lane_speeds", "road_speeds"),
-        *("beside_gaps", "beside_speeds", "cav_share"),
+    is_closed: ClassVar[bool] = False
+    provided_fields: ClassVar[tuple[str, ...]] = (
+        *("allowed_speed", "distance_to_merge", "lane_speeds", "road_speeds"),
+        *("adjacent_gaps", "adjacent_speeds", "penetration_rate"),
     )
 
     lanes: Literal[1, 2] = 2
     """of the motorway"""
     inflow: Positive = 3200.0
     """vehicles that want to enter the motorway in the peak [veh/h]"""
-    ramp_flow: NotNegative = 500.0
+    ramp_flow: NonNegative = 500.0
     """vehicles that want to enter the ramp in the peak [veh/h]"""
-    calm_inflow: NotNegative = 1800.0
+    off_peak_inflow: NonNegative = 1800.0
     """before and after the peak [veh/h]"""
-    calm_ramp_flow: NotNegative = 250.0
+    off_peak_ramp_flow: NonNegative = 250.0
     """before and after the peak [veh/h]"""
     peak: Interval = (300.0, 1500.0)
     """from when to when it lasts [s]"""
-    entry_headway: NotNegative = 1.1
+    min_entry_headway: NonNegative = 1.1
     """smallest time between two vehicles that want to enter a lane of the motorway [s]"""
-    cav_share: Annotated[float, Field(ge=0, le=1)] = 0.1
+    penetration_rate: Annotated[float, Field(ge=0, le=1)] = 0.1
     """share of all vehicles that are CAVs; a larger share contains the smaller one"""
-    cavs: Count | None = None
+    cavs: PositiveInt | None = None
     """exactly so many CAVs instead of a share, among those that want to enter in the first half"""
-    following: Literal["EIDM", "IDM"] = "EIDM"
+    car_following: Literal["EIDM", "IDM"] = "EIDM"
     """SUMO's model of how people follow"""
     time_headways: Interval = (1.0, 1.8)
     """between which people's lie [s]"""
@@ -86,17 +76,17 @@ class OnRamp(Scenario):
     """between which people's lie [m/s2]"""
     decelerations: Interval = (1.5, 2.0)
     """between which people's comfortable ones lie [m/s2]"""
-    gaps: Interval = (2.0, 2.5)
+    minimum_gaps: Interval = (2.0, 2.5)
     """between which people's lie in a standing queue [m]"""
-    speed_spread: NotNegative = 0.1
+    speed_factor_std: NonNegative = 0.1
     """standard deviation of people's wanted speed over what the road allows, which is 1, at most 0.2 off"""
     vehicle_length: Positive = 4.8
     """[m]"""
-    roadside: Roadside = field(default_factory=Roadside)
+    roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
     """how late and how smooth CAVs are told of the speeds ahead"""
     simulation_step: Positive = 0.5
-    steps_per_decision: Count = 2
-    horizon: Count = 2400
+    steps_per_control_step: PositiveInt = 2
+    horizon: PositiveInt = 2400
     """decisions in an episode"""
     action_limit: Positive = 2.5
     actuation: Actuation = "cruise"
@@ -107,68 +97,68 @@ class OnRamp(Scenario):
     emission_class: str = "HBEFA4/PC_petrol_Euro-6d"
 
     @model_validator(mode="after")
-    def _fits(self) -> "OnRamp":
-        for name in ("time_headways", "accelerations", "decelerations", "gaps", "peak"):
+    def _check_settings(self) -> "OnRamp":
+        for name in ("time_headways", "accelerations", "decelerations", "minimum_gaps", "peak"):
             low, high = getattr(self, name)
             if not 0 <= low <= high or (high == 0 and name != "peak"):
                 raise ValueError(f"{name}: ({low:g}, {high:g}) is not allowed; allowed: 0 < low <= high")
-        for name, flow in (("inflow", self.inflow), ("calm_inflow", self.calm_inflow)):
-            most = 3600.0 * self.lanes / max(self.entry_headway, 1e-9)
+        for name, flow in (("inflow", self.inflow), ("off_peak_inflow", self.off_peak_inflow)):
+            most = 3600.0 * self.lanes / max(self.min_entry_headway, 1e-9)
             if flow >= most:
                 raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {most:.0f}, by entry_headway")
-        for name, flow in (("ramp_flow", self.ramp_flow), ("calm_ramp_flow", self.calm_ramp_flow)):
-            if flow >= 3600.0 / RAMP_HEADWAY:
-                raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {3600.0 / RAMP_HEADWAY:.0f}")
-        self.check_people_are_native("on the on-ramp")
+        for name, flow in (("ramp_flow", self.ramp_flow), ("off_peak_ramp_flow", self.off_peak_ramp_flow)):
+            if flow >= 3600.0 / MIN_RAMP_HEADWAY:
+                raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {3600.0 / MIN_RAMP_HEADWAY:.0f}")
+        self.check_native_humans("on the on-ramp")
         return self
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
         """Return the road with who wants to enter it; random are the people, when they come, who is a CAV."""
-        kinds = {f"person_{number}": self._person(generator) for number in range(KINDS)}
+        kinds = {f"person_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
         entries, draws = list[Entry](), dict[str, float]()
         for number, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
-            name, kind = f"vehicle_{number}", f"person_{generator.integers(KINDS)}"
+            name, kind = f"vehicle_{number}", f"person_{generator.integers(HUMAN_TYPE_COUNT)}"
             draws[name] = generator.random()
             entries.append(Entry(name, route, 0.0, speed, time, lane, kind))
         return MotorwayRoad(
             network=_network(self.lanes),
             routes=_ROUTES,
             entries=tuple(entries),
-            limit_speed=MOTORWAY_SPEED,
-            kinds=kinds,
-            cav_ids=self._chosen(draws),
-            lanes=_lanes(self.lanes),
-            ways=("ramp", "motorway") if self.lanes == 1 else ("ramp", "right lane", "left lane"),
-            merge=BEFORE,
-            length=BEFORE + MERGING + AFTER,
+            limit_speed=MOTORWAY_SPEED_LIMIT,
+            vehicle_types=kinds,
+            cav_ids=self._select_cavs(draws),
+            edge_lanes=_edge_lanes(self.lanes),
+            lane_names=("ramp", "motorway") if self.lanes == 1 else ("ramp", "right lane", "left lane"),
+            merge_position=UPSTREAM_LENGTH,
+            length=UPSTREAM_LENGTH + MERGING_LENGTH + DOWNSTREAM_LENGTH,
             vehicle_length=self.vehicle_length,
             peak=self.peak,
-            free_time=FREE_TIME[self.lanes],
+            free_flow_time=FREE_FLOW_TIMES[self.lanes],
             roadside=self.roadside,
         )
 
-    def _chosen(self, draws: dict[str, float]) -> frozenset[str]:
+    def _select_cavs(self, draws: dict[str, float]) -> frozenset[str]:
         """Return who is a CAV: those with the lowest draws."""
         if self.cavs is None:
-            return frozenset(name for name, draw in draws.items() if draw < self.cav_share)
+            return frozenset(name for name, draw in draws.items() if draw < self.penetration_rate)
         early = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
         return frozenset(early[: self.cavs])
 
-    def _person(self, generator: np.random.Generator) -> Person:
-        def between(interval: tuple[float, float]) -> float:
+    def _draw_human_type(self, generator: np.random.Generator) -> VehicleType:
+        def draw_uniform(interval: tuple[float, float]) -> float:
             return round(float(generator.uniform(*interval)), 4)
 
-        drawn = Person(
-            model=self.following,
-            time_headway=between(self.time_headways),
-            acceleration=between(self.accelerations),
-            deceleration=between(self.decelerations),
-            gap=between(self.gaps),
-            speed_factor=round(float(np.clip(generator.normal(1.0, self.speed_spread), 0.8, 1.2)), 4),
+        drawn = VehicleType(
+            model=self.car_following,
+            time_headway=draw_uniform(self.time_headways),
+            acceleration=draw_uniform(self.accelerations),
+            deceleration=draw_uniform(self.decelerations),
+            minimum_gap=draw_uniform(self.minimum_gaps),
+            speed_factor=round(float(np.clip(generator.normal(1.0, self.speed_factor_std), 0.8, 1.2)), 4),
         )
-        if self.calibrated is None:
+        if self.driver_population is None:
             return drawn
-        (one,) = self.calibrated.draw(1, generator)
+        (one,) = self.driver_population.draw(1, generator)
         # They follow as they were calibrated; how fast people want to be no recording of a jam tells.
         return drawn._replace(
             model="IDM",
@@ -181,22 +171,22 @@ class OnRamp(Scenario):
     def _arrivals(self, generator: np.random.Generator) -> Iterator[Arrival]:
         """Yield when vehicles want to enter, on which route, in which lane, and how fast."""
         for lane in range(self.lanes):
-            flows = self.calm_inflow / self.lanes, self.inflow / self.lanes
-            for time in self._times(generator, *flows, self.entry_headway):
+            flows = self.off_peak_inflow / self.lanes, self.inflow / self.lanes
+            for time in self._entry_times(generator, *flows, self.min_entry_headway):
                 yield time, "motorway", lane, "last"
-        for time in self._times(generator, self.calm_ramp_flow, self.ramp_flow, RAMP_HEADWAY):
+        for time in self._entry_times(generator, self.off_peak_ramp_flow, self.ramp_flow, MIN_RAMP_HEADWAY):
             yield time, "ramp", 0, RAMP_ENTRY_SPEED
 
-    def _times(
-        self, generator: np.random.Generator, calm: float, peak: float, smallest: float
+    def _entry_times(
+        self, generator: np.random.Generator, off_peak: float, peak: float, min_headway: float
     ) -> Iterator[float]:
         """Yield times with shifted exponential headways, period by period [s]; flows in veh/h."""
         begin = 0.0
-        for end, flow in ((self.peak[0], calm), (self.peak[1], peak), (self.seconds, calm)):
+        for end, flow in ((self.peak[0], off_peak), (self.peak[1], peak), (self.max_duration, off_peak)):
             time = begin
             while flow:
-                time += smallest + float(generator.exponential(3600.0 / flow - smallest))
-                if time >= min(end, self.seconds):
+                time += min_headway + float(generator.exponential(3600.0 / flow - min_headway))
+                if time >= min(end, self.max_duration):
                     break
                 yield round(time, 2)
             begin = max(begin, end)
@@ -204,18 +194,18 @@ class OnRamp(Scenario):
     @property
     def top_speed(self) -> float:
         """What the road allows [m/s]."""
-        return MOTORWAY_SPEED
+        return MOTORWAY_SPEED_LIMIT
 
     @property
-    def people_in_words(self) -> str:
+    def human_description(self) -> str:
         """How people drive."""
-        who = f"as {self.calibrated_in_words}" if self.calibrated else self.following
-        return f"{KINDS} different people, {who}, with SUMO's lane changes"
+        who = f"as {self.population_description}" if self.driver_population else self.car_following
+        return f"{HUMAN_TYPE_COUNT} different people, {who}, with SUMO's lane changes"
 
-    def possible_cavs(self) -> tuple[str, ...]:
+    def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids that CAVs may have: any vehicle's."""
-        flow = max(self.inflow, self.calm_inflow) + max(self.ramp_flow, self.calm_ramp_flow)
-        most = int(self.seconds / 3600.0 * 2.0 * flow)
+        flow = max(self.inflow, self.off_peak_inflow) + max(self.ramp_flow, self.off_peak_ramp_flow)
+        most = int(self.max_duration / 3600.0 * 2.0 * flow)
         return tuple(f"vehicle_{number}" for number in range(most))
 
     def facts(self) -> list[tuple[str, str]]:
@@ -223,50 +213,53 @@ class OnRamp(Scenario):
         lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
         begin, end = self.peak
         return [
-            ("road", f"motorway of {(BEFORE + MERGING + AFTER) / 1000:g} km, {lanes}, with a ramp"),
+            (
+                "road",
+                f"motorway of {(UPSTREAM_LENGTH + MERGING_LENGTH + DOWNSTREAM_LENGTH) / 1000:g} km, {lanes}, with a ramp",
+            ),
             (
                 "vehicles",
                 f"{self.inflow:g} + {self.ramp_flow:g} veh/h from {begin:g} to {end:g} s, "
-                f"else {self.calm_inflow:g} + {self.calm_ramp_flow:g} ({100 * self.cav_share:g} % CAV)",
+                f"else {self.off_peak_inflow:g} + {self.off_peak_ramp_flow:g} ({100 * self.penetration_rate:g} % CAV)",
             ),
-            ("limit", f"{MOTORWAY_SPEED:.2f} m/s"),
+            ("limit", f"{MOTORWAY_SPEED_LIMIT:.2f} m/s"),
             ("limit is", "what the motorway allows"),
         ]
 
 
 def _network(lanes: int) -> RoadNetwork:
     nodes = (
-        Node("entrance", -BEFORE, 0.0),
-        Node("ramp_entrance", -RAMP + 1.0, -APART),
+        Node("entrance", -UPSTREAM_LENGTH, 0.0),
+        Node("ramp_entrance", -RAMP_LENGTH + 1.0, -RAMP_OFFSET),
         Node("joins", 0.0, 0.0),
-        Node("closes", MERGING, 0.0),
-        Node("exit", MERGING + AFTER, 0.0),
+        Node("closes", MERGING_LENGTH, 0.0),
+        Node("exit", MERGING_LENGTH + DOWNSTREAM_LENGTH, 0.0),
     )
     edges = (
-        Edge("motorway", "entrance", "joins", BEFORE, lanes=lanes),
-        Edge("ramp", "ramp_entrance", "joins", RAMP, speed=RAMP_SPEED),
-        Edge("merging", "joins", "closes", MERGING, lanes=lanes + 1),
-        Edge("after", "closes", "exit", AFTER, lanes=lanes),
+        Edge("motorway", "entrance", "joins", UPSTREAM_LENGTH, lanes=lanes),
+        Edge("ramp", "ramp_entrance", "joins", RAMP_LENGTH, speed_limit=RAMP_SPEED_LIMIT),
+        Edge("merging", "joins", "closes", MERGING_LENGTH, lanes=lanes + 1),
+        Edge("after", "closes", "exit", DOWNSTREAM_LENGTH, lanes=lanes),
     )
     connections = (
         *(Connection("motorway", "merging", lane, lane + 1) for lane in range(lanes)),
         Connection("ramp", "merging", 0, 0),
         *(Connection("merging", "after", lane + 1, lane) for lane in range(lanes)),
     )
-    return RoadNetwork(nodes, edges, MOTORWAY_SPEED, links=False, connections=connections)
+    return RoadNetwork(nodes, edges, MOTORWAY_SPEED_LIMIT, has_internal_links=False, connections=connections)
 
 
-def _lanes(lanes: int) -> tuple[Lane, ...]:
+def _edge_lanes(lanes: int) -> tuple[EdgeLane, ...]:
     """Return all lanes; way 0 is the ramp and the lane beside the motorway in which it ends."""
     found = [
-        Lane("ramp_0", 0, BEFORE - RAMP, RAMP_SPEED),
-        Lane("merging_0", 0, BEFORE, MOTORWAY_SPEED, closing=True),
+        EdgeLane("ramp_0", 0, UPSTREAM_LENGTH - RAMP_LENGTH, RAMP_SPEED_LIMIT),
+        EdgeLane("merging_0", 0, UPSTREAM_LENGTH, MOTORWAY_SPEED_LIMIT, is_merging=True),
     ]
     for lane in range(lanes):
         found += [
-            Lane(f"motorway_{lane}", lane + 1, 0.0, MOTORWAY_SPEED),
-            Lane(f"merging_{lane + 1}", lane + 1, BEFORE, MOTORWAY_SPEED, closing=True),
-            Lane(f"after_{lane}", lane + 1, BEFORE + MERGING, MOTORWAY_SPEED),
+            EdgeLane(f"motorway_{lane}", lane + 1, 0.0, MOTORWAY_SPEED_LIMIT),
+            EdgeLane(f"merging_{lane + 1}", lane + 1, UPSTREAM_LENGTH, MOTORWAY_SPEED_LIMIT, is_merging=True),
+            EdgeLane(f"after_{lane}", lane + 1, UPSTREAM_LENGTH + MERGING_LENGTH, MOTORWAY_SPEED_LIMIT),
         ]
     return tuple(found)
 
@@ -274,10 +267,10 @@ def _lanes(lanes: int) -> tuple[Lane, ...]:
 _ROUTES = (Route("motorway", ("motorway", "merging", "after")), Route("ramp", ("ramp", "merging", "after")))
 
 ON_RAMP = OnRamp()
-ON_RAMPS = {
+ON_RAMP_SCENARIOS = {
     "on-ramp": ON_RAMP,
     "on-ramp-1": replace(
-        ON_RAMP, lanes=1, inflow=1400.0, ramp_flow=350.0, calm_inflow=900.0, calm_ramp_flow=125.0
+        ON_RAMP, lanes=1, inflow=1400.0, ramp_flow=350.0, off_peak_inflow=900.0, off_peak_ramp_flow=125.0
     ),
     "on-ramp-steady": replace(ON_RAMP, peak=(300.0, 2400.0)),
 }

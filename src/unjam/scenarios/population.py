@@ -18,21 +18,21 @@ import numpy as np
 from safetensors.numpy import load, save
 
 from unjam import __version__
-from unjam.drivers.network import Network, network_arrays, network_from_arrays
-from unjam.errors import InputError, wrong, wrong_name
-from unjam.files import DAMAGED, SHIPPED, to_json, write_whole
-from unjam.parameters import build
+from unjam.drivers.network import Network, network_from_weights, network_weights
+from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.files import INVALID_DATA_ERRORS, PACKAGED_PREFIX, atomic_write, to_json
+from unjam.parameters import build_dataclass
 from unjam.physics.arrays import Array, clip, namespace
-from unjam.physics.idm import PARAMETER_NAMES, IDMParameters
+from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMParameters
 
-SHIPPED_PEOPLE = Path(str(files("unjam") / "scenarios/people"))
+PACKAGED_POPULATIONS = Path(str(files("unjam") / "scenarios/people"))
 """populations that are part of the package, results/field/measure.sh: five parameters of each driver's own"""
-FORMAT = 1
+POPULATION_FORMAT = 1
 RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
 """what the residual sees [m/s, m/s, m]"""
-LARGEST = 64 * 2**20
+MAX_POPULATION_BYTES = 64 * 2**20
 """bytes of a file"""
-WRITTEN = ("format", "unjam", "typical", "spread", "limits", "drivers", "residual")
+POPULATION_KEYS = ("format", "unjam", "typical", "parameter_statistics", "limits", "drivers", "residual")
 """keys of the file; others are `about`"""
 
 
@@ -49,16 +49,16 @@ class Population:
     """what all of them do beside their IDM: a network of RESIDUAL_INPUTS that answers [m/s2]"""
     details: tuple[dict[str, Any], ...] = field(default=(), repr=False)
     """of each driver, whatever else is known"""
-    about: dict[str, Any] = field(default_factory=dict, repr=False)
+    metadata: dict[str, Any] = field(default_factory=dict, repr=False)
     """where it comes from"""
 
     @property
-    def fastest(self) -> float:
+    def max_desired_speed(self) -> float:
         """The largest desired speed [m/s]."""
         return max(one.desired_speed for one in (self.typical, *self.drivers))
 
     @property
-    def quickest(self) -> float:
+    def min_time_headway(self) -> float:
         """The smallest time headway [s]."""
         return min(one.time_headway for one in (self.typical, *self.drivers))
 
@@ -66,10 +66,10 @@ class Population:
         """Return `count` drivers, drawn with replacement; each keeps its own parameters together."""
         return [self.drivers[index] for index in generator.integers(len(self.drivers), size=count)]
 
-    def spread(self) -> dict[str, dict[str, float]]:
+    def parameter_statistics(self) -> dict[str, dict[str, float]]:
         """Return mean, standard deviation and quartiles of each parameter."""
         found = {}
-        for name in PARAMETER_NAMES:
+        for name in IDM_PARAMETER_NAMES:
             values = np.array([getattr(one, name) for one in self.drivers])
             found[name] = {
                 "mean": float(values.mean()),
@@ -84,7 +84,7 @@ def residual_inputs(speed: Array, leader_speed: Array, gap: Array) -> Array:
     return namespace(gap).stack([speed, leader_speed - speed, gap], -1)
 
 
-def as_calibrated(
+def apply_population(
     population: Population | None, acceleration: Array, speed: Array, leader_speed: Array, gap: Array
 ) -> Array:
     """Return IDM accelerations with what a population adds to them: its residual and its limits [m/s2].
@@ -102,27 +102,27 @@ def write_population(path: Path, population: Population) -> None:
     """Write a population to `path`, its residual beside it."""
     residual = None
     if population.residual is not None:
-        weights = save(network_arrays(population.residual))
+        weights = save(network_weights(population.residual))
         beside = path.with_suffix(".safetensors")
         residual = {
             "file": beside.name,
             "sha256": hashlib.sha256(weights).hexdigest(),
             "authority": population.residual.authority,
         }
-        write_whole(beside, weights)
+        atomic_write(beside, weights)
     details = population.details or ({},) * len(population.drivers)
     drivers = [{**detail, **asdict(one)} for detail, one in zip(details, population.drivers, strict=True)]
     content = {
-        "format": FORMAT,
+        "format": POPULATION_FORMAT,
         "unjam": __version__,
         "typical": asdict(population.typical),
-        "spread": population.spread(),
+        "parameter_statistics": population.parameter_statistics(),
         "limits": list(population.limits),
         "residual": residual,
-        **population.about,
+        **population.metadata,
         "drivers": drivers,
     }
-    write_whole(path, to_json(content, indent=1))
+    atomic_write(path, to_json(content, indent=1))
 
 
 def population_file(name: Path | str) -> Path:
@@ -131,11 +131,11 @@ def population_file(name: Path | str) -> Path:
     Raises:
         InputError: none of that name is part of the package.
     """
-    if not str(name).startswith(SHIPPED):
+    if not str(name).startswith(PACKAGED_PREFIX):
         return Path(name)
-    known = {f"{SHIPPED}{path.stem}": path for path in sorted(SHIPPED_PEOPLE.glob("*.json"))}
+    known = {f"{PACKAGED_PREFIX}{path.stem}": path for path in sorted(PACKAGED_POPULATIONS.glob("*.json"))}
     if name not in known:
-        raise wrong_name("population", str(name), known)
+        raise unknown_name("population", str(name), known)
     return known[str(name)]
 
 
@@ -149,23 +149,23 @@ def read_population(name: Path | str) -> Population:
     if not os.path.exists(path):
         raise InputError(f"population: {str(path)!r} does not exist")
     if not os.path.isfile(path):  # a device would be read without end
-        raise wrong("population", str(path), "a file of `unjam fit-drivers`")
+        raise invalid_value("population", str(path), "a file of `unjam fit-drivers`")
     stamp = path.stat()
-    return _read(path, stamp.st_mtime_ns, stamp.st_size)
+    return _read_cached(path, stamp.st_mtime_ns, stamp.st_size)
 
 
 @lru_cache(maxsize=8)
-def _read(path: Path, changed: int, size: int) -> Population:
+def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
     """Read a file once, as long as it stays as it is: every episode asks for it."""
-    if size > LARGEST:
-        raise InputError(f"population {path.name}: {size} bytes are not allowed; allowed: <= {LARGEST}")
+    if size > MAX_POPULATION_BYTES:
+        raise InputError(f"population {path.name}: {size} bytes are not allowed; allowed: <= {MAX_POPULATION_BYTES}")
     try:
         content = json.loads(path.read_bytes())
-        if content["format"] != FORMAT:
+        if content["format"] != POPULATION_FORMAT:
             raise InputError(f"population {path.name}: format {content['format']!r} is unknown")
         drivers = tuple(
-            build(
-                IDMParameters, {name: one[name] for name in PARAMETER_NAMES}, f"population.drivers.{number}"
+            build_dataclass(
+                IDMParameters, {name: one[name] for name in IDM_PARAMETER_NAMES}, f"population.drivers.{number}"
             )
             for number, one in enumerate(content["drivers"])
         )
@@ -173,35 +173,33 @@ def _read(path: Path, changed: int, size: int) -> Population:
             raise InputError(f"population {path.name}: it has no drivers")
         low, high = (float(limit) for limit in content["limits"])
         if not (isfinite(low) and isfinite(high) and low < 0.0 < high):
-            raise ValueError(
-                f"limits: [{low:g}, {high:g}] are not allowed; allowed: one below and one above 0"
-            )
+            raise ValueError(f"limits: [{low:g}, {high:g}] are not allowed; allowed: one below and one above 0")
         return Population(
-            typical=build(IDMParameters, content["typical"], "population.typical"),
+            typical=build_dataclass(IDMParameters, content["typical"], "population.typical"),
             drivers=drivers,
             limits=(low, high),
-            residual=_residual(path, content["residual"]),
+            residual=_read_residual(path, content["residual"]),
             details=tuple(
-                {key: value for key, value in one.items() if key not in PARAMETER_NAMES}
+                {key: value for key, value in one.items() if key not in IDM_PARAMETER_NAMES}
                 for one in content["drivers"]
             ),
-            about={key: value for key, value in content.items() if key not in WRITTEN},
+            metadata={key: value for key, value in content.items() if key not in POPULATION_KEYS},
         )
-    except DAMAGED as error:
+    except INVALID_DATA_ERRORS as error:
         words = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise InputError(f"population {path.name}: not a population: {words}") from None
 
 
-def _residual(path: Path, named: dict[str, Any] | None) -> Network | None:
-    if named is None:
+def _read_residual(path: Path, entry: dict[str, Any] | None) -> Network | None:
+    if entry is None:
         return None
-    beside = path.parent / Path(str(named["file"])).name  # never a file of another folder
-    if beside.stat().st_size > LARGEST:
+    beside = path.parent / Path(str(entry["file"])).name  # never a file of another folder
+    if beside.stat().st_size > MAX_POPULATION_BYTES:
         raise InputError(f"population {path.name}: its residual is too large")
     weights = beside.read_bytes()
-    if hashlib.sha256(weights).hexdigest() != named["sha256"]:
+    if hashlib.sha256(weights).hexdigest() != entry["sha256"]:
         raise InputError(f"population {path.name}: damaged: {beside.name} does not have the hash it names")
-    network = network_from_arrays(load(weights), float(named["authority"]), 0.0)
-    if network.inputs != len(RESIDUAL_INPUTS):
-        raise InputError(f"population {path.name}: {network.inputs} inputs are not allowed; allowed: 3")
+    network = network_from_weights(load(weights), float(entry["authority"]), 0.0)
+    if network.input_size != len(RESIDUAL_INPUTS):
+        raise InputError(f"population {path.name}: {network.input_size} inputs are not allowed; allowed: 3")
     return network

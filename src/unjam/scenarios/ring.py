@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, Count, OneOrRange
+from unjam.parameters import STRICT, NumberOrRange, PositiveInt
 from unjam.physics.idm import equilibrium_speed
-from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_line
+from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_polyline
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
-EDGES = 4
+RING_EDGES = 4
 """of a ring"""
 
 
-class Place(NamedTuple):
+class EdgeSpan(NamedTuple):
     """Where along a closed road an edge lies."""
 
     name: str
@@ -33,10 +33,10 @@ class Place(NamedTuple):
         return self.start + self.length
 
 
-class Lap(NamedTuple):
+class LoopLayout(NamedTuple):
     """One closed road, and where vehicles stand on it."""
 
-    places: Sequence[Place]
+    edges: Sequence[EdgeSpan]
     """its edges, in driving order"""
     length: float
     """[m]"""
@@ -50,98 +50,98 @@ class Lap(NamedTuple):
 
 
 @dataclass(frozen=True, config=STRICT)
-class Loop(Scenario):
+class LoopScenario(Scenario):
     """What closed roads share: each episode draws their size anew."""
 
-    size: ClassVar[str]
+    size_parameter: ClassVar[str]
     """the parameter that is drawn, uniformly among the integers of its range [m]"""
-    about: ClassVar[str]
+    description: ClassVar[str]
     """in words, with braces for the sizes"""
-    about_limit: ClassVar[str]
+    limit_description: ClassVar[str]
     """what its limit is, in words"""
-    tells: ClassVar[tuple[str, ...]] = ("cav_share",)
-    first_in_front: ClassVar[bool] = False
+    provided_fields: ClassVar[tuple[str, ...]] = ("penetration_rate",)
+    is_first_leading: ClassVar[bool] = False
     """whether vehicle 0 leads the queue, and does not end it"""
 
     vehicles: Annotated[int, Field(ge=2)] = 22
     """on the road, CAVs among them"""
-    cavs: Count = 1
+    cavs: PositiveInt = 1
     """vehicles that are CAVs, evenly spread"""
 
     @model_validator(mode="after")
-    def _counts_fit(self) -> "Loop":
-        low, high = self._sizes
+    def _check_counts(self) -> "LoopScenario":
+        low, high = self._size_range
         if high < low:
-            raise ValueError(f"{self.size}: {high} m is not allowed as the largest; allowed: >= {low} m")
+            raise ValueError(f"{self.size_parameter}: {high} m is not allowed as the largest; allowed: >= {low} m")
         if self.cavs > self.vehicles:
             raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= vehicles, {self.vehicles}")
-        if self.human_control == "native" and self.calibrated and self.calibrated.residual is not None:
+        if self.human_control == "native" and self.driver_population and self.driver_population.residual is not None:
             raise ValueError(
                 "human_control: native is not allowed for a population with a residual network, which SUMO's "
                 "own IDM knows nothing of; allowed: commanded"
             )
         return self
 
-    def lap(self, size: float) -> Lap:
+    def layout(self, size: float) -> LoopLayout:
         """Return the road of a size [m]."""
         raise NotImplementedError
 
-    def limit(self, size: float) -> float:
+    def limit_speed(self, size: float) -> float:
         """Return the speed that the traffic cannot exceed in the long run on a road of a size [m/s]."""
         raise NotImplementedError
 
     def draw(self, generator: np.random.Generator) -> ClosedRoad:
         """Return a road of random size with its vehicles."""
-        size = float(generator.integers(*self._sizes, endpoint=True))
-        lap, ids = self.lap(size), self._vehicle_ids()
-        routes, entries = _entries(lap, ids, self.seconds * self.top_speed)
+        size = float(generator.integers(*self._size_range, endpoint=True))
+        lap, ids = self.layout(size), self._vehicle_ids()
+        routes, entries = _entries(lap, ids, self.max_duration * self.top_speed)
         return ClosedRoad(
             network=lap.network,
             routes=routes,
             entries=entries,
             vehicle_ids=ids,
-            cav_ids=self.possible_cavs(),
+            cav_ids=self.possible_cav_ids(),
             start_positions=lap.positions,
             loop_length=lap.length,
             crossings=lap.crossings,
-            limit_speed=self.limit(size),
-            outline=lap.outline,
-            drawn={self.size: size},
-            people=self.draw_people(ids, generator),
+            limit_speed=self.limit_speed(size),
+            center_line=lap.outline,
+            drawn_values={self.size_parameter: size},
+            human_parameters=self.draw_humans(ids, generator),
         )
 
     @property
     def drawn_ranges(self) -> dict[str, tuple[float, float]]:
         """The size."""
-        return {self.size: self._sizes}
+        return {self.size_parameter: self._size_range}
 
-    def part(self, index: int, count: int) -> Self:
+    def stratum(self, index: int, count: int) -> Self:
         """Return this road with one of `count` equal parts of its sizes, both ends included."""
-        low, high = self._sizes
+        low, high = self._size_range
         borders = np.linspace(low, high + 1, count + 1).astype(int)
         first, last = int(borders[index]), int(borders[index + 1]) - 1
-        return replace(self, **{self.size: (first, max(first, last))})
+        return replace(self, **{self.size_parameter: (first, max(first, last))})
 
-    def possible_cavs(self) -> tuple[str, ...]:
+    def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of the CAVs, in the order in which they stand along the road."""
         return tuple(name for name in self._vehicle_ids() if name.startswith("cav"))
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the road's own facts for `unjam scenarios`."""
-        ends = dict.fromkeys(self._sizes)
+        ends = dict.fromkeys(self._size_range)
         return [
-            ("road", self.about.format("-".join(map(str, ends)))),
+            ("road", self.description.format("-".join(map(str, ends)))),
             ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
-            ("limit", "-".join(f"{self.limit(size):.2f}" for size in ends) + " m/s"),
-            ("limit is", self.about_limit),
+            ("limit_speed", "-".join(f"{self.limit_speed(size):.2f}" for size in ends) + " m/s"),
+            ("limit is", self.limit_description),
         ]
 
     @property
-    def _sizes(self) -> tuple[int, int]:
-        return getattr(self, self.size)
+    def _size_range(self) -> tuple[int, int]:
+        return getattr(self, self.size_parameter)
 
     @property
-    def _needed(self) -> float:
+    def _min_length(self) -> float:
         """Road that the vehicles need at least [m]."""
         return self.vehicles * (VEHICLE_LENGTH + self.humans.minimum_gap)
 
@@ -149,11 +149,11 @@ class Loop(Scenario):
         """Return all ids in the order along the road; CAVs are evenly spread, vehicle 0 is one of them."""
         chosen = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
         ids = [f"{'cav' if index in chosen else 'human'}_{index}" for index in range(self.vehicles)]
-        return tuple(reversed(ids) if self.first_in_front else ids)
+        return tuple(reversed(ids) if self.is_first_leading else ids)
 
 
 @dataclass(frozen=True, config=STRICT)
-class Ring(Loop):
+class Ring(LoopScenario):
     """Vehicles on a circle, evenly spaced and standing at the start; the length is new in each episode.
 
     The paper's ring has 22 vehicles, one of them a CAV, on 220 to 270 m. At that density the IDM's own
@@ -162,70 +162,64 @@ class Ring(Loop):
 
     title: ClassVar[str] = "ring"
     reward: ClassVar[str] = "released"
-    size: ClassVar[str] = "length"
-    about: ClassVar[str] = "ring of {} m"
-    about_limit: ClassVar[str] = (
-        "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"
-    )
+    size_parameter: ClassVar[str] = "length"
+    description: ClassVar[str] = "ring of {} m"
+    limit_description: ClassVar[str] = "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"
 
-    length: Annotated[tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]], OneOrRange] = (
-        220,
-        270,
-    )
+    length: Annotated[tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]], NumberOrRange] = (220, 270)
     """shortest and longest ring, drawn uniformly among the integers between them; or one length [m]"""
 
     @model_validator(mode="after")
-    def _fits(self) -> "Ring":
+    def _check_length(self) -> "Ring":
         shortest = self.length[0]
-        if shortest < self._needed:
+        if shortest < self._min_length:
             raise ValueError(
-                f"length: {shortest} m is not allowed for {self.vehicles} vehicles; "
-                f"allowed: >= {self._needed:g} m"
+                f"length: {shortest} m is not allowed for {self.vehicles} vehicles; allowed: >= {self._min_length:g} m"
             )
         return self
 
-    def lap(self, size: float) -> Lap:
+    def layout(self, size: float) -> LoopLayout:
         """Return the circle of a length [m], of equal edges."""
-        each = size / EDGES
+        each = size / RING_EDGES
         coordinates = np.linspace(0, size, 161)
-        return Lap(
-            places=[Place(f"edge_{index}", index * each, each) for index in range(EDGES)],
+        return LoopLayout(
+            edges=[EdgeSpan(f"edge_{index}", index * each, each) for index in range(RING_EDGES)],
             length=size,
             positions=np.arange(self.vehicles, dtype=np.float64) * (size / self.vehicles),
-            network=_circle(size, self.top_speed),
-            outline=np.column_stack([coordinates, _on_circle(2 * np.pi * coordinates / size, size)]),
+            network=_circle_network(size, self.top_speed),
+            outline=np.column_stack([coordinates, _circle_points(2 * np.pi * coordinates / size, size)]),
         )
 
-    def limit(self, size: float) -> float:
+    def limit_speed(self, size: float) -> float:
         """Return the IDM's equilibrium speed on a ring of this length [m/s]."""
         return equilibrium_speed(size / self.vehicles - VEHICLE_LENGTH, self.humans)
 
 
-def _entries(lap: Lap, ids: Sequence[str], way: float) -> tuple[tuple[Route, ...], tuple[Entry, ...]]:
+def _entries(
+    layout: LoopLayout, ids: Sequence[str], min_distance: float
+) -> tuple[tuple[Route, ...], tuple[Entry, ...]]:
     """Return routes from each edge on, at least `way` [m] long, and the vehicles that stand there."""
-    places = lap.places
-    laps = int(way / sum(place.length for place in places)) + 2
+    places = layout.edges
+    laps = int(min_distance / sum(place.length for place in places)) + 2
     names = [place.name for place in places]
-    routes = [
-        Route(f"from_{name}", (*names[first:], *names[:first]), laps) for first, name in enumerate(names)
-    ]
+    routes = [Route(f"from_{name}", (*names[first:], *names[:first]), laps) for first, name in enumerate(names)]
     entries = []
-    for name, position in zip(ids, lap.positions.tolist(), strict=True):
+    for name, position in zip(ids, layout.positions.tolist(), strict=True):
         edge = max((place for place in places if place.start <= position), key=lambda place: place.start)
         entries.append(Entry(name, f"from_{edge.name}", min(position - edge.start, edge.length)))
     return tuple(routes), tuple(entries)
 
 
-def _on_circle(angles: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+def _circle_points(angles: NDArray[np.float64], length: float) -> NDArray[np.float64]:
     return length / (2 * np.pi) * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _circle(length: float, speed: float) -> RoadNetwork:
-    corners = _on_circle(2 * np.pi * np.arange(EDGES) / EDGES, length)
-    nodes = tuple(Node(f"node_{index}", x, y, priority=True) for index, (x, y) in enumerate(corners.tolist()))
+def _circle_network(length: float, speed: float) -> RoadNetwork:
+    corners = _circle_points(2 * np.pi * np.arange(RING_EDGES) / RING_EDGES, length)
+    nodes = tuple(Node(f"node_{index}", x, y, has_priority=True) for index, (x, y) in enumerate(corners.tolist()))
     edges = []
-    for index in range(EDGES):
-        line = _on_circle(2 * np.pi * (index + np.linspace(0, 1, 41)) / EDGES, length)
-        begin, end = nodes[index].name, nodes[(index + 1) % EDGES].name
-        edges.append(Edge(f"edge_{index}", begin, end, length / EDGES, shape=as_line(line)))
-    return RoadNetwork(nodes, tuple(edges), speed, links=False)
+    for index in range(RING_EDGES):
+        line = _circle_points(2 * np.pi * (index + np.linspace(0, 1, 41)) / RING_EDGES, length)
+        begin, end = nodes[index].name, nodes[(index + 1) % RING_EDGES].name
+        edges.append(Edge(f"edge_{index}", begin, end, length / RING_EDGES, shape=as_polyline(line)))
+    return RoadNetwork(nodes, tuple(edges), speed, has_internal_links=False)

@@ -7,15 +7,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.roadside import Roadside
+from unjam.drivers.roadside import RoadsideSettings
 from unjam.physics.idm import IDMParameters
 from unjam.sumo_files import SumoFiles
 
-Line = tuple[tuple[float, float], ...]
+Polyline = tuple[tuple[float, float], ...]
 """points (x, y) [m]"""
 
 
-def as_line(points: NDArray[np.float64]) -> Line:
+def as_polyline(points: NDArray[np.float64]) -> Polyline:
     """Return points of shape (n, 2) as a line."""
     return tuple((x, y) for x, y in points.tolist())
 
@@ -28,7 +28,7 @@ class Node(NamedTuple):
     """[m]"""
     y: float
     """[m]"""
-    priority: bool = False
+    has_priority: bool = False
     """whether priorities of the edges decide who goes first"""
     radius: float | None = None
     """of its junction [m]; None: the simulator's"""
@@ -38,27 +38,27 @@ class Edge(NamedTuple):
     """A stretch of road between two nodes."""
 
     name: str
-    begin: str
-    end: str
+    from_node: str
+    to_node: str
     length: float
     """[m]"""
     priority: int | None = None
     """larger goes first where edges meet"""
-    shape: Line = ()
+    shape: Polyline = ()
     """empty: straight"""
     lanes: int = 1
-    speed: float | None = None
+    speed_limit: float | None = None
     """what it allows [m/s]; None: what the network does"""
 
 
 class Connection(NamedTuple):
     """An edge that another one follows, or a lane that follows a lane; lanes count from 0 at the right."""
 
-    before: str
-    after: str
-    lane: int | None = None
+    from_edge: str
+    to_edge: str
+    from_lane: int | None = None
     """None: all lanes, as the simulator connects them"""
-    lane_after: int | None = None
+    to_lane: int | None = None
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class RoadNetwork:
 
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
-    speed: float
+    speed_limit: float
     """what every edge allows that says nothing else [m/s]"""
-    links: bool = True
+    has_internal_links: bool = True
     """whether ways across junctions have a length of their own"""
     connections: tuple[Connection, ...] = ()
     """empty: all that are possible"""
@@ -96,8 +96,8 @@ class Entry(NamedTuple):
     time: float = 0.0
     """[s]"""
     lane: int = 0
-    kind: str = ""
-    """of the road's `kinds`; empty: as the scenario's people"""
+    vehicle_type: str = ""
+    """of the road's `vehicle_types`; empty: as the scenario's people"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +106,9 @@ class Road:
 
     limit_speed: float
     """speed that the traffic cannot exceed in the long run [m/s]: the scenario's own limit; NaN: unknown"""
-    drawn: dict[str, float] = field(default_factory=dict)
+    drawn_values: dict[str, float] = field(default_factory=dict)
     """what the episode's seed has drawn, by name"""
-    people: dict[str, IDMParameters] = field(default_factory=dict)
+    human_parameters: dict[str, IDMParameters] = field(default_factory=dict)
     """how each vehicle's human driver drives, by vehicle; empty: all as the scenario says"""
 
 
@@ -136,15 +136,15 @@ class ClosedRoad(BuiltRoad):
     """length of the closed road [m]"""
     crossings: tuple[tuple[float, float], ...]
     """where along the road it crosses another way: there SUMO drives commanded people itself [m]"""
-    outline: NDArray[np.float64]
+    center_line: NDArray[np.float64]
     """the road's centre line: rows (coordinate along the route, x, y) [m]"""
 
-    def share_told(self, asked: Collection[str]) -> float | None:
+    def provided_penetration_rate(self, required_fields: Collection[str]) -> float | None:
         """Return the share of CAVs, as a service tells it, where it is among what a driver asks for."""
-        return len(self.cav_ids) / len(self.vehicle_ids) if "cav_share" in asked else None
+        return len(self.cav_ids) / len(self.vehicle_ids) if "penetration_rate" in required_fields else None
 
 
-class Person(NamedTuple):
+class VehicleType(NamedTuple):
     """How somebody drives on a motorway, as SUMO's car-following models take it."""
 
     model: str
@@ -155,23 +155,23 @@ class Person(NamedTuple):
     """[m/s2]"""
     deceleration: float
     """comfortable [m/s2]"""
-    gap: float
+    minimum_gap: float
     """to who stands ahead [m]"""
     speed_factor: float
     """wanted speed over what the road allows"""
 
 
-class Lane(NamedTuple):
+class EdgeLane(NamedTuple):
     """A lane of an edge, and which way it is part of: a way is lanes one after the other."""
 
     name: str
     """the simulator's"""
-    way: int
+    lane_index: int
     start: float
     """where along the main road it begins [m]"""
-    speed: float
+    speed_limit: float
     """what it allows [m/s]"""
-    closing: bool = False
+    is_merging: bool = False
     """whether it leads nowhere and is there to change lanes: nobody is commanded on its edge"""
 
 
@@ -193,12 +193,12 @@ class Origin(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergingRoad(BuiltRoad, OpenRoad):
+class MergeRoad(BuiltRoad, OpenRoad):
     """A main road that a ramp joins, with one lane each."""
 
     origins: dict[str, Origin]
     """of all vehicles that may enter"""
-    junctions: tuple[float, float]
+    junction_lengths: tuple[float, float]
     """lengths of the ways across the junction, of main road and ramp [m]; they end where the ways meet, and
     there SUMO drives commanded people itself"""
 
@@ -207,13 +207,13 @@ class MergingRoad(BuiltRoad, OpenRoad):
 class MotorwayRoad(BuiltRoad, OpenRoad):
     """A main road with lanes that ramps join; people differ and overtake."""
 
-    kinds: dict[str, Person]
+    vehicle_types: dict[str, VehicleType]
     """the people that there are, by name"""
-    lanes: tuple[Lane, ...]
+    edge_lanes: tuple[EdgeLane, ...]
     """of all edges"""
-    ways: tuple[str, ...]
+    lane_names: tuple[str, ...]
     """names of the ways that lanes join to, from right to left"""
-    merge: float
+    merge_position: float
     """where along the main road the ramp's lane begins to run beside it [m]"""
     length: float
     """of the main road [m]"""
@@ -221,19 +221,19 @@ class MotorwayRoad(BuiltRoad, OpenRoad):
     """of every vehicle [m]"""
     peak: tuple[float, float]
     """from when to when the most vehicles want to enter [s]"""
-    free_time: float
+    free_flow_time: float
     """mean travel time of people where they are few [s]"""
-    roadside: Roadside
+    roadside: RoadsideSettings
     """what CAVs are told of the road ahead"""
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnRoad(OpenRoad):
+class UserNetworkRoad(OpenRoad):
     """A network of the user's own, with all its traffic."""
 
     files: SumoFiles
     """what its files say"""
-    cav_share: float
+    penetration_rate: float
     """share of the vehicles that become CAVs"""
     cav_types: tuple[str, ...]
     """vehicle types all of whose vehicles become CAVs"""
@@ -245,7 +245,7 @@ class OwnRoad(OpenRoad):
     """at most so many of them, the first that enter"""
     drivers: tuple[IDMParameters, ...] = ()
     """calibrated people, one of whom drives each car; nobody where all drive as their types say"""
-    driven_types: frozenset[str] = frozenset()
+    calibrated_types: frozenset[str] = frozenset()
     """vehicle types that they drive"""
-    roadside: Roadside = field(default_factory=Roadside)
+    roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
     """what CAVs are told of the road ahead"""

@@ -2,7 +2,7 @@
 
 Such files may come from anywhere. So that none can harm who asks, `program.py` reads them in a process of its
 own that `unjam.sandbox` limits, and answers one JSON document. What SUMO would write, and where it would
-listen, is never passed on to it: see `copy_harmless`.
+listen, is never passed on to it: see `write_harmless_copy`.
 """
 
 import json
@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from unjam import sandbox
-from unjam.children import child_environment, python_command
-from unjam.errors import InputError, did_you_mean, wrong
-from unjam.sumo_files.reader import IN_PARAMETERS, TO_FILES, stamp_of
+from unjam.child_processes import child_environment, python_command
+from unjam.errors import InputError, invalid_value, spelling_hint
+from unjam.sumo_files.reader import FILE_ATTRIBUTES, FILE_PARAMETER_PARTS, file_stamp
 
-PROGRAM = Path(__file__).with_name("program.py")
-LARGEST_MEMORY = 4 * 2**30
+READER_PROGRAM = Path(__file__).with_name("program.py")
+MAX_READER_MEMORY = 4 * 2**30
 """bytes that reading may take"""
-LONGEST_TIME = 120
+MAX_READER_TIME = 120
 """seconds that reading may take"""
 
-Lane = tuple[str, float, list[tuple[float, float]]]
+LaneShape = tuple[str, float, list[tuple[float, float]]]
 """edge, length [m] and centre line [(x, y), m]"""
-PASSED = {
+PASSED_OPTIONS = {
     *("begin", "end", "junction-taz", "weight-attribute", "step-method.ballistic", "extrapolate-departpos"),
     *("lateral-resolution", "route-steps", "no-internal-links", "ignore-junction-blocker"),
     *("ignore-route-errors", "ignore-accidents", "intermodal-collision.action", "collision.stoptime"),
@@ -38,7 +38,7 @@ PASSED = {
     *("thread-rngs", "phemlight-year", "phemlight-temperature"),
 }
 """options that only say how to simulate"""
-PASSED_GROUPS = (
+PASSED_OPTION_PREFIXES = (
     *("time-to-teleport.", "lanechange.", "tls.", "railsignal.", "railsignal-moving-block", "default."),
     *("overhead-wire.", "emergencydecel.", "parking.", "pedestrian.striping.", "ride.", "mapmatch."),
     *("weights.", "persontrip.", "railway.", "device.rerouting.", "person-device.rerouting."),
@@ -47,7 +47,7 @@ PASSED_GROUPS = (
     *("device.elechybrid.", "pedestrian.jupedsim.", "meso-"),
 )
 """what the names of others of them begin with"""
-OTHERWISE = {
+IGNORED_OPTIONS = {
     *("step-length", "no-step-log", "no-warnings", "aggregate-warnings", "verbose", "start"),
     *("duration-log.disable", "duration-log.statistics"),
     *("xml-validation", "xml-validation.net", "xml-validation.routes", "gui-settings-file", "quit-on-end"),
@@ -60,16 +60,16 @@ OTHERWISE = {
     *("gui-testing-debug", "suppress-warnings", "no-duration-log", *"vtgdHWXVQGSDTBmN?"),
 }
 """options that unjam decides itself, or that change nothing: of no interest where they are left out"""
-REPLACED = ("seed", "random", "max-depart-delay")
+REPLACED_OPTIONS = ("seed", "random", "max-depart-delay")
 """options that change the traffic, and for which unjam has a value of its own"""
-NOT_WRITTEN = re.compile(
+OUTPUT_OPTIONS = re.compile(
     r"output|^(write-|save-|netstate|ndump|dump-|summary$|tripinfo$|personinfo$|vehroutes|personroutes$)"
     r"|^(log|log-file|message-log|error-log|precision\.geo|person-fcd|remote-port|num-clients|l|C)$"
     r"|^(person-)?device\.(fcd|ssm|tripinfo|vehroute|btsender|btreceiver|example)\."
     r"|^device\.toc\.file$|^device\.fcd-replay\.(?!files)|^pedestrian\.jupedsim\.(wkt|py)"
 )
 """options about what SUMO writes, and where it listens: without them the traffic is the same"""
-REFUSED = {
+REFUSED_OPTIONS = {
     "load-state": "no file, as episodes begin on an empty road; begin earlier, with --set warmup=600",
     "astar.all-distances": "no file, as unjam cannot check what is in it",
     "astar.landmark-distances": "no file, as unjam cannot check what is in it",
@@ -77,7 +77,7 @@ REFUSED = {
     "phemlight-path": "./PHEMlight/, SUMO's default",
 }
 """options that change what is simulated, and that SUMO cannot be told; with what is allowed instead"""
-FILED = ("file", "output", "threads", ".wkt", ".py")
+HARMFUL_OPTION_PARTS = ("file", "output", "threads", ".wkt", ".py")
 """what is in the names of options that belong to these groups and are harmful all the same"""
 
 
@@ -104,11 +104,11 @@ class SumoFiles(NamedTuple):
     """[s]"""
     options: dict[str, str]
     """what else SUMO may be told of it, by name: harmless ways of simulating"""
-    dropped: tuple[str, ...]
+    dropped_items: tuple[str, ...]
     """options and elements that are left out: they only write or listen"""
-    replaced: tuple[str, ...]
+    replaced_options: tuple[str, ...]
     """options that change the traffic, and for which unjam has a value of its own"""
-    to_copy: dict[Path, tuple[Path, ...]]
+    copy_sources: dict[Path, tuple[Path, ...]]
     """files that SUMO gets a harmless copy of, and what the copy is made from; it reads others themselves"""
     types: dict[str, dict[str, str]]
     """attributes of all vehicle types, by id"""
@@ -118,7 +118,7 @@ class SumoFiles(NamedTuple):
     """types that vehicles have"""
 
 
-_known: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
+_read_files: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
 """what was read already, with the stamps of all files that were read for it"""
 _answers: dict[str, dict[str, Any]] = {}
 """of each configuration that was read: what the program answered, as it is passed on to other processes"""
@@ -131,11 +131,11 @@ def read_sumo_files(path: Path) -> SumoFiles:
         InputError: one is missing, broken or too large, the network has no version, or there are no
             vehicles.
     """
-    if path in _known:
-        stamps, files = _known[path]
-        if all(file.is_file() and stamp_of(file) == before for file, before in stamps.items()):
+    if path in _read_files:
+        stamps, files = _read_files[path]
+        if all(file.is_file() and file_stamp(file) == before for file, before in stamps.items()):
             return files
-    return take_answer(str(path), _ask("configuration", path))
+    return take_answer(str(path), _run_reader("configuration", path))
 
 
 def answer_of(path: str) -> dict[str, Any] | None:
@@ -154,56 +154,51 @@ def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
     found["network"], found["sources"] = Path(found["network"]), tuple(stamps)
     for name in ("additional_files", "route_files", "weight_files"):
         found[name] = tuple(map(Path, found[name]))
-    found["to_copy"] = {Path(each): tuple(map(Path, made)) for each, made in found["to_copy"].items()}
+    found["copy_sources"] = {Path(each): tuple(map(Path, made)) for each, made in found["copy_sources"].items()}
     found["used_types"] = frozenset(found["used_types"])
     options: dict[str, str] = found["options"]
-    kinds = {name: kind_of_option(path.name, name, value) for name, value in options.items()}
+    kinds = {name: classify_option(path.name, name, value) for name, value in options.items()}
     found["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
-    found["dropped"] = (
-        *(f"option {name}" for name in options if kinds[name] == "not written"),
-        *found["dropped"],
-    )
-    found["replaced"] = tuple(name for name in options if kinds[name] == "replaced")
+    found["dropped_items"] = (*(f"option {name}" for name in options if kinds[name] == "not written"), *found["dropped_items"])
+    found["replaced_options"] = tuple(name for name in options if kinds[name] == "replaced")
     files = SumoFiles(path, **found)
-    _known[path], _answers[file] = (stamps, files), answer
+    _read_files[path], _answers[file] = (stamps, files), answer
     return files
 
 
-def kind_of_option(
-    file: str, name: str, value: str
-) -> Literal["passed", "ignored", "replaced", "not written"]:
+def classify_option(file: str, name: str, value: str) -> Literal["passed", "ignored", "replaced", "not written"]:
     """Return what becomes of an option of a configuration.
 
     Raises:
         InputError: SUMO has no such option, or it changes the traffic and cannot be passed on.
     """
-    if is_passed(name):
+    if is_passed_option(name):
         return "passed"
-    if name in OTHERWISE:
+    if name in IGNORED_OPTIONS:
         return "ignored"
-    if name in REPLACED:
+    if name in REPLACED_OPTIONS:
         return "replaced"
-    if NOT_WRITTEN.search(name):
+    if OUTPUT_OPTIONS.search(name):
         return "not written"
-    if name not in REFUSED:
-        known = [*PASSED, *OTHERWISE, *REPLACED, *REFUSED]
-        raise InputError(f"{file}: {name}: SUMO 1.28 has no such option{did_you_mean(name, known)}")
-    if value == REFUSED[name].partition(",")[0]:  # as in a configuration that lists all defaults
+    if name not in REFUSED_OPTIONS:
+        known = [*PASSED_OPTIONS, *IGNORED_OPTIONS, *REPLACED_OPTIONS, *REFUSED_OPTIONS]
+        raise InputError(f"{file}: {name}: SUMO 1.28 has no such option{spelling_hint(name, known)}")
+    if value == REFUSED_OPTIONS[name].partition(",")[0]:  # as in a configuration that lists all defaults
         return "ignored"
-    raise wrong(f"{file}: {name}", value, REFUSED[name])
+    raise invalid_value(f"{file}: {name}", value, REFUSED_OPTIONS[name])
 
 
-def read_lanes(path: Path) -> list[Lane]:
+def read_lanes(path: Path) -> list[LaneShape]:
     """Return all lanes of a network file.
 
     Raises:
         InputError: it is broken, or too large.
     """
-    lanes = _ask("lanes", path)
+    lanes = _run_reader("lanes", path)
     return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in lanes]
 
 
-def copy_harmless(path: Path, copy: Path, types: Path | None = None) -> None:
+def write_harmless_copy(path: Path, copy: Path, types: Path | None = None) -> None:
     """Write one of SUMO's files again without what makes SUMO write a file, listen, or read another file.
 
     Vehicle types get the attributes that a JSON file `types` has for them, by id.
@@ -211,40 +206,42 @@ def copy_harmless(path: Path, copy: Path, types: Path | None = None) -> None:
     Raises:
         InputError: it is broken, or too large.
     """
-    _ask("copy", path, copy, *([types] if types else []))
+    _run_reader("copy", path, copy, *([types] if types else []))
 
 
 def is_harmless_attribute(name: str) -> bool:
     """Return whether SUMO may read an attribute of a vehicle type: it names no file."""
-    return name not in TO_FILES and not name.endswith("File")
+    return name not in FILE_ATTRIBUTES and not name.endswith("File")
 
 
 def is_harmless_parameter(key: str) -> bool:
     """Return whether SUMO may read a `<param>` of a vehicle type: it makes SUMO write no file."""
-    return not any(word in key.lower() for word in IN_PARAMETERS)
+    return not any(word in key.lower() for word in FILE_PARAMETER_PARTS)
 
 
-def _ask(command: Literal["configuration", "lanes", "copy"], path: Path, *more: Path) -> Any:
+def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, *extra_paths: Path) -> Any:
     """Return what the program answers; raise `InputError` where it says what is wrong, or is lost."""
-    limits = [str(LARGEST_MEMORY), str(LONGEST_TIME), str(more[0].parent) if more else ""]
-    program = python_command("-I", "-S", sandbox.__file__, *limits, str(PROGRAM), command)
+    limits = [str(MAX_READER_MEMORY), str(MAX_READER_TIME), str(extra_paths[0].parent) if extra_paths else ""]
+    program = python_command("-I", "-S", sandbox.__file__, *limits, str(READER_PROGRAM), command)
     try:
         done = subprocess.run(
-            [*program, str(path), *map(str, more)],
+            [*program, str(path), *map(str, extra_paths)],
             capture_output=True,
-            timeout=LONGEST_TIME,
+            timeout=MAX_READER_TIME,
             env=child_environment(),
             check=False,
         )
         answer = json.loads(done.stdout)
     except (subprocess.TimeoutExpired, ValueError):
-        limits = f"{LARGEST_MEMORY / 2**30:g} GiB, {LONGEST_TIME:g} s"
+        limits = f"{MAX_READER_MEMORY / 2**30:g} GiB, {MAX_READER_TIME:g} s"
         raise InputError(f"{path.name}: its files cannot be read within {limits}") from None
     if "broken" in answer:
         raise InputError(answer["broken"])
     return answer["found"]
 
 
-def is_passed(name: str) -> bool:
+def is_passed_option(name: str) -> bool:
     """Return whether SUMO may be told an option: it only says how to simulate."""
-    return name in PASSED or (name.startswith(PASSED_GROUPS) and not any(word in name for word in FILED))
+    return name in PASSED_OPTIONS or (
+        name.startswith(PASSED_OPTION_PREFIXES) and not any(word in name for word in HARMFUL_OPTION_PARTS)
+    )

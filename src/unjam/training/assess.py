@@ -10,73 +10,67 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from unjam.controller import BEST, make_driver
+from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
-from unjam.errors import InputError, NoCavError, wrong
-from unjam.files import to_json, write_whole
+from unjam.errors import InputError, NoCavError, invalid_value
+from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
-from unjam.measures.effect import AccResult, Judged, headline, recommended, shown_beside
-from unjam.measures.notes import check_baseline, notes_of_rows
-from unjam.measures.statistics import estimate_of
+from unjam.measures.effect import AccResult, ControllerResult, assessment_headline, plotted_result, recommended_result
+from unjam.measures.notes import check_baseline, episode_notes
+from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
-from unjam.scenarios import NAMED_BEFORE, make_scenario, scenario_recipe
-from unjam.scenarios.own_network import WITH_OWN_ACC, OwnNetwork
+from unjam.scenarios import OLD_PARAMETER_NAMES, make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.training.choice import (
-    ACC,
-    HUMAN,
-    UNCHANGED_ACC,
-    Budget,
-    Choice,
-    Findings,
-    OnLine,
+from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
+from unjam.training.evaluate import Evaluation, evaluate_on_roads, raise_failure, save_evaluation
+from unjam.training.run_folder import make_new_folder
+from unjam.training.seeds import make_test_seeds
+from unjam.training.selection import (
+    ACC_DRIVER,
+    HUMAN_BASELINE,
+    UNCHANGED_ACC_DRIVER,
+    EpisodeBudget,
+    EpisodeSeed,
     Option,
-    Rows,
-    Seed,
-    choose,
-    in_words,
-    judge,
-    least_episodes,
+    OptionMessageCallback,
+    OptionRows,
+    Selection,
+    TestFindings,
+    compare_on_test_seeds,
+    format_duration,
+    min_episodes,
+    select_controllers,
 )
-from unjam.training.evaluate import Evaluation, evaluate_each, raise_failure, save_evaluation
-from unjam.training.folder import make_new_folder
-from unjam.training.seeds import held_out_seeds
 from unjam.worlds.episode import can_drive
-from unjam.worlds.workers import Workers
+from unjam.worlds.worker_pool import WorkerPool
 
-DRIVERS_OF_OPEN_ROADS = (BEST, "follower-stopper", "pi")
+DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
 """controllers that are tried where none is named: they fit roads with ends"""
-PROPERTIES = ("acceleration", "deceleration", "keep_right", "overtake")
+ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "overtake")
 """settings of the CAVs' ACC that replace a property of the vehicle"""
-ENOUGH_BASELINE = 20
+MIN_BASELINE_EPISODES = 20
 """episodes of the baseline for which early ends are counted before the last one: two of them are too many"""
-FOR_PICTURES = 2
+PLOT_EPISODE_COUNT = 2
 """episodes of the budget that are kept for pictures"""
-NOBODY = 1e-12
+ZERO_PENETRATION_RATE = 1e-12
 """share of CAVs where people are alone: a network without any is not allowed"""
-CHOOSING = "choosing"
+SELECTION_FOLDER = "choosing"
 """folder within the results: the rows of the seeds that chose"""
-WHO_IS_A_CAV = "cav_share", "cav_types", "cavs"
+CAV_SELECTION_OPTIONS = "penetration_rate", "cav_types", "cavs"
 """settings of a road that the penetration rates stand for"""
-METRICS_OF_PEOPLE = (
-    "travel_time",
-    "throughput_veh_per_h",
-    "fuel_ml_per_km",
-    "people_beyond_4_5",
-    "collisions",
-)
+BASELINE_METRICS = ("travel_time", "outflow_veh_per_h", "fuel_ml_per_km", "people_beyond_4_5", "collisions")
 
 
 @dataclass(frozen=True)
-class Question:
+class AssessmentRequest:
     """What is asked of a road; everything in it has been checked."""
 
     file: str
-    road: OwnNetwork
+    network: UserNetwork
     """with human drivers alone"""
     drivers: dict[str, Driver]
     """the controllers"""
-    shares: tuple[float, ...]
+    penetration_rates: tuple[float, ...]
     episodes: int
     """at most, in all"""
     minutes: float | None
@@ -87,69 +81,71 @@ class Question:
     @property
     def options(self) -> list[Option]:
         """All penetration rates with all controllers."""
-        return [Option(share, driver) for share in self.shares for driver in self.drivers]
+        return [Option(share, driver) for share in self.penetration_rates for driver in self.drivers]
 
     @property
-    def sets_properties(self) -> bool:
+    def has_acc_properties(self) -> bool:
         """Whether the user replaces a property of the vehicles by another one for CAVs."""
-        return any(getattr(self.road.cruise, name) is not None for name in PROPERTIES)
+        return any(getattr(self.network.cruise, name) is not None for name in ACC_PROPERTIES)
 
-    def setup(self, option: Option) -> tuple[Scenario, Driver]:
+    def make_setup(self, option: Option) -> tuple[Scenario, Driver]:
         """Return the road with so many CAVs, and their driver."""
-        if option == HUMAN:
-            return self.road, make_driver(HUMAN.driver, self.road.decision_step)
-        road = replace(self.road, cav_share=option.share)
-        if option.driver not in (ACC, UNCHANGED_ACC):
+        if option == HUMAN_BASELINE:
+            return self.network, make_driver(HUMAN_BASELINE.driver, self.network.control_step)
+        road = replace(self.network, penetration_rate=option.penetration_rate)
+        if option.driver not in (ACC_DRIVER, UNCHANGED_ACC_DRIVER):
             return road, self.drivers[option.driver]
         cruise = road.cruise
-        if option.driver == UNCHANGED_ACC:
-            cruise = replace(cruise, **dict.fromkeys(PROPERTIES))
+        if option.driver == UNCHANGED_ACC_DRIVER:
+            cruise = replace(cruise, **dict.fromkeys(ACC_PROPERTIES))
         safety = replace(road.safety, active=False)
         return replace(road, actuation="cruise", safety=safety, cruise=cruise), make_driver(
-            ACC, road.decision_step
+            ACC_DRIVER, road.control_step
         )
 
 
-def question(
+def make_request(
     file: str,
-    shares: Sequence[float],
+    penetration_rates: Sequence[float],
     episodes: int,
     precision: float,
     minutes: float | None = None,
-    drivers: Sequence[str] = DRIVERS_OF_OPEN_ROADS,
-    changes: dict[str, Any] | None = None,
-) -> Question:
+    drivers: Sequence[str] = DEFAULT_CONTROLLERS,
+    options: dict[str, Any] | None = None,
+) -> AssessmentRequest:
     """Return a question whose parts have been checked; a share of 0 is always asked for.
 
     Raises:
         InputError: one of them is wrong.
     """
     if not file.endswith(".sumocfg"):
-        raise wrong("scenario", file, "your own .sumocfg file")
-    for name in [name for name in changes or {} if NAMED_BEFORE.get(name, name) in WHO_IS_A_CAV]:
+        raise invalid_value("scenario", file, "your own .sumocfg file")
+    for name in [name for name in options or {} if OLD_PARAMETER_NAMES.get(name, name) in CAV_SELECTION_OPTIONS]:
         raise InputError(f"{name}: it is not allowed here: --shares says how many vehicles are CAVs")
-    for share in shares:
+    for share in penetration_rates:
         if not 0 <= share <= 1:
-            raise wrong("shares", share, ">= 0, <= 1")
-    asked = tuple(sorted(set(shares) - {0.0}))
+            raise invalid_value("penetration_rates", share, ">= 0, <= 1")
+    asked = tuple(sorted(set(penetration_rates) - {0.0}))
     if not asked:
-        raise wrong("shares", ",".join(f"{share:g}" for share in shares), "one above 0 at least")
+        raise invalid_value(
+            "penetration_rates", ",".join(f"{share:g}" for share in penetration_rates), "one above 0 at least"
+        )
     if minutes is not None and not minutes > 0:
-        raise wrong("minutes", minutes, "> 0")
+        raise invalid_value("minutes", minutes, "> 0")
     if not 0 < precision < 1:
-        raise wrong("precision", precision, "> 0, < 1")
-    road = make_scenario(file, {**WITH_OWN_ACC, **(changes or {}), "cav_share": NOBODY})
-    assert isinstance(road, OwnNetwork)
-    made = {name: make_driver(name, road.decision_step) for name in drivers if name != ACC}
+        raise invalid_value("precision", precision, "> 0, < 1")
+    road = make_scenario(file, {**ACC_SETTINGS, **(options or {}), "penetration_rate": ZERO_PENETRATION_RATE})
+    assert isinstance(road, UserNetwork)
+    made = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
     for name, driver in made.items():
-        if driver.native or not can_drive(driver, road):
-            why = "the human baseline is driven anyway" if driver.native else "one that needs no closed road"
-            raise wrong("driver", name, why)
-    asked_for = Question(file, road, made, asked, episodes, minutes, precision)
-    least = least_episodes(len(asked), len(made), asked_for.sets_properties) + FOR_PICTURES
+        if driver.is_native or not can_drive(driver, road):
+            why = "the human baseline is driven anyway" if driver.is_native else "one that needs no closed road"
+            raise invalid_value("driver", name, why)
+    asked_for = AssessmentRequest(file, road, made, asked, episodes, minutes, precision)
+    least = min_episodes(len(asked), len(made), asked_for.has_acc_properties) + PLOT_EPISODE_COUNT
     if episodes < least:
         controllers = f"{len(asked)} penetration rates and {len(made)} controllers"
-        raise wrong("episodes", episodes, f">= {least} for {controllers}")
+        raise invalid_value("episodes", episodes, f">= {least} for {controllers}")
     return asked_for
 
 
@@ -157,9 +153,9 @@ def question(
 class Assessment:
     """The answer."""
 
-    judged: list[Judged]
+    controller_results: list[ControllerResult]
     """the controller that was chosen for each penetration rate; none where all were set aside"""
-    acc: list[AccResult]
+    acc_results: list[AccResult]
     """what ACC vehicles alone do at each penetration rate"""
     document: dict[str, Any]
     """all of it but the rows, as `assessment.json` has it"""
@@ -167,11 +163,11 @@ class Assessment:
 
 
 def assess(
-    asked: Question,
+    request: AssessmentRequest,
     folder: Path,
-    workers: Workers,
+    workers: WorkerPool,
     progress: Callable[[Any, int], None] | None = None,
-    on_line: OnLine = lambda line: None,
+    on_message: OptionMessageCallback = lambda line: None,
 ) -> Assessment:
     """Answer a question, and write rows, `assessment.json` and the page into a new folder.
 
@@ -183,25 +179,27 @@ def assess(
         InputError: the folder holds something, or no driver can drive this road.
     """
     make_new_folder(folder)
-    budget, baseline = Budget(asked.episodes - 1, asked.minutes, workers.count), Rows()
+    budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
 
-    def driven(options: Sequence[Option], seeds: Sequence[Seed], pictured: bool = False) -> Evaluation:
-        setups = {option.label: asked.setup(option) for option in options}
-        batch = budget.spent
+    def evaluate_options(
+        options: Sequence[Option], seeds: Sequence[EpisodeSeed], with_plots: bool = False
+    ) -> Evaluation:
+        setups = {option.label: request.make_setup(option) for option in options}
+        batch = budget.used_episodes
 
-        def note(episode: tuple[str, int], steps: int) -> None:
+        def report_progress(episode: tuple[str, int], steps: int) -> None:
             if progress is not None:
                 progress((batch, *episode), steps)
 
-        found = evaluate_each(setups, seeds, workers, progress=note, pictured=pictured)
+        found = evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots)
         budget.spend(len(options) * len(seeds))
         return found
 
-    def drive(options: Sequence[Option], seeds: Sequence[Seed]) -> dict[Option, Rows]:
-        rows = driven(options, seeds).rows
-        humans = rows[HUMAN.label]
+    def run_options(options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
+        rows = evaluate_options(options, seeds).rows
+        humans = rows[HUMAN_BASELINE.label]
         baseline.extend(humans)
-        check_baseline(baseline, ENOUGH_BASELINE)
+        check_baseline(baseline, MIN_BASELINE_EPISODES)
         # On a seed with which a small share picks no vehicle, human drivers alone are driven.
         return {
             option: [
@@ -211,64 +209,80 @@ def assess(
             for option in options
         }
 
-    first = driven([HUMAN], held_out_seeds(1), pictured=True)
-    raise_failure(first.rows[HUMAN.label])
-    took, whole = in_words(budget.elapsed), in_words(budget.seconds_for(budget.episodes))
-    on_line(
-        f"an episode of the human baseline took {took}; all {asked.episodes} episodes on {workers.count} "
-        f"workers may take {whole}" + (f", but at most {asked.minutes:g} min" if asked.minutes else "")
+    first = evaluate_options([HUMAN_BASELINE], make_test_seeds(1), with_plots=True)
+    raise_failure(first.rows[HUMAN_BASELINE.label])
+    took, whole = format_duration(budget.elapsed_seconds), format_duration(budget.estimate_seconds(budget.episodes))
+    on_message(
+        f"an episode of the human baseline took {took}; all {request.episodes} episodes on {workers.count} "
+        f"workers may take {whole}" + (f", but at most {request.minutes:g} min" if request.minutes else "")
     )
-    choice = choose(asked.options, drive, budget, on_line)
-    chose = budget.spent - 1
-    tested = judge(
-        choice.finalists, asked.shares, asked.sets_properties, drive, budget, asked.precision, on_line
+    choice = select_controllers(request.options, run_options, budget, on_message)
+    chose = budget.used_episodes - 1
+    tested = compare_on_test_seeds(
+        choice.finalists,
+        request.penetration_rates,
+        request.has_acc_properties,
+        run_options,
+        budget,
+        request.precision,
+        on_message,
     )
-    best = shown_beside(tested.judged)
-    option = Option(best.share, best.driver) if best else Option(asked.shares[-1], ACC)
-    shown = first.shown | driven([option], held_out_seeds(1), pictured=True).shown
+    best = plotted_result(tested.controller_results)
+    option = Option(best.penetration_rate, best.driver) if best else Option(request.penetration_rates[-1], ACC_DRIVER)
+    shown = first.plot_episodes | evaluate_options([option], make_test_seeds(1), with_plots=True).plot_episodes
 
-    about = {"scenario": Path(asked.file).name, "reward": asked.road.reward, "manifest": manifest()}
+    about = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
     tried = {option.label: found for option, found in choice.rows.items()}
     rows = {option.label: found for option, found in tested.rows.items()}
     check_baseline(baseline)
     notes = [
-        *notes_of_rows({label: [*tried.get(label, ()), *found] for label, found in rows.items()}),
-        *asked.road.notes,
+        *episode_notes({label: [*tried.get(label, ()), *found] for label, found in rows.items()}),
+        *request.network.notes,
     ]
-    document = {**about, **_document(asked, choice, tested, chose, budget), "notes": notes}
-    save_evaluation(folder / CHOOSING, Evaluation(tried, {}), about)
+    document = {**about, **_assessment_document(request, choice, tested, chose, budget), "notes": notes}
+    save_evaluation(folder / SELECTION_FOLDER, Evaluation(tried, {}), about)
     save_evaluation(folder, Evaluation(rows, shown), about)
-    write_whole(folder / ASSESSMENT_FILE, to_json(document, indent=1))
+    atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
     page = write_assessment(folder, folder / ASSESSMENT_PAGE)
-    return Assessment(tested.judged, tested.acc, json.loads(to_json(document)), page)
+    return Assessment(tested.controller_results, tested.acc_results, json.loads(to_json(document)), page)
 
 
-def _document(asked: Question, choice: Choice, found: Findings, chose: int, budget: Budget) -> dict[str, Any]:
+def _assessment_document(
+    request: AssessmentRequest,
+    selection: Selection,
+    findings: TestFindings,
+    selection_episodes: int,
+    budget: EpisodeBudget,
+) -> dict[str, Any]:
     """Return what is known in the end, but for the rows."""
-    best = recommended(found.judged)
+    best = recommended_result(findings.controller_results)
     tried = [
         {
             **option._asdict(),
-            "set_aside": choice.set_aside.get(option, ""),
-            "chosen": option in choice.finalists,
-            "effect": asdict(choice.effect(option)),
+            "rejection_reasons": selection.rejection_reasons.get(option, ""),
+            "chosen": option in selection.finalists,
+            "effect": asdict(selection.effect(option)),
         }
-        for option in asked.options
-        if choice.rows[option]
+        for option in request.options
+        if selection.rows[option]
     ]
     return {
-        "headline": headline(found.judged, found.acc, found.rows[HUMAN]),
-        "recommended": best and {"share": best.share, "driver": best.driver},
-        "judged": [{**asdict(each), "reasons": each.reasons, "words": each.words} for each in found.judged],
-        "acc": [{**asdict(each), "driver": ACC, "words": each.words} for each in found.acc],
+        "headline": assessment_headline(
+            findings.controller_results, findings.acc_results, findings.rows[HUMAN_BASELINE]
+        ),
+        "recommended": best and {"share": best.penetration_rate, "driver": best.driver},
+        "controller_results": [
+            {**asdict(each), "reasons": each.reasons, "words": each.summary} for each in findings.controller_results
+        ],
+        "acc_results": [{**asdict(each), "driver": ACC_DRIVER, "words": each.summary} for each in findings.acc_results],
         "tried": tried,
-        "people": {name: asdict(estimate_of(found.rows[HUMAN], name)) for name in METRICS_OF_PEOPLE},
-        "road": {**scenario_recipe(asked.road), "file": asked.file},
-        "people_drive": asked.road.people_in_words,
-        "drivers": {name: driver.recipe().get("parameters", {}) for name, driver in asked.drivers.items()},
-        "shares": asked.shares,
-        "precision": asked.precision,
-        "budget": {"episodes": asked.episodes, "minutes": asked.minutes},
-        "episodes": {"choosing": chose, "all": budget.spent},
-        "seeds": {"choosing": len(choice.rows[HUMAN]), "judging": len(found.rows[HUMAN])},
+        "people": {name: asdict(metric_estimate(findings.rows[HUMAN_BASELINE], name)) for name in BASELINE_METRICS},
+        "road": {**scenario_recipe(request.network), "file": request.file},
+        "people_drive": request.network.human_description,
+        "drivers": {name: driver.recipe().get("parameters", {}) for name, driver in request.drivers.items()},
+        "penetration_rates": request.penetration_rates,
+        "precision": request.precision,
+        "budget": {"episodes": request.episodes, "minutes": request.minutes},
+        "episodes": {"choosing": selection_episodes, "all": budget.used_episodes},
+        "seeds": {"choosing": len(selection.rows[HUMAN_BASELINE]), "judging": len(findings.rows[HUMAN_BASELINE])},
     }

@@ -13,50 +13,60 @@ from pydantic.dataclasses import dataclass
 
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
-from unjam.drivers.from_file import is_file_reference
-from unjam.drivers.observation import observed
-from unjam.drivers.wrappers import Remembering
-from unjam.errors import InputError, wrong
-from unjam.learners.settings import Agents, PolicySettings
-from unjam.parameters import STRICT, Count, CountOrNone, Positive, build, changed, flat, nested, parse_toml
+from unjam.drivers.observation import observation_inputs
+from unjam.drivers.user_driver import is_file_reference
+from unjam.drivers.wrappers import HistoryDriver
+from unjam.errors import InputError, invalid_value
+from unjam.learners.settings import AgentSettings, PolicySettings
+from unjam.models.settings import ModelSettings
+from unjam.parameters import (
+    STRICT,
+    NonNegativeInt,
+    Positive,
+    PositiveInt,
+    build_dataclass,
+    flatten_keys,
+    merge_changes,
+    nest_keys,
+    parse_toml,
+)
 from unjam.scenarios import SCENARIOS, make_scenario
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
-from unjam.training.sampling import Sampling, episodes_of_iteration, shares_by_weight
-from unjam.training.seeds import TRAINING_BELOW
-from unjam.trust import check_values
-from unjam.virtual.settings import VirtualSettings
-from unjam.worlds.batch.possible import statistical_why_not, why_not
+from unjam.training.seeds import TRAINING_SEED_LIMIT
+from unjam.training.task_sampling import TaskSampling, count_episodes, weight_shares
+from unjam.trust import check_trusted_values
+from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import Task
 
-CONFIG = "config.toml"
+CONFIG_FILE = "config.toml"
 """the configuration in a folder of a run, or of a search"""
 
 
-def _plain(road: dict[str, Any]) -> dict[str, Any]:
+def _without_tuples(options: dict[str, Any]) -> dict[str, Any]:
     """Return changes as a TOML file gives them back, so that a run knows its own road again."""
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in road.items()}
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in options.items()}
 
 
-ScenarioChanges = Annotated[dict[str, Any], AfterValidator(_plain)]
+ScenarioOptions = Annotated[dict[str, Any], AfterValidator(_without_tuples)]
 
 
 @dataclass(frozen=True, config=STRICT)
 class EvaluationSettings:
     """How a run is judged, always with the deterministic policy; its steps are counted apart."""
 
-    every: CountOrNone = 5
+    validation_interval: NonNegativeInt = 5
     """iterations between two validations; 0: none, and the last policy becomes the controller"""
-    patience: CountOrNone = 0
+    patience: NonNegativeInt = 0
     """validations in a row without a new best after which training ends; 0: it goes on to `steps`"""
-    converged: CountOrNone = 0
+    convergence_window: NonNegativeInt = 0
     """training ends where the mean return of so many iterations, exploration included, is no better than that
     of as many before them, looked at whenever as many have been made: the paper's rule; 0: it goes on to
     `steps`"""
-    validation_episodes: Count = 4
+    validation_episodes: PositiveInt = 4
     """episodes of a validation, the same seeds each time: they choose the controller"""
-    episodes: Count = 20
+    episodes: PositiveInt = 20
     """episodes of the final evaluation, on held-out seeds that chose nothing"""
     baselines: tuple[str, ...] = ("human", "pi", "follower-stopper")
     """drivers that are evaluated beside the expert and the trained controller"""
@@ -67,7 +77,7 @@ class TaskConfig:
     """One of several roads of a training; what is left out, or empty, is the run's own."""
 
     scenario: str = ""
-    road: ScenarioChanges = field(default_factory=dict)
+    scenario_options: ScenarioOptions = field(default_factory=dict)
     """changes to the scenario's parameters, beside the run's"""
     expert: str = ""
     reward: str = ""
@@ -78,79 +88,75 @@ class TaskConfig:
 
 
 @dataclass(frozen=True, config=STRICT)
-class RunConfig(Agents):
+class RunConfig(AgentSettings):
     """One training run. Every key can be set in a TOML file, by `--set key=value`, and in Python."""
 
     scenario: str = "ring"
-    road: ScenarioChanges = field(default_factory=dict)
+    scenario_options: ScenarioOptions = field(default_factory=dict)
     """changes to the scenario's parameters"""
     expert: str = "pi"
     """driver that the residual is added to: a name, `path.py:name`, a run folder, a .unjam file; `none`:
     the network drives alone"""
     reward: str = ""
     """a name or `path.py:name`; empty: the scenario's own"""
-    steps: Count = 960_000
+    steps: PositiveInt = 960_000
     """actual steps of training"""
-    seed: Annotated[int, Field(ge=0, lt=TRAINING_BELOW)] = 0
+    seed: Annotated[int, Field(ge=0, lt=TRAINING_SEED_LIMIT)] = 0
     """of the whole run; numbers from a million on are those of the episodes that judge"""
-    workers: Count = 2
-    world: Literal["sumo", "batch"] = "sumo"
+    workers: PositiveInt = 2
+    simulator: Literal["sumo", "batch"] = "sumo"
     """where episodes of training and validation are driven: in SUMO, or, on rings, all of an iteration at
     once in what equals it but for rounding; it pays where iterations are large. A figure eight alone is
     driven so too, where episodes are SUMO's in distribution. Other roads of a mixture are driven in SUMO,
     which judges in any case"""
-    spread: bool = True
+    stratified: bool = True
     """whether the episodes of an iteration, and of a validation, cover the range of what they draw (the
     ring's lengths) evenly"""
     policy: PolicySettings = field(default_factory=PolicySettings)
-    virtual: VirtualSettings = field(default_factory=VirtualSettings)
+    model: ModelSettings = field(default_factory=ModelSettings)
     """the virtual environment, in which the agent learns between actual episodes"""
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     tasks: tuple[TaskConfig, ...] = ()
     """roads that are trained on together; empty: the one above"""
-    sampling: Sampling = "weights"
+    task_sampling: TaskSampling = "weights"
     """how many episodes each of several roads has: as its `weight` says; `regret`: from each validation to
     the next, half of all steps go where the policy earns less than was seen there before"""
     preset: str = ""
     """which preset this started from, for the record"""
 
     @model_validator(mode="after")
-    def _possible(self) -> "RunConfig":
-        why_none = why_not if self.tasks else statistical_why_not
-        scenarios = [road.make_scenario() for road in self.roads().values()]
+    def _check_combinations(self) -> "RunConfig":
+        why_none = unsupported_reason if self.tasks else statistically_unsupported_reason
+        scenarios = [road.make_scenario() for road in self.task_configs().values()]
         whys = [why_none(scenario) for scenario in scenarios]
-        if self.world == "batch" and all(whys):
+        if self.simulator == "batch" and all(whys):
             raise ValueError(f"world: batch is not allowed; allowed: sumo, for {whys[0]}")
-        imagines = self.virtual.model if self.virtual.virtual_ratio > 0 else ""
-        if self.policy.afterwards and imagines == "row":
-            raise ValueError("policy.afterwards: true is not allowed; allowed: false where rows are imagined")
-        own = any(is_file_reference(name) for name in self.policy.observe)
-        if self.policy.remember and "expert_memory" not in self.policy.observe and not own:
+        imagines = self.model.kind if self.model.model_ratio > 0 else ""
+        if self.policy.reward_after_exit and imagines == "row":
+            raise ValueError("policy.reward_after_exit: true is not allowed; allowed: false where rows are imagined")
+        own = any(is_file_reference(name) for name in self.policy.inputs)
+        if self.policy.history_features and "expert_memory" not in self.policy.inputs and not own:
             raise ValueError(
-                "policy.remember: true is not allowed; allowed: false, where expert_memory is not observed"
+                "policy.history_features: true is not allowed; allowed: false, where expert_memory is not observed"
             )
-        if self.evaluation.patience and not self.evaluation.every:
+        if self.evaluation.patience and not self.evaluation.validation_interval:
             raise ValueError(
-                "evaluation.patience: it is not allowed without validations (evaluation.every 0)"
+                "evaluation.patience: it is not allowed without validations (evaluation.validation_interval 0)"
             )
-        if imagines == "road" and self.virtual.device != "cpu":
-            raise ValueError(
-                f"virtual.device: {self.virtual.device} is not allowed; allowed: cpu, for whole roads"
-            )
-        if self.policy.lasts and self.agent not in ("trpo", "ppo"):
+        if imagines == "road" and self.model.device != "cpu":
+            raise ValueError(f"model.device: {self.model.device} is not allowed; allowed: cpu, for whole roads")
+        if self.policy.episode_noise and self.agent not in ("trpo", "ppo"):
             kind = self.policy.exploration
             raise ValueError(f"policy.exploration: {kind} is not allowed; allowed: anew, for {self.agent}")
         on_ramps = imagines == "road" and all(isinstance(road, OnRamp) for road in scenarios)
         if self.policy.exploration == "mirrored" and imagines and not on_ramps:
             allowed = "anew, lasting, for what is imagined here has no twins"
             raise ValueError(f"policy.exploration: mirrored is not allowed; allowed: {allowed}")
-        if self.sampling == "regret" and (len(self.tasks) < 2 or self.evaluation.every == 0):
-            raise ValueError(
-                "sampling: regret is not allowed; allowed: weights, but for several validated tasks"
-            )
+        if self.task_sampling == "regret" and (len(self.tasks) < 2 or self.evaluation.validation_interval == 0):
+            raise ValueError("sampling: regret is not allowed; allowed: weights, but for several validated tasks")
         return self
 
-    def roads(self) -> dict[str, "RunConfig"]:
+    def task_configs(self) -> dict[str, "RunConfig"]:
         """Return the configuration of each road alone, by its folder's name; one road has none."""
         if not self.tasks:
             return {"": self}
@@ -165,14 +171,14 @@ class RunConfig(Agents):
             road = replace(
                 self,
                 scenario=scenario,
-                road=changed(self.road, task.road),
+                road=merge_changes(self.scenario_options, task.scenario_options),
                 expert=task.expert or self.expert,
                 reward=task.reward or self.reward,
                 tasks=(),
                 sampling="weights",
                 world="sumo",
             )
-            batched = self.world == "batch" and not why_not(road.make_scenario())
+            batched = self.simulator == "batch" and not unsupported_reason(road.make_scenario())
             found[name] = replace(road, world="batch") if batched else road
         return found
 
@@ -185,20 +191,20 @@ class RunConfig(Agents):
         weights = [task.weight for task in self.tasks] or [1.0]
         tasks = [
             Task(road.make_scenario(), road.make_expert(), road.reward, weight, name)
-            for (name, road), weight in zip(self.roads().items(), weights, strict=True)
+            for (name, road), weight in zip(self.task_configs().items(), weights, strict=True)
         ]
         first = tasks[0]
         for task in tasks[1:]:
-            if observed(self.policy.observe, task.expert) != observed(self.policy.observe, first.expert):
-                raise InputError(
-                    f"tasks: on {task.name} the network would see something else than on {first.name}"
-                )
+            if observation_inputs(self.policy.inputs, task.expert) != observation_inputs(
+                self.policy.inputs, first.expert
+            ):
+                raise InputError(f"tasks: on {task.name} the network would see something else than on {first.name}")
         return tasks
 
     def make_scenario(self) -> Scenario:
         """Return the scenario with its changes."""
         try:
-            return make_scenario(self.scenario, self.road)
+            return make_scenario(self.scenario, self.scenario_options)
         except InputError as error:
             raise ValueError(str(error)) from None
 
@@ -206,22 +212,20 @@ class RunConfig(Agents):
         """Return the driver that the residual is added to."""
         from unjam.controller import make_expert
 
-        step = self.make_scenario().decision_step
+        step = self.make_scenario().control_step
         expert = Constant() if self.expert == "none" else make_expert(self.expert, step)
-        return Remembering(expert, step) if self.policy.remember else expert
+        return HistoryDriver(expert, step) if self.policy.history_features else expert
 
 
-def steps_to_train(config: RunConfig) -> int:
+def planned_steps(config: RunConfig) -> int:
     """Return how many actual steps a new training will make: whole iterations, unless episodes end early."""
     tasks = config.make_tasks()
-    counts = episodes_of_iteration(tasks, config.learner.batch_steps, shares_by_weight(tasks))
+    counts = count_episodes(tasks, config.learner.steps_per_iteration, weight_shares(tasks))
     each = sum(count * task.scenario.horizon for count, task in zip(counts, tasks, strict=True))
     return ceil(config.steps / each) * each
 
 
-def load_config(
-    file: Path | None = None, preset: str = "", changes: dict[str, Any] | None = None
-) -> RunConfig:
+def load_config(file: Path | None = None, preset: str = "", changes: dict[str, Any] | None = None) -> RunConfig:
     """Return a configuration: the defaults, changed by a preset, by a TOML file, by `changes`, in this order.
 
     Keys of `changes` may have dots: `trpo.gamma`.
@@ -231,9 +235,9 @@ def load_config(
             folder names Python code that is not trusted.
     """
     read = read_toml(file) if file is not None else {}
-    if file is not None and _is_below_results(file):  # by itself it is the user's own
-        check_values(f"config file {file}", read)
-    given = changed(read, nested(changes or {}))
+    if file is not None and _is_in_run_folder(file):  # by itself it is the user's own
+        check_trusted_values(f"config file {file}", read)
+    given = merge_changes(read, nest_keys(changes or {}))
     values: dict[str, Any] = {}
     road = SCENARIOS.get(str(given.get("scenario", RunConfig.scenario)), Scenario)
     for name in given.keys() - {each.name for each in fields(RunConfig)}:
@@ -242,34 +246,34 @@ def load_config(
     if preset:
         started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
         if "tasks" in started and "tasks" not in given:
-            _check_heeded(preset, started["tasks"], given)
+            _check_preset_conflicts(preset, started["tasks"], given)
         values = {**started, "preset": preset}
-    wanted = changed(values, given)
-    virtual = wanted.get("virtual", {})
+    wanted = merge_changes(values, given)
+    virtual = wanted.get("model", {})
     if road.actuation == "cruise" and isinstance(virtual, dict) and virtual.get("model", "row") == "row":
         # Virtual rows know no ACC of a CAV's own: without a model, unless one is asked for.
-        wanted = changed({"virtual": {"virtual_ratio": 0.0}}, wanted)
-    return build(RunConfig, wanted, "")
+        wanted = merge_changes({"model": {"model_ratio": 0.0}}, wanted)
+    return build_dataclass(RunConfig, wanted, "")
 
 
-def _is_below_results(file: Path) -> bool:
+def _is_in_run_folder(file: Path) -> bool:
     """Return whether a file lies in or below a folder of results; the search ends at the working folder."""
     for folder in file.absolute().parents:
-        if (folder / CONFIG).is_file():
+        if (folder / CONFIG_FILE).is_file():
             return True
         if folder == Path.cwd():
             break
     return False
 
 
-def _check_heeded(preset: str, tasks: Sequence[dict[str, Any]], given: dict[str, Any]) -> None:
+def _check_preset_conflicts(preset: str, tasks: Sequence[dict[str, Any]], user_values: dict[str, Any]) -> None:
     """Raise `InputError` where the user says what every task of a preset says otherwise."""
-    said = {name: value for name, value in given.items() if name in ("scenario", "reward")}
-    changes = given.get("road", {})
+    said = {name: value for name, value in user_values.items() if name in ("scenario", "reward")}
+    changes = user_values.get("scenario_options", {})
     said |= {f"road.{name}": value for name, value in changes.items()} if isinstance(changes, dict) else {}
     for name, value in said.items():
-        if all(flat(task).get(name, "") not in ("", value) for task in tasks):
-            raise wrong(name, value, f"none with the preset {preset}, whose roads have their own")
+        if all(flatten_keys(task).get(name, "") not in ("", value) for task in tasks):
+            raise invalid_value(name, value, f"none with the preset {preset}, whose roads have their own")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

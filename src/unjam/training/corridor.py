@@ -6,34 +6,34 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from unjam.controller.file import hash_of_file
-from unjam.errors import InputError, did_you_mean, wrong, wrong_name
+from unjam.controller.file import sha256_of_file
+from unjam.errors import InputError, invalid_value, spelling_hint, unknown_name
 from unjam.measures.detectors import Measurement, read_detectors
-from unjam.scenarios.own_network import ROAD_CLASSES, OwnNetwork, own_network, passenger_types
+from unjam.scenarios.user_network import ROAD_CLASSES, UserNetwork, load_user_network, passenger_types
 from unjam.sumo_files import SumoFiles, read_sumo_files
-from unjam.training.assess import NOBODY
-from unjam.training.space import Range, Space, space_of
-from unjam.worlds.sumo.detectors import Loop
+from unjam.training.assess import ZERO_PENETRATION_RATE
+from unjam.training.search_space import NumericRange, SearchSpace, parse_search_space
+from unjam.worlds.sumo.detectors import InductionLoop
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts
 
-FLOWS = "flows"
+FLOW_FACTOR = "flows"
 """factor on the number of vehicles, of all types"""
-VARIED: Space = {
-    "tau": Range(0.5, 2.0, log=True),
-    "accel": Range(0.5, 2.0, log=True),
-    "decel": Range(0.5, 2.0, log=True),
-    "minGap": Range(0.5, 2.0, log=True),
-    "speedFactor": Range(0.8, 1.25, log=True),
-    FLOWS: Range(0.67, 1.5, log=True),
+FACTOR_RANGES: SearchSpace = {
+    "tau": NumericRange(0.5, 2.0, log=True),
+    "accel": NumericRange(0.5, 2.0, log=True),
+    "decel": NumericRange(0.5, 2.0, log=True),
+    "minGap": NumericRange(0.5, 2.0, log=True),
+    "speedFactor": NumericRange(0.8, 1.25, log=True),
+    FLOW_FACTOR: NumericRange(0.67, 1.5, log=True),
 }
 """factors on the attributes of passenger vehicle types, and on flows"""
-SUMO_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
+SUMO_TYPE_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
 """of passenger types that do not say otherwise"""
-DISTRIBUTED = re.compile(r"(normc?)\(([^()]*)\)")
+NORMAL_DISTRIBUTION = re.compile(r"(normc?)\(([^()]*)\)")
 """a speed factor that each vehicle draws"""
 
-Factors = dict[str, float]
-"""by the names of `VARIED`"""
+CalibrationFactors = dict[str, float]
+"""by the names of `FACTOR_RANGES`"""
 
 
 @dataclass(frozen=True)
@@ -46,35 +46,33 @@ class Corridor:
     """[s]"""
     end: float
     """[s]"""
-    measured: tuple[Measurement, ...]
+    measurements: tuple[Measurement, ...]
     """intervals that lie between these two"""
-    left_out: int
+    excluded_count: int
     """intervals that do not"""
-    loops: tuple[Loop, ...]
-    loops_of: tuple[tuple[int, ...], ...]
+    loops: tuple[InductionLoop, ...]
+    loop_numbers: tuple[tuple[int, ...], ...]
     """numbers of the loops of each interval"""
 
-    def scenario(self, file: Path) -> OwnNetwork:
+    def scenario(self, file: Path) -> UserNetwork:
         """Return a network's traffic, people alone, until nothing more is measured."""
-        changes = {"cav_share": NOBODY, "cav_types": (), "begin": self.begin, "end": self.end}
-        return own_network(str(file), changes)
+        changes = {"penetration_rate": ZERO_PENETRATION_RATE, "cav_types": (), "begin": self.begin, "end": self.end}
+        return load_user_network(str(file), changes)
 
-    def about(self) -> dict[str, Any]:
+    def metadata(self) -> dict[str, Any]:
         """Return what a calibration is about: names and hashes of the files, and what is measured when."""
         files = self.files
         return {
             "scenario": files.path.name,
             "detectors": self.detectors.name,
-            "files": [
-                {"name": path.name, "sha256": hash_of_file(path)} for path in (self.detectors, *files.sources)
-            ],
+            "files": [{"name": path.name, "sha256": sha256_of_file(path)} for path in (self.detectors, *files.sources)],
             "begin": self.begin,
             "end": self.end,
-            "intervals": {"used": len(self.measured), "left_out": self.left_out},
+            "intervals": {"used": len(self.measurements), "excluded_count": self.excluded_count},
         }
 
 
-def corridor(file: str, detectors: Path, begin: float | None = None, end: float | None = None) -> Corridor:
+def load_corridor(file: str, detectors: Path, begin: float | None = None, end: float | None = None) -> Corridor:
     """Return a network and what its detectors measured, once both have been checked.
 
     Args:
@@ -87,11 +85,11 @@ def corridor(file: str, detectors: Path, begin: float | None = None, end: float 
         InputError: one of them is wrong, a detector has no place on the road, or nothing can be varied.
     """
     if not file.endswith(".sumocfg"):
-        raise wrong("scenario", file, "your own .sumocfg file")
+        raise invalid_value("scenario", file, "your own .sumocfg file")
     kind, rows = read_detectors(detectors)
     # People alone: the share is so small that nobody has it.
     times = {name: time for name, time in (("begin", begin), ("end", end)) if time is not None}
-    checked = own_network(file, {"cav_share": NOBODY, "cav_classes": ROAD_CLASSES, **times})
+    checked = load_user_network(file, {"penetration_rate": ZERO_PENETRATION_RATE, "cav_classes": ROAD_CLASSES, **times})
     files = read_sumo_files(Path(checked.file))
     first = files.begin if begin is None else begin
     last = next((limit for limit in (end, files.end) if limit is not None), inf)
@@ -101,10 +99,8 @@ def corridor(file: str, detectors: Path, begin: float | None = None, end: float 
     if not passenger_types(files):
         known = ", ".join(sorted(files.used_types))
         raise InputError(f"{files.path.name}: no vehicle type is a passenger car; its types are {known}")
-    lanes = [_lanes(files.network, kind, row) for row in kept]
-    loops = {
-        loop: number for number, loop in enumerate(dict.fromkeys(loop for each in lanes for loop in each))
-    }
+    lanes = [_detector_loops(files.network, kind, row) for row in kept]
+    loops = {loop: number for number, loop in enumerate(dict.fromkeys(loop for each in lanes for loop in each))}
     return Corridor(
         files,
         detectors,
@@ -117,20 +113,20 @@ def corridor(file: str, detectors: Path, begin: float | None = None, end: float 
     )
 
 
-def _lanes(network: Path, kind: str, row: Measurement) -> list[Loop]:
+def _detector_loops(network: Path, kind: str, row: Measurement) -> list[InductionLoop]:
     """Return the loops of a detector; raise `InputError` where the network has no such place."""
     counts, lengths = lane_counts(network), edge_lengths(network)
     edge = row.place if kind == "edge" else row.place.rpartition("_")[0]
     all_lanes = [f"{edge}_{number}" for number in range(counts.get(edge, 0))]
     lanes = all_lanes if kind == "edge" else [lane for lane in all_lanes if lane == row.place]
     if not lanes:
-        raise wrong(kind, row.place, f"one of {network.name}{did_you_mean(row.place, all_lanes or counts)}")
+        raise invalid_value(kind, row.place, f"one of {network.name}{spelling_hint(row.place, all_lanes or counts)}")
     if row.position > lengths[edge]:
-        raise wrong(f"{kind} {row.place}: position", row.position, f"<= {lengths[edge]:g} m, its length")
-    return [Loop(lane, row.position) for lane in lanes]
+        raise invalid_value(f"{kind} {row.place}: position", row.position, f"<= {lengths[edge]:g} m, its length")
+    return [InductionLoop(lane, row.position) for lane in lanes]
 
 
-def changed_types(files: SumoFiles, factors: Factors) -> dict[str, dict[str, str]]:
+def scale_vehicle_types(files: SumoFiles, factors: CalibrationFactors) -> dict[str, dict[str, str]]:
     """Return the attributes of all passenger types once they are multiplied by `factors`, by id.
 
     What would stay as it is is left out. A reaction time never falls below the simulation step: people would
@@ -141,39 +137,39 @@ def changed_types(files: SumoFiles, factors: Factors) -> dict[str, dict[str, str
     """
     found: dict[str, dict[str, str]] = {}
     for name in passenger_types(files):
-        own = {**{key: str(value) for key, value in SUMO_DEFAULTS.items()}, **files.types.get(name, {})}
+        own = {**{key: str(value) for key, value in SUMO_TYPE_DEFAULTS.items()}, **files.types.get(name, {})}
         changed = {
-            key: _multiplied(f"vType {name}: {key}", own[key], factor, files.step if key == "tau" else 0.0)
+            key: _scale_attribute(f"vType {name}: {key}", own[key], factor, files.step if key == "tau" else 0.0)
             for key, factor in factors.items()
-            if key != FLOWS and factor != 1
+            if key != FLOW_FACTOR and factor != 1
         }
         if changed:
             found[name] = changed
     return found
 
 
-def _multiplied(field: str, text: str, factor: float, least: float) -> str:
-    drawn = DISTRIBUTED.fullmatch(text.replace(" ", ""))
+def _scale_attribute(field: str, text: str, factor: float, minimum: float) -> str:
+    drawn = NORMAL_DISTRIBUTION.fullmatch(text.replace(" ", ""))
     try:
         if drawn:  # mean, deviation and bounds alike: every vehicle's own is multiplied
             return f"{drawn[1]}({','.join(f'{float(part) * factor:.6g}' for part in drawn[2].split(','))})"
         value = float(text)
     except ValueError:
-        raise wrong(field, text, "a number, or norm(...) or normc(...) of numbers") from None
-    return f"{max(value * factor, min(value, least)):.6g}"
+        raise invalid_value(field, text, "a number, or norm(...) or normc(...) of numbers") from None
+    return f"{max(value * factor, min(value, minimum)):.6g}"
 
 
-def varied(texts: list[str]) -> Space:
+def parse_factor_space(texts: list[str]) -> SearchSpace:
     """Return what is varied, from texts `tau=0.5..2` or `tau=0.5..2:log`; without any, all.
 
     Raises:
         InputError: a name is unknown, or these are no factors.
     """
-    found: Space = {}
-    for name, values in (space_of(texts) if texts else VARIED).items():
-        if name not in VARIED:
-            raise wrong_name("vary", name, VARIED)
-        if not isinstance(values, Range) or not values.low > 0:
-            raise wrong(f"vary {name}", values.ends, "a range of factors > 0, as 0.5..2")
-        found[name] = Range(float(values.low), float(values.high), values.log)
+    found: SearchSpace = {}
+    for name, values in (parse_search_space(texts) if texts else FACTOR_RANGES).items():
+        if name not in FACTOR_RANGES:
+            raise unknown_name("vary", name, FACTOR_RANGES)
+        if not isinstance(values, NumericRange) or not values.low > 0:
+            raise invalid_value(f"vary {name}", values.boundary_values, "a range of factors > 0, as 0.5..2")
+        found[name] = NumericRange(float(values.low), float(values.high), values.log)
     return found

@@ -7,29 +7,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unjam.measures.drivable import verdicts
-from unjam.measures.effect import Effect, beside_people
+from unjam.measures.effect import Effect, effects_by_driver
+from unjam.measures.feasibility import feasibility_by_driver
+from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_table, table_headings
 from unjam.measures.metrics import METRICS
-from unjam.measures.notes import early_ends
-from unjam.measures.statistics import Estimate, paired_difference, summarise
-from unjam.measures.table import Rows, baseline_of, headings_of, table_of
-from unjam.reports.results import shown_of
+from unjam.measures.notes import count_early_ends
+from unjam.measures.statistics import Estimate, paired_difference, summarize
+from unjam.reports.results import to_plot_episode
 from unjam.worlds.record import Episode
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def frame_of_rows(rows_by_driver: Rows) -> "pd.DataFrame":
+def rows_to_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
     """Return a row per episode and driver: `driver`, `seed` in words, `status`, and every metric."""
     import pandas as pd
 
     return pd.DataFrame(
-        [
-            {"driver": label, **row, "seed": str(row["seed"])}
-            for label, rows in rows_by_driver.items()
-            for row in rows
-        ]
+        [{"driver": label, **row, "seed": str(row["seed"])} for label, rows in rows_by_driver.items() for row in rows]
     ).drop(columns="warnings", errors="ignore")
 
 
@@ -38,12 +34,12 @@ class DriveResult:
     """Episodes of one or several drivers on the same traffic."""
 
     scenario: str
-    rows: Rows = field(repr=False)
+    rows: RowsByDriver = field(repr=False)
     """by driver: a row of metrics per episode"""
     folder: Path | None = None
     """where everything was written"""
     report: Path | None = None
-    shown: dict[str, Episode] = field(default_factory=dict, repr=False)
+    plot_episodes: dict[str, Episode] = field(default_factory=dict, repr=False)
     """by driver: the episode that pictures show, the same seed for all"""
     notes: list[str] = field(default_factory=list)
     """what to know before trusting it: controllers on a road that they were not made for"""
@@ -55,7 +51,7 @@ class DriveResult:
 
     def summary(self, driver: str) -> dict[str, Estimate]:
         """Return mean and 95 % interval of every metric for a driver."""
-        return summarise(self.rows[driver])
+        return summarize(self.rows[driver])
 
     def table(self) -> "pd.DataFrame":
         """Return a row per metric and, for each driver, its mean and both ends of its 95 % interval.
@@ -74,47 +70,53 @@ class DriveResult:
 
     def episodes(self) -> "pd.DataFrame":
         """Return a row per episode and driver, with its seed, its status and every metric."""
-        return frame_of_rows(self.rows)
+        return rows_to_frame(self.rows)
 
     def _repr_html_(self) -> str:
         """What a notebook shows: every metric with its interval, and where each vehicle was at each time."""
         import pandas as pd
 
         from unjam.reports.figures import data_uri
-        from unjam.reports.lanes import space_time_of
+        from unjam.reports.lanes import space_time_figure
 
-        baseline = baseline_of(self.rows)
+        baseline = choose_baseline(self.rows)
         cells = [
             [f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)]
-            for row in table_of(self.rows, baseline)
+            for row in metric_table(self.rows, baseline)
         ]
-        headings = ["", *headings_of(self.rows, baseline)]
+        headings = ["", *table_headings(self.rows, baseline)]
         table = pd.DataFrame(cells, columns=headings).to_html(index=False, border=0)
-        if not self.shown:
+        if not self.plot_episodes:
             return table
-        picture = data_uri(space_time_of([shown_of(label, each) for label, each in self.shown.items()]))
+        picture = data_uri(
+            space_time_figure([to_plot_episode(label, each) for label, each in self.plot_episodes.items()])
+        )
         about = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
         return f'{table}<img {about} src="{picture}">'
 
     def document(self) -> dict[str, Any]:
         """Return the result as `unjam drive --json` prints it; of several drivers, a list of such."""
-        said, effects, baseline = verdicts(self.rows), beside_people(self.rows), baseline_of(self.rows)
+        said, effects, baseline = (
+            feasibility_by_driver(self.rows),
+            effects_by_driver(self.rows),
+            choose_baseline(self.rows),
+        )
         documents = [
             {
                 **self._document(driver, said[driver], effects.get(driver)),
                 "baseline": baseline or None,
-                "beyond_baseline": self._beyond(driver, baseline),
+                "beyond_baseline": self._baseline_differences(driver, baseline),
             }
             for driver in self.rows
         ]
         return documents[0] if len(documents) == 1 else {"scenario": self.scenario, "drivers": documents}
 
-    def _beyond(self, driver: str, baseline: str) -> dict[str, list[float]] | None:
+    def _baseline_differences(self, driver: str, baseline: str) -> dict[str, list[float]] | None:
         """Return the paired differences of all metrics; None of the baseline itself, and without one."""
         if driver == baseline or not baseline:
             return None
         rows, others = self.rows[driver], self.rows[baseline]
-        return {name: _three(paired_difference(rows, others, name)) for name in METRICS}
+        return {name: _mean_and_interval(paired_difference(rows, others, name)) for name in METRICS}
 
     def _document(self, driver: str, verdict: str, effect: Effect | None) -> dict[str, Any]:
         summary = self.summary(driver)
@@ -125,19 +127,19 @@ class DriveResult:
             "episodes": self.rows[driver],
             "mean": {name: summary[name].mean for name in METRICS},
             "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},
-            "beside_people": _effect(effect) if effect else None,
-            "ended_early": early_ends(self.rows[driver]),
+            "effects_by_driver": _effect_document(effect) if effect else None,
+            "ended_early": count_early_ends(self.rows[driver]),
             "notes": self.notes,
             "folder": str(self.folder) if self.folder else None,
             "report": str(self.report) if self.report else None,
         }
 
 
-def _effect(effect: Effect) -> dict[str, Any]:
+def _effect_document(effect: Effect) -> dict[str, Any]:
     """Return the paired differences to people alone as JSON: mean and ends of the interval."""
-    names = ("travel_time", "delay_cut", "speed", "flow", "fuel", "hard_braking")
-    return {name: _three(getattr(effect, name)) for name in names}
+    names = ("travel_time", "delay_reduction", "speed", "flow", "fuel", "hard_braking")
+    return {name: _mean_and_interval(getattr(effect, name)) for name in names}
 
 
-def _three(found: Estimate) -> list[float]:
-    return [found.mean, found.low, found.high]
+def _mean_and_interval(estimate: Estimate) -> list[float]:
+    return [estimate.mean, estimate.low, estimate.high]

@@ -13,34 +13,34 @@ from typing import Any
 
 from safetensors.numpy import save
 
-from unjam.controller import SHIPPED, hash_of_controller, make_driver
-from unjam.controller.domain import notes_on_controllers
+from unjam.controller import PACKAGED_PREFIX, controller_hash, make_driver
+from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
-from unjam.drivers.from_file import DriverLike, as_driver
-from unjam.drivers.registry import driver_names, free_label, travels
-from unjam.errors import InputError, error_named, wrong
-from unjam.files import make_folder, to_json, write_whole
+from unjam.drivers.registry import driver_names, is_serializable, unique_label
+from unjam.drivers.user_driver import DriverLike, as_driver
+from unjam.errors import InputError, error_from_name, invalid_value
+from unjam.files import atomic_write, make_folder, to_json
 from unjam.manifest import manifest
 from unjam.measures.metrics import measure
-from unjam.measures.notes import notes_of_rows
-from unjam.measures.statistics import Estimate, paired_difference, summarise
-from unjam.reports.results import ABOUT_SHOWN, EVALUATION_FILE, packed, shown_of
+from unjam.measures.notes import episode_notes
+from unjam.measures.statistics import Estimate, paired_difference, summarize
+from unjam.reports.results import EPISODE_ENTRIES, EVALUATION_FILE, pack_episode, to_plot_episode
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
-from unjam.training.drive_result import DriveResult, Rows, frame_of_rows
-from unjam.training.folder import new_and_owned
-from unjam.training.seeds import TRAINING_BELOW, held_out_seeds
+from unjam.training.drive_result import DriveResult, RowsByDriver, rows_to_frame
+from unjam.training.run_folder import lock_new_folder
+from unjam.training.seeds import TRAINING_SEED_LIMIT, make_test_seeds
 from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
-from unjam.worlds.sumo.apart import simulation_for
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.sumo.sandboxed import open_simulation
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-WANTS_ACC = "holds back a car's own ACC, which none has: --set actuation=cruise --set safety.active=false"
-TRAINED = "trained"
+MISSING_ACC_NOTE = "holds back a car's own ACC, which none has: --set actuation=cruise --set safety.active=false"
+TRAINED_LABEL = "trained"
 """label of the trained controller in tables and pictures"""
-Progress = Callable[[tuple[str, int], int], None]
+EvaluationProgress = Callable[[tuple[str, int], int], None]
 """called now and then with (the driver's label, the index of its episode), and the decisions made so far"""
 
 
@@ -48,15 +48,14 @@ Progress = Callable[[tuple[str, int], int], None]
 class Evaluation:
     """Several drivers on the same episodes."""
 
-    rows: Rows
-    shown: dict[str, Episode] = field(repr=False)
+    rows: RowsByDriver
+    plot_episodes: dict[str, Episode] = field(repr=False)
     """by driver: the episode that pictures show, the same seed for all"""
 
     def means(self) -> dict[str, dict[str, float]]:
         """Return the mean of each metric, by driver."""
         return {
-            label: {name: found.mean for name, found in summarise(rows).items()}
-            for label, rows in self.rows.items()
+            label: {name: found.mean for name, found in summarize(rows).items()} for label, rows in self.rows.items()
         }
 
 
@@ -64,22 +63,22 @@ def evaluate(
     scenario: Scenario,
     drivers: dict[str, Driver],
     seeds: Sequence[tuple[int, ...]],
-    workers: Workers,
+    workers: WorkerPool,
     reward: str = "",
-    progress: Progress | None = None,
+    progress: EvaluationProgress | None = None,
 ) -> Evaluation:
     """Run every driver on every seed, and measure."""
     on_road = {label: (scenario, driver) for label, driver in drivers.items()}
-    return evaluate_each(on_road, seeds, workers, reward, progress)
+    return evaluate_on_roads(on_road, seeds, workers, reward, progress)
 
 
-def evaluate_each(
+def evaluate_on_roads(
     drivers: dict[str, tuple[Scenario, Driver]],
     seeds: Sequence[tuple[int, ...]],
-    workers: Workers,
+    workers: WorkerPool,
     reward: str = "",
-    progress: Progress | None = None,
-    pictured: bool = True,
+    progress: EvaluationProgress | None = None,
+    with_plots: bool = True,
 ) -> Evaluation:
     """Run every driver, each on a road of its own, on every seed, and measure.
 
@@ -93,24 +92,24 @@ def evaluate_each(
         if progress is not None:
             progress(pairs[task], steps)
 
-    def measured(task: int, episode: Episode) -> tuple[dict[str, Any], Episode | None]:
+    def measure_task(task: int, episode: Episode) -> tuple[dict[str, Any], Episode | None]:
         _, index = pairs[task]
-        return measure(episode), episode if pictured and index == 0 and episode.ok else None
+        return measure(episode), episode if with_plots and index == 0 and episode.has_run else None
 
-    away = [index for index, (label, _) in enumerate(pairs) if travels(drivers[label][1])]
+    away = [index for index, (label, _) in enumerate(pairs) if is_serializable(drivers[label][1])]
     found = dict(
         zip(
             away,
-            workers.run_each(
+            workers.run_and_map(
                 [tasks[index] for index in away],
-                lambda number, episode: measured(away[number], episode),
+                lambda number, episode: measure_task(away[number], episode),
                 lambda number, steps: on_progress(away[number], steps),
             ),
             strict=True,
         )
     )
-    found |= _driven_here(tasks, found.keys(), measured, on_progress)
-    rows: Rows = {label: [] for label in drivers}
+    found |= _run_in_process(tasks, found.keys(), measure_task, on_progress)
+    rows: RowsByDriver = {label: [] for label in drivers}
     shown: dict[str, Episode] = {}
     for index, (label, _) in enumerate(pairs):
         row, episode = found[index]
@@ -120,24 +119,24 @@ def evaluate_each(
     return Evaluation(rows, shown)
 
 
-def _driven_here(
+def _run_in_process(
     tasks: Sequence[EpisodeTask],
-    done: Container[int],
-    keep: Callable[[int, Episode], Any],
+    finished: Container[int],
+    process: Callable[[int, Episode], Any],
     on_progress: Callable[[int, int], None],
 ) -> dict[int, Any]:
     """Run those tasks that are not done in this process; return what `keep` makes of each, by index."""
-    left = {index: task for index, task in enumerate(tasks) if index not in done}
+    left = {index: task for index, task in enumerate(tasks) if index not in finished}
     if not left:
         return {}
-    with simulation_for(*(task.scenario for task in left.values())) as simulation:
+    with open_simulation(*(task.scenario for task in left.values())) as simulation:
         return {
-            index: keep(
+            index: process(
                 index,
                 run_episode(
-                    *(task.scenario, task.driver, task.seed, task.reward, task.explore, task.full),
+                    *(task.scenario, task.driver, task.seed, task.reward, task.explore, task.record_details),
                     simulation=simulation,
-                    progress=partial(on_progress, index),
+                    on_progress=partial(on_progress, index),
                     stop_at_contact=task.stop_at_contact,
                 ),
             )
@@ -150,7 +149,7 @@ def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
     for row in rows:
         if row["status"] == "failed":
             again = "" if row["error"] == InputError.__name__ else f" (seed {row['seed']})"
-            raise error_named(row["error"], f"{row['reason']}{again}")
+            raise error_from_name(row["error"], f"{row['reason']}{again}")
 
 
 def raise_failures(result: "Evaluation | DriveResult") -> None:
@@ -158,7 +157,7 @@ def raise_failures(result: "Evaluation | DriveResult") -> None:
     raise_failure([row for rows in result.rows.values() for row in rows])
 
 
-def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any]) -> None:
+def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, Any]) -> None:
     """Write an evaluation into a folder: what reports are made of.
 
     `evaluation.json` (rows, and `about`), `episodes.parquet` (the rows as a table), and
@@ -166,48 +165,48 @@ def save_evaluation(folder: Path, evaluation: Evaluation, about: dict[str, Any])
     """
     make_folder(folder)
     rows = [{"driver": label, **row} for label, found in evaluation.rows.items() for row in found]
-    shown = [shown_of(label, episode) for label, episode in evaluation.shown.items()]
+    shown = [to_plot_episode(label, episode) for label, episode in evaluation.plot_episodes.items()]
     arrays = {
-        f"{number}.{name}": array for number, each in enumerate(shown) for name, array in packed(each).items()
+        f"{number}.{name}": array for number, each in enumerate(shown) for name, array in pack_episode(each).items()
     }
-    about_shown = [
-        {"driver": each.driver, **{name: getattr(each, name) for name in ABOUT_SHOWN}} for each in shown
-    ]
-    write_whole(folder / "shown.safetensors", save(arrays))
-    write_whole(folder / "episodes.parquet", frame_of_rows(evaluation.rows).to_parquet())
-    write_whole(folder / "evaluation.json", to_json({**about, "rows": rows, "shown": about_shown}, indent=1))
+    about_shown = [{"driver": each.driver, **{name: getattr(each, name) for name in EPISODE_ENTRIES}} for each in shown]
+    atomic_write(folder / "shown.safetensors", save(arrays))
+    atomic_write(folder / "episodes.parquet", rows_to_frame(evaluation.rows).to_parquet())
+    atomic_write(
+        folder / "evaluation.json", to_json({**metadata, "rows": rows, "plot_episodes": about_shown}, indent=1)
+    )
 
 
-def comparison(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:
+def drivers_to_compare(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:
     """Return the drivers to compare, by label: the baselines, the run's expert, its trained controller."""
     scenario = config.make_scenario()
     expert = {} if config.expert == "none" else {(made := config.make_expert()).describe(): made}
     drivers: dict[str, Driver] = {}
     for name in baselines:
-        driver = make_driver(name, scenario.decision_step)
+        driver = make_driver(name, scenario.control_step)
         if can_drive(driver, scenario):
             # The description of a shipped driver has every parameter that was tuned.
-            shipped = name.startswith(SHIPPED) and name != config.expert
-            drivers[name if shipped else free_label(driver, {**expert, **drivers})] = driver
-    return {**drivers, **expert, TRAINED: make_driver(str(folder), scenario.decision_step)}
+            shipped = name.startswith(PACKAGED_PREFIX) and name != config.expert
+            drivers[name if shipped else unique_label(driver, {**expert, **drivers})] = driver
+    return {**drivers, **expert, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)}
 
 
-def steps_to_judge(
+def evaluation_steps(
     config: RunConfig, folder: Path, baselines: Sequence[str] | None = None, episodes: int | None = None
 ) -> int:
     """Return how many decisions `judge` makes at most."""
     chosen = config.evaluation
-    drivers = comparison(config, folder, chosen.baselines if baselines is None else baselines)
+    drivers = drivers_to_compare(config, folder, chosen.baselines if baselines is None else baselines)
     return len(drivers) * (episodes or chosen.episodes) * config.make_scenario().horizon
 
 
-def judge(
+def evaluate_run(
     folder: Path,
     config: RunConfig,
-    workers: Workers,
+    workers: WorkerPool,
     baselines: Sequence[str] | None = None,
     episodes: int | None = None,
-    progress: Progress | None = None,
+    progress: EvaluationProgress | None = None,
     out: Path | None = None,
 ) -> Evaluation:
     """Evaluate a run's controller beside others on the same held-out seeds, and save it all in its folder.
@@ -216,42 +215,42 @@ def judge(
     where it is saved.
     """
     scenario = config.make_scenario()
-    drivers = comparison(config, folder, config.evaluation.baselines if baselines is None else baselines)
-    seeds = held_out_seeds(episodes or config.evaluation.episodes)
+    drivers = drivers_to_compare(config, folder, config.evaluation.baselines if baselines is None else baselines)
+    seeds = make_test_seeds(episodes or config.evaluation.episodes)
     found = evaluate(scenario, drivers, seeds, workers, config.reward, progress)
     about = {
         "scenario": Path(config.scenario).name,
         "reward": config.reward or scenario.reward,
-        "trained": TRAINED,
+        "trained": TRAINED_LABEL,
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
-        "controllers": _hashes({TRAINED: str(folder)}),
-        "notes": notes_of_rows(found.rows),
+        "controllers": _controller_hashes({TRAINED_LABEL: str(folder)}),
+        "notes": episode_notes(found.rows),
         "manifest": manifest(),
     }
     target = out or folder
     if (target / EVALUATION_FILE).is_file():  # what was judged before is not written over by less
-        raise_failure(found.rows[TRAINED])
+        raise_failure(found.rows[TRAINED_LABEL])
     save_evaluation(target, found, about)
     raise_failures(found)
     return found
 
 
-def gain_of(config: RunConfig, rows: Rows) -> Estimate | None:
+def test_gain(config: RunConfig, rows: RowsByDriver) -> Estimate | None:
     """Return what the trained controller earns beyond its expert, same seeds paired."""
     if config.expert == "none":
         return None
-    return paired_difference(rows[TRAINED], rows[config.make_expert().describe()], "return")
+    return paired_difference(rows[TRAINED_LABEL], rows[config.make_expert().describe()], "return")
 
 
 def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
     """Whether a driver is told of the road ahead to hold back an ACC which CAVs have not got."""
-    told = "lane_speeds" in driver.perceives and "lane_speeds" in scenario.tells
+    told = "lane_speeds" in driver.input_fields and "lane_speeds" in scenario.provided_fields
     return told and scenario.actuation != "cruise"
 
 
-def _hashes(controllers: dict[str, str]) -> dict[str, str]:
+def _controller_hashes(controllers: dict[str, str]) -> dict[str, str]:
     """Return the hashes of the files that were judged, by the driver's label; others are none."""
-    found = {label: hash_of_controller(text) for label, text in controllers.items()}
+    found = {label: controller_hash(text) for label, text in controllers.items()}
     return {label: sha256 for label, sha256 in found.items() if sha256}
 
 
@@ -260,12 +259,12 @@ def drive(
     driver: str | DriverLike | Sequence[str | DriverLike] = "pi",
     episodes: int = 5,
     seed: int = 0,
-    road: dict[str, Any] | None = None,
+    scenario_options: dict[str, Any] | None = None,
     reward: str = "",
     workers: int | None = None,
     out: Path | str | None = None,
     progress: Callable[[Any, int], None] | None = None,
-    held_out: bool = False,
+    test_seeds: bool = False,
 ) -> DriveResult:
     """Run episodes and measure them.
 
@@ -288,39 +287,39 @@ def drive(
     """
     for name, number, least in (("episodes", episodes, 1), ("seed", seed, 0), ("workers", workers, 1)):
         if number is not None and number < least:
-            raise wrong(name, number, f">= {least}")
-    if seed + episodes > TRAINING_BELOW:
-        raise wrong("seed", seed, f"<= {TRAINING_BELOW - episodes}: those above choose or judge")
-    if held_out and seed:
-        raise wrong("seed", seed, "none with held-out seeds")
-    made = make_scenario(scenario, road)
+            raise invalid_value(name, number, f">= {least}")
+    if seed + episodes > TRAINING_SEED_LIMIT:
+        raise invalid_value("seed", seed, f"<= {TRAINING_SEED_LIMIT - episodes}: those above choose or judge")
+    if test_seeds and seed:
+        raise invalid_value("seed", seed, "none with held-out seeds")
+    made = make_scenario(scenario, scenario_options)
     drivers: dict[str, Driver] = {}
     if isinstance(driver, str) or not isinstance(driver, Sequence):
         driver = [driver]
     for entry in driver:
         if isinstance(entry, str):
-            drivers[entry] = make_driver(entry, made.decision_step)
+            drivers[entry] = make_driver(entry, made.control_step)
         else:
             one = as_driver(entry)
-            drivers[free_label(one, drivers)] = one
+            drivers[unique_label(one, drivers)] = one
     if not drivers:
-        raise wrong("driver", driver, driver_names())
+        raise invalid_value("driver", driver, driver_names())
     make_reward(reward or made.reward)
     folder = Path(out) if out is not None else None
-    seeds = held_out_seeds(episodes) if held_out else [(seed + index,) for index in range(episodes)]
-    pool = Workers(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
-    with new_and_owned(folder) if folder is not None else nullcontext(), pool:
+    seeds = make_test_seeds(episodes) if test_seeds else [(seed + index,) for index in range(episodes)]
+    pool = WorkerPool(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
+    with lock_new_folder(folder) if folder is not None else nullcontext(), pool:
         found = evaluate(made, drivers, seeds, pool, reward, progress)
-        report, notes = None, notes_on_controllers(scenario_recipe(made), drivers, found.shown)
-        notes += [f"{name} {WANTS_ACC}" for name, one in drivers.items() if _lacks_acc(one, made)]
-        notes = [*notes_of_rows(found.rows), *notes, *made.notes]
+        report, notes = None, controller_notes(scenario_recipe(made), drivers, found.plot_episodes)
+        notes += [f"{name} {MISSING_ACC_NOTE}" for name, one in drivers.items() if _lacks_acc(one, made)]
+        notes = [*episode_notes(found.rows), *notes, *made.notes]
         ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
         if folder is not None and ran:
             about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
             named = {label: label for label in drivers}
-            save_evaluation(folder, found, {**about, "controllers": _hashes(named), "notes": notes})
-            from unjam.reports.html import write_report  # draws: so late that what is wrong is told at once
+            save_evaluation(folder, found, {**about, "controllers": _controller_hashes(named), "notes": notes})
+            from unjam.reports.html import write_report_page  # draws: so late that what is wrong is told at once
 
-            report = write_report([folder], folder / "report.html")
+            report = write_report_page([folder], folder / "report.html")
     kept = folder if ran else None  # there is nothing to look at
-    return DriveResult(scenario, found.rows, kept, report, found.shown, notes)
+    return DriveResult(scenario, found.rows, kept, report, found.plot_episodes, notes)

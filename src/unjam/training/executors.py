@@ -20,80 +20,80 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from unjam.children import child_environment, child_import_path, isolated_start, python_command
-from unjam.errors import MissingPartError, UnjamError, error_named
-from unjam.files import APPEND, make_folder, open_in_place, write_whole
-from unjam.folders import HELD_FOLDERS
-from unjam.parameters import build
-from unjam.processes import bound, end_with_parent
-from unjam.trust import FLAG, expecting_code, is_all_trusted
+from unjam.child_processes import child_environment, child_import_path, isolated_start, python_command
+from unjam.errors import MissingPartError, UnjamError, error_from_name
+from unjam.files import APPEND_FLAGS, atomic_write, make_folder, open_in_place
+from unjam.folders import PROTECTED_FOLDERS_VARIABLE
+from unjam.parameters import build_dataclass
+from unjam.processes import bind_to_parent, exit_with_parent
+from unjam.trust import TRUST_CODE_OPTION, expecting_code, is_all_code_trusted
 
 if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
     from unjam.training.config import RunConfig
-    from unjam.training.evaluate import Progress, Rows
+    from unjam.training.evaluate import EvaluationProgress, RowsByDriver
 
 Executor = Literal["local", "ray"]
 EXECUTORS: tuple[Executor, ...] = ("local", "ray")
-OnLine = Callable[[str], None]
+MessageCallback = Callable[[str], None]
 """gets a line of progress"""
-OnIteration = Callable[[dict[str, Any]], object]
+IterationCallback = Callable[[dict[str, Any]], object]
 """called with each row of progress as it is written; False ends the training"""
-ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 """how often a command line is started that a signal kills, or whose machine is lost"""
 
 
 class CommandLine(NamedTuple):
     """A command line of unjam."""
 
-    words: Sequence[str]
+    arguments: Sequence[str]
     """what follows `unjam`"""
     log: Path
     """where what it prints is added"""
-    begun: Path | None = None
+    resume_marker: Path | None = None
     """the file whose presence says that it was begun before"""
-    again: Sequence[str] = ()
+    resume_arguments: Sequence[str] = ()
     """words that go on with what was begun"""
 
-    def line(self) -> list[str]:
+    def argv(self) -> list[str]:
         """Return the whole command line, as it must be on this machine at this moment."""
-        begun = self.begun is not None and self.begun.is_file()
-        return python_command("-m", "unjam", *(self.again if begun else self.words))
+        begun = self.resume_marker is not None and self.resume_marker.is_file()
+        return python_command("-m", "unjam", *(self.resume_arguments if begun else self.arguments))
 
 
-def training_command(config: "RunConfig", folder: Path, plan: Path, log: Path) -> CommandLine:
+def training_command(config: "RunConfig", folder: Path, config_file: Path, log: Path) -> CommandLine:
     """Return the command line that begins a training or goes on with it; `plan` gets its configuration."""
     from unjam.training.config import to_toml
 
-    make_folder(plan.parent)
-    write_whole(plan, to_toml(config))
-    once = ["--workers", str(config.workers), *([FLAG] if is_all_trusted() else [])]
+    make_folder(config_file.parent)
+    atomic_write(config_file, to_toml(config))
+    once = ["--workers", str(config.workers), *([TRUST_CODE_OPTION] if is_all_code_trusted() else [])]
     return CommandLine(
-        ["train", "--config", str(plan), *once, "--out", str(folder)],
+        ["train", "--config", str(config_file), *once, "--out", str(folder)],
         log,
         folder / "config.toml",
         ["train", "--resume", str(folder), *once, "--steps", str(config.steps)],
     )
 
 
-class Processes:
+class LocalExecutor:
     """Runs command lines on this machine, and can end all that still run."""
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes]] = set()
         self._lock = threading.Lock()
-        self._stopped = False
+        self._is_stopped = False
 
     def run(self, command: CommandLine) -> int:
         """Run a command line to its end, anew where a signal kills it; return its exit code."""
         make_folder(command.log.parent)
-        for _ in range(ATTEMPTS - 1):
-            if (code := self._once(command)) >= 0 or self._stopped:
+        for _ in range(MAX_ATTEMPTS - 1):
+            if (code := self._run_once(command)) >= 0 or self._is_stopped:
                 return code
-        return self._once(command)
+        return self._run_once(command)
 
-    def _once(self, command: CommandLine) -> int:
-        line = command.line()
-        with open(open_in_place(command.log, APPEND), "ab") as log:
+    def _run_once(self, command: CommandLine) -> int:
+        line = command.argv()
+        with open(open_in_place(command.log, APPEND_FLAGS), "ab") as log:
             log.write(f"$ {shlex.join(line)}\n".encode())
             log.flush()
             with subprocess.Popen(
@@ -108,14 +108,14 @@ class Processes:
 
     def stop(self) -> None:
         """Ask all that still run to end: a training then writes its checkpoint."""
-        self._stopped = True
+        self._is_stopped = True
         with self._lock:
             for process in self._running:
                 process.terminate()
 
 
 @contextmanager
-def running(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine], Future[int]]]:
+def open_executor(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine], Future[int]]]:
     """Give what starts a command line and promises its exit code; an exception in the block ends them all.
 
     At most `workers` run at once; on a Ray cluster, whose machines share the folders, so many are asked for.
@@ -123,8 +123,8 @@ def running(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine]
     Raises:
         MissingPartError: Ray is not installed.
     """
-    processes = Processes()
-    place = _ray(workers) if executor == "ray" else nullcontext(processes.run)
+    processes = LocalExecutor()
+    place = _open_ray(workers) if executor == "ray" else nullcontext(processes.run)
     with ThreadPoolExecutor(workers) as threads, place as run:
         try:
             yield lambda command: threads.submit(run, command)
@@ -134,7 +134,7 @@ def running(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine]
             raise
 
 
-def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, on_line: OnLine) -> None:
+def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, on_message: MessageCallback) -> None:
     """Run command lines, given by name, `workers` at once; `on_line` gets a line when one has ended.
 
     Raises:
@@ -144,12 +144,12 @@ def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, 
     if not commands:
         return
     failed, started = [], time.monotonic()
-    with running(executor, workers) as start:
+    with open_executor(executor, workers) as start:
         names = {start(command): name for name, command in commands.items()}
         for done, future in enumerate(as_completed(names), start=1):
             name, code = names[future], future.result()
             minutes = (time.monotonic() - started) / 60.0
-            on_line(f"{done} of {len(names)}, {minutes:.0f} min: {name}{' failed' if code else ''}")
+            on_message(f"{done} of {len(names)}, {minutes:.0f} min: {name}{' failed' if code else ''}")
             if code != 0:
                 failed.append(name)
     if failed:
@@ -158,7 +158,7 @@ def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, 
 
 
 @contextmanager
-def _ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
+def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
     """Give what runs a command line somewhere on the Ray cluster that is there, or on one of this machine."""
     try:
         import ray  # pyright: ignore[reportMissingImports]
@@ -169,27 +169,27 @@ def _ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
             ray.init(address="auto", log_to_driver=False)
         except ConnectionError:
             ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
-    remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_run_here)
+    remote = ray.remote(num_cpus=1, max_retries=MAX_ATTEMPTS - 1)(_run_on_node)
     try:
-        yield lambda command: ray.get(remote.remote(command, bound({})[HELD_FOLDERS]))
+        yield lambda command: ray.get(remote.remote(command, bind_to_parent({})[PROTECTED_FOLDERS_VARIABLE]))
     finally:
         ray.shutdown()
 
 
-def _run_here(command: CommandLine, held_folders: str) -> int:
+def _run_on_node(command: CommandLine, held_folders: str) -> int:
     """Run a command line in a process of the cluster, where folders are held that another machine holds."""
-    os.environ[HELD_FOLDERS] = held_folders
-    return Processes().run(command)
+    os.environ[PROTECTED_FOLDERS_VARIABLE] = held_folders
+    return LocalExecutor().run(command)
 
 
 @expecting_code()
-def train_apart(
+def train_in_subprocess(
     config: "RunConfig",
     folder: Path,
     resume: bool,
-    on_iteration: OnIteration | None,
-    progress: "Progress | None",
-) -> "dict[str, Rows]":
+    on_iteration: IterationCallback | None,
+    progress: "EvaluationProgress | None",
+) -> "dict[str, RowsByDriver]":
     """Train as `unjam.train` does, and return the rows of the judgement, by road and driver.
 
     Raises:
@@ -216,7 +216,7 @@ def train_apart(
                 case ["judged", driver, episode, steps] if progress is not None:
                     progress((driver, episode), steps)
                 case ["error", kind, words]:
-                    raise error_named(kind, words)
+                    raise error_from_name(kind, words)
                 case ["done", rows]:
                     return rows
         raise UnjamError(f"training: its process ended with code {child.wait()}")
@@ -225,37 +225,37 @@ def train_apart(
         child.wait()
 
 
-def main() -> None:
+def train_from_stdin() -> None:
     """Train as the line on standard input says."""
-    end_with_parent(signal.SIGTERM)
+    exit_with_parent(signal.SIGTERM)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
     values, folder, resume, path = json.loads(sys.stdin.readline())
     # A user's driver may import what the program added to its path; last, it hides nothing that is installed.
     sys.path.extend(each for each in path if each not in sys.path)
 
-    def say(*words: Any) -> None:
-        print(json.dumps(words), file=answers, flush=True)
+    def send(*message: Any) -> None:
+        print(json.dumps(message), file=answers, flush=True)
 
-    def iterated(row: dict[str, Any]) -> bool:
-        say("row", row)
+    def report_iteration(row: dict[str, Any]) -> bool:
+        send("row", row)
         return json.loads(sys.stdin.readline())
 
     try:
         from unjam.training.config import RunConfig
-        from unjam.training.train import train_here
+        from unjam.training.train import train_in_process
 
-        rows = train_here(
-            build(RunConfig, values, ""),
+        rows = train_in_process(
+            build_dataclass(RunConfig, values, ""),
             Path(folder),
             resume,
-            iterated,
-            lambda episode, steps: say("judged", *episode, steps),
+            report_iteration,
+            lambda episode, steps: send("judged", *episode, steps),
         )
-        say("done", rows)
+        send("done", rows)
     except UnjamError as error:
-        say("error", type(error).__name__, str(error))
+        send("error", type(error).__name__, str(error))
 
 
 if __name__ == "__main__":
-    main()
+    train_from_stdin()

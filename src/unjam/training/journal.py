@@ -7,7 +7,7 @@ from typing import Any
 
 from optuna.storages.journal import BaseJournalBackend
 
-from unjam.files import append_line, read_lines, write_whole
+from unjam.files import append_line, atomic_write, read_json_lines
 
 
 class Journal(BaseJournalBackend):
@@ -18,9 +18,9 @@ class Journal(BaseJournalBackend):
 
     def __init__(self, path: Path) -> None:
         """Take the file, which may be missing; a line that a crash has cut short is left out."""
-        self._path, self._lines = path, list(map(_as_line, read_lines(path)))
+        self._path, self._lines = path, list(map(_json_line, read_json_lines(path)))
         if path.is_file():
-            write_whole(path, "".join(f"{line}\n" for line in self._lines))
+            atomic_write(path, "".join(f"{line}\n" for line in self._lines))
 
     def read_logs(self, log_number_from: int) -> Iterable[dict[str, Any]]:
         """Return the entries of the log from a number on."""
@@ -28,10 +28,10 @@ class Journal(BaseJournalBackend):
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
         """Add entries to the log; they are on the disk when this returns."""
-        lines = list(map(_as_line, logs))
+        lines = list(map(_json_line, logs))
         append_line(self._path, "\n".join(lines))
         self._lines += lines
 
 
-def _as_line(entry: dict[str, Any]) -> str:
+def _json_line(entry: dict[str, Any]) -> str:
     return json.dumps(entry, separators=(",", ":"))

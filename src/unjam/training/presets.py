@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from unjam.errors import wrong, wrong_name
-from unjam.parameters import changed
-from unjam.scenarios.ring import Loop
+from unjam.errors import invalid_value, unknown_name
+from unjam.parameters import merge_changes
+from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.scenario import Scenario
-from unjam.training.family import ALL_ROADS, FAMILY, SHARED_RINGS, roads_of
+from unjam.training.road_family import ALL_ROADS_GROUP, FAMILY, SHARED_RINGS_GROUP, family_scenarios
 
 PRESETS: dict[str, dict[str, Any]] = {
     # What the paper says, where it says something: Tables B2 to B5, section 4.1.
@@ -18,8 +18,8 @@ PRESETS: dict[str, dict[str, Any]] = {
             "observe": ["local"],
             "exploration_std": 1.0,
             "hold": 0,
-            "critic_sees_road": False,
-            "normalise_value": False,
+            "privileged_critic": False,
+            "normalize_value": False,
         },
         "trpo": {"batch_steps": 6000, "gamma": 0.995, "target_kl": 0.01},
         "ppo": {
@@ -27,8 +27,8 @@ PRESETS: dict[str, dict[str, Any]] = {
             "gamma": 0.99,
             "clip": 0.2,
             "epochs": 80,
-            "actor_rate": 3e-4,
-            "critic_rate": 1e-3,
+            "actor_learning_rate": 3e-4,
+            "critic_learning_rate": 1e-3,
         },
         "sac": {
             "gamma": 0.99,
@@ -38,10 +38,10 @@ PRESETS: dict[str, dict[str, Any]] = {
             "learn_temperature": False,
             "reward_scale": 1.0,
             "batch": 256,
-            "start_steps": 10_000,
+            "learning_starts": 10_000,
             "start": "uniform",
         },
-        "virtual": {"k_max": 500, "kappa": 2.0, "virtual_ratio": 1.0},
+        "virtual": {"k_max": 500, "kappa": 2.0, "model_ratio": 1.0},
     },
     # Also where it says less, as it would have been done: one network as it was drawn, whose mean is taken,
     # no best of several looks, and an end where nothing gets better.
@@ -50,65 +50,65 @@ PRESETS: dict[str, dict[str, Any]] = {
     "demo": {"steps": 300_000, "evaluation": {"every": 2}},
 }
 
-PRESETS["paper-exact"] = changed(
+PRESETS["paper-exact"] = merge_changes(
     PRESETS["paper"],
     {
-        "policy": {"begin_at_expert": False},
-        "virtual": {"members": 1, "fall_back": False, "noise": False, "error": "transitions"},
+        "policy": {"zero_init": False},
+        "virtual": {"members": 1, "fallback_to_base": False, "noise": False, "error": "transitions"},
         "evaluation": {"every": 0, "converged": 50},
     },
 )
 
-RINGS_TUNED = "unjam:rings-tuned"
+RINGS_EXPERT = "unjam:rings-tuned"
 """the expert that gets furthest on all rings of the family together"""
-SHARED_RINGS_TUNED = "unjam:shared-rings-tuned"
+SHARED_RINGS_EXPERT = "unjam:shared-rings-tuned"
 """the expert that gets furthest where several CAVs share a ring"""
 BRAKING_COST = 0.0075
 """weight of the acceleration's term where the speed's is such that the limit earns 1"""
 
 
-MOTORWAYS_WEIGHT = 0.3333
+ON_RAMP_TASK_WEIGHT = 0.3333
 """of a task: an episode there has as many CAVs as twenty on rings, and takes as long"""
 
 
-def _task(name: str, road: Scenario) -> dict[str, Any]:
+def _family_task(name: str, scenario: Scenario) -> dict[str, Any]:
     """Return a road of the family as a task; on loops one earns the share of what people could drive."""
     reward = ""
-    if isinstance(road, Loop):
-        limits = [road.limit(size) for size in road.drawn_ranges[road.size]]
+    if isinstance(scenario, LoopScenario):
+        limits = [scenario.limit_speed(size) for size in scenario.drawn_ranges[scenario.size_parameter]]
         speed = round(5.0 * len(limits) / sum(limits), 4)
         reward = f"released:speed={speed},acceleration={BRAKING_COST}"
-    found = {"scenario": FAMILY[name].scenario, "road": FAMILY[name].changes, "reward": reward, "name": name}
-    return found if isinstance(road, Loop) else {**found, "weight": MOTORWAYS_WEIGHT}
+    found = {"scenario": FAMILY[name].scenario, "road": FAMILY[name].options, "reward": reward, "name": name}
+    return found if isinstance(scenario, LoopScenario) else {**found, "weight": ON_RAMP_TASK_WEIGHT}
 
 
 # One residual for all rings of the family that may be seen. An iteration has four episodes of each, for the
 # roads differ. Of six pilots, most of which differ in more than one setting, this one got furthest for its
 # steps in validation: results/tried/rings-settings.json. What helps a wave to dissolve pays for minutes.
 PRESETS["rings"] = {
-    "expert": RINGS_TUNED,
+    "expert": RINGS_EXPERT,
     "steps": 4_800_000,
     "world": "batch",
     "policy": {"remember": True},
     "trpo": {"batch_steps": 120_000, "gamma": 0.996, "target_kl": 0.02},
     "ppo": {"batch_steps": 120_000, "gamma": 0.996},
-    "virtual": {"virtual_ratio": 0.0},
+    "virtual": {"model_ratio": 0.0},
     "evaluation": {"every": 10, "validation_episodes": 8, "episodes": 10, "baselines": ["human", "pi"]},
-    "tasks": [_task(name, ring) for name, ring in roads_of("rings", "seen").items()],
+    "tasks": [_family_task(name, ring) for name, ring in family_scenarios("rings", "seen").items()],
 }
 
 # Where several CAVs share a ring: a residual on all rings helps them and harms one that is alone. On the law
 # for all rings large iterations are the steadier ones; on the law that is tuned for shared rings nothing is
 # left to learn: results/tried/shared-rings-settings.json, results/shared-rings.
-PRESETS["shared-rings"] = changed(
+PRESETS["shared-rings"] = merge_changes(
     PRESETS["rings"],
     {
-        "expert": SHARED_RINGS_TUNED,
+        "expert": SHARED_RINGS_EXPERT,
         "steps": 1_440_000,
         "trpo": {"batch_steps": 240_000},
         "ppo": {"batch_steps": 240_000},
         "evaluation": {"every": 2, "validation_episodes": 16},
-        "tasks": [_task(name, ring) for name, ring in roads_of(SHARED_RINGS, "seen").items()],
+        "tasks": [_family_task(name, ring) for name, ring in family_scenarios(SHARED_RINGS_GROUP, "seen").items()],
     },
 )
 
@@ -118,33 +118,32 @@ PRESETS["everywhere"] = {
     "expert": "unjam:best",
     "steps": 1_000_000,
     "world": "batch",
-    "policy": {"observe": ["local", "expert_acceleration", "cav_share"]},
-    "trpo": {"batch_steps": 75_000, "gamma": 0.996, "target_kl": 0.01, "critic_batch": 1000},
+    "policy": {"observe": ["local", "expert_acceleration", "penetration_rate"]},
+    "trpo": {"batch_steps": 75_000, "gamma": 0.996, "target_kl": 0.01, "critic_batch_size": 1000},
     "ppo": {"batch_steps": 75_000, "gamma": 0.996},
-    "virtual": {"virtual_ratio": 0.0},
+    "virtual": {"model_ratio": 0.0},
     "evaluation": {"every": 5, "validation_episodes": 4, "episodes": 10, "baselines": ["human"]},
-    "tasks": [_task(name, road) for name, road in roads_of(ALL_ROADS, "seen").items()],
+    "tasks": [_family_task(name, road) for name, road in family_scenarios(ALL_ROADS_GROUP, "seen").items()],
 }
 
-GATHERING_PACER = "pacer:varying=true,gathering_speed=1.934,gathering_gap=0.445,regathering_gap=0.6469"
+FIGURE_EIGHT_PACER = "pacer:use_tuned=true,gathering_speed=1.934,gathering_gap=0.445,regathering_gap=0.6469"
 """the expert that was tuned on the figure eight, but for its time constant"""
 
-ON_RAMP_LONG = (
-    "jam-ahead:first=3,last=4,margin=-1.536,margin_by_share=19.83,lowest=2.568,slowing=1.106,"
-    "time_constant=1.681"
+ON_RAMP_JAM_AHEAD = (
+    "jam-ahead:first=3,last=4,margin=-1.536,margin_by_share=19.83,lowest=2.568,slowing=1.106,time_constant=1.681"
 )
 """what `unjam tune on-ramp --expert jam-ahead --set cav_share=0.05 --steps 4608000` finds, mostly in batches;
 with 710,400 steps, all in SUMO, it is `unjam:on-ramp-tuned`"""
 
-CLOSING_ABSORBER = "jam-absorber:gap_gain=0,push=0.9,speed_gain=0.8"
+MERGE_JAM_ABSORBER = "jam-absorber:gap_gain=0,extra_acceleration=0.9,speed_gain=0.8"
 """the expert that gets furthest on the merge"""
 
-EXPERT_SEEN = ["local", "expert_acceleration", "expert_memory"]
+EXPERT_INPUTS = ["local", "expert_acceleration", "expert_memory"]
 """features where what to add depends on what the expert is about"""
 
-LITTLE_NOISE = {"exploration_std": 0.015, "learn_exploration": False}
+LOW_EXPLORATION = {"exploration_std": 0.015, "learn_exploration_std": False}
 """exploration that neither grows nor vanishes, on experts that much of it upsets"""
-BEST: dict[str, dict[str, Any]] = {
+BEST_BY_SCENARIO: dict[str, dict[str, Any]] = {
     # Much of what is learned from few episodes is their noise: iterations are large, and the batch affords
     # them. More exploration makes another task of it: PI answers noise with braking. Less vanishes too soon.
     # The expert knows how to start; a residual on PI spends twice the steps on learning just that.
@@ -152,9 +151,9 @@ BEST: dict[str, dict[str, Any]] = {
         "steps": 6_000_000,
         "world": "batch",
         "expert": "unjam:ring-gap-tuned",
-        "policy": {"remember": True, **LITTLE_NOISE},
+        "policy": {"remember": True, **LOW_EXPLORATION},
         "trpo": {"batch_steps": 96_000, "target_kl": 0.02},
-        "virtual": {"virtual_ratio": 0.0},
+        "virtual": {"model_ratio": 0.0},
         "evaluation": {"every": 5, "validation_episodes": 32},
     },
     # A wave that has grown: what ends it sooner may leave a slower flow for minutes, so it takes whole
@@ -163,26 +162,26 @@ BEST: dict[str, dict[str, Any]] = {
         "steps": 6_000_000,
         "world": "batch",
         "expert": "unjam:ring-jammed-tuned",
-        "policy": {"remember": True, "exploration_std": 0.013, "learn_exploration": False, "hold": 2.1},
+        "policy": {"remember": True, "exploration_std": 0.013, "learn_exploration_std": False, "hold": 2.1},
         "trpo": {"batch_steps": 192_000, "target_kl": 0.0086, "gamma": 0.99, "gae_lambda": 0.966},
-        "virtual": {"virtual_ratio": 0.0},
+        "virtual": {"model_ratio": 0.0},
         "evaluation": {"every": 6, "validation_episodes": 32},
     },
     # The pacer alone holds the queue; the residual gathers it sooner. It needs room: with the time constant
     # that was tuned the pacer cancels whatever is added. What is done to gather them shows half a lap later,
     # and one episode in forty breaks the queue: what is better is seen in many, and goes on for long.
     "figure-eight": {
-        "expert": f"{GATHERING_PACER},time_constant=1",
+        "expert": f"{FIGURE_EIGHT_PACER},time_constant=1",
         "reward": "eq16",
         "steps": 4_860_000,
         "policy": {
-            "observe": [*EXPERT_SEEN, "place"],
+            "observe": [*EXPERT_INPUTS, "place"],
             "remember": True,
             "exploration_std": 0.2,
-            "learn_exploration": False,
+            "learn_exploration_std": False,
         },
         "trpo": {"batch_steps": 45_000, "gamma": 0.998, "target_kl": 0.02},
-        "virtual": {"virtual_ratio": 0.0},
+        "virtual": {"model_ratio": 0.0},
         "evaluation": {"every": 6, "validation_episodes": 64},
     },
     # One CAV in twenty, whose commands all vanish in people's noise: an episode explores with one change for
@@ -190,13 +189,13 @@ BEST: dict[str, dict[str, Any]] = {
     # tell little: seven times as many are imagined, and learned from in turn.
     "on-ramp": {
         "steps": 28_800,
-        "road": {"cav_share": 0.05},
+        "road": {"penetration_rate": 0.05},
         "expert": "unjam:on-ramp-tuned",
         "policy": {
             "observe": ["approach"],
             "exploration": "mirrored",
             "exploration_std": 0.12,
-            "learn_exploration": False,
+            "learn_exploration_std": False,
             "afterwards": True,
             "hold": 5.0,
         },
@@ -205,11 +204,11 @@ BEST: dict[str, dict[str, Any]] = {
             "gamma": 0.995,
             "gae_lambda": 0.99,
             "target_kl": 0.05,
-            "critic_batch": 2000,
+            "critic_batch_size": 2000,
         },
         "virtual": {
             "model": "road",
-            "virtual_ratio": 7.0,
+            "model_ratio": 7.0,
             "begin": "first",
             "k_max": 2400,
             "kappa": 10_000.0,
@@ -219,25 +218,25 @@ BEST: dict[str, dict[str, Any]] = {
     },
     # A jam comes or does not: what a CAV did shows minutes later, and only in the mean of many episodes.
     "merge": {
-        "expert": CLOSING_ABSORBER,
+        "expert": MERGE_JAM_ABSORBER,
         "steps": 300_000,
-        "policy": {"observe": EXPERT_SEEN, "exploration_std": 0.4},
+        "policy": {"observe": EXPERT_INPUTS, "exploration_std": 0.4},
         "trpo": {"batch_steps": 6000, "gamma": 0.998, "gae_lambda": 0.99},
-        "virtual": {"virtual_ratio": 0.0},
+        "virtual": {"model_ratio": 0.0},
         "evaluation": {"every": 10, "validation_episodes": 32},
     },
 }
 """the preset `best`: what is known to reach furthest, road by road"""
 
-QUICK: dict[str, dict[str, Any]] = {
-    "merge": BEST["merge"],
+QUICK_BY_SCENARIO: dict[str, dict[str, Any]] = {
+    "merge": BEST_BY_SCENARIO["merge"],
     # The expert is tuned: what a residual on it gains, no parameter does. It is easily upset: seven times the
     # noise makes the first 40 iterations unlearn what it can, and noise that is learned vanishes too soon.
     "ring": {
         **PRESETS["demo"],
         "steps": 1_500_000,
         "expert": "unjam:ring-tuned",
-        "policy": LITTLE_NOISE,
+        "policy": LOW_EXPLORATION,
         "trpo": {"target_kl": 0.02},
     },
     # Larger steps of the policy unlearn what the expert can, and no wave comes in the virtual environment of
@@ -245,26 +244,23 @@ QUICK: dict[str, dict[str, Any]] = {
     "ring-jammed": {
         "steps": 600_000,
         "trpo": {"target_kl": 0.01},
-        "virtual": {"virtual_ratio": 0.0},
+        "virtual": {"model_ratio": 0.0},
         "evaluation": {"every": 3, "validation_episodes": 8},
     },
     # The virtual environment of rows does not know the crossing.
     "figure-eight": {
-        "expert": "pacer:varying=true,time_constant=1",
+        "expert": "pacer:use_tuned=true,time_constant=1",
         "reward": "eq16",
         "steps": 300_000,
-        "policy": {
-            "observe": [*EXPERT_SEEN, "place"],
-            "exploration_std": 0.3,
-        },
-        "virtual": {"virtual_ratio": 0.0},
+        "policy": {"observe": [*EXPERT_INPUTS, "place"], "exploration_std": 0.3},
+        "virtual": {"model_ratio": 0.0},
         "evaluation": {"every": 2, "validation_episodes": 8},
     },
 }
 """the preset `quick`: what reaches furthest within a million actual steps or so, road by road"""
 
 
-DEMO: dict[str, dict[str, Any]] = {
+DEMO_BY_SCENARIO: dict[str, dict[str, Any]] = {
     # People have made a wave, and one CAV dissolves it: half a minute of training. Rows imagine no wave, and
     # iterations are large, for the batch affords them.
     "ring-jammed": {
@@ -272,27 +268,27 @@ DEMO: dict[str, dict[str, Any]] = {
         "world": "batch",
         "road": {"horizon": 1500},
         "trpo": {"batch_steps": 48_000},
-        "virtual": {"virtual_ratio": 0.0},
+        "virtual": {"model_ratio": 0.0},
         "evaluation": {
             "every": 2,
             "validation_episodes": 16,
             "episodes": 8,
             "baselines": ["human", "unjam:ring-jammed-tuned"],
         },
-    },
+    }
 }
 """the preset `demo` where it is another: on the road that a first visit sees"""
-BY_ROAD = {"best": BEST, "quick": QUICK, "demo": DEMO}
+PRESETS_BY_SCENARIO = {"best": BEST_BY_SCENARIO, "quick": QUICK_BY_SCENARIO, "demo": DEMO_BY_SCENARIO}
 """presets that differ from road to road"""
 
 
 def preset_values(preset: str, scenario: str) -> dict[str, Any]:
     """Return what a preset changes on a scenario; raise `InputError` where there is no such preset."""
-    by_road = BY_ROAD.get(preset, {})
+    by_road = PRESETS_BY_SCENARIO.get(preset, {})
     if scenario in by_road:
         return by_road[scenario]
     if preset in PRESETS:
         return PRESETS[preset]
     if by_road:
-        raise wrong("scenario", scenario, f"with the preset {preset}: {', '.join(by_road)}")
-    raise wrong_name("preset", preset, dict.fromkeys([*PRESETS, *BY_ROAD]))
+        raise invalid_value("scenario", scenario, f"with the preset {preset}: {', '.join(by_road)}")
+    raise unknown_name("preset", preset, dict.fromkeys([*PRESETS, *PRESETS_BY_SCENARIO]))

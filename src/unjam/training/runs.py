@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from unjam.errors import InputError, UnjamError
-from unjam.files import DAMAGED, remove
+from unjam.files import INVALID_DATA_ERRORS, remove
 from unjam.measures.statistics import Estimate, paired_difference
-from unjam.parameters import flat
-from unjam.processes import check_not_owned, is_owned
-from unjam.reports.results import EVALUATION_FILE, damaged, read_about, read_progress
+from unjam.parameters import flatten_keys
+from unjam.processes import check_not_locked, is_locked
+from unjam.reports.results import EVALUATION_FILE, damaged_results_error, read_evaluation, read_progress
 from unjam.training.config import RunConfig
-from unjam.training.folder import MANIFEST, read_config
-from unjam.training.stopping import ends_early
+from unjam.training.early_stopping import should_stop_early
+from unjam.training.run_folder import MANIFEST_FILE, read_config
 
-State = Literal["running", "finished", "stopped", "damaged"]
+RunState = Literal["running", "finished", "stopped", "damaged"]
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Run:
     """its path below the folder that was listed"""
     folder: Path
     config: RunConfig = field(repr=False)
-    state: State
-    """`running`: a process of this machine writes it; `stopped`: it can go on with `unjam train --resume`"""
+    state: RunState
+    """`open_executor`: a process of this machine writes it; `stop_reason`: it can go on with `unjam train --resume`"""
     steps: int
     """actual steps that are done, of `config.steps`"""
     gains: dict[str, Estimate | None]
@@ -45,38 +45,38 @@ class Run:
         }
 
 
-def list_runs(under: Path | str = "runs", scenario: str = "") -> list[Run]:
+def list_runs(root: Path | str = "runs", scenario: str = "") -> list[Run]:
     """Return the runs in a folder and all below it, by name; with `scenario`, those that train on it.
 
     Raises:
         InputError: there is no such folder.
     """
-    under = Path(under)
-    if not under.is_dir():
-        raise InputError(f"under: {str(under)!r} is not a folder; allowed: one that holds run folders")
-    found = [_listed(folder, str(folder.relative_to(under))) for folder in sorted(_run_folders(under))]
+    root = Path(root)
+    if not root.is_dir():
+        raise InputError(f"under: {str(root)!r} is not a folder; allowed: one that holds run folders")
+    found = [_read_listed_run(folder, str(folder.relative_to(root))) for folder in sorted(_run_folders(root))]
     return [
         run
         for run in found
-        if not scenario or scenario in {Path(road.scenario).name for road in run.config.roads().values()}
+        if not scenario or scenario in {Path(road.scenario).name for road in run.config.task_configs().values()}
     ]
 
 
-def _listed(folder: Path, name: str) -> Run:
+def _read_listed_run(folder: Path, name: str) -> Run:
     """Return how far a run is; one that is damaged is listed as such, beside the others."""
     try:
         return read_run(folder, name)
     except InputError:
-        config = read_config(folder, to_run=False)
-        return Run(name, folder, config, "damaged", 0, dict.fromkeys(config.roads()))
+        config = read_config(folder, check_trust=False)
+        return Run(name, folder, config, "damaged", 0, dict.fromkeys(config.task_configs()))
 
 
-def _run_folders(under: Path) -> Iterator[Path]:
-    for place, below, files in os.walk(under):
-        if {"config.toml", MANIFEST} <= set(files):
+def _run_folders(root: Path) -> Iterator[Path]:
+    for place, below, files in os.walk(root):
+        if {"config.toml", MANIFEST_FILE} <= set(files):
             below.clear()  # the roads of a run are no runs
             try:
-                read_config(Path(place), to_run=False)
+                read_config(Path(place), check_trust=False)
             except UnjamError:  # of another unjam, or somebody else's
                 continue
             yield Path(place)
@@ -84,37 +84,37 @@ def _run_folders(under: Path) -> Iterator[Path]:
 
 def read_run(folder: Path, name: str = "") -> Run:
     """Return how far a run is; raise `InputError` where the folder is none of a run."""
-    config, progress = read_config(folder, to_run=False), read_progress(folder)
-    if not (folder / MANIFEST).is_file():
-        raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {MANIFEST}")
+    config, progress = read_config(folder, check_trust=False), read_progress(folder)
+    if not (folder / MANIFEST_FILE).is_file():
+        raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {MANIFEST_FILE}")
     try:
-        steps = int(progress[-1]["actual_steps"]) if progress else 0
-        gains = {road: _gain(folder / road) for road in config.roads()}
-    except DAMAGED as error:
-        raise damaged(folder, error) from None
+        steps = int(progress[-1]["environment_steps"]) if progress else 0
+        gains = {road: _test_gain(folder / road) for road in config.task_configs()}
+    except INVALID_DATA_ERRORS as error:
+        raise damaged_results_error(folder, error) from None
     judged = all((folder / road / EVALUATION_FILE).is_file() for road in gains)
-    over = steps >= config.steps or ends_early(config, progress)
-    done: State = "finished" if judged and over else "stopped"
-    return Run(name or str(folder), folder, config, "running" if is_owned(folder) else done, steps, gains)
+    over = steps >= config.steps or should_stop_early(config, progress)
+    done: RunState = "finished" if judged and over else "stopped"
+    return Run(name or str(folder), folder, config, "running" if is_locked(folder) else done, steps, gains)
 
 
-def _gain(folder: Path) -> Estimate | None:
+def _test_gain(folder: Path) -> Estimate | None:
     """Return what a judged controller earns beyond its expert; None before that, or without an expert."""
     if not (folder / EVALUATION_FILE).is_file():
         return None
-    about, rows = read_about(folder)
+    about, rows = read_evaluation(folder)
     expert = rows.get(about.get("expert", ""))
     return paired_difference(rows[about["trained"]], expert, "return") if expert else None
 
 
-def find_run(name: str, under: Path) -> Path:
-    """Return the folder of a run by its name below `under`, or by its path."""
-    return under / name if (under / name).is_dir() else Path(name)
+def find_run(name: str, root: Path) -> Path:
+    """Return the folder of a run by its name below `tensors_with_prefix`, or by its path."""
+    return root / name if (root / name).is_dir() else Path(name)
 
 
-def differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
+def config_differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
     """Return the settings in which runs differ, each with the value of every run; dots lead into tables."""
-    settings = [flat(asdict(run.config)) for run in runs]
+    settings = [flatten_keys(asdict(run.config)) for run in runs]
     names = dict.fromkeys(name for of_one in settings for name in of_one)
     values = {name: [of_one.get(name) for of_one in settings] for name in names}
     return {name: each for name, each in values.items() if any(value != each[0] for value in each)}
@@ -129,5 +129,5 @@ def remove_run(folder: Path) -> None:
     read_run(folder)
     if folder.is_symlink() or Path.cwd().is_relative_to(folder.resolve()):
         raise InputError(f"run: {str(folder)!r} is a link, or where you are; allowed: a run folder elsewhere")
-    check_not_owned(folder)
+    check_not_locked(folder)
     remove(folder)

@@ -7,14 +7,14 @@ from typing import Any
 
 from unjam.errors import MissingPartError
 from unjam.files import make_folder
-from unjam.parameters import flat
-from unjam.training.executors import OnIteration
+from unjam.parameters import flatten_keys
+from unjam.training.executors import IterationCallback
 
-FOLDER = "tensorboard"
+TENSORBOARD_FOLDER = "tensorboard"
 """of a run: what `tensorboard --logdir` is given"""
 
 
-def tensorboard_into(folder: Path | str) -> OnIteration:
+def tensorboard_writer(folder: Path | str) -> IterationCallback:
     """Return what writes each row of progress into a run's folder: for `on_iteration` of `unjam.train`.
 
     Every number of a row has its curve over actual steps; those of one kind have one group.
@@ -26,7 +26,7 @@ def tensorboard_into(folder: Path | str) -> OnIteration:
         raise MissingPartError("tensorboard: it is not installed: pip install 'unjam[train]'")
     from torch.utils.tensorboard.writer import SummaryWriter
 
-    place = Path(folder, FOLDER)
+    place = Path(folder, TENSORBOARD_FOLDER)
     writer: SummaryWriter | None = None
 
     def write(row: dict[str, Any]) -> None:
@@ -34,9 +34,9 @@ def tensorboard_into(folder: Path | str) -> OnIteration:
         if writer is None:  # the run makes its folder first
             make_folder(place)  # no link is followed there, and nobody can guess the name of the file
             writer = SummaryWriter(str(place), filename_suffix=f".{secrets.token_hex(8)}")
-        for name, value in flat(row).items():
-            if isinstance(value, int | float) and name not in ("iteration", "actual_steps"):
-                writer.add_scalar(name.replace(".", "/", 1), value, row["actual_steps"])
+        for name, value in flatten_keys(row).items():
+            if isinstance(value, int | float) and name not in ("iteration", "environment_steps"):
+                writer.add_scalar(name.replace(".", "/", 1), value, row["environment_steps"])
         writer.flush()
 
     return write

@@ -14,47 +14,47 @@ import numpy as np
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
-from unjam.files import append_line, make_folder, to_json, write_whole
-from unjam.kernels import child_would_be_pinned
-from unjam.learners.algorithm_1 import Collected, Iteration, Validated, algorithm_1, begin_training
-from unjam.learners.imagination import full_policy
+from unjam.files import append_line, atomic_write, make_folder, to_json
+from unjam.kernels import needs_new_process
+from unjam.learners.algorithm_1 import Iteration, TaskEpisodes, ValidationReturns, algorithm_1, start_training
+from unjam.learners.model_rollouts import full_policy
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate
-from unjam.processes import owned
-from unjam.reports.html import write_report
+from unjam.processes import lock_folder
+from unjam.reports.html import write_report_page
 from unjam.reports.results import read_progress
-from unjam.training.belonging import belonging
 from unjam.training.config import RunConfig, to_toml
-from unjam.training.evaluate import Progress, Rows, gain_of, judge, raise_failure
-from unjam.training.executors import OnIteration, train_apart
-from unjam.training.export import KeptControllers
-from unjam.training.folder import (
-    PROGRESS,
-    check_possible,
-    continue_folder,
-    last_state,
+from unjam.training.early_stopping import should_stop_early
+from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, raise_failure, test_gain
+from unjam.training.executors import IterationCallback, train_in_subprocess
+from unjam.training.export import ControllerStore
+from unjam.training.fingerprint import fingerprint
+from unjam.training.model_facts import no_facts_reason, write_model_facts
+from unjam.training.random_state import exclusive_random_state
+from unjam.training.run_folder import (
+    PROGRESS_FILE,
+    append_lineage,
+    check_config,
+    controller_origin,
+    create_run_folder,
     make_new_folder,
-    note_lineage,
-    origin,
     read_config,
+    restore_newest_checkpoint,
+    resume_run_folder,
     save_checkpoint,
-    start_folder,
 )
-from unjam.training.generators import exclusive_generators
-from unjam.training.model_facts import why_no_facts, write_model_facts
-from unjam.training.sampling import Sampler, episodes_of, iterations_ahead
-from unjam.training.seeds import VALIDATE
-from unjam.training.stopping import ends_early
+from unjam.training.seeds import VALIDATION_SEED
+from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
 from unjam.trust import expecting_code
-from unjam.worlds.batch.run import run_where_possible
-from unjam.worlds.workers import Workers
+from unjam.worlds.batch.run import run_batched_if_supported
+from unjam.worlds.worker_pool import WorkerPool
 
-MEANS = (
+PROGRESS_METRICS = (
     *("mean_speed", "speed_std_fleet", "cav_mean_speed", "speed_std_cav", "mean_abs_accel"),
     "shield_override_share",
 )
 """metrics whose means over an iteration's episodes are in progress"""
-RETURNS = ("return_mean", "return_expert", "return_validation")
+PROGRESS_RETURNS = ("return_mean", "return_expert", "return_validation")
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class TrainResult:
     """A finished training run; of several roads, each has its own result in `roads`, and no other."""
 
     folder: Path
-    rows: Rows
+    rows: RowsByDriver
     """by driver: a row of metrics per held-out episode"""
     gain: Estimate | None
     """return of the trained controller beyond its expert's, same seeds paired; None without an expert"""
-    roads: dict[str, "TrainResult"] = field(default_factory=dict)
+    tasks: dict[str, "TrainResult"] = field(default_factory=dict)
     """by task, each in a folder of its own; empty where there is one road alone"""
 
     @property
@@ -84,8 +84,8 @@ def train(
     config: RunConfig,
     folder: Path | str,
     resume: bool = False,
-    on_iteration: OnIteration | None = None,
-    progress: Progress | None = None,
+    on_iteration: IterationCallback | None = None,
+    progress: EvaluationProgress | None = None,
 ) -> TrainResult:
     """Train as `config` says into `folder`, judge the controller on held-out seeds, and write the report.
 
@@ -111,58 +111,58 @@ def train(
         DiskError: the disk is full; the last checkpoint is whole.
     """
     folder = Path(folder)
-    train_it = train_apart if child_would_be_pinned() else train_here
+    train_it = train_in_subprocess if needs_new_process() else train_in_process
     rows = train_it(config, folder, resume, on_iteration, progress)
     results = {
-        name: TrainResult(folder / name, rows[name], gain_of(road, rows[name]))
-        for name, road in config.roads().items()
+        name: TrainResult(folder / name, rows[name], test_gain(road, rows[name]))
+        for name, road in config.task_configs().items()
     }
     return TrainResult(folder, {}, None, results) if config.tasks else results[""]
 
 
-@exclusive_generators()
-def train_here(
+@exclusive_random_state()
+def train_in_process(
     config: RunConfig,
     folder: Path,
     resume: bool = False,
-    on_iteration: OnIteration | None = None,
-    progress: Progress | None = None,
-) -> dict[str, Rows]:
+    on_iteration: IterationCallback | None = None,
+    progress: EvaluationProgress | None = None,
+) -> dict[str, RowsByDriver]:
     """Train in this process, as `train` does; return the rows of the judgement, by road and driver."""
-    check_possible(config)  # what is wrong is said before anything is written
+    check_config(config)  # what is wrong is said before anything is written
     if resume:
         read_config(folder)
     else:
         make_new_folder(folder, f", or --resume {folder}")
-    with expecting_code(), owned(folder):
-        return _train_owned(config, folder, resume, on_iteration, progress)
+    with expecting_code(), lock_folder(folder):
+        return _train_in_folder(config, folder, resume, on_iteration, progress)
 
 
-def _train_owned(
+def _train_in_folder(
     config: RunConfig,
     folder: Path,
     resume: bool,
-    on_iteration: OnIteration | None,
-    progress: Progress | None,
-) -> dict[str, Rows]:
+    on_iteration: IterationCallback | None,
+    progress: EvaluationProgress | None,
+) -> dict[str, RowsByDriver]:
     """Train into a folder that no other process writes."""
-    (continue_folder if resume else start_folder)(folder, config)
-    with ExitStack() as held, Workers(config.workers) as workers:
-        for place in [folder / name for name in config.roads() if name]:  # others may evaluate one alone
+    (resume_run_folder if resume else create_run_folder)(folder, config)
+    with ExitStack() as held, WorkerPool(config.workers) as workers:
+        for place in [folder / name for name in config.task_configs() if name]:  # others may evaluate one alone
             make_folder(place)
-            held.enter_context(owned(place))
+            held.enter_context(lock_folder(place))
         Trainer(folder, config, workers, on_iteration).train()
-        rows: dict[str, Rows] = {}
-        for name, road in config.roads().items():
-            of_road = partial(_on_road, progress, name) if progress else None
-            rows[name] = judge(folder / name, road, workers, progress=of_road).rows
-    if not why_no_facts(config):
+        rows: dict[str, RowsByDriver] = {}
+        for name, road in config.task_configs().items():
+            of_road = partial(_report_task_progress, progress, name) if progress else None
+            rows[name] = evaluate_run(folder / name, road, workers, progress=of_road).rows
+    if not no_facts_reason(config):
         write_model_facts(folder, config)
-    write_report([folder / name for name in rows], folder / "report.html")
+    write_report_page([folder / name for name in rows], folder / "report.html")
     return rows
 
 
-def _on_road(progress: Progress, name: str, episode: tuple[str, int], steps: int) -> None:
+def _report_task_progress(progress: EvaluationProgress, name: str, episode: tuple[str, int], steps: int) -> None:
     """Tell how far an episode is; those of another road are others."""
     driver, number = episode
     progress((f"{name} {driver}".strip(), number), steps)
@@ -176,145 +176,154 @@ class Trainer:
     """
 
     def __init__(
-        self, folder: Path, config: RunConfig, workers: Workers, on_iteration: OnIteration | None = None
+        self, folder: Path, config: RunConfig, workers: WorkerPool, on_iteration: IterationCallback | None = None
     ) -> None:
         """Prepare a run, from its newest checkpoint if it has one."""
         self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
         self.folders = [folder / task.name for task in self.tasks]
-        self.training = begin_training(self.tasks, config.policy, config.learner, config.virtual, config.seed)
+        self.training = start_training(self.tasks, config.policy, config.learner, config.model, config.seed)
         self._on_iteration = on_iteration or (lambda row: None)
-        self._validation_best, self._expert_returns = -np.inf, [float("nan")] * len(self.tasks)
-        self._sampler = Sampler(self.tasks, config.sampling, self._expert_returns)
-        self._controllers = KeptControllers(self.folders)
-        self._belongs = belonging(config)
-        if checkpoint := last_state(folder, {folder, *self.folders}, self._belongs):
+        self._best_validation, self._expert_returns = -np.inf, [float("nan")] * len(self.tasks)
+        self._sampler = TaskSampler(self.tasks, config.task_sampling, self._expert_returns)
+        self._controllers = ControllerStore(self.folders)
+        self._fingerprint = fingerprint(config)
+        if checkpoint := restore_newest_checkpoint(folder, {folder, *self.folders}, self._fingerprint):
             state, tensors = checkpoint
-            ended = state["actual_steps"] >= config.steps or ends_early(config, read_progress(folder))
+            ended = state["environment_steps"] >= config.steps or should_stop_early(config, read_progress(folder))
             self._controllers.restore(tensors, ended)
             self.training.restore(state, tensors)
-            self._validation_best = state["validation_best"]
+            self._best_validation = state["validation_best"]
             self._expert_returns = state["expert_returns"]
             self._sampler.restore(state.get("sampler", {"reached": self._expert_returns}))
-            note_lineage(folder, state["iteration"])
+            append_lineage(folder, state["iteration"])
 
     def train(self) -> None:
         """Learn until the configured number of actual steps; a stop loses at most the running iteration."""
         if self.config.tasks:
-            for place, road in zip(self.folders, self.config.roads().values(), strict=True):
+            for place, road in zip(self.folders, self.config.task_configs().values(), strict=True):
                 make_folder(place)
-                write_whole(place / "config.toml", to_toml(road))
+                atomic_write(place / "config.toml", to_toml(road))
         if self.training.iteration == 0:
-            self._expert_returns = self.returns_of([task.expert for task in self.tasks])
-            self._sampler.reached = self._expert_returns
-            self._keep_controllers(self.training.learner.network(), best=True)
-            self._validation_best = self._sampler.mean(self._expert_returns)
-        if not ends_early(self.config, read_progress(self.folder)):
-            algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write)
+            self._expert_returns = self.validation_returns([task.expert for task in self.tasks])
+            self._sampler.best_returns = self._expert_returns
+            self._save_controllers(self.training.learner.network(), is_best=True)
+            self._best_validation = self._sampler.weighted_mean(self._expert_returns)
+        if not should_stop_early(self.config, read_progress(self.folder)):
+            algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write_progress)
 
-    def drivers(self, network: Network) -> list[Driver]:
+    def make_drivers(self, network: Network) -> list[Driver]:
         """Return the full policy on each road: its expert plus this residual."""
         return [full_policy(task, self.config.policy, network) for task in self.tasks]
 
-    def collect(self, network: Network, iteration: int) -> Collected:
+    def collect(self, network: Network, iteration: int) -> TaskEpisodes:
         """Return the episodes of an iteration, at least one of each road, as many as the sampler asks for."""
-        steps, left = self.config.learner.batch_steps, self.config.steps - self.training.actual_steps
-        counts = self._sampler.episodes(steps)
-        ahead = iterations_ahead(iteration, left, steps, self.tasks, counts)
+        steps, left = self.config.learner.steps_per_iteration, self.config.steps - self.training.environment_steps
+        counts = self._sampler.episode_counts(steps)
+        ahead = warm_up_iterations(iteration, left, steps, self.tasks, counts)
         seeds = ((self.config.seed, each) for each in ahead)
-        return self._drive(self.drivers(network), counts, self.config.policy.explores, *seeds)
+        return self._run_episodes(self.make_drivers(network), counts, self.config.policy.exploration_signs, *seeds)
 
-    def validate(self, iteration: Iteration, ended: bool = False) -> Validated:
+    def validate(self, iteration: Iteration, has_ended: bool = False) -> ValidationReturns:
         """Now and then, and at the end, drive the validation seeds, and keep the best controller."""
         started, found = time.perf_counter(), None
-        network, every = self.training.learner.network(), self.config.evaluation.every
-        last = ended or iteration.actual_steps >= self.config.steps
+        network, every = self.training.learner.network(), self.config.evaluation.validation_interval
+        last = has_ended or iteration.environment_steps >= self.config.steps
         scheduled = every > 0 and iteration.number % every == 0
         if scheduled or (every and last):
-            found = self.returns_of(self.drivers(network))
-            if self._sampler.mean(found) > self._validation_best:
-                self._keep_controllers(network, scheduled)
+            found = self.validation_returns(self.make_drivers(network))
+            if self._sampler.weighted_mean(found) > self._best_validation:
+                self._save_controllers(network, scheduled)
                 if scheduled:  # a longer run would not have looked here, and may go on from this checkpoint
-                    self._validation_best = self._sampler.mean(found)
+                    self._best_validation = self._sampler.weighted_mean(found)
             if scheduled:
-                self._sampler.follow(found)
+                self._sampler.update(found)
         elif last:
-            self._keep_controllers(network, best=False)
+            self._save_controllers(network, is_best=False)
         iteration.seconds["validation"] = time.perf_counter() - started
         return found
 
-    def write(self, iteration: Iteration, validated: Validated) -> bool:
+    def write_progress(self, iteration: Iteration, validation: ValidationReturns) -> bool:
         """Write a row of progress, of the whole run and of each road, and a checkpoint.
 
-        Return whether it is time to stop: the user says so, or `ends_early`.
+        Return whether it is time to stop: the user says so, or `should_stop_early`.
         """
-        whole, *roads = self._rows(iteration, validated)
-        early = ends_early(self.config, [*read_progress(self.folder), whole])
-        if early and validated is None:
-            whole, *roads = self._rows(iteration, self.validate(iteration, ended=True))
+        whole, *roads = self._progress_rows(iteration, validation)
+        early = should_stop_early(self.config, [*read_progress(self.folder), whole])
+        if early and validation is None:
+            whole, *roads = self._progress_rows(iteration, self.validate(iteration, has_ended=True))
         for place, row in zip(self.folders, roads, strict=False):
-            append_line(place / PROGRESS, to_json(row))
-        append_line(self.folder / PROGRESS, to_json(whole))
+            append_line(place / PROGRESS_FILE, to_json(row))
+        append_line(self.folder / PROGRESS_FILE, to_json(whole))
         counters, tensors = self.training.state()
-        state = {**counters, "belongs": self._belongs, "sampler": self._sampler.state()}
-        state |= {"validation_best": self._validation_best, "expert_returns": self._expert_returns}
+        state = {**counters, "belongs": self._fingerprint, "sampler": self._sampler.state()}
+        state |= {"validation_best": self._best_validation, "expert_returns": self._expert_returns}
         save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
         stopped = self._on_iteration(whole) is False
-        if stopped and validated is None and not early:
-            self.validate(iteration, ended=True)
+        if stopped and validation is None and not early:
+            self.validate(iteration, has_ended=True)
         return stopped or early
 
-    def returns_of(self, drivers: Sequence[Driver]) -> list[float]:
+    def validation_returns(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean return on the validation seeds, by road, each driven by its own of `drivers`."""
         counts = [self.config.evaluation.validation_episodes] * len(self.tasks)
-        episodes = self._drive(drivers, counts, [0.0], (VALIDATE,))
+        episodes = self._run_episodes(drivers, counts, [0.0], (VALIDATION_SEED,))
         return [float(np.mean([measure(episode)["return"] for episode in driven])) for driven in episodes]
 
-    def _drive(
-        self, drivers: Sequence[Driver], counts: Sequence[int], noise: list[float], *seeds: tuple[int, ...]
-    ) -> Collected:
+    def _run_episodes(
+        self, drivers: Sequence[Driver], counts: Sequence[int], exploration_scales: list[float], *seeds: tuple[int, ...]
+    ) -> TaskEpisodes:
         """Run `counts` episodes of the first seed, road by road; those of the others are to come."""
-        all_of = partial(episodes_of, self.tasks, drivers, counts, spread=self.config.spread, explore=noise)
+        all_of = partial(
+            make_episodes,
+            self.tasks,
+            drivers,
+            counts,
+            stratified=self.config.stratified,
+            exploration_scales=exploration_scales,
+        )
         now, *coming = map(all_of, seeds)
         alone, later = not self.config.tasks, list(chain(*coming))
-        at_once = partial(run_where_possible, run=self.workers.run, coming=later, statistical=alone)
-        episodes = (at_once if self.config.world == "batch" else self.workers.run)(now)
-        raise_failure([measure(episode) for episode in episodes if not episode.ok])
+        at_once = partial(
+            run_batched_if_supported, run_unsupported=self.workers.run, upcoming=later, allow_statistical=alone
+        )
+        episodes = (at_once if self.config.simulator == "batch" else self.workers.run)(now)
+        raise_failure([measure(episode) for episode in episodes if not episode.has_run])
         return [episodes[end - count : end] for end, count in zip(np.cumsum(counts), counts, strict=True)]
 
-    def _rows(self, iteration: Iteration, validated: Validated) -> list[dict[str, Any]]:
+    def _progress_rows(self, iteration: Iteration, validation: ValidationReturns) -> list[dict[str, Any]]:
         """Return the row of progress of the whole run, then those of its roads, where it has several."""
-        rows = [self._row(iteration, validated, index) for index in range(len(self.tasks))]
+        rows = [self._progress_row(iteration, validation, index) for index in range(len(self.tasks))]
         if not self.config.tasks:
             return rows
-        names = [*RETURNS, *MEANS] if validated else [*RETURNS[:-1], *MEANS]
+        names = [*PROGRESS_RETURNS, *PROGRESS_METRICS] if validation else [*PROGRESS_RETURNS[:-1], *PROGRESS_METRICS]
         whole = {
             **rows[0],
-            **{name: self._sampler.mean([row[name] for row in rows]) for name in names},
+            **{name: self._sampler.weighted_mean([row[name] for row in rows]) for name in names},
             **{"k_star": None, "eps_m": None, "virtual": {}},
             **{name: sum(row[name] for row in rows) for name in ("collisions", "episodes")},
             "tasks": {
-                task.name: {name: row[name] for name in (*RETURNS, "episodes", "k_star", "eps_m")}
+                task.name: {name: row[name] for name in (*PROGRESS_RETURNS, "episodes", "k_star", "eps_m")}
                 for task, row in zip(self.tasks, rows, strict=True)
             },
         }
         return [whole, *rows]
 
-    def _row(self, iteration: Iteration, validated: Validated, index: int) -> dict[str, Any]:
+    def _progress_row(self, iteration: Iteration, validation: ValidationReturns, index: int) -> dict[str, Any]:
         """Return the row of progress of one road."""
         measured = [measure(episode) for episode in iteration.episodes[index]]
-        virtual = iteration.virtual[index] if iteration.virtual else {}
-        means = {name: float(np.mean([row[name] for row in measured])) for name in ("return", *MEANS)}
+        virtual = iteration.model[index] if iteration.model else {}
+        means = {name: float(np.mean([row[name] for row in measured])) for name in ("return", *PROGRESS_METRICS)}
         return {
             "iteration": iteration.number,
-            "actual_steps": iteration.actual_steps,
+            "environment_steps": iteration.environment_steps,
             "episodes": len(measured),
-            "virtual_steps": iteration.virtual_steps,
+            "model_steps": iteration.model_steps,
             "k_star": virtual.get("k_star"),
             "eps_m": virtual.get("eps_m"),
             "return_mean": means.pop("return"),
             "return_expert": self._expert_returns[index],
-            "return_validation": validated[index] if validated else None,
+            "return_validation": validation[index] if validation else None,
             **means,
             "collisions": sum(row["collisions"] for row in measured),
             "learner": iteration.log,
@@ -322,10 +331,10 @@ class Trainer:
             "seconds": iteration.seconds,
         }
 
-    def _keep_controllers(self, network: Network, best: bool) -> None:
-        done = {"iteration": self.training.iteration, "actual_steps": self.training.actual_steps}
+    def _save_controllers(self, network: Network, is_best: bool) -> None:
+        done = {"iteration": self.training.iteration, "environment_steps": self.training.environment_steps}
         contents = [
-            controller_bytes(driver, {**origin(task.scenario, task.expert), **done})
-            for task, driver in zip(self.tasks, self.drivers(network), strict=True)
+            controller_bytes(driver, {**controller_origin(task.scenario, task.expert), **done})
+            for task, driver in zip(self.tasks, self.make_drivers(network), strict=True)
         ]
-        self._controllers.keep(contents, best)
+        self._controllers.save(contents, is_best)

@@ -8,19 +8,19 @@ from typing import SupportsIndex
 import numpy as np
 
 from unjam.drivers.driver import Driver
-from unjam.drivers.from_file import DriverLike, as_driver
 from unjam.drivers.observation import feature
-from unjam.errors import EpisodeError, InputError, NoCavError, RefusedError, UnjamError, in_own_words, wrong
-from unjam.scenarios.own_network import OwnNetwork
+from unjam.drivers.user_driver import DriverLike, as_driver
+from unjam.errors import EpisodeError, InputError, NoCavError, SumoInputError, UnjamError, as_unjam_error, invalid_value
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.drive import drive
-from unjam.worlds.earned import earned
+from unjam.scenarios.user_network import UserNetwork
+from unjam.worlds.drive import drive_world
+from unjam.worlds.episode_reward import episode_reward_terms
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import Reward, make_reward
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.apart import simulation_for
+from unjam.worlds.sumo.sandboxed import open_simulation
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.world import OnProgress
+from unjam.worlds.world import ProgressCallback
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ def run_episode(
     seed: SupportsIndex | Sequence[int],
     reward: str = "",
     explore: float = 0.0,
-    full: bool = False,
+    record_details: bool = False,
     simulation: Simulation | None = None,
-    progress: OnProgress | None = None,
+    on_progress: ProgressCallback | None = None,
     stop_at_contact: bool = True,
 ) -> Episode:
     """Run one episode and return all of it.
@@ -73,42 +73,44 @@ def run_episode(
         InputError: driver or reward answer something that is not finite, or of a wrong shape.
         RefusedError: SUMO refuses files or options, at once or when it comes to them.
         EpisodeError: SUMO cannot run the scenario for another reason, or other code in this process has
-            started, stepped or closed a simulation through libsumo meanwhile (`LostError`).
+            started, stepped or closed a simulation through libsumo meanwhile (`LostWorkerError`).
         UnjamError: another episode runs in `simulation`.
     """
     driver, seed = as_driver(driver), as_seed(seed)
     check_can_drive(driver, scenario)
     paid = make_reward(reward or scenario.reward)
     if simulation is None:
-        with simulation_for(scenario) as simulation:
-            how = (reward, explore, full, simulation, progress, stop_at_contact)
+        with open_simulation(scenario) as simulation:
+            how = (reward, explore, record_details, simulation, on_progress, stop_at_contact)
             return run_episode(scenario, driver, seed, *how)
-    if not simulation.in_use.acquire(blocking=False):
+    if not simulation.episode_lock.acquire(blocking=False):
         raise UnjamError("simulation: an episode is running in it; allowed: one at a time")
     try:
-        traffic = make_traffic(scenario, seed, simulation, driver.plain_numbers, full, driver.asks)
+        traffic = make_traffic(
+            scenario, seed, simulation, driver.accepts_floats, record_details, driver.measured_fields
+        )
         traffic.stop_at_contact = stop_at_contact
-        episode = drive(traffic, driver, explore, on_progress=progress)
+        episode = drive_world(traffic, driver, explore, on_progress=on_progress)
         episode = replace(episode, warnings=simulation.finish())
     except Exception as error:
         simulation.check()  # or other code's changes would be reported as an error of SUMO
-        known = in_own_words(error)
-        if isinstance(scenario, OwnNetwork) and type(known) is EpisodeError and simulation.has_refused():
-            raise RefusedError(str(known)) from error  # what a file holds further on
+        known = as_unjam_error(error)
+        if isinstance(scenario, UserNetwork) and type(known) is EpisodeError and simulation.has_refused():
+            raise SumoInputError(str(known)) from error  # what a file holds further on
         raise
     finally:
-        simulation.in_use.release()
-    if isinstance(scenario, OwnNetwork):
+        simulation.episode_lock.release()
+    if isinstance(scenario, UserNetwork):
         scenario.check_vehicles(bool(episode.vehicle_ids), [each.example for each in episode.warnings])
-    check_cavs_drove(episode, driver)
-    return rewarded(episode, paid)
+    check_has_cavs(episode, driver)
+    return add_reward_terms(episode, paid)
 
 
 def as_seed(seed: SupportsIndex | Sequence[int]) -> tuple[int, ...]:
     """Return a seed's integers; raise `InputError` where one is negative."""
     found = tuple(map(int, seed)) if isinstance(seed, Sequence | np.ndarray) else (index(seed),)
     if min(found, default=0) < 0:
-        raise wrong("seed", seed, ">= 0")
+        raise invalid_value("seed", seed, ">= 0")
     return found
 
 
@@ -116,38 +118,38 @@ def check_can_drive(driver: Driver, scenario: Scenario) -> None:
     """Raise `InputError` where a driver cannot drive on a scenario's road."""
     if not can_drive(driver, scenario):
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
-    check_can_see(driver.sees, scenario, "driver: its network's feature")
+    check_policy_inputs(driver.policy_inputs, scenario, "driver: its network's feature")
 
 
-def check_can_see(features: Sequence[str], scenario: Scenario, where: str) -> None:
+def check_policy_inputs(features: Sequence[str], scenario: Scenario, context: str) -> None:
     """Raise `InputError` where features look at what a scenario's road does not tell."""
     for name in features:
-        needs, told = feature(name).needs, feature(name).told
-        if needs == "loop" and not scenario.closed:
-            raise InputError(f"{where}: {name!r} is not allowed on a road with ends")
-        if not set(told) <= set(scenario.tells):
-            raise InputError(f"{where}: {name!r} is not allowed on {scenario.title}")
+        needs, told = feature(name).road_requirement, feature(name).required_fields
+        if needs == "loop" and not scenario.is_closed:
+            raise InputError(f"{context}: {name!r} is not allowed on a road with ends")
+        if not set(told) <= set(scenario.provided_fields):
+            raise InputError(f"{context}: {name!r} is not allowed on {scenario.title}")
         if needs == "coordinate" and not scenario.has_coordinate:
-            raise InputError(f"{where}: {name!r} is not allowed on a network of one's own")
+            raise InputError(f"{context}: {name!r} is not allowed on a network of one's own")
 
 
-def check_cavs_drove(episode: Episode, driver: Driver) -> None:
+def check_has_cavs(episode: Episode, driver: Driver) -> None:
     """Raise `NoCavError` where a driver had no CAV."""
-    if not episode.cav_ids and not driver.native:
-        raise NoCavError(f"no CAV was on the road in {episode.steps} decisions: let more vehicles be CAVs")
+    if not episode.cav_ids and not driver.is_native:
+        raise NoCavError(f"no CAV was on the road in {episode.control_steps} decisions: let more vehicles be CAVs")
 
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:
     """Return whether a driver can drive a scenario: some need a loop."""
-    return scenario.closed or not driver.needs_loop
+    return scenario.is_closed or not driver.needs_loop
 
 
-def rewarded(episode: Episode, reward: Reward) -> Episode:
+def add_reward_terms(episode: Episode, reward: Reward) -> Episode:
     """Return an episode with what was earned in it; raise `InputError` where a term is not finite."""
     crashed = episode.status == "collision"
-    terms = earned(reward, episode.speeds, episode.trajectories, crashed, episode.waiting)
+    terms = episode_reward_terms(reward, episode.speeds, episode.trajectories, crashed, episode.backlog)
     trajectories = tuple(
-        replace(each, terms={name: values[each.during] for name, values in terms.items()})
+        replace(each, terms={name: values[each.step_slice] for name, values in terms.items()})
         for each in episode.trajectories
     )
     return replace(episode, terms=terms, trajectories=trajectories)

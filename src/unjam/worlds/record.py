@@ -13,9 +13,9 @@ from unjam.drivers.local_state import LocalState
 from unjam.physics.arrays import Floats
 from unjam.worlds.audit import Audit
 from unjam.worlds.trips import Trips
-from unjam.worlds.world import Driven
+from unjam.worlds.world import DriverLog
 
-FRAMES = 200
+SHARED_COLUMN_FRAMES = 200
 """an episode in so many frames has an empty one between two vehicles that share a column: else it would look
 as if one flew back"""
 
@@ -25,62 +25,62 @@ class Trajectory:
     """One stay of one CAV on the road; T decisions. Arrays of shape (T,) where nothing else is said."""
 
     vehicle: str
-    start: int
+    start_step: int
     """decision of the episode at which it began"""
     states: LocalState
     """what it perceived, shape (T + 1,): the last entry is where it ended"""
     observations: Floats
     """what the residual network saw at each of its choices, and at the end, shape (choices + 1, inputs); it
     chooses every `hold` decisions; (1, 0) without a network"""
-    expert: Floats
+    expert_acceleration: Floats
     """the expert's acceleration within the action limit [m/s2]"""
     residual: Floats
     """the network's residual with its exploration noise, not clipped [m/s2]; zero without one"""
-    applied: Floats
+    applied_acceleration: Floats
     """the acceleration that was commanded, within the action limit, or harder braking where the safety filter
     demanded it; the mean over the decision [m/s2]"""
-    filtered: Floats
+    filter_braking: Floats
     """the most that the safety filter took from what the driver wanted [m/s2]; zero where it let it pass"""
-    shield: Floats
+    shield_braking: Floats
     """braking that SUMO's safety check added to the command [m/s2]; zero where it let it pass"""
-    memory: dict[str, Any]
+    initial_memory: dict[str, Any]
     """what the expert remembered before the first decision, without the axis of rows; empty without a
     network"""
-    hold: int
+    action_repeat: int
     """decisions for which one residual was held"""
     terminated: bool
     """whether a collision ended it; otherwise it was cut by the horizon or by leaving the road"""
-    terms: dict[str, Floats] = field(default_factory=dict)
+    reward_terms: dict[str, Floats] = field(default_factory=dict)
     """terms of the reward by name"""
 
     @property
-    def during(self) -> slice:
+    def step_slice(self) -> slice:
         """Its decisions among those of the episode."""
-        return slice(self.start, self.start + len(self.applied))
+        return slice(self.start_step, self.start_step + len(self.applied_acceleration))
 
     @cached_property
     def reward(self) -> Floats:
         """What each decision earned: the sum of the terms."""
-        return np.sum(list(self.terms.values()), axis=0)
+        return np.sum(list(self.reward_terms.values()), axis=0)
 
     @property
-    def choices(self) -> tuple[Floats, Floats]:
+    def actions_and_rewards(self) -> tuple[Floats, Floats]:
         """The residuals that the network chose, and what was earned while each was held; shape (choices,)."""
-        starts = np.arange(0, len(self.residual), self.hold)
+        starts = np.arange(0, len(self.residual), self.action_repeat)
         return self.residual[starts], np.add.reduceat(self.reward, starts)
 
 
-def trajectory(
+def make_trajectory(
     vehicle: str,
-    number: int,
-    start: int,
+    entry_number: int,
+    start_step: int,
     rows: NDArray[np.intp] | None,
     states: LocalState,
-    applied: Floats,
-    filtered: Floats,
-    shield: Floats,
+    applied_acceleration: Floats,
+    filter_braking: Floats,
+    shield_braking: Floats,
     terminated: bool,
-    driven: Driven,
+    driver_log: DriverLog,
 ) -> Trajectory:
     """Return the trajectory of a stay, with what the driver decided; arrays as `Trajectory` has them.
 
@@ -96,27 +96,27 @@ def trajectory(
         terminated: whether a collision ended it.
         driven: all that the driver decided.
     """
-    about = (vehicle, start, states)
-    if not driven.decisions:
-        nothing = np.zeros((1, 0)), applied, np.zeros_like(applied)
-        return Trajectory(*about, *nothing, applied, filtered, shield, {}, 1, terminated)
+    about = (vehicle, start_step, states)
+    if not driver_log.decisions:
+        nothing = np.zeros((1, 0)), applied_acceleration, np.zeros_like(applied_acceleration)
+        return Trajectory(*about, *nothing, applied_acceleration, filter_braking, shield_braking, {}, 1, terminated)
 
-    def own(values: Sequence[Any], steps: Sequence[int]) -> Floats:
+    def select(values: Sequence[Any], steps: Sequence[int]) -> Floats:
         """Return this CAV's of all values at some steps."""
-        return np.array(
-            [values[step] if rows is None else values[step][rows[step - start]] for step in steps]
-        )
+        return np.array([values[step] if rows is None else values[step][rows[step - start_step]] for step in steps])
 
-    experts, residuals, seen = zip(*driven.decisions, strict=True)
-    steps = range(start, start + len(applied))
-    choices = [*steps[:: driven.hold], steps.stop]
-    looks = [*seen, driven.last_observation]
+    experts, residuals, seen = zip(*driver_log.decisions, strict=True)
+    steps = range(start_step, start_step + len(applied_acceleration))
+    choices = [*steps[:: driver_log.action_repeat], steps.stop]
+    looks = [*seen, driver_log.last_observation]
     if np.size(looks[steps.stop]) == 0:  # it crashed while others drove on, between two looks of the network
         choices[-1] = choices[-2]
-    observations = own(looks, choices).astype(np.float64).reshape(len(choices), -1)
-    decided = observations, own(experts, steps), own(residuals, steps)
-    commanded = applied, filtered, shield
-    return Trajectory(*about, *decided, *commanded, driven.memories[number], driven.hold, terminated)
+    observations = select(looks, choices).astype(np.float64).reshape(len(choices), -1)
+    decided = observations, select(experts, steps), select(residuals, steps)
+    commanded = applied_acceleration, filter_braking, shield_braking
+    return Trajectory(
+        *about, *decided, *commanded, driver_log.initial_memories[entry_number], driver_log.action_repeat, terminated
+    )
 
 
 @dataclass(frozen=True)
@@ -136,16 +136,16 @@ class Episode:
 
     seed: tuple[int, ...]
     status: str
-    """`completed`; `failed`; `collision`, or `teleports` beyond SUMO's max-num-teleports, ended it early"""
+    """`completed`; `failed_episodes`; `collision`, or `teleports` beyond SUMO's max-num-teleports, ended it early"""
     reason: str = ""
     """why it failed or ended early"""
     error: str = ""
     """name of the error that made it fail"""
-    step: float = 0.1
+    control_step: float = 0.1
     """time between two decisions [s]"""
     warmup: int = 0
     """simulation steps before the first decision"""
-    drawn: dict[str, float] = field(default_factory=dict)
+    drawn_values: dict[str, float] = field(default_factory=dict)
     """what the seed has drawn, by name"""
     loop_length: float = float("nan")
     """of a closed road [m]; NaN of one with ends"""
@@ -155,10 +155,10 @@ class Episode:
     """the scenario's own limit of speed [m/s]"""
     vehicle_ids: tuple[str, ...] = ()
     cav_ids: tuple[str, ...] = ()
-    columns: tuple[int, ...] = ()
+    vehicle_columns: tuple[int, ...] = ()
     """which of N columns each vehicle has, where those that are never there together share one: with an empty
     moment between two, and CAVs with CAVs alone; empty: each vehicle its own, in order"""
-    every: int = 1
+    snapshot_stride: int = 1
     """where vehicles are is kept of every so many-th moment: not of all where many drive for long"""
     collisions: int = 0
     """vehicles that collided: on a built-in road by contact, on a user's network as its settings say"""
@@ -177,33 +177,33 @@ class Episode:
     """a closed road's centre line: rows (coordinate along the route, x, y) [m]"""
     branches: tuple[str, ...] = ()
     """where the vehicles of each column came from, on a road with several ways in"""
-    arrived: int = 0
+    arrivals: int = 0
     """vehicles that left at the end of their route"""
     teleports: int = 0
     """times that SUMO took a vehicle that had stood for long or collided off the road; until it is put back
     it waits"""
-    peak: tuple[float, float] = (0.0, 0.0)
+    demand_peak: tuple[float, float] = (0.0, 0.0)
     """from when to when the most vehicles want to enter [s]; (0, 0) where there is no peak"""
-    planned: float = float("nan")
+    planned_duration: float = float("nan")
     """how long a road with ends was to be driven [s], were nobody to touch; NaN of a closed one"""
-    free_time: float = float("nan")
+    free_flow_time: float = float("nan")
     """mean travel time where nobody disturbs anybody [s]; NaN where it is not known"""
-    waiting: Floats = field(default_factory=lambda: np.zeros(0))
+    backlog: Floats = field(default_factory=lambda: np.zeros(0))
     """vehicles that wanted to enter and could not, or were lifted off the road, at each moment, shape
     (T + 1,); (0,) of a closed road"""
-    lifted: int = 0
+    teleported: int = 0
     """of those that wait at the end, how many were lifted off the road and not put back"""
-    lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    lane_lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) where not recorded"""
-    places: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    poses: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
     """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T // every + 1, N, 3); no rows
     where not recorded"""
-    lanes: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    lane_indices: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """which of `lane_names` each vehicle is in, shape (T // every + 1, N), NaN where in none of them; (0, 0)
     where not recorded"""
     lane_names: tuple[str, ...] = ()
     """of a road with lanes, from left to right as one drives"""
-    terms: dict[str, Floats] = field(default_factory=dict)
+    reward_terms: dict[str, Floats] = field(default_factory=dict)
     """terms of the reward by name, shape (T,)"""
     trajectories: tuple[Trajectory, ...] = ()
     trips: Trips = field(default_factory=Trips)
@@ -215,28 +215,28 @@ class Episode:
     @property
     def reward(self) -> Floats:
         """What each decision earned, shape (T,): the sum of the terms."""
-        return np.sum(list(self.terms.values()), axis=0)
+        return np.sum(list(self.reward_terms.values()), axis=0)
 
     @property
-    def steps(self) -> int:
+    def control_steps(self) -> int:
         """How many decisions were made: the episode's actual steps."""
         return len(self.speeds) - 1
 
     @property
-    def cavs(self) -> list[int]:
+    def cav_columns(self) -> list[int]:
         """Columns of the CAVs, in order of entry."""
-        columns = self.columns or range(len(self.vehicle_ids))
+        columns = self.vehicle_columns or range(len(self.vehicle_ids))
         column = dict(zip(self.vehicle_ids, columns, strict=True))
         return list(dict.fromkeys(column[name] for name in self.cav_ids))
 
     @property
-    def ok(self) -> bool:
+    def has_run(self) -> bool:
         """Whether the episode ran, also where it ended early."""
         return self.status != "failed"
 
 
-def shared_columns(
-    first: NDArray[np.intp], last: NDArray[np.intp], groups: Sequence[Hashable], apart: int = 1
+def assign_columns(
+    first_moments: NDArray[np.intp], last_moments: NDArray[np.intp], groups: Sequence[Hashable], min_spacing: int = 1
 ) -> NDArray[np.intp]:
     """Return a column for each of n stays, with at least `apart` empty moments between two in the same one.
 
@@ -245,14 +245,14 @@ def shared_columns(
     columns, used = np.zeros(len(groups), np.intp), 0
     busy: dict[Hashable, list[tuple[int, int]]] = {}
     """of each group a heap: until which moment, which column"""
-    for stay in np.argsort(first, kind="stable").tolist():
+    for stay in np.argsort(first_moments, kind="stable").tolist():
         waiting = busy.setdefault(groups[stay], [])
-        if waiting and waiting[0][0] + apart < first[stay]:
+        if waiting and waiting[0][0] + min_spacing < first_moments[stay]:
             _, column = heappop(waiting)
         else:
             column, used = used, used + 1
         columns[stay] = column
-        heappush(waiting, (int(last[stay]), column))
+        heappush(waiting, (int(last_moments[stay]), column))
     return columns
 
 

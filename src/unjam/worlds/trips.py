@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from unjam.physics.arrays import Floats
 
-TRAVEL_CLASSES = {
+VEHICLE_GROUPS = {
     "cars": ("passenger", "private", "hov", "taxi", "evehicle", "custom1", "custom2"),
     "trucks": ("truck", "trailer", "delivery"),
     "buses": ("bus", "coach"),
@@ -15,7 +15,7 @@ TRAVEL_CLASSES = {
 """SUMO's vehicle classes whose travel times are reported separately, by the name of the group"""
 
 
-def _no_times() -> Floats:
+def _empty_array() -> Floats:
     return np.zeros(0)
 
 
@@ -30,13 +30,13 @@ class Trips:
     vehicle_ids: tuple[str, ...] = ()
     vehicle_classes: tuple[str, ...] = ()
     """SUMO's vehicle class of each"""
-    depart_delay: Floats = field(default_factory=_no_times)
+    depart_delay: Floats = field(default_factory=_empty_array)
     """time for which each waited for its insertion, `departDelay` [s]"""
-    duration: Floats = field(default_factory=_no_times)
+    duration: Floats = field(default_factory=_empty_array)
     """time since its insertion [s]; 0 of a vehicle that was not inserted"""
-    time_loss: Floats = field(default_factory=_no_times)
+    time_loss: Floats = field(default_factory=_empty_array)
     """time lost by driving below its desired speed, `timeLoss` [s]"""
-    arrived: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    has_arrived: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     """whether it has reached the end of its route"""
 
     @property
@@ -50,6 +50,6 @@ class Trips:
         return self.duration + self.depart_delay
 
     def mean_travel_time(self, group: str) -> float:
-        """Return the mean travel time of a group of `TRAVEL_CLASSES` [s]; NaN where it has no vehicles."""
-        chosen = np.isin(self.vehicle_classes, TRAVEL_CLASSES[group])
+        """Return the mean travel time of a group of `VEHICLE_GROUPS` [s]; NaN where it has no vehicles."""
+        chosen = np.isin(self.vehicle_classes, VEHICLE_GROUPS[group])
         return float(self.travel_time[chosen].mean()) if chosen.any() else float("nan")

@@ -7,44 +7,44 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.command import Command, Limits, accelerations
+from unjam.drivers.command import Command, Limits, commanded_accelerations
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.safety import Ahead
+from unjam.drivers.safety import FollowingState
 from unjam.physics.arrays import Array, Floats
 from unjam.physics.kinematics import next_speed
 from unjam.tree import Arrays
 
-Recorded = TypeVar("Recorded", covariant=True)
+RecordT = TypeVar("RecordT", covariant=True)
 
-OnProgress = Callable[[int], None]
+ProgressCallback = Callable[[int], None]
 """called now and then with how many decisions have been made"""
 
 
 @dataclass(frozen=True)
-class Driven:
+class DriverLog:
     """What a driver decided in a world, decision by decision."""
 
     decisions: list[tuple[Array, Array, Array]] = field(default_factory=list)
     """the expert's share, the residual, and what the network saw; nothing where there is no network"""
     last_observation: Array | None = None
     """what the network would have seen at the end"""
-    memories: list[Arrays] = field(default_factory=list)
+    initial_memories: list[Arrays] = field(default_factory=list)
     """what the expert remembered before the first decision of each CAV by itself, in order of entry"""
-    hold: int = 1
+    action_repeat: int = 1
     """decisions for which one residual was held"""
 
 
-class World(Protocol[Recorded]):
+class World(Protocol[RecordT]):
     """Moves n CAVs as they are told, and says what they perceive; `unjam.worlds.drive` alone calls it."""
 
     limits: Limits
     """within which accelerations are kept"""
-    single: bool
+    is_scalar: bool
     """whether its only CAV perceives and is driven in plain numbers instead of arrays of one row"""
-    entered: int
+    entered_count: int
     """CAVs that the driver was given so far"""
 
-    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> LocalState | None:
+    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Begin, and hand the CAVs over, unless they stay human (`controlled` false).
 
         Returns:
@@ -54,21 +54,21 @@ class World(Protocol[Recorded]):
         ...
 
     @property
-    def rows(self) -> int:
+    def cav_count(self) -> int:
         """CAVs on the road now: the rows of what drivers are given and answer."""
         ...
 
     @property
-    def kept(self) -> Sequence[int] | None:
+    def remaining_rows(self) -> Sequence[int] | None:
         """Rows before the last decision that are still there, newcomers being behind them; None: the same."""
         ...
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether there is nothing more to decide."""
         ...
 
-    def perceive(self) -> LocalState:
+    def local_state(self) -> LocalState:
         """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
         ...
 
@@ -80,15 +80,15 @@ class World(Protocol[Recorded]):
         """
         ...
 
-    def noise(self, lasting: int = 0) -> Array:
+    def noise(self, episode_noise_size: int = 0) -> Array:
         """Return standard normal noise for one look of a network: shape (CAVs,), or a plain number.
 
-        With `lasting`, so many numbers for each CAV, shape (CAVs, lasting), that are the same for all CAVs
+        With `episode_noise`, so many numbers for each CAV, shape (CAVs, lasting), that are the same for all CAVs
         of a road and in all looks.
         """
         ...
 
-    def record(self, driven: Driven) -> Recorded:
+    def record(self, driver_log: DriverLog) -> RecordT:
         """Return what happened, with what the driver decided."""
         ...
 
@@ -96,44 +96,46 @@ class World(Protocol[Recorded]):
 class RecordedWorld:
     """States that were recorded go by, whatever a driver does: what would it do, what does it remember?"""
 
-    single = False
-    kept = None
+    is_scalar = False
+    remaining_rows = None
 
     def __init__(self, states: LocalState, limits: Limits) -> None:
         """Take the states of n CAVs at T moments, arrays of shape (T, n)."""
         self.states, self.limits = states, limits
-        self.rows = self.entered = states.speed.shape[1]
-        self._names = [f"row {number}" for number in range(self.rows)]
-        self._answers: list[list[float]] = []
+        self.cav_count = self.entered_count = states.speed.shape[1]
+        self._row_names = [f"row {number}" for number in range(self.cav_count)]
+        self._accelerations: list[list[float]] = []
 
-    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
+    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
         """Begin at the first moment; nothing was before."""
-        self._answers = []
+        self._accelerations = []
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether all moments have gone by."""
-        return len(self._answers) == len(self.states.speed)
+        return len(self._accelerations) == len(self.states.speed)
 
-    def perceive(self) -> LocalState:
+    def local_state(self) -> LocalState:
         """Return what was perceived at this moment; after the last one, at the last."""
-        moment = min(len(self._answers), len(self.states.speed) - 1)
-        return self.states.at(moment)
+        moment = min(len(self._accelerations), len(self.states.speed) - 1)
+        return self.states.select(moment)
 
     def advance(self, command: Command | None) -> None:
         """Note what was asked for, and go on to the next moment."""
-        self._answers.append(accelerations(command, self.limits, self._names, len(self._answers)))
+        self._accelerations.append(
+            commanded_accelerations(command, self.limits, self._row_names, len(self._accelerations))
+        )
 
-    def noise(self, lasting: int = 0) -> Any:
+    def noise(self, episode_noise_size: int = 0) -> Any:
         """Return none: nobody explores here."""
-        return np.zeros((self.rows, lasting) if lasting else self.rows)
+        return np.zeros((self.cav_count, episode_noise_size) if episode_noise_size else self.cav_count)
 
-    def record(self, driven: Driven) -> NDArray[np.float64]:
+    def record(self, driver_log: DriverLog) -> NDArray[np.float64]:
         """Return what was asked for, within the limits [m/s2], shape (T, n)."""
-        return np.array(self._answers)
+        return np.array(self._accelerations)
 
 
-class Pursued(NamedTuple):
+class CarFollowingRecord(NamedTuple):
     """What happened to n pairs; T steps."""
 
     speed: Floats
@@ -144,14 +146,14 @@ class Pursued(NamedTuple):
     """[m], shape (T + 1, n)"""
 
 
-class PursuitWorld:
+class CarFollowingWorld:
     """n CAVs behind leaders; who follows a CAV is as far behind and as fast as it is."""
 
-    single, kept = False, None
+    is_scalar, remaining_rows = False, None
 
     def __init__(
         self,
-        start: Ahead,
+        initial_state: FollowingState,
         leader_accelerations: Any,
         limits: Limits,
         step: float,
@@ -159,39 +161,39 @@ class PursuitWorld:
     ) -> None:
         """Take where the pairs begin, arrays of shape (n,), and what leaders do [m/s2], shape (T, n)."""
         self.limits, self._step = limits, step
-        self._ahead = [Ahead(*(np.array(values, np.float64) for values in start))]
-        self._leader = np.asarray(leader_accelerations, np.float64)
-        self.rows = self.entered = len(start.speed)
-        self._position, self._loop = np.zeros(self.rows), np.full(self.rows, loop_length)
+        self._states = [FollowingState(*(np.array(values, np.float64) for values in initial_state))]
+        self._leader_accelerations = np.asarray(leader_accelerations, np.float64)
+        self.cav_count = self.entered_count = len(initial_state.speed)
+        self._position, self._loop_length = np.zeros(self.cav_count), np.full(self.cav_count, loop_length)
 
-    def start(self, controlled: bool, on_progress: OnProgress | None = None) -> None:
+    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
         """Begin; nothing was before."""
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether leaders have nothing more to do."""
-        return len(self._ahead) > len(self._leader)
+        return len(self._states) > len(self._leader_accelerations)
 
-    def perceive(self) -> LocalState:
+    def local_state(self) -> LocalState:
         """Return what the CAVs perceive now, arrays of shape (n,)."""
-        speed, leader, gap = self._ahead[-1]
-        place = self._position if np.isnan(self._loop).all() else self._position % self._loop
-        return LocalState(speed, leader, gap, speed, gap, place, self._loop)
+        speed, leader, gap = self._states[-1]
+        place = self._position if np.isnan(self._loop_length).all() else self._position % self._loop_length
+        return LocalState(speed, leader, gap, speed, gap, place, self._loop_length)
 
     def advance(self, command: Command | None) -> None:
         """Make one step of all pairs."""
         assert command is not None
-        before, step = self._ahead[-1], self._step
-        told = self.limits.keep(np.asarray(command.acceleration))
+        before, step = self._states[-1], self._step
+        told = self.limits.clip(np.asarray(command.acceleration))
         speed = next_speed(before.speed, told, step)
-        leader = next_speed(before.leader_speed, self._leader[len(self._ahead) - 1], step)
+        leader = next_speed(before.leader_speed, self._leader_accelerations[len(self._states) - 1], step)
         self._position = self._position + speed * step
-        self._ahead.append(Ahead(speed, leader, before.gap + (leader - speed) * step))
+        self._states.append(FollowingState(speed, leader, before.gap + (leader - speed) * step))
 
-    def noise(self, lasting: int = 0) -> Floats:
+    def noise(self, episode_noise_size: int = 0) -> Floats:
         """Return none: nobody explores here."""
-        return np.zeros((self.rows, lasting) if lasting else self.rows)
+        return np.zeros((self.cav_count, episode_noise_size) if episode_noise_size else self.cav_count)
 
-    def record(self, driven: Driven) -> Pursued:
+    def record(self, driver_log: DriverLog) -> CarFollowingRecord:
         """Return what happened."""
-        return Pursued(*(np.array(values) for values in zip(*self._ahead, strict=True)))
+        return CarFollowingRecord(*(np.array(values) for values in zip(*self._states, strict=True)))

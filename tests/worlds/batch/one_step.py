@@ -7,9 +7,9 @@ from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.batch.lanes import Leader
-from unjam.worlds.batch.movement import EightMovement
-from unjam.worlds.closed import NOISE_BLOCK
+from unjam.worlds.batch.figure_eight.movement import FigureEightMovement
+from unjam.worlds.batch.leaders import Leader
+from unjam.worlds.closed_road import NOISE_BLOCK_STEPS
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.simulation import Simulation
@@ -18,16 +18,16 @@ from unjam.worlds.sumo.simulation import Simulation
 def errors(eight: FigureEight, driver: Driver, seed: int, simulation: Simulation) -> Floats:
     """Return by how much each speed differs after one step from SUMO's own state, (steps, vehicles) [m/s]."""
     episode = run_episode(eight, driver, (seed,), simulation=simulation)
-    road, others = eight.of_seed((seed,))
+    road, others = eight.draw_from_seed((seed,))
     assert isinstance(road, ClosedRoad)
     steps, vehicles = len(episode.speeds) - 1, len(road.vehicle_ids)
     controlled = [road.vehicle_ids.index(name) for name in road.cav_ids] if episode.trajectories else []
-    applied = np.array([each.applied for each in episode.trajectories])
+    applied = np.array([each.applied_acceleration for each in episode.trajectories])
     generator = np.random.default_rng(others[0])
-    blocks = [generator.standard_normal((NOISE_BLOCK, vehicles)) for _ in range(steps // NOISE_BLOCK + 1)]
+    blocks = [generator.standard_normal((NOISE_BLOCK_STEPS, vehicles)) for _ in range(steps // NOISE_BLOCK_STEPS + 1)]
     step = eight.simulation_step
     noise = np.concatenate(blocks) * eight.noise_per_step * step
-    movement, found = EightMovement(eight, [road], controlled, np.asarray), np.empty((steps, vehicles))
+    movement, found = FigureEightMovement(eight, [road], controlled, np.asarray), np.empty((steps, vehicles))
     movement.hand_over()
     for moment in range(steps):
         speed, position = episode.speeds[moment][:, None], episode.positions[moment][:, None]
@@ -36,6 +36,6 @@ def errors(eight: FigureEight, driver: Driver, seed: int, simulation: Simulation
         if controlled:
             told = np.maximum(speed[controlled] + applied[:, [moment]] * step, 0.0)
         ahead = Leader(np.roll(speed, -1, 0), gap)
-        moved = movement.moved(speed, position, ahead, noise[moment][:, None], told)
+        moved = movement.next_speeds(speed, position, ahead, noise[moment][:, None], told)
         found[moment] = moved[:, 0] - episode.speeds[moment + 1]
     return found

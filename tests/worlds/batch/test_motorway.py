@@ -11,37 +11,51 @@ from tests.conftest import random_network
 from unjam.drivers import ResidualDriver
 from unjam.drivers.command import Command
 from unjam.drivers.driver import Driver
-from unjam.drivers.registry import named_driver
+from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError
-from unjam.measures.metrics import travel_time
+from unjam.measures.metrics import mean_travel_time
 from unjam.physics.arrays import Floats
-from unjam.physics.idm import IDMRows
+from unjam.physics.idm import IDMArrays
 from unjam.scenarios import OnRamp
 from unjam.scenarios.on_ramp import ON_RAMP
 from unjam.scenarios.road import Edge, Node, RoadNetwork
-from unjam.worlds.batch import extended
-from unjam.worlds.batch.beside import Stretch
-from unjam.worlds.batch.extended import Ahead, Errors, bounds, felt, finished, follow
-from unjam.worlds.batch.lane_changes import change_lanes
-from unjam.worlds.batch.motorway import Motorways
-from unjam.worlds.batch.motorway_world import MotorwayBatch
-from unjam.worlds.batch.possible import statistical_why_not, why_not
-from unjam.worlds.batch.run import run_batch, run_where_possible
-from unjam.worlds.batch.vehicles import FREELY, Drivers, Vehicles, around, chosen, in_order
+from unjam.worlds.batch.on_ramp import eidm
+from unjam.worlds.batch.on_ramp.eidm import (
+    DriverErrors,
+    LeaderMotion,
+    eidm_effective_gap,
+    eidm_follow_speed,
+    eidm_speed_bounds,
+    finalize_eidm_speed,
+)
+from unjam.worlds.batch.on_ramp.lane_change_context import MotorwayGeometry
+from unjam.worlds.batch.on_ramp.lane_changes import change_lanes
+from unjam.worlds.batch.on_ramp.traffic import BatchMotorways
+from unjam.worlds.batch.on_ramp.vehicles import (
+    NO_ADVICE,
+    MotorwayDrivers,
+    MotorwayVehicles,
+    find_neighbors,
+    neighbors_on_lane,
+    sort_vehicles,
+)
+from unjam.worlds.batch.on_ramp.world import MotorwayBatch
+from unjam.worlds.batch.run import run_batch, run_batched_if_supported
+from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.networks import document, network_file
+from unjam.worlds.sumo.inputs import SumoInputs
+from unjam.worlds.sumo.networks import network_file, xml_document
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask
+from unjam.worlds.worker_pool import EpisodeTask
 
 STEP, LIMIT, LENGTH = 0.5, 27.78, 4.8
 SHORT = replace(ON_RAMP, horizon=320, peak=(60.0, 300.0))
 
 
-def rows_of(drawn: Floats) -> IDMRows:
+def rows_of(drawn: Floats) -> IDMArrays:
     time_headway, most, braking, gap, factor = drawn.T
-    return IDMRows(LIMIT * factor, time_headway, most, braking, 4.0, gap)
+    return IDMArrays(LIMIT * factor, time_headway, most, braking, 4.0, gap)
 
 
 def people(count: int, generator: np.random.Generator) -> Floats:
@@ -60,19 +74,19 @@ def load(simulation: Simulation, drawn: Floats, times: Floats, lanes: int) -> li
         for name, row in zip(names, drawn, strict=True)
     ]
     nodes = Node("here", 0.0, 0.0), Node("there", 4000.0, 0.0)
-    network = RoadNetwork(nodes, (Edge("road", "here", "there", 4000.0, lanes=lanes),), LIMIT, links=False)
+    network = RoadNetwork(nodes, (Edge("road", "here", "there", 4000.0, lanes=lanes),), LIMIT, has_internal_links=False)
     routes = "<route id='all' edges='road'/>" + "".join(
         f"<vehicle id='{name}' type='{name}' route='all' depart='{time:.1f}' departSpeed='last' "
         f"departLane='{number % lanes}' departPos='base' insertionChecks='collision'/>"
         for number, (name, time) in enumerate(zip(names, times, strict=True))
     )
-    xml = document("routes", "vType", types).replace("</routes>", routes + "</routes>")
-    files = Files((), {"--net-file": (network_file(network),)}, xml, "--route-files")
+    xml = xml_document("routes", "vType", types).replace("</routes>", routes + "</routes>")
+    files = SumoInputs((), {"--net-file": (network_file(network),)}, xml, "--route-files")
     simulation.load(files, STEP, 1)
     return names
 
 
-def platoon(simulation: Simulation) -> tuple[IDMRows, Floats, Floats]:
+def platoon(simulation: Simulation) -> tuple[IDMArrays, Floats, Floats]:
     """People on one lane behind one who stops and goes: who they are, places and speeds by step."""
     drawn = people(8, np.random.default_rng(3))
     drawn[0, 4] = 0.6
@@ -80,10 +94,10 @@ def platoon(simulation: Simulation) -> tuple[IDMRows, Floats, Floats]:
     places, speeds = [], []
     for step in range(330):
         if step in (140, 180, 220):
-            simulation.set_fastest(names[0], {140: 3.0, 180: 0.01, 220: 40.0}[step])
+            simulation.set_max_speed(names[0], {140: 3.0, 180: 0.01, 220: 40.0}[step])
         simulation.step()
         if step > 60:
-            places.append(simulation.along_lanes(names))
+            places.append(simulation.lane_offsets(names))
             speeds.append(simulation.speeds(names))
     return rows_of(drawn), np.array(places), np.array(speeds)
 
@@ -91,24 +105,26 @@ def platoon(simulation: Simulation) -> tuple[IDMRows, Floats, Floats]:
 def test_extended_drivers_who_err_in_nothing_are_sumos(simulation: Simulation) -> None:
     people, places, speeds = platoon(simulation)
     count = places.shape[1] - 1
-    own = IDMRows(*(each if np.ndim(each) == 0 else each[1:] for each in people))
+    own = IDMArrays(*(each if np.ndim(each) == 0 else each[1:] for each in people))
     started, worst = np.full(count, -1000.0), []
-    exact = Errors(*np.zeros((3, count)))
+    exact = DriverErrors(*np.zeros((3, count)))
     for step in range(2, len(speeds)):
         before, now = speeds[step - 1], (step + 61.0) * STEP
         speed, leader = before[1:], before[:-1]
         acceleration = (before - speeds[step - 2]) / STEP
         gap = places[step - 1, :-1] - LENGTH - places[step - 1, 1:]
-        cool = (started + extended.STARTING < now - STEP) & (speed > extended.HALTING)
-        wanted = follow(speed, gap, leader, own, exact, STEP, Ahead(acceleration[:-1], cool))
-        freely = follow(speed, 500.0 + own.minimum_gap, own.desired_speed, own, exact, STEP)
+        cool = (started + eidm.START_UP_DURATION < now - STEP) & (speed > eidm.EIDM_HALTING_SPEED)
+        wanted = eidm_follow_speed(speed, gap, leader, own, exact, STEP, LeaderMotion(acceleration[:-1], cool))
+        freely = eidm_follow_speed(speed, 500.0 + own.minimum_gap, own.desired_speed, own, exact, STEP)
         heeded = np.where(
-            freely.urgent < wanted.urgent + 1e-3, np.minimum(freely.speed, wanted.speed), wanted.speed
+            freely.uncooled_acceleration < wanted.uncooled_acceleration + 1e-3,
+            np.minimum(freely.speed, wanted.speed),
+            wanted.speed,
         )
         safe = np.minimum(heeded, speed + own.max_acceleration * STEP)
-        _, wish, highest = bounds(speed, safe, felt(gap, own), leader, own, exact, STEP)
+        _, wish, highest = eidm_speed_bounds(speed, safe, eidm_effective_gap(gap, own), leader, own, exact, STEP)
         about = wish, highest, started, own.max_acceleration, now, STEP
-        found, started = finished(speed, acceleration[1:], *about)
+        found, started = finalize_eidm_speed(speed, acceleration[1:], *about)
         worst.append(np.abs(found - speeds[step, 1:]).max())
     assert min(speeds[:, 3]) < 0.05
     assert max(speeds[:, 3]) > 10.0
@@ -122,15 +138,15 @@ def test_gaps_and_speeds_of_both_kinds_of_drivers_are_sumos(simulation: Simulati
     states = np.array([[20.0, 20.0, 30.0], [20.0, 15.0, 18.0], [25.0, 5.0, 60.0], [5.0, 8.0, 4.0]])
     for row in (2, 5):
         name = f"car_{row}"
-        one = IDMRows(*(each if np.ndim(each) == 0 else np.full(len(states), each[row]) for each in people))
-        drivers = Drivers(one, Errors(*np.zeros((3, len(states)))), np.ones(len(states), bool))
+        one = IDMArrays(*(each if np.ndim(each) == 0 else np.full(len(states), each[row]) for each in people))
+        drivers = MotorwayDrivers(one, DriverErrors(*np.zeros((3, len(states)))), np.ones(len(states), bool))
         speed, leader, gap = states.T
         told = [sumo.getSecureGap(name, *state[:2], 2.0, "car_1") for state in states]
         assert drivers.secure_gap(speed, leader).clip(0.0) == pytest.approx(told, abs=1e-6)
         told = [sumo.getFollowSpeed(name, own, gap, its, 2.0, "car_1") for own, its, gap in states]
-        assert drivers.follow(speed, gap + one.minimum_gap, leader, STEP) == pytest.approx(told, abs=1e-6)
+        assert drivers.follow_speed(speed, gap + one.minimum_gap, leader, STEP) == pytest.approx(told, abs=1e-6)
         told = [sumo.getStopSpeed(name, own, way) for own, _, way in states]
-        assert drivers.stop(speed, gap, STEP) == pytest.approx(told, abs=1e-6)
+        assert drivers.stop_speed(speed, gap, STEP) == pytest.approx(told, abs=1e-6)
 
 
 def test_who_changes_lanes_is_who_does_in_sumo(simulation: Simulation) -> None:
@@ -138,44 +154,35 @@ def test_who_changes_lanes_is_who_does_in_sumo(simulation: Simulation) -> None:
     drawn = people(160, generator)
     names = load(simulation, drawn, np.cumsum(generator.uniform(0.6, 1.6, 160)), 2)
     time_headway, most, braking, gap, factor = drawn.T
-    road = Stretch(4000.0, 4000.0, 4000.0, LIMIT, LIMIT, 2, LENGTH)
-    nothing, free = np.zeros(160), np.full(160, FREELY)
+    road = MotorwayGeometry(4000.0, 4000.0, 4000.0, LIMIT, LIMIT, 2, LENGTH)
+    nothing, free = np.zeros(160), np.full(160, NO_ADVICE)
     wishes = dict.fromkeys(("gain", "keep", "look"), nothing)
     before = {"speed": nothing, "way": nothing - 1.0}
     changes, alike, others, moments = 0, 0, 0, 0
     for _ in range(320):
         simulation.step()
         known = [number for number in range(160) if before["way"][number] >= 0]
-        there = (
-            set(simulation.on_lane("road_0")),
-            set(simulation.on_lane("road_1")),
-        )
+        there = (set(simulation.vehicles_on_lane("road_0")), set(simulation.vehicles_on_lane("road_1")))
         way = np.array([next((lane + 1 for lane in (0, 1) if name in there[lane]), -1) for name in names])
         on_road = [number for number in range(160) if way[number] >= 0]
         speed, place = np.zeros((2, 160))
         speed[on_road] = simulation.speeds([names[number] for number in on_road])
-        place[on_road] = simulation.along_lanes([names[number] for number in on_road])
+        place[on_road] = simulation.lane_offsets([names[number] for number in on_road])
         columns = (
-            dict.fromkeys(Vehicles._fields, nothing)
+            dict.fromkeys(MotorwayVehicles._fields, nothing)
             | wishes
             | {
                 **{"road": np.zeros(160, int), "entry": np.arange(160), "way": before["way"].astype(int)},
                 **{"place": place, "speed": speed, "acceleration": (speed - before["speed"]) / STEP},
-                **{
-                    "time_headway": time_headway,
-                    "most": most,
-                    "braking": braking,
-                    "gap": gap,
-                    "factor": factor,
-                },
+                **{"time_headway": time_headway, "most": most, "braking": braking, "gap": gap, "factor": factor},
                 **{"extended": np.ones(160, bool), "cap": free, "wish": LIMIT * factor},
             }
         )
         if known:
-            vehicles = in_order(Vehicles(**columns).at(np.array(known)))
+            vehicles = sort_vehicles(MotorwayVehicles(**columns).select(np.array(known)))
             after = change_lanes(vehicles, road, STEP)
-            mine, sumos = after.way != vehicles.way, way[after.entry] != vehicles.way
-            counted = (vehicles.place > 20.0) & (way[after.entry] > 0)
+            mine, sumos = after.lane != vehicles.lane, way[after.entry] != vehicles.lane
+            counted = (vehicles.position > 20.0) & (way[after.entry] > 0)
             changes += int((sumos & counted).sum())
             alike += int((mine & sumos & counted).sum())
             others += int((mine & ~sumos & counted).sum())
@@ -199,11 +206,11 @@ def tasks_of(road: OnRamp, driver: Driver, count: int) -> list[EpisodeTask]:
 
 
 def driver_of(name: str) -> Driver:
-    return named_driver(name, SHORT.decision_step)
+    return driver_from_name(name, SHORT.control_step)
 
 
 def batch_of(road: OnRamp, name: str, count: int) -> list[Episode]:
-    return run_batch(tasks_of(road, driver_of(name), count), statistical=True)
+    return run_batch(tasks_of(road, driver_of(name), count), allow_statistical=True)
 
 
 @pytest.fixture(scope="module")
@@ -213,26 +220,24 @@ def driven() -> dict[str, list[Episode]]:
 
 def about(episode: Episode) -> list[float]:
     """Mean travel time, speed, share on the right lane, and lane changes for a vehicle."""
-    there = ~np.isnan(episode.lanes)
+    there = ~np.isnan(episode.lane_indices)
     both = there[1:] & there[:-1] & (np.diff(episode.speeds, axis=0) > -20.0)
-    changes = (np.diff(episode.lanes, axis=0) != 0.0) & both
+    changes = (np.diff(episode.lane_indices, axis=0) != 0.0) & both
     return [
-        travel_time(episode),
+        mean_travel_time(episode),
         float(np.nanmean(episode.speeds)),
-        float((episode.lanes[there] == 1.0).mean()),
+        float((episode.lane_indices[there] == 1.0).mean()),
         changes.sum() / len(episode.vehicle_ids),
     ]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["human", "jam-ahead"])
-def test_episodes_are_sumos_in_the_mean(
-    name: str, driven: dict[str, list[Episode]], simulation: Simulation
-) -> None:
+def test_episodes_are_sumos_in_the_mean(name: str, driven: dict[str, list[Episode]], simulation: Simulation) -> None:
     ours = np.array([about(episode) for episode in driven[name]])
     theirs = np.array(
         [
-            about(run_episode(SHORT, driver_of(name), seed, full=True, simulation=simulation))
+            about(run_episode(SHORT, driver_of(name), seed, record_details=True, simulation=simulation))
             for seed in seeds_of(4)
         ]
     )
@@ -241,7 +246,7 @@ def test_episodes_are_sumos_in_the_mean(
 
 @pytest.mark.long
 def test_a_road_is_the_same_alone_and_among_others(driven: dict[str, list[Episode]]) -> None:
-    (alone,) = run_batch([EpisodeTask(SHORT, driver_of("jam-ahead"), seeds_of(4)[2])], statistical=True)
+    (alone,) = run_batch([EpisodeTask(SHORT, driver_of("jam-ahead"), seeds_of(4)[2])], allow_statistical=True)
     among = driven["jam-ahead"][2]
     np.testing.assert_array_equal(alone.speeds, among.speeds)
     assert alone.vehicle_ids == among.vehicle_ids
@@ -253,26 +258,26 @@ def test_nobody_touches_anybody_or_is_lost(driven: dict[str, list[Episode]]) -> 
         assert episode.status == "completed"
         assert np.nanmin(episode.gaps) > 0.0
         there = ~np.isnan(episode.speeds)
-        assert there[-1].sum() + episode.arrived == len(episode.vehicle_ids)
+        assert there[-1].sum() + episode.arrivals == len(episode.vehicle_ids)
         assert np.nanmin(episode.speeds) >= 0.0
-        assert episode.audit.people.hardest <= 9.0 + 1e-9
+        assert episode.audit.human_braking.max_braking <= 9.0 + 1e-9
 
 
 @pytest.mark.long
 def test_each_road_has_its_own_driver_and_exploration() -> None:
-    road = replace(SHORT, horizon=150, cav_share=0.3)
+    road = replace(SHORT, horizon=150, penetration_rate=0.3)
     drivers = [driver_of("jam-ahead"), driver_of("cruise"), driver_of("gap-maker")]
     tasks = [EpisodeTask(road, driver, seeds_of(2)[-1]) for driver in drivers]
-    for task, together in zip(tasks, run_batch(tasks, statistical=True), strict=True):
-        (alone,) = run_batch([task], statistical=True)
+    for task, together in zip(tasks, run_batch(tasks, allow_statistical=True), strict=True):
+        (alone,) = run_batch([task], allow_statistical=True)
         np.testing.assert_array_equal(together.speeds, alone.speeds)
     noises = [replace(random_network(3), lasts=lasts) for lasts in (False, True)]
     for network in noises:
         driver = ResidualDriver(
-            driver_of("jam-ahead"), network, 2.5, ("to_merge", "allowed_speed", "cav_share")
+            driver_of("jam-ahead"), network, 2.5, ("distance_to_merge", "allowed_speed", "penetration_rate")
         )
         tasks = [EpisodeTask(road, driver, seeds_of(1)[0], explore=explore) for explore in (1.0, -1.0)]
-        one, other = run_batch(tasks, statistical=True)
+        one, other = run_batch(tasks, allow_statistical=True)
         first, second = (each.trajectories[0] for each in (one, other))
         calm = network(first.observations[:1])
         assert first.residual[0] != second.residual[0]
@@ -280,42 +285,40 @@ def test_each_road_has_its_own_driver_and_exploration() -> None:
 
 
 def test_noise_that_lasts_is_that_of_the_road() -> None:
-    world = MotorwayBatch(replace(SHORT, cav_share=0.5), seeds_of(2))
+    world = MotorwayBatch(replace(SHORT, penetration_rate=0.5), seeds_of(2))
     world.start(True)
     seen = set[tuple[float, ...]]()
     for _ in range(40):
-        world.advance(Command(np.zeros(world.rows)))
-        assert world.noise(3).shape == (world.rows, 3)
+        world.advance(Command(np.zeros(world.cav_count)))
+        assert world.noise(3).shape == (world.cav_count, 3)
         seen |= set(map(tuple, world.noise(3).tolist()))
     assert len(seen) == 2
 
 
 def test_what_a_cav_perceived_is_what_was_there(driven: dict[str, list[Episode]]) -> None:
     episode = driven["jam-ahead"][0]
-    column = dict(zip(episode.vehicle_ids, episode.columns, strict=True))
+    column = dict(zip(episode.vehicle_ids, episode.vehicle_columns, strict=True))
     assert len(episode.trajectories) > 5
     for each in episode.trajectories:
-        moments = slice(each.start, each.start + len(each.states.speed))
+        moments = slice(each.start_step, each.start_step + len(each.states.speed))
         np.testing.assert_allclose(each.states.speed, episode.speeds[moments, column[each.vehicle]])
-        np.testing.assert_allclose(
-            each.states.route_position, episode.positions[moments, column[each.vehicle]]
-        )
+        np.testing.assert_allclose(each.states.route_position, episode.positions[moments, column[each.vehicle]])
         gaps = episode.gaps[moments, column[each.vehicle]]
         near = gaps < 100.0
         np.testing.assert_allclose(each.states.leader_gap[near], gaps[near])
-        change = np.diff(each.states.speed) / episode.step
-        np.testing.assert_allclose(each.applied, change, atol=1e-12)
+        change = np.diff(each.states.speed) / episode.control_step
+        np.testing.assert_allclose(each.applied_acceleration, change, atol=1e-12)
         assert not each.terminated
         assert np.isfinite(each.reward).all()
 
 
 @pytest.mark.long
 def test_cavs_that_hold_back_are_slower_upstream_than_those_that_never_do() -> None:
-    crowded = replace(SHORT, cav_share=0.5, horizon=200)
+    crowded = replace(SHORT, penetration_rate=0.5, horizon=200)
 
     def upstream(name: str) -> float:
         states = [each.states for episode in batch_of(crowded, name, 3) for each in episode.trajectories]
-        return float(np.mean(np.concatenate([each.speed[each.to_merge > 0.0] for each in states])))
+        return float(np.mean(np.concatenate([each.speed[each.distance_to_merge > 0.0] for each in states])))
 
     assert upstream("constant:acceleration=-1") < 0.8 * upstream("cruise")
 
@@ -326,43 +329,43 @@ def test_neighbours_are_those_next_on_each_way_of_the_same_road() -> None:
     road, way = np.sort(generator.integers(0, 3, count)), generator.integers(0, 3, count)
     place = generator.uniform(0.0, 3000.0, count)
     order = np.lexsort((-place, road))
-    columns = dict.fromkeys(Vehicles._fields, np.zeros(count)) | {"road": road, "way": way, "place": place}
-    vehicles = Vehicles(**columns).at(order)
-    near = around(vehicles, 3)
+    columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(count)) | {"road": road, "way": way, "place": place}
+    vehicles = MotorwayVehicles(**columns).select(order)
+    near = find_neighbors(vehicles, 3)
     for row in range(count):
         for side in range(3):
-            there = np.flatnonzero((vehicles.road == vehicles.road[row]) & (vehicles.way == side))
+            there = np.flatnonzero((vehicles.road == vehicles.road[row]) & (vehicles.lane == side))
             ahead = there[there < row].max(initial=-1)
             behind = there[there > row].min(initial=count)
-            assert near.ahead[side, row] == ahead
-            assert near.behind[side, row] == (behind if behind < count else -1)
-    beyond = chosen(near.ahead, vehicles.way + 5)
+            assert near.leaders[side, row] == ahead
+            assert near.followers[side, row] == (behind if behind < count else -1)
+    beyond = neighbors_on_lane(near.leaders, vehicles.lane + 5)
     assert (beyond == -1).all()
 
 
 def test_nobody_enters_before_the_time_or_without_room() -> None:
     road = SHORT.draw(np.random.default_rng(1))
-    traffic = Motorways([road], STEP, lambda shape: np.zeros(shape), np.asarray)
+    traffic = BatchMotorways([road], STEP, lambda shape: np.zeros(shape), np.asarray)
     times = [entry.time for entry in road.entries]
     for _ in range(240):
         known = set(traffic.vehicles.entry.tolist())
         traffic.step()
         vehicles = traffic.vehicles
         new = [row for row, entry in enumerate(vehicles.entry.tolist()) if entry not in known]
-        assert all(times[vehicles.entry[row]] <= traffic.now for row in new)
-        row = chosen(around(vehicles, 3).ahead, vehicles.way)
-        gaps = np.where(row >= 0, vehicles.place[row] - LENGTH - vehicles.place, np.inf)
-        assert (gaps[new] >= vehicles.gap[new] - 1e-9).all()
-    assert traffic.waiting.entered[0] >= len(traffic.vehicles.entry) > 20
+        assert all(times[vehicles.entry[row]] <= traffic.time for row in new)
+        row = neighbors_on_lane(find_neighbors(vehicles, 3).leaders, vehicles.lane)
+        gaps = np.where(row >= 0, vehicles.position[row] - LENGTH - vehicles.position, np.inf)
+        assert (gaps[new] >= vehicles.minimum_gap[new] - 1e-9).all()
+    assert traffic.insertion_queue.entry_counts[0] >= len(traffic.vehicles.entry) > 20
 
 
 REFUSED: dict[str, dict[str, Any]] = {
     "actuation": {"actuation": "shielded"},
-    "simulation_step": {"simulation_step": 0.25, "steps_per_decision": 4},
+    "simulation_step": {"simulation_step": 0.25, "steps_per_control_step": 4},
     "warmup": {"warmup": 100},
-    "roadside.loss": {"roadside": replace(SHORT.roadside, loss=0.1)},
+    "roadside.loss_rate": {"roadside": replace(SHORT.roadside, loss=0.1)},
     "cruise.keep_right": {"cruise": replace(SHORT.cruise, keep_right=5.0)},
-    "cruise.keep_right and cruise.overtake": {"cruise": replace(SHORT.cruise, overtake=0.0)},
+    "cruise.keep_right and cruise.speed_gain": {"cruise": replace(SHORT.cruise, overtake=0.0)},
     "sensors": {"actuator": replace(SHORT.actuator, lag=0.3)},
 }
 
@@ -370,14 +373,14 @@ REFUSED: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_a_batch_cannot_do_is_refused_by_name(name: str) -> None:
     road = replace(SHORT, **REFUSED[name])
-    assert statistical_why_not(road).startswith(name)
+    assert statistically_unsupported_reason(road).startswith(name)
     with pytest.raises(InputError, match=f"batch: {name}"):
-        run_batch(tasks_of(road, driver_of("cruise"), 1), statistical=True)
+        run_batch(tasks_of(road, driver_of("cruise"), 1), allow_statistical=True)
 
 
 def test_where_episodes_must_be_sumos_it_runs_in_sumo() -> None:
-    assert why_not(SHORT)
-    assert not statistical_why_not(SHORT)
+    assert unsupported_reason(SHORT)
+    assert not statistically_unsupported_reason(SHORT)
     asked = list[EpisodeTask]()
 
     def run(tasks: Any) -> list[Episode]:
@@ -385,10 +388,10 @@ def test_where_episodes_must_be_sumos_it_runs_in_sumo() -> None:
         return [Episode(seed=task.seed, status="completed") for task in tasks]
 
     some = tasks_of(replace(SHORT, horizon=20), driver_of("cruise"), 1)
-    run_where_possible(some, run)
+    run_batched_if_supported(some, run)
     assert asked == some
     asked.clear()
-    run_where_possible(some, run, statistical=True)
+    run_batched_if_supported(some, run, allow_statistical=True)
     assert not asked
 
 
@@ -397,9 +400,9 @@ def test_tensors_are_stepped_as_arrays_are() -> None:
     generator = np.random.default_rng(0)
     drawn = [generator.standard_normal((3, 300)) for _ in range(90)]
 
-    def after(numbers: Any) -> Vehicles:
+    def after(numbers: Any) -> MotorwayVehicles:
         steps = iter(drawn)
-        traffic = Motorways(roads, STEP, lambda shape: numbers(next(steps)[:, : shape[1]]), numbers)
+        traffic = BatchMotorways(roads, STEP, lambda shape: numbers(next(steps)[:, : shape[1]]), numbers)
         for _ in range(90):  # later somebody changes lanes one step sooner: roots are rounded otherwise
             traffic.step()
         return traffic.vehicles
@@ -407,7 +410,7 @@ def test_tensors_are_stepped_as_arrays_are() -> None:
     arrays, tensors = after(np.asarray), after(torch.as_tensor)
     assert len(arrays.road) > 50
     came = [roads[road].entries[entry].route for road, entry in zip(arrays.road, arrays.entry, strict=True)]
-    assert any(route == "ramp" and way > 0 for route, way in zip(came, arrays.way, strict=True))
+    assert any(route == "ramp" and way > 0 for route, way in zip(came, arrays.lane, strict=True))
     np.testing.assert_array_equal(arrays.entry, tensors.entry.numpy())
-    np.testing.assert_array_equal(arrays.way, tensors.way.numpy())
-    np.testing.assert_allclose(arrays.place, tensors.place.numpy(), atol=1e-6)
+    np.testing.assert_array_equal(arrays.lane, tensors.lane.numpy())
+    np.testing.assert_allclose(arrays.position, tensors.position.numpy(), atol=1e-6)

@@ -16,26 +16,26 @@ from unjam.drivers import Constant, Driver
 from unjam.drivers.command import Command
 from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.registry import named_driver
+from unjam.drivers.registry import driver_from_name
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
+from unjam.models.dynamics import to_device
 from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
-from unjam.training.batch_speed import neural_driver
-from unjam.virtual.world import on_device
-from unjam.worlds.batch.begun import Begun, BegunRings
-from unjam.worlds.batch.noise import NoiseState, Numbers
-from unjam.worlds.batch.possible import why_not
-from unjam.worlds.batch.run import BEGUN, begin, run_batch, run_batches
-from unjam.worlds.batch.world import RingBatch
-from unjam.worlds.drive import driven_to_the_end
+from unjam.training.batch_benchmark import make_benchmark_driver
+from unjam.worlds.batch.noise import ArrayFactory, NoiseState
+from unjam.worlds.batch.ring.warm_up import WarmUpCache, WarmUpState
+from unjam.worlds.batch.ring.world import RingBatch
+from unjam.worlds.batch.run import WARM_UP_CACHE, run_batch, run_batches, start_batch_drive
+from unjam.worlds.batch.support import unsupported_reason
+from unjam.worlds.drive import finish_drive
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask
+from unjam.worlds.worker_pool import EpisodeTask
 
 NEEDS_A_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no graphics card")
 SHORT = Ring(horizon=300)
@@ -69,7 +69,7 @@ RINGS: dict[str, tuple[Ring, str]] = {
     "people alone after a warm-up": (replace(SHORT, warmup=130), "human"),
     "a CAV": (SHORT, "pi"),
     "a CAV after a warm-up": (replace(SHORT, warmup=750), "pi"),
-    "a CAV that forgets the warm-up": (replace(SHORT, warmup=130, recall_warmup=False), "pi"),
+    "a CAV that forgets the warm-up": (replace(SHORT, warmup=130, remember_warmup=False), "pi"),
     "four CAVs": (replace(SHORT, cavs=4), "pi"),
     "CAVs alone": (replace(SHORT, cavs=22), "pi"),
     "a short ring": (Ring(length=(60, 80), vehicles=8, cavs=2, horizon=300, warmup=100), "pi"),
@@ -77,13 +77,13 @@ RINGS: dict[str, tuple[Ring, str]] = {
     "a long ring": (Ring(length=(500, 560), vehicles=50, cavs=5, horizon=300), "pi"),
     "a ring with few": (Ring(length=(300, 400), vehicles=2, horizon=300), "pi"),
     "a wide ring, where people see past the car ahead": (Ring(length=(800, 900), horizon=300), "pi"),
-    "commands that are held": (replace(SHORT, steps_per_decision=5, horizon=80, warmup=52), "pi"),
+    "commands that are held": (replace(SHORT, steps_per_control_step=5, horizon=80, warmup=52), "pi"),
     "a coarser step": (replace(SHORT, simulation_step=0.3), "pi"),
     "the paper's PI": (SHORT, "pi:time_constant=0"),
     "late cars": (replace(SHORT, actuator=Actuator(delay=0.2, lag=0.3)), "pi"),
     "wrong sensors": (replace(SHORT, warmup=130, **WRONG), "idm"),
     "wrong sensors of three late CAVs": (
-        replace(SHORT, cavs=3, steps_per_decision=3, actuator=Actuator(delay=0.2, lag=0.3), **WRONG),
+        replace(SHORT, cavs=3, steps_per_control_step=3, actuator=Actuator(delay=0.2, lag=0.3), **WRONG),
         "idm",
     ),
     "raw": (replace(SHORT, actuation="raw", safety=NO_FILTER), "pi"),
@@ -111,10 +111,10 @@ RINGS: dict[str, tuple[Ring, str]] = {
 class ByShare(Driver):
     """Brakes by the share of CAVs that it is told."""
 
-    told: ClassVar[tuple[str, ...]] = ("cav_share",)
+    required_fields: ClassVar[tuple[str, ...]] = ("penetration_rate",)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        return -state.cav_share, memory
+        return -state.penetration_rate, memory
 
 
 @pytest.mark.parametrize(("cavs", "warmup"), [(1, 0), (4, 130)])
@@ -124,16 +124,16 @@ def test_the_share_of_cavs_is_told_to_whom_asks_for_it_alone(cavs: int, warmup: 
     actual = run_episode(ring, ByShare(), (3,))
     for episode in (found, actual):
         for trajectory in episode.trajectories:
-            assert trajectory.states.cav_share == pytest.approx(cavs / 22)
-            assert trajectory.applied == pytest.approx(-cavs / 22)
+            assert trajectory.states.penetration_rate == pytest.approx(cavs / 22)
+            assert trajectory.applied_acceleration == pytest.approx(-cavs / 22)
     assert_alike(found, actual)
-    assert run_episode(ring, named_driver("pi", 0.1), (3,)).trajectories[0].states.cav_share is None
+    assert run_episode(ring, driver_from_name("pi", 0.1), (3,)).trajectories[0].states.penetration_rate is None
 
 
 @pytest.mark.parametrize("name", RINGS)
 def test_a_ring_of_the_batch_is_sumos_of_the_same_seed(name: str, simulation: Simulation) -> None:
     ring, expert = RINGS[name]
-    driver = named_driver(expert, ring.decision_step)
+    driver = driver_from_name(expert, ring.control_step)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2))), (1, 2), strict=True):
         assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
 
@@ -142,12 +142,12 @@ def test_a_ring_of_the_batch_is_sumos_of_the_same_seed(name: str, simulation: Si
 @pytest.mark.parametrize("name", ["people alone after a warm-up", "a CAV after a warm-up", "wrong sensors"])
 def test_a_ring_that_was_warmed_up_with_others_goes_on_to_the_same_bits(name: str) -> None:
     ring, expert = RINGS[name]
-    now, coming = (tasks(ring, named_driver(expert, 0.1), seeds) for seeds in ((1, 2), (3, 4, 5)))
-    BEGUN.clear()
+    now, coming = (tasks(ring, driver_from_name(expert, 0.1), seeds) for seeds in ((1, 2), (3, 4, 5)))
+    WARM_UP_CACHE.clear()
     alone = run_batch(coming)
-    BEGUN.clear()
-    run_batches(now, coming=[*coming, *tasks(replace(ring, cavs=2), Constant(), [3])])
-    assert [(scenario.cavs, seed) for scenario, seed, _ in BEGUN] == [
+    WARM_UP_CACHE.clear()
+    run_batches(now, upcoming=[*coming, *tasks(replace(ring, cavs=2), Constant(), [3])])
+    assert [(scenario.cavs, seed) for scenario, seed, _ in WARM_UP_CACHE] == [
         (ring.cavs, (each,)) for each in range(1, 6)
     ]
     for found, expected in zip(run_batch(coming[::-1]), alone[::-1], strict=True):
@@ -158,28 +158,28 @@ def test_a_ring_that_was_warmed_up_with_others_goes_on_to_the_same_bits(name: st
 def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[str]] = []
 
-    def warm_up(rings: Sequence[str]) -> dict[str, Begun]:
+    def warm_up(rings: Sequence[str]) -> dict[str, WarmUpState]:
         asked.append(list(rings))
         still, noise = np.zeros(3), NoiseState({}, np.zeros((0, 2)))
-        return {ring: Begun(still, still[1:], still[1:], False, noise, None) for ring in rings}
+        return {ring: WarmUpState(still, still[1:], still[1:], False, noise, None) for ring in rings}
 
-    monkeypatch.setattr("unjam.worlds.batch.begun.MOST_KEPT", 4)
-    kept = BegunRings[str]()
-    first, second, same = kept.of(["a", "b", "a"], ["b", "c"], warm_up)
+    monkeypatch.setattr("unjam.worlds.batch.ring.warm_up.MOST_KEPT", 4)
+    kept = WarmUpCache[str]()
+    first, second, same = kept.get_states(["a", "b", "a"], ["b", "c"], warm_up)
     assert first is same is kept["a"]
     assert second is kept["b"]
-    assert kept.of(["c"], ["d"], warm_up) == [kept["c"]]
+    assert kept.get_states(["c"], ["d"], warm_up) == [kept["c"]]
     assert asked == [["a", "b", "c"]], "where nothing is missing nothing is warmed up ahead"
-    assert kept.of(["a", "e", "f"], [], warm_up) == [first, kept["e"], kept["f"]]
+    assert kept.get_states(["a", "e", "f"], [], warm_up) == [first, kept["e"], kept["f"]]
     assert asked[1:] == [["e", "f"]]
     assert list(kept) == ["b", "c", "e", "f"]
 
 
 @pytest.mark.long
 def test_it_stays_so_for_five_minutes(simulation: Simulation) -> None:
-    ring, driver = Ring(cavs=2), named_driver("pi", 0.1)
+    ring, driver = Ring(cavs=2), driver_from_name("pi", 0.1)
     for found, seed in zip(run_batch(tasks(ring, driver, (7, 8))), (7, 8), strict=True):
-        assert found.steps == 3000
+        assert found.control_steps == 3000
         assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
 
 
@@ -188,15 +188,15 @@ def test_it_stays_so_for_five_minutes(simulation: Simulation) -> None:
 def test_a_network_sees_explores_and_is_recorded_as_in_sumo(
     hold: int, wrong: dict[str, Any], simulation: Simulation
 ) -> None:
-    ring, driver = Ring(cavs=2, warmup=120, horizon=100, **wrong), neural_driver(hold)
+    ring, driver = Ring(cavs=2, warmup=120, horizon=100, **wrong), make_benchmark_driver(hold)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2), True)), (1, 2), strict=True):
         actual = run_episode(ring, driver, seed, explore=True, simulation=simulation)
         assert_alike(found, actual)
         for one, other in zip(found.trajectories, actual.trajectories, strict=True):
             for name in ("observations", "expert", "residual", "applied", "filtered", "reward"):
                 assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-9), name
-            for name, values in other.memory.items():
-                assert one.memory[name] == pytest.approx(values, abs=1e-9, nan_ok=True), name
+            for name, values in other.initial_memory.items():
+                assert one.initial_memory[name] == pytest.approx(values, abs=1e-9, nan_ok=True), name
 
 
 def test_who_collides_ends_there_and_others_go_on(simulation: Simulation) -> None:
@@ -205,7 +205,7 @@ def test_who_collides_ends_there_and_others_go_on(simulation: Simulation) -> Non
     for episode, seed in zip(found, (1, 2, 3), strict=True):
         assert_alike(episode, run_episode(ring, Constant(0.6), seed, simulation=simulation))
     assert {episode.status for episode in found} == {"collision"}
-    assert len({episode.steps for episode in found}) > 1
+    assert len({episode.control_steps for episode in found}) > 1
 
 
 class Hasty(Driver):
@@ -219,7 +219,7 @@ def test_brakes_do_what_they_can(simulation: Simulation) -> None:
     ring = replace(SHORT, action_limit=8.0)
     (found,) = run_batch(tasks(ring, Hasty(), (1,)))
     assert_alike(found, run_episode(ring, Hasty(), 1, simulation=simulation))
-    assert found.audit.cavs.hardest == pytest.approx(6.0)
+    assert found.audit.cav_braking.max_braking == pytest.approx(6.0)
 
 
 def test_each_of_a_population_drives_in_its_own_way(tmp_path: Path, simulation: Simulation) -> None:
@@ -228,13 +228,13 @@ def test_each_of_a_population_drives_in_its_own_way(tmp_path: Path, simulation: 
     quick = replace(one, max_acceleration=1.8, minimum_gap=1.5, exponent=2.0)
     write_population(tmp_path / "people.json", Population(one, (one, slow, quick), (-9.0, 3.0)))
     ring = replace(SHORT, population=str(tmp_path / "people.json"), warmup=130)
-    driver = named_driver("pi", 0.1)
+    driver = driver_from_name("pi", 0.1)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2))), (1, 2), strict=True):
         assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
 
 
 def test_people_collide_where_sumo_says_so(simulation: Simulation) -> None:
-    ring, driver = Ring(noise=40.0, horizon=90), named_driver("human", 0.1)
+    ring, driver = Ring(noise=40.0, horizon=90), driver_from_name("human", 0.1)
     found = run_batch(tasks(ring, driver, (1, 2, 3)))
     for episode, seed in zip(found, (1, 2, 3), strict=True):
         assert_alike(episode, run_episode(ring, driver, seed, simulation=simulation))
@@ -247,18 +247,18 @@ def doubles(values: Floats) -> Tensor:
 
 @pytest.mark.parametrize("wrong", [{}, WRONG], ids=["exact sensors", "wrong sensors"])
 def test_tensors_do_what_arrays_do(wrong: dict[str, Any]) -> None:
-    asked = tasks(Ring(horizon=200, cavs=2, warmup=100, **wrong), neural_driver(10), range(3))
+    asked = tasks(Ring(horizon=200, cavs=2, warmup=100, **wrong), make_benchmark_driver(10), range(3))
     for one, other in zip(run_batch(asked), run_batch(asked, doubles), strict=True):
         assert_alike(one, other)
 
 
-def singles(device: str) -> Numbers:
-    return partial(on_device, device=device)
+def singles(device: str) -> ArrayFactory:
+    return partial(to_device, device=device)
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=NEEDS_A_CARD)])
 def test_single_precision_is_near(device: str) -> None:
-    asked = tasks(Ring(horizon=300), neural_driver(10), range(3))
+    asked = tasks(Ring(horizon=300), make_benchmark_driver(10), range(3))
     for one, other in zip(run_batch(asked), run_batch(asked, singles(device)), strict=True):
         assert np.abs(one.speeds - other.speeds).max() < 1e-3
         assert other.reward.sum() == pytest.approx(one.reward.sum(), rel=1e-4)
@@ -266,27 +266,27 @@ def test_single_precision_is_near(device: str) -> None:
 
 def test_sensors_read_once_in_a_decision() -> None:
     world, exact = (RingBatch([replace(SHORT, **each)] * 2, [(1,), (2,)]) for each in (WRONG, {}))
-    first = world.perceive()
-    assert world.perceive() is first
-    off = np.abs(first.leader_gap - exact.perceive().leader_gap)
+    first = world.local_state()
+    assert world.local_state() is first
+    off = np.abs(first.leader_gap - exact.local_state().leader_gap)
     assert 0.0 < off.min() <= off.max() <= 0.5
     world.start(True)
     world.advance(Command(np.zeros(2)))
-    assert world.perceive() is not first
+    assert world.local_state() is not first
 
 
 def test_sums_are_those_of_the_episodes() -> None:
-    ring, driver, seeds = Ring(horizon=150, cavs=2, warmup=50), named_driver("pi", 0.1), [(1,), (2,)]
+    ring, driver, seeds = Ring(horizon=150, cavs=2, warmup=50), driver_from_name("pi", 0.1), [(1,), (2,)]
     kept = run_batch(tasks(ring, driver, (1, 2)))
-    rings = driven_to_the_end(begin(RingBatch([ring] * 2, seeds, keep=False), driver))
+    rings = finish_drive(start_batch_drive(RingBatch([ring] * 2, seeds, keep_record=False), driver))
     assert rings.episodes == ()
     for number, episode in enumerate(kept):
-        assert rings.decisions[number] == episode.steps
+        assert rings.decisions[number] == episode.control_steps
         assert rings.crashed[number] == 0
         assert rings.mean_speed[number] == pytest.approx(episode.speeds[1:].mean())
-        assert rings.headway[number] == pytest.approx(episode.audit.following.headway)
-        assert rings.braking[number] == pytest.approx(episode.audit.cavs.hardest)
-        for name, terms in episode.terms.items():
+        assert rings.headway[number] == pytest.approx(episode.audit.following.min_time_gap)
+        assert rings.braking[number] == pytest.approx(episode.audit.cav_braking.max_braking)
+        for name, terms in episode.reward_terms.items():
             assert rings.terms[name][number] == pytest.approx(terms.sum())
 
 
@@ -297,14 +297,10 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
         return torch.randn(shape, generator=generator)
 
     ring = Ring(horizon=30, noise=2.0, humans=replace(Ring().humans, time_headway=0.5))
-    world = RingBatch(
-        [replace(ring, warmup=60)] * 50, [(seed,) for seed in range(50)], singles("cpu"), draw=draw
-    )
-    episodes = driven_to_the_end(begin(world, Constant(0.2), singles("cpu"))).episodes
+    world = RingBatch([replace(ring, warmup=60)] * 50, [(seed,) for seed in range(50)], singles("cpu"), draw=draw)
+    episodes = finish_drive(start_batch_drive(world, Constant(0.2), singles("cpu"))).episodes
     noise = [
-        each.speeds[1:] - np.diff(each.positions, axis=0) / each.step
-        for each in episodes
-        if each.speeds.min() > 0.5
+        each.speeds[1:] - np.diff(each.positions, axis=0) / each.step for each in episodes if each.speeds.min() > 0.5
     ]
     cav = episodes[0].vehicle_ids.index("cav_0")
     added = np.array(noise)
@@ -324,19 +320,19 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
     ],
 )
 def test_what_would_not_be_exact_is_refused(scenario: Any, why: str) -> None:
-    assert why in why_not(scenario)
+    assert why in unsupported_reason(scenario)
     with pytest.raises(InputError, match="batch: "):
-        run_batch(tasks(scenario, named_driver("pi", 0.1), (1,)))
+        run_batch(tasks(scenario, driver_from_name("pi", 0.1), (1,)))
 
 
 def test_rings_differ_in_their_lengths_alone() -> None:
-    driver = named_driver("pi", 0.1)
+    driver = driver_from_name("pi", 0.1)
     two = [EpisodeTask(each, driver, (1,)) for each in (SHORT, replace(SHORT, cavs=2))]
     with pytest.raises(InputError, match="differ in more than their lengths"):
         run_batch(two)
-    parts = [EpisodeTask(SHORT.part(part, 2), driver, (1,)) for part in range(2)]
+    parts = [EpisodeTask(SHORT.stratum(part, 2), driver, (1,)) for part in range(2)]
     assert len({episode.loop_length for episode in run_batch(parts)}) == 2
-    other = [*tasks(SHORT, driver, (1,)), *tasks(SHORT, named_driver("idm", 0.1), (2,))]
+    other = [*tasks(SHORT, driver, (1,)), *tasks(SHORT, driver_from_name("idm", 0.1), (2,))]
     together, alone = run_batch(other), [run_batch([each])[0] for each in other]
     assert all(np.array_equal(one.speeds, two.speeds) for one, two in zip(together, alone, strict=True))
     with pytest.raises(InputError, match="differ in driver"):
@@ -348,25 +344,21 @@ def test_who_of_a_mixture_drives_does_not_depend_on_the_other_rings() -> None:
     for ring in (SHORT, two):
         every = tasks(ring, make_driver("pi+idm", 0.1), (1, 2, 3))
         together, alone = run_batch(every), [run_batch([each])[0] for each in every]
-        assert all(
-            np.array_equal(one.speeds, other.speeds) for one, other in zip(together, alone, strict=True)
-        )
+        assert all(np.array_equal(one.speeds, other.speeds) for one, other in zip(together, alone, strict=True))
 
 
 def test_what_a_driver_sees_is_not_the_worlds_own() -> None:
     world = RingBatch([SHORT], [(1,)])
     with pytest.raises(ValueError, match="read-only"):
-        world.perceive().speed[0] = 1.0
+        world.local_state().speed[0] = 1.0
 
 
 def test_rings_on_which_somebody_touched_within_a_decision_have_collided() -> None:
-    raw = replace(
-        SHORT, actuation="raw", safety=NO_FILTER, steps_per_decision=10, action_limit=3.0, horizon=40
-    )
+    raw = replace(SHORT, actuation="raw", safety=NO_FILTER, steps_per_control_step=10, action_limit=3.0, horizon=40)
     every = tasks(raw, Constant(3.0), range(24))
     scenarios, seeds = [each.scenario for each in every], [each.seed for each in every]
     world = RingBatch(scenarios, seeds)  # pyright: ignore[reportArgumentType]
-    rings = driven_to_the_end(begin(world, Constant(3.0)))
+    rings = finish_drive(start_batch_drive(world, Constant(3.0)))
     crashed = [episode.status == "collision" for episode in rings.episodes]
     assert crashed == [bool(each) for each in rings.crashed]
     assert all(episode.collisions >= 2 for episode in rings.episodes if episode.status == "collision")
@@ -374,12 +366,12 @@ def test_rings_on_which_somebody_touched_within_a_decision_have_collided() -> No
 
 
 def test_rings_of_many_kinds_come_back_in_their_order() -> None:
-    pi, idm = (named_driver(name, 0.1) for name in ("pi", "idm"))
+    pi, idm = (driver_from_name(name, 0.1) for name in ("pi", "idm"))
     asked = [
-        EpisodeTask(SHORT.part(1, 2), pi, (1,)),
+        EpisodeTask(SHORT.stratum(1, 2), pi, (1,)),
         EpisodeTask(replace(SHORT, cavs=2), pi, (2,)),
-        EpisodeTask(SHORT.part(0, 2), pi, (3,)),
-        EpisodeTask(SHORT.part(0, 2), idm, (4,)),
+        EpisodeTask(SHORT.stratum(0, 2), pi, (3,)),
+        EpisodeTask(SHORT.stratum(0, 2), idm, (4,)),
         EpisodeTask(replace(SHORT, vehicles=40, length=(400, 480)), pi, (5,)),  # who do not fit on the others
     ]
     found = run_batches(asked)

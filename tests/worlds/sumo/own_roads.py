@@ -103,8 +103,7 @@ def two_way(folder: Path, configuration: str = "") -> Path:
     """A road with left-hand traffic on which cars overtake slow tractors in the opposite lane."""
     nodes = '<node id="a" x="0" y="0"/><node id="b" x="3000" y="0"/>'
     edges = "".join(
-        f'<edge id="{there}" from="{there[0]}" to="{there[1]}" numLanes="1" speed="25">'
-        f'<neigh lane="{back}_0"/></edge>'
+        f'<edge id="{there}" from="{there[0]}" to="{there[1]}" numLanes="1" speed="25"><neigh lane="{back}_0"/></edge>'
         for there, back in (("ab", "ba"), ("ba", "ab"))
     )
     flow = '<flow id="{}" type="{}" route="{}" begin="1" end="600" vehsPerHour="{}" departSpeed="max"/>'

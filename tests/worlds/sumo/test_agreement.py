@@ -10,7 +10,7 @@ from unjam.drivers import IDM, Driver, Human, PISaturation
 from unjam.measures.metrics import measure
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.record import Episode
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 WARMUP, STEPS = 750, 3000
 
@@ -30,8 +30,8 @@ FLOW_SEEDS = 2
 
 
 @pytest.fixture(scope="module")
-def workers() -> Iterator[Workers]:
-    with Workers(2) as pool:
+def workers() -> Iterator[WorkerPool]:
+    with WorkerPool(2) as pool:
         yield pool
 
 
@@ -41,7 +41,7 @@ def ring_warm(length: int) -> Ring:
     return scenario
 
 
-def run(workers: Workers, scenario: Ring, driver: Driver, seeds: Sequence[int]) -> list[Episode]:
+def run(workers: WorkerPool, scenario: Ring, driver: Driver, seeds: Sequence[int]) -> list[Episode]:
     episodes = workers.run([EpisodeTask(scenario, driver, (seed,)) for seed in seeds])
     assert [episode.status for episode in episodes] == ["completed"] * len(seeds)
     return episodes
@@ -70,10 +70,7 @@ def plain_rings(length: int, rings: int = 150) -> tuple[Measured, Measured]:
         position = position + 0.1 * speed
         if step >= WARMUP:
             means, stds = means + speed.mean(1) / STEPS, stds + speed.std(1) / STEPS
-    return (
-        Measured(float(means.mean()), float(stds.mean())),
-        Measured(float(means.std()), float(stds.std())),
-    )
+    return (Measured(float(means.mean()), float(stds.mean())), Measured(float(means.std()), float(stds.std())))
 
 
 def slowly(length: int) -> Any:
@@ -81,7 +78,7 @@ def slowly(length: int) -> Any:
 
 
 @pytest.fixture(scope="module", params=[230, slowly(260)])
-def human_rings(request: pytest.FixtureRequest, workers: Workers) -> tuple[int, list[Episode]]:
+def human_rings(request: pytest.FixtureRequest, workers: WorkerPool) -> tuple[int, list[Episode]]:
     return request.param, run(workers, ring_warm(request.param), Human(), range(20))
 
 
@@ -107,7 +104,7 @@ def test_human_rings_agree_with_flow(human_rings: tuple[int, list[Episode]]) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("length", [230, 260])
-def test_rings_with_the_papers_pi_agree_with_flow(length: int, workers: Workers) -> None:
+def test_rings_with_the_papers_pi_agree_with_flow(length: int, workers: WorkerPool) -> None:
     flow = FLOW_PI[length]
     found, _ = measured(run(workers, ring_warm(length), PISaturation(time_constant=0), range(8)))
     assert found.mean == pytest.approx(flow.mean, rel=0.05)
@@ -115,21 +112,21 @@ def test_rings_with_the_papers_pi_agree_with_flow(length: int, workers: Workers)
 
 
 @pytest.mark.parametrize("length", [220, 270, *map(slowly, range(230, 261, 10))])
-def test_pi_holds_a_warm_ring_at_its_limit(length: int, workers: Workers) -> None:
+def test_pi_holds_a_warm_ring_at_its_limit(length: int, workers: WorkerPool) -> None:
     (episode,) = run(workers, ring_warm(length), PISaturation(), [0])
     row = measure(episode)
     assert row["speed_limit_ratio_steady"] >= 0.98
     assert row["collisions"] == 0.0
 
 
-def test_idm_leaves_a_jammed_ring_jammed(workers: Workers) -> None:
+def test_idm_leaves_a_jammed_ring_jammed(workers: WorkerPool) -> None:
     scenario = make_scenario("ring-jammed")
     assert isinstance(scenario, Ring)
     for episode in run(workers, scenario, IDM(), range(2)):
         assert measure(episode)["speed_limit_ratio_steady"] < 0.9
 
 
-def test_a_ring_without_noise_flows_evenly_at_its_limit(workers: Workers) -> None:
+def test_a_ring_without_noise_flows_evenly_at_its_limit(workers: WorkerPool) -> None:
     (episode,) = run(workers, replace(ring_warm(230), noise=0.0), Human(), [0])
     assert measure(episode)["speed_std_fleet"] < 1e-6
     assert measure(episode)["speed_limit_ratio_steady"] == pytest.approx(1.0, abs=2e-3)

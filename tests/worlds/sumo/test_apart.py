@@ -19,13 +19,12 @@ from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.apart import SimulationApart, simulation_for
-from unjam.worlds.sumo.files import files_of
+from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.sandboxed import SandboxedSimulation, open_simulation
 from unjam.worlds.sumo.simulation import Simulation
 
 CARS = "".join(
-    f'<vehicle id="{number}" type="car" route="along" depart="0" departPos="{400 - 60 * number}" '
-    f'departSpeed="10"/>'
+    f'<vehicle id="{number}" type="car" route="along" depart="0" departPos="{400 - 60 * number}" departSpeed="10"/>'
     for number in range(5)
 )
 WRITING = ("--tripinfo-output={}", "--fcd-output={}", "--save-configuration={}")
@@ -33,33 +32,29 @@ WRITING = ("--tripinfo-output={}", "--fcd-output={}", "--save-configuration={}")
 
 @pytest.fixture
 def road(tmp_path: Path) -> Scenario:
-    return make_scenario(str(straight(tmp_path, CARS)), {"cav_share": 0.5, "horizon": 40})
+    return make_scenario(str(straight(tmp_path, CARS)), {"penetration_rate": 0.5, "horizon": 40})
 
 
 def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, simulation: Simulation) -> None:
-    here = run_episode(road, IDM(), 3, simulation=simulation, full=True)
-    apart = run_episode(road, IDM(), 3, full=True)
+    here = run_episode(road, IDM(), 3, simulation=simulation, record_details=True)
+    apart = run_episode(road, IDM(), 3, record_details=True)
     assert fingerprint(here) == fingerprint(apart)
-    np.testing.assert_array_equal(here.places, apart.places)
+    np.testing.assert_array_equal(here.poses, apart.poses)
 
 
 def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, simulation: Simulation) -> None:
     asked = [(name, of) for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
-    told = {"load", "step", "close", "command_speeds", "replace_speeds", "command_people"}
+    told = {"load", "step", "close", "command_speeds", "replace_speeds", "command_humans"}
     told |= {"take_control", "change_type", "end_with_trips", "is_in_contact", "teleport_count", "finish"}
     answers = []
-    with SimulationApart() as apart:
+    with SandboxedSimulation() as apart:
         for each in (simulation, apart):
-            make_traffic(road, (0,), each).start(controlled=False)  # pyright: ignore[reportArgumentType]
+            make_traffic(road, (0,), each).start(is_controlled=False)  # pyright: ignore[reportArgumentType]
             names = ["0", "1"]
-            arguments = {"neighbours": ("1", 100.0), "left": (), "more_expected": (), "lanes": ()}
+            arguments = {"neighbours": ("1", 100.0), "left": (), "expects_vehicles": (), "lanes": ()}
             arguments |= dict.fromkeys(("type_of", "route_of"), ("1",))
             answers.append(
-                {
-                    name: getattr(each, name)(*arguments.get(name, (names,)))
-                    for name, _ in asked
-                    if name not in told
-                }
+                {name: getattr(each, name)(*arguments.get(name, (names,))) for name, _ in asked if name not in told}
             )
     for name, answer in answers[0].items():
         assert type(answers[1][name]) is type(answer), name
@@ -74,7 +69,7 @@ def test_a_function_of_the_program_drives_where_it_is(road: Scenario, tmp_path: 
         (tmp_path / "mine").touch()
         return np.zeros(len(state.speed))
 
-    result = drive(road.file, mine, 1, road={"cav_share": 0.5, "horizon": 5})  # pyright: ignore
+    result = drive(road.file, mine, 1, scenario_options={"penetration_rate": 0.5, "horizon": 5})  # pyright: ignore
     assert [row["status"] for rows in result.rows.values() for row in rows] == ["completed"]
     assert set(seen) == {os.getpid()}
 
@@ -82,13 +77,11 @@ def test_a_function_of_the_program_drives_where_it_is(road: Scenario, tmp_path: 
 @pytest.mark.long
 @kept
 @pytest.mark.parametrize("option", WRITING)
-def test_what_sumo_might_be_brought_to_do_the_kernel_refuses(
-    option: str, road: Scenario, tmp_path: Path
-) -> None:
-    canary, files = tmp_path / "canary", files_of(road, road.of_seed((0,))[0])
+def test_what_sumo_might_be_brought_to_do_the_kernel_refuses(option: str, road: Scenario, tmp_path: Path) -> None:
+    canary, files = tmp_path / "canary", sumo_inputs(road, road.draw_from_seed((0,))[0])
     canary.write_text("as it was")
     told = (*files.options, option.format(canary))
-    with SimulationApart() as simulation, pytest.raises(EpisodeError, match="SUMO cannot start") as caught:
+    with SandboxedSimulation() as simulation, pytest.raises(EpisodeError, match="SUMO cannot start") as caught:
         simulation.load(files._replace(options=told), road.simulation_step, 0)
     assert "\n" not in str(caught.value)
     assert canary.read_text() == "as it was"
@@ -99,7 +92,7 @@ def test_what_sumo_might_be_brought_to_do_the_kernel_refuses(
 def test_sumo_as_a_child_of_its_own_and_its_window_write_nothing_either(
     option: str, road: Scenario, tmp_path: Path
 ) -> None:
-    canary, files = tmp_path / "canary", files_of(road, road.of_seed((0,))[0])
+    canary, files = tmp_path / "canary", sumo_inputs(road, road.draw_from_seed((0,))[0])
     canary.write_text("as it was")
     told = (*files.options, option.format(canary))
     with Simulation("traci") as simulation, pytest.raises(EpisodeError, match="SUMO cannot start"):
@@ -109,9 +102,9 @@ def test_sumo_as_a_child_of_its_own_and_its_window_write_nothing_either(
 
 
 def test_a_lost_process_is_an_error_in_one_line_and_leaves_nothing(road: Scenario) -> None:
-    with SimulationApart() as simulation:
+    with SandboxedSimulation() as simulation:
         process, folder = psutil.Process(simulation._process.pid), Path(simulation._folder.name)
-        files = files_of(road, road.of_seed((0,))[0])
+        files = sumo_inputs(road, road.draw_from_seed((0,))[0])
         simulation.load(files, road.simulation_step, 0)
         process.kill()
         with pytest.raises(EpisodeError, match=r"SUMO was lost: .* -9"):
@@ -122,12 +115,12 @@ def test_a_lost_process_is_an_error_in_one_line_and_leaves_nothing(road: Scenari
 
 def test_it_outlives_the_thread_that_started_it(road: Scenario) -> None:
     with ThreadPoolExecutor(1) as pool:
-        apart = pool.submit(SimulationApart).result()
+        apart = pool.submit(SandboxedSimulation).result()
     with apart:
-        make_traffic(road, (0,), apart).start(controlled=False)  # pyright: ignore[reportArgumentType]
+        make_traffic(road, (0,), apart).start(is_controlled=False)  # pyright: ignore[reportArgumentType]
         assert apart.type_of("1") == "car"
 
 
 def test_only_networks_of_others_run_apart(road: Scenario) -> None:
-    with simulation_for(Ring()) as here, simulation_for(Ring(), road) as apart:
-        assert [type(here), type(apart)] == [Simulation, SimulationApart]
+    with open_simulation(Ring()) as here, open_simulation(Ring(), road) as apart:
+        assert [type(here), type(apart)] == [Simulation, SandboxedSimulation]

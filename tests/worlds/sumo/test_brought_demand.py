@@ -11,17 +11,15 @@ from tests.networks import count_teleports
 from tests.worlds.sumo.own_roads import STANDING, TELEPORTS, built, network, straight
 from unjam import sumo_files
 from unjam.drivers import IDM, Human
-from unjam.errors import InputError, RefusedError
+from unjam.errors import InputError, SumoInputError
 from unjam.scenarios import make_scenario
 from unjam.sumo_files import read_sumo_files
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-PERSONS = (
-    '<personFlow id="p" begin="0" end="40" period="10"><personTrip from="ab" to="bc" {how}/></personFlow>'
-)
+PERSONS = '<personFlow id="p" begin="0" end="40" period="10"><personTrip from="ab" to="bc" {how}/></personFlow>'
 CALIBRATOR = (
     '<calibrator id="c" edge="road" pos="0"><route id="all" edges="road"/>'
     '<flow begin="100" end="160" route="all" vehsPerHour="600" speed="15" type="slow"/></calibrator>'
@@ -33,22 +31,17 @@ SPEEDS = '<calibrator id="c" edge="road" pos="0"><flow begin="0" end="60" speed=
 def two_edges(folder: Path, demand: str) -> Path:
     """Write a road of two edges with a demand, and return its configuration."""
     nodes = "".join(f'<node id="{name}" x="{x}" y="0"/>' for name, x in (("a", 0), ("b", 300), ("c", 600)))
-    edges = "".join(
-        f'<edge id="{n}" from="{n[0]}" to="{n[1]}" numLanes="1" speed="15"/>' for n in ("ab", "bc")
-    )
+    edges = "".join(f'<edge id="{n}" from="{n[0]}" to="{n[1]}" numLanes="1" speed="15"/>' for n in ("ab", "bc"))
     return built(folder, nodes, edges, demand, '<end value="120"/><step-length value="0.5"/>')
 
 
 @pytest.mark.parametrize(
-    ("how", "kind"),
-    [('modes="car"', "DEFAULT_VEHTYPE"), ('vTypes="own"', "own"), ('modes="car" vTypes="own"', "own")],
+    ("how", "kind"), [('modes="car"', "DEFAULT_VEHTYPE"), ('vTypes="own"', "own"), ('modes="car" vTypes="own"', "own")]
 )
-def test_personal_cars_are_demand_and_become_cavs(
-    how: str, kind: str, tmp_path: Path, simulation: Simulation
-) -> None:
+def test_personal_cars_are_demand_and_become_cavs(how: str, kind: str, tmp_path: Path, simulation: Simulation) -> None:
     file = two_edges(tmp_path, '<vType id="own" speedDev="0"/>' + PERSONS.format(how=how))
     assert read_sumo_files(file).used_types == {kind}
-    scenario = make_scenario(str(file), {"cav_share": 1.0})
+    scenario = make_scenario(str(file), {"penetration_rate": 1.0})
     episode = run_episode(scenario, IDM(), (1,), simulation=simulation)
     assert len(episode.vehicle_ids) >= 3
     assert len(episode.cav_ids) >= 3
@@ -59,14 +52,10 @@ def test_persons_who_bring_no_vehicle_are_no_demand(tmp_path: Path) -> None:
         read_sumo_files(two_edges(tmp_path, PERSONS.format(how='modes="public"')))
 
 
-def test_vehicles_of_a_calibrator_alone_are_waited_for_as_in_sumo(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_vehicles_of_a_calibrator_alone_are_waited_for_as_in_sumo(tmp_path: Path, simulation: Simulation) -> None:
     file = straight(tmp_path, "", end=300.0, step=0.5, options='<additional-files value="more.add.xml"/>')
-    (tmp_path / "more.add.xml").write_text(
-        f'<additional><vType id="slow" speedDev="0"/>{CALIBRATOR}</additional>'
-    )
-    scenario = make_scenario(str(file), {"cav_share": 1.0})
+    (tmp_path / "more.add.xml").write_text(f'<additional><vType id="slow" speedDev="0"/>{CALIBRATOR}</additional>')
+    scenario = make_scenario(str(file), {"penetration_rate": 1.0})
     human = run_episode(scenario, Human(), (1,), simulation=simulation)
     command = [sumo_program("sumo"), "-c", str(file), "--tripinfo-output", str(tmp_path / "trips.xml")]
     subprocess.run([*command, "--tripinfo-output.write-unfinished"], check=True, capture_output=True)
@@ -93,26 +82,24 @@ def test_only_the_very_first_task_is_an_answer_for_all(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         straight(tmp_path / name, demand, end=1000.0, step=1.0)
     good, bad = (
-        EpisodeTask(
-            make_scenario(str(tmp_path / name / "straight.sumocfg"), {"cav_share": 0.5}), Human(), (0,)
-        )
+        EpisodeTask(make_scenario(str(tmp_path / name / "straight.sumocfg"), {"penetration_rate": 0.5}), Human(), (0,))
         for name in ("good", "bad")
     )
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         assert [each.status for each in workers.run([good, bad])] == ["completed", "failed"]
         assert [each.status for each in workers.run([bad])] == ["failed"]
-    with Workers(1) as workers, pytest.raises(RefusedError, match="SUMO cannot go on: Invalid departPos"):
+    with WorkerPool(1) as workers, pytest.raises(SumoInputError, match="SUMO cannot go on: Invalid departPos"):
         workers.run([bad, good])
 
 
 def test_workers_are_told_what_was_read_of_the_files(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="50" period="9"/>')
-    task = EpisodeTask(make_scenario(str(file), {"cav_share": 0.5}), Human(), (0,))
+    task = EpisodeTask(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,))
     answer = json.loads(json.dumps(sumo_files.answer_of(str(file))))
     assert sumo_files.take_answer(str(file), answer) == read_sumo_files(file)
     answer["end"] = 30.0  # what no file says shows that the worker has not read them
     sumo_files.take_answer(str(file), answer)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         first, second = workers.run([task, task])
     assert first.status == second.status == "completed"
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation
-from unjam.drivers.local_state import EVERYWHERE
+from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.drivers.safety import SafetyFilter
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
@@ -66,7 +66,7 @@ class Answers(Driver):
 
 
 class PlainAnswers(Answers):
-    plain_numbers = True
+    accepts_floats = True
 
 
 def moves(episode: Episode) -> Floats:
@@ -85,9 +85,7 @@ def idm(episode: Episode) -> Floats:
 @pytest.mark.parametrize(
     ("vehicles", "cavs", "length"), [(2, 2, 40), (5, 1, 55), (11, 1, 120), (22, 1, 220), (44, 1, 520)]
 )
-def test_as_many_vehicles_run_as_were_asked_for(
-    vehicles: int, cavs: int, length: int, simulation: Simulation
-) -> None:
+def test_as_many_vehicles_run_as_were_asked_for(vehicles: int, cavs: int, length: int, simulation: Simulation) -> None:
     ring = replace(RING, vehicles=vehicles, cavs=cavs, length=(length, length))
     episode = run_episode(ring, PISaturation(), (0,), simulation=simulation)
     assert episode.speeds.shape == (301, vehicles)
@@ -125,9 +123,9 @@ def test_humans_and_undriven_cavs_move_as_the_paper_says(simulation: Simulation)
     episode = run_episode(replace(RING, horizon=1500), Human(), (0,), simulation=simulation)
     np.testing.assert_allclose(moves(episode), idm(episode), rtol=0, atol=1e-9)
     assert np.ptp(episode.speeds[-1]) > 0.5
-    assert not episode.trajectories[0].shield.any()
+    assert not episode.trajectories[0].shield_braking.any()
     done = np.diff(episode.speeds[:, 0]) / STEP
-    np.testing.assert_allclose(episode.trajectories[0].applied, done, atol=1e-12)
+    np.testing.assert_allclose(episode.trajectories[0].applied_acceleration, done, atol=1e-12)
 
 
 def test_humans_with_other_parameters_move_by_those(simulation: Simulation) -> None:
@@ -173,10 +171,10 @@ def test_raw_follows_every_command_exactly(simulation: Simulation) -> None:
     ring = replace(RING, actuation="raw", horizon=3000)
     episode = run_episode(ring, Playback(commands), (0,), simulation=simulation)
     speed = episode.trajectories[0].states.speed
-    expected = np.maximum(speed[:-1] + STEP * commands[: episode.steps], 0.0)
+    expected = np.maximum(speed[:-1] + STEP * commands[: episode.control_steps], 0.0)
     np.testing.assert_allclose(speed[1:], expected, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(episode.trajectories[0].applied, commands[: episode.steps])
-    assert not episode.trajectories[0].shield.any()
+    np.testing.assert_array_equal(episode.trajectories[0].applied_acceleration, commands[: episode.control_steps])
+    assert not episode.trajectories[0].shield_braking.any()
 
 
 def test_a_reckless_raw_driver_collides_and_the_episode_ends_there(simulation: Simulation) -> None:
@@ -184,12 +182,12 @@ def test_a_reckless_raw_driver_collides_and_the_episode_ends_there(simulation: S
     episode = run_episode(ring, Constant(1.0), (0,), simulation=simulation)
     trajectory = episode.trajectories[0]
     assert episode.status == "collision"
-    assert episode.ok
+    assert episode.has_run
     assert trajectory.terminated
     assert episode.collisions == 2
-    assert 0 < episode.steps < 200
+    assert 0 < episode.control_steps < 200
     gap = trajectory.states.leader_gap
-    assert len(gap) == episode.steps + 1
+    assert len(gap) == episode.control_steps + 1
     assert gap[-1] < 0.0
     assert (gap[:-1] >= 0.0).all()
     assert trajectory.reward[-1] == 0.0
@@ -200,10 +198,10 @@ def test_a_reckless_raw_driver_collides_and_the_episode_ends_there(simulation: S
 def test_a_collision_ends_the_decision_in_which_it_happens(held: int, simulation: Simulation) -> None:
     ring = replace(RING, actuation="raw", horizon=3000, noise=0.0)
     exact = run_episode(ring, Constant(1.0), (0,), simulation=simulation)
-    coarse = replace(ring, steps_per_decision=held, horizon=3000 // held)
+    coarse = replace(ring, steps_per_control_step=held, horizon=3000 // held)
     episode = run_episode(coarse, Constant(1.0), (0,), simulation=simulation)
     assert episode.status == "collision"
-    assert episode.steps == -(-exact.steps // held)
+    assert episode.control_steps == -(-exact.control_steps // held)
     assert episode.collisions == 2
 
 
@@ -213,25 +211,23 @@ def test_a_collision_ends_the_decision_in_which_it_happens(held: int, simulation
 def test_the_same_driver_shielded_never_collides_and_every_override_is_counted(
     length: int, held: int, simulation: Simulation
 ) -> None:
-    ring = replace(RING, horizon=3000 // held, length=(length, length), steps_per_decision=held)
+    ring = replace(RING, horizon=3000 // held, length=(length, length), steps_per_control_step=held)
     for seed in range(2):
         episode = run_episode(ring, Constant(1.0), (seed,), simulation=simulation)
         trajectory = episode.trajectories[0]
-        assert (episode.status, episode.collisions, episode.steps) == ("completed", 0, 3000 // held)
+        assert (episode.status, episode.collisions, episode.control_steps) == ("completed", 0, 3000 // held)
         assert not trajectory.terminated
         assert episode.gaps.min() > 0.0
-        assert (trajectory.shield > 1e-6).mean() > 0.5
-        np.testing.assert_array_equal(trajectory.applied, 1.0)
+        assert (trajectory.shield_braking > 1e-6).mean() > 0.5
+        np.testing.assert_array_equal(trajectory.applied_acceleration, 1.0)
 
 
-def test_shielded_executes_every_command_exactly_but_for_the_braking_that_it_counts(
-    simulation: Simulation,
-) -> None:
+def test_shielded_executes_every_command_exactly_but_for_the_braking_that_it_counts(simulation: Simulation) -> None:
     commands = np.random.default_rng(1).uniform(-0.6, 1.0, 3000)
     ring = replace(RING, horizon=3000)
     episode = run_episode(ring, Playback(commands), (0,), simulation=simulation)
     trajectory = episode.trajectories[0]
-    speed, shield = trajectory.states.speed, trajectory.shield
+    speed, shield = trajectory.states.speed, trajectory.shield_braking
     commanded = np.maximum(speed[:-1] + STEP * commands, 0.0)
     np.testing.assert_allclose(speed[1:], commanded - STEP * shield, rtol=0, atol=1e-9)
     assert (shield == 0.0).mean() > 0.1
@@ -243,18 +239,18 @@ def test_shielded_executes_every_command_exactly_but_for_the_braking_that_it_cou
 def test_the_shield_lets_a_careful_driver_alone(simulation: Simulation) -> None:
     ring = replace(RING, horizon=3000, length=(270, 270))
     trajectory = run_episode(ring, PISaturation(), (0,), simulation=simulation).trajectories[0]
-    assert trajectory.shield.max() < 1e-9
-    expected = np.maximum(trajectory.states.speed[:-1] + STEP * trajectory.applied, 0.0)
+    assert trajectory.shield_braking.max() < 1e-9
+    expected = np.maximum(trajectory.states.speed[:-1] + STEP * trajectory.applied_acceleration, 0.0)
     np.testing.assert_allclose(trajectory.states.speed[1:], expected, rtol=0, atol=1e-9)
-    assert np.abs(trajectory.applied).max() > 0.1
+    assert np.abs(trajectory.applied_acceleration).max() > 0.1
 
 
 def test_the_shield_of_a_held_command_is_its_hardest_braking(simulation: Simulation) -> None:
     fine = run_episode(replace(RING, horizon=1000), Constant(1.0), (0,), simulation=simulation)
-    ring = replace(RING, horizon=200, steps_per_decision=5)
+    ring = replace(RING, horizon=200, steps_per_control_step=5)
     coarse = run_episode(ring, Constant(1.0), (0,), simulation=simulation)
-    expected = fine.trajectories[0].shield.reshape(200, 5).max(1)
-    np.testing.assert_array_equal(coarse.trajectories[0].shield, expected)
+    expected = fine.trajectories[0].shield_braking.reshape(200, 5).max(1)
+    np.testing.assert_array_equal(coarse.trajectories[0].shield_braking, expected)
 
 
 def test_flow_never_exceeds_the_human_model(simulation: Simulation) -> None:
@@ -267,10 +263,10 @@ def test_flow_never_exceeds_the_human_model(simulation: Simulation) -> None:
             place = episode.vehicle_ids.index(trajectory.vehicle)
             human = idm(episode)[:, place]
             assert (trajectory.states.speed[1:] <= human + 1e-9).all()
-            commanded = np.maximum(trajectory.states.speed[:-1] + STEP * trajectory.applied, 0.0)
+            commanded = np.maximum(trajectory.states.speed[:-1] + STEP * trajectory.applied_acceleration, 0.0)
             expected = np.minimum(commanded, human)
             np.testing.assert_allclose(trajectory.states.speed[1:], expected, rtol=0, atol=1e-9)
-            assert (trajectory.shield > 1e-6).any()
+            assert (trajectory.shield_braking > 1e-6).any()
 
 
 @pytest.mark.parametrize("limit", [0.4, 1.0, 3.0])
@@ -281,7 +277,7 @@ def test_commands_stay_within_the_action_limit(limit: float, wanted: float, simu
         for scenario in (ring, replace(ring, cavs=1)):
             episode = run_episode(scenario, driver, (0,), simulation=simulation)
             for trajectory in episode.trajectories:
-                np.testing.assert_array_equal(trajectory.applied, np.sign(wanted) * limit)
+                np.testing.assert_array_equal(trajectory.applied_acceleration, np.sign(wanted) * limit)
             assert episode.speeds[1, 0] == pytest.approx(max(np.sign(wanted) * limit * STEP, 0.0))
 
 
@@ -355,7 +351,7 @@ def test_a_short_warmup_is_heard_whole(simulation: Simulation) -> None:
 
 def test_the_warmup_is_heard_at_the_times_of_decisions(simulation: Simulation) -> None:
     driver = Watcher()
-    ring = replace(RING, warmup=752, horizon=4, steps_per_decision=5)
+    ring = replace(RING, warmup=752, horizon=4, steps_per_control_step=5)
     run_episode(ring, driver, (3,), simulation=simulation)
     human = run_episode(replace(RING, horizon=800), Human(), (3,), simulation=simulation).trajectories[0]
     moments = np.arange(752 - 120 * 5, 752, 5)
@@ -364,7 +360,7 @@ def test_the_warmup_is_heard_at_the_times_of_decisions(simulation: Simulation) -
     np.testing.assert_array_equal(driver.history[0].speed[0], human.states.speed[moments])
 
 
-@pytest.mark.parametrize("changes", [{"warmup": 0}, {"warmup": 100, "recall_warmup": False}])
+@pytest.mark.parametrize("changes", [{"warmup": 0}, {"warmup": 100, "remember_warmup": False}])
 def test_a_driver_hears_of_no_warmup_where_there_is_none_or_it_shall_not(
     changes: dict[str, Any], simulation: Simulation
 ) -> None:
@@ -377,8 +373,8 @@ def test_a_driver_hears_of_no_warmup_where_there_is_none_or_it_shall_not(
 def test_what_is_recalled_changes_how_pi_drives_on(simulation: Simulation) -> None:
     ring = replace(RING, warmup=400)
     recalled, fresh = (
-        run_episode(scenario, PISaturation(), (3,), simulation=simulation).trajectories[0].applied
-        for scenario in (ring, replace(ring, recall_warmup=False))
+        run_episode(scenario, PISaturation(), (3,), simulation=simulation).trajectories[0].applied_acceleration
+        for scenario in (ring, replace(ring, remember_warmup=False))
     )
     assert not np.array_equal(recalled, fresh)
 
@@ -387,37 +383,35 @@ def test_what_is_perceived_is_what_is_recorded(simulation: Simulation) -> None:
     driver = Watcher()
     episode = run_episode(replace(RING, cavs=3, horizon=80), driver, (3,), simulation=simulation)
     for row, trajectory in enumerate(episode.trajectories):
-        for name in EVERYWHERE:
+        for name in COMMON_FIELDS:
             seen = [getattr(state, name)[row] for state in driver.perceived]
             np.testing.assert_allclose(seen, getattr(trajectory.states, name)[:-1], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("actuation", ["shielded", "raw", "flow"])
-def test_five_steps_a_decision_are_each_command_held_for_five_steps(
-    actuation: Any, simulation: Simulation
-) -> None:
+def test_five_steps_a_decision_are_each_command_held_for_five_steps(actuation: Any, simulation: Simulation) -> None:
     commands = np.random.default_rng(2).uniform(-0.8, 0.8, (60, 2))
     fine = replace(RING, cavs=2, horizon=300, warmup=50, actuation=actuation)
-    coarse = replace(fine, horizon=60, steps_per_decision=5)
+    coarse = replace(fine, horizon=60, steps_per_control_step=5)
     held = run_episode(coarse, Playback(commands), (1,), simulation=simulation)
     each = run_episode(fine, Playback(np.repeat(commands, 5, 0)), (1,), simulation=simulation)
     assert each.status == "completed"
     np.testing.assert_array_equal(held.speeds, each.speeds[::5])
     np.testing.assert_array_equal(held.positions, each.positions[::5])
-    assert (held.steps, held.step, held.trajectories[0].states.speed.shape) == (60, 0.5, (61,))
+    assert (held.control_steps, held.control_step, held.trajectories[0].states.speed.shape) == (60, 0.5, (61,))
     for row, trajectory in enumerate(held.trajectories):
-        np.testing.assert_array_equal(trajectory.applied, commands[:, row])
+        np.testing.assert_array_equal(trajectory.applied_acceleration, commands[:, row])
 
 
 def test_a_finer_simulation_step_drives_about_alike(simulation: Simulation) -> None:
     ring = replace(RING, noise=0.0)
     coarse = run_episode(ring, IDM(), (0,), simulation=simulation)
     fine = run_episode(
-        replace(ring, simulation_step=0.05, steps_per_decision=2), IDM(), (0,), simulation=simulation
+        replace(ring, simulation_step=0.05, steps_per_control_step=2), IDM(), (0,), simulation=simulation
     )
     np.testing.assert_allclose(fine.speeds[-1], coarse.speeds[-1], atol=0.02)
     np.testing.assert_allclose(fine.positions[-1], coarse.positions[-1], atol=0.3)
-    assert fine.step == coarse.step == 0.1
+    assert fine.control_step == coarse.control_step == 0.1
 
 
 def test_positions_follow_from_speeds(simulation: Simulation) -> None:

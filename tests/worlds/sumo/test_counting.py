@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from tests.worlds.sumo.own_roads import game, straight
-from unjam.errors import EpisodeError, LostError
-from unjam.scenarios.own_network import OwnNetwork, own_network
-from unjam.worlds.sumo.counting import ATTEMPTS, Counting
-from unjam.worlds.sumo.detectors import Loop, Passage, load_with_loops, loop_name, passages
+from unjam.errors import EpisodeError, LostWorkerError
+from unjam.scenarios.user_network import UserNetwork, load_user_network
+from unjam.worlds.sumo.detector_pool import MAX_DETECTOR_ATTEMPTS, DetectorPool
+from unjam.worlds.sumo.detectors import DetectorPassage, InductionLoop, load_with_loops, loop_name, passages
 from unjam.worlds.sumo.simulation import Simulation
 
 STEADY = (
@@ -19,15 +19,15 @@ STEADY = (
 )
 
 
-def road(folder: Path, vehicles: str = STEADY) -> OwnNetwork:
+def road(folder: Path, vehicles: str = STEADY) -> UserNetwork:
     """A road with one lane, people alone."""
     folder.mkdir(exist_ok=True)
-    return own_network(str(straight(folder, vehicles)), {"cav_share": 1e-12})
+    return load_user_network(str(straight(folder, vehicles)), {"penetration_rate": 1e-12})
 
 
 def test_loops_tell_when_and_how_fast_everybody_passed(tmp_path: Path) -> None:
-    with Counting(1) as counting:
-        (passed,) = counting.run(road(tmp_path), [(1,)], [Loop("road_0", 105.0)])
+    with DetectorPool(1) as counting:
+        (passed,) = counting.run(road(tmp_path), [(1,)], [InductionLoop("road_0", 105.0)])
     assert [one.vehicle for one in passed] == [f"f.{number}" for number in range(9)]
     # They begin at 5.1 m (a car's length, SUMO's base position) with 10 m/s, six seconds apart.
     assert [one.time for one in passed] == pytest.approx([10.0 + 6 * number for number in range(9)], abs=0.25)
@@ -40,22 +40,22 @@ def test_the_count_does_not_depend_on_how_many_count(tmp_path: Path) -> None:
     seeds = [(1,), (2,), (1,)]
     found = []
     for count in (1, 2):
-        with Counting(count) as counting:
-            found.append(counting.run(road(tmp_path, random), seeds, [Loop("road_0", 50.0)]))
+        with DetectorPool(count) as counting:
+            found.append(counting.run(road(tmp_path, random), seeds, [InductionLoop("road_0", 50.0)]))
     assert found[0] == found[1]
     assert found[0][0] == found[0][2] != found[0][1]
 
 
 def test_after_one_that_failed_others_go_on(tmp_path: Path) -> None:
-    with Counting(1) as counting:
+    with DetectorPool(1) as counting:
         with pytest.raises(EpisodeError, match="SUMO cannot start"):
-            counting.run(road(tmp_path), [(1,), (2,)], [Loop("nowhere_0", 5.0)])
-        assert counting.run(road(tmp_path), [(1,)], [Loop("road_0", 5.0)]) != [[]]
+            counting.run(road(tmp_path), [(1,), (2,)], [InductionLoop("nowhere_0", 5.0)])
+        assert counting.run(road(tmp_path), [(1,)], [InductionLoop("road_0", 5.0)]) != [[]]
 
 
 def test_who_leaves_a_loop_sideways_tells_no_speed_as_with_sumos_own_detectors(tmp_path: Path) -> None:
-    loops = [Loop(f"{edge}_{lane}", at) for edge, at in (("gneE2", 50.0), ("gneE7", 60.0)) for lane in (0, 1)]
-    ramp = own_network(str(game(tmp_path, "ramp")), {"cav_share": 1e-12})
+    loops = [InductionLoop(f"{edge}_{lane}", at) for edge, at in (("gneE2", 50.0), ("gneE7", 60.0)) for lane in (0, 1)]
+    ramp = load_user_network(str(game(tmp_path, "ramp")), {"penetration_rate": 1e-12})
     with Simulation() as simulation:
         load_with_loops(simulation, ramp, (1,), loops)
         passed = passages(simulation, loops, 250)
@@ -69,18 +69,18 @@ def test_who_leaves_a_loop_sideways_tells_no_speed_as_with_sumos_own_detectors(t
 def test_a_simulation_that_was_lost_runs_again_and_one_that_is_lost_again_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, left = Counting._run_one, [0]
+    run, left = DetectorPool._run_one, [0]
 
-    def lost(self: Counting, *arguments: Any) -> list[Passage]:
+    def lost(self: DetectorPool, *arguments: Any) -> list[DetectorPassage]:
         if left[0] > 0:
             left[0] -= 1
-            raise LostError("SUMO was lost: its process ended with code -9")
+            raise LostWorkerError("SUMO was lost: its process ended with code -9")
         return run(self, *arguments)
 
-    monkeypatch.setattr(Counting, "_run_one", lost)
-    with Counting(1) as counting:
-        left[0] = ATTEMPTS - 1
-        assert len(counting.run(road(tmp_path), [(1,)], [Loop("road_0", 105.0)])[0]) == 9
-        left[0] = ATTEMPTS
-        with pytest.raises(LostError, match="-9"):
-            counting.run(road(tmp_path), [(1,)], [Loop("road_0", 105.0)])
+    monkeypatch.setattr(DetectorPool, "_run_one", lost)
+    with DetectorPool(1) as counting:
+        left[0] = MAX_DETECTOR_ATTEMPTS - 1
+        assert len(counting.run(road(tmp_path), [(1,)], [InductionLoop("road_0", 105.0)])[0]) == 9
+        left[0] = MAX_DETECTOR_ATTEMPTS
+        with pytest.raises(LostWorkerError, match="-9"):
+            counting.run(road(tmp_path), [(1,)], [InductionLoop("road_0", 105.0)])

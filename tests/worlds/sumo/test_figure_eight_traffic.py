@@ -14,12 +14,12 @@ from unjam.drivers.road_experts import Pacer
 from unjam.drivers.safety import SafetyFilter
 from unjam.measures.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
-from unjam.scenarios.scenario import SMALLEST_CAV_GAP
+from unjam.scenarios.scenario import MIN_CAV_GAP
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.closed import ClosedTraffic
+from unjam.worlds.sumo.closed_road import ClosedTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 SEEDS = 5
 FLOW = {
@@ -29,7 +29,7 @@ FLOW = {
     ("pi", 32): 6.33,
     ("pi", 35): 6.39,
 }
-AS_FLOW = FigureEight(actuation="flow", bounded=False, safety=SafetyFilter(active=False))
+AS_FLOW = FigureEight(actuation="flow", enforce_human_limits=False, safety=SafetyFilter(active=False))
 DRIVERS = {"human": Human(), "pi": PISaturation(time_constant=0.0)}
 
 
@@ -40,7 +40,7 @@ def test_agrees_with_flow_within_six_percent_without_collision() -> None:
         for driver, radius in FLOW
         for seed in range(SEEDS)
     ]
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         episodes = workers.run(tasks)
     assert all(episode.status == "completed" for episode in episodes)
     speeds = np.array([measure(episode)["mean_speed"] for episode in episodes]).reshape(-1, SEEDS).mean(1)
@@ -50,17 +50,17 @@ def test_agrees_with_flow_within_six_percent_without_collision() -> None:
 def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
     traffic = make_traffic(FigureEight(cavs=14), (3,), simulation)
     assert isinstance(traffic, ClosedTraffic)
-    traffic.start(controlled=True)
+    traffic.start(is_controlled=True)
     ids, compared = traffic.road.vehicle_ids, 0
     for _ in range(400):
         traffic.advance(Command(np.full(14, 0.2)))
-        state = traffic.perceive()
+        state = traffic.local_state()
         for row, name in enumerate(ids):
             found = libsumo.vehicle.getLeader(name, 200.0)
             if found:
                 leader, gap = found
                 assert leader == ids[(row + 1) % 14]
-                assert state.leader_gap[row] == pytest.approx(gap + SMALLEST_CAV_GAP, abs=1e-3)
+                assert state.leader_gap[row] == pytest.approx(gap + MIN_CAV_GAP, abs=1e-3)
                 compared += 1
     assert compared > 1000
 
@@ -77,9 +77,11 @@ def test_each_of_several_cavs_is_driven_and_recorded_by_itself(cavs: int, simula
         np.testing.assert_array_equal(states.speed, episode.speeds[:, place])
         np.testing.assert_array_equal(states.leader_speed, episode.speeds[:, (place + 1) % 14])
         np.testing.assert_array_equal(states.follower_gap, episode.gaps[:, (place - 1) % 14])
-        np.testing.assert_allclose(trajectory.applied, 0.1 + 0.02 * row + 0.001 * np.arange(300), atol=1e-12)
-        wanted = np.maximum(states.speed[:-1] + 0.1 * trajectory.applied, 0.0)
-        np.testing.assert_allclose(states.speed[1:], wanted - 0.1 * trajectory.shield, atol=1e-9)
+        np.testing.assert_allclose(
+            trajectory.applied_acceleration, 0.1 + 0.02 * row + 0.001 * np.arange(300), atol=1e-12
+        )
+        wanted = np.maximum(states.speed[:-1] + 0.1 * trajectory.applied_acceleration, 0.0)
+        np.testing.assert_allclose(states.speed[1:], wanted - 0.1 * trajectory.shield_braking, atol=1e-9)
 
 
 class ByRow(Driver):
@@ -104,19 +106,15 @@ def test_vehicles_from_the_right_yield(simulation: Simulation) -> None:
         assert bool((standing & at_the_line)[50:].any()) is expected
 
 
-def test_on_the_crossing_people_are_left_to_sumo(
-    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_on_the_crossing_people_are_left_to_sumo(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
     traffic = make_traffic(FigureEight(radius=(32, 32)), (0,), simulation)
     assert isinstance(traffic, ClosedTraffic)
     asked: list[tuple[str, float]] = []
-    monkeypatch.setattr(
-        simulation, "command_speeds", lambda ids, speeds: asked.extend(zip(ids, speeds, strict=True))
-    )
-    traffic.start(controlled=False)
+    monkeypatch.setattr(simulation, "command_speeds", lambda ids, speeds: asked.extend(zip(ids, speeds, strict=True)))
+    traffic.start(is_controlled=False)
     for _ in range(200):
         asked.clear()
-        place = np.array(list(traffic._near_positions.values())) % traffic.road.loop_length
+        place = np.array(list(traffic._tracked_positions.values())) % traffic.road.loop_length
         traffic.advance(None)
         for row, (_, speed) in enumerate(asked):
             inside = any(start <= place[row] < end for start, end in traffic.road.crossings)
@@ -133,15 +131,15 @@ def slowly(*values: object) -> Any:
     [
         slowly(Pacer(), 32, 5.8),
         slowly(Pacer(), 35, 6.2),
-        slowly(Pacer(varying=True), 32, 6.8),
-        slowly(Pacer(varying=True), 33, 6.8),
-        slowly(Pacer(varying=True), 34, 6.9),
-        (Pacer(varying=True), 35, 7.2),
+        slowly(Pacer(use_tuned=True), 32, 6.8),
+        slowly(Pacer(use_tuned=True), 33, 6.8),
+        slowly(Pacer(use_tuned=True), 34, 6.9),
+        (Pacer(use_tuned=True), 35, 7.2),
     ],
 )
 def test_pacers_hold_a_queue_that_never_meets_itself(driver: Pacer, radius: int, speed: float) -> None:
     road = FigureEight(radius=(radius, radius), horizon=3000)
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         episodes = workers.run([EpisodeTask(road, driver, (seed,)) for seed in range(3)])
     assert all(episode.status == "completed" for episode in episodes)
     assert min(measure(episode)["mean_speed_steady"] for episode in episodes) > speed

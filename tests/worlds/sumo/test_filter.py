@@ -9,7 +9,7 @@ from unjam.drivers import IDM, Driver, PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
-from unjam.measures.drivable import DRIVABLE
+from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring, Scenario
 from unjam.worlds.episode import run_episode
@@ -29,9 +29,9 @@ def test_a_reckless_driver_touches_nobody_on_rings_of_all_kinds(
     episode = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
     row = measure(episode)
     assert (row["status"], row["collisions"]) == ("completed", 0.0)
-    assert row["drivable"] == DRIVABLE
-    assert row["filter_share"] > 0.1
-    assert row["min_headway"] > 1.0
+    assert row["drivable"] == FEASIBLE
+    assert row["filter_override_share"] > 0.1
+    assert row["min_time_gap"] > 1.0
 
 
 @pytest.mark.parametrize("late", [Actuator(), Actuator(lag=0.3, delay=0.2)], ids=["at once", "late"])
@@ -40,8 +40,8 @@ def test_sensors_that_err_and_miss_readings_touch_nobody(late: Actuator, simulat
     ring = replace(RAW, cavs=2, sensors=sensors, safety=knows, actuator=late)
     episode = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
     row = measure(episode)
-    assert (row["status"], row["collisions"], row["drivable"]) == ("completed", 0.0, DRIVABLE)
-    assert row["min_headway"] > 1.0
+    assert (row["status"], row["collisions"], row["drivable"]) == ("completed", 0.0, FEASIBLE)
+    assert row["min_time_gap"] > 1.0
     again = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
     np.testing.assert_array_equal(episode.speeds, again.speeds)
 
@@ -49,47 +49,43 @@ def test_sensors_that_err_and_miss_readings_touch_nobody(late: Actuator, simulat
 def test_what_is_commanded_is_what_the_filter_lets_pass(simulation: Simulation) -> None:
     episode = run_episode(RAW, Constant(1.0), (0,), simulation=simulation)
     (cav,) = episode.trajectories
-    np.testing.assert_allclose(cav.applied, 1.0 - cav.filtered, atol=1e-12)
-    expected = np.maximum(cav.states.speed[:-1] + 0.1 * cav.applied, 0.0)
+    np.testing.assert_allclose(cav.applied_acceleration, 1.0 - cav.filter_braking, atol=1e-12)
+    expected = np.maximum(cav.states.speed[:-1] + 0.1 * cav.applied_acceleration, 0.0)
     np.testing.assert_allclose(cav.states.speed[1:], expected, atol=1e-9)
 
 
 def test_within_a_held_decision_every_simulation_step_is_filtered(simulation: Simulation) -> None:
-    held = replace(RAW, steps_per_decision=10, horizon=150)
+    held = replace(RAW, steps_per_control_step=10, horizon=150)
     episode = run_episode(held, Constant(1.0), (0,), simulation=simulation)
-    assert episode.audit.following.headway > 1.0
-    assert measure(episode)["drivable"] == DRIVABLE
+    assert episode.audit.following.min_time_gap > 1.0
+    assert measure(episode)["drivable"] == FEASIBLE
 
 
 @pytest.mark.parametrize("road", [Ring(horizon=1500, warmup=3000), FigureEight(horizon=800)])
 @pytest.mark.parametrize("driver", [IDM(), PISaturation(), Constant(1.0)])
-def test_sumo_overrides_no_command_in_following(
-    road: Scenario, driver: Driver, simulation: Simulation
-) -> None:
-    assert run_episode(road, driver, (1,), simulation=simulation).audit.following.overridden == 0.0
+def test_sumo_overrides_no_command_in_following(road: Scenario, driver: Driver, simulation: Simulation) -> None:
+    assert run_episode(road, driver, (1,), simulation=simulation).audit.following.override_share == 0.0
 
 
 def test_on_the_figure_eight_sumo_makes_cars_yield_and_that_is_told_apart(simulation: Simulation) -> None:
     found = run_episode(FigureEight(), PISaturation(catch_up_speed=8.0), (1,), simulation=simulation)
     followed = found.audit.following
-    assert followed.overridden == 0.0
-    assert followed.yielded == pytest.approx((found.trajectories[0].shield > 1e-5).mean())
+    assert followed.override_share == 0.0
+    assert followed.yield_share == pytest.approx((found.trajectories[0].shield_braking > 1e-5).mean())
 
 
 @pytest.mark.long
-def test_people_on_a_published_merge_brake_as_no_car_can_and_elsewhere_they_do_not(
-    simulation: Simulation,
-) -> None:
+def test_people_on_a_published_merge_brake_as_no_car_can_and_elsewhere_they_do_not(simulation: Simulation) -> None:
     published = run_episode(Merge(), IDM(), (0,), simulation=simulation)
-    assert measure(published)["drivable"] not in ("", DRIVABLE)
-    assert published.audit.people.hardest > 9.0
-    bounded = Merge(safety=SafetyFilter(), bounded=True, right_of_way=True)
+    assert measure(published)["drivable"] not in ("", FEASIBLE)
+    assert published.audit.human_braking.max_braking > 9.0
+    bounded = Merge(safety=SafetyFilter(), enforce_human_limits=True, right_of_way=True)
     honest = run_episode(bounded, IDM(), (0,), simulation=simulation)
-    assert honest.audit.people.hardest < published.audit.people.hardest
+    assert honest.audit.human_braking.max_braking < published.audit.human_braking.max_braking
 
 
 def test_a_wider_floor_is_kept_and_no_floor_is_none(simulation: Simulation) -> None:
     for floor in (0.0, 1.5):
-        ring = replace(RAW, warmup=0, safety=SafetyFilter(time_headway=floor))
-        headway = run_episode(ring, Constant(1.0), (0,), simulation=simulation).audit.following.headway
+        ring = replace(RAW, warmup=0, safety=SafetyFilter(time_gap=floor))
+        headway = run_episode(ring, Constant(1.0), (0,), simulation=simulation).audit.following.min_time_gap
         assert headway > 1.5 if floor else headway < 1.0

@@ -18,12 +18,12 @@ from tests.worlds.sumo.own_roads import game, straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM
 from unjam.scenarios import make_scenario
-from unjam.scenarios.own_network import _log_once
-from unjam.sumo_files import PASSED, is_passed, read_sumo_files
+from unjam.scenarios.user_network import _log_once
+from unjam.sumo_files import PASSED_OPTIONS, is_passed_option, read_sumo_files
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 COLUMN = "".join(
     f'<vehicle id="{number}" type="{"van" if number % 3 == 1 else "car"}" route="along" depart="0" '
@@ -107,19 +107,19 @@ def test_nothing_is_written_and_nothing_listens(
     here.mkdir()
     monkeypatch.chdir(here)  # outputs may have names of their own
     before = contents(tmp_path)
-    scenario = make_scenario(str(hostile), {"cav_share": 0.5, "horizon": 100})
+    scenario = make_scenario(str(hostile), {"penetration_rate": 0.5, "horizon": 100})
     episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
     assert listening() == []
     simulation.close()  # outputs are written at the end at last
-    assert (episode.status, episode.steps) == ("completed", 100)
+    assert (episode.status, episode.control_steps) == ("completed", 100)
     assert (tmp_path / "canary").read_text() == CONTENT
     assert contents(tmp_path) == before
 
 
 def test_in_a_worker_it_is_the_same(hostile: Path, tmp_path: Path) -> None:
     before = contents(tmp_path)
-    scenario = make_scenario(str(hostile), {"cav_share": 0.5, "horizon": 100})
-    with Workers(1) as workers:
+    scenario = make_scenario(str(hostile), {"penetration_rate": 0.5, "horizon": 100})
+    with WorkerPool(1) as workers:
         (episode,) = workers.run([EpisodeTask(scenario, IDM(), (0,))])
     assert episode.status == "completed"
     assert contents(tmp_path) == before
@@ -128,28 +128,19 @@ def test_in_a_worker_it_is_the_same(hostile: Path, tmp_path: Path) -> None:
 def test_what_is_left_out_is_told_once_in_one_line(hostile: Path, caplog: pytest.LogCaptureFixture) -> None:
     _log_once.cache_clear()
     for _ in range(2):
-        make_scenario(str(hostile), {"cav_share": 0.5})
+        make_scenario(str(hostile), {"penetration_rate": 0.5})
     (line,) = [record.getMessage() for record in caplog.records]
-    words = (
-        r"straight\.sumocfg: left out, for they only write or listen: option tripinfo-output, .* and \d+ more"
-    )
+    words = r"straight\.sumocfg: left out, for they only write or listen: option tripinfo-output, .* and \d+ more"
     assert re.fullmatch(words, line)
-    dropped = read_sumo_files(hostile).dropped
-    assert {
-        "option remote-port",
-        "file of e1Detector",
-        "edgeData",
-        "parameter device.ssm.file",
-    } <= {*dropped}
+    dropped = read_sumo_files(hostile).dropped_items
+    assert {"option remote-port", "file of e1Detector", "edgeData", "parameter device.ssm.file"} <= {*dropped}
 
 
 def test_it_is_noted_in_results_and_report(hostile: Path, tmp_path: Path) -> None:
-    road, out = {"horizon": 20, "cav_share": 0.5}, tmp_path / "out"
-    found = unjam.drive(str(hostile), ["human"], 1, road=road, workers=1, out=out)
+    road, out = {"horizon": 20, "penetration_rate": 0.5}, tmp_path / "out"
+    found = unjam.drive(str(hostile), ["human"], 1, scenario_options=road, workers=1, out=out)
     (note,) = [each for each in found.notes if "left out" in each]
-    assert note.startswith(
-        "straight.sumocfg: left out, for they only write or listen: option tripinfo-output"
-    )
+    assert note.startswith("straight.sumocfg: left out, for they only write or listen: option tripinfo-output")
     assert note in json.loads((out / "evaluation.json").read_text())["notes"]
     assert "left out, for they only write or listen" in (out / "report.html").read_text()
 
@@ -158,8 +149,8 @@ def test_harmless_files_are_read_themselves_and_nothing_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     found = read_sumo_files(straight(tmp_path, COLUMN))
-    make_scenario(str(found.path), {"cav_share": 0.5})
-    assert (found.dropped, found.replaced, found.to_copy, caplog.records) == ((), (), {}, [])
+    make_scenario(str(found.path), {"penetration_rate": 0.5})
+    assert (found.dropped_items, found.replaced_options, found.copy_sources, caplog.records) == ((), (), {}, [])
 
 
 def test_left_out_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulation) -> None:
@@ -169,13 +160,11 @@ def test_left_out_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulati
         folder.mkdir()
         path = straight(folder, COLUMN)
         if folder is noted:
-            path.write_text(
-                path.read_text().replace("<end ", '<additional-files value="outputs.add.xml"/><end ')
-            )
+            path.write_text(path.read_text().replace("<end ", '<additional-files value="outputs.add.xml"/><end '))
             (folder / "more.add.xml").write_text(NESTED)
             without = re.sub("<calibrator.*</calibrator>", "", WRITING, flags=re.DOTALL)
             (folder / "outputs.add.xml").write_text(without.replace("CANARY", str(tmp_path / "canary")))
-        scenario = make_scenario(str(path), {"cav_share": 0.5, "horizon": 200})
+        scenario = make_scenario(str(path), {"penetration_rate": 0.5, "horizon": 200})
         episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
         episodes.append(replace(episode, warnings=()))  # detectors warn of vehicles that miss them
     assert fingerprint(episodes[0]) == fingerprint(episodes[1])
@@ -199,7 +188,7 @@ def test_folders_with_blanks_and_commas_drive_alike(tmp_path: Path, simulation: 
     episodes = []
     for name in ("plain", "with a blank, a comma; and $HOME"):
         (tmp_path / name).mkdir()
-        scenario = make_scenario(str(straight(tmp_path / name, COLUMN)), {"cav_share": 0.5, "horizon": 50})
+        scenario = make_scenario(str(straight(tmp_path / name, COLUMN)), {"penetration_rate": 0.5, "horizon": 50})
         episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
         episodes.append(replace(episode, warnings=()))  # detectors warn of vehicles that miss them
     assert fingerprint(episodes[0]) == fingerprint(episodes[1])
@@ -207,13 +196,13 @@ def test_folders_with_blanks_and_commas_drive_alike(tmp_path: Path, simulation: 
 
 def test_compressed_and_strangely_encoded_files_are_copied(tmp_path: Path, simulation: Simulation) -> None:
     path = straight(tmp_path, COLUMN)
-    scenario = make_scenario(str(path), {"cav_share": 0.5, "horizon": 50})
+    scenario = make_scenario(str(path), {"penetration_rate": 0.5, "horizon": 50})
     plain = run_episode(scenario, IDM(), (0,), simulation=simulation)
     demand, network = tmp_path / "demand.rou.xml", tmp_path / "road.net.xml"
     demand.write_bytes(f"<?xml version='1.0' encoding='utf-16'?>{demand.read_text()}".encode("utf-16"))
     (tmp_path / "road.net.xml.gz").write_bytes(gzip.compress(network.read_bytes()))
     path.write_text(path.read_text().replace("road.net.xml", "road.net.xml.gz"))
-    assert read_sumo_files(path).to_copy.keys() == {demand, tmp_path / "road.net.xml.gz"}
+    assert read_sumo_files(path).copy_sources.keys() == {demand, tmp_path / "road.net.xml.gz"}
     assert fingerprint(run_episode(scenario, IDM(), (0,), simulation=simulation)) == fingerprint(plain)
 
 
@@ -229,8 +218,8 @@ def test_what_hides_is_found(name: str, tmp_path: Path) -> None:
     )
     path.write_text(path.read_text().replace("<end ", '<additional-files value="hidden.add.xml"/><end '))
     found = read_sumo_files(path)
-    assert found.to_copy.keys() == {tmp_path / "hidden.add.xml"}
-    assert found.dropped in (("edgeData",), ("parameter file",), ("parameter SWARMLOG",))
+    assert found.copy_sources.keys() == {tmp_path / "hidden.add.xml"}
+    assert found.dropped_items in (("edgeData",), ("parameter file",), ("parameter SWARMLOG",))
 
 
 def test_an_option_whose_value_looks_like_another_is_no_other(tmp_path: Path, simulation: Simulation) -> None:
@@ -238,7 +227,7 @@ def test_an_option_whose_value_looks_like_another_is_no_other(tmp_path: Path, si
     sly = "<scale-suffix value='--log=canary'/><end "
     path.write_text(path.read_text().replace("<end ", sly))
     before = contents(tmp_path)
-    scenario = make_scenario(str(path), {"cav_share": 0.5, "horizon": 20})
+    scenario = make_scenario(str(path), {"penetration_rate": 0.5, "horizon": 20})
     assert run_episode(scenario, IDM(), (0,), simulation=simulation).status == "completed"
     assert contents(tmp_path) == before
     assert not Path("canary").exists()
@@ -251,17 +240,17 @@ def test_no_option_that_is_passed_names_a_file_or_is_an_output(tmp_path: Path) -
     for group in ElementTree.parse(template).getroot():
         for option in group:
             known.add(option.tag)
-            if is_passed(option.tag):
+            if is_passed_option(option.tag):
                 assert option.get("type") != "FILE", option.tag
                 assert group.tag not in ("output", "report", "traci_server", "gui_only"), option.tag
-    assert known >= PASSED
+    assert known >= PASSED_OPTIONS
 
 
 def test_games_of_sumos_own_drive_though_they_want_outputs(tmp_path: Path, simulation: Simulation) -> None:
     path = game(tmp_path, "cross")
     before = contents(tmp_path)
-    scenario = make_scenario(str(path), {"cav_share": 0.3, "horizon": 50})
-    assert read_sumo_files(path).dropped == ("edgeData", "osgFile of vType", "timedEvent")
+    scenario = make_scenario(str(path), {"penetration_rate": 0.3, "horizon": 50})
+    assert read_sumo_files(path).dropped_items == ("edgeData", "osgFile of vType", "timedEvent")
     assert run_episode(scenario, IDM(), (0,), simulation=simulation).status == "completed"
     assert contents(tmp_path) == before
     assert not {"netstate.xml", "tlsstate.xml"} & set(os.listdir())

@@ -12,16 +12,16 @@ from unjam.drivers import Constant, Human
 from unjam.drivers.command import Command
 from unjam.drivers.driver import Driver
 from unjam.scenarios import make_scenario
-from unjam.scenarios.own_network import WITH_OWN_ACC
+from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.user_network import UserNetworkTraffic
 
 LAW = 'carFollowModel="IDM" tau="1.1" minGap="2"'
 """the law of a CAV's own ACC, so that nothing at all may change"""
-ACCS = {**WITH_OWN_ACC, "cav_share": 1.0, "end": 60.0}
+ACCS = {**ACC_SETTINGS, "penetration_rate": 1.0, "end": 60.0}
 
 
 def drive(simulation: Simulation, file: str, driver: Driver, **changes: Any) -> Episode:
@@ -47,27 +47,10 @@ PASSENGERS = (
     [
         ('<vType id="own" {law}/>' + SPARSE, "", ""),
         ('<vType id="own" {law} speedFactor="normc(0.9,0.2,0.5,1.5)"/>' + SPARSE, "", ""),
-        (
-            '<vType id="own" {law}/><vehicle id="v" type="own" route="along" depart="0" speedFactor="0.7"/>',
-            "",
-            "",
-        ),
-        (
-            '<vType id="own" vClass="truck" accel="0.5" decel="4" length="12" maxSpeed="18" {law}/>' + SPARSE,
-            "",
-            "",
-        ),
-        (
-            '<vType id="own" accel="2" emergencyDecel="5" jmTimegapMinor="3" impatience="0.5" {law}/>'
-            + SPARSE,
-            "",
-            "",
-        ),
-        (
-            '<vType id="own" actionStepLength="0.7" {law}/>' + SPARSE,
-            "",
-            '<step-method.ballistic value="true"/>',
-        ),
+        ('<vType id="own" {law}/><vehicle id="v" type="own" route="along" depart="0" speedFactor="0.7"/>', "", ""),
+        ('<vType id="own" vClass="truck" accel="0.5" decel="4" length="12" maxSpeed="18" {law}/>' + SPARSE, "", ""),
+        ('<vType id="own" accel="2" emergencyDecel="5" jmTimegapMinor="3" impatience="0.5" {law}/>' + SPARSE, "", ""),
+        ('<vType id="own" actionStepLength="0.7" {law}/>' + SPARSE, "", '<step-method.ballistic value="true"/>'),
         (
             '<vType id="own" laneChangeModel="SL2015" latAlignment="arbitrary" minGapLat="0.1" width="0.8" '
             'maxSpeedLat="2" lcPushy="1" {law}/><vType id="slow" vClass="bicycle" maxSpeed="4" width="0.6" '
@@ -78,11 +61,7 @@ PASSENGERS = (
             '<lateral-resolution value="0.4"/>',
         ),
         (PASSENGERS, BUS_STOPS, ""),
-        (
-            '<vType id="own" {law}><carFollowing-IDM tau="1.1" minGap="2" accel="0.8"/></vType>' + SPARSE,
-            "",
-            "",
-        ),
+        ('<vType id="own" {law}><carFollowing-IDM tau="1.1" minGap="2" accel="0.8"/></vType>' + SPARSE, "", ""),
         (
             '<vTypeDistribution id="mix"><vType id="own" accel="0.6" probability="0.5" {law}/>'
             '<vType id="other" maxSpeed="12" probability="0.5" {law}/></vTypeDistribution>'
@@ -91,18 +70,7 @@ PASSENGERS = (
             "",
         ),
     ],
-    ids=[
-        "drawn",
-        "distribution",
-        "vehicle",
-        "truck",
-        "limits",
-        "action step",
-        "lateral",
-        "bus",
-        "nested",
-        "mix",
-    ],
+    ids=["drawn", "distribution", "vehicle", "truck", "limits", "action step", "lateral", "bus", "nested", "mix"],
 )
 def test_acc_vehicles_with_the_law_of_their_vehicles_change_nothing(
     demand: str, more: str, options: str, tmp_path: Path, simulation: Simulation
@@ -117,34 +85,26 @@ def test_acc_vehicles_with_the_law_of_their_vehicles_change_nothing(
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {},
-        {"actuation": "shielded"},
-        {"actuation": "raw"},
-        {"actuation": "flow"},
-        {"population": "unjam:ngsim"},
-    ],
+    [{}, {"actuation": "shielded"}, {"actuation": "raw"}, {"actuation": "flow"}, {"population": "unjam:ngsim"}],
     ids=["cruise", "shielded", "raw", "flow", "calibrated"],
 )
 def test_each_vehicle_keeps_its_speed_factor_and_others_draw_the_same(
     changes: dict[str, Any], tmp_path: Path, simulation: Simulation
 ) -> None:
     own = '<vehicle id="it" type="own" route="along" depart="1" speedFactor="1.3"/>'
-    file = network(
-        tmp_path, '<vType id="own" speedDev="0.3"/>' + SPARSE.replace('period="4"', 'period="3"') + own
-    )
+    file = network(tmp_path, '<vType id="own" speedDev="0.3"/>' + SPARSE.replace('period="4"', 'period="3"') + own)
 
     def factors(share: float) -> dict[str, float]:
-        scenario = make_scenario(file, {**ACCS, **changes, "cav_share": share, "cavs": 9})
+        scenario = make_scenario(file, {**ACCS, **changes, "penetration_rate": share, "cavs": 9})
         traffic = make_traffic(scenario, (3,), simulation)
-        traffic.start(controlled=share == 1.0)
+        traffic.start(is_controlled=share == 1.0)
         found: dict[str, float] = {}
-        while not traffic.ended:
-            traffic.advance(Command(np.zeros(len(traffic.cavs))))
-            names = [name for name in simulation.departed() if name not in found]
-            found |= zip(names, (factor for factor, _ in simulation.wishes(names)), strict=True)
-            last = [name for name in traffic.cavs if name in found]
-            found |= zip(last, (factor for factor, _ in simulation.wishes(last)), strict=True)
+        while not traffic.has_ended:
+            traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
+            names = [name for name in simulation.departed_vehicles() if name not in found]
+            found |= zip(names, (factor for factor, _ in simulation.desired_speeds(names)), strict=True)
+            last = [name for name in traffic.cav_ids if name in found]
+            found |= zip(last, (factor for factor, _ in simulation.desired_speeds(last)), strict=True)
         return found
 
     human, cavs = factors(1e-12), factors(1.0)  # which may end early: a CAV without brakes
@@ -168,8 +128,8 @@ def test_commands_cannot_exceed_the_limits_of_the_vehicle(
         (trip,) = drive(simulation, file, Constant(wanted), **asked).trajectories
         steps = np.diff(trip.states.speed)[:10]
         np.testing.assert_allclose(steps, 0.1 * possible, atol=1e-9)
-        assert not (trip.shield > 1e-9).any()
-        np.testing.assert_allclose(trip.applied[:10], possible)
+        assert not (trip.shield_braking > 1e-9).any()
+        np.testing.assert_allclose(trip.applied_acceleration[:10], possible)
 
 
 @pytest.mark.parametrize(("vehicle", "most"), [(TRUCK, 0.5), (CAR, 2.6)])
@@ -178,9 +138,7 @@ def test_a_set_speed_makes_a_vehicle_accelerate_as_asked_within_its_limits(
 ) -> None:
     file = network(tmp_path, vehicle + ONE)
     for wanted in (0.2, 0.4):
-        (trip,) = drive(
-            simulation, file, Constant(wanted), cav_classes=["passenger", "truck"], horizon=20
-        ).trajectories
+        (trip,) = drive(simulation, file, Constant(wanted), cav_classes=["passenger", "truck"], horizon=20).trajectories
         np.testing.assert_allclose(np.diff(trip.states.speed)[1:], 0.1 * wanted, rtol=0.06)
     free = drive(simulation, file, make_driver("cruise", 0.1), cav_classes=["passenger", "truck"], horizon=20)
     assert np.diff(free.trajectories[0].states.speed).max() == pytest.approx(0.1 * most, rel=0.03)
@@ -201,12 +159,12 @@ def test_brakes_are_those_of_the_filter_or_of_the_vehicle_if_these_are_weaker(
 ) -> None:
     other = '<vType id="car"/><vehicle id="w" type="car" route="along" depart="2"/>'
     file = network(tmp_path, TRUCK + ONE + other)
-    changes = {"cav_share": 1.0, "cav_classes": ["truck", "passenger"], "horizon": 50}
+    changes = {"penetration_rate": 1.0, "cav_classes": ["truck", "passenger"], "horizon": 50}
     traffic = make_traffic(make_scenario(file, changes), (0,), simulation)
-    assert isinstance(traffic, OwnTraffic)
-    traffic.start(controlled=True)
+    assert isinstance(traffic, UserNetworkTraffic)
+    traffic.start(is_controlled=True)
     for _ in range(40):
-        traffic.advance(Command(np.zeros(len(traffic.cavs))))
+        traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
     limits = {kind: simulation.type_limits(f"cav_of_{kind}") for kind in ("own", "car")}
-    assert (limits["own"].acceleration, limits["own"].braking) == (0.5, 3.0)
-    assert (limits["car"].acceleration, limits["car"].braking) == (2.6, 6.0)
+    assert (limits["own"].acceleration, limits["own"].emergency_deceleration) == (0.5, 3.0)
+    assert (limits["car"].acceleration, limits["car"].emergency_deceleration) == (2.6, 6.0)

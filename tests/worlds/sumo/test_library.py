@@ -18,12 +18,12 @@ import traci
 import unjam
 from tests.worlds.sumo.own_roads import straight
 from unjam.drivers import LocalState
-from unjam.environments.single import RoadEnv
-from unjam.errors import EpisodeError, LostError, UnjamError
+from unjam.environments.gymnasium_env import RoadEnv
+from unjam.errors import EpisodeError, LostWorkerError, UnjamError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.files import files_of
-from unjam.worlds.sumo.library import InUseError
+from unjam.worlds.sumo.backends import InUseError
+from unjam.worlds.sumo.inputs import sumo_inputs
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -76,7 +76,7 @@ def parallel_rewards() -> Any:
 
 
 def driven_speeds() -> Any:
-    result = unjam.drive("ring", coast, 1, road={"warmup": 0, "horizon": 20})  # pyright: ignore
+    result = unjam.drive("ring", coast, 1, scenario_options={"warmup": 0, "horizon": 20})  # pyright: ignore
     return [row["mean_speed"] for rows in result.rows.values() for row in rows]
 
 
@@ -97,7 +97,7 @@ def test_a_users_traci_connection_stays_the_active_one(command: list[str]) -> No
         with closing(RoadEnv(warmup=0)) as first, closing(RoadEnv(warmup=0)) as second:
             first.reset(seed=1)
             second.reset(seed=1)
-        road = files_of(RING, RING.of_seed((0,))[0])
+        road = sumo_inputs(RING, RING.draw_from_seed((0,))[0])
         with Simulation("traci") as simulation:
             with pytest.raises(EpisodeError):
                 simulation.load(road._replace(traffic="<routes"), 0.1, 0)
@@ -134,7 +134,7 @@ def test_what_other_code_does_to_an_episodes_simulation_is_an_error_in_one_line(
             CHANGES[change](command)
         return coast(state)
 
-    with pytest.raises(LostError, match=r"SUMO was lost: other code in this process has .*run the episode"):
+    with pytest.raises(LostWorkerError, match=r"SUMO was lost: other code in this process has .*run the episode"):
         run_episode(road, interfering, 0)
     assert len(calls) == 5
     assert libsumo.isLoaded() == (change in ("start", "load"))  # what is the user's goes on
@@ -154,7 +154,7 @@ def test_an_environment_that_lost_its_simulation_says_so_and_starts_anew_with_a_
         CHANGES[change](command)
         for act in (lambda: environment.step(np.zeros(1)), environment.render):
             environment.render_mode = "rgb_array"
-            with pytest.raises(LostError, match="SUMO was lost"):
+            with pytest.raises(LostWorkerError, match="SUMO was lost"):
                 act()
         np.testing.assert_array_equal(environment.reset(seed=0)[0], expected)
         environment.step(np.zeros(1))
@@ -184,7 +184,7 @@ AS_USERS_DO = """
 import json, traci, unjam, warnings
 warnings.simplefilter("ignore")
 from tests.worlds.sumo.test_library import environment_rewards, episode_speeds
-from unjam.environments.single import RoadEnv
+from unjam.environments.gymnasium_env import RoadEnv
 environment = RoadEnv(warmup=0)
 environment.reset(seed=0)
 apart = environment_rewards()
@@ -212,5 +212,5 @@ def test_libsumo_as_traci_changes_no_number(tmp_path: Path) -> None:
 
 
 def run_rows(road: str, driver: str) -> float:
-    (row,) = unjam.drive(road, driver, 1, road={"warmup": 0, "horizon": 20}).rows[driver]
+    (row,) = unjam.drive(road, driver, 1, scenario_options={"warmup": 0, "horizon": 20}).rows[driver]
     return row["mean_speed"]

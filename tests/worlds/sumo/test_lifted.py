@@ -16,9 +16,9 @@ from unjam.scenarios import make_scenario
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.networks import sumo_program
-from unjam.worlds.sumo.open import OpenTraffic
+from unjam.worlds.sumo.open_road import OpenTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.world import Driven
+from unjam.worlds.world import DriverLog
 
 
 @pytest.fixture(scope="module")
@@ -57,15 +57,15 @@ def blocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def driven(simulation: Simulation, file: Path, share: float) -> tuple[Episode, int]:
     """Drive CAVs with 0.3 m/s2 until all have left; the record, and how many SUMO had there in all steps."""
-    scenario = make_scenario(str(file), {"cav_share": share, "horizon": 400})
+    scenario = make_scenario(str(file), {"penetration_rate": share, "horizon": 400})
     traffic = make_traffic(scenario, (0,), simulation)
     assert isinstance(traffic, OpenTraffic)
-    traffic.start(controlled=True)
+    traffic.start(is_controlled=True)
     count = 0
-    while not traffic.over:
-        traffic.advance(Command(np.full(len(traffic.cavs), 0.3)))
+    while not traffic.is_finished:
+        traffic.advance(Command(np.full(len(traffic.cav_ids), 0.3)))
         count += libsumo.vehicle.getIDCount()
-    return traffic.record(Driven()), count
+    return traffic.record(DriverLog()), count
 
 
 @pytest.mark.parametrize("share", [1e-9, 1.0])
@@ -75,9 +75,9 @@ def test_they_count_on_the_road_and_off_it_until_they_arrive(
     episode, count = driven(simulation, blocked, share)
     assert episode.teleports >= 4
     assert (~np.isnan(episode.speeds[1:])).sum() == count
-    assert episode.arrived == len(episode.vehicle_ids) == 15
-    assert episode.waiting.max() >= 2, "whom SUMO finds no room for waits"
-    assert episode.waiting[-1] == 0
+    assert episode.arrivals == len(episode.vehicle_ids) == 15
+    assert episode.backlog.max() >= 2, "whom SUMO finds no room for waits"
+    assert episode.backlog[-1] == 0
     assert measure(episode)["teleports"] == episode.teleports
 
 
@@ -86,18 +86,22 @@ def test_a_cav_that_is_put_back_is_driven_again(blocked: Path, simulation: Simul
     stays = Counter(each.vehicle for each in episode.trajectories)
     again = [name for name, count in stays.items() if count > 1]
     assert again
-    starts = [each.start for each in episode.trajectories]
+    starts = [each.start_step for each in episode.trajectories]
     assert starts == sorted(starts), "in order of entry, as drivers' memories are"
     told = list[bool]()
     for name in again:
         first, *_, last = (each for each in episode.trajectories if each.vehicle == name)
-        assert first.start + len(first.applied) < last.start
+        assert first.start_step + len(first.applied_acceleration) < last.start_step
         told += np.isclose(np.diff(last.states.speed), 0.15).tolist()
     assert sum(told) > 100, "with 0.3 m/s2 for half a second, where nobody is in its way"
 
 
 def test_who_drives_is_told_of_them(blocked: Path, tmp_path: Path) -> None:
     (note,) = unjam.drive(
-        str(blocked), ["human"], road={"horizon": 400, "cav_share": 0.5}, workers=1, out=tmp_path / "out"
+        str(blocked),
+        ["human"],
+        scenario_options={"horizon": 400, "penetration_rate": 0.5},
+        workers=1,
+        out=tmp_path / "out",
     ).notes
     assert re.fullmatch(r"human: SUMO teleported or removed \d+ vehicles that had stood .*", note)

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from tests.reports.open_roads import own_episode, ramp_episode
 from unjam.measures.metrics import measure
 from unjam.reports.html import replay_data
-from unjam.reports.lanes import lane_maps
-from unjam.reports.results import packed, shown_of, unpacked
+from unjam.reports.lanes import lane_map_figure
+from unjam.reports.results import pack_episode, to_plot_episode, unpack_episode
 from unjam.worlds import earned as earning
-from unjam.worlds.earned import earned
+from unjam.worlds.episode_reward import episode_reward_terms
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import REWARDS, make_reward
 from unjam.worlds.sumo import log as logging
-from unjam.worlds.sumo.log import TrafficLog
+from unjam.worlds.sumo.traffic_log import TrafficLog
 
 Stays = list[tuple[int, int]]
 """of each vehicle its first moment, and how many more it stays"""
@@ -30,9 +30,9 @@ def small() -> Iterator[None]:
     """Limits that a minute of traffic is beyond."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(logging, "MOST_CELLS", 1000)
-        patch.setattr(logging, "MOST_PICTURED", 1500)
+        patch.setattr(logging, "MAX_SNAPSHOT_VEHICLES", 1500)
         patch.setattr(logging, "FRAMES", 20)
-        patch.setattr(earning, "CELLS_AT_ONCE", 500)
+        patch.setattr(earning, "MAX_REWARD_CELLS", 500)
         yield
 
 
@@ -47,54 +47,52 @@ def thinned(whole: Episode, small: None) -> Episode:
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 12)), max_size=25), st.integers(1, 60))
-def test_whoever_comes_and_goes_every_speed_is_kept_in_a_column_of_its_own_kind(
-    stays: Stays, most: int
-) -> None:
+def test_whoever_comes_and_goes_every_speed_is_kept_in_a_column_of_its_own_kind(stays: Stays, most: int) -> None:
     moments = max((first + more for first, more in stays), default=0) + 1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(logging, "MOST_CELLS", 0)
-        patch.setattr(logging, "MOST_PICTURED", most)
+        patch.setattr(logging, "MAX_SNAPSHOT_VEHICLES", most)
         log = TrafficLog()
         for time in range(moments):
             there = [number for number, (first, more) in enumerate(stays) if first <= time <= first + more]
-            log.note([f"v{number}" for number in there], [100.0 * number + time for number in there])
-            if log.is_pictured:
-                log.picture({"positions": [1e4 * number + time for number in there]})
-        numbers = [int(name[1:]) for name in log.vehicles]
+            log.add([f"v{number}" for number in there], [100.0 * number + time for number in there])
+            if log.needs_snapshot:
+                log.add_snapshot({"positions": [1e4 * number + time for number in there]})
+        numbers = [int(name[1:]) for name in log.vehicle_ids]
         groups = [number % 2 for number in numbers]
         columns = log.columns(groups)
-    speeds, positions = log.speeds(columns), log.pictures("positions", columns)
-    assert len(positions) == len(range(0, moments, log.every))
+    speeds, positions = log.speeds(columns), log.snapshots("positions", columns)
+    assert len(positions) == len(range(0, moments, log.snapshot_stride))
     assert np.isfinite(speeds).sum() == sum(more + 1 for _, more in stays)
     for number, column, group in zip(numbers, columns, groups, strict=True):
         first, more = stays[number]
         during = np.arange(first, first + more + 1)
         assert speeds[during, column].tolist() == (100.0 * number + during).tolist()
-        pictured = during[during % log.every == 0]
-        assert positions[pictured // log.every, column].tolist() == (1e4 * number + pictured).tolist()
+        pictured = during[during % log.snapshot_stride == 0]
+        assert positions[pictured // log.snapshot_stride, column].tolist() == (1e4 * number + pictured).tolist()
         assert {groups[other] for other in np.flatnonzero(columns == column)} == {group}
 
 
 def test_a_picture_is_kept_of_every_moment_until_they_are_many() -> None:
     log = TrafficLog()
     for time in range(100):
-        log.note(["one", "other"], [1.0, 2.0])
-        assert log.is_pictured
-        log.picture({"positions": [time, time]})
-    assert log.every == 1
+        log.add(["one", "other"], [1.0, 2.0])
+        assert log.needs_snapshot
+        log.add_snapshot({"positions": [time, time]})
+    assert log.snapshot_stride == 1
     assert log.columns(["", ""]).tolist() == [0, 1]
 
 
 def test_all_that_is_measured_is_the_same_where_columns_are_shared(whole: Episode, thinned: Episode) -> None:
-    assert thinned.every > 1
+    assert thinned.snapshot_stride > 1
     assert 0 < thinned.speeds.shape[1] < whole.speeds.shape[1] == len(whole.vehicle_ids)
     assert (thinned.vehicle_ids, thinned.cav_ids) == (whole.vehicle_ids, whole.cav_ids)
-    column = dict(zip(thinned.vehicle_ids, thinned.columns, strict=True))
+    column = dict(zip(thinned.vehicle_ids, thinned.vehicle_columns, strict=True))
     for number, name in enumerate(whole.vehicle_ids):
         there = ~np.isnan(whole.speeds[:, number])
         np.testing.assert_array_equal(thinned.speeds[there, column[name]], whole.speeds[there, number])
     cavs = {column[name] for name in whole.cav_ids}
-    assert set(thinned.cavs) == cavs
+    assert set(thinned.cav_columns) == cavs
     assert not cavs & {column[name] for name in set(whole.vehicle_ids) - set(whole.cav_ids)}
     expected, found = measure(whole), measure(thinned)
     for name, value in expected.items():
@@ -103,30 +101,30 @@ def test_all_that_is_measured_is_the_same_where_columns_are_shared(whole: Episod
 
 
 def test_pictures_of_what_is_thinned_show_the_moments_that_are_kept(whole: Episode, thinned: Episode) -> None:
-    every = thinned.every
-    one, other = shown_of("", whole), shown_of("", thinned)
-    assert other.step == pytest.approx(one.step * every)
-    assert len(other.speeds) == len(other.positions) == len(other.waiting) == len(one.speeds[::every])
-    column = dict(zip(thinned.vehicle_ids, thinned.columns, strict=True))
+    every = thinned.snapshot_stride
+    one, other = to_plot_episode("", whole), to_plot_episode("", thinned)
+    assert other.control_step == pytest.approx(one.control_step * every)
+    assert len(other.speeds) == len(other.positions) == len(other.backlog) == len(one.speeds[::every])
+    column = dict(zip(thinned.vehicle_ids, thinned.vehicle_columns, strict=True))
     for number, name in enumerate(whole.vehicle_ids):
         there = ~np.isnan(whole.speeds[::every, number])
         for quantity in ("positions", "lanes", "places"):
             kept, all_of_it = getattr(other, quantity), getattr(one, quantity)[::every]
             np.testing.assert_array_equal(kept[there, column[name]], all_of_it[there, number])
-    read = unpacked(packed(other))
+    read = unpack_episode(pack_episode(other))
     np.testing.assert_array_equal(read["positions"], other.positions.astype(np.float32))
     (driver,) = replay_data([other])["drivers"]
     assert driver["vehicles"] <= other.speeds.shape[1]
-    assert lane_maps([replace(other, driver="it")]).axes
+    assert lane_map_figure([replace(other, driver="it")]).axes
 
 
 def test_a_reward_that_sees_an_episode_part_by_part_pays_the_same(whole: Episode, small: None) -> None:
-    assert whole.speeds.size > earning.CELLS_AT_ONCE
-    seen = (whole.speeds, whole.trajectories, False, whole.waiting)
-    parts = {name: earned(make_reward(f"{name}:headway=1,comfort=1"), *seen) for name in REWARDS}
+    assert whole.speeds.size > earning.MAX_REWARD_CELLS
+    seen = (whole.speeds, whole.trajectories, False, whole.backlog)
+    parts = {name: episode_reward_terms(make_reward(f"{name}:headway=1,comfort=1"), *seen) for name in REWARDS}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(earning, "CELLS_AT_ONCE", 10**9)
-        at_once = {name: earned(make_reward(f"{name}:headway=1,comfort=1"), *seen) for name in REWARDS}
+        patch.setattr(earning, "MAX_REWARD_CELLS", 10**9)
+        at_once = {name: episode_reward_terms(make_reward(f"{name}:headway=1,comfort=1"), *seen) for name in REWARDS}
     for name, terms in at_once.items():
         assert terms.keys() == parts[name].keys()
         for term, values in terms.items():
@@ -137,17 +135,17 @@ def test_a_collision_ends_the_last_part_alone(whole: Episode, small: None) -> No
     def crashes(outcome: object) -> dict[str, np.ndarray]:
         return {"crashed": 1.0 * outcome.crashed}  # pyright: ignore[reportAttributeAccessIssue]
 
-    found = earned(crashes, whole.speeds, whole.trajectories, True, whole.waiting)["crashed"]
-    assert np.flatnonzero(found).tolist() == [whole.steps - 1]
+    found = episode_reward_terms(crashes, whole.speeds, whole.trajectories, True, whole.backlog)["crashed"]
+    assert np.flatnonzero(found).tolist() == [whole.control_steps - 1]
 
 
 @pytest.mark.long
 def test_a_network_of_ones_own_is_thinned_as_well(tmp_path: Path, small: None) -> None:
     episode = own_episode(tmp_path)
-    shown = shown_of("", episode)
-    assert episode.every > 1
+    shown = to_plot_episode("", episode)
+    assert episode.snapshot_stride > 1
     there = ~np.isnan(shown.speeds)
-    np.testing.assert_array_equal(np.isnan(shown.places[..., 0]), ~there)
+    np.testing.assert_array_equal(np.isnan(shown.poses[..., 0]), ~there)
     assert 0 < np.isfinite(shown.positions).sum() <= there.sum()
     on_route = np.isfinite(shown.positions)
     assert (np.diff(shown.positions, axis=0)[on_route[1:] & on_route[:-1]] > -1e-6).all()

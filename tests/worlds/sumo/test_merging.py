@@ -17,18 +17,16 @@ from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.files import files_of
-from unjam.worlds.sumo.merging import MergingTraffic
+from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.merge_road import MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask, Workers
-from unjam.worlds.world import Driven
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam.worlds.world import DriverLog
 
 STEP = 0.2
 
 
-def merging(
-    scenario: Merge, simulation: Simulation, seed: int = 1, controlled: bool = True
-) -> MergingTraffic:
+def merging(scenario: Merge, simulation: Simulation, seed: int = 1, controlled: bool = True) -> MergingTraffic:
     traffic = make_traffic(scenario, (seed,), simulation)
     assert isinstance(traffic, MergingTraffic)
     traffic.start(controlled)
@@ -100,7 +98,7 @@ def leader_of(places: dict[str, float], name: str, traffic: MergingTraffic) -> s
 def test_people_are_asked_for_the_speeds_of_the_idm_and_on_the_junction_left_to_sumo(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    traffic = merging(Merge(noise=0.0, cav_share=0.0), simulation)
+    traffic = merging(Merge(noise=0.0, penetration_rate=0.0), simulation)
     found = Commands(traffic, simulation, monkeypatch, 400)
     _, asked, wanted = np.array(found.off).T
     assert len(asked) > 5000
@@ -115,7 +113,7 @@ def test_people_are_asked_for_the_speeds_of_the_idm_and_on_the_junction_left_to_
 def test_their_noise_is_normal_and_as_large_as_was_asked_for(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    traffic = merging(Merge(cav_share=0.0, standing=0), simulation)
+    traffic = merging(Merge(penetration_rate=0.0, standing_vehicles=0), simulation)
     found = Commands(traffic, simulation, monkeypatch, 400)
     speed, asked, wanted = np.array(found.off).T
     noise = ((asked - wanted) / STEP)[speed > 3.0]
@@ -127,37 +125,35 @@ def test_their_noise_is_normal_and_as_large_as_was_asked_for(
 
 def test_people_obey_the_right_of_way_only_where_they_shall(simulation: Simulation) -> None:
     for right_of_way, mode in ((False, 1), (True, 25)):
-        traffic = merging(Merge(right_of_way=right_of_way, cav_share=0.3), simulation)
+        traffic = merging(Merge(right_of_way=right_of_way, penetration_rate=0.3), simulation)
         for _ in range(20):
-            traffic.advance(Command(np.zeros(len(traffic.cavs))))
+            traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
         modes = {
-            libsumo.vehicle.getSpeedMode(name)
-            for name in libsumo.vehicle.getIDList()
-            if name not in traffic.cavs
+            libsumo.vehicle.getSpeedMode(name) for name in libsumo.vehicle.getIDList() if name not in traffic.cav_ids
         }
         assert modes == {mode}
-        assert {libsumo.vehicle.getSpeedMode(name) for name in traffic.cavs} == {31 if right_of_way else 1}
-        assert {libsumo.vehicle.getTypeID(name) for name in traffic.cavs} == {"cav"}
+        assert {libsumo.vehicle.getSpeedMode(name) for name in traffic.cav_ids} == {31 if right_of_way else 1}
+        assert {libsumo.vehicle.getTypeID(name) for name in traffic.cav_ids} == {"cav"}
 
 
 def test_waiting_and_arrived_are_those_of_the_timetable_and_of_sumo(simulation: Simulation) -> None:
     traffic = merging(Merge(), simulation)
-    written = ElementTree.fromstring(files_of(traffic.scenario, traffic.road).traffic)
+    written = ElementTree.fromstring(sumo_inputs(traffic.scenario, traffic.road).traffic_xml)
     departs = [float(vehicle.get("depart", "nan")) for vehicle in written.iter("vehicle")]
     seen: set[str] = set(libsumo.vehicle.getIDList())
     waiting, gone = [0], []
     for _ in range(120):
-        traffic.advance(Command(np.zeros(len(traffic.cavs))))
+        traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
         there = set(libsumo.vehicle.getIDList())
         seen |= there
         due = sum(time < libsumo.simulation.getTime() for time in departs)
         waiting.append(due - len(seen))
         gone.append(len(seen) - len(there))
-    found = traffic.record(Driven())
+    found = traffic.record(DriverLog())
     assert max(waiting) > 3
-    np.testing.assert_allclose(found.waiting, waiting, atol=1)  # one that is due in this very step
-    assert np.mean(found.waiting == waiting) > 0.8
-    assert found.arrived == gone[-1] > 10
+    np.testing.assert_allclose(found.backlog, waiting, atol=1)  # one that is due in this very step
+    assert np.mean(found.backlog == waiting) > 0.8
+    assert found.arrivals == gone[-1] > 10
 
 
 def test_throughput_and_backlog_are_those_counts(simulation: Simulation) -> None:
@@ -165,9 +161,9 @@ def test_throughput_and_backlog_are_those_counts(simulation: Simulation) -> None
     row = measure(episode)
     last = episode.speeds[-1]
     left = np.isnan(last).sum()
-    assert episode.arrived == left
-    assert row["throughput_veh_per_h"] == pytest.approx(left * 30.0)
-    assert row["backlog_veh"] == episode.waiting[-1]
+    assert episode.arrivals == left
+    assert row["outflow_veh_per_h"] == pytest.approx(left * 30.0)
+    assert row["insertion_backlog_veh"] == episode.backlog[-1]
 
 
 def test_positions_that_differ_from_sumos_odometer_are_an_error(
@@ -175,20 +171,20 @@ def test_positions_that_differ_from_sumos_odometer_are_an_error(
 ) -> None:
     traffic = merging(Merge(), simulation)
     for _ in range(10):
-        traffic.advance(Command(np.zeros(len(traffic.cavs))))
+        traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
     driven = simulation.distances
-    traffic.record(Driven())
+    traffic.record(DriverLog())
     monkeypatch.setattr(simulation, "distances", lambda ids: [way + 2e-6 for way in driven(ids)])
     with pytest.raises(EpisodeError, match="positions differ from SUMO's odometer by 2e-06 m"):
-        traffic.record(Driven())
+        traffic.record(DriverLog())
 
 
 def test_what_pictures_show_of_it(simulation: Simulation) -> None:
-    episode = run_episode(Merge(horizon=60), PISaturation(), (1,), full=True, simulation=simulation)
+    episode = run_episode(Merge(horizon=60), PISaturation(), (1,), record_details=True, simulation=simulation)
     assert len(episode.branches) == len(episode.vehicle_ids)
     for name, branch in zip(episode.vehicle_ids, episode.branches, strict=True):
         assert branch == ("ramp" if re.match("human_r", name) else "highway")
-    x, y, heading = np.moveaxis(episode.places, -1, 0)
+    x, y, heading = np.moveaxis(episode.poses, -1, 0)
     on_highway = np.array([branch == "highway" for branch in episode.branches])
     there = ~np.isnan(episode.speeds)
     straight = there & on_highway
@@ -198,13 +194,13 @@ def test_what_pictures_show_of_it(simulation: Simulation) -> None:
     np.testing.assert_allclose(x[beyond], 100.0 - (100.0 - episode.positions[beyond]) * 0.88675, atol=0.01)
     on_ramp = there & ~on_highway & (episode.positions < -25)
     np.testing.assert_allclose(heading[on_ramp], np.pi / 4, atol=1e-3)
-    assert episode.lines.shape[1] == 2
-    assert np.nanmin(episode.lines[:, 0]) == -600.0
-    assert np.nanmax(episode.lines[:, 0]) == 100.0
+    assert episode.lane_lines.shape[1] == 2
+    assert np.nanmin(episode.lane_lines[:, 0]) == -600.0
+    assert np.nanmax(episode.lane_lines[:, 0]) == 100.0
 
 
 def episodes_of(driver: Driver, seeds: Sequence[int], **changes: Any) -> list[Episode]:
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         found = workers.run([EpisodeTask(Merge(**changes), driver, (seed,)) for seed in seeds])
     assert [episode.status for episode in found] == ["completed"] * len(seeds)
     assert all(episode.collisions == 0 for episode in found)
@@ -225,21 +221,21 @@ def test_from_a_standing_start_people_stay_in_a_jam_and_pi_makes_it_worse(human:
     pi = episodes_of(PISaturation(), range(2))
     assert 8.5 < fleet_mean(human) < 13.5
     assert fleet_mean(pi) < fleet_mean(human)
-    assert all(episode.waiting[-1] > 5 for episode in [*human, *pi])
+    assert all(episode.backlog[-1] > 5 for episode in [*human, *pi])
 
 
 def test_from_an_empty_start_people_flow_freely(human: list[Episode]) -> None:
     free = episodes_of(Human(), range(2), standing=0)
     assert fleet_mean(free) == pytest.approx(19.9, rel=0.06)
     assert fleet_mean(free) < min(episode.limit_speed for episode in free)
-    assert all(episode.waiting[-1] <= 1 for episode in free)
-    assert min(episode.arrived for episode in free) > max(episode.arrived for episode in human)
+    assert all(episode.backlog[-1] <= 1 for episode in free)
+    assert min(episode.arrivals for episode in free) > max(episode.arrivals for episode in human)
 
 
 @pytest.mark.long
 def test_nobody_collides_whoever_drives() -> None:
     for driver in (Constant(1.0), Constant(-0.1)):
-        episodes_of(driver, range(2), horizon=200, cav_share=0.3)
+        episodes_of(driver, range(2), horizon=200, penetration_rate=0.3)
 
 
 @pytest.mark.slow

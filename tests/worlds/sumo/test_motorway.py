@@ -9,38 +9,38 @@ import pytest
 from unjam.drivers import Human
 from unjam.drivers.adaptive_acc import AdaptiveACC
 from unjam.drivers.command import Command
-from unjam.drivers.local_state import LARGEST_GAP
+from unjam.drivers.local_state import MAX_OBSERVED_GAP
 from unjam.drivers.road_experts import Cruise, JamAhead
 from unjam.measures.metrics import measure
 from unjam.scenarios import OnRamp
-from unjam.worlds.batch.motorway_world import MotorwayBatch
+from unjam.worlds.batch.on_ramp.world import MotorwayBatch
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.motorway import MotorwayTraffic
 from unjam.worlds.sumo.simulation import Simulation
 
-BUSY = OnRamp(peak=(0.0, 240.0), cav_share=0.2, horizon=240)
+BUSY = OnRamp(peak=(0.0, 240.0), penetration_rate=0.2, horizon=240)
 
 
 def motorway(simulation: Simulation, scenario: OnRamp = BUSY) -> MotorwayTraffic:
     traffic = make_traffic(scenario, (3,), simulation)
     assert isinstance(traffic, MotorwayTraffic)
-    traffic.start(controlled=True)
+    traffic.start(is_controlled=True)
     return traffic
 
 
 @pytest.fixture(scope="module")
 def capped() -> Episode:
-    return run_episode(BUSY, JamAhead(), (3,), full=True)
+    return run_episode(BUSY, JamAhead(), (3,), record_details=True)
 
 
 def test_leaders_and_gaps_are_sumos(simulation: Simulation) -> None:
     traffic, compared = motorway(simulation), 0
     for _ in range(150):
-        traffic.advance(Command(np.full(traffic.rows, 100.0)))
-        seen = traffic.perceive()
-        for row, name in enumerate(traffic.cavs):
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+        seen = traffic.local_state()
+        for row, name in enumerate(traffic.cav_ids):
             leader, gap = libsumo.vehicle.getLeader(name, 90.0) or ("", 0.0)
             if not leader or libsumo.vehicle.getRoadID(name) in ("ramp", "merging"):
                 continue  # there SUMO looks across lanes
@@ -56,9 +56,9 @@ def test_leaders_and_gaps_are_sumos(simulation: Simulation) -> None:
 def test_who_is_beside_a_cav_is_whom_sumo_sees_there(simulation: Simulation) -> None:
     traffic, compared = motorway(simulation), 0
     for _ in range(150):
-        traffic.advance(Command(np.full(traffic.rows, 100.0)))
-        seen = traffic.perceive()
-        for row, name in enumerate(traffic.cavs):
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+        seen = traffic.local_state()
+        for row, name in enumerate(traffic.cav_ids):
             here = libsumo.vehicle.getRoadID(name)
             if here != "motorway":  # where lanes end SUMO looks on to those that follow
                 continue
@@ -74,80 +74,78 @@ def test_who_is_beside_a_cav_is_whom_sumo_sees_there(simulation: Simulation) -> 
                 (other,) = found
                 way = libsumo.vehicle.getLanePosition(other) - libsumo.vehicle.getLanePosition(name)
                 gap = abs(way) - 4.8
-                if gap < LARGEST_GAP:
-                    assert seen.beside_gaps[row, column] == pytest.approx(gap, abs=1e-6)
-                    assert seen.beside_speeds[row, column] == libsumo.vehicle.getSpeed(other)
+                if gap < MAX_OBSERVED_GAP:
+                    assert seen.adjacent_gaps[row, column] == pytest.approx(gap, abs=1e-6)
+                    assert seen.adjacent_speeds[row, column] == libsumo.vehicle.getSpeed(other)
                     compared += 1
     assert compared > 500
 
 
 def test_a_ramps_vehicles_are_beside_the_right_lane_before_it_joins(simulation: Simulation) -> None:
-    traffic, seen_there = motorway(simulation, replace(BUSY, cav_share=1.0)), 0
+    traffic, seen_there = motorway(simulation, replace(BUSY, penetration_rate=1.0)), 0
     for _ in range(200):
-        traffic.advance(Command(np.full(traffic.rows, 100.0)))
-        seen = traffic.perceive()
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+        seen = traffic.local_state()
         on_ramp = {
             libsumo.vehicle.getLanePosition(name) - 400.0: libsumo.vehicle.getSpeed(name)
             for name in libsumo.edge.getLastStepVehicleIDs("ramp")
         }
-        for row, name in enumerate(traffic.cavs):
+        for row, name in enumerate(traffic.cav_ids):
             if libsumo.vehicle.getLaneID(name) != "motorway_0":
                 continue
             place = libsumo.vehicle.getLanePosition(name) - 2000.0
             ahead = [other for other in on_ramp if place <= other]
-            if ahead and min(ahead) - place - 4.8 < LARGEST_GAP:
-                assert seen.beside_gaps[row, 2] == pytest.approx(min(ahead) - place - 4.8, abs=1e-6)
-                assert seen.beside_speeds[row, 2] == on_ramp[min(ahead)]
+            if ahead and min(ahead) - place - 4.8 < MAX_OBSERVED_GAP:
+                assert seen.adjacent_gaps[row, 2] == pytest.approx(min(ahead) - place - 4.8, abs=1e-6)
+                assert seen.adjacent_speeds[row, 2] == on_ramp[min(ahead)]
                 seen_there += 1
-            assert (seen.beside_gaps[row] > -4.8 - 1e-9).all()
+            assert (seen.adjacent_gaps[row] > -4.8 - 1e-9).all()
     assert seen_there > 20
 
 
 def test_a_cav_is_held_back_upstream_and_left_alone_where_the_lane_closes(simulation: Simulation) -> None:
     traffic, held, free = motorway(simulation), [], []
     for _ in range(200):
-        before = dict(zip(traffic.cavs, traffic.perceive().speed.tolist(), strict=True))
-        traffic.advance(Command(np.full(traffic.rows, -0.1)))
-        seen = traffic.perceive()
-        for row, name in enumerate(traffic.cavs):
+        before = dict(zip(traffic.cav_ids, traffic.local_state().speed.tolist(), strict=True))
+        traffic.advance(Command(np.full(traffic.cav_count, -0.1)))
+        seen = traffic.local_state()
+        for row, name in enumerate(traffic.cav_ids):
             if name in before and before[name] > 10.0:
                 change = seen.speed[row] - before[name]
-                (held if seen.to_merge[row] > 60.0 else free).append(change)
+                (held if seen.distance_to_merge[row] > 60.0 else free).append(change)
     assert len(held) > 200
     assert max(held) <= -0.1 + 1e-9
     assert max(free) > 0.5
 
 
 def test_it_is_told_how_many_of_all_that_have_entered_are_cavs(simulation: Simulation) -> None:
-    traffic = motorway(simulation, replace(BUSY, cav_share=0.3))
+    traffic = motorway(simulation, replace(BUSY, penetration_rate=0.3))
     for _ in range(100):
-        traffic.advance(Command(np.full(traffic.rows, 1.0)))
-    came = {*libsumo.vehicle.getIDList(), *simulation.arrived()}
-    share = np.unique(traffic.perceive().cav_share)
+        traffic.advance(Command(np.full(traffic.cav_count, 1.0)))
+    came = {*libsumo.vehicle.getIDList(), *simulation.arrived_vehicles()}
+    share = np.unique(traffic.local_state().penetration_rate)
     assert share == pytest.approx([sum(name in traffic.road.cav_ids for name in came) / len(came)], abs=0.02)
 
 
-def test_an_acc_keeps_the_time_headway_that_it_is_asked_for_until_it_is_asked_no_more(
-    simulation: Simulation,
-) -> None:
+def test_an_acc_keeps_the_time_headway_that_it_is_asked_for_until_it_is_asked_no_more(simulation: Simulation) -> None:
     def shortest(asked: float) -> float:
         """Return a short time headway of CAVs on a full road [s], and look that SUMO knows what was asked."""
-        traffic, own, found = motorway(simulation), BUSY.cruise.time_headway, list[float]()
+        traffic, own, found = motorway(simulation), BUSY.cruise.time_gap, list[float]()
         for decision in range(200):
-            free = np.full(traffic.rows, 100.0)
-            traffic.advance(Command(free, np.full(traffic.rows, asked)))
+            free = np.full(traffic.cav_count, 100.0)
+            traffic.advance(Command(free, np.full(traffic.cav_count, asked)))
             if decision > 100:
-                seen = traffic.perceive()
-                found += (seen.leader_gap / seen.speed.clip(0.1))[seen.leader_gap < LARGEST_GAP].tolist()
-        told = traffic.cavs
-        traffic.advance(Command(np.full(traffic.rows, 100.0), np.full(traffic.rows, asked)))
-        kept = [name for name in told if name in traffic.cavs]
+                seen = traffic.local_state()
+                found += (seen.leader_gap / seen.speed.clip(0.1))[seen.leader_gap < MAX_OBSERVED_GAP].tolist()
+        told = traffic.cav_ids
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0), np.full(traffic.cav_count, asked)))
+        kept = [name for name in told if name in traffic.cav_ids]
         assert {libsumo.vehicle.getTau(name) for name in kept} == {max(asked, own)}
-        traffic.advance(Command(np.full(traffic.rows, 100.0), np.full(traffic.rows, np.nan)))
-        assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cavs} == {own}
-        traffic.advance(Command(np.full(traffic.rows, 100.0), np.full(traffic.rows, asked)))
-        traffic.advance(Command(np.full(traffic.rows, 100.0)))  # nothing asked is as NaN for all
-        assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cavs} == {own}
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0), np.full(traffic.cav_count, np.nan)))
+        assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cav_ids} == {own}
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0), np.full(traffic.cav_count, asked)))
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))  # nothing asked is as NaN for all
+        assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cav_ids} == {own}
         return float(np.quantile(found, 0.1))
 
     assert shortest(2.0) > shortest(0.5) + 0.3
@@ -157,7 +155,7 @@ def test_who_is_not_held_back_drives_as_its_own_acc_does(simulation: Simulation)
     episode = run_episode(BUSY, Cruise(), (3,), simulation=simulation)
     assert episode.status == "completed"
     assert measure(episode)["shield_override_share"] == 0.0
-    fastest = max(trajectory.applied.max() for trajectory in episode.trajectories)
+    fastest = max(trajectory.applied_acceleration.max() for trajectory in episode.trajectories)
     assert 1.5 < fastest <= 2.5
 
 
@@ -169,23 +167,23 @@ def test_who_stands_and_is_asked_to_go_does_so_however_gently_in_sumo_and_in_a_b
     for world in (make_traffic(BUSY, (3,), simulation), MotorwayBatch(BUSY, [(3,)])):
         world.start(controlled=True)
         for _ in range(36):
-            world.advance(Command(np.full(world.rows, -3.0)))
-        assert world.perceive().speed.max() <= 0.1
+            world.advance(Command(np.full(world.cav_count, -3.0)))
+        assert world.local_state().speed.max() <= 0.1
         for _ in range(10):
-            world.advance(Command(np.full(world.rows, asked)))
-        assert 0.8 * asked * 10.0 < world.perceive().speed[0] < 1.3 + asked * 10.0
+            world.advance(Command(np.full(world.cav_count, asked)))
+        assert 0.8 * asked * 10.0 < world.local_state().speed[0] < 1.3 + asked * 10.0
 
 
 def test_cavs_want_to_drive_as_fast_as_those_whom_they_replace(simulation: Simulation) -> None:
     traffic = motorway(simulation)
     for _ in range(60):
-        traffic.advance(Command(np.full(traffic.rows, 100.0)))
-    kinds = {entry.name: entry.kind for entry in traffic.road.entries}
-    for row, name in enumerate(traffic.cavs):
-        factor = traffic.road.kinds[kinds[name]].speed_factor
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+    kinds = {entry.name: entry.vehicle_type for entry in traffic.road.entries}
+    for row, name in enumerate(traffic.cav_ids):
+        factor = traffic.road.vehicle_types[kinds[name]].speed_factor
         assert libsumo.vehicle.getSpeedFactor(name) == pytest.approx(factor)
         assert simulation.type_of(name) == f"cav_of_{kinds[name]}"
-        assert traffic.perceive().allowed_speed[row] == libsumo.vehicle.getAllowedSpeed(name)
+        assert traffic.local_state().allowed_speed[row] == libsumo.vehicle.getAllowedSpeed(name)
 
 
 def on_the_left(simulation: Simulation, **lanes: float) -> float:
@@ -194,8 +192,8 @@ def on_the_left(simulation: Simulation, **lanes: float) -> float:
     traffic = motorway(simulation, road)
     left = upstream = 0
     for _ in range(200):
-        traffic.advance(Command(np.full(traffic.rows, 100.0)))
-        lanes_now = [libsumo.vehicle.getLaneID(name) for name in traffic.cavs]
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+        lanes_now = [libsumo.vehicle.getLaneID(name) for name in traffic.cav_ids]
         left += lanes_now.count("motorway_1")
         upstream += lanes_now.count("motorway_1") + lanes_now.count("motorway_0")
     return left / upstream
@@ -213,9 +211,9 @@ def test_cavs_keep_right_and_overtake_as_eagerly_as_their_road_says(simulation: 
 def test_the_message_is_the_mean_speed_of_the_lane_ahead(simulation: Simulation) -> None:
     traffic = motorway(simulation)
     for _ in range(120):
-        traffic.advance(Command(np.full(traffic.rows, 100.0)))
-    state, checked = traffic.perceive(), 0
-    for row, name in enumerate(traffic.cavs):
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+    state, checked = traffic.local_state(), 0
+    for row, name in enumerate(traffic.cav_ids):
         lane = libsumo.vehicle.getLaneID(name)
         if not lane.startswith("motorway"):
             continue
@@ -233,9 +231,7 @@ def test_the_message_is_the_mean_speed_of_the_lane_ahead(simulation: Simulation)
 
 def test_people_alone_are_the_same_whoever_would_be_automated(simulation: Simulation) -> None:
     one, other = (
-        run_episode(
-            OnRamp(peak=(0.0, 60.0), horizon=60, cav_share=share), Human(), (1,), simulation=simulation
-        )
+        run_episode(OnRamp(peak=(0.0, 60.0), horizon=60, penetration_rate=share), Human(), (1,), simulation=simulation)
         for share in (0.05, 0.5)
     )
     np.testing.assert_array_equal(one.speeds, other.speeds)
@@ -243,14 +239,14 @@ def test_people_alone_are_the_same_whoever_would_be_automated(simulation: Simula
 
 def test_the_audit_tells_cut_ins_from_following(capped: Episode) -> None:
     audit = capped.audit
-    assert audit.lanes
-    assert audit.floor == 1.0
-    assert audit.cut_in.moments > 100
-    assert audit.cavs.moments > audit.cut_in.moments
-    everybody = audit.people.moments + audit.cavs.moments + audit.cut_in.moments
+    assert audit.has_lanes
+    assert audit.required_time_gap == 1.0
+    assert audit.cut_in_braking.samples > 100
+    assert audit.cav_braking.samples > audit.cut_in_braking.samples
+    everybody = audit.human_braking.samples + audit.cav_braking.samples + audit.cut_in_braking.samples
     there = (~np.isnan(capped.speeds[1:])).sum()
     assert everybody == pytest.approx(2 * there, rel=0.02)
-    assert 0.5 < audit.following.headway < 3.0
+    assert 0.5 < audit.following.min_time_gap < 3.0
     row = measure(capped)
     assert row["drivable"] == "drivable"
     assert row["cav_max_braking"] < 4.0
@@ -258,19 +254,19 @@ def test_the_audit_tells_cut_ins_from_following(capped: Episode) -> None:
 
 def test_where_each_came_from_and_the_peak_are_recorded(capped: Episode) -> None:
     assert set(capped.branches) == {"motorway", "ramp"}
-    assert capped.peak == (0.0, 240.0)
+    assert capped.demand_peak == (0.0, 240.0)
     assert -2000.0 <= np.nanmin(capped.positions) < np.nanmax(capped.positions) <= 1000.0
-    stays = [trajectory for trajectory in capped.trajectories if len(trajectory.applied) > 60]
+    stays = [trajectory for trajectory in capped.trajectories if len(trajectory.applied_acceleration) > 60]
     assert stays
-    assert all((np.diff(stay.states.to_merge) <= 1e-9).all() for stay in stays)
+    assert all((np.diff(stay.states.distance_to_merge) <= 1e-9).all() for stay in stays)
 
 
 @pytest.mark.long
 def test_a_cav_that_is_held_back_still_brakes_as_hard_as_its_own_acc_must(simulation: Simulation) -> None:
     """SUMO keeps who is told a speed to comfortable braking: told on, this one ran into a jam's tail."""
-    road = OnRamp(cav_share=0.3, horizon=800)
+    road = OnRamp(penetration_rate=0.3, horizon=800)
     episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), simulation=simulation)
     assert (episode.status, episode.collisions) == ("completed", 0)
     assert road.cruise.deceleration is not None
-    assert episode.audit.cavs.hardest > road.cruise.deceleration + 0.1
-    assert episode.audit.cavs.beyond[1] == 0
+    assert episode.audit.cav_braking.max_braking > road.cruise.deceleration + 0.1
+    assert episode.audit.cav_braking.exceedances[1] == 0

@@ -5,11 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.drivers.command import Command
-from unjam.drivers.local_state import EVERYWHERE
+from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.scenarios import Ring
-from unjam.worlds.closed import loop_neighbours, loop_state
+from unjam.worlds.closed_road import loop_neighbors, loop_state
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.closed import ClosedTraffic
+from unjam.worlds.sumo.closed_road import ClosedTraffic
 from unjam.worlds.sumo.simulation import Simulation
 
 CAR = 5.0
@@ -41,15 +41,13 @@ def search(place: int, positions: list[float], loop: float) -> tuple[int, float,
 
 
 @given(vehicles_on_a_loop())
-def test_neighbours_and_gaps_are_those_that_a_search_finds(
-    traffic: tuple[list[float], list[float], float],
-) -> None:
+def test_neighbours_and_gaps_are_those_that_a_search_finds(traffic: tuple[list[float], list[float], float]) -> None:
     speeds, positions, loop = traffic
-    everyone = loop_neighbours(np.arange(len(speeds)), len(speeds))
+    everyone = loop_neighbors(np.arange(len(speeds)), len(speeds))
     states = loop_state(np.array(speeds), np.array(positions), everyone, loop)
     for place in range(len(speeds)):
         leader, gap, follower, gap_behind = search(place, positions, loop)
-        assert (everyone.ahead[place], everyone.behind[place]) == (leader, follower)
+        assert (everyone.leader[place], everyone.follower[place]) == (leader, follower)
         assert states.speed[place] == speeds[place]
         assert states.leader_speed[place] == speeds[leader]
         assert states.follower_speed[place] == speeds[follower]
@@ -65,28 +63,26 @@ def test_one_vehicle_in_plain_numbers_perceives_what_it_does_in_arrays(
 ) -> None:
     speeds, positions, loop = traffic
     for place in range(len(speeds)):
-        alone = loop_state(speeds, positions, loop_neighbours(place, len(speeds)), loop)
-        row = loop_neighbours(np.array([place]), len(speeds))
+        alone = loop_state(speeds, positions, loop_neighbors(place, len(speeds)), loop)
+        row = loop_neighbors(np.array([place]), len(speeds))
         among = loop_state(np.array(speeds), np.array(positions), row, loop)
-        assert all(type(value) is float for value in alone[: len(EVERYWHERE)])
-        assert alone == among.at(0)
+        assert all(type(value) is float for value in alone[: len(COMMON_FIELDS)])
+        assert alone == among.select(0)
 
 
 def test_many_moments_are_what_each_moment_is() -> None:
     generator = np.random.default_rng(0)
     positions = np.array([[0.0], [20.0], [50.0]]) + generator.uniform(0, 5, (3, 7)).cumsum(1)
     speeds = generator.uniform(0, 10, (3, 7))
-    near = loop_neighbours(np.array([2, 0]), 3)
+    near = loop_neighbors(np.array([2, 0]), 3)
     together = loop_state(speeds, positions, near, 90.0)
     assert together.speed.shape == (2, 7)
     for moment in range(7):
         alone = loop_state(speeds[:, moment], positions[:, moment], near, 90.0)
-        together.each(lambda values, one: np.testing.assert_array_equal(values[:, moment], one), alone)  # noqa: B023
+        together.map(lambda values, one: np.testing.assert_array_equal(values[:, moment], one), alone)  # noqa: B023
 
 
-@pytest.mark.parametrize(
-    ("vehicles", "cavs", "length"), [(22, 3, 221), (11, 1, 128), (2, 1, 47), (44, 1, 520)]
-)
+@pytest.mark.parametrize(("vehicles", "cavs", "length"), [(22, 3, 221), (11, 1, 128), (2, 1, 47), (44, 1, 520)])
 def test_leaders_and_gaps_in_running_traffic_are_sumos(
     vehicles: int, cavs: int, length: int, simulation: Simulation
 ) -> None:
@@ -94,7 +90,7 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
     ring = Ring(length=(length, length), vehicles=vehicles, cavs=cavs, warmup=40, horizon=steps)
     traffic = make_traffic(ring, (3,), simulation)
     assert isinstance(traffic, ClosedTraffic)
-    traffic.start(controlled=True)
+    traffic.start(is_controlled=True)
     pushes = np.random.default_rng(0).uniform(-0.6, 1.0, (steps, cavs))
     names, seen = traffic.road.vehicle_ids, []
     for push in pushes:
@@ -104,8 +100,8 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
         kept = [libsumo.vehicle.getMinGap(name) for name in names]
         seen.append([(leader, gap + keep) for (leader, gap), keep in zip(leaders, kept, strict=True)])
         gaps = [seen[-1][names.index(name)][1] for name in traffic.road.cav_ids]
-        np.testing.assert_allclose(traffic.perceive().leader_gap, gaps, rtol=0, atol=1e-6)
-    everybody = loop_neighbours(np.arange(vehicles), vehicles)
+        np.testing.assert_allclose(traffic.local_state().leader_gap, gaps, rtol=0, atol=1e-6)
+    everybody = loop_neighbors(np.arange(vehicles), vehicles)
     states = loop_state(*traffic.speeds_and_positions(), everybody, traffic.road.loop_length)
     for place, name in enumerate(names):
         assert {leaders[place][0] for leaders in seen} == {names[(place + 1) % vehicles]}, name
@@ -119,7 +115,7 @@ def test_positions_are_sumos_own_along_the_road(simulation: Simulation) -> None:
     ring = Ring(length=(222, 222), warmup=30, horizon=400)
     traffic = make_traffic(ring, (1,), simulation)
     assert isinstance(traffic, ClosedTraffic)
-    traffic.start(controlled=False)
+    traffic.start(is_controlled=False)
     for _ in range(400):
         traffic.advance(None)
     _, positions = traffic.speeds_and_positions()

@@ -68,18 +68,14 @@ def test_a_road_made_before_is_not_made_again(cache: Path, monkeypatch: pytest.M
         network_file(road_of(231))
 
 
-def test_other_traffic_on_the_same_road_needs_no_other_network(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_traffic_on_the_same_road_needs_no_other_network(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = network_file(road_of(230))
     monkeypatch.setattr(subprocess, "run", refuse_to_run)
     other = Ring(length=(230, 230), vehicles=11, cavs=3).draw(np.random.default_rng(1))
     assert network_file(other.network) == made
 
 
-def test_whatever_changes_the_network_makes_another_file(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_whatever_changes_the_network_makes_another_file(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     road = road_of(230)
     other = road_of(240)
     plain = tuple(node._replace(priority=False) for node in road.nodes)
@@ -146,9 +142,7 @@ def test_processes_that_make_the_same_network_at_once_get_one_whole_file(cache: 
         "print(network_file(road))\n"
     )
     processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         for _ in range(2)
     ]
     for process in processes:
@@ -176,9 +170,7 @@ def test_a_road_that_cannot_be_made_leaves_nothing_behind(cache: Path) -> None:
 
 @pytest.mark.usefixtures("no_sumo")
 def test_a_missing_netconvert_is_named_with_the_way_to_get_it(cache: Path) -> None:
-    with pytest.raises(
-        MissingPartError, match="netconvert is not there; install it: pip install eclipse-sumo"
-    ):
+    with pytest.raises(MissingPartError, match="netconvert is not there; install it: pip install eclipse-sumo"):
         network_file(road_of(230))
     assert files_in(cache) <= {cache / "networks"}
 
@@ -191,9 +183,7 @@ def test_a_netconvert_on_the_path_does_where_the_package_has_none(tmp_path: Path
     assert sumo_program("netconvert") == str(program)
 
 
-def test_a_cache_that_cannot_be_a_folder_is_a_disk_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cache_that_cannot_be_a_folder_is_a_disk_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / "file" / "cache"))
     with pytest.raises(DiskError, match=r"cannot write .*file/cache/networks"):
@@ -230,9 +220,7 @@ def unsealed(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [cut, edit, empty, unsealed])
-def test_a_network_that_is_no_longer_as_it_was_made_is_made_anew(
-    damage: Callable[[Path], None], cache: Path
-) -> None:
+def test_a_network_that_is_no_longer_as_it_was_made_is_made_anew(damage: Callable[[Path], None], cache: Path) -> None:
     made = network_file(road_of(230))
     whole = edges_of(made)
     damage(made)
@@ -250,9 +238,7 @@ def test_another_process_notices_too(cache: Path, monkeypatch: pytest.MonkeyPatc
     assert edges_of(network_file(road_of(230))) == {f"edge_{index}": 57.5 for index in range(4)}
 
 
-def test_a_network_that_a_full_disk_cut_short_is_not_kept(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_that_a_full_disk_cut_short_is_not_kept(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = subprocess.run
 
     def run_on_full_disk(command: list[str], **options: Any) -> Any:

@@ -10,17 +10,17 @@ from tests.conftest import random_network
 from tests.worlds.test_record import fingerprint, travelled
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
 from unjam.drivers.command import Command
-from unjam.drivers.from_file import FunctionDriver
-from unjam.drivers.observation import local_vector
+from unjam.drivers.observation import local_observation
+from unjam.drivers.user_driver import FunctionDriver
 from unjam.errors import InputError
 from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Trajectory
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask, Workers
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-MERGE = Merge(cav_share=0.3, horizon=120)
+MERGE = Merge(penetration_rate=0.3, horizon=120)
 
 
 class Counting(Driver):
@@ -50,11 +50,13 @@ def counted() -> Episode:
 def test_a_driver_remembers_each_cav_by_itself_from_its_entry_on(counted: Episode) -> None:
     assert len(counted.trajectories) > 12
     for trajectory in counted.trajectories:
-        np.testing.assert_allclose(trajectory.applied, expected_of_counting(trajectory), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            trajectory.applied_acceleration, expected_of_counting(trajectory), rtol=0, atol=1e-12
+        )
 
 
 def test_cavs_came_and_left_in_between(counted: Episode) -> None:
-    stays = [(each.start, each.start + len(each.applied)) for each in counted.trajectories]
+    stays = [(each.start_step, each.start_step + len(each.applied_acceleration)) for each in counted.trajectories]
     assert len({start for start, _ in stays}) > 10
     assert sum(end < 120 for _, end in stays) > 3
     assert sum(end == 120 for _, end in stays) > 3
@@ -66,7 +68,7 @@ def test_each_stay_of_a_cav_is_one_trajectory_that_holds_what_was_recorded_of_it
     assert counted.cav_ids == tuple(each.vehicle for each in counted.trajectories)
     for trajectory in counted.trajectories:
         column = counted.vehicle_ids.index(trajectory.vehicle)
-        start, end = trajectory.start, trajectory.start + len(trajectory.applied)
+        start, end = trajectory.start_step, trajectory.start_step + len(trajectory.applied_acceleration)
         speeds = counted.speeds[:, column]
         there = np.flatnonzero(~np.isnan(speeds))
         assert there.tolist() == list(range(start, end + 1))
@@ -76,19 +78,19 @@ def test_each_stay_of_a_cav_is_one_trajectory_that_holds_what_was_recorded_of_it
         np.testing.assert_array_equal(states.route_position, counted.positions[start : end + 1, column])
         assert np.isnan(states.loop_length).all()
         assert not trajectory.terminated
-        for name, values in trajectory.terms.items():
-            np.testing.assert_array_equal(values, counted.terms[name][start:end])
+        for name, values in trajectory.reward_terms.items():
+            np.testing.assert_array_equal(values, counted.reward_terms[name][start:end])
 
 
 def test_leader_and_follower_of_a_stay_were_there_as_recorded(counted: Episode) -> None:
     seen = 0
     for trajectory in counted.trajectories:
         column = counted.vehicle_ids.index(trajectory.vehicle)
-        for moment in range(len(trajectory.applied) + 1):
-            row = trajectory.start + moment
+        for moment in range(len(trajectory.applied_acceleration) + 1):
+            row = trajectory.start_step + moment
             own, others = counted.positions[row, column], np.delete(counted.positions[row], column)
             speeds = np.delete(counted.speeds[row], column)
-            states = trajectory.states.at(moment)
+            states = trajectory.states.select(moment)
             for gap, speed, place in (
                 (states.leader_gap, states.leader_speed, own + 5.0 + states.leader_gap),
                 (states.follower_gap, states.follower_speed, own - 5.0 - states.follower_gap),
@@ -104,8 +106,8 @@ def test_leader_and_follower_of_a_stay_were_there_as_recorded(counted: Episode) 
 
 def test_commands_are_carried_out_unless_the_shield_brakes(counted: Episode) -> None:
     for trajectory in counted.trajectories:
-        speed, free = trajectory.states.speed, trajectory.shield < 1e-9
-        expected = np.maximum(speed[:-1] + trajectory.applied, 0.0)  # five steps of 0.2 s
+        speed, free = trajectory.states.speed, trajectory.shield_braking < 1e-9
+        expected = np.maximum(speed[:-1] + trajectory.applied_acceleration, 0.0)  # five steps of 0.2 s
         calm = free & (expected < 29.0) & (speed[:-1] > 1.0)
         np.testing.assert_allclose(speed[1:][calm], expected[calm], atol=1e-9)
         assert (speed[1:] <= expected + 1e-9).all()
@@ -113,13 +115,13 @@ def test_commands_are_carried_out_unless_the_shield_brakes(counted: Episode) -> 
 
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(simulation: Simulation) -> None:
-    residual = ResidualDriver(PISaturation(), random_network(), 1.0, hold=3)
+    residual = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=3)
     tasks = [
         EpisodeTask(MERGE, residual, (2,), explore=True),
         EpisodeTask(replace(MERGE, warmup=100), Counting(), (5, 1)),
-        EpisodeTask(replace(MERGE, cav_share=0.0), Human(), (2,)),
+        EpisodeTask(replace(MERGE, penetration_rate=0.0), Human(), (2,)),
     ]
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         found = [fingerprint(episode) for episode in workers.run([*tasks[:1], *tasks[2:]])]
     here = [
         run_episode(task.scenario, task.driver, task.seed, explore=task.explore, simulation=simulation)
@@ -145,30 +147,30 @@ def test_undriven_cavs_have_trajectories_of_what_they_did(simulation: Simulation
     episode = run_episode(MERGE, Human(), (2,), simulation=simulation)
     assert len(episode.trajectories) > 5
     for trajectory in episode.trajectories:
-        np.testing.assert_allclose(trajectory.applied, np.diff(trajectory.states.speed), atol=1e-12)
-        assert not trajectory.shield.any()
+        np.testing.assert_allclose(trajectory.applied_acceleration, np.diff(trajectory.states.speed), atol=1e-12)
+        assert not trajectory.shield_braking.any()
 
 
 @pytest.mark.parametrize("hold", [1, 4])
 def test_a_residual_driver_counts_its_looks_from_each_entry(hold: int, simulation: Simulation) -> None:
-    driver = ResidualDriver(Counting(), random_network(), 1.0, hold=hold)
+    driver = ResidualDriver(Counting(), random_network(), 1.0, action_repeat=hold)
     episode = run_episode(MERGE, driver, (2,), explore=True, simulation=simulation)
     noises = []
     assert len(episode.trajectories) > 5
     for trajectory in episode.trajectories:
-        steps = len(trajectory.applied)
-        np.testing.assert_allclose(trajectory.expert, expected_of_counting(trajectory), atol=1e-12)
-        total = np.clip(trajectory.expert + trajectory.residual, -1.0, 1.0)
-        np.testing.assert_allclose(trajectory.applied, total, atol=1e-12)
+        steps = len(trajectory.applied_acceleration)
+        np.testing.assert_allclose(trajectory.expert_acceleration, expected_of_counting(trajectory), atol=1e-12)
+        total = np.clip(trajectory.expert_acceleration + trajectory.residual, -1.0, 1.0)
+        np.testing.assert_allclose(trajectory.applied_acceleration, total, atol=1e-12)
         looks = [*range(0, steps, hold), steps]
-        seen = local_vector(trajectory.states.at(looks))
+        seen = local_observation(trajectory.states.select(looks))
         np.testing.assert_allclose(trajectory.observations, seen, atol=1e-12)
-        chosen, _ = trajectory.choices
+        chosen, _ = trajectory.actions_and_rewards
         np.testing.assert_array_equal(trajectory.residual, np.repeat(chosen, hold)[:steps])
         noises.append(chosen - driver.network(trajectory.observations[:-1]))
-        assert trajectory.memory.keys() == {"decisions", "speeds"}
-        assert trajectory.memory["decisions"] == 0.0
-        np.testing.assert_array_equal(trajectory.memory["speeds"], -1.0)
+        assert trajectory.initial_memory.keys() == {"decisions", "speeds"}
+        assert trajectory.initial_memory["decisions"] == 0.0
+        np.testing.assert_array_equal(trajectory.initial_memory["speeds"], -1.0)
     noise = np.concatenate(noises)
     assert noise.std() == pytest.approx(0.2, rel=0.15)
     assert len(np.unique(noise)) == len(noise)
@@ -178,11 +180,11 @@ def test_what_stays_say_is_enough_to_drive_them_again(simulation: Simulation) ->
     driver = ResidualDriver(PISaturation(), random_network(), 1.0)
     episode = run_episode(MERGE, driver, (2,), simulation=simulation)
     for trajectory in episode.trajectories:
-        memory = {name: values[None] for name, values in trajectory.memory.items()}
-        for step in range(len(trajectory.applied)):
-            state = trajectory.states.at(slice(step, step + 1))
+        memory = {name: values[None] for name, values in trajectory.initial_memory.items()}
+        for step in range(len(trajectory.applied_acceleration)):
+            state = trajectory.states.select(slice(step, step + 1))
             expert, memory = driver.expert.act(state, memory)
-            assert np.clip(expert[0], -1, 1) == pytest.approx(trajectory.expert[step], abs=1e-12)
+            assert np.clip(expert[0], -1, 1) == pytest.approx(trajectory.expert_acceleration[step], abs=1e-12)
 
 
 def test_exploration_leaves_the_traffics_noise_alone(simulation: Simulation) -> None:
@@ -197,24 +199,24 @@ def test_a_driver_that_remembers_nothing_drives_whoever_comes(simulation: Simula
     function = FunctionDriver(lambda state: 0.1 * (state.leader_speed - state.speed))
     episode = run_episode(MERGE, function, (2,), simulation=simulation)
     for trajectory in episode.trajectories:
-        states = trajectory.states.at(slice(-1))
+        states = trajectory.states.select(slice(-1))
         wanted = np.clip(0.1 * (states.leader_speed - states.speed), -1, 1)
-        np.testing.assert_allclose(trajectory.applied, wanted, atol=1e-12)
+        np.testing.assert_allclose(trajectory.applied_acceleration, wanted, atol=1e-12)
 
 
-@pytest.mark.parametrize("driver", [IDM(), ResidualDriver(PISaturation(), random_network(), 1.0, hold=2)])
+@pytest.mark.parametrize("driver", [IDM(), ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=2)])
 def test_time_goes_on_while_no_cav_is_on_the_road(driver: Driver, simulation: Simulation) -> None:
-    lonely = Merge(cavs=1, standing=0, horizon=150)
+    lonely = Merge(cavs=1, standing_vehicles=0, horizon=150)
     episode = run_episode(lonely, driver, (3,), explore=True, simulation=simulation)
     (trajectory,) = episode.trajectories
-    assert trajectory.start > 3
-    assert trajectory.start + len(trajectory.applied) < 150
-    assert episode.steps == 150
-    assert {values.shape for values in episode.terms.values()} == {(150,)}
+    assert trajectory.start_step > 3
+    assert trajectory.start_step + len(trajectory.applied_acceleration) < 150
+    assert episode.control_steps == 150
+    assert {values.shape for values in episode.reward_terms.values()} == {(150,)}
 
 
 def test_where_no_cav_ever_comes_one_line_says_so(simulation: Simulation) -> None:
-    empty = Merge(cav_share=0.0, horizon=10)
+    empty = Merge(penetration_rate=0.0, horizon=10)
     with pytest.raises(InputError, match="no CAV was on the road in 10 decisions"):
         run_episode(empty, Constant(), (0,), simulation=simulation)
     assert run_episode(empty, Human(), (0,), simulation=simulation).trajectories == ()
@@ -223,34 +225,34 @@ def test_where_no_cav_ever_comes_one_line_says_so(simulation: Simulation) -> Non
 def test_a_warmup_hands_over_the_cavs_that_are_on_the_road(simulation: Simulation) -> None:
     warm = replace(MERGE, warmup=200, horizon=60)
     episode = run_episode(warm, Counting(), (2,), simulation=simulation)
-    assert sum(trajectory.start == 0 for trajectory in episode.trajectories) > 2
+    assert sum(trajectory.start_step == 0 for trajectory in episode.trajectories) > 2
     for trajectory in episode.trajectories:
-        np.testing.assert_allclose(trajectory.applied, expected_of_counting(trajectory), atol=1e-12)
+        np.testing.assert_allclose(trajectory.applied_acceleration, expected_of_counting(trajectory), atol=1e-12)
     assert episode.warmup == 200
     assert (~np.isnan(episode.speeds[0])).sum() > 15
 
 
 def test_a_collision_terminates_the_stays_that_it_ends_and_no_earlier_ones(simulation: Simulation) -> None:
-    reckless = Merge(cav_share=0.5, actuation="raw", standing=0)
+    reckless = Merge(penetration_rate=0.5, actuation="raw", standing_vehicles=0)
     episode = run_episode(reckless, Constant(1.0), (1,), simulation=simulation)
     assert (episode.status, episode.collisions >= 2) == ("collision", True)
-    assert episode.steps < 600
-    ends = [each.start + len(each.applied) for each in episode.trajectories]
-    assert [each.terminated for each in episode.trajectories] == [end == episode.steps for end in ends]
+    assert episode.control_steps < 600
+    ends = [each.start_step + len(each.applied_acceleration) for each in episode.trajectories]
+    assert [each.terminated for each in episode.trajectories] == [end == episode.control_steps for end in ends]
     assert episode.reward[-1] == 0.0
 
 
 def test_rows_of_those_who_stay_follow_who_leaves_and_enters(simulation: Simulation) -> None:
     traffic = make_traffic(MERGE, (2,), simulation)
-    traffic.start(controlled=True)
+    traffic.start(is_controlled=True)
     moved = 0
     for _ in range(100):
-        before = list(traffic.cavs)
+        before = list(traffic.cav_ids)
         traffic.advance(Command(np.zeros(len(before))))
-        stayed = before if traffic.kept is None else [before[row] for row in traffic.kept]
-        assert list(traffic.cavs[: len(stayed)]) == stayed
-        assert not set(traffic.cavs[len(stayed) :]) & set(before)
-        assert traffic.perceive().speed.shape == (len(traffic.cavs),)
+        stayed = before if traffic.remaining_rows is None else [before[row] for row in traffic.remaining_rows]
+        assert list(traffic.cav_ids[: len(stayed)]) == stayed
+        assert not set(traffic.cav_ids[len(stayed) :]) & set(before)
+        assert traffic.local_state().speed.shape == (len(traffic.cav_ids),)
         moved += stayed != before
     assert moved > 2
 
@@ -263,22 +265,20 @@ def test_rows_of_those_who_stay_follow_who_leaves_and_enters(simulation: Simulat
     ],
 )
 def test_a_wrong_answer_is_refused_with_its_step(answer: Any, words: str, simulation: Simulation) -> None:
-    everyone = Merge(cav_share=1.0, standing=0, horizon=20)
+    everyone = Merge(penetration_rate=1.0, standing_vehicles=0, horizon=20)
     with pytest.raises(InputError, match=f"driver: step \\d+: {words}"):
         run_episode(everyone, FunctionDriver(answer), (0,), simulation=simulation)
 
 
-def test_fuel_and_places_are_recorded_only_when_asked_for_and_change_nothing_else(
-    simulation: Simulation,
-) -> None:
+def test_fuel_and_places_are_recorded_only_when_asked_for_and_change_nothing_else(simulation: Simulation) -> None:
     short = replace(MERGE, horizon=40)
     plain, full = (
-        run_episode(short, Counting(), (2,), full=asked, simulation=simulation) for asked in (False, True)
+        run_episode(short, Counting(), (2,), record_details=asked, simulation=simulation) for asked in (False, True)
     )
     steps, vehicles = plain.speeds.shape
-    assert (plain.fuel.shape, plain.places.shape, plain.lines.shape) == ((0, 0), (0, 0, 3), (0, 2))
-    assert (full.fuel.shape, full.places.shape) == ((steps - 1,), (steps, vehicles, 3))
+    assert (plain.fuel.shape, plain.poses.shape, plain.lane_lines.shape) == ((0, 0), (0, 0, 3), (0, 2))
+    assert (full.fuel.shape, full.poses.shape) == ((steps - 1,), (steps, vehicles, 3))
     assert (full.fuel > 0).all()
-    np.testing.assert_array_equal(np.isnan(full.places[..., 0]), np.isnan(full.speeds))
-    same = replace(full, fuel=plain.fuel, places=plain.places, lines=plain.lines)
+    np.testing.assert_array_equal(np.isnan(full.poses[..., 0]), np.isnan(full.speeds))
+    same = replace(full, fuel=plain.fuel, places=plain.poses, lines=plain.lane_lines)
     assert fingerprint(same) == fingerprint(plain)

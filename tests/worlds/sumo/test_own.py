@@ -13,19 +13,19 @@ from tests.worlds.test_record import fingerprint, travelled
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.command import Command
 from unjam.drivers.network import Network
-from unjam.errors import InputError, RefusedError
-from unjam.measures.drivable import drivable
+from unjam.errors import InputError, SumoInputError
+from unjam.measures.feasibility import feasibility
 from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Scenario, make_scenario
 from unjam.scenarios.population import Population, write_population
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.files import files_of
-from unjam.worlds.sumo.own import OwnTraffic
+from unjam.worlds.sumo.inputs import sumo_inputs
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.workers import EpisodeTask, Workers
-from unjam.worlds.world import Driven
+from unjam.worlds.sumo.user_network import UserNetworkTraffic
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam.worlds.world import DriverLog
 
 
 @pytest.fixture(scope="module", params=["ramp", "cross", "grid"])
@@ -40,24 +40,22 @@ def signalled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def scenario_of(file: Path, **changes: Any) -> Scenario:
-    return make_scenario(str(file), {"cav_share": 0.3, "horizon": 200, **changes})
+    return make_scenario(str(file), {"penetration_rate": 0.3, "horizon": 200, **changes})
 
 
-def own(simulation: Simulation, file: Path, seed: int = 0, **changes: Any) -> OwnTraffic:
-    traffic = make_traffic(scenario_of(file, **changes), (seed,), simulation, full=True)
-    assert isinstance(traffic, OwnTraffic)
-    traffic.start(controlled=True)
+def own(simulation: Simulation, file: Path, seed: int = 0, **changes: Any) -> UserNetworkTraffic:
+    traffic = make_traffic(scenario_of(file, **changes), (seed,), simulation, record_details=True)
+    assert isinstance(traffic, UserNetworkTraffic)
+    traffic.start(is_controlled=True)
     return traffic
 
 
 @pytest.mark.long
-def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(
-    file: Path, simulation: Simulation
-) -> None:
+def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(file: Path, simulation: Simulation) -> None:
     task = EpisodeTask(scenario_of(file, horizon=80), PISaturation(), (3,))
     here = run_episode(task.scenario, task.driver, task.seed, simulation=simulation)
     run_episode(task.scenario, Constant(0.4), (4,), simulation=simulation)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         (there,) = workers.run([task])
     again = run_episode(task.scenario, task.driver, task.seed, simulation=simulation)
     assert here.status == "completed"
@@ -67,8 +65,7 @@ def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(
 def test_the_same_vehicles_are_cavs_whoever_drives(file: Path, simulation: Simulation) -> None:
     scenario = scenario_of(file)
     slow, fast, human = (
-        run_episode(scenario, driver, (0,), simulation=simulation)
-        for driver in (Constant(-0.2), IDM(), Human())
+        run_episode(scenario, driver, (0,), simulation=simulation) for driver in (Constant(-0.2), IDM(), Human())
     )
     assert len(human.cav_ids) > 2
     for one, other in ((slow, fast), (fast, human)):
@@ -86,19 +83,19 @@ def stayed(episode: Any, name: str) -> int:
 @pytest.mark.long
 def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path) -> None:
     file = game(tmp_path, "ramp")
-    episode = run_episode(scenario_of(file, cav_share=0.3, horizon=600), Human(), (0,))
+    episode = run_episode(scenario_of(file, penetration_rate=0.3, horizon=600), Human(), (0,))
     share = len(episode.cav_ids) / len(episode.vehicle_ids)
     assert share == pytest.approx(0.3, abs=0.12)
     with Simulation() as simulation:
-        traffic = own(simulation, file, cav_share=0.0, cav_types=["truck"], horizon=300)
+        traffic = own(simulation, file, penetration_rate=0.0, cav_types=["truck"], horizon=300)
         kinds: dict[str, str] = {}
         for _ in range(150):
             for name in libsumo.vehicle.getIDList():
                 kinds.setdefault(name, libsumo.vehicle.getTypeID(name))
-            traffic.advance(Command(np.zeros(len(traffic.cavs))))
-        assert {name for name, kind in kinds.items() if "truck" in kind} >= set(traffic.cavs)
-        driven = {name for moment in traffic._stays.cavs for name in moment}
-        there = set(traffic._log.names) | driven
+            traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
+        assert {name for name, kind in kinds.items() if "truck" in kind} >= set(traffic.cav_ids)
+        driven = {name for moment in traffic._trip_log.cav_ids for name in moment}
+        there = set(traffic._traffic_log.names) | driven
         assert driven == {name for name in there if "truck" in kinds.get(name, "")} != set()
 
 
@@ -109,7 +106,7 @@ def test_calibrated_people_drive_the_cars_and_the_same_vehicles_stay_cavs(tmp_pa
     write_population(people, Population(near, (near, far), (-9.0, 3.0)))
     plain = run_episode(scenario_of(file, horizon=400), Human(), (0,))
     calibrated = scenario_of(file, horizon=400, population=str(people))
-    assert "2 calibrated drivers" in calibrated.people_in_words
+    assert "2 calibrated drivers" in calibrated.human_description
     driven = run_episode(calibrated, Human(), (0,))
     assert set(plain.cav_ids) & set(driven.cav_ids)
     assert not set(driven.cav_ids) & (set(plain.vehicle_ids) - set(plain.cav_ids))
@@ -118,12 +115,10 @@ def test_calibrated_people_drive_the_cars_and_the_same_vehicles_stay_cavs(tmp_pa
         traffic = own(simulation, file, population=str(people), horizon=100)
         seen: dict[str, set[tuple[float, float]]] = {}
         for _ in range(100):
-            traffic.advance(Command(np.zeros(len(traffic.cavs))))
-            for name in set(libsumo.vehicle.getIDList()) - set(traffic.cavs):
+            traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
+            for name in set(libsumo.vehicle.getIDList()) - set(traffic.cav_ids):
                 kind = libsumo.vehicle.getVehicleClass(name)
-                seen.setdefault(kind, set()).add(
-                    (libsumo.vehicle.getTau(name), libsumo.vehicle.getMinGap(name))
-                )
+                seen.setdefault(kind, set()).add((libsumo.vehicle.getTau(name), libsumo.vehicle.getMinGap(name)))
     assert seen["passenger"] == {(one.time_headway, one.minimum_gap) for one in (near, far)}
     assert not seen.get("truck", set()) & seen["passenger"]
 
@@ -134,43 +129,41 @@ def test_a_population_with_a_residual_is_refused_where_sumo_drives(tmp_path: Pat
     write_population(people, Population(one, (one,), (-9.0, 3.0), residual))
     with pytest.raises(InputError, match="residual network is not allowed on your own network"):
         scenario_of(game(tmp_path, "ramp"), population=str(people))
-    with pytest.raises(
-        InputError, match="human_control: native is not allowed for a population with a residual"
-    ):
+    with pytest.raises(InputError, match="human_control: native is not allowed for a population with a residual"):
         make_scenario("ring", {"population": str(people), "human_control": "native"})
 
 
 def test_everyone_may_be_a_cav_and_nobody(file: Path, simulation: Simulation) -> None:
-    everyone = run_episode(scenario_of(file, cav_share=1.0, horizon=60), IDM(), (0,), simulation=simulation)
+    everyone = run_episode(scenario_of(file, penetration_rate=1.0, horizon=60), IDM(), (0,), simulation=simulation)
     there = [name for name in everyone.vehicle_ids if stayed(everyone, name) > 1]
     assert set(everyone.cav_ids) == set(there)
     with pytest.raises(InputError, match="no CAV was on the road in 5 decisions"):
-        run_episode(scenario_of(file, cav_share=1e-9, horizon=5), IDM(), (0,), simulation=simulation)
+        run_episode(scenario_of(file, penetration_rate=1e-9, horizon=5), IDM(), (0,), simulation=simulation)
 
 
 def test_cavs_are_never_faster_than_allowed_but_while_they_brake(file: Path, simulation: Simulation) -> None:
     traffic = own(simulation, file)
     compared, brakes = 0, traffic.scenario.safety.braking
     for _ in range(200):
-        driven = list(traffic.cavs)
+        driven = list(traffic.cav_ids)
         before = {name: libsumo.vehicle.getSpeed(name) for name in driven}
         traffic.advance(Command(np.ones(len(driven))))
         for name in driven:
-            if name in traffic.cavs:
+            if name in traffic.cav_ids:
                 speed, allowed = libsumo.vehicle.getSpeed(name), libsumo.vehicle.getAllowedSpeed(name)
                 compared += 1
-                braked = before[name] - brakes * traffic.scenario.decision_step
+                braked = before[name] - brakes * traffic.scenario.control_step
                 assert speed <= max(allowed, braked) + 1e-6
     assert compared > 200
-    assert not traffic.crashed
+    assert not traffic.has_crashed
 
 
 def test_cavs_stop_at_red(signalled: Path, simulation: Simulation) -> None:
-    traffic = own(simulation, signalled, cav_share=1.0, horizon=240)
+    traffic = own(simulation, signalled, penetration_rate=1.0, horizon=240)
     waited = passed = 0
     ahead: dict[str, Any] = {}
     for _ in range(200):
-        traffic.advance(Command(np.ones(len(traffic.cavs))))
+        traffic.advance(Command(np.ones(len(traffic.cav_ids))))
         for name in libsumo.vehicle.getIDList():
             signals = libsumo.vehicle.getNextTLS(name)
             now = signals[0] if signals else None
@@ -195,25 +188,21 @@ COLUMN = "".join(
 
 
 def test_neighbours_on_one_lane_are_those_of_the_positions(tmp_path: Path, simulation: Simulation) -> None:
-    traffic = own(simulation, straight(tmp_path, COLUMN), cav_share=1.0, horizon=400)
+    traffic = own(simulation, straight(tmp_path, COLUMN), penetration_rate=1.0, horizon=400)
     generator = np.random.default_rng(0)
     lengths = {name: 7.0 if int(name) % 3 == 1 else 5.0 for name in "01234"}
     seen = 0
     for _ in range(300):
-        traffic.advance(Command(generator.uniform(-0.6, 0.5, len(traffic.cavs))))
-        state = traffic.perceive()
-        order = sorted(traffic.cavs)  # nobody overtakes on one lane
+        traffic.advance(Command(generator.uniform(-0.6, 0.5, len(traffic.cav_ids))))
+        state = traffic.local_state()
+        order = sorted(traffic.cav_ids)  # nobody overtakes on one lane
         place = {name: libsumo.vehicle.getLanePosition(name) for name in order}
         speed = {name: libsumo.vehicle.getSpeed(name) for name in order}
-        for row, name in enumerate(traffic.cavs):
+        for row, name in enumerate(traffic.cav_ids):
             at = order.index(name)
             for other, gap, rate in (
                 (order[at - 1] if at else None, state.leader_gap[row], state.leader_speed[row]),
-                (
-                    order[at + 1] if at + 1 < len(order) else None,
-                    state.follower_gap[row],
-                    state.follower_speed[row],
-                ),
+                (order[at + 1] if at + 1 < len(order) else None, state.follower_gap[row], state.follower_speed[row]),
             ):
                 if other is None:
                     assert (gap, rate) == (100.0, speed[name])
@@ -227,24 +216,20 @@ def test_neighbours_on_one_lane_are_those_of_the_positions(tmp_path: Path, simul
     assert seen > 500
 
 
-def test_commands_are_carried_out_exactly_where_it_is_safe_and_allowed(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_commands_are_carried_out_exactly_where_it_is_safe_and_allowed(tmp_path: Path, simulation: Simulation) -> None:
     one = '<vehicle id="v" type="van" route="along" depart="0" departPos="10" departSpeed="5"/>'
-    scenario = scenario_of(straight(tmp_path, one), cav_share=1.0, horizon=300)
+    scenario = scenario_of(straight(tmp_path, one), penetration_rate=1.0, horizon=300)
     (trajectory,) = run_episode(scenario, Constant(0.7), (0,), simulation=simulation).trajectories
     expected = np.minimum(5.0 + 0.07 * np.arange(301), 20.0)
     np.testing.assert_allclose(trajectory.states.speed, expected, atol=1e-9)
-    assert not (trajectory.shield > 1e-9).any()
+    assert not (trajectory.shield_braking > 1e-9).any()
 
 
-def test_a_command_holds_for_its_step_whatever_the_configuration_says(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_a_command_holds_for_its_step_whatever_the_configuration_says(tmp_path: Path, simulation: Simulation) -> None:
     one = '<vehicle id="v" type="car" route="along" depart="0" departPos="10" departSpeed="5"/>'
     file = straight(tmp_path, one)
     file.write_text(file.read_text().replace("<end ", '<default.action-step-length value="1"/><end '))
-    scenario = scenario_of(file, cav_share=1.0, horizon=100)
+    scenario = scenario_of(file, penetration_rate=1.0, horizon=100)
     (trajectory,) = run_episode(scenario, Constant(0.7), (0,), simulation=simulation).trajectories
     np.testing.assert_allclose(np.diff(trajectory.states.speed), 0.07, atol=1e-9)
 
@@ -254,30 +239,26 @@ def test_a_heavy_vehicle_stays_so_as_a_cav(tmp_path: Path) -> None:
     file = straight(tmp_path, one)
     demand = tmp_path / "demand.rou.xml"
     demand.write_text(demand.read_text().replace('id="van"', 'id="van" mass="3000"'))
-    scenario = scenario_of(file, cav_share=1.0)
-    traffic = files_of(scenario, scenario.draw(np.random.default_rng(0))).traffic
+    scenario = scenario_of(file, penetration_rate=1.0)
+    traffic = sumo_inputs(scenario, scenario.draw(np.random.default_rng(0))).traffic_xml
     assert 'mass="3000"' in traffic
 
 
 def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, simulation: Simulation) -> None:
-    scenario = scenario_of(straight(tmp_path, COLUMN), cav_share=1.0, horizon=4000)
+    scenario = scenario_of(straight(tmp_path, COLUMN), penetration_rate=1.0, horizon=4000)
     episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
     assert episode.status == "completed"
-    assert episode.steps < 1500
-    assert (episode.arrived, len(episode.trajectories)) == (5, 5)
+    assert episode.control_steps < 1500
+    assert (episode.arrivals, len(episode.trajectories)) == (5, 5)
     assert not any(trajectory.terminated for trajectory in episode.trajectories)
 
 
 def test_flow_is_not_decided_by_who_arrives_last(tmp_path: Path, simulation: Simulation) -> None:
     vehicles = '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>'
-    scenario = make_scenario(str(straight(tmp_path, vehicles, 800.0, 120.0)), {"cav_share": 1.0})
-    one, other = (
-        run_episode(scenario, driver, (0,), simulation=simulation) for driver in (Human(), Constant(0.3))
-    )
-    assert other.steps != one.steps
-    assert (
-        measure(other)["throughput_veh_per_h"] == measure(one)["throughput_veh_per_h"] == 10 * 3600.0 / 120.0
-    )
+    scenario = make_scenario(str(straight(tmp_path, vehicles, 800.0, 120.0)), {"penetration_rate": 1.0})
+    one, other = (run_episode(scenario, driver, (0,), simulation=simulation) for driver in (Human(), Constant(0.3)))
+    assert other.control_steps != one.control_steps
+    assert measure(other)["outflow_veh_per_h"] == measure(one)["outflow_veh_per_h"] == 10 * 3600.0 / 120.0
 
 
 def test_who_waits_long_to_enter_is_not_forgotten(tmp_path: Path, simulation: Simulation) -> None:
@@ -285,15 +266,13 @@ def test_who_waits_long_to_enter_is_not_forgotten(tmp_path: Path, simulation: Si
     file = straight(tmp_path, vehicles)
     file.write_text(file.read_text().replace("<end ", '<max-depart-delay value="5"/><end '))
     episode = run_episode(scenario_of(file, horizon=350), Human(), (0,), simulation=simulation)
-    assert len(episode.vehicle_ids) + episode.waiting[-1] == 150
+    assert len(episode.vehicle_ids) + episode.backlog[-1] == 150
 
 
-def test_flows_without_an_end_go_on_until_the_end_that_is_asked_for(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_flows_without_an_end_go_on_until_the_end_that_is_asked_for(tmp_path: Path, simulation: Simulation) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" period="5"/>', end=30.0)
     asked = [{}, {"end": 100.0}, {"end": 100.0, "begin": 0.0}, {"horizon": 1000}]
-    roads = [make_scenario(str(file), {"cav_share": 0.5, **each}) for each in asked]
+    roads = [make_scenario(str(file), {"penetration_rate": 0.5, **each}) for each in asked]
     counts = [len(run_episode(road, Human(), (0,), simulation=simulation).vehicle_ids) for road in roads]
     assert counts[0] < 8
     assert counts[1:] == [counts[1]] * 3
@@ -306,11 +285,11 @@ def test_people_who_touch_people_are_counted_once_each_and_end_nothing(
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     told = iter([["f.0", "f.1"], ["f.0", "f.1"], ["f.1", "f.2"]])
     monkeypatch.setattr(simulation, "colliding", lambda: next(told, []))
-    episode = run_episode(scenario_of(file, cav_share=0.2, horizon=300), IDM(), (0,), simulation=simulation)
+    episode = run_episode(scenario_of(file, penetration_rate=0.2, horizon=300), IDM(), (0,), simulation=simulation)
     row = measure(episode)
     assert not {"f.0", "f.1", "f.2"} & set(episode.cav_ids)
     assert (episode.status, row["collisions"]) == ("completed", 3.0)
-    assert "contact" not in drivable(row)
+    assert "contact" not in feasibility(row)
 
 
 def test_an_episode_is_measured_without_complaint(file: Path, simulation: Simulation) -> None:
@@ -318,35 +297,31 @@ def test_an_episode_is_measured_without_complaint(file: Path, simulation: Simula
         warnings.simplefilter("error")
         for horizon in (2, 200):
             found = run_episode(
-                scenario_of(file, cav_share=0.9, horizon=horizon),
+                scenario_of(file, penetration_rate=0.9, horizon=horizon),
                 Human(),
                 (0,),
-                full=True,
+                record_details=True,
                 simulation=simulation,
             )
             row = measure(found)
     assert 0 < row["mean_speed"] < 40
-    assert row["throughput_veh_per_h"] == pytest.approx(found.arrived / (200 * found.step) * 3600)
+    assert row["outflow_veh_per_h"] == pytest.approx(found.arrivals / (200 * found.control_step) * 3600)
     assert 0.2 < row["speed_limit_ratio"] < 1.2
     assert row["fuel_ml_per_km"] > 20
 
 
-def test_lanes_count_from_the_left_and_are_those_that_sumo_says(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_lanes_count_from_the_left_and_are_those_that_sumo_says(tmp_path: Path, simulation: Simulation) -> None:
     traffic = own(simulation, game(tmp_path, "ramp"))
     for _ in range(60):
-        traffic.advance(Command(np.zeros(len(traffic.cavs))))
+        traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
     here = {
-        name: libsumo.edge.getLaneNumber(libsumo.vehicle.getRoadID(name))
-        - 1
-        - libsumo.vehicle.getLaneIndex(name)
+        name: libsumo.edge.getLaneNumber(libsumo.vehicle.getRoadID(name)) - 1 - libsumo.vehicle.getLaneIndex(name)
         for name in libsumo.vehicle.getIDList()
     }
-    episode = traffic.record(Driven())
+    episode = traffic.record(DriverLog())
     column, seen = {name: number for number, name in enumerate(episode.vehicle_ids)}, set()
     for name, from_left in here.items():
-        lane = episode.lanes[-1, column[name]]
+        lane = episode.lane_indices[-1, column[name]]
         assert np.isnan(lane) == np.isnan(episode.positions[-1, column[name]]), "lanes of the route alone"
         if not np.isnan(lane):
             assert lane == from_left
@@ -356,16 +331,16 @@ def test_lanes_count_from_the_left_and_are_those_that_sumo_says(
 
 
 def test_positions_are_along_the_route_that_most_drive(file: Path, simulation: Simulation) -> None:
-    episode = run_episode(scenario_of(file), Human(), (0,), full=True, simulation=simulation)
+    episode = run_episode(scenario_of(file), Human(), (0,), record_details=True, simulation=simulation)
     assert np.isnan(run_episode(scenario_of(file), Human(), (0,), simulation=simulation).positions).all()
     there = ~np.isnan(episode.positions)
     assert there.sum() > 300
     assert not (there & np.isnan(episode.speeds)).any()
     forward = np.diff(episode.positions, axis=0)
     assert np.nanmin(forward) > -1e-6
-    assert np.isfinite(episode.places[~np.isnan(episode.speeds)]).all()
+    assert np.isfinite(episode.poses[~np.isnan(episode.speeds)]).all()
     # On the route, distance driven is distance along it, but for the ways across junctions.
-    step = episode.speeds[1:] * episode.step
+    step = episode.speeds[1:] * episode.control_step
     close = np.abs(forward - step)[there[1:] & there[:-1]]
     assert np.mean(close < 1e-3) > 0.6
 
@@ -381,8 +356,8 @@ def test_a_warmup_runs_before_the_first_decision(file: Path, simulation: Simulat
 
 def test_a_vehicle_that_sumo_refuses_later_is_told_in_one_line(tmp_path: Path) -> None:
     late = COLUMN + '<vehicle id="v" type="ghost" route="along" depart="300"/>'
-    scenario = scenario_of(straight(tmp_path, late, end=1000.0), cav_share=1.0, horizon=5000)
-    with Workers(1) as workers, pytest.raises(RefusedError, match="ghost") as refused:
+    scenario = scenario_of(straight(tmp_path, late, end=1000.0), penetration_rate=1.0, horizon=5000)
+    with WorkerPool(1) as workers, pytest.raises(SumoInputError, match="ghost") as refused:
         workers.run([EpisodeTask(scenario, IDM(), (0,))])
     assert "\n" not in str(refused.value)
 
@@ -393,12 +368,12 @@ def test_what_sumo_refuses_on_the_way_is_told_in_one_line(tmp_path: Path) -> Non
     late += '<trip id="v" type="car" from="road" to="road" depart="700" departPos="nowhere"/>'
     file = straight(tmp_path, late, end=1000.0)
     file.write_text(file.read_text().replace('value="0.1"', 'value="1"'))
-    task = EpisodeTask(scenario_of(file, cav_share=0.5, horizon=1000), IDM(), (0,))
+    task = EpisodeTask(scenario_of(file, penetration_rate=0.5, horizon=1000), IDM(), (0,))
     words = "^SUMO cannot go on: Invalid departPos definition for trip 'v'"
-    with Workers(1) as workers, pytest.raises(RefusedError, match=words) as refused:
+    with WorkerPool(1) as workers, pytest.raises(SumoInputError, match=words) as refused:
         workers.run([task])
     assert "\n" not in str(refused.value)
-    with pytest.raises(RefusedError, match=words):
+    with pytest.raises(SumoInputError, match=words):
         run_episode(task.scenario, task.driver, task.seed)
 
 
@@ -407,32 +382,30 @@ def test_what_sumo_says_before_it_has_a_log_is_told(tmp_path: Path) -> None:
     demand = tmp_path / "demand.rou.xml"
     demand.write_text(demand.read_text().replace('id="van"', 'id="van" emissionClass="PHEMlight5/none"'))
     words = "emissionClass with name 'PHEMlight5/none' doesn't exist"
-    with Workers(1) as workers, pytest.raises(RefusedError, match=words):
-        workers.run([EpisodeTask(scenario_of(file, cav_share=1.0, horizon=5), IDM(), (0,))])
+    with WorkerPool(1) as workers, pytest.raises(SumoInputError, match=words):
+        workers.run([EpisodeTask(scenario_of(file, penetration_rate=1.0, horizon=5), IDM(), (0,))])
 
 
-def test_of_a_network_that_is_made_again_pictures_show_the_new_one(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_of_a_network_that_is_made_again_pictures_show_the_new_one(tmp_path: Path, simulation: Simulation) -> None:
     for length in (500.0, 800.0):
-        scenario = scenario_of(straight(tmp_path, COLUMN, length), cav_share=1.0, horizon=5)
-        episode = run_episode(scenario, IDM(), (0,), simulation=simulation, full=True)
-        assert np.nanmax(episode.lines) == length
+        scenario = scenario_of(straight(tmp_path, COLUMN, length), penetration_rate=1.0, horizon=5)
+        episode = run_episode(scenario, IDM(), (0,), simulation=simulation, record_details=True)
+        assert np.nanmax(episode.lane_lines) == length
 
 
 def test_nothing_is_written_into_the_users_folder(tmp_path: Path) -> None:
-    scenario = scenario_of(straight(tmp_path, COLUMN), cav_share=1.0, horizon=20)
+    scenario = scenario_of(straight(tmp_path, COLUMN), penetration_rate=1.0, horizon=20)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with Workers(1) as workers:
-        (episode,) = workers.run([EpisodeTask(scenario, IDM(), (0,), full=True)])
-    assert episode.ok
+    with WorkerPool(1) as workers:
+        (episode,) = workers.run([EpisodeTask(scenario, IDM(), (0,), record_details=True)])
+    assert episode.has_run
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_network_that_breaks_later_fails_its_episode_and_nothing_else(tmp_path: Path) -> None:
-    scenario = scenario_of(straight(tmp_path, COLUMN), cav_share=1.0, horizon=20)
+    scenario = scenario_of(straight(tmp_path, COLUMN), penetration_rate=1.0, horizon=20)
     whole = (tmp_path / "road.net.xml").read_text()
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         task = EpisodeTask(scenario, IDM(), (0,))
         (tmp_path / "road.net.xml").write_text("<net><edge/></net>")  # on this one SUMO itself would crash
         (broken,) = workers.run([task])
@@ -452,7 +425,7 @@ def test_who_drives_fast_stops_behind_who_stands_beyond_what_drivers_see(
     file = straight(tmp_path, stands + fast, end=50, speed=45)
     road = scenario_of(
         file,
-        cav_share=0.0,
+        penetration_rate=0.0,
         cav_types=("car",),
         horizon=480,
         actuation="raw",
@@ -463,4 +436,4 @@ def test_who_drives_fast_stops_behind_who_stands_beyond_what_drivers_see(
     fastest = max(each.states.speed.max() for each in episode.trajectories)
     assert fastest > 36.0, "from there nobody stops within 100 m"
     assert episode.status == "completed"
-    assert episode.audit.cavs.hardest <= 6.0 + 1e-6
+    assert episode.audit.cav_braking.max_braking <= 6.0 + 1e-6

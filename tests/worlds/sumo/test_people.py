@@ -7,13 +7,10 @@ from unjam.drivers.car_following import Human
 from unjam.drivers.network import Network
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
 from unjam.scenarios import make_scenario
-from unjam.scenarios.population import Population, as_calibrated, write_population
+from unjam.scenarios.population import Population, apply_population, write_population
 from unjam.worlds.episode import run_episode
 
-DRIVERS = (
-    IDMParameters(time_headway=0.9),
-    IDMParameters(time_headway=1.3, max_acceleration=1.4, minimum_gap=3.0),
-)
+DRIVERS = (IDMParameters(time_headway=0.9), IDMParameters(time_headway=1.3, max_acceleration=1.4, minimum_gap=3.0))
 QUARTER = Network(((np.zeros((3, 1)), np.array([np.arctanh(0.5)])),), 0.5)
 """a residual of a quarter m/s2, whatever it sees"""
 
@@ -27,8 +24,8 @@ def population(folder: Path, residual: Network | None = None) -> str:
 def test_limits_and_residual_change_an_idm() -> None:
     seen = np.array([5.0, 5.0]), np.array([4.0, 0.0]), np.array([10.0, 0.5])
     acceleration = idm_acceleration(*seen)
-    assert as_calibrated(None, acceleration, *seen) is acceleration
-    found = as_calibrated(Population(PAPER_IDM, DRIVERS, (-4.0, 2.0), QUARTER), acceleration, *seen)
+    assert apply_population(None, acceleration, *seen) is acceleration
+    found = apply_population(Population(PAPER_IDM, DRIVERS, (-4.0, 2.0), QUARTER), acceleration, *seen)
     np.testing.assert_allclose(found, [acceleration[0] + 0.25, -4.0])
 
 
@@ -36,20 +33,13 @@ def test_limits_and_residual_change_an_idm() -> None:
 def test_each_person_on_the_ring_drives_by_its_own_parameters(tmp_path: Path, human_control: str) -> None:
     file = population(tmp_path)
     scenario = make_scenario(
-        "ring",
-        {
-            "population": file,
-            "human_control": human_control,
-            "noise": 0.0,
-            "horizon": 300,
-            "length": (300, 300),
-        },
+        "ring", {"population": file, "human_control": human_control, "noise": 0.0, "horizon": 300, "length": (300, 300)}
     )
     road = scenario.draw(np.random.default_rng(0))
-    assert set(road.people.values()) == set(DRIVERS)
+    assert set(road.human_parameters.values()) == set(DRIVERS)
     episode = run_episode(scenario, Human(), (3,))
-    assert episode.ok
-    acceleration = np.diff(episode.speeds, axis=0)[200:] / episode.step
+    assert episode.has_run
+    acceleration = np.diff(episode.speeds, axis=0)[200:] / episode.control_step
     speeds, gaps = episode.speeds[200:-1], episode.gaps[200:-1]
     # Who drives what is drawn: it is told from how they drive.
     wanted = [idm_acceleration(speeds, np.roll(speeds, -1, 1), gaps, one) for one in DRIVERS]

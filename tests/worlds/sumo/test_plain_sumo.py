@@ -53,7 +53,7 @@ def random_network(folder: Path, seed: int, lanes: int, junctions: str, period: 
 def trips_of_plain_sumo(path: Path, seed: int, end: float) -> Trips:
     """Return the trips of `sumo -c` itself; it ends a step later, as unjam's first step only inserts."""
     out = path.with_name("plain.xml")
-    step = make_scenario(str(path), {"cav_share": 0.2}).simulation_step
+    step = make_scenario(str(path), {"penetration_rate": 0.2}).simulation_step
     command = [sumo_program("sumo"), "-c", str(path), "--seed", str(seed), "--end", str(end + step)]
     subprocess.run([*command, *trip_options(out)], check=True, capture_output=True, cwd=path.parent)
     return read_trips(out, CLASSES, 0.0)
@@ -61,7 +61,7 @@ def trips_of_plain_sumo(path: Path, seed: int, end: float) -> Trips:
 
 def human_baseline(path: Path, simulation: Simulation, **changes: float) -> tuple[Episode, int]:
     """Return the human baseline, and the seed that SUMO had."""
-    scenario = make_scenario(str(path), {"cav_share": 0.2, **changes})
+    scenario = make_scenario(str(path), {"penetration_rate": 0.2, **changes})
     seeds = []
     original = simulation.load
 
@@ -114,9 +114,7 @@ def test_the_human_baseline_has_the_trips_of_plain_sumo(
     check_same_trips(episode.trips, plain)
 
 
-def test_the_human_baseline_of_a_motorway_has_the_trips_of_plain_sumo(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_the_human_baseline_of_a_motorway_has_the_trips_of_plain_sumo(tmp_path: Path, simulation: Simulation) -> None:
     path = game(tmp_path, "ramp")
     episode, sumo_seed = human_baseline(path, simulation, end=60.0)
     check_same_trips(episode.trips, trips_of_plain_sumo(path, sumo_seed, 60.0))
@@ -139,15 +137,9 @@ def test_flows_without_an_end_of_their_own_bring_as_many_vehicles_as_in_plain_su
 
 def test_trips_of_any_type_have_its_class(tmp_path: Path, simulation: Simulation) -> None:
     vehicles = "".join(
-        f'<vType id="{kind}" vClass="{name}"/>'
-        f'<vehicle id="{kind}-v@1" type="{kind}" route="along" depart="{n}"/>'
+        f'<vType id="{kind}" vClass="{name}"/><vehicle id="{kind}-v@1" type="{kind}" route="along" depart="{n}"/>'
         for n, (kind, name) in enumerate(
-            {
-                "a@b": "passenger",
-                "bus": "passenger",
-                "bus_of_driver_a": "bus",
-                "x_of_driver_3": "truck",
-            }.items()
+            {"a@b": "passenger", "bus": "passenger", "bus_of_driver_a": "bus", "x_of_driver_3": "truck"}.items()
         )
     )
     episode, _ = human_baseline(straight(tmp_path, vehicles, step=0.5), simulation)
@@ -161,9 +153,7 @@ def test_a_type_cannot_keep_its_vehicles_out_of_the_trips(tmp_path: Path, simula
     assert episode.trips.vehicle_ids == ("v",)
 
 
-def test_delay_and_travel_time_by_vehicle_class_are_those_of_the_trips(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_delay_and_travel_time_by_vehicle_class_are_those_of_the_trips(tmp_path: Path, simulation: Simulation) -> None:
     vehicles = '<vType id="lorry" vClass="truck" maxSpeed="8" speedDev="0"/>'
     vehicles += '<vehicle id="slow" type="lorry" route="along" depart="0" departSpeed="max"/>'
     vehicles += '<vehicle id="fast" type="car" route="along" depart="4" departSpeed="max"/>'

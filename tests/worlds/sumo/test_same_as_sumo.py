@@ -49,9 +49,7 @@ def speeds_of_sumo(file: Path, seed: int) -> Speeds:
     command = [sumo_program("sumo"), "-c", str(file), "--seed", str(seed), "--fcd-output", str(written)]
     subprocess.run([*command, "--precision", "6", "--no-warnings"], check=True, capture_output=True)
     return {
-        float(step.attrib["time"]): {
-            each.attrib["id"]: float(each.attrib["speed"]) for each in step.iter("vehicle")
-        }
+        float(step.attrib["time"]): {each.attrib["id"]: float(each.attrib["speed"]) for each in step.iter("vehicle")}
         for step in ElementTree.parse(written).getroot()
     }
 
@@ -61,12 +59,12 @@ def assert_same(file: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPa
     seeds, load = list[int](), simulation.load
     with monkeypatch.context() as patch:
         patch.setattr(simulation, "load", lambda *given: (seeds.append(given[2]), load(*given)))
-        road = make_scenario(str(file), {"cav_share": 0.3, "cav_classes": ["passenger", "bus"]})
+        road = make_scenario(str(file), {"penetration_rate": 0.3, "cav_classes": ["passenger", "bus"]})
         episode = run_episode(road, Human(), (0,), simulation=simulation)
     expected = speeds_of_sumo(file, seeds[0])
     begin, compared = min(expected), 0
     for time, there in expected.items():
-        row = round((time - begin) / episode.step)
+        row = round((time - begin) / episode.control_step)
         if row < len(episode.speeds):
             found = dict(zip(episode.vehicle_ids, episode.speeds[row], strict=True))
             found = {name: speed for name, speed in found.items() if not np.isnan(speed)}
@@ -161,7 +159,7 @@ FORMS: dict[str, tuple[Files, str]] = {
         {
             "r.xml": f'<routes>{TYPE}<vType id="slow" maxSpeed="7"/><vTypeDistribution id="mix">'
             '<vType refId="car" probability="0.5"/><vType refId="slow" probability="0.5"/>'
-            f"</vTypeDistribution>{ROUTE}{FLOW.replace('car', 'mix')}</routes>",
+            f"</vTypeDistribution>{ROUTE}{FLOW.replace('car', 'mix')}</routes>"
         },
         '<route-files value="r.xml"/>',
     ),
@@ -169,7 +167,7 @@ FORMS: dict[str, tuple[Files, str]] = {
         {
             "r.xml": f"<routes>{TYPE}"
             '<routeDistribution id="short"><route id="1" edges="ab bc" probability="1"/>'
-            f'<route id="2" edges="ab bd dc" probability="2"/></routeDistribution>{FLOW}</routes>',
+            f'<route id="2" edges="ab bd dc" probability="2"/></routeDistribution>{FLOW}</routes>'
         },
         '<route-files value="r.xml"/>',
     ),
@@ -257,12 +255,8 @@ def test_a_changed_file_that_another_includes_is_copied_anew(
     assert before != after
 
 
-def test_an_episode_without_any_vehicle_is_no_result(
-    network: str, tmp_path: Path, simulation: Simulation
-) -> None:
+def test_an_episode_without_any_vehicle_is_no_result(network: str, tmp_path: Path, simulation: Simulation) -> None:
     files: Files = {"r.xml": f"<routes>{TYPE}{ROUTE}{FLOW.replace('90', '9')}</routes>"}
     path = write(tmp_path, network, files, '<route-files value="r.xml"/><begin value="20"/>')
-    with pytest.raises(
-        InputError, match="no vehicle entered before 60 s; the first departs at 0 s; use --begin 0"
-    ):
-        run_episode(make_scenario(str(path), {"cav_share": 0.3}), Human(), (0,), simulation=simulation)
+    with pytest.raises(InputError, match="no vehicle entered before 60 s; the first departs at 0 s; use --begin 0"):
+        run_episode(make_scenario(str(path), {"penetration_rate": 0.3}), Human(), (0,), simulation=simulation)

@@ -12,15 +12,15 @@ from tests.worlds.sumo.own_roads import grid, straight
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState
 from unjam.drivers.road_experts import Cruise, JamAhead
-from unjam.drivers.roadside import Roadside
+from unjam.drivers.roadside import RoadsideSettings
 from unjam.scenarios import make_scenario
-from unjam.studies.harm_roads import HARM_ROADS, write_road
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.networks import NetworkLane
-from unjam.worlds.sumo.own import OwnTraffic
-from unjam.worlds.sumo.sections import NOWHERE, LaneSections
+from unjam.worlds.sumo.sections import NO_SECTION, LaneSections
 from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.user_network import UserNetworkTraffic
+from unjam_paper.open_test_roads import OPEN_TEST_ROADS, write_road_files
 
 LANES = [
     NetworkLane("a_0", "a", 250.0, 20.0, ("b_0", "ramp_0")),
@@ -46,26 +46,24 @@ def sections() -> LaneSections:
 def numbered(sections: LaneSections) -> dict[int, str]:
     """The lane of each section."""
     cells = [lane for lane in LANES for _ in range(int(np.ceil(lane.length / 100)))]
-    assert len(cells) == len(sections.allowed)
-    return {number: lane.name for number, lane in enumerate(cells)} | {NOWHERE: ""}
+    assert len(cells) == len(sections.speed_limits)
+    return {number: lane.name for number, lane in enumerate(cells)} | {NO_SECTION: ""}
 
 
-def test_vehicles_are_counted_in_the_sections_of_their_lanes_and_not_in_junctions(
-    sections: LaneSections,
-) -> None:
+def test_vehicles_are_counted_in_the_sections_of_their_lanes_and_not_in_junctions(sections: LaneSections) -> None:
     places = [("a_0", 0.0), ("a_0", 99.0), ("a_0", 100.0), ("b_1", 330.0), (":node_0", 3.0), ("", 0.0)]
     counts, speed_sums = sections.measure(places, np.array([4.0, 6.0, 9.0, 2.0, 1.0, 1.0]))
     assert counts.tolist() == [2.0, 1.0, *[0.0] * 11, 1.0, 0.0]
     assert speed_sums.tolist() == [10.0, 9.0, *[0.0] * 11, 2.0, 0.0]
-    assert sections.allowed.tolist() == [*[20.0] * 6, *[25.0] * 8, 10.0]
+    assert sections.speed_limits.tolist() == [*[20.0] * 6, *[25.0] * 8, 10.0]
 
 
 def test_the_sections_ahead_follow_the_lanes_that_lead_along_the_route(sections: LaneSections) -> None:
     names = numbered(sections)
-    ahead = sections.ahead("a_1", 20.0, ("a", "b"))
+    ahead = sections.sections_ahead("a_1", 20.0, ("a", "b"))
     assert [names[each] for each in ahead] == ["a_1"] * 2 + ["b_1"] * 4 + [""] * (SECTIONS_AHEAD - 6)
     assert len(set(ahead)) == 7
-    assert [names[each] for each in sections.ahead("a_0", 240.0, ("a", "ramp"))][:3] == ["a_0", "ramp_0", ""]
+    assert [names[each] for each in sections.sections_ahead("a_0", 240.0, ("a", "ramp"))][:3] == ["a_0", "ramp_0", ""]
 
 
 def test_the_lanes_of_an_edge_share_their_cross_sections(sections: LaneSections) -> None:
@@ -74,12 +72,9 @@ def test_the_lanes_of_an_edge_share_their_cross_sections(sections: LaneSections)
 
 def monitored(length: float, *, stop_line: bool) -> list[bool]:
     """Of two lanes of 600 m and of a `length`, one after the other: which sections are monitored."""
-    lanes = [
-        NetworkLane("a_0", "a", 600.0, 20.0, ("b_0",)),
-        NetworkLane("b_0", "b", length, 20.0, (), stop_line),
-    ]
+    lanes = [NetworkLane("a_0", "a", 600.0, 20.0, ("b_0",)), NetworkLane("b_0", "b", length, 20.0, (), stop_line)]
     simulation: Any = SimpleNamespace(lanes=lambda: lanes)
-    return LaneSections(simulation).monitored.tolist()
+    return LaneSections(simulation).is_monitored.tolist()
 
 
 def test_before_a_stop_line_no_congestion_is_reported_as_far_as_its_queue_may_reach() -> None:
@@ -97,20 +92,20 @@ def test_of_a_section_too_short_for_a_mean_no_congestion_is_reported() -> None:
 def test_queues_at_signals_and_at_right_of_way_are_no_congestion(
     kind: str, tmp_path: Path, simulation: Simulation
 ) -> None:
-    scenario = make_scenario(str(grid(tmp_path, kind)), {"cav_share": 0.3})
+    scenario = make_scenario(str(grid(tmp_path, kind)), {"penetration_rate": 0.3})
     make_traffic(scenario, (1,), simulation)
-    assert not LaneSections(simulation).monitored.any()
+    assert not LaneSections(simulation).is_monitored.any()
 
 
 def test_a_motorway_is_monitored_where_ramps_join_and_leave(tmp_path: Path, simulation: Simulation) -> None:
-    file = write_road(HARM_ROADS["on-ramp with reserve"], tmp_path)
-    make_traffic(make_scenario(str(file), {"cav_share": 0.1}), (1,), simulation)
-    assert LaneSections(simulation).monitored.mean() > 0.95, "all but pieces of a few meters"
+    file = write_road_files(OPEN_TEST_ROADS["on-ramp with reserve"], tmp_path)
+    make_traffic(make_scenario(str(file), {"penetration_rate": 0.1}), (1,), simulation)
+    assert LaneSections(simulation).is_monitored.mean() > 0.95, "all but pieces of a few meters"
 
 
 def test_who_must_change_lanes_is_told_of_the_lane_beside(sections: LaneSections) -> None:
     names = numbered(sections)
-    assert [names[each] for each in sections.ahead("a_1", 240.0, ("a", "ramp"))][:2] == ["a_1", "ramp_0"]
+    assert [names[each] for each in sections.sections_ahead("a_1", 240.0, ("a", "ramp"))][:2] == ["a_1", "ramp_0"]
 
 
 @pytest.fixture
@@ -119,11 +114,11 @@ def jammed(tmp_path: Path) -> Any:
     return make_scenario(str(straight(tmp_path, JAM)), changes)
 
 
-def told(scenario: Any, simulation: Simulation) -> tuple[OwnTraffic, Any]:
-    traffic = make_traffic(scenario, (1,), simulation, asked=JamAhead().asks)
-    assert isinstance(traffic, OwnTraffic)
-    traffic.start(controlled=True)
-    return traffic, traffic.perceive()
+def told(scenario: Any, simulation: Simulation) -> tuple[UserNetworkTraffic, Any]:
+    traffic = make_traffic(scenario, (1,), simulation, measured_fields=JamAhead().measured_fields)
+    assert isinstance(traffic, UserNetworkTraffic)
+    traffic.start(is_controlled=True)
+    return traffic, traffic.local_state()
 
 
 def test_a_cav_is_told_how_fast_its_lane_is_ahead(jammed: Any, simulation: Simulation) -> None:
@@ -131,20 +126,20 @@ def test_a_cav_is_told_how_fast_its_lane_is_ahead(jammed: Any, simulation: Simul
     own, van, other = simulation.speeds(["0", "1", "2"])
     expected = [own, 20.0, 20.0, 20.0, (van + other) / 2, *[20.0] * 6]
     assert state.lane_speeds[0].tolist() == pytest.approx(expected)
-    assert (state.allowed_speed[0], state.cav_share[0]) == (20.0, pytest.approx(1 / 3))
+    assert (state.allowed_speed[0], state.penetration_rate[0]) == (20.0, pytest.approx(1 / 3))
     assert state.leader_gap[0] == 100.0, "nobody is near: only the message tells of the jam"
 
 
 def test_who_is_held_back_knows_what_is_allowed_all_the_same(jammed: Any, simulation: Simulation) -> None:
     traffic, _ = told(jammed, simulation)
-    simulation.set_fastest("0", 6.0)
-    assert traffic._states(["0"]).allowed_speed.tolist() == [20.0]
+    simulation.set_max_speed("0", 6.0)
+    assert traffic._local_states(["0"]).allowed_speed.tolist() == [20.0]
 
 
 def test_who_does_not_ask_is_told_nothing(jammed: Any, simulation: Simulation) -> None:
     traffic = make_traffic(jammed, (1,), simulation)
-    traffic.start(controlled=True)
-    assert traffic.perceive().lane_speeds is None
+    traffic.start(is_controlled=True)
+    assert traffic.local_state().lane_speeds is None
 
 
 def test_a_function_of_ones_own_is_told_too(jammed: Any, simulation: Simulation) -> None:
@@ -171,7 +166,7 @@ def test_a_cav_slows_down_for_congestion_that_it_cannot_see(tmp_path: Path, simu
     scenario = make_scenario(str(straight(tmp_path, QUEUE, 2500.0, 500.0)), changes)
     careful, free = (
         run_episode(scenario, driver, (1,), simulation=simulation).trajectories[0].states
-        for driver in (JamAhead(first=4, last=4, margin=0.0, margin_by_share=0.0), Cruise())
+        for driver in (JamAhead(first_section=4, last_section=4, speed_margin=0.0, margin_by_penetration=0.0), Cruise())
     )
     slowest, of_acc = (states.speed[10:][states.leader_gap[10:] == 100.0].min() for states in (careful, free))
     assert careful.congestion.max() == 1.0
@@ -182,13 +177,13 @@ def test_a_cav_slows_down_for_congestion_that_it_cannot_see(tmp_path: Path, simu
 def test_an_episode_that_begins_in_a_jam_holds_no_cav_back(jammed: Any, simulation: Simulation) -> None:
     first, second = (
         run_episode(jammed, driver, (1,), simulation=simulation).trajectories[0].states
-        for driver in (JamAhead(first=4, last=4, margin=0.0, margin_by_share=0.0), Cruise())
+        for driver in (JamAhead(first_section=4, last_section=4, speed_margin=0.0, margin_by_penetration=0.0), Cruise())
     )
     assert first.speed.tolist() == second.speed.tolist()
 
 
 def test_a_message_of_ones_own_road_is_late_as_asked(jammed: Any, simulation: Simulation) -> None:
-    traffic, first = told(replace(jammed, roadside=Roadside(age=2.0)), simulation)
+    traffic, first = told(replace(jammed, roadside=RoadsideSettings(latency=2.0)), simulation)
     for _ in range(10):
         traffic.advance(Command(np.zeros(1)))
-    assert traffic.perceive().lane_speeds.tolist() == first.lane_speeds.tolist()
+    assert traffic.local_state().lane_speeds.tolist() == first.lane_speeds.tolist()

@@ -14,7 +14,7 @@ from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.road import Connection
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.files import Files, files_of
+from unjam.worlds.sumo.inputs import SumoInputs, sumo_inputs
 from unjam.worlds.sumo.networks import network_file
 from unjam.worlds.sumo.simulation import Backend, Simulation
 
@@ -22,9 +22,9 @@ RING = Ring(horizon=100, length=(230, 230))
 
 
 @pytest.fixture
-def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Files:
+def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SumoInputs:
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path))
-    return files_of(RING, RING.draw(np.random.default_rng(0)))
+    return sumo_inputs(RING, RING.draw(np.random.default_rng(0)))
 
 
 def test_a_second_simulation_in_one_process_is_refused(simulation: Simulation) -> None:
@@ -44,7 +44,7 @@ def test_simulations_over_traci_run_beside_it_without_disturbing_it(simulation: 
     with Simulation("traci") as first, Simulation("traci") as second:
         traffics = [make_traffic(RING, (0,), each) for each in (simulation, first, second)]
         for traffic in traffics:
-            traffic.start(controlled=False)
+            traffic.start(is_controlled=False)
         for _ in range(50):
             for traffic in traffics:
                 traffic.advance(None)
@@ -53,7 +53,7 @@ def test_simulations_over_traci_run_beside_it_without_disturbing_it(simulation: 
     np.testing.assert_array_equal(again.speeds, expected.speeds)
 
 
-def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: Files) -> None:
+def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: SumoInputs) -> None:
     first = Simulation()
     first.load(road, 0.1, 0)
     first.close()
@@ -71,7 +71,7 @@ def test_one_that_never_ran_can_be_closed() -> None:
     Simulation().close()
 
 
-def test_closing_removes_its_files(road: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_removes_its_files(road: SumoInputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with Simulation() as simulation:
         simulation.load(road, 0.1, 0)
@@ -79,7 +79,7 @@ def test_closing_removes_its_files(road: Files, tmp_path: Path, monkeypatch: pyt
     assert not list(tmp_path.glob("unjam-*"))
 
 
-def test_an_error_inside_the_block_closes_it(road: Files) -> None:
+def test_an_error_inside_the_block_closes_it(road: SumoInputs) -> None:
     def fail() -> None:
         with Simulation() as simulation:
             simulation.load(road, 0.1, 0)
@@ -90,13 +90,13 @@ def test_an_error_inside_the_block_closes_it(road: Files) -> None:
     Simulation().close()
 
 
-def test_loading_puts_every_vehicle_in_its_place_at_rest(road: Files, simulation: Simulation) -> None:
+def test_loading_puts_every_vehicle_in_its_place_at_rest(road: SumoInputs, simulation: Simulation) -> None:
     simulation.load(road, 0.1, 0)
     assert simulation.vehicle_count() == 22
     ids = RING.draw(np.random.default_rng(0)).vehicle_ids
     assert simulation.speeds(ids) == [0.0] * 22
     assert simulation.distances(ids) == [0.0] * 22
-    assert not simulation.colliding()
+    assert not simulation.colliding_vehicles()
 
 
 BROKEN_TRAFFIC = {
@@ -112,7 +112,7 @@ BROKEN_TRAFFIC = {
 @pytest.mark.parametrize("loaded_before", [False, True])
 @pytest.mark.parametrize(("traffic", "words"), BROKEN_TRAFFIC.items())
 def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
-    loaded_before: bool, traffic: str, words: str, road: Files, simulation: Simulation
+    loaded_before: bool, traffic: str, words: str, road: SumoInputs, simulation: Simulation
 ) -> None:
     if loaded_before:
         simulation.load(road, 0.1, 0)
@@ -122,7 +122,7 @@ def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_sumos_own_words_come_from_the_child_process_too(road: Files) -> None:
+def test_sumos_own_words_come_from_the_child_process_too(road: SumoInputs) -> None:
     for traffic, words in list(BROKEN_TRAFFIC.items())[:2]:
         with Simulation("traci") as simulation, pytest.raises(EpisodeError) as caught:
             simulation.load(road._replace(traffic=traffic), 0.1, 0)
@@ -138,7 +138,7 @@ BROKEN_ROADS = {
 
 @pytest.mark.parametrize(("change", "words"), BROKEN_ROADS.items())
 def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
-    change: tuple[str, Any], words: str, road: Files
+    change: tuple[str, Any], words: str, road: SumoInputs
 ) -> None:
     with pytest.raises(EpisodeError) as caught:
         network_file(replace(RING.draw(np.random.default_rng(0)).network, **dict([change])))
@@ -146,7 +146,7 @@ def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: Files, simulation: Simulation) -> None:
+def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: SumoInputs, simulation: Simulation) -> None:
     for traffic, words in BROKEN_TRAFFIC.items():
         with pytest.raises(EpisodeError) as caught:
             simulation.load(road._replace(traffic=traffic), 0.1, 0)
@@ -155,7 +155,7 @@ def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: Files, simul
 
 
 @pytest.mark.parametrize("backend", ["libsumo", pytest.param("traci", marks=pytest.mark.slow)])
-def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: Backend, road: Files) -> None:
+def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: Backend, road: SumoInputs) -> None:
     expected = run_episode(RING, IDM(), (0,))
     first, second, *_ = BROKEN_TRAFFIC
     with Simulation(backend) as simulation:
@@ -176,7 +176,7 @@ def test_libsumo_and_traci_give_identical_episodes() -> None:
     found = []
     for backend in ("libsumo", "traci"):
         with Simulation(backend) as simulation:
-            episode = run_episode(RING, PISaturation(), (5,), full=True, simulation=simulation)
+            episode = run_episode(RING, PISaturation(), (5,), record_details=True, simulation=simulation)
         found.append(fingerprint(episode))
     assert found[0] == found[1]
 
@@ -204,7 +204,7 @@ def broken(folder: Path, network: str, vehicles: str) -> Path:
 def test_what_sumo_refuses_of_the_users_own_network_is_told_in_one_line_and_the_next_episode_runs(
     network: str, vehicles: str, words: str, tmp_path: Path, simulation: Simulation
 ) -> None:
-    scenario = make_scenario(str(broken(tmp_path, network, vehicles)), {"cav_share": 1.0})
+    scenario = make_scenario(str(broken(tmp_path, network, vehicles)), {"penetration_rate": 1.0})
     with pytest.raises(EpisodeError, match=words) as caught:
         run_episode(scenario, IDM(), (0,), simulation=simulation)
     assert caught.value.exit_code == 2
@@ -212,7 +212,7 @@ def test_what_sumo_refuses_of_the_users_own_network_is_told_in_one_line_and_the_
     assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
 
 
-def test_over_traci_sumo_is_reached_from_this_machine_alone_once_we_are_there(road: Files) -> None:
+def test_over_traci_sumo_is_reached_from_this_machine_alone_once_we_are_there(road: SumoInputs) -> None:
     """SUMO has no option to listen on loopback alone: it must stop to listen once its one client is there."""
     with Simulation("traci") as simulation:
         simulation.load(road, 0.1, 1)

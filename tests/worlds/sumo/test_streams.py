@@ -12,9 +12,9 @@ from unjam.drivers.command import Command
 from unjam.errors import EpisodeError
 from unjam.scenarios import Merge
 from unjam.scenarios.road import Origin
-from unjam.scenarios.scenario import SMALLEST_CAV_GAP
+from unjam.scenarios.scenario import MIN_CAV_GAP
 from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.merging import FAR, MergingTraffic, Streams
+from unjam.worlds.sumo.merge_road import ABSENT_LEADER_GAP, MergingStreams, MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
 
 WAYS = (24.0, 23.0)
@@ -56,10 +56,10 @@ def drive(vehicles: list[Vehicle], wanted: list[float], step: float) -> None:
         vehicle.position += vehicle.speed * step
 
 
-def same(streams: Streams, vehicles: list[Vehicle]) -> None:
+def same(streams: MergingStreams, vehicles: list[Vehicle]) -> None:
     by_name = {vehicle.name: vehicle for vehicle in vehicles}
     assert sorted(streams.names) == sorted(by_name)
-    leaders, states, on_junction = streams.leaders(), streams.states(), streams.on_junction(WAYS)
+    leaders, states, on_junction = streams.leaders(), streams.states(), streams.is_on_junction(WAYS)
     gaps = streams.gaps(leaders)
     for row, name in enumerate(streams.names):
         own = by_name[name]
@@ -67,12 +67,12 @@ def same(streams: Streams, vehicles: list[Vehicle]) -> None:
         assert streams.speeds[row] == own.speed
         leader, follower = leader_of(own, vehicles), follower_of(own, vehicles)
         assert (streams.names[leaders[row]] if leaders[row] >= 0 else None) == (leader and leader.name)
-        gap = FAR if leader is None else leader.position - own.position - 5.0
+        gap = ABSENT_LEADER_GAP if leader is None else leader.position - own.position - 5.0
         assert gaps[row] == pytest.approx(gap, abs=1e-9)
         near = leader is not None and gap < 100.0
         assert states.leader_gap[row] == pytest.approx(gap if near else 100.0, abs=1e-9)
         assert states.leader_speed[row] == (leader.speed if leader and near else own.speed)
-        gap = FAR if follower is None else own.position - follower.position - 5.0
+        gap = ABSENT_LEADER_GAP if follower is None else own.position - follower.position - 5.0
         near = follower is not None and gap < 100.0
         assert states.follower_gap[row] == pytest.approx(gap if near else 100.0, abs=1e-9)
         assert states.follower_speed[row] == (follower.speed if follower and near else own.speed)
@@ -82,7 +82,7 @@ def same(streams: Streams, vehicles: list[Vehicle]) -> None:
 
 @given(st.data())
 def test_order_and_neighbours_are_those_of_a_plain_search(data: st.DataObject) -> None:
-    streams, vehicles, step = Streams(), [], 1.0
+    streams, vehicles, step = MergingStreams(), [], 1.0
     speeds = st.floats(0.0, 30.0).map(lambda speed: round(speed, 3))
     for number in range(data.draw(st.integers(1, 14), "moments")):
         front = sorted((each for each in vehicles if each.position >= 100), key=lambda each: -each.position)
@@ -101,9 +101,9 @@ def test_order_and_neighbours_are_those_of_a_plain_search(data: st.DataObject) -
         same(streams, vehicles)
 
 
-def standing(*positions: tuple[int, float]) -> Streams:
+def standing(*positions: tuple[int, float]) -> MergingStreams:
     """Vehicles `a`, `b`, ... on (branch, position)."""
-    streams = Streams()
+    streams = MergingStreams()
     for name, (branch, position) in zip("abcdef", positions, strict=False):
         streams.enter(name, Origin(branch, position), 0.0)
     return streams
@@ -113,7 +113,7 @@ def test_of_two_that_cross_in_one_step_the_one_further_ahead_leads() -> None:
     streams = standing((0, -6.0), (1, -0.5))
     streams.move([30.5, 32.0], 0.2)  # to 0.1 and 5.9
     assert streams.names == ["b", "a"]
-    assert streams.gaps(streams.leaders()).tolist() == pytest.approx([FAR, 0.8])
+    assert streams.gaps(streams.leaders()).tolist() == pytest.approx([ABSENT_LEADER_GAP, 0.8])
 
 
 def test_the_first_of_both_ways_follow_the_last_beyond_the_meeting_place() -> None:
@@ -134,10 +134,10 @@ def test_who_enters_beyond_the_meeting_place_is_there() -> None:
 
 
 def test_an_empty_road_has_nobody_on_it() -> None:
-    streams = Streams()
+    streams = MergingStreams()
     streams.move([], 0.2)
     assert {values.shape for values in streams.states() if values is not None} == {(0,)}
-    assert streams.on_junction(WAYS).shape == (0,)
+    assert streams.is_on_junction(WAYS).shape == (0,)
 
 
 def test_who_leaves_from_behind_another_is_an_error() -> None:
@@ -157,7 +157,7 @@ def test_positions_are_where_sumo_has_the_vehicles(simulation: Simulation) -> No
     traffic = merging(simulation)
     compared = 0
     for _ in range(60):
-        traffic.advance(Command(np.zeros(len(traffic.cavs))))
+        traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
         streams = traffic._streams
         assert sorted(streams.names) == sorted(libsumo.vehicle.getIDList())
         for name, position in zip(streams.names, streams.positions, strict=True):
@@ -178,7 +178,7 @@ def test_leaders_on_the_same_lane_are_those_of_sumo(simulation: Simulation) -> N
     traffic = merging(simulation)
     compared = 0
     for _ in range(100):
-        traffic.advance(Command(np.zeros(len(traffic.cavs))))
+        traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
         streams = traffic._streams
         leaders = streams.leaders()
         gaps = streams.gaps(leaders)
@@ -187,14 +187,14 @@ def test_leaders_on_the_same_lane_are_those_of_sumo(simulation: Simulation) -> N
             if not found or libsumo.vehicle.getLaneID(found[0]) != libsumo.vehicle.getLaneID(name):
                 continue
             assert streams.names[leaders[row]] == found[0]
-            kept = SMALLEST_CAV_GAP if name in traffic.cavs else 2.5
+            kept = MIN_CAV_GAP if name in traffic.cav_ids else 2.5
             assert gaps[row] == pytest.approx(found[1] + kept, abs=1e-6)
             compared += 1
     assert compared > 1500
 
 
 def merging(simulation: Simulation) -> MergingTraffic:
-    traffic = make_traffic(Merge(cav_share=0.3), (3,), simulation)
+    traffic = make_traffic(Merge(penetration_rate=0.3), (3,), simulation)
     assert isinstance(traffic, MergingTraffic)
-    traffic.start(controlled=True)
+    traffic.start(is_controlled=True)
     return traffic

@@ -22,12 +22,12 @@ NONE = '<collision.action value="none"/>'
 
 
 def human(file: Path, simulation: Simulation, share: float = 0.5) -> Episode:
-    return run_episode(make_scenario(str(file), {"cav_share": share}), Human(), (0,), simulation=simulation)
+    return run_episode(make_scenario(str(file), {"penetration_rate": share}), Human(), (0,), simulation=simulation)
 
 
 def trips_of_plain_sumo(file: Path) -> tuple[int, int, float]:
     """How many vehicles enter and arrive in plain SUMO with the seed of episode 0, and their seconds."""
-    _, seeds = make_scenario(str(file), {"cav_share": 0.5}).of_seed((0,))
+    _, seeds = make_scenario(str(file), {"penetration_rate": 0.5}).draw_from_seed((0,))
     seed = int(seeds[2].generate_state(1)[0]) % 2**31
     command = [sumo_program("sumo"), "-c", file.name, "--seed", str(seed), "--tripinfo-output", "trips.xml"]
     command += ["--tripinfo-output.write-unfinished", "true", "--no-warnings"]
@@ -39,8 +39,8 @@ def trips_of_plain_sumo(file: Path) -> tuple[int, int, float]:
 
 def trips_of(episode: Episode) -> tuple[int, int, float]:
     """The same of an episode; who is on the road at the last moment has not driven on from there."""
-    seconds = float((~np.isnan(episode.speeds[:-1])).sum() * episode.step)
-    return len(episode.vehicle_ids), episode.arrived, seconds
+    seconds = float((~np.isnan(episode.speeds[:-1])).sum() * episode.control_step)
+    return len(episode.vehicle_ids), episode.arrivals, seconds
 
 
 def standing(folder: Path, configuration: str = "") -> Path:
@@ -60,29 +60,23 @@ def test_human_only_traffic_is_that_of_plain_sumo_whatever_the_penetration_rate(
     assert few.status == every.status == "completed"
     assert trips_of(few) == trips_of(every) == trips_of_plain_sumo(file)
     assert few.vehicle_ids == every.vehicle_ids
-    assert np.array_equal(
-        np.sort(few.speeds), np.sort(every.speeds)[:, : few.speeds.shape[1]], equal_nan=True
-    )
+    assert np.array_equal(np.sort(few.speeds), np.sort(every.speeds)[:, : few.speeds.shape[1]], equal_nan=True)
     assert few.collisions == every.collisions
     assert (few.collisions > 0) == (network is two_way)
 
 
 @pytest.mark.long
-def test_junctions_are_checked_where_the_configuration_asks_for_it(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_junctions_are_checked_where_the_configuration_asks_for_it(tmp_path: Path, simulation: Simulation) -> None:
     episode = human(crossing(tmp_path, WARN + '<collision.check-junctions value="true"/>'), simulation)
     assert episode.status == "completed"
     assert episode.collisions > 0
 
 
-def test_vehicles_that_are_removed_after_a_collision_have_not_arrived(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_vehicles_that_are_removed_after_a_collision_have_not_arrived(tmp_path: Path, simulation: Simulation) -> None:
     episode = human(two_way(tmp_path, '<collision.action value="remove"/>'), simulation)
     still_there = int((~np.isnan(episode.speeds[-1])).sum())
     assert episode.teleports == episode.collisions > 0
-    assert episode.arrived == len(episode.vehicle_ids) - still_there - episode.teleports
+    assert episode.arrivals == len(episode.vehicle_ids) - still_there - episode.teleports
 
 
 @pytest.mark.parametrize("settings", ["", WARN, NONE])
@@ -99,7 +93,7 @@ def test_a_cav_in_a_collision_ends_the_episode_also_where_sumo_counts_none(
     episode = run_episode(make_scenario(str(file), changes), Constant(0.5), (0,), simulation=simulation)
     assert episode.status == "collision"
     assert episode.collisions == 2
-    assert episode.steps < 300
+    assert episode.control_steps < 300
     people = run_episode(make_scenario(str(file), changes), Human(), (0,), simulation=simulation)
     assert (people.status, people.collisions) == ("completed", 0)
 
@@ -114,14 +108,11 @@ def test_as_many_teleports_as_the_configuration_allows_are_the_last(
         assert (episode.status, episode.reason) == ("completed", "")
         return
     assert episode.teleports == most + 1
-    assert (episode.status, episode.reason) == (
-        "teleports",
-        f"more than {most} teleports (max-num-teleports)",
-    )
-    assert episode.steps < 240
+    assert (episode.status, episode.reason) == ("teleports", f"more than {most} teleports (max-num-teleports)")
+    assert episode.control_steps < 240
     with pytest.raises(EpisodeError, match=f"more than {most} teleports .* of the all-human warm-up"):
         run_episode(
-            make_scenario(str(file), {"cav_share": 0.5, "warmup": 200, "horizon": 10}),
+            make_scenario(str(file), {"penetration_rate": 0.5, "warmup": 200, "horizon": 10}),
             *(Human(), (0,)),
             simulation=simulation,
         )

@@ -10,19 +10,17 @@ from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import SumoWarning
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.warnings_log import LARGEST_LOG, LONGEST_MESSAGE, kind_of, read_warnings
+from unjam.worlds.sumo.warnings_log import MAX_EXAMPLE_LENGTH, MAX_LOG_BYTES, read_warnings, warning_kind
 
 STOP = "Vehicle '%' performs emergency stop at lane '%', decel=%, time=%, stage=%."
 
 
 def stop(number: int) -> str:
-    return (
-        STOP.replace("'%'", f"'car.{number}'").replace("stage=%", "stage=move").replace("=%", f"={number}.50")
-    )
+    return STOP.replace("'%'", f"'car.{number}'").replace("stage=%", "stage=move").replace("=%", f"={number}.50")
 
 
 def test_messages_of_a_kind_differ_in_names_values_and_numbers_alone(tmp_path: Path) -> None:
-    assert kind_of(stop(1)) == kind_of(stop(20)) == STOP
+    assert warning_kind(stop(1)) == warning_kind(stop(20)) == STOP
     log = tmp_path / "error.log"
     log.write_text(f"Warning: {stop(1)}\nWarning: {stop(2)}\nError: No route\n  from 'a'\n")
     assert read_warnings(log) == (
@@ -45,9 +43,9 @@ def test_the_totals_that_sumo_writes_at_the_end_are_counts_of_examples(tmp_path:
 def test_what_is_read_of_a_log_is_bounded(tmp_path: Path) -> None:
     log = tmp_path / "error.log"
     log.write_text(f"Warning: {'long ' * 200}\n" + "".join(f"Warning: {stop(n)}\n" for n in range(40_000)))
-    assert log.stat().st_size > 2 * LARGEST_LOG
+    assert log.stat().st_size > 2 * MAX_LOG_BYTES
     long, many = read_warnings(log)
-    assert len(long.example) == LONGEST_MESSAGE
+    assert len(long.example) == MAX_EXAMPLE_LENGTH
     assert 5_000 < many.count < 20_000
 
 
@@ -63,7 +61,7 @@ def test_an_episode_has_the_warnings_of_its_own_and_of_no_other(backend: str, tm
     plain = straight(tmp_path / "sorted", UNSORTED[: UNSORTED.index('<flow id="c"')])
     with Simulation(backend) as simulation:  # pyright: ignore[reportArgumentType]
         found = [
-            run_episode(make_scenario(str(file), {"cav_share": 0.5}), Human(), (0,), simulation=simulation)
+            run_episode(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,), simulation=simulation)
             for file in (unsorted, plain, unsorted)
         ]
     assert [[each.example for each in episode.warnings] for episode in found] == [
@@ -76,7 +74,7 @@ def test_an_episode_has_the_warnings_of_its_own_and_of_no_other(backend: str, tm
 
 def test_teleports_are_counted_and_not_warned_of_again(tmp_path: Path, simulation: Simulation) -> None:
     file = straight(tmp_path, STANDING, end=90.0, step=0.5, options=TELEPORTS)
-    episode = run_episode(make_scenario(str(file), {"cav_share": 0.5}), Human(), (0,), simulation=simulation)
+    episode = run_episode(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,), simulation=simulation)
     assert episode.teleports > 0
     assert episode.warnings == ()
 
@@ -87,7 +85,7 @@ def test_teleports_are_counted_and_not_warned_of_again(tmp_path: Path, simulatio
         ("ring", {"horizon": 50}),
         ("figure-eight", {"horizon": 50}),
         ("merge", {"horizon": 30}),
-        ("on-ramp", {"horizon": 60, "cav_share": 0.3}),
+        ("on-ramp", {"horizon": 60, "penetration_rate": 0.3}),
     ],
 )
 def test_sumo_warns_of_nothing_on_the_built_in_roads(

@@ -7,28 +7,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.physics.arrays import Array, namespace
-from unjam.worlds.closed import NOISE_BLOCK
+from unjam.worlds.closed_road import NOISE_BLOCK_STEPS
 
-Numbers = Callable[[NDArray[np.float64]], Array]
+ArrayFactory = Callable[[NDArray[np.float64]], Array]
 """makes arrays of the kind and precision in which a batch is stepped"""
 
 
-class Noise(Protocol):
+class BatchNoise(Protocol):
     """Standard normal numbers for W worlds."""
 
-    def of_people(self) -> Array:
+    def human_noise(self) -> Array:
         """Return a number for each vehicle in this step, shape (vehicles, W)."""
         ...
 
-    def begin_anew(self) -> None:
+    def drop_block(self) -> None:
         """Drop what is left of a block: CAVs take over."""
         ...
 
-    def of_networks(self, decision: int) -> Array:
+    def exploration_noise(self, step_index: int) -> Array:
         """Return a number for each CAV, shape (CAVs * W,), for its network's exploration."""
         ...
 
-    def lasting(self, numbers: int) -> Array:
+    def episode_noise(self, count: int) -> Array:
         """Return so many numbers for each CAV, shape (CAVs * W, numbers): always those of its world."""
         ...
 
@@ -38,7 +38,7 @@ class NoiseState(NamedTuple):
 
     generator: Mapping[str, Any]
     """state of its bit generator"""
-    left: NDArray[np.float64]
+    remaining_block: NDArray[np.float64]
     """of the block that was drawn last, the next step at the end, shape (steps, vehicles)"""
 
 
@@ -48,57 +48,59 @@ class SeededNoise:
     def __init__(
         self,
         seeds: Sequence[Sequence[np.random.SeedSequence]],
-        vehicles: int,
-        decisions: tuple[int, int],
-        numbers: Numbers,
+        vehicle_count: int,
+        exploration_shape: tuple[int, int],
+        to_array: ArrayFactory,
     ) -> None:
-        """Take the seeds of each world, of `Scenario.of_seed`, and how many decisions of how many CAVs."""
-        self._people = [np.random.default_rng(noise) for noise, *_ in seeds]
-        self._networks = [exploration for _, exploration, *_ in seeds]
-        self._drawn = np.empty((len(seeds), NOISE_BLOCK, vehicles))
-        self._decisions, self._numbers = decisions, numbers
-        self._left: list[Array] = []
+        """Take the seeds of each world, of `Scenario.draw_from_seed`, and how many decisions of how many CAVs."""
+        self._human_generators = [np.random.default_rng(noise) for noise, *_ in seeds]
+        self._exploration_seeds = [exploration for _, exploration, *_ in seeds]
+        self._block = np.empty((len(seeds), NOISE_BLOCK_STEPS, vehicle_count))
+        self._exploration_shape, self._to_array = exploration_shape, to_array
+        self._remaining_steps: list[Array] = []
         self._exploration: Array = None
 
-    def of_people(self) -> Array:
+    def human_noise(self) -> Array:
         """Return a number for each vehicle in this step, shape (vehicles, W)."""
-        if not self._left:
-            for generator, place in zip(self._people, self._drawn, strict=True):
+        if not self._remaining_steps:
+            for generator, place in zip(self._human_generators, self._block, strict=True):
                 generator.standard_normal(out=place)
-            block = np.ascontiguousarray(self._drawn.transpose(1, 2, 0))
-            self._left = list(self._numbers(block))[::-1]
-        return self._left.pop()
+            block = np.ascontiguousarray(self._block.transpose(1, 2, 0))
+            self._remaining_steps = list(self._to_array(block))[::-1]
+        return self._remaining_steps.pop()
 
     def states(self) -> list[NoiseState]:
         """Return where each world's noise is, NumPy arrays."""
-        left = np.array(self._left).reshape(-1, *self._drawn.shape[2:], len(self._people))
+        left = np.array(self._remaining_steps).reshape(-1, *self._block.shape[2:], len(self._human_generators))
         return [
             NoiseState(generator.bit_generator.state, left[:, :, world].copy())
-            for world, generator in enumerate(self._people)
+            for world, generator in enumerate(self._human_generators)
         ]
 
-    def go_on(self, states: Sequence[NoiseState]) -> None:
+    def restore(self, states: Sequence[NoiseState]) -> None:
         """Go on from where each world's noise was; all must have as much left."""
-        for generator, state in zip(self._people, states, strict=True):
+        for generator, state in zip(self._human_generators, states, strict=True):
             generator.bit_generator.state = dict(state.generator)
-        self._left = list(self._numbers(np.stack([state.left for state in states], 2)))
+        self._remaining_steps = list(self._to_array(np.stack([state.remaining_block for state in states], 2)))
 
-    def begin_anew(self) -> None:
+    def drop_block(self) -> None:
         """Drop what is left of a block."""
-        self._left = []
+        self._remaining_steps = []
 
-    def of_networks(self, decision: int) -> Array:
+    def exploration_noise(self, step_index: int) -> Array:
         """Return a number for each CAV, shape (CAVs * W,)."""
         if self._exploration is None:
-            each = [np.random.default_rng(seed).standard_normal(self._decisions) for seed in self._networks]
-            self._exploration = self._numbers(np.stack(each, 2).reshape(len(each[0]), -1))
-        return self._exploration[decision]
+            each = [
+                np.random.default_rng(seed).standard_normal(self._exploration_shape) for seed in self._exploration_seeds
+            ]
+            self._exploration = self._to_array(np.stack(each, 2).reshape(len(each[0]), -1))
+        return self._exploration[step_index]
 
-    def lasting(self, numbers: int) -> Array:
+    def episode_noise(self, count: int) -> Array:
         """Return so many numbers for each CAV, shape (CAVs * W, numbers)."""
         if self._exploration is None:
-            each = [np.random.default_rng(seed).standard_normal(numbers) for seed in self._networks]
-            self._exploration = self._numbers(np.tile(each, (self._decisions[1], 1)))
+            each = [np.random.default_rng(seed).standard_normal(count) for seed in self._exploration_seeds]
+            self._exploration = self._to_array(np.tile(each, (self._exploration_shape[1], 1)))
         return self._exploration
 
 
@@ -106,39 +108,43 @@ class QuickNoise:
     """One generator for all worlds: other numbers than SUMO's episodes draw, of the same kind."""
 
     def __init__(
-        self, draw: Callable[[tuple[int, ...]], Array], vehicles: int, cavs: int, worlds: int
+        self, draw: Callable[[tuple[int, ...]], Array], vehicle_count: int, cav_count: int, world_count: int
     ) -> None:
         """Take what draws standard normal numbers of a shape."""
-        self._draw, self._people, self._networks = draw, (vehicles, worlds), (cavs * worlds,)
-        self._worlds, self._exploration = worlds, cast(Array, None)
+        self._draw, self._human_shape, self._exploration_shape = (
+            draw,
+            (vehicle_count, world_count),
+            (cav_count * world_count,),
+        )
+        self._world_count, self._exploration = world_count, cast(Array, None)
 
-    def of_people(self) -> Array:
+    def human_noise(self) -> Array:
         """Return a number for each vehicle in this step, shape (vehicles, W)."""
-        return self._draw(self._people)
+        return self._draw(self._human_shape)
 
-    def begin_anew(self) -> None:
+    def drop_block(self) -> None:
         """Do nothing: nothing is drawn ahead."""
 
-    def of_networks(self, decision: int) -> Array:
+    def exploration_noise(self, step_index: int) -> Array:
         """Return a number for each CAV, shape (CAVs * W,)."""
-        return self._draw(self._networks)
+        return self._draw(self._exploration_shape)
 
-    def lasting(self, numbers: int) -> Array:
+    def episode_noise(self, count: int) -> Array:
         """Return so many numbers for each CAV, shape (CAVs * W, numbers)."""
         if self._exploration is None:
-            each = self._draw((self._worlds, numbers))
-            self._exploration = namespace(each).tile(each, (self._networks[0] // self._worlds, 1))
+            each = self._draw((self._world_count, count))
+            self._exploration = namespace(each).tile(each, (self._exploration_shape[0] // self._world_count, 1))
         return self._exploration
 
 
-def noise_of(
+def make_noise(
     seeds: Sequence[Sequence[np.random.SeedSequence]],
-    vehicles: int,
-    decisions: tuple[int, int],
-    numbers: Numbers,
+    vehicle_count: int,
+    exploration_shape: tuple[int, int],
+    to_array: ArrayFactory,
     draw: Callable[[tuple[int, ...]], Array] | None,
-) -> Noise:
+) -> BatchNoise:
     """Return noise as SUMO's episodes draw it; where `draw` is given, quicker. Arguments as of both."""
     if draw is None:
-        return SeededNoise(seeds, vehicles, decisions, numbers)
-    return QuickNoise(draw, vehicles, decisions[1], len(seeds))
+        return SeededNoise(seeds, vehicle_count, exploration_shape, to_array)
+    return QuickNoise(draw, vehicle_count, exploration_shape[1], len(seeds))

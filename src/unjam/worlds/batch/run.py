@@ -8,41 +8,46 @@ import numpy as np
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.residual import AGE
-from unjam.drivers.wrappers import KIND, Mixed
+from unjam.drivers.residual import RESIDUAL_AGE_KEY
+from unjam.drivers.wrappers import DRIVER_INDEX_KEY, MixedDriver
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.scenarios.on_ramp import OnRamp
-from unjam.scenarios.ring import Loop
-from unjam.tree import mapped
-from unjam.worlds.batch.begun import Begun, BegunRings
-from unjam.worlds.batch.motorway_world import MotorwayBatch
-from unjam.worlds.batch.noise import Numbers
-from unjam.worlds.batch.possible import alike, check_together, statistical_why_not, why_not
-from unjam.worlds.batch.record import Rings
-from unjam.worlds.batch.world import RingBatch
-from unjam.worlds.drive import Drive, driven_to_the_end
-from unjam.worlds.episode import check_can_drive, check_cavs_drove, rewarded
+from unjam.scenarios.ring import LoopScenario
+from unjam.tree import map_leaves
+from unjam.worlds.batch.noise import ArrayFactory
+from unjam.worlds.batch.on_ramp.world import MotorwayBatch
+from unjam.worlds.batch.ring.record import RingResults
+from unjam.worlds.batch.ring.warm_up import WarmUpCache, WarmUpState
+from unjam.worlds.batch.ring.world import RingBatch
+from unjam.worlds.batch.support import (
+    check_batch_scenarios,
+    differ_only_in_size,
+    statistically_unsupported_reason,
+    unsupported_reason,
+)
+from unjam.worlds.drive import DriveLoop, finish_drive
+from unjam.worlds.episode import add_reward_terms, check_can_drive, check_has_cavs
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import make_reward
-from unjam.worlds.workers import EpisodeTask
+from unjam.worlds.worker_pool import EpisodeTask
 
-_Ring = tuple[Loop, tuple[int, ...], frozenset[str]]
+_WarmUpKey = tuple[LoopScenario, tuple[int, ...], frozenset[str]]
 """a ring, an episode's seed, and what of all that is told drivers ask for"""
-BEGUN = BegunRings[_Ring]()
-MOST = 128
+WARM_UP_CACHE = WarmUpCache[_WarmUpKey]()
+MAX_BATCH_ROADS = 128
 """rings that are stepped at once at most, where whole episodes are kept: some 130 MB for 22 vehicles each"""
-MOST_MOTORWAYS = 64
+MAX_BATCH_MOTORWAYS = 64
 """motorways, likewise: some 40 MB each"""
 
 
-def begin(
+def start_batch_drive(
     world: RingBatch,
     driver: Driver,
-    numbers: Numbers = np.asarray,
+    to_array: ArrayFactory = np.asarray,
     explore: float = 0.0,
     memory: Memory | None = None,
-) -> Drive:
+) -> DriveLoop:
     """Return a driver who has just begun in a batch, and remembers in its arrays.
 
     Args:
@@ -52,23 +57,23 @@ def begin(
         explore: by how much exploration noise of what was learned counts.
         memory: what the driver remembers already; None: nothing but what the world began with.
     """
-    world.asked = driver.asks
+    world.measured_fields = driver.measured_fields
     if memory is None:  # who drives which CAV of a ring does not depend on the other rings
         rings = len(world.roads)
-        each_ring = driver.initial_memory(world.rows // rings)
-        memory = mapped(lambda values: np.repeat(values, rings, axis=0), each_ring)
-    driving = Drive(world, driver, explore, memory)
-    driving.memory = mapped(numbers, driving.memory)
-    if driver.hold > 1 and AGE in driving.memory:
-        driving.memory[AGE] = 0.0  # all rows began together: no network is asked while residuals are held
+        each_ring = driver.initial_memory(world.cav_count // rings)
+        memory = map_leaves(lambda values: np.repeat(values, rings, axis=0), each_ring)
+    driving = DriveLoop(world, driver, explore, memory)
+    driving.memory = map_leaves(to_array, driving.memory)
+    if driver.action_repeat > 1 and RESIDUAL_AGE_KEY in driving.memory:
+        driving.memory[RESIDUAL_AGE_KEY] = 0.0  # all rows began together: no network is asked while residuals are held
     return driving
 
 
 def run_batch(
     tasks: Sequence[EpisodeTask],
-    numbers: Numbers = np.asarray,
-    coming: Sequence[EpisodeTask] = (),
-    statistical: bool = False,
+    to_array: ArrayFactory = np.asarray,
+    upcoming: Sequence[EpisodeTask] = (),
+    allow_statistical: bool = False,
 ) -> list[Episode]:
     """Return the episodes of tasks, as `run_episode` does in SUMO, but for rounding; all are stepped at once.
 
@@ -79,65 +84,67 @@ def run_batch(
         statistical: whether roads are allowed whose episodes are SUMO's in distribution alone.
 
     Raises:
-        InputError: the tasks differ in more, or `batch.possible.why_not` says why they cannot be run so.
+        InputError: the tasks differ in more, or `batch.possible.unsupported_reason` says why they cannot be run so.
     """
     first = tasks[0]
-    if any(_driven(each) != _driven(first) for each in tasks):
+    if any(_shared_settings(each) != _shared_settings(first) for each in tasks):
         raise InputError("batch: the tasks differ in driver, reward or exploration")
     earned = make_reward(first.reward or first.scenario.reward)
-    return [rewarded(episode, earned) for episode in _driven_at_once(tasks, numbers, coming, statistical)]
+    return [add_reward_terms(episode, earned) for episode in _run_at_once(tasks, to_array, upcoming, allow_statistical)]
 
 
-def _driven_at_once(
-    tasks: Sequence[EpisodeTask], numbers: Numbers, coming: Sequence[EpisodeTask], statistical: bool
+def _run_at_once(
+    tasks: Sequence[EpisodeTask], to_array: ArrayFactory, upcoming: Sequence[EpisodeTask], allow_statistical: bool
 ) -> Sequence[Episode]:
     """Return the episodes of tasks, without what was earned; arguments as of `run_batch`."""
     first = tasks[0]
     for task in tasks:
         check_can_drive(task.driver, task.scenario)
     if isinstance(first.scenario, OnRamp):
-        check_together([task.scenario for task in tasks], statistical)
-        if len(tasks) > 1 and any(_counts_cavs(task.driver) for task in tasks):  # those of its own road
-            return [each for task in tasks for each in _driven_at_once([task], numbers, (), statistical)]
+        check_batch_scenarios([task.scenario for task in tasks], allow_statistical)
+        if len(tasks) > 1 and any(_depends_on_entry_order(task.driver) for task in tasks):  # those of its own road
+            return [each for task in tasks for each in _run_at_once([task], to_array, (), allow_statistical)]
         explore = [task.explore for task in tasks]
         motorways = MotorwayBatch(first.scenario, [task.seed for task in tasks], explore=explore)
-        driver = _of_all(tasks, lambda owner: owner[motorways.of_road])
-        motorways.asked = driver.asks
-        episodes = driven_to_the_end(Drive(motorways, driver, float(any(explore))))
+        driver = _combined_driver(tasks, lambda owner: owner[motorways.cav_roads])
+        motorways.measured_fields = driver.measured_fields
+        episodes = finish_drive(DriveLoop(motorways, driver, float(any(explore))))
         for episode in episodes:
-            check_cavs_drove(episode, driver)
+            check_has_cavs(episode, driver)
         return episodes
-    scenarios, seeds = [cast(Loop, each.scenario) for each in tasks], [each.seed for each in tasks]
-    world = RingBatch(scenarios, seeds, numbers, first.reward, statistical=statistical)
+    scenarios, seeds = [cast(LoopScenario, each.scenario) for each in tasks], [each.seed for each in tasks]
+    world = RingBatch(scenarios, seeds, to_array, first.reward, allow_statistical=allow_statistical)
     if world.scenario.warmup > 0:
-        world.begun = BEGUN.of([_ring(task) for task in tasks], [_ring(task) for task in coming], _warm_up)
-    driver = _of_all(tasks, lambda owner: numbers(np.tile(owner, world.rows // len(owner))))
-    rings: Rings = driven_to_the_end(begin(world, driver, numbers, first.explore))
+        world.warm_up_states = WARM_UP_CACHE.get_states(
+            [_warm_up_key(task) for task in tasks], [_warm_up_key(task) for task in upcoming], _warm_up
+        )
+    driver = _combined_driver(tasks, lambda owner: to_array(np.tile(owner, world.cav_count // len(owner))))
+    rings: RingResults = finish_drive(start_batch_drive(world, driver, to_array, first.explore))
     return rings.episodes
 
 
 @dataclass(frozen=True)
-class PerRoad(Mixed):
+class DriverPerRoad(MixedDriver):
     """Drives each road of a batch by its own of several drivers."""
 
-    owner: Callable[[], Array]
+    driver_indices: Callable[[], Array]
     """returns which driver each CAV's road has, of all CAVs that are there now"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration that each CAV's driver wants, and the new memory."""
-        return super().act(state, memory | {KIND: self.owner()})
+        return super().act(state, memory | {DRIVER_INDEX_KEY: self.driver_indices()})
 
-    def time_headways(self, state: LocalState, memory: Memory) -> Array | None:
+    def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return for each CAV that of its driver."""
-        return super().time_headways(state, memory | {KIND: self.owner()})
+        return super().time_gaps(state, memory | {DRIVER_INDEX_KEY: self.driver_indices()})
 
 
-def _counts_cavs(driver: Driver) -> bool:
+def _depends_on_entry_order(driver: Driver) -> bool:
     """Return whether who drives a CAV depends on how many entered before it."""
-    return isinstance(driver, Mixed) or any(map(_counts_cavs, driver.inner.values()))
+    return isinstance(driver, MixedDriver) or any(map(_depends_on_entry_order, driver.inner_drivers.values()))
 
 
-def _of_all(tasks: Sequence[EpisodeTask], of_cavs: Callable[[Array], Array]) -> Driver:
+def _combined_driver(tasks: Sequence[EpisodeTask], to_cavs: Callable[[Array], Array]) -> Driver:
     """Return the driver of all tasks, or who drives each road by its own.
 
     `of_cavs` returns what it is given of each road, shape (W,), of each CAV that is there.
@@ -149,35 +156,35 @@ def _of_all(tasks: Sequence[EpisodeTask], of_cavs: Callable[[Array], Array]) -> 
     if len(drivers) == 1:
         return drivers[0]
     owner = np.array([drivers.index(task.driver) for task in tasks])
-    return PerRoad(tuple(drivers), lambda: of_cavs(owner))
+    return DriverPerRoad(tuple(drivers), lambda: to_cavs(owner))
 
 
-def _ring(task: EpisodeTask) -> _Ring:
-    return cast(Loop, task.scenario), task.seed, frozenset(task.driver.asks)
+def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
+    return cast(LoopScenario, task.scenario), task.seed, frozenset(task.driver.measured_fields)
 
 
-def _warm_up(rings: Sequence[_Ring]) -> dict[_Ring, Begun]:
+def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
     """Return rings after their warm-up, `MOST` at once."""
-    found: dict[_Ring, Begun] = {}
-    for some in (rings[first : first + MOST] for first in range(0, len(rings), MOST)):
+    found: dict[_WarmUpKey, WarmUpState] = {}
+    for some in (keys[first : first + MAX_BATCH_ROADS] for first in range(0, len(keys), MAX_BATCH_ROADS)):
         scenarios, seeds, (asked, *_) = zip(*some, strict=True)
-        world = RingBatch(scenarios, seeds, keep=False, statistical=True)
-        world.asked = asked
-        found |= zip(some, world.warmed_up(), strict=True)
+        world = RingBatch(scenarios, seeds, keep_record=False, allow_statistical=True)
+        world.measured_fields = asked
+        found |= zip(some, world.run_warm_up(), strict=True)
     return found
 
 
 def run_batches(
-    tasks: Sequence[EpisodeTask], coming: Sequence[EpisodeTask] = (), statistical: bool = False
+    tasks: Sequence[EpisodeTask], upcoming: Sequence[EpisodeTask] = (), allow_statistical: bool = False
 ) -> list[Episode]:
     """Return the episodes of tasks on roads of any kinds, in their order; those that are alike at once.
 
-    `coming` are tasks that will follow, of any kinds; see `run_batch`, of `statistical` too.
+    `is_approaching` are tasks that will follow, of any kinds; see `run_batch`, of `statistical` too.
     """
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
-        most = MOST_MOTORWAYS if isinstance(task.scenario, OnRamp) else MOST
-        fits = (batch for batch in batches if len(batch) < most and _alike(task, next(iter(batch.values()))))
+        most = MAX_BATCH_MOTORWAYS if isinstance(task.scenario, OnRamp) else MAX_BATCH_ROADS
+        fits = (batch for batch in batches if len(batch) < most and _can_share_batch(task, next(iter(batch.values()))))
         batch = next(fits, None)
         if batch is None:
             batches.append(batch := {})
@@ -185,38 +192,42 @@ def run_batches(
     found: dict[int, Episode] = {}
     for batch in batches:
         first = next(iter(batch.values()))
-        later = [task for task in coming if _alike(task, first)]
+        later = [task for task in upcoming if _can_share_batch(task, first)]
         found |= zip(
-            batch, run_batch(list(batch.values()), coming=later, statistical=statistical), strict=True
+            batch, run_batch(list(batch.values()), upcoming=later, allow_statistical=allow_statistical), strict=True
         )
     return [found[index] for index in range(len(tasks))]
 
 
-def run_where_possible(
+def run_batched_if_supported(
     tasks: Sequence[EpisodeTask],
-    run: Callable[[Sequence[EpisodeTask]], list[Episode]],
-    coming: Sequence[EpisodeTask] = (),
-    statistical: bool = False,
+    run_unsupported: Callable[[Sequence[EpisodeTask]], list[Episode]],
+    upcoming: Sequence[EpisodeTask] = (),
+    allow_statistical: bool = False,
 ) -> list[Episode]:
     """Return the episodes of tasks, in their order: in batches where that can be, else what `run` answers.
 
-    `coming` are tasks that will follow: see `run_batch`, of `statistical` too.
+    `is_approaching` are tasks that will follow: see `run_batch`, of `statistical` too.
     """
-    why_none = statistical_why_not if statistical else why_not
+    why_none = statistically_unsupported_reason if allow_statistical else unsupported_reason
     batched = [not why_none(task.scenario) for task in tasks]
     at_once = [task for task, possible in zip(tasks, batched, strict=True) if possible]
-    quick = iter(run_batches(at_once, coming, statistical))
+    quick = iter(run_batches(at_once, upcoming, allow_statistical))
     others = [task for task, possible in zip(tasks, batched, strict=True) if not possible]
-    slow = iter(run(others) if others else ())
+    slow = iter(run_unsupported(others) if others else ())
     return [next(quick if possible else slow) for possible in batched]
 
 
-def _driven(task: EpisodeTask) -> tuple[object, ...]:
+def _shared_settings(task: EpisodeTask) -> tuple[object, ...]:
     """Return in what tasks may not differ that are driven at once."""
-    alone = task.driver if task.driver.native or task.driver.shown is not None else None
+    alone = task.driver if task.driver.is_native or task.driver.network_inputs is not None else None
     return alone, task.reward, task.explore != 0.0 if isinstance(task.scenario, OnRamp) else task.explore
 
 
-def _alike(one: EpisodeTask, other: EpisodeTask) -> bool:
-    together = isinstance(one.scenario, OnRamp) or one.driver == other.driver
-    return together and _driven(one) == _driven(other) and alike(one.scenario, other.scenario)
+def _can_share_batch(first: EpisodeTask, second: EpisodeTask) -> bool:
+    together = isinstance(first.scenario, OnRamp) or first.driver == second.driver
+    return (
+        together
+        and _shared_settings(first) == _shared_settings(second)
+        and differ_only_in_size(first.scenario, second.scenario)
+    )

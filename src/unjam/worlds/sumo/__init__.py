@@ -3,20 +3,20 @@
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from unjam.scenarios.road import ClosedRoad, MergingRoad, MotorwayRoad, OwnRoad, Road
+from unjam.scenarios.road import ClosedRoad, MergeRoad, MotorwayRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.sumo.closed import ClosedTraffic
-from unjam.worlds.sumo.merging import MergingTraffic
+from unjam.worlds.sumo.closed_road import ClosedTraffic
+from unjam.worlds.sumo.merge_road import MergingTraffic
 from unjam.worlds.sumo.motorway import MotorwayTraffic
-from unjam.worlds.sumo.own import OwnTraffic
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import Seed, Traffic
+from unjam.worlds.sumo.traffic import SeedTree, Traffic
+from unjam.worlds.sumo.user_network import UserNetworkTraffic
 
-KINDS: dict[type[Road], Any] = {
+TRAFFIC_CLASSES: dict[type[Road], Any] = {
     ClosedRoad: ClosedTraffic,
-    MergingRoad: MergingTraffic,
+    MergeRoad: MergingTraffic,
     MotorwayRoad: MotorwayTraffic,
-    OwnRoad: OwnTraffic,
+    UserNetworkRoad: UserNetworkTraffic,
 }
 """the traffic of each kind of road"""
 
@@ -25,18 +25,18 @@ def make_traffic(
     scenario: Scenario,
     seed: Sequence[int],
     simulation: Simulation,
-    plain_numbers: bool = False,
-    full: bool = False,
-    asked: Collection[str] = (),
+    is_scalar: bool = False,
+    record_details: bool = False,
+    measured_fields: Collection[str] = (),
 ) -> Traffic:
     """Put the vehicles of `seed` on the road; nothing moves yet.
 
-    With `plain_numbers`, a single CAV on a closed road perceives and is driven in floats instead of arrays
-    of one row. With `full`, fuel is recorded, and on roads with ends where on the plane vehicles are. On a
+    With `accepts_floats`, a single CAV on a closed road perceives and is driven in floats instead of arrays
+    of one row. With `record_details`, fuel is recorded, and on roads with ends where on the plane vehicles are. On a
     network of the user's own CAVs are told of the road ahead where `asked` has that field of `LocalState`.
     """
-    road, seeds = scenario.of_seed(seed)
-    traffic = KINDS[type(road)](scenario, road, Seed(tuple(seed), seeds), simulation, full)
-    traffic.asked = asked
-    traffic.single = plain_numbers and isinstance(traffic, ClosedTraffic) and traffic.rows == 1
+    road, seeds = scenario.draw_from_seed(seed)
+    traffic = TRAFFIC_CLASSES[type(road)](scenario, road, SeedTree(tuple(seed), seeds), simulation, record_details)
+    traffic.asked = measured_fields
+    traffic.is_scalar = is_scalar and isinstance(traffic, ClosedTraffic) and traffic.cav_count == 1
     return traffic

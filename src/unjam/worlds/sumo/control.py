@@ -7,9 +7,9 @@ from unjam.scenarios.scenario import Actuation
 
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode bits for each way of actuation: bit 0 is the check for a safe speed."""
-WITHOUT_RIGHT_OF_WAY = 1
+SAFE_SPEED_BIT = 1
 """the bit that stays where vehicles need not obey the right of way: who is surprised stops as it must"""
-LIMITS_OF_ACCELERATION = 2 | 4
+ACCELERATION_LIMIT_BITS = 2 | 4
 """the bits by which vehicles keep to the acceleration and the braking of their type"""
 
 
@@ -19,7 +19,7 @@ class VehicleLimits(NamedTuple):
     acceleration: float
     deceleration: float
     """comfortable"""
-    braking: float
+    emergency_deceleration: float
     """hardest"""
 
 
@@ -28,14 +28,14 @@ class VehicleControl:
 
     _sumo: Any
 
-    def command_people(self, ids: Iterable[str], right_of_way: bool, bounded: bool) -> None:
+    def command_humans(self, ids: Iterable[str], right_of_way: bool, has_acceleration_limits: bool) -> None:
         """Let SUMO keep `ids` safe and to the right of way and, if `bounded`, to limits of acceleration."""
-        mode = SPEED_MODES["flow"] if right_of_way else SPEED_MODES["flow"] & WITHOUT_RIGHT_OF_WAY
-        mode |= LIMITS_OF_ACCELERATION if bounded else 0
+        mode = SPEED_MODES["flow"] if right_of_way else SPEED_MODES["flow"] & SAFE_SPEED_BIT
+        mode |= ACCELERATION_LIMIT_BITS if has_acceleration_limits else 0
         for name in ids:
             self._sumo.vehicle.setSpeedMode(name, mode)
 
-    def change_type(self, name: str, kind: str, is_changed_later: bool = False) -> None:
+    def change_type(self, name: str, kind: str, is_modified_later: bool = False) -> None:
         """Give a vehicle another type; its speed factor, which SUMO draws anew, stays its own.
 
         SUMO draws it once more when the first property of the vehicle itself is changed. If one
@@ -44,7 +44,7 @@ class VehicleControl:
         vehicle = self._sumo.vehicle
         factor = vehicle.getSpeedFactor(name)
         vehicle.setType(name, kind)
-        if is_changed_later:
+        if is_modified_later:
             vehicle.setMaxSpeed(name, vehicle.getMaxSpeed(name))
         vehicle.setSpeedFactor(name, factor)
 
@@ -57,20 +57,20 @@ class VehicleControl:
         types = self._sumo.vehicletype
         return VehicleLimits(types.getAccel(kind), types.getDecel(kind), types.getEmergencyDecel(kind))
 
-    def limit_braking(self, kind: str, most: float) -> None:
+    def limit_braking(self, kind: str, max_braking: float) -> None:
         """Let vehicles of a type brake with at most so much [m/s2]."""
         types = self._sumo.vehicletype
         for set_limit in (types.setDecel, types.setEmergencyDecel, types.setApparentDecel):
-            set_limit(kind, most)
+            set_limit(kind, max_braking)
 
     def take_control(
-        self, ids: Iterable[str], actuation: Actuation, right_of_way: bool = True, types: str = "cav"
+        self, ids: Iterable[str], actuation: Actuation, right_of_way: bool = True, type_template: str = "cav"
     ) -> None:
         """Make `ids` CAVs: from now on they obey `command_speeds`.
 
         Their type becomes `types`, in which `{}` stands for the type that they had.
         """
-        mode = SPEED_MODES[actuation] if right_of_way else SPEED_MODES[actuation] & WITHOUT_RIGHT_OF_WAY
+        mode = SPEED_MODES[actuation] if right_of_way else SPEED_MODES[actuation] & SAFE_SPEED_BIT
         for name in ids:
-            self.change_type(name, types.format(self.type_of(name)), actuation == "cruise")
+            self.change_type(name, type_template.format(self.type_of(name)), actuation == "cruise")
             self._sumo.vehicle.setSpeedMode(name, mode)

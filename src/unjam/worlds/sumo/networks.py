@@ -19,22 +19,22 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import platformdirs
 
-from unjam.errors import DISK_ERRNOS, DiskError, EpisodeError, MissingPartError, disk_error, wrong
-from unjam.files import is_leftover, make_folder, remove, write_whole
+from unjam.errors import DISK_ERRNOS, DiskError, EpisodeError, MissingPartError, disk_error, invalid_value
+from unjam.files import atomic_write, is_leftover, make_folder, remove
 from unjam.processes import PrivateFolder
 from unjam.scenarios.road import Connection, Edge, Node, RoadNetwork
-from unjam.sumo_files import read_lanes, stamp_of
+from unjam.sumo_files import file_stamp, read_lanes
 from unjam.worlds.record import Floats
 
-LONG_AGO = 3600.0
+STALE_FILE_SECONDS = 3600.0
 """seconds after which nobody makes a network any more"""
-TOTAL = "total messages of type:"
+MESSAGE_TOTAL_MARKER = "total messages of type:"
 """in the lines at the end of a log that count its messages"""
-Attributes = dict[str, Any]
+XMLAttributes = dict[str, Any]
 """of an XML element"""
-_whole: dict[Path, tuple[int, int]] = {}
+_intact_networks: dict[Path, tuple[int, int]] = {}
 """networks in the cache that this process has found whole, with their stamps"""
-FREE_LINKS = "MZ-"
+UNCONTROLLED_LINK_STATES = "MZ-"
 """states of connections that no vehicle waits at: with the right of way, a zipper merge, a dead end"""
 
 
@@ -44,8 +44,8 @@ class NetworkLane(NamedTuple):
     name: str
     edge: str
     length: float
-    speed: float
-    leads_to: tuple[str, ...]
+    speed_limit: float
+    successors: tuple[str, ...]
     """lanes of the next edges"""
     has_stop_line: bool = False
     """whether vehicles may have to wait at its end: at a signal, a stop sign, or to give way"""
@@ -79,18 +79,18 @@ def sumo_version() -> str:
         raise MissingPartError("libsumo is not installed; install it: pip install libsumo==1.28.0") from None
 
 
-def sumo_words(lines: Iterable[str]) -> str:
+def sumo_message(lines: Iterable[str]) -> str:
     """Return what one of SUMO's programs says of an error, as one line."""
     return "; ".join(said for line in lines if (said := line.strip()) and said != "Quitting (on error).")
 
 
-def said_in(log: Path) -> str:
+def last_error_message(log_path: Path) -> str:
     """Return SUMO's own words about its last error: they are in its log, behind warnings."""
     try:
-        lines = [line for line in log.read_text(errors="replace").splitlines() if TOTAL not in line]
+        lines = [line for line in log_path.read_text(errors="replace").splitlines() if MESSAGE_TOTAL_MARKER not in line]
     except OSError:
         return ""
-    return sumo_words(dropwhile(lambda line: not line.lstrip().startswith("Error"), lines))
+    return sumo_message(dropwhile(lambda line: not line.lstrip().startswith("Error"), lines))
 
 
 def network_file(network: RoadNetwork) -> Path:
@@ -100,44 +100,44 @@ def network_file(network: RoadNetwork) -> Path:
         MissingPartError: netconvert is missing.
         DiskError: the cache cannot be written.
     """
-    edges = (_edge(edge, network.speed) for edge in network.edges)
+    edges = (_edge_attributes(edge, network.speed_limit) for edge in network.edges)
     files = {
-        ("--node-files", "road.nod.xml"): document("nodes", "node", map(_node, network.nodes)),
-        ("--edge-files", "road.edg.xml"): document("edges", "edge", edges),
+        ("--node-files", "road.nod.xml"): xml_document("nodes", "node", map(_node_attributes, network.nodes)),
+        ("--edge-files", "road.edg.xml"): xml_document("edges", "edge", edges),
     }
     if network.connections:
-        pairs = map(_connection, network.connections)
-        files["--connection-files", "road.con.xml"] = document("connections", "connection", pairs)
-    options = ["--no-turnarounds", "true", *([] if network.links else ["--no-internal-links", "true"])]
+        pairs = map(_connection_attributes, network.connections)
+        files["--connection-files", "road.con.xml"] = xml_document("connections", "connection", pairs)
+    options = ["--no-turnarounds", "true", *([] if network.has_internal_links else ["--no-internal-links", "true"])]
     content = "\n".join([sumo_version(), *options, *files.values()])
     name = hashlib.sha256(content.encode()).hexdigest()[:24]
     target = cache_folder() / "networks" / f"{name}.net.xml"
-    if is_as_made(target):
+    if is_intact(target):
         return target
     make_folder(target.parent)
     for left in filter(is_leftover, target.parent.glob(".*")):  # of processes that were killed
         with suppress(FileNotFoundError, DiskError):  # another process has just removed it
-            if time.time() - left.lstat().st_mtime > LONG_AGO:
+            if time.time() - left.lstat().st_mtime > STALE_FILE_SECONDS:
                 remove(left)
     try:
         with PrivateFolder() as folder:
-            made = netconvert(files, options, Path(folder)).read_bytes()
+            made = run_netconvert(files, options, Path(folder)).read_bytes()
     except OSError as error:
         raise (disk_error(error, "a temporary file") if error.errno in DISK_ERRNOS else error) from None
-    write_whole(target, made + seal(made))  # whole or not at all, also with several workers at it
+    atomic_write(target, made + checksum_line(made))  # whole or not at all, also with several workers at it
     return target
 
 
-class _Shape(NamedTuple):
+class _NetworkGeometry(NamedTuple):
     """What pictures and services want to know of a network file."""
 
-    lines: Floats
-    lengths: dict[str, float]
-    lanes: dict[str, int]
+    lane_lines: Floats
+    edge_lengths: dict[str, float]
+    lane_counts: dict[str, int]
 
 
 @lru_cache(8)
-def _shape_of(path: Path, stamp: tuple[int, int]) -> _Shape:
+def _network_geometry(path: Path, stamp: tuple[int, int]) -> _NetworkGeometry:
     """Return the shape of a network file; read again where another one has taken its place."""
     lanes = read_lanes(path)
     rows: list[tuple[float, float]] = []
@@ -145,53 +145,53 @@ def _shape_of(path: Path, stamp: tuple[int, int]) -> _Shape:
         rows += [*points, (float("nan"), float("nan"))]
     lines = np.array(rows, np.float64).reshape(-1, 2)
     lengths = {edge: length for edge, length, _ in lanes}
-    return _Shape(lines, lengths, dict(Counter(edge for edge, _, _ in lanes)))
+    return _NetworkGeometry(lines, lengths, dict(Counter(edge for edge, _, _ in lanes)))
 
 
-def network_lines(path: Path) -> Floats:
+def lane_center_lines(path: Path) -> Floats:
     """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
-    return _shape_of(path, stamp_of(path)).lines
+    return _network_geometry(path, file_stamp(path)).lane_lines
 
 
 def edge_lengths(path: Path) -> dict[str, float]:
     """Return the length of each edge [m]."""
-    return _shape_of(path, stamp_of(path)).lengths
+    return _network_geometry(path, file_stamp(path)).edge_lengths
 
 
 def lane_counts(path: Path) -> dict[str, int]:
     """Return how many lanes each edge has."""
-    return _shape_of(path, stamp_of(path)).lanes
+    return _network_geometry(path, file_stamp(path)).lane_counts
 
 
-def _node(node: Node) -> Attributes:
-    kind = "priority" if node.priority else None
+def _node_attributes(node: Node) -> XMLAttributes:
+    kind = "priority" if node.has_priority else None
     return {"id": node.name, "x": f"{node.x:.6f}", "y": f"{node.y:.6f}", "type": kind, "radius": node.radius}
 
 
-def _connection(connection: Connection) -> Attributes:
-    ends = {"from": connection.before, "to": connection.after}
-    return {**ends, "fromLane": connection.lane, "toLane": connection.lane_after}
+def _connection_attributes(connection: Connection) -> XMLAttributes:
+    ends = {"from": connection.from_edge, "to": connection.to_edge}
+    return {**ends, "fromLane": connection.from_lane, "toLane": connection.to_lane}
 
 
-def _edge(edge: Edge, speed: float) -> Attributes:
-    ends = {"id": edge.name, "from": edge.begin, "to": edge.end}
+def _edge_attributes(edge: Edge, speed: float) -> XMLAttributes:
+    ends = {"id": edge.name, "from": edge.from_node, "to": edge.to_node}
     shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in edge.shape) or None
-    lane = {"numLanes": edge.lanes, "speed": edge.speed or speed, "length": repr(edge.length)}
+    lane = {"numLanes": edge.lanes, "speed": edge.speed_limit or speed, "length": repr(edge.length)}
     return {**ends, **lane, "priority": edge.priority, "shape": shape}
 
 
-def document(root: str, tag: str, elements: Iterable[Attributes]) -> str:
+def xml_document(root: str, tag: str, elements: Iterable[XMLAttributes]) -> str:
     """Return an XML document of elements of one kind."""
-    return "\n".join([f"<{root}>", *(element(tag, **each) for each in elements), f"</{root}>"])
+    return "\n".join([f"<{root}>", *(xml_element(tag, **each) for each in elements), f"</{root}>"])
 
 
-def element(tag: str, /, **attributes: Any) -> str:
+def xml_element(tag: str, /, **attributes: Any) -> str:
     """Return an XML element without content, and without the attributes that are None."""
     pairs = [f"{key}={quoteattr(str(value))}" for key, value in attributes.items() if value is not None]
     return f"<{tag} {' '.join(pairs)}/>"
 
 
-def netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
+def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
     """Return the network that netconvert makes in a folder of files by (option, name), and further options.
 
     Raises:
@@ -213,7 +213,7 @@ def netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Pa
         if made.read_bytes().rstrip().endswith(b"</net>"):
             return made
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # of which netconvert itself says nothing
-    words = sumo_words((done.stderr or done.stdout).splitlines())
+    words = sumo_message((done.stderr or done.stdout).splitlines())
     raise EpisodeError(f"netconvert cannot make the road: {words}")
 
 
@@ -225,25 +225,25 @@ def cache_folder() -> Path:
     """
     chosen = os.environ.get("UNJAM_CACHE") or platformdirs.user_cache_dir("unjam")
     if any(sign in chosen for sign in ",;$%"):
-        raise wrong("UNJAM_CACHE", chosen, "a folder without , ; $ % in its name")
+        raise invalid_value("UNJAM_CACHE", chosen, "a folder without , ; $ % in its name")
     return Path(chosen)
 
 
-def seal(content: bytes) -> bytes:
+def checksum_line(content: bytes) -> bytes:
     """Return the last line of a network in the cache: the hash of what is before it."""
     return f"<!-- sha256 {hashlib.sha256(content).hexdigest()} -->\n".encode()
 
 
-def is_as_made(network: Path) -> bool:
+def is_intact(network: Path) -> bool:
     """Return whether a network in the cache is there, and nobody has changed or cut it since it was made."""
     try:
-        stamp = stamp_of(network)
-        if _whole.get(network) != stamp:
+        stamp = file_stamp(network)
+        if _intact_networks.get(network) != stamp:
             content = network.read_bytes()
-            length = len(content) - len(seal(b""))
-            if content[length:] != seal(content[:length]):
+            length = len(content) - len(checksum_line(b""))
+            if content[length:] != checksum_line(content[:length]):
                 return False
-            _whole[network] = stamp
+            _intact_networks[network] = stamp
     except OSError:
         return False
     return True

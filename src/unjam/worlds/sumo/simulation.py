@@ -13,21 +13,21 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import EpisodeError, RefusedError, wrong
-from unjam.processes import PrivateFolder, printed_to
-from unjam.sumo_files import copy_harmless, stamp_of
+from unjam.errors import EpisodeError, SumoInputError, invalid_value
+from unjam.processes import PrivateFolder, redirect_stderr
+from unjam.sumo_files import file_stamp, write_harmless_copy
 from unjam.worlds.record import SumoWarning
+from unjam.worlds.sumo.backends import Backend, Libsumo, NeighborStates, Traci, sumo_function
 from unjam.worlds.sumo.control import VehicleControl
-from unjam.worlds.sumo.files import Files
-from unjam.worlds.sumo.library import Backend, Libsumo, Neighbours, Traci, function_of
-from unjam.worlds.sumo.networks import FREE_LINKS, NetworkLane, said_in, sumo_program
+from unjam.worlds.sumo.inputs import SumoInputs
+from unjam.worlds.sumo.networks import UNCONTROLLED_LINK_STATES, NetworkLane, last_error_message, sumo_program
 from unjam.worlds.sumo.tripinfo import read_trips, trip_options
-from unjam.worlds.sumo.warnings_log import LIMIT_OF_EXAMPLES, read_warnings
+from unjam.worlds.sumo.warnings_log import MAX_EXAMPLES_OPTION, read_warnings
 from unjam.worlds.trips import Trips
 
-CONTACT = 0.01
+MIN_CONTACT_OVERLAP = 0.01
 """overlap that is no rounding error [m]"""
-_exhaust = deque(maxlen=0).extend
+_consume = deque(maxlen=0).extend
 """runs through an iterator, in C: a loop would cost as much as the calls"""
 
 
@@ -40,7 +40,7 @@ class Simulation(VehicleControl):
     """
 
     def __init__(
-        self, backend: Backend = "libsumo", gui_options: Sequence[str] = (), alone: bool = False
+        self, backend: Backend = "libsumo", gui_options: Sequence[str] = (), owns_stdout: bool = False
     ) -> None:
         """Open a simulation; nothing runs before `load`.
 
@@ -50,22 +50,22 @@ class Simulation(VehicleControl):
             InUseError: libsumo already runs a simulation in this process.
         """
         if "," in (folder := gettempdir()):  # between the names of files that SUMO is given
-            raise wrong("TMPDIR", folder, "a folder without , in its name")
+            raise invalid_value("TMPDIR", folder, "a folder without , in its name")
         self.backend = backend
         self._gui_options = gui_options
         self._library = Libsumo() if backend == "libsumo" else Traci()
         self.check: Callable[[], None] = self._library.check
-        """raises `LostError` where other code of this process has changed the simulation"""
+        """raises `LostWorkerError` where other code of this process has changed the simulation"""
         self.step: Callable[[], None] = self._library.step
         """simulates one time step"""
         self._folder = PrivateFolder()
         self._error_log = Path(self._folder.name) / "error.log"
-        self._copies: dict[Path, tuple[list[tuple[int, int]], Path]] = {}
+        self._harmless_copies: dict[Path, tuple[list[tuple[int, int]], Path]] = {}
         """of users' own files, with the stamps of what they are made from"""
-        self._trips = Path(self._folder.name) / "trips.xml"
-        self._printed = Path(self._folder.name) / "printed.log" if alone else None
+        self._trip_file = Path(self._folder.name) / "trips.xml"
+        self._stdout_log = Path(self._folder.name) / "printed.log" if owns_stdout else None
         """what SUMO says before it has a log"""
-        self.in_use = Lock()
+        self.episode_lock = Lock()
         """held by the episode that runs"""
         if backend == "libsumo":
             self._bind()
@@ -73,38 +73,38 @@ class Simulation(VehicleControl):
     def _bind(self) -> None:
         """Look up the functions that are called often."""
         self._sumo: Any = self._library.functions
-        call = partial(function_of, self._sumo)
+        call = partial(sumo_function, self._sumo)
         self._get_speed = call("vehicle", "getSpeed")
         self._get_distance = call("vehicle", "getDistance")
-        self._get_along = call("vehicle", "getLanePosition")
+        self._get_lane_position = call("vehicle", "getLanePosition")
         self._get_lane = call("vehicle", "getLaneID")
         self._get_fuel = call("vehicle", "getFuelConsumption")
         self._set_speed = call("vehicle", "setSpeed")
-        self.fastest: Callable[[str], float] = call("vehicle", "getMaxSpeed")
+        self.max_speed: Callable[[str], float] = call("vehicle", "getMaxSpeed")
         """how fast a vehicle drives at most, whatever the road allows [m/s]"""
-        self.set_fastest: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
+        self.set_max_speed: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
         """changes that for one vehicle"""
-        self.set_headway: Callable[[str, float], object] = call("vehicle", "setTau")
+        self.set_time_gap: Callable[[str, float], object] = call("vehicle", "setTau")
         """changes the time headway that a vehicle keeps [s]"""
         self.set_parameter: Callable[[str, str, str], object] = call("vehicle", "setParameter")
         """changes one of a vehicle's other parameters, by name"""
         self._set_previous_speed = call("vehicle", "setPreviousSpeed")
-        self.on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
+        self.vehicles_on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
         """whose front bumpers are on a lane"""
         self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
         """how many vehicles are on the road"""
-        self.departed: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
+        self.departed_vehicles: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
         """who entered the road in the last step"""
-        self.arrived: Callable[[], Sequence[str]] = call("simulation", "getArrivedIDList")
+        self.arrived_vehicles: Callable[[], Sequence[str]] = call("simulation", "getArrivedIDList")
         """who left the road at the end of its route in the last step"""
-        self.lifted: Callable[[], Sequence[str]] = call("simulation", "getStartingTeleportIDList")
+        self.teleporting_vehicles: Callable[[], Sequence[str]] = call("simulation", "getStartingTeleportIDList")
         """whom SUMO lifted off the road in the last step, for it had stood for long; and whom it put back"""
-        self.put_back: Callable[[], Sequence[str]] = call("simulation", "getEndingTeleportIDList")
-        self.colliding: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
+        self.reinserted_vehicles: Callable[[], Sequence[str]] = call("simulation", "getEndingTeleportIDList")
+        self.colliding_vehicles: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
         """who touched another in the last step"""
-        self.on_loop: Callable[[str], Sequence[Any]] = call("inductionloop", "getVehicleData")
+        self.vehicles_on_loop: Callable[[str], Sequence[Any]] = call("inductionloop", "getVehicleData")
         """who was on a loop in the last step: (name, length, when it came, when it left or -1, type)"""
-        self.waiting: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
+        self.pending_vehicles: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
         """who wants to enter and cannot"""
 
     def now(self) -> float:
@@ -115,7 +115,7 @@ class Simulation(VehicleControl):
         """Return whether a step of this episode has failed: SUMO refuses what a file holds further on."""
         return self._library.has_refused
 
-    def load(self, files: Files, step: float, seed: int) -> None:
+    def load(self, files: SumoInputs, step: float, seed: int) -> None:
         """Start an episode: load network and traffic, and put the vehicles on the road.
 
         Raises:
@@ -125,17 +125,18 @@ class Simulation(VehicleControl):
         """
         self.check()
         traffic = Path(self._folder.name) / "traffic.rou.xml"
-        traffic.write_text(files.traffic)
+        traffic.write_text(files.traffic_xml)
         named = {
-            option: [self._readable(path, files) for path in paths] for option, paths in files.named.items()
+            option: [self._readable_path(path, files) for path in paths]
+            for option, paths in files.existing_files.items()
         }
-        named.setdefault(files.option, []).append(str(traffic))
+        named.setdefault(files.traffic_option, []).append(str(traffic))
         inputs = [f"{option}={','.join(paths)}" for option, paths in named.items() if paths]
-        options = [*inputs, *files.options, *self._options(step, seed)]
+        options = [*inputs, *files.options, *self._simulation_options(step, seed)]
         if files.records_trips:
-            options += trip_options(self._trips)
+            options += trip_options(self._trip_file)
         try:
-            with printed_to(self._printed) if self._printed else nullcontext():
+            with redirect_stderr(self._stdout_log) if self._stdout_log else nullcontext():
                 if self._library.is_running:
                     self._library.load(options)
                 else:
@@ -146,39 +147,43 @@ class Simulation(VehicleControl):
                 self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
             self._library.end()  # only then is SUMO's message in its log, and can the next episode start
-            words = said_in(self._error_log) or (said_in(self._printed) if self._printed else "")
-            kind = RefusedError if words or self.backend != "gui" else EpisodeError  # a window may be missing
+            words = last_error_message(self._error_log) or (
+                last_error_message(self._stdout_log) if self._stdout_log else ""
+            )
+            kind = SumoInputError if words or self.backend != "gui" else EpisodeError  # a window may be missing
             raise kind(f"SUMO cannot start: {words or ' '.join(str(error).split())}") from error
 
-    def _readable(self, path: Path, files: Files) -> str:
+    def _readable_path(self, path: Path, files: SumoInputs) -> str:
         """Return what SUMO reads instead of a file: itself, or a harmless copy of its content."""
-        if path not in files.to_copy:
+        if path not in files.copied_files:
             return str(path)
-        before, copy = self._copies.get(path, ([], Path(self._folder.name) / f"{len(self._copies)}.xml"))
-        if (stamps := list(map(stamp_of, files.to_copy[path]))) != before:
-            self._copies[path] = [], copy
-            copy_harmless(path, copy)
-            self._copies[path] = stamps, copy
+        before, copy = self._harmless_copies.get(
+            path, ([], Path(self._folder.name) / f"{len(self._harmless_copies)}.xml")
+        )
+        if (stamps := list(map(file_stamp, files.copied_files[path]))) != before:
+            self._harmless_copies[path] = [], copy
+            write_harmless_copy(path, copy)
+            self._harmless_copies[path] = stamps, copy
         return str(copy)
 
-    def _options(self, step: float, seed: int) -> list[str]:
+    def _simulation_options(self, step: float, seed: int) -> list[str]:
         return [
             *("--step-length", str(step), "--seed", str(seed)),
             *("--no-step-log", "true", "--duration-log.disable", "true"),
             # Warnings go to the log alone, which keeps one example and the number of each kind.
             *("--no-warnings", "true", "--error-log", str(self._error_log)),
-            *("--aggregate-warnings", LIMIT_OF_EXAMPLES),
+            *("--aggregate-warnings", MAX_EXAMPLES_OPTION),
         ]
 
     def speeds(self, ids: Sequence[str]) -> list[float]:
         """Return the speeds of `ids` [m/s]."""
         return list(map(self._get_speed, ids))
 
-    def along_lanes(self, ids: Sequence[str]) -> list[float]:
+    def lane_offsets(self, ids: Sequence[str]) -> list[float]:
         """Return how far each of `ids` is along its lane [m]."""
-        return list(map(self._get_along, ids))
+        return list(map(self._get_lane_position, ids))
 
-    def places(self, ids: Sequence[str]) -> NDArray[np.float64]:
+    def poses(self, ids: Sequence[str]) -> NDArray[np.float64]:
         """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""
         vehicle = self._sumo.vehicle
         rows = [(*vehicle.getPosition(name)[:2], vehicle.getAngle(name)) for name in ids]
@@ -186,7 +191,7 @@ class Simulation(VehicleControl):
         places[:, 2] = np.radians(90.0 - places[:, 2])  # SUMO counts clockwise from north, in degrees
         return places
 
-    def more_expected(self) -> bool:
+    def expects_vehicles(self) -> bool:
         """Return whether anybody is on the road or will be."""
         return self._sumo.simulation.getMinExpectedNumber() > 0
 
@@ -200,50 +205,50 @@ class Simulation(VehicleControl):
         names = [name for name in lane.getIDList() if not name.startswith(":")]
         links = [lane.getLinks(name) for name in names]
         leads_to = (tuple(link[0] for link in each) for each in links)
-        stops = (any(link[5] not in FREE_LINKS for link in each) for each in links)
+        stops = (any(link[5] not in UNCONTROLLED_LINK_STATES for link in each) for each in links)
         facts = map(lane.getEdgeID, names), map(lane.getLength, names), map(lane.getMaxSpeed, names)
         return list(map(NetworkLane, names, *facts, leads_to, stops))
 
-    def lane_places(self, ids: Sequence[str]) -> list[tuple[str, float]]:
+    def lane_positions(self, ids: Sequence[str]) -> list[tuple[str, float]]:
         """Return in which lane each of `ids` is, and how far along it [m]."""
-        return list(zip(map(self._get_lane, ids), map(self._get_along, ids), strict=True))
+        return list(zip(map(self._get_lane, ids), map(self._get_lane_position, ids), strict=True))
 
-    def ways(self, ids: Sequence[str]) -> list[tuple[str, ...]]:
+    def remaining_routes(self, ids: Sequence[str]) -> list[tuple[str, ...]]:
         """Return the edges that each of `ids` has before it, its own first."""
         vehicle = self._sumo.vehicle
         return [tuple(vehicle.getRoute(name)[vehicle.getRouteIndex(name) :]) for name in ids]
 
-    def wishes(self, ids: Sequence[str]) -> list[tuple[float, float]]:
+    def desired_speeds(self, ids: Sequence[str]) -> list[tuple[float, float]]:
         """Return how fast each of `ids` wants to drive over what a road allows, and at most [m/s]."""
-        return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.fastest, ids), strict=True))
+        return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.max_speed, ids), strict=True))
 
     def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
         """Return how fast each of `ids` may drive where it is [m/s]."""
         return [self._sumo.vehicle.getAllowedSpeed(name) for name in ids]
 
-    def neighbours(self, name: str, farthest: float) -> Neighbours:
+    def neighbors(self, name: str, max_distance: float) -> NeighborStates:
         """Return who is ahead and behind, as SUMO sees them.
 
         Who is farther than `farthest` [m] is not there: as fast, and that far away.
         """
         vehicle, speed = self._sumo.vehicle, self._get_speed(name)
-        leader, ahead = vehicle.getLeader(name, farthest) or ("", 0.0)
-        follower, behind = vehicle.getFollower(name, farthest)
+        leader, ahead = vehicle.getLeader(name, max_distance) or ("", 0.0)
+        follower, behind = vehicle.getFollower(name, max_distance)
         found: list[float] = []
         for other, gap, keeper in ((leader, ahead, name), (follower, behind, follower)):
             # SUMO's gap lacks the one that the vehicle behind keeps.
-            true_gap = gap + vehicle.getMinGap(keeper) if other else farthest
-            there = true_gap < farthest
-            found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), farthest)]
-        return Neighbours(leader if found[1] < farthest else "", *found)
+            true_gap = gap + vehicle.getMinGap(keeper) if other else max_distance
+            there = true_gap < max_distance
+            found += [self._get_speed(other) if there else speed, min(max(true_gap, 0.0), max_distance)]
+        return NeighborStates(leader if found[1] < max_distance else "", *found)
 
     def is_in_contact(self, name: str, leader: str) -> bool:
         """Return whether a vehicle overlaps with the one ahead of it on its lane, along it and across."""
         vehicle = self._sumo.vehicle
-        gap = self._get_along(leader) - vehicle.getLength(leader) - self._get_along(name)
+        gap = self._get_lane_position(leader) - vehicle.getLength(leader) - self._get_lane_position(name)
         apart = vehicle.getLateralLanePosition(name) - vehicle.getLateralLanePosition(leader)
         across = 2.0 * abs(apart) < vehicle.getWidth(name) + vehicle.getWidth(leader)
-        return self._get_lane(name) == self._get_lane(leader) and gap < -CONTACT and across
+        return self._get_lane(name) == self._get_lane(leader) and gap < -MIN_CONTACT_OVERLAP and across
 
     def teleport_count(self) -> int:
         """Return how many teleports SUMO has counted since it started."""
@@ -259,16 +264,16 @@ class Simulation(VehicleControl):
 
     def command_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Ask for the speeds that `ids` shall have after the next step [m/s]: plain floats."""
-        _exhaust(starmap(self._set_speed, zip(ids, speeds, strict=True)))
+        _consume(starmap(self._set_speed, zip(ids, speeds, strict=True)))
 
     def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Give `ids` other current speeds [m/s], plain floats: how noise enters."""
-        _exhaust(map(self._set_previous_speed, ids, speeds))
+        _consume(map(self._set_previous_speed, ids, speeds))
 
-    def end_with_trips(self, classes: dict[str, str], after: float) -> Trips:
+    def end_with_trips(self, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
         """End the episode, so that SUMO writes its last records, and return what `read_trips` finds."""
         self._library.end()
-        return read_trips(self._trips, classes, after)
+        return read_trips(self._trip_file, vehicle_classes, warmup_end)
 
     @property
     def is_lost(self) -> bool:

@@ -9,9 +9,9 @@ from unjam.worlds.trips import Trips
 
 NOT_ARRIVED = -1.0
 """what SUMO writes for the time of an arrival that has not happened"""
-TIMES = "departDelay", "duration", "timeLoss", "arrival"
+TRIP_TIME_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival"
 """attributes of a trip that are read [s]"""
-CHUNK = 1 << 20
+TRIP_CHUNK_BYTES = 1 << 20
 """bytes that are read at once"""
 
 
@@ -21,7 +21,7 @@ def trip_options(path: Path) -> list[str]:
     return ["--tripinfo-output", str(path), *(word for option in unfinished for word in (option, "true"))]
 
 
-def read_trips(path: Path, classes: dict[str, str], after: float) -> Trips:
+def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
     """Return the trips in a file that SUMO has closed, in SUMO's order.
 
     `classes` has the vehicle class of each vehicle type. Left out are trips that ended before the time
@@ -29,24 +29,24 @@ def read_trips(path: Path, classes: dict[str, str], after: float) -> Trips:
     """
     ids, kinds, times = list[str](), list[str](), list[list[float]]()
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag != "tripinfo" or NOT_ARRIVED < float(attributes["arrival"]) <= after:
+    def start_element(tag: str, attributes: dict[str, str]) -> None:
+        if tag != "tripinfo" or NOT_ARRIVED < float(attributes["arrival"]) <= warmup_end:
             return
         if float(attributes["depart"]) >= 0.0 or float(attributes["departDelay"]) > 0.0:
             ids.append(attributes["id"])
-            kinds.append(_class_of(attributes["vType"], classes))
-            times.append([float(attributes[name]) for name in TIMES])
+            kinds.append(_vehicle_class(attributes["vType"], vehicle_classes))
+            times.append([float(attributes[name]) for name in TRIP_TIME_ATTRIBUTES])
 
     parser = expat.ParserCreate()
-    parser.StartElementHandler = start
+    parser.StartElementHandler = start_element
     with path.open("rb") as file:
-        while chunk := file.read(CHUNK):
+        while chunk := file.read(TRIP_CHUNK_BYTES):
             parser.Parse(chunk)
-    depart_delay, duration, time_loss, arrival = np.array(times, np.float64).reshape(-1, len(TIMES)).T
+    depart_delay, duration, time_loss, arrival = np.array(times, np.float64).reshape(-1, len(TRIP_TIME_ATTRIBUTES)).T
     return Trips(tuple(ids), tuple(kinds), depart_delay, duration, time_loss, arrival != NOT_ARRIVED)
 
 
-def _class_of(kind: str, classes: dict[str, str]) -> str:
+def _vehicle_class(kind: str, vehicle_classes: dict[str, str]) -> str:
     """Return the class of a type; SUMO calls a copy that belongs to one vehicle `type@vehicle`."""
     names = kind, kind.rpartition("@")[0], kind.partition("@")[0]
-    return next((classes[name] for name in names if name in classes), "")
+    return next((vehicle_classes[name] for name in names if name in vehicle_classes), "")

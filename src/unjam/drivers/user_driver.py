@@ -1,0 +1,269 @@
+"""What users bring in their own Python files, given as `path.py:name`.
+
+Such a file is code and is run as such: use only files that you trust.
+"""
+
+import inspect
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import RLock
+from traceback import extract_tb
+from typing import Any, Protocol
+
+import numpy as np
+
+from unjam.drivers.command import answer_as_array
+from unjam.drivers.driver import Driver, Memory, Recipe, label_with_parameters
+from unjam.drivers.local_state import LocalState
+from unjam.errors import InputError
+from unjam.physics.arrays import Array
+from unjam.processes import redirect_user_output
+from unjam.trust import check_code_unchanged, remember_trusted
+from unjam.user_code import UserCode, read_code
+
+_module_lock = RLock()
+"""held while a file runs: its modules then have their short names in `sys.modules`, of which there is one"""
+
+
+def is_file_reference(text: str) -> bool:
+    """Return whether `text` has the form `path.py:name`."""
+    return ".py:" in text
+
+
+@dataclass(frozen=True)
+class FileReference:
+    """A name in a Python file."""
+
+    path: Path
+    """resolved"""
+    name: str
+
+    @classmethod
+    def parse(cls, text: str) -> "FileReference":
+        """Return what `path.py:name` refers to."""
+        path, _, name = text.rpartition(":")
+        if "\0" in text:
+            raise InputError(f"driver file: {text!r} is not allowed; allowed: path.py:name")
+        return cls(Path(path).resolve(), name)
+
+    def __str__(self) -> str:
+        return f"{self.path.name}:{self.name}"
+
+    def file_recipe(self, sha256: str) -> Recipe:
+        """Return where the code is, and its hash."""
+        return {"kind": "file", "path": str(self.path), "name": self.name, "sha256": sha256}
+
+    def read_code(self) -> UserCode:
+        """Return the code of the file as it is now.
+
+        Raises:
+            InputError: the file is missing, unreadable or no Python file, or imports a compiled module of its
+                folder.
+        """
+        if not os.path.isfile(self.path):
+            raise InputError(f"driver file: {str(self.path)!r} is not a file")
+        if self.path.suffix != ".py":
+            raise InputError(f"driver file: {str(self.path)!r} is not a Python file")
+        try:
+            return read_code(self.path)
+        except OSError as error:
+            raise InputError(f"driver file: {str(error.filename)!r}: {error.strerror}") from None
+
+    def load_object(self, code: UserCode | None = None) -> Any:
+        """Return what has the name, running the file: as it was read, else as it is now.
+
+        Raises:
+            InputError: as `read`; the file fails when run, or has no such name.
+        """
+        code = code or self.read_code()
+        check_code_unchanged(code)
+        remember_trusted(code.path, code.sha256)  # what a folder names was checked before it comes here
+        try:
+            with _module_lock, redirect_user_output():
+                module = code.run()
+        except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
+            raise InputError(f"{self.path.name}: {type(error).__name__} when loading it: {error}") from error
+        if not hasattr(module, self.name):
+            public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
+            raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public}")
+        return getattr(module, self.name)
+
+    def load_function(self, argument: str, code: UserCode | None = None) -> Callable[..., Any]:
+        """Return the function of that name, which takes `of`; raise `InputError` where it is none."""
+        found = self.load_object(code)
+        if not callable(found) or inspect.isclass(found):
+            raise InputError(f"{self}: is not a function of {argument}")
+        return found
+
+    def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what the user's function answers.
+
+        Raises:
+            InputError: it fails; with the last line of the file that ran.
+        """
+        try:
+            return function(*arguments)
+        except (Exception, SystemExit) as error:
+            frames = extract_tb(error.__traceback__)
+            lines = [str(frame.lineno) for frame in frames if frame.filename == str(self.path)]
+            place = f" (line {lines[-1]})" if lines else ""
+            raise InputError(f"{self}: {type(error).__name__}: {error}{place}") from error
+
+
+class UserDriver(Driver):
+    """A driver of the user's own, by what it holds: anything with `act` and `initial_memory`."""
+
+    implementation: Any
+
+    @property
+    def measured_fields(self) -> frozenset[str]:
+        """All that a road tells: what the user's code looks at it alone knows."""
+        return frozenset(LocalState._fields)
+
+    def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what the user's function answers."""
+        return function(*arguments)
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return what the user's driver remembers before its first step."""
+        return self.call_user_code(self.implementation.initial_memory, n)
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return what the user's driver makes of the warm-up, if it has `recall`."""
+        recall = getattr(self.implementation, "recall", None)
+        return self.call_user_code(recall, memory, history) if recall else memory
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the user's acceleration and memory; raise `InputError` where the user's code fails.
+
+        While no CAV is on the road it is not asked: the smallest gap of nobody is an error in NumPy.
+        """
+        if np.size(state.speed) == 0:
+            return np.zeros(0), memory
+        found = self.call_user_code(self.implementation.act, state, memory)
+        if not (isinstance(found, tuple) and len(found) == 2):
+            raise InputError(f"{self.describe()}: act() answers {found!r:.60}; allowed: (accelerations, memory)")
+        accelerations, memory = found
+        if type(accelerations) in (list, tuple):  # what is around it counts with arrays
+            accelerations = answer_as_array(accelerations, np.size(state.speed), self.describe())
+        return accelerations, memory
+
+    def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return what the user's driver asks of its cars' ACCs, if it asks for anything."""
+        asked = getattr(self.implementation, "time_headways", None)
+        return self.call_user_code(asked, state, memory) if asked and np.size(state.speed) else None
+
+    def memory_features(self, memory: Memory) -> Array | None:
+        """Return the user's features of the memory, if the driver has any."""
+        features = getattr(self.implementation, "memory_features", None)
+        return self.call_user_code(features, memory) if features else None
+
+
+@dataclass(frozen=True)
+class FileDriver(FileReference, UserDriver):
+    """The driver `name` of the user's file: a function of the state, a class, or an instance of one."""
+
+    parameters: dict[str, Any] = field(default_factory=dict)
+    time_step: float = 0.1
+    sha256: str = field(default="", repr=False, compare=False)
+    """of the file; given: of what it must be"""
+    implementation: Any = field(init=False, repr=False, compare=False)
+    """what the file has, as a driver"""
+
+    def __post_init__(self) -> None:
+        """Load it; raise `InputError` where the file is another than it must be."""
+        object.__setattr__(self, "path", self.path.resolve())
+        code = self.read_code()
+        if self.sha256 and self.sha256 != code.sha256:
+            raise InputError(f"{self}: its file has changed since; allowed: as it was when it was first loaded")
+        object.__setattr__(self, "implementation", self._build_implementation(code))
+        object.__setattr__(self, "sha256", code.sha256)
+
+    def _build_implementation(self, code: UserCode) -> Any:
+        found = self.load_object(code)
+        if inspect.isclass(found):
+            arguments = dict(self.parameters)
+            if "time_step" in inspect.signature(found).parameters:
+                arguments.setdefault("time_step", self.time_step)
+            try:
+                found = found(**arguments)
+            except Exception as error:
+                raise InputError(f"{self}: {type(error).__name__} when made: {error}") from error
+        elif self.parameters:
+            raise InputError(f"{self}: takes no parameters; only a class does")
+        return as_implementation(found, str(self))
+
+    def describe(self) -> str:
+        """Return the names of file and driver, and the parameters that were given."""
+        return label_with_parameters(str(self), self.parameters)
+
+    def recipe(self) -> Recipe:
+        """Return where the code is, and the hash of what was loaded."""
+        made = {"parameters": self.parameters, "time_step": self.time_step}
+        return {**self.file_recipe(self.sha256), **made}
+
+
+@dataclass(frozen=True)
+class FunctionDriver(Driver):
+    """A plain function `state -> acceleration` as a driver."""
+
+    function: Callable[[LocalState], Array]
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the function's acceleration; nothing is remembered."""
+        return self.function(state), memory
+
+
+@dataclass(frozen=True, eq=False)
+class PythonDriver(UserDriver):
+    """A function or an object of this process as a driver: no other could make it."""
+
+    implementation: Any
+    label: str
+
+    def describe(self) -> str:
+        """Return the name of the function or the class."""
+        return self.label
+
+    def recipe(self) -> Recipe:
+        """Return that of a driver without a name, which stays in its process."""
+        return {"kind": "named", "name": "", "parameters": {}}
+
+
+class DriverProtocol(Protocol):
+    """Anything that drives and remembers, as `unjam.Driver` says of the two methods."""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return the memory of `n` CAVs before their first step."""
+        ...
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        """Return accelerations, and the memory after this step."""
+        ...
+
+
+DriverLike = Driver | DriverProtocol | Callable[[LocalState], Any]
+"""what drives where a program asks for it: a driver, what acts like one, or a function of the state"""
+
+
+def as_driver(driver: DriverLike) -> Driver:
+    """Return whatever drives as a `Driver`; raise `InputError` where it is a class, or does not drive."""
+    if isinstance(driver, Driver):
+        return driver
+    name = getattr(driver, "__name__", type(driver).__name__)
+    if inspect.isclass(driver):
+        raise InputError(f"driver: {name} is a class; allowed: an instance of it, like {name}()")
+    return PythonDriver(as_implementation(driver, f"driver {name}"), name)
+
+
+def as_implementation(candidate: Any, context: str) -> Any:
+    """Return what has `act` and `initial_memory`, or a function as such; else raise `InputError`."""
+    if callable(getattr(candidate, "act", None)):
+        if not callable(getattr(candidate, "initial_memory", None)):
+            raise InputError(f"{context}: has act() but no initial_memory(n)")
+        return candidate
+    if callable(candidate):
+        return FunctionDriver(candidate)
+    raise InputError(f"{context}: is neither a function nor a class with act(state, memory)")

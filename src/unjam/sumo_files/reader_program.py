@@ -1,0 +1,341 @@
+"""The program that reads users' own SUMO files: in a process of its own, limited by `unjam.sandbox`.
+
+It answers one JSON document, uses Python's own library alone, and starts in a twentieth of a second.
+"""
+
+import json
+import os
+import re
+import sys
+from collections.abc import Callable
+from functools import partial
+from math import inf, isfinite, nan
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from urllib.parse import unquote
+from xml.parsers import expat
+
+_PROGRAM_FOLDER = Path(__file__).parent
+if __name__ == "__main__":  # packages that run none of their own code: it imports more than is needed
+    for name, folder in (("unjam", _PROGRAM_FOLDER.parent), ("unjam.sumo_files", _PROGRAM_FOLDER)):
+        sys.modules[name] = ModuleType(name)
+        sys.modules[name].__path__ = [str(folder)]
+
+from unjam.sumo_files.reader import (  # noqa: E402
+    BrokenFileError,
+    XmlAttributes,
+    XmlHandlers,
+    XmlReader,
+    check_file_exists,
+    file_stamp,
+    parse_xml,
+)
+
+DEFAULT_VEHICLE_TYPE = "DEFAULT_VEHTYPE"
+"""SUMO's type of vehicles that name none"""
+MODE_TYPES = {"car": DEFAULT_VEHICLE_TYPE, "bicycle": "DEFAULT_BIKETYPE"}
+"""types of the vehicles that SUMO creates for a person's trip that names modes alone"""
+OTHER_DEFAULT_TYPES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
+"""vehicle classes of SUMO's other types that no file need define"""
+DEMAND_ELEMENTS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}
+"""elements that bring vehicles, with the attribute that says when the first one departs"""
+TIME_UNITS = (1.0, 60.0, 3600.0, 86400.0)
+"""seconds, minutes, hours and days [s]: SUMO's times may be 1:30:00"""
+FILE_OPTIONS = ("net-file", "additional-files", "route-files", "weight-files")
+"""options that name files which SUMO reads, and which are passed on once they have been checked"""
+SYNONYMS = {
+    synonym: name
+    for name, synonyms in {
+        "net-file": "n net",
+        "route-files": "r routes",
+        "additional-files": "a additional",
+        "weight-files": "w weights",
+        "weight-attribute": "x measure",
+        "begin": "b",
+        "end": "e",
+        "route-steps": "s",
+        "seed": "srand",
+        "random": "abs-rand",
+        "default.carfollowmodel": "carfollow.model",
+        "railsignal-moving-block": "railsignal.moving-block",
+        "device.rerouting.with-taz": "with-taz",
+        "device.rerouting.threads": "routing-threads",
+        "device.taxi.vclasses": "taxi.vclasses",
+        "device.fcd-replay.files": "device.fcd-replay.file",
+        "meso-ignore-lanes-by-vclass": "meso.ignore-lanes.by-vclass",
+    }.items()
+    for synonym in synonyms.split()
+}
+"""other names of options, as SUMO has them"""
+CAR_FOLLOWING_MODELS = (
+    *("Krauss", "KraussOrig1", "KraussPS", "KraussX", "IDM", "IDMM", "EIDM", "SmartSK"),
+    *("Daniel1", "PWagner2009", "BKerner", "Wiedemann", "W99", "ACC", "CACC", "CC", "Rail"),
+)
+"""car-following models that older files name in an element of their own"""
+TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")
+"""what SUMO takes for yes"""
+_LaneShape = tuple[str, float, list[tuple[float, float]]]
+"""edge, length [m] and centre line [(x, y), m]"""
+
+
+def _read_configuration(path: Path) -> dict[str, Any]:
+    """Return what a .sumocfg file and the files that it names say, as JSON; the fields of `SumoFiles`.
+
+    Raises:
+        Broken: one is missing or broken, the network has no version, or there are no vehicles.
+    """
+    check_file_exists(path)
+    stamps = {path: file_stamp(path)}
+    options = _read_options(path)
+    if options.get("mesosim", "").lower() in TRUE_VALUES:
+        raise BrokenFileError(f"{path.name}: mesosim: true is not allowed; allowed: false, for it obeys no commands")
+    networks, additional, routes, weights = (
+        [path.parent / unquote(name.strip()) for name in options.pop(files, "").split(",") if name.strip()]
+        for files in FILE_OPTIONS
+    )
+    if len(networks) != 1:
+        raise BrokenFileError(f"{path.name}: names {'more than one' if networks else 'no'} net-file")
+    (network,), demand = networks, _Demand()
+    files = [network, *additional, *routes, *weights]
+    for file in files:
+        check_file_exists(file)
+    readers = {file: XmlReader(demand.handlers()) for file in files}
+    for file, reader in readers.items():
+        reader.read(file)
+        stamps = {**reader.sources, **stamps}
+    _check_network(network, readers[network])
+    if not demand.used_names:
+        raise BrokenFileError(f"{path.name}: its route and additional files have no vehicle, trip, flow or personal car")
+    begin = _read_seconds(path, options, "begin", 0.0) or 0.0
+    end = _read_seconds(path, options, "end", None)
+    if end is not None and end <= begin:
+        raise BrokenFileError(f"{path.name}: end: {end:g} s is not allowed; allowed: after begin, {begin:g} s")
+    return {
+        "network": str(network),
+        "additional_files": list(map(str, additional)),
+        "route_files": list(map(str, routes)),
+        "weight_files": list(map(str, weights)),
+        "options": options,
+        "dropped": sorted({name for reader in readers.values() for name in reader.dropped_items}),
+        "to_copy": {str(file): list(map(str, one.sources)) for file, one in readers.items() if one.needs_copy},
+        "begin": begin,
+        "end": end,
+        "first_departure": demand.first_departure,
+        "calibrated_until": demand.last_end if demand.calibrates else 0.0,
+        "step": _read_seconds(path, options, "step-length", 1.0) or 1.0,
+        "used_types": sorted(demand.used_types()),
+        "types": demand.types,
+        "type_parameters": demand.type_parameters,
+        "stamps": {str(file): stamps[file] for file in [path, *files, *sorted(stamps.keys() - {path, *files})]},
+    }
+
+
+def _read_options(path: Path) -> dict[str, str]:
+    """Return the options of a configuration that have a value, by SUMO's own names for them.
+
+    Raises:
+        Broken: an option is set twice, or has a text instead of a value.
+    """
+    options: dict[str, str] = {}
+
+    def add_option(tag: str, attributes: XmlAttributes) -> None:
+        for value in filter(None, map(attributes.get, ("value", "v"))):
+            name = canonical_option(tag)
+            if name in options:
+                raise BrokenFileError(f"{path.name}: {tag}: is set twice")
+            options[name] = _substitute_variables(value)
+
+    def refuse_text(text: str) -> None:
+        if text.strip():
+            raise BrokenFileError(f'{path.name}: {text.strip()[:60]!r} is not allowed; allowed: <option value="..."/>')
+
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler, parser.CharacterDataHandler = add_option, refuse_text
+    parse_xml(path, parser, [path.read_bytes()])
+    return options
+
+
+def canonical_option(name: str) -> str:
+    """Return the name by which SUMO lists an option that has several."""
+    for old, new in (("device.routing.", "device.rerouting."), (".knownveh", ".explicit")):
+        name = name.replace(old, new)
+    return SYNONYMS.get(name, name)
+
+
+def _substitute_variables(text: str) -> str:
+    """Return an option's value with what SUMO puts for `~` and `${VARIABLE}`; unset ones are empty."""
+    home = re.sub("(^|,)~", r"\1${HOME}", text)
+    return re.sub(r"\$\{(.+?)\}", lambda found: os.environ.get(found[1], ""), home)
+
+
+def _read_lanes(path: Path) -> list[_LaneShape]:
+    """Return all lanes of a network file."""
+    lanes: list[_LaneShape] = []
+
+    def add_lane(attributes: XmlAttributes) -> None:
+        edge, length, shape = (attributes.get(name, "") for name in ("id", "length", "shape"))
+        line = [tuple(map(float, point.split(",")[:2])) for point in shape.split()]
+        lanes.append((edge.rpartition("_")[0], float(length), [(x, y) for x, y in line]))
+
+    XmlReader({"lane": add_lane}).read(path)
+    return lanes
+
+
+def _read_seconds(path: Path, options: dict[str, str], name: str, default: float | None) -> float | None:
+    """Return a time option [s]; SUMO writes -1 for no end."""
+    text = options.get(name)
+    if text is None or (name == "end" and text.strip() in ("-1", "-1.00")):
+        return default
+    value, positive = _parse_time(text), name == "step-length"
+    if value < 0 or not isfinite(value) or (positive and not value):
+        allowed = "seconds > 0" if positive else "seconds, hours:minutes:seconds"
+        raise BrokenFileError(f"{path.name}: {name}: {text!r} is not allowed; allowed: {allowed}")
+    return value
+
+
+def _parse_time(text: str) -> float:
+    """Return a time [s] of 90, 1:30:00 or 1:00:00:00; NaN where it is none."""
+    parts = text.split(":")
+    try:
+        value = sum(float(part) * unit for part, unit in zip(reversed(parts), TIME_UNITS, strict=False))
+    except ValueError:
+        return nan
+    return value if len(parts) in (1, 3, 4) else nan
+
+
+def _check_network(path: Path, reader: "XmlReader") -> None:
+    """Raise `BrokenFileError` unless it is a network with a version: SUMO itself would crash without."""
+    if reader.root != "net":
+        raise BrokenFileError(f"{path.name}: is not a SUMO network: it begins with <{reader.root}>")
+    if not reader.version:
+        raise BrokenFileError(f"{path.name}: the network has no version; make it anew: netconvert -s {path.name} -o")
+
+
+class _Demand:
+    """The vehicle types that files define, and the vehicles that they bring."""
+
+    def __init__(self) -> None:
+        self.types: dict[str, XmlAttributes] = {}
+        self.used_names: set[str] = set()
+        """types and distributions that vehicles have"""
+        self.first_departure: float | None = inf
+        """when the first vehicle departs [s]; None where that cannot be told"""
+        self.calibrates = False
+        """whether there is a calibrator: SUMO does not count among those it expects whom it will bring"""
+        self.last_end = 0.0
+        """the latest end of a flow that names one [s], in calibrators and elsewhere"""
+        self._distributions: dict[str, set[str]] = {}
+        """types of each distribution; it may be used in another file than the one that defines it"""
+        self.type_parameters: dict[str, XmlAttributes] = {}
+        """values of the parameters of each type, by key"""
+        self._current_type = ""
+        """the type that is being read; empty where none is"""
+        self._current_distribution: set[str] = set()
+        """types of the distribution that is being read"""
+
+    def handlers(self) -> XmlHandlers:
+        """Return what to call with the attributes of an element, by its name."""
+        vehicles = {tag: partial(self._on_vehicle, depart) for tag, depart in DEMAND_ELEMENTS.items()}
+        types = {"vType": self._on_type, "vTypeDistribution": self._on_distribution}
+        persons = dict.fromkeys(("person", "personFlow"), self._on_person)
+        persons |= {"personTrip": self._note_person_trip, "calibrator": self._note_calibrator}
+        laws = {f"carFollowing-{name}": self._on_model for name in CAR_FOLLOWING_MODELS}
+        ends = {"/vType": self._on_type_end, "/vTypeDistribution": self._on_distribution_end}
+        return {**vehicles, **types, **persons, **laws, "param": self._on_parameter, **ends}
+
+    def _on_vehicle(self, depart_attribute: str, attributes: XmlAttributes) -> None:
+        if "speed" in attributes and "vehsPerHour" not in attributes:
+            return  # a calibrator that only changes speeds
+        self.used_names.add(attributes.get("type", DEFAULT_VEHICLE_TYPE))
+        if (end := attributes.get("end")) and isfinite(last := _parse_time(end)):
+            self.last_end = max(self.last_end, last)
+        if self.first_departure is not None:
+            self._add_departure(attributes.get(depart_attribute, ""))
+
+    def _on_person(self, attributes: XmlAttributes) -> None:
+        self.first_departure = None  # persons may take a car of their own
+
+    def _note_person_trip(self, attributes: XmlAttributes) -> None:
+        modes = attributes.get("modes", "").replace(",", " ").split()
+        own = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
+        self.wanted |= set(attributes.get("vTypes", "").split()) or own
+
+    def _note_calibrator(self, attributes: XmlAttributes) -> None:
+        self.calibrates = True
+
+    def _on_type(self, attributes: XmlAttributes) -> None:
+        name = attributes.get("refId") or attributes.get("id", "")
+        self._current_distribution.add(name)
+        if "refId" not in attributes:
+            self._current_type, self.types[name], self.type_parameters[name] = name, dict(attributes), {}
+
+    def _on_model(self, attributes: XmlAttributes) -> None:
+        if self._current_type:  # older files have the attributes of the car-following law in an element of its own
+            self.types[self._current_type] |= attributes
+
+    def _on_parameter(self, attributes: XmlAttributes) -> None:
+        if self._current_type:
+            self.type_parameters[self._current_type][attributes.get("key", "")] = attributes.get("value", "")
+
+    def _on_type_end(self, attributes: XmlAttributes) -> None:
+        self._current_type = ""
+
+    def _on_distribution(self, attributes: XmlAttributes) -> None:
+        self._current_distribution = set(attributes.get("vTypes", "").split())
+        self._distributions[attributes.get("id", "")] = self._current_distribution
+
+    def _on_distribution_end(self, attributes: XmlAttributes) -> None:
+        self._current_distribution = set()
+
+    def _add_departure(self, text: str) -> None:
+        try:
+            time = float(text or 0)
+        except ValueError:
+            time = _parse_time(text)
+        self.first_departure = (
+            None if self.first_departure is None or not isfinite(time) else min(self.first_departure, time)
+        )
+
+    def used_types(self) -> set[str]:
+        """Return the types that vehicles have; those of SUMO's own among them are defined from now on."""
+        used, left = set[str](), set(self.used_names)
+        while left:
+            name = left.pop()
+            used.add(name)
+            left |= self._distributions.get(name, set()) - used
+        used -= self._distributions.keys()
+        self.types.setdefault(DEFAULT_VEHICLE_TYPE, {})
+        for name in used & OTHER_DEFAULT_TYPES.keys():
+            self.types.setdefault(name, {"vClass": OTHER_DEFAULT_TYPES[name]})
+        return used
+
+
+def _write_copy(path: Path, copy: Path, types: Path | None = None) -> None:
+    """Write an XML file again without what is not harmless, vehicle types changed as a JSON file says."""
+    changes = json.loads(types.read_bytes()) if types else {}
+    with open(copy, "w", encoding="utf-8") as out:
+        XmlReader({}, out, changes).read(path)
+
+
+READER_COMMANDS: dict[str, Callable[..., Any]] = {
+    "configuration": _read_configuration,
+    "lanes": _read_lanes,
+    "copy": _write_copy,
+}
+
+
+def _main(command: str, *paths: str) -> None:
+    """Print what a file says, or what is wrong with it."""
+    try:
+        found = {"found": READER_COMMANDS[command](*map(Path, paths))}
+    except BrokenFileError as error:
+        found = {"broken": str(error)}
+    except (MemoryError, RecursionError):
+        found = {"broken": f"{Path(paths[0]).name}: its files are too large to be read"}
+    sys.stdout.write(json.dumps(found))
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

@@ -1,0 +1,82 @@
+"""What a training belongs to: its settings, and hashes of the code, networks and packages in it."""
+
+import json
+import logging
+from collections.abc import Iterable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from unjam.controller.file import sha256_of, sha256_of_file
+from unjam.drivers.registry import driver_recipe
+from unjam.drivers.user_driver import FileReference, is_file_reference
+from unjam.errors import InputError, invalid_value
+from unjam.files import to_json
+from unjam.kernels import kernel_info
+from unjam.manifest import package_versions
+from unjam.parameters import flatten_keys
+from unjam.scenarios.population import population_file
+from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.user_network import UserNetwork
+from unjam.sumo_files import read_sumo_files
+from unjam.training.config import RunConfig
+from unjam.worlds.episode import Task
+
+_LOG = logging.getLogger(__name__)
+
+
+def fingerprint(config: RunConfig) -> dict[str, Any]:
+    """Return what a training's result depends on, as JSON.
+
+    Returns:
+        `settings`: all but steps and workers, by name; `files`: hashes of the expert, and of the user's own
+        code and networks; `packages` and `kernel_info`: what it computes with.
+    """
+    roads = zip(config.task_configs().values(), config.make_tasks(), strict=True)
+    files = {name: sha256 for road, task in roads for name, sha256 in _task_file_hashes(road, task).items()}
+    settings = flatten_keys(asdict(replace(config, steps=1, workers=1)))
+    found = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
+    return json.loads(to_json(found))
+
+
+def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
+    """Compare what a checkpoint belongs to with what would go on; other packages and kernels are only told.
+
+    Raises:
+        InputError: a setting, the expert, or a file of the user's own is another one.
+    """
+    for name, value in current["settings"].items():
+        if name in stored["settings"] and stored["settings"][name] != value:
+            raise invalid_value(f"resume: {name}", value, f"{stored['settings'][name]!r}, as in the checkpoint")
+    check_file_hashes(stored, current, "resume")
+    for part in ("packages", "kernels"):
+        if stored[part] != current[part]:
+            _LOG.warning("resume: other %s than the checkpoint's: the result is not what it would be", part)
+
+
+def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:
+    """Raise `InputError` where the expert, or a file of the user's own, is another one."""
+    for name in sorted(stored["files"].keys() | current["files"].keys()):
+        if stored["files"].get(name) != current["files"].get(name):
+            raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
+
+
+def _task_file_hashes(config: RunConfig, task: Task) -> dict[str, str]:
+    """Return hashes by what they are of."""
+    recipe, arrays = driver_recipe(task.expert)
+    weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
+    found = {f"expert {config.expert}": sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)}
+    return found | file_hashes((config.reward, *config.policy.inputs), task.scenario)
+
+
+def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
+    """Return hashes of the code that `names` refer to and of the files of scenarios, by path."""
+    codes = [FileReference.parse(name).read_code() for name in names if is_file_reference(name)]
+    paths = list[Path]()
+    for scenario in scenarios:
+        if isinstance(scenario, UserNetwork):
+            paths += read_sumo_files(Path(scenario.file)).sources
+        if scenario.population:
+            paths.append(population_file(scenario.population))
+    hashes = {str(code.path): code.sha256 for code in codes}
+    return hashes | {str(path): sha256_of_file(path) for path in paths}

@@ -1,0 +1,132 @@
+"""The family of roads on which one controller is trained and judged: what it sees, and what is held out.
+
+Each road draws its size, its people and their noise from the seed. Held out are whole axes (a density, a
+number of vehicles, people, a demand, a radius) and new combinations of what is seen; which, was fixed before
+anything was trained or tuned on them. Wrong sensors, very late cars and calibrated people came last, and are
+held out.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from unjam.drivers.road_type_switch import MIN_SHARED_PENETRATION_RATE
+from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import Scenario
+
+FamilyPart = Literal["seen", "combination", "axis"]
+
+SHORT_WARM_UP, LONG_WARM_UP = 750, 6000
+"""all-human simulation steps before the CAVs take over: a wave begins, or is there"""
+AGGRESSIVE_IDM = {"time_headway": 0.9, "max_acceleration": 1.3, "comfortable_deceleration": 2.0}
+"""people who follow closer and accelerate harder than the paper's"""
+NGSIM_IDM = {
+    "desired_speed": 17.49,
+    "time_headway": 1.355,
+    "max_acceleration": 1.243,
+    "comfortable_deceleration": 1.424,
+    "minimum_gap": 2.157,
+}
+"""the IDM that suits the 325 drivers of the NGSIM pairs best together, results/field/ngsim-drivers.json"""
+ACTUATOR_LATENCY, LONG_ACTUATOR_LATENCY = {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}
+"""cars that do late what they are told [s]"""
+SENSOR_ERRORS = {"gap_error": 0.5, "speed_error": 0.3}
+NOISY_SENSORS: dict[str, Any] = {"sensors": {**SENSOR_ERRORS, "dropout": 0.1}, "safety": SENSOR_ERRORS}
+"""sensors that err, and lose a tenth of the readings; the filter allows for it"""
+NGSIM_DRIVERS: dict[str, Any] = {"population": "unjam:ngsim"}
+ASTAZERO_DRIVERS: dict[str, Any] = {"population": "unjam:astazero"}
+"""people each of whom drives as somebody did who was recorded; on the on-ramp with what they can carry"""
+
+
+@dataclass(frozen=True)
+class FamilyRoad:
+    """One road of the family."""
+
+    scenario: str
+    options: dict[str, Any] = field(default_factory=dict)
+    part: FamilyPart = "seen"
+    """`seen` in training and tuning; held out: a new `combination` of what is seen, or a whole `axis`"""
+
+    def make_scenario(self) -> Scenario:
+        """Return the road."""
+        return make_scenario(self.scenario, self.options)
+
+
+def ring_options(
+    vehicles: int, cavs: int, warmup: int, spacing: tuple[float, float] = (10.0, 12.27), **extra: Any
+) -> dict[str, Any]:
+    """Return a ring's parameters; `cav_spacing` is the road for each vehicle [m], the paper's by default."""
+    length = [round(vehicles * each) for each in spacing]
+    return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **extra}
+
+
+FAMILY: dict[str, FamilyRoad] = {
+    "ring-22-standing": FamilyRoad("ring", ring_options(22, 1, 0)),
+    "ring-22-growing": FamilyRoad("ring", ring_options(22, 1, SHORT_WARM_UP)),
+    "ring-22-grown": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP)),
+    "ring-33-growing-3-cavs": FamilyRoad("ring", ring_options(33, 3, SHORT_WARM_UP)),
+    "ring-44-grown": FamilyRoad("ring", ring_options(44, 1, LONG_WARM_UP)),
+    "ring-44-growing-2-cavs": FamilyRoad("ring", ring_options(44, 2, SHORT_WARM_UP)),
+    "ring-66-grown-4-cavs": FamilyRoad("ring", ring_options(66, 4, LONG_WARM_UP)),
+    "ring-22-wide": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, (13.0, 16.0))),
+    "ring-22-hurried": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=AGGRESSIVE_IDM)),
+    "ring-22-late": FamilyRoad("ring", ring_options(22, 1, SHORT_WARM_UP, actuator=ACTUATOR_LATENCY)),
+    "figure-eight-14": FamilyRoad("figure-eight"),
+    "figure-eight-12": FamilyRoad("figure-eight", {"vehicles": 12}),
+    "on-ramp-5": FamilyRoad("on-ramp", {"penetration_rate": 0.05}),
+    "on-ramp-20": FamilyRoad("on-ramp", {"penetration_rate": 0.2}),
+    "on-ramp-10-less-demand": FamilyRoad("on-ramp", {"penetration_rate": 0.1, "inflow": 2900.0}),
+    "ring-33-grown": FamilyRoad("ring", ring_options(33, 1, LONG_WARM_UP), "combination"),
+    "ring-66-growing-2-cavs": FamilyRoad("ring", ring_options(66, 2, SHORT_WARM_UP), "combination"),
+    "ring-44-late-hurried": FamilyRoad(
+        "ring", ring_options(44, 2, LONG_WARM_UP, humans=AGGRESSIVE_IDM, actuator=ACTUATOR_LATENCY), "combination"
+    ),
+    "on-ramp-10": FamilyRoad("on-ramp", {"penetration_rate": 0.1}, "combination"),
+    "ring-22-dense": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, (9.1, 9.8)), "axis"),
+    "ring-88-grown": FamilyRoad("ring", ring_options(88, 1, LONG_WARM_UP), "axis"),
+    "ring-44-grown-5-cavs": FamilyRoad("ring", ring_options(44, 5, LONG_WARM_UP), "axis"),
+    "ring-22-measured": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=NGSIM_IDM), "axis"),
+    "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38)}, "axis"),
+    "on-ramp-10-more-demand": FamilyRoad(
+        "on-ramp", {"penetration_rate": 0.1, "inflow": 3400.0, "ramp_flow": 600.0}, "axis"
+    ),
+    "one-lane-10": FamilyRoad("on-ramp-1", {"penetration_rate": 0.1}, "axis"),
+    "ring-22-very-late": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, actuator=LONG_ACTUATOR_LATENCY), "axis"),
+    "ring-22-unsure": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NOISY_SENSORS), "axis"),
+    "ring-22-ngsim": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NGSIM_DRIVERS), "axis"),
+    "ring-22-astazero": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **ASTAZERO_DRIVERS), "axis"),
+    "figure-eight-ngsim": FamilyRoad("figure-eight", NGSIM_DRIVERS, "axis"),
+    "figure-eight-astazero": FamilyRoad("figure-eight", ASTAZERO_DRIVERS, "axis"),
+    "on-ramp-10-ngsim": FamilyRoad(
+        "on-ramp", {"penetration_rate": 0.1, "inflow": 2600.0, "ramp_flow": 400.0, **NGSIM_DRIVERS}, "axis"
+    ),
+    "on-ramp-10-astazero": FamilyRoad(
+        "on-ramp", {"penetration_rate": 0.1, "inflow": 2200.0, "ramp_flow": 350.0, **ASTAZERO_DRIVERS}, "axis"
+    ),
+}
+"""every road by name"""
+
+
+GROUP_BY_SCENARIO = {"ring": "rings", "figure-eight": "figure-eights", "on-ramp": "motorways", "on-ramp-1": "motorways"}
+"""for each scenario the group of roads that one law can be written for"""
+SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "everywhere"
+"""names of the rings that several CAVs share, and of the whole family"""
+ROAD_GROUPS = (*dict.fromkeys(GROUP_BY_SCENARIO.values()), SHARED_RINGS_GROUP, ALL_ROADS_GROUP)
+"""names of several roads"""
+
+
+def _is_in(road: FamilyRoad, group: str) -> bool:
+    """Return whether a road belongs to a group, one of `ROAD_GROUPS`."""
+    if group == SHARED_RINGS_GROUP:
+        changes = road.options
+        return road.scenario == "ring" and changes["cavs"] >= MIN_SHARED_PENETRATION_RATE * changes["vehicles"]
+    return group in (GROUP_BY_SCENARIO[road.scenario], ALL_ROADS_GROUP)
+
+
+def family_roads(group: str) -> dict[str, FamilyRoad]:
+    """Return the roads of a group, one of `ROAD_GROUPS`, seen and held out, by name."""
+    return {name: road for name, road in FAMILY.items() if _is_in(road, group)}
+
+
+def family_scenarios(group: str, *parts: FamilyPart) -> dict[str, Scenario]:
+    """Return the roads of some parts of a group, one of `ROAD_GROUPS`, by name."""
+    return {name: road.make_scenario() for name, road in family_roads(group).items() if road.part in parts}

@@ -1,0 +1,1 @@
+"""Batch simulation of figure eights, with the crossing as SUMO drives it."""

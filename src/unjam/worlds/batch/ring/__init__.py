@@ -1,0 +1,1 @@
+"""Batch simulation of rings: all vehicles of many rings as arrays."""

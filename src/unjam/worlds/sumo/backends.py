@@ -1,0 +1,229 @@
+"""How SUMO is reached: the only module that imports libsumo or traci.
+
+Both libraries keep state of the whole process, in which the user may run a simulation of their own: it is
+never closed, stepped, or replaced, and the user's TraCI connection stays the active one. The records of what
+SUMO answers are here, too.
+"""
+
+import importlib
+import socket
+import subprocess
+import threading
+import time
+import weakref
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
+
+from unjam.errors import LostWorkerError, MissingPartError, UnjamError
+from unjam.sandbox import restrict_writing
+
+Backend = Literal["libsumo", "traci", "gui"]
+"""`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
+BACKEND_MODULES = {"libsumo": "libsumo", "traci": "traci.main", "gui": "traci.main"}
+"""where each is; `import traci` would give what LIBSUMO_AS_TRACI or LIBTRACI_AS_TRACI make of it"""
+MAX_START_SECONDS = 600.0
+"""how long SUMO may take until it accepts a connection [s]: it reads the network first"""
+CONNECT_RETRY_SECONDS = 0.02
+"""time between two attempts to connect [s]"""
+_libsumo_lock = threading.Lock()
+"""held by the one simulation that runs on libsumo in this process; never waited for"""
+
+
+class InUseError(UnjamError):
+    """libsumo, which holds one simulation per process, already holds one."""
+
+
+class Libsumo:
+    """SUMO in this process, for one simulation; what other code does to that simulation is detected."""
+
+    def __init__(self) -> None:
+        """Claim libsumo.
+
+        Raises:
+            InUseError: another simulation, unjam's or the user's, is open in this process.
+        """
+        self.functions: Any = import_backend("libsumo")
+        call = partial(sumo_function, self.functions)
+        self._is_loaded = call("simulation", "isLoaded")
+        self._get_time, self._step = call("simulation", "getTime"), call("simulation", "step")
+        self._get_time_step, self._get_option = call("simulation", "getDeltaT"), call("simulation", "getOption")
+        self._log_path: str | None = None
+        """the error log of the running simulation, which tells it from any other; None: it does not run"""
+        self._step_count = 0
+        """simulated since the simulation was started"""
+        self._begin_time = 0.0
+        self.has_refused = False
+        """whether a step has failed since the simulation was started"""
+        self._is_claimed = _libsumo_lock.acquire(blocking=False)
+        if not self._is_claimed or self._is_loaded():
+            self.close()
+            raise InUseError("a simulation is already open in this process; close it, or use another")
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the simulation has been started."""
+        return self._log_path is not None
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether other code of this process has started, stepped or closed libsumo's simulation."""
+        if not self._is_own():
+            return True
+        return (
+            self.is_running and round((self._get_time() - self._begin_time) / self._get_time_step()) != self._step_count
+        )
+
+    def check(self) -> None:
+        """Raise `LostWorkerError` where other code of this process has changed the simulation.
+
+        It costs less than a microsecond.
+        """
+        if self.is_lost:
+            raise LostWorkerError(
+                "SUMO was lost: other code in this process has started, stepped or closed a simulation "
+                "through libsumo; run the episode again"
+            )
+
+    def start(self, command: Sequence[str], log_path: Path) -> None:
+        """Start SUMO, which writes its errors to `log`."""
+        self._log_path = str(log_path)
+        self.functions.start([*command])
+        self._reset_step_count()
+
+    def load(self, options: Sequence[str]) -> None:
+        """Start the simulation again with other options."""
+        self.functions.load([*options])
+        self._reset_step_count()
+
+    def _reset_step_count(self) -> None:
+        self._begin, self._steps, self.has_refused = self._time(), 0, False
+
+    def step(self) -> None:
+        """Simulate one time step."""
+        try:
+            self._step()
+        except Exception:
+            self.has_refused = True
+            raise
+        self._step_count += 1
+
+    def end(self) -> None:
+        """End the simulation; one that is gone is no error, and one of other code goes on."""
+        if self._log_path is not None and self._is_own():
+            close_sumo(self.functions)
+        self._log_path = None
+
+    def close(self) -> None:
+        """Give libsumo back; may be called twice."""
+        if self._is_claimed:
+            self._is_claimed = False
+            _libsumo_lock.release()
+
+    def _is_own(self) -> bool:
+        """Return whether libsumo holds this simulation, or none where it is not running."""
+        if self._log_path is None or not self._is_loaded():
+            return self._log_path is None and not self._is_loaded()
+        return self._get_option("error-log") == self._log_path
+
+
+class Traci:
+    """SUMO as a child process, over a connection that nobody else in this process is given."""
+
+    is_lost = has_refused = False
+
+    def __init__(self) -> None:
+        """Import traci; nothing is started yet."""
+        self._traci = import_backend("traci")
+        self.functions: Any = None
+        """the connection; None while there is none"""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether SUMO has been started."""
+        return self.functions is not None
+
+    def check(self) -> None:
+        """Do nothing: no other code reaches the simulation."""
+
+    def start(self, command: Sequence[str], log_path: Path) -> None:
+        """Start SUMO, which may write only into the folder of `log`, and connect to it."""
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+
+        def start_process() -> subprocess.Popen[bytes]:
+            restrict_writing(log_path.parent, Path("/dev"))  # screens and sockets it needs
+            return subprocess.Popen([*command, "--remote-port", str(port)], stdout=subprocess.DEVNULL)
+
+        # A thread that ends with it: what is forbidden to SUMO is forbidden to nothing else here.
+        with ThreadPoolExecutor(1) as confined:
+            process = confined.submit(start_process).result()
+        deadline = time.monotonic() + MAX_START_SECONDS
+        while self.functions is None:
+            try:  # one attempt at a time: traci prints each of several
+                self.functions = self._traci.connect(port, numRetries=0, host="127.0.0.1", proc=process)
+            except self._traci.FatalTraCIError:
+                if time.monotonic() > deadline:
+                    process.kill()
+                    raise
+                time.sleep(CONNECT_RETRY_SECONDS)
+        # An open connection would print an error when this process ends.
+        weakref.finalize(self, close_sumo, self.functions)
+        self._step = sumo_function(self.functions, "simulation", "step")
+
+    def load(self, options: Sequence[str]) -> None:
+        """Start the simulation again with other options."""
+        self.functions.load([*options])
+
+    def step(self) -> None:
+        """Simulate one time step."""
+        self._step()
+
+    def end(self) -> None:
+        """End SUMO; one that is gone is no error."""
+        if self.functions is not None:
+            close_sumo(self.functions)
+        self.functions = None
+
+    def close(self) -> None:
+        """Do nothing more."""
+
+
+class NeighborStates(NamedTuple):
+    """Who is ahead of a vehicle and behind it [m/s, m from bumper to bumper]; no name: nobody is ahead."""
+
+    leader: str
+    leader_speed: float
+    leader_gap: float
+    follower_speed: float
+    follower_gap: float
+
+
+def close_sumo(sumo: Any) -> None:
+    """End a simulation; one that is gone already is no error."""
+    with suppress(Exception):
+        sumo.close()
+
+
+def sumo_function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
+    """Return a function of libsumo or traci; of libsumo the compiled one, without its Python wrapper.
+
+    The wrapper only passes its arguments on, and is a third of the cost of a call.
+    """
+    compiled = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
+    wrapped = sumo.simulationStep if name == "step" else getattr(getattr(sumo, domain), name)
+    return getattr(compiled, f"{domain}_{name}", wrapped)
+
+
+def import_backend(backend: Backend) -> ModuleType:
+    """Return the library of a backend; raise `MissingPartError` where it is not installed."""
+    try:
+        return importlib.import_module(BACKEND_MODULES[backend])
+    except ImportError as error:
+        name = BACKEND_MODULES[backend].partition(".")[0]
+        raise MissingPartError(f"{name} cannot be imported ({error}); install it: pip install {name}==1.28.0") from None

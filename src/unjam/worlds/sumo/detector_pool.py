@@ -1,0 +1,92 @@
+"""Several confined simulations at once, of people alone on a network of the user's own, with detectors."""
+
+import queue
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import Self
+
+from unjam.errors import EpisodeError, LostWorkerError
+from unjam.scenarios.user_network import UserNetwork
+from unjam.tree import unpack
+from unjam.worlds.sumo.detectors import DetectorPassage, InductionLoop, load_with_loops
+from unjam.worlds.sumo.sandboxed import SandboxedSimulation
+
+MAX_DETECTOR_ATTEMPTS = 3
+"""processes that may be lost on the same simulation"""
+
+
+class DetectorPool:
+    """A fixed number of confined SUMO processes, started when first needed, that count who passes loops.
+
+    What they count depends on scenario, seed and loops alone, not on how many there are.
+    """
+
+    def __init__(self, count: int = 1) -> None:
+        """Prepare `count` processes; nothing is started yet."""
+        self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-counting")
+        self._idle_simulations: queue.SimpleQueue[SandboxedSimulation | None] = queue.SimpleQueue()
+        self._open_simulations: set[SandboxedSimulation] = set()
+        for _ in range(count):
+            self._idle_simulations.put(None)
+
+    def run(
+        self, scenario: UserNetwork, seeds: Sequence[tuple[int, ...]], loops: Sequence[InductionLoop]
+    ) -> list[list[DetectorPassage]]:
+        """Return who passed the loops in the traffic of each seed, in the order of the seeds.
+
+        Raises:
+            EpisodeError: SUMO cannot run the scenario.
+            LostError: its process was lost, again and again.
+        """
+        futures = [self._thread_pool.submit(self._run_with_retries, scenario, seed, loops) for seed in seeds]
+        try:
+            return [future.result() for future in futures]
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+
+    def _run_with_retries(
+        self, scenario: UserNetwork, seed: tuple[int, ...], loops: Sequence[InductionLoop]
+    ) -> list[DetectorPassage]:
+        """Return who passed, in another process where one was lost."""
+        for _ in range(MAX_DETECTOR_ATTEMPTS - 1):
+            with suppress(LostWorkerError):
+                return self._run_one(scenario, seed, loops)
+        return self._run_one(scenario, seed, loops)
+
+    def _run_one(
+        self, scenario: UserNetwork, seed: tuple[int, ...], loops: Sequence[InductionLoop]
+    ) -> list[DetectorPassage]:
+        simulation = self._idle_simulations.get()
+        try:
+            if simulation is None:
+                simulation = SandboxedSimulation()
+                self._open_simulations.add(simulation)
+            load_with_loops(simulation, scenario, seed, loops)  # pyright: ignore[reportArgumentType]
+            steps = scenario.horizon * scenario.steps_per_control_step
+            return unpack(list[DetectorPassage], simulation.passages(loops, steps), {})
+        except EpisodeError:
+            if simulation is not None:  # it may be lost: another one goes on
+                simulation.close()
+                self._open_simulations.discard(simulation)
+            simulation = None
+            raise
+        finally:
+            self._idle_simulations.put(simulation)
+
+    def close(self) -> None:
+        """End all processes; may be called twice."""
+        self._thread_pool.shutdown(wait=False, cancel_futures=True)
+        for simulation in list(self._open_simulations):  # who waits for one is told that it was lost
+            simulation.close()
+        self._thread_pool.shutdown()
+        for simulation in list(self._open_simulations):
+            simulation.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()

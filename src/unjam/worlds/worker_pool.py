@@ -1,0 +1,267 @@
+"""Many episodes at once, each in a worker process, with the same result whatever happens to a worker."""
+
+import queue
+import subprocess
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Self, TypeVar
+
+from unjam.child_processes import child_environment, python_command
+from unjam.drivers.driver import Driver
+from unjam.drivers.registry import driver_recipe
+from unjam.errors import EpisodeError, SumoInputError
+from unjam.processes import PrivateFolder, remove_stale_private_folders
+from unjam.scenarios import scenario_recipe
+from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.user_network import UserNetwork
+from unjam.sumo_files import MAX_READER_TIME, answer_of
+from unjam.tree import Arrays, unpack
+from unjam.worlds.messages import read_message, write_message
+from unjam.worlds.record import Episode, failed_episode
+
+MAX_EPISODE_ATTEMPTS = 3
+"""how often an episode is tried before its row says that it failed"""
+WORKER_TIMEOUT = 30.0
+"""seconds without a sign of life after which a worker counts as hung"""
+
+ResultT = TypeVar("ResultT")
+Message = tuple[dict[str, Any], Arrays]
+
+
+@dataclass(frozen=True)
+class EpisodeTask:
+    """The arguments of one `run_episode`."""
+
+    scenario: Scenario
+    driver: Driver
+    seed: tuple[int, ...]
+    reward: str = ""
+    explore: float = 0.0
+    record_details: bool = False
+    stop_at_contact: bool = True
+
+    def message(self) -> Message:
+        """Return the task as it travels to a worker."""
+        recipe, arrays = driver_recipe(self.driver)
+        how = {
+            "seed": list(self.seed),
+            "reward": self.reward,
+            "explore": self.explore,
+            "record_details": self.record_details,
+        }
+        how |= {"stop_at_contact": self.stop_at_contact}
+        return {"scenario": scenario_recipe(self.scenario), "driver": recipe, **how}, arrays
+
+
+class WorkerPool:
+    """A fixed number of worker processes, started when first needed, replaced when they die or hang.
+
+    The episodes that come back depend on the tasks alone: not on the number of workers, on which of them
+    ran what, or on how often one had to be replaced.
+    """
+
+    def __init__(
+        self, count: int = 1, timeout: float = WORKER_TIMEOUT, max_attempts: int = MAX_EPISODE_ATTEMPTS
+    ) -> None:
+        """Prepare `count` workers; nothing is started yet."""
+        self.count, self._max_attempts, self._is_first = count, max_attempts, True
+        # Of all workers, so that nothing stays behind of one that was killed.
+        remove_stale_private_folders()
+        self._temporary_folder = PrivateFolder()
+        self._idle_workers: queue.LifoQueue[_Worker] = queue.LifoQueue()
+        self._workers = [_Worker(timeout, self._temporary_folder.name) for _ in range(count)]
+        self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-worker")
+        for worker in self._workers:
+            self._idle_workers.put(worker)
+
+    def run(self, tasks: Sequence[EpisodeTask], on_progress: Callable[[int, int], None] | None = None) -> list[Episode]:
+        """Run all tasks and return their episodes, in the order of the tasks; one that failed says why.
+
+        Where SUMO refuses the files of the very first one, raise `SumoInputError`, as `run_and_map` does.
+        `on_progress` is called with a task's index and its decisions so far, from several threads.
+        """
+        return self.run_and_map(tasks, lambda index, episode: episode, on_progress)
+
+    def run_and_map(
+        self,
+        tasks: Sequence[EpisodeTask],
+        transform: Callable[[int, Episode], ResultT],
+        on_progress: Callable[[int, int], None] | None = None,
+    ) -> list[ResultT]:
+        """Run all tasks and return what `transform` makes of each index and episode: many need much memory.
+
+        `transform` is called as an episode ends, from several threads.
+
+        Raises:
+            SumoInputError: SUMO refuses the files of the very first task: it would refuse those of others, too.
+        """
+        is_first, self._is_first = self._is_first, False
+
+        def run_one(index: int, task: EpisodeTask) -> ResultT:
+            episode = self._run_one(index, task, on_progress)
+            if is_first and index == 0 and episode.error == SumoInputError.__name__:
+                raise SumoInputError(episode.reason)
+            return transform(index, episode)
+
+        futures = list[Future[ResultT]]()
+        try:
+            for index, task in enumerate(tasks):  # it takes a while: an interrupt may come already
+                futures.append(self._thread_pool.submit(run_one, index, task))
+            return [future.result() for future in futures]
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            self.close()
+            raise
+
+    def _run_one(self, index: int, task: EpisodeTask, on_progress: Callable[[int, int], None] | None) -> Episode:
+        worker = self._idle_workers.get()
+        problems = []
+        try:
+            for _ in range(self._max_attempts):
+                try:
+                    worker.set_sandboxed(isinstance(task.scenario, UserNetwork))
+                    episode = worker.run(task.message(), lambda steps: on_progress and on_progress(index, steps))
+                    if on_progress is not None:
+                        on_progress(index, episode.control_steps)
+                    return episode
+                except _WorkerLostError as lost:
+                    problems.append(str(lost))
+            reason = f"{self._max_attempts} workers were lost on it: {'; '.join(dict.fromkeys(problems))}"
+            return failed_episode(task.seed, reason, EpisodeError.__name__)
+        finally:
+            self._idle_workers.put(worker)
+
+    def close(self) -> None:
+        """Stop all workers; may be called twice."""
+        for worker in self._workers:
+            worker.stop()
+        self._thread_pool.shutdown(wait=True, cancel_futures=True)
+        self._temporary_folder.cleanup()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+class _WorkerLostError(Exception):
+    """The worker died or fell silent."""
+
+
+class _Worker:
+    """One worker process and the pipe to it."""
+
+    def __init__(self, timeout: float, temporary_folder: str) -> None:
+        self._timeout, self._temporary_folder = timeout, temporary_folder
+        self._process: subprocess.Popen[bytes] | None = None
+        self._is_stopped = self._is_sandboxed = False
+        self._told = set[str]()
+        """the user's configurations that the process need not read"""
+        self._start_lock = threading.Lock()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        # A BLAS with threads of its own would fight with the other workers for the cores.
+        single = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        self._error_file = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
+        process = subprocess.Popen(
+            python_command("-m", "unjam.worlds.worker"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._error_file,
+            env=child_environment(**single, TMPDIR=self._temporary_folder),
+            start_new_session=True,  # an interrupt in the terminal is the parent's to handle
+        )
+        self._told.clear()
+        self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        threading.Thread(target=_forward_messages, args=(process, self._messages), daemon=True).start()
+        return process
+
+    def set_sandboxed(self, is_sandboxed: bool) -> None:
+        """Note whether the next episode is one that takes the process its rights; it never has them again."""
+        if self._is_sandboxed and not is_sandboxed:
+            self._kill()
+        self._is_sandboxed = is_sandboxed
+
+    def run(self, task: Message, on_progress: Callable[[int], object]) -> Episode:
+        """Return the episode of a task; raise `_WorkerLostError` where the process dies or falls silent."""
+        with self._start_lock:
+            if self._is_stopped:
+                raise _WorkerLostError("stopped")
+            process = self._process = self._process or self._start()
+        # A network of the user's own is read, and loaded, before there is anything to tell.
+        patience = self._timeout + (MAX_READER_TIME if self._is_sandboxed else 0.0)
+        try:
+            self._send(process, self._with_files(task))
+            while True:
+                message = self._messages.get(timeout=patience)
+                patience = self._timeout
+                if message is None:
+                    raise _WorkerLostError(self._exit_reason(process))
+                facts, arrays = message
+                if "episode" in facts:
+                    return unpack(Episode, facts["episode"], arrays)
+                on_progress(facts["progress"])
+        except queue.Empty:
+            self._kill()
+            raise _WorkerLostError(f"no sign of life for {patience:g} s") from None
+        except BrokenPipeError:
+            raise _WorkerLostError(self._exit_reason(process)) from None
+
+    def _with_files(self, task: Message) -> Message:
+        """Return a task with what was read of the user's files, the first time that the process needs it."""
+        facts, arrays = task
+        file = facts["scenario"].get("file")
+        answer = answer_of(file) if file and file not in self._told else None
+        if answer is None:
+            return task
+        self._told.add(file)
+        return {**facts, "files": answer}, arrays
+
+    def _send(self, process: subprocess.Popen[bytes], task: Message) -> None:
+        assert process.stdin is not None
+        guard = threading.Timer(self._timeout, process.kill)  # a full pipe that nobody reads blocks for ever
+        guard.start()
+        try:
+            facts, arrays = task
+            write_message(process.stdin, facts, dict(arrays))
+        finally:
+            guard.cancel()
+
+    def _exit_reason(self, process: subprocess.Popen[bytes]) -> str:
+        try:
+            code = process.wait(timeout=1.0)
+        except subprocess.TimeoutExpired:  # it lives, but what it says cannot be read
+            process.kill()
+            code = process.wait()
+        self._process = None
+        self._error_file.seek(0)
+        last = self._error_file.read().decode(errors="replace").strip().splitlines()[-1:]
+        how = f"killed by signal {-code}" if code < 0 else f"ended with code {code}"
+        return ": ".join([how, *last])
+
+    def _kill(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+
+    def stop(self) -> None:
+        """End the process, now and for good."""
+        with self._start_lock:
+            self._is_stopped = True
+            self._kill()
+
+
+def _forward_messages(process: subprocess.Popen[bytes], messages: "queue.SimpleQueue[Message | None]") -> None:
+    """Pass on what the process says; None when it says no more."""
+    assert process.stdout is not None
+    try:
+        while True:
+            messages.put(read_message(process.stdout))
+    except Exception:  # end of file, or a frame cut short by the process's death
+        messages.put(None)

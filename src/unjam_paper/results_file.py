@@ -1,0 +1,116 @@
+"""Write and read the results file of a study: one JSON object with its manifest and an entry for each part.
+
+Tables of rows with the same keys are stored column by column, `{"columns": {NAME: [VALUES]}}`; a number or a
+text that is the same in all rows is stored once, `{NAME: VALUE}`. That takes a third of the space. Pictures
+and controllers lie beside the file, as NAME-PICTURE.png and NAME-controllers.zip.
+"""
+
+import json
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
+
+from unjam.files import atomic_write, to_json
+
+COLUMNS = "columns"
+"""the only key of a table that is stored by columns"""
+CONTROLLERS = "controllers"
+"""the subfolder of a study's working folder that holds its controllers"""
+
+
+def write_results(path: Path, parts: Mapping[str, Any]) -> None:
+    """Write a results file, one line for each part; NaN and infinities become null."""
+    lines = (f"{json.dumps(name)}: {_compact_json(part)}" for name, part in parts.items())
+    atomic_write(path, "{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def collect_results(folder: Path) -> Path:
+    """Write what the working folder of a study holds as one file beside it, and return this file.
+
+    The manifest comes first, then the parts in the order of their names. Pictures and controllers are copied.
+    """
+    path = folder.with_name(f"{folder.name}.json")
+    parts = read_parts(folder)
+    manifest = {"manifest": parts.pop("manifest")} if "manifest" in parts else {}
+    write_results(path, manifest | parts)
+    for picture in sorted(folder.glob("*.png")):
+        name = picture.name if picture.stem == folder.name else f"{folder.name}-{picture.name}"
+        atomic_write(folder.with_name(name), picture.read_bytes())
+    controllers = sorted((folder / CONTROLLERS).glob("*.unjam"))
+    if controllers:
+        atomic_write(folder.with_name(f"{folder.name}-controllers.zip"), _zip_of(controllers))
+    return path
+
+
+def read_part(path: Path, name: str) -> Any:
+    """Return one part of a study, from its results file or from its working folder.
+
+    Raises:
+        KeyError, FileNotFoundError: there is no such part.
+    """
+    if path.is_dir():
+        return json.loads((path / f"{name}.json").read_text(encoding="utf-8"))
+    return _by_rows(json.loads(path.read_text(encoding="utf-8"))[name])
+
+
+def read_parts(path: Path) -> dict[str, Any]:
+    """Return all parts of a study by name, from its results file or from its working folder."""
+    if path.is_dir():
+        return {file.stem: read_part(path, file.stem) for file in sorted(path.glob("*.json"))}
+    return _by_rows(json.loads(path.read_text(encoding="utf-8")))
+
+
+def _zip_of(files: list[Path]) -> bytes:
+    """Return an archive that depends on nothing but the names and the contents of files."""
+    content = BytesIO()
+    with ZipFile(content, "w") as archive:
+        for file in files:
+            archive.writestr(ZipInfo(file.name), file.read_bytes(), ZIP_DEFLATED, compresslevel=9)
+    return content.getvalue()
+
+
+def _compact_json(part: Any) -> str:
+    return json.dumps(json.loads(to_json(_by_columns(part))), separators=(",", ":"))
+
+
+def _by_columns(value: Any) -> Any:
+    """Return a JSON value with its tables of rows stored by columns."""
+    if isinstance(value, Mapping):
+        return {key: _by_columns(entry) for key, entry in value.items()}
+    if not isinstance(value, (list, tuple)):
+        return value
+    if len(value) > 1 and all(isinstance(row, Mapping) and row for row in value):
+        names = list(value[0])
+        if all(list(row) == names for row in value):
+            columns = {name: [row[name] for row in value] for name in names}
+            same = {name for name, entries in columns.items() if _is_constant(entries)}
+            if len(same) < len(names):  # a column tells how many rows there are
+                return {
+                    COLUMNS: {
+                        name: entries[0] if name in same else _by_columns(entries) for name, entries in columns.items()
+                    }
+                }
+    return [_by_columns(entry) for entry in value]
+
+
+def _is_constant(entries: list[Any]) -> bool:
+    """Return whether all rows have one number or text; 1, 1.0 and true are three."""
+    if isinstance(entries[0], (Mapping, list, tuple)):
+        return False
+    return len({(type(entry), str(entry)) for entry in entries}) == 1
+
+
+def _by_rows(value: Any) -> Any:
+    """Return what `_by_columns` was given."""
+    if isinstance(value, list):
+        return [_by_rows(entry) for entry in value]
+    if not isinstance(value, dict):
+        return value
+    if list(value) != [COLUMNS]:
+        return {key: _by_rows(entry) for key, entry in value.items()}
+    columns = {name: _by_rows(entry) for name, entry in value[COLUMNS].items()}
+    rows = max(len(entries) for entries in columns.values() if isinstance(entries, list))
+    whole = (entries if isinstance(entries, list) else [entries] * rows for entries in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*whole, strict=True)]

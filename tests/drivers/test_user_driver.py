@@ -1,0 +1,117 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import random_network
+from unjam import check_driver
+from unjam.controller import make_driver
+from unjam.drivers.check import random_state
+from unjam.drivers.registry import driver_from_recipe, driver_recipe
+from unjam.drivers.residual import ResidualDriver
+from unjam.drivers.user_driver import FileDriver, FileReference
+from unjam.errors import InputError
+from unjam.scenarios import Merge
+from unjam.worlds.episode import run_episode
+
+
+def test_a_function_becomes_a_driver(my_drivers: Path) -> None:
+    driver = make_driver(f"{my_drivers}:gentle", 0.1)
+    check_driver(driver)
+    assert not driver.accepts_floats
+
+
+def test_a_class_takes_parameters_and_the_time_step(my_drivers: Path) -> None:
+    driver = make_driver(f"{my_drivers}:Keeper:gain=0.5", 0.1)
+    check_driver(driver)
+    state = random_state(np.random.default_rng(0), 2)
+    found, memory = driver.act(state, driver.initial_memory(2))
+    np.testing.assert_allclose(found, 0.5 * (state.leader_gap - 10))
+    assert set(memory) == {"last"}
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("nobody", "has no 'nobody'; it has: .*gentle"),
+        ("NoMemory", r"has act\(\) but no initial_memory"),
+        ("Raises", "RuntimeError when made: no battery"),
+        ("not_callable", "neither a function nor a class"),
+        ("gentle:gain=1", "takes no parameters"),
+        ("Keeper:strength=1", "TypeError when made"),
+    ],
+)
+def test_says_what_is_wrong_with_a_file(my_drivers: Path, name: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make_driver(f"{my_drivers}:{name}", 0.1)
+
+
+def test_says_that_a_file_is_missing_or_fails(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is not a file"):
+        make_driver(f"{tmp_path}/none.py:x", 0.1)
+    (tmp_path / "syntax.py").write_text("def x(:")
+    with pytest.raises(InputError, match="SyntaxError when loading"):
+        make_driver(f"{tmp_path}/syntax.py:x", 0.1)
+
+
+def test_a_file_may_import_its_neighbours(tmp_path: Path) -> None:
+    (tmp_path / "my_gains_of_mine.py").write_text("GAIN = 0.25")
+    (tmp_path / "main.py").write_text("from my_gains_of_mine import GAIN\ndef d(state): return GAIN * state.speed")
+    driver = make_driver(f"{tmp_path}/main.py:d", 0.1)
+    state = random_state(np.random.default_rng(0), 3)
+    np.testing.assert_allclose(driver.act(state, {})[0], 0.25 * state.speed)
+
+
+def test_a_users_driver_is_not_asked_while_no_cav_is_on_the_road(tmp_path: Path) -> None:
+    file = tmp_path / "nearest.py"
+    file.write_text("def nearest(state):\n    return state.speed * 0.0 + 0.001 * state.leader_gap.min()\n")
+    lonely = Merge(cavs=1, standing_vehicles=0, horizon=60)
+    episode = run_episode(lonely, FileDriver(file, "nearest"), (3,))
+    (trajectory,) = episode.trajectories
+    assert trajectory.start_step > 3
+    np.testing.assert_allclose(trajectory.applied_acceleration, 0.001 * trajectory.states.leader_gap[:-1], atol=1e-12)
+
+
+def test_files_of_two_folders_have_neighbours_of_the_same_name(tmp_path: Path) -> None:
+    found = []
+    for folder, gain in (("a", -0.1), ("b", 0.3)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "gains.py").write_text(f"GAIN = {gain}")
+        (tmp_path / folder / "mine.py").write_text("from gains import GAIN\ndef hold(state):\n    return GAIN")
+        found.append(FileDriver(tmp_path / folder / "mine.py", "hold"))
+    state = random_state(np.random.default_rng(0), 1)
+    assert [driver.act(state, {})[0] for driver in found] == [-0.1, 0.3]
+
+
+def test_code_that_changes_under_way_is_another_driver(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("def go(state):\n    return 0.5 + 0.0 * state.speed\n")
+    driver = make_driver(f"{file}:go", 0.1)
+    recipe, arrays = driver_recipe(driver)
+    assert driver_from_recipe(recipe, arrays) == driver
+    file.write_text(file.read_text().replace("0.5", "0.1"))
+    assert driver_recipe(driver)[0] == recipe  # that of what drives, not of what the file has become
+    with pytest.raises(InputError, match=r"mine\.py:go: its file has changed since"):
+        driver_from_recipe(recipe, arrays)
+
+
+def test_a_list_of_accelerations_will_do(tmp_path: Path) -> None:
+    (tmp_path / "lists.py").write_text("def d(state): return [0.25 for _ in state.speed]")
+    driver = ResidualDriver(make_driver(f"{tmp_path}/lists.py:d", 0.1), random_network(scale=0.0), 1.0)
+    state = random_state(np.random.default_rng(0), 3)
+    np.testing.assert_allclose(driver.act(state, driver.initial_memory(3))[0], 0.25)
+
+
+@pytest.mark.parametrize(("is_own", "expected"), [(True, ("", "loading\n")), (False, ("loading\n", ""))])
+def test_only_the_command_line_keeps_what_a_file_prints_off_its_results(
+    is_own: bool,
+    expected: tuple[str, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("unjam.processes._is_own", is_own)
+    path = tmp_path / "loud.py"
+    path.write_text("print('loading')\n\ndef gentle(state):\n    return 0.0 * state.speed\n")
+    FileReference(path, "gentle").load_object()
+    assert tuple(capsys.readouterr()) == expected

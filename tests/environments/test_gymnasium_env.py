@@ -1,0 +1,317 @@
+import re
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
+
+import unjam
+from tests.worlds.sumo.own_roads import straight
+from unjam.drivers import IDM, Constant
+from unjam.drivers.registry import driver_from_name
+from unjam.environments.gymnasium_env import RoadEnv
+from unjam.errors import InputError, MissingPartError, UnjamError
+from unjam.processes import has_display
+from unjam.scenarios import make_scenario
+from unjam.worlds.episode import run_episode
+
+NAMES = {
+    "unjam/Ring-v0": "ring",
+    "unjam/FigureEight-v0": "figure-eight",
+    "unjam/Merge-v0": "merge",
+    "unjam/OnRamp-v0": "on-ramp",
+}
+OWN = "unjam/OwnNetwork-v0"
+OPEN = ("unjam/Merge-v0", "unjam/OnRamp-v0")
+SHORT: Any = {"horizon": 60}
+
+
+@pytest.fixture(params=NAMES)
+def environment(request: pytest.FixtureRequest) -> Iterator[gymnasium.Env]:
+    made = gymnasium.make(request.param, **SHORT)
+    yield made
+    made.close()
+
+
+def test_passes_the_checks_of_gymnasium_and_stable_baselines3_without_warnings(environment: gymnasium.Env) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("default", "another simulation is open")  # a picture is drawn by another one
+        if make_scenario(NAMES[environment.spec.id if environment.spec else ""]).action_limit != 1:
+            warnings.filterwarnings("ignore", ".*symmetric and normalized")  # m/s2, as the road has them
+        check_env(environment.unwrapped, skip_render_check=not has_display())
+        check_env_of_sb3(environment.unwrapped)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("warmup", [0, 50])
+def test_steps_the_very_episode_that_run_episode_runs(name: str, warmup: int) -> None:
+    changes: Any = {"horizon": 120, "warmup": warmup, "cavs": 1}
+    scenario = make_scenario(NAMES[name], changes)
+    expected = run_episode(scenario, Constant(acceleration=0.3), (7,))
+    environment = gymnasium.make(name, **changes)
+    environment.reset(seed=7)
+    speeds, rewards = [], []
+    done = False
+    while not done:
+        _, reward, terminated, truncated, info = environment.step(np.array([0.3]))
+        done = terminated or truncated
+        speeds.append(environment.unwrapped._road.traffic.speeds)  # pyright: ignore[reportAttributeAccessIssue]
+        rewards.append(reward)
+        assert sum(info["terms"].values()) == reward
+    environment.close()
+    (stay,) = expected.trajectories
+    decided = len(stay.applied_acceleration)
+    left_early = stay.start_step + decided < scenario.horizon
+    assert len(rewards) == decided + left_early  # the decision in which it left is no part of its stay
+    np.testing.assert_allclose(rewards[:decided], stay.reward, atol=1e-12)
+    in_order = np.sort if name in OPEN else np.array  # of entry, or along the road
+    for found, recorded in zip(speeds, expected.speeds[1 + stay.start_step :], strict=False):
+        np.testing.assert_array_equal(in_order(found), in_order(recorded[~np.isnan(recorded)]))
+
+
+def test_actions_are_added_to_an_expert(environment: gymnasium.Env) -> None:
+    environment.close()
+    made = RoadEnv("ring", expert="pi", features=("local", "expert_acceleration", "expert_memory"), **SHORT)
+    assert made.observation_space.shape == (8,)
+    made.reset(seed=3)
+    speeds = []
+    for _ in range(60):
+        made.step(np.zeros(1))
+        speeds.append(made._road.traffic.speeds)
+    made.close()
+    expected = run_episode(make_scenario("ring", SHORT), driver_from_name("pi", 0.1), (3,))
+    np.testing.assert_array_equal(speeds, expected.speeds[1:])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_horizon_truncates_and_does_not_terminate(name: str) -> None:
+    horizon = 20 if name in OPEN else 60
+    environment = gymnasium.make(name, horizon=horizon)
+    environment.reset(seed=1)
+    decided = environment.unwrapped._road.traffic.decisions  # pyright: ignore[reportAttributeAccessIssue]
+    ends = [environment.step(np.zeros(1))[2:4] for _ in range(horizon - decided)]
+    environment.close()
+    assert len(ends) > 5
+    assert ends[:-1] == [(False, False)] * (len(ends) - 1)
+    assert ends[-1] == (False, True)
+
+
+@pytest.mark.parametrize("expert", ["", "pi"])
+def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
+    environment = RoadEnv("merge", cavs=1, horizon=200, expert=expert)
+    observation, _ = environment.reset(seed=1)
+    seen, ends = [observation], []
+    while not ends or ends[-1] == (False, False):
+        observation, _, terminated, truncated, _ = environment.step(np.zeros(1))
+        seen.append(observation)
+        ends.append((terminated, truncated))
+    traffic = environment._road.traffic
+    assert not traffic.cav_ids
+    assert traffic.control_steps < 200
+    assert ends[-1] == (False, True)
+    np.testing.assert_array_equal(seen[-1], seen[-2])  # what it saw before it left
+    with pytest.raises(InputError, match="cavs"):
+        RoadEnv("merge")
+    environment.close()
+
+
+@pytest.mark.long
+def test_on_an_own_network_the_first_that_the_share_picks_is_driven(tmp_path: Path) -> None:
+    flow = '<flow id="car" type="car" route="along" begin="0" end="60" period="2"/>'
+    road: Any = {"penetration_rate": 0.5, "horizon": 300}
+    file = str(straight(tmp_path, flow, length=200.0))
+    expected = run_episode(make_scenario(file, {**road, "cavs": 1}), Constant(acceleration=-0.1), (2,))
+    environment = gymnasium.make(OWN, scenario=file, **road)
+    check_env(environment.unwrapped, skip_render_check=not has_display())
+    environment.reset(seed=2)
+    speeds, done = [], False
+    while not done:
+        observation, _, terminated, truncated, _ = environment.step(np.array([-0.1], np.float32))
+        speeds.append(10.0 * observation[0])
+        done = terminated or truncated
+    environment.close()
+    (driven,) = expected.trajectories
+    assert len(speeds) == len(driven.states.speed)
+    np.testing.assert_allclose(speeds[:-1], driven.states.speed[1:], atol=1e-5)
+
+
+def test_a_collision_terminates_and_does_not_truncate() -> None:
+    environment = RoadEnv("ring", actuation="raw", length=(160, 160), safety={"active": False})
+    environment.reset(seed=0)
+    terminated = truncated = False
+    while not (terminated or truncated):
+        *_, terminated, truncated, _ = environment.step(np.ones(1))
+    environment.close()
+    assert terminated
+    assert not truncated
+
+
+def test_the_same_seed_starts_the_same_episode_and_later_ones_differ() -> None:
+    environment = RoadEnv(**SHORT)
+    first = environment.reset(seed=5)[1]["drawn"]
+    following = [environment.reset()[1]["drawn"] for _ in range(6)]
+    assert environment.reset(seed=5)[1]["drawn"] == first
+    assert [environment.reset()[1]["drawn"] for _ in range(6)] == following
+    assert len({entry["length"] for entry in following}) > 1
+    environment.close()
+
+
+def test_environments_of_one_process_do_not_disturb_each_other() -> None:
+    alone, seen = RoadEnv(**SHORT), []
+    alone.reset(seed=0)
+    expected = [alone.step(np.full(1, 0.5))[0] for _ in range(40)]
+    other, third = RoadEnv(**SHORT), RoadEnv("figure-eight", **SHORT)
+    alone.reset(seed=0)
+    for environment in (other, third):
+        with pytest.warns(UserWarning, match="runs in a process of its own"):
+            environment.reset(seed=0)
+    for _ in range(40):
+        third.step(np.zeros(1))
+        seen.append((alone.step(np.full(1, 0.5))[0], other.step(np.full(1, 0.5))[0]))
+    for environment in (alone, other, third):
+        environment.close()
+        environment.close()
+    np.testing.assert_array_equal([first for first, _ in seen], expected)
+    np.testing.assert_array_equal([second for _, second in seen], expected)
+
+
+@pytest.mark.long
+def test_nothing_is_said_as_a_process_ends_with_environments_open() -> None:
+    code = "import gymnasium, unjam\n" + "gymnasium.make('unjam/Ring-v0', horizon=60).reset(seed=0)\n"
+    code += "left = [gymnasium.make('unjam/Ring-v0', horizon=60) for _ in range(2)]\n"
+    code += "[one.reset(seed=0) for one in left]"
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert (ran.stdout, ran.stderr) == ("", "")
+
+
+@pytest.mark.parametrize("make", [RoadEnv, partial(gymnasium.make, "unjam/Ring-v0")])
+def test_a_window_without_a_display_is_refused_in_one_line(
+    make: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("unjam.environments.gymnasium_env.has_display", lambda: False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(MissingPartError, match="without one: 'rgb_array'"):
+            make(render_mode="human")
+
+
+def test_one_number_is_a_range_of_one() -> None:
+    environment = RoadEnv(length=231, **SHORT)
+    assert environment.reset(seed=0)[1]["drawn"] == {"length": 231.0}
+    environment.close()
+
+
+def test_stepping_before_a_reset_is_told() -> None:
+    with pytest.raises(UnjamError, match="call reset first"):
+        RoadEnv().step(np.zeros(1))
+
+
+def test_several_at_once_in_processes() -> None:
+    environments = gymnasium.make_vec("unjam/Ring-v0", num_envs=2, vectorization_mode="async", **SHORT)
+    observations, _ = environments.reset(seed=[1, 2])  # pyright: ignore[reportArgumentType]
+    assert observations.shape == (2, 5)
+    observations, rewards, *_ = environments.step(np.zeros((2, 1), np.float32))
+    assert observations.shape == (2, 5)
+    assert rewards.shape == (2,)
+    environments.close()
+
+
+@pytest.mark.parametrize("scenario", ["ring", "figure-eight"])
+def test_renders_the_road_with_its_cav(scenario: str) -> None:
+    environment = RoadEnv(scenario, render_mode="rgb_array", **SHORT)
+    environment.reset(seed=0)
+    picture = environment.render()
+    assert picture.shape == (640, 640, 3)
+    assert picture.dtype == np.uint8
+    red = (picture[..., 0] > 180) & (picture[..., 1] < 90) & (picture[..., 2] < 120)
+    assert red.sum() > 20
+    environment.step(np.ones(1))
+    environment.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"cavs": 2}, "use unjam.parallel_env"),
+        ({"render_mode": "cinema"}, "human, rgb_array"),
+        ({"scenario": "moon"}, "ring, ring-warm"),
+        ({"lenght": (230, 230)}, "lenght: unknown name"),
+        ({"expert": "nobody"}, "nobody"),
+        ({"scenario": "merge", "expert": "pacer"}, "it needs a closed road"),
+    ],
+)
+def test_wrong_arguments_get_one_clear_line(arguments: Any, words: str) -> None:
+    with pytest.raises(InputError, match=re.escape(words)):
+        RoadEnv(**arguments)
+
+
+def test_gymnasium_knows_the_environments_after_importing_unjam() -> None:
+    code = "import unjam, gymnasium; print(sorted(n for n in gymnasium.registry if n.startswith('unjam/')))"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == str(sorted([*NAMES, OWN]))
+    assert unjam.__version__
+
+
+def test_rewards_are_for_what_happens_and_not_for_what_sensors_read() -> None:
+    changes: Any = {"horizon": 60, "sensors": {"gap_error": 3.0}, "safety": {"active": False}}
+    expected = run_episode(make_scenario("ring", changes), IDM(time_headway=0.4), (0,), "eq16")
+    environment = RoadEnv("ring", reward="eq16", expert="idm:time_headway=0.4", **changes)
+    environment.reset(seed=0)
+    earned = [environment.step(np.zeros(1))[1] for _ in range(60)]
+    environment.close()
+    np.testing.assert_allclose(earned, expected.reward, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "shown", "words"),
+    [
+        ("merge", "place", "observe: 'place' is not allowed on a road with ends"),
+        ("ring", "distance_to_merge", "observe: 'to_merge' is not allowed on ring"),
+    ],
+)
+def test_what_the_road_does_not_tell_is_not_shown(name: str, shown: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        RoadEnv(name, features=("local", shown))
+
+
+def test_a_feature_of_ones_own_is_told_what_the_road_tells(tmp_path: Path) -> None:
+    file = tmp_path / "share.py"
+    file.write_text("def share(state):\n    return state.cav_share\n")
+    with closing(RoadEnv("ring", features=("local", f"{file}:share"))) as environment:
+        observation, _ = environment.reset(seed=0)
+    assert observation[-1] == np.float32(1 / 22)
+
+
+def test_a_reward_that_is_not_finite_is_refused_as_in_an_episode(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("def nothing(seen): return {'mean': seen.speeds.mean(-1) * float('nan')}")
+    environment = RoadEnv("ring", reward=f"{tmp_path}/mine.py:nothing", horizon=40)
+    environment.reset(seed=0)
+    with pytest.raises(InputError, match=r"reward: step 0: term 'mean' is nan; allowed: finite"):
+        environment.step(np.zeros(1, np.float32))
+    environment.close()
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"observe": "local"}, "observe: 'local' is not allowed; allowed: a list of features"),
+        ({"observe": []}, r"observe: \[\] is not allowed; allowed: a list of features"),
+        ({"observe": ["locla"]}, "observe: 'locla' is not allowed; .* did you mean 'local'"),
+        ({"expert": "human"}, "expert: 'human' is not allowed; .* idm drives like people"),
+    ],
+)
+def test_what_cannot_be_observed_or_added_to_is_told(asked: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        RoadEnv("ring", **asked)

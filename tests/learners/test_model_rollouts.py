@@ -1,0 +1,238 @@
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+
+from tests.conftest import random_network
+from tests.learners.task import same
+from unjam.drivers import PISaturation
+from unjam.drivers.network import Network
+from unjam.drivers.observation import observation_size
+from unjam.drivers.residual import ResidualDriver
+from unjam.learners.algorithm_1 import Iteration, TaskEpisodes, algorithm_1, start_training
+from unjam.learners.experience import join_experience
+from unjam.learners.learner import Update
+from unjam.learners.model_rollouts import RowRollouts, rollout_experience
+from unjam.learners.settings import AGENT_NAMES, PolicySettings, PPOSettings, SACSettings, TD3Settings, TRPOSettings
+from unjam.models.rollouts import RolloutBatch
+from unjam.models.settings import ModelSettings
+from unjam.physics.idm import IDMParameters
+from unjam.scenarios import Ring
+from unjam.worlds.episode import Task, run_episode
+from unjam.worlds.sumo.simulation import Simulation
+
+torch.set_num_threads(1)
+
+RING = Ring(length=(110, 120), vehicles=9, horizon=120)
+POLICY = PolicySettings(hidden=(16,))
+VIRTUAL = ModelSettings(members=2, hidden=(16,), epochs=2, max_fit_rows=500, k_max=30, kappa=30.0)
+SETTINGS = {
+    "trpo": TRPOSettings(critic_epochs=2, critic_batch_size=16),
+    "ppo": PPOSettings(epochs=3),
+    "sac": SACSettings(learning_starts=0, gradient_steps_per_step=0.02, batch_size=16, buffer_size=500),
+    "td3": TD3Settings(learning_starts=0, gradient_steps_per_step=0.02, batch_size=16, buffer_size=500),
+}
+TASK = Task(RING, PISaturation())
+FREE = ModelSettings(model_ratio=0.0)
+INPUTS = observation_size(POLICY.inputs, PISaturation())
+
+every_learner = pytest.mark.parametrize("agent", AGENT_NAMES)
+
+
+def driver_of(network: Network) -> ResidualDriver:
+    return ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, POLICY.action_repeat(0.1))
+
+
+class Trained:
+    """A learner on a small ring of the actual simulator, and what its iterations told."""
+
+    def __init__(self, simulation: Simulation, agent: str, virtual: ModelSettings | None, **policy: Any) -> None:
+        settings = replace(POLICY, **policy)
+        self.told: list[Iteration] = []
+        self.episodes_run = 0
+
+        def collect(network: Network, iteration: int) -> TaskEpisodes:
+            driver = ResidualDriver(PISaturation(), network, 1.0, settings.inputs, settings.action_repeat(0.1))
+            self.episodes_run += 2
+            return [
+                [
+                    run_episode(RING, driver, (0, iteration, index), explore=True, simulation=simulation)
+                    for index in range(2)
+                ]
+            ]
+
+        self.collect = collect
+        self.training = start_training([TASK], POLICY, SETTINGS[agent], virtual or FREE, 0)
+        self.learner: Any = self.training.learner
+
+    def learn(self, iterations: int) -> "Trained":
+        budget = iterations * 2 * RING.horizon
+        algorithm_1(self.training, budget, self.collect, lambda _: None, lambda done, _: self.told.append(done))
+        return self
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Simulation]:
+    with Simulation() as opened:
+        yield opened
+
+
+@pytest.mark.long
+@every_learner
+def test_virtual_rows_change_what_is_learned_and_cost_no_actual_step(agent: str, shared: Simulation) -> None:
+    alone, imagined = (Trained(shared, agent, virtual).learn(2) for virtual in (None, VIRTUAL))
+    assert [entry.environment_steps for entry in imagined.told] == [entry.environment_steps for entry in alone.told]
+    assert imagined.episodes_run == alone.episodes_run == 4
+    assert [entry.model_steps for entry in alone.told] == [0, 0]
+    assert imagined.told[-1].model_steps >= 2 * 2 * RING.horizon
+    assert not same(policy_of(alone), policy_of(imagined))
+
+
+def policy_of(trained: Trained) -> dict[str, torch.Tensor]:
+    return dict(trained.learner.sb3.policy.state_dict())
+
+
+@every_learner
+@pytest.mark.parametrize("update", ["union", "sequential"])
+def test_a_learner_that_was_stopped_goes_on_with_the_same_model_and_data(
+    agent: str, update: str, shared: Simulation
+) -> None:
+    virtual = replace(VIRTUAL, update=update, updates=2)
+    expected = Trained(shared, agent, virtual).learn(3)
+    stopped = Trained(shared, agent, virtual).learn(1)
+    resumed = Trained(shared, agent, virtual)
+    resumed.training.restore(*stopped.training.state())
+    resumed.learn(3)
+    assert same(resumed.training.state()[1], expected.training.state()[1])
+    assert resumed.told[-1].model == expected.told[-1].model
+    assert resumed.told[-1].model_steps == expected.told[-1].model_steps
+
+
+@pytest.mark.parametrize("agent", ["trpo", "ppo"])
+def test_the_ratio_is_exactly_one_before_each_update(agent: str, shared: Simulation) -> None:
+    trained = Trained(shared, agent, replace(VIRTUAL, update="sequential", updates=2))
+    learner = trained.learner
+    seen: list[Update] = []
+
+    def learn(update: Update) -> None:
+        learner.fill(
+            join_experience([part for part in (update.environment_rows, update.model_rows) if part is not None])
+        )
+        buffer = learner.sb3.rollout_buffer
+        observations, actions = (torch.as_tensor(part[:, 0]) for part in (buffer.observations, buffer.actions))
+        _, log_prob, _ = learner.sb3.policy.evaluate_actions(observations, actions)
+        np.testing.assert_array_equal(log_prob.detach().numpy(), buffer.log_probs[:, 0])
+        seen.append(update)
+
+    learner.learn = learn
+    trained.learn(1)
+    assert len(seen) == 3
+
+
+def rollouts_of(rewards: np.ndarray, made: list[int], terminated: list[bool]) -> RolloutBatch:
+    rows, choices = rewards.shape
+    generator = torch.Generator().manual_seed(0)
+    return RolloutBatch(
+        observations=torch.randn((rows, choices + 1, INPUTS), generator=generator),
+        actions=torch.randn((rows, choices), generator=generator),
+        rewards=torch.as_tensor(rewards),
+        lengths=torch.tensor(made),
+        terminated=torch.tensor(terminated),
+        drawn_values=torch.linspace(-1, 1, rows)[:, None],
+        start_indices=np.zeros((rows, 2), np.int64),
+        control_steps=sum(made),
+        clipped_share={},
+    )
+
+
+def test_rows_of_a_rollout_end_where_it_crashed() -> None:
+    rollouts = rollouts_of(np.arange(6.0).reshape(2, 3), [3, 2], [False, True])
+    rows = rollout_experience(rollouts, rollouts.drawn_values.numpy())
+    assert rows.rewards.tolist() == [0, 1, 2, 3, 4]
+    assert rows.starts.tolist() == [0, 3]
+    assert rows.terminated.tolist() == [False, True]
+    np.testing.assert_array_equal(rows.observations[3, :-1], rollouts.observations[1, 0])
+    np.testing.assert_array_equal(rows.last_observations[1, :-1], rollouts.observations[1, 2])
+    assert rows.observations[:, -1].tolist() == [-1, -1, -1, 1, 1]
+
+
+def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(shared: Simulation) -> None:
+    learner = Trained(shared, "trpo", None).learner
+    rollouts = rollouts_of(np.array([[1.0, 2.0], [3.0, 4.0]]), [2, 2], [False, True])
+    rows = rollout_experience(rollouts, rollouts.drawn_values.numpy())
+    learner.fill(rows)
+    with torch.no_grad():
+        values, ends = (
+            learner.sb3.policy.predict_values(torch.as_tensor(part)).numpy().ravel()
+            for part in (rows.observations, rows.last_observations)
+        )
+    found = learner.sb3.rollout_buffer.advantages[:, 0]
+    assert found[1] == pytest.approx(2.0 + learner.gamma * ends[0] - values[1], abs=1e-4)
+    assert found[3] == pytest.approx(4.0 - values[3], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("begin", "episodes_begun"), [("newest", {2, 3}), ("all", {0, 1, 2, 3}), ("first", {0, 1, 2, 3})]
+)
+def test_rollouts_begin_in_the_episodes_asked_for_and_are_as_many(
+    shared: Simulation, begin: Any, episodes_begun: set[int]
+) -> None:
+    imagination = RowRollouts(replace(VIRTUAL, model_ratio=3.0, begin=begin), TASK, POLICY, 0)
+    network = random_network(INPUTS, scale=0.1)
+    driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, 10)
+    for iteration in (1, 2):
+        episodes = [run_episode(RING, driver, (9, iteration, n), explore=True, simulation=shared) for n in (0, 1)]
+        imagination.learn(episodes, iteration)
+    rollouts = cast(RolloutBatch, imagination.roll_out_rows(network, 2))
+    assert imagination.k_star == 30
+    assert rollouts.rewards.numel() == 3 * 240 / 10
+    assert set(rollouts.start_indices[:, 0]) == episodes_begun
+    assert (set(rollouts.start_indices[:, 1]) == {0}) == (begin == "first")
+
+
+def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:
+    trained = Trained(shared, "trpo", replace(VIRTUAL, kappa=1e-6)).learn(2)
+    assert [(entry.model[0]["k_star"], entry.model_steps) for entry in trained.told] == [(0, 0), (0, 0)]
+    assert same(policy_of(trained), policy_of(Trained(shared, "trpo", None).learn(2)))
+
+
+def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() -> None:
+    sac: Any = start_training([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
+    buffer = sac.buffer
+    actual, virtual = (
+        rollout_experience(rollouts, rollouts.drawn_values.numpy())
+        for rollouts in (rollouts_of(np.full((4, 3), reward), [3] * 4, [False] * 4) for reward in (1.0, 2.0))
+    )
+    sac.fill(buffer, actual)
+    assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
+    sac.fill(buffer.new_model_buffer(12), virtual)
+    buffer.real_ratio = 0.25
+    found = buffer.sample(8).rewards.numpy().ravel()
+    assert sorted(found) == pytest.approx([0.1] * 2 + [0.2] * 6)
+    buffer.drop_model_buffer()
+    assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
+
+
+def test_what_is_told_of_the_virtual_environment_is_whole(shared: Simulation) -> None:
+    told = Trained(shared, "trpo", VIRTUAL).learn(1).told[0]
+    (virtual,) = told.model
+    assert {"k_star", "eps_m", "eps_m_by_estimator", "one_step", "bound", "return_virtual", "return_actual"} <= set(
+        virtual
+    )
+    assert set(told.seconds) == {"actual", "fit", "imagine", "update"}
+    assert 0 < told.log["eps_pi_mean"] <= told.log["eps_pi_max"] <= 1
+    assert virtual["bound"] > abs(virtual["return_virtual"] - virtual["return_actual"])
+
+
+def test_what_is_known_of_people_survives_a_stop(shared: Simulation) -> None:
+    one, other = (RowRollouts(VIRTUAL, TASK, POLICY, 0) for _ in range(2))
+    people = IDMParameters(time_headway=1.3, max_acceleration=0.8)
+    one.scenario = replace(RING, humans=people)
+    one.data.add([run_episode(RING, PISaturation(), (0,), simulation=shared)], RING)
+    facts, tensors = one.state()
+    other.restore(json.loads(json.dumps(facts)), tensors)
+    assert other.scenario == one.scenario

@@ -1,0 +1,226 @@
+"""On-ramps that are imagined: the same people come, drive as in actual episodes, and misjudge anew."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.learners.test_road_rollouts import network_of
+from unjam.drivers.registry import driver_from_name
+from unjam.errors import InputError
+from unjam.learners.experience import join_experience, make_experience
+from unjam.learners.model_rollouts import ExperienceFactory, full_policy
+from unjam.learners.motorway_rollouts import MotorwayRollouts
+from unjam.learners.settings import PolicySettings
+from unjam.models import motorway_model
+from unjam.models.ensemble import torch_generator
+from unjam.models.motorway_model import learned_correction, motorway_samples
+from unjam.models.road_model import RoadModel
+from unjam.models.settings import ModelSettings
+from unjam.physics.arrays import Floats
+from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.worlds.batch.on_ramp.world import MotorwayBatch, ReplayOptions
+from unjam.worlds.batch.run import run_batch
+from unjam.worlds.drive import DriveLoop, finish_drive
+from unjam.worlds.episode import Task, run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask
+
+ROAD = replace(ON_RAMP, horizon=160, peak=(20.0, 160.0), penetration_rate=0.2)
+EXPERT = driver_from_name("jam-ahead", 1.0)
+POLICY = PolicySettings(hidden=(8,), inputs=("local",), action_duration=5.0, exploration="mirrored")
+VIRTUAL = ModelSettings(kind="road", rollout_starts="first", k_max=160, model_ratio=1.0, max_fit_rows=2000)
+HOW = ExperienceFactory(
+    lambda drawn: drawn,
+    lambda episodes: join_experience(
+        [make_experience(each.trajectories, np.zeros((len(each.trajectories), 0))) for each in episodes]
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def actual() -> list[Episode]:
+    return run_batch([EpisodeTask(ROAD, EXPERT, (seed,)) for seed in range(4)], allow_statistical=True)
+
+
+@pytest.fixture(scope="module")
+def in_sumo() -> list[Episode]:
+    return [run_episode(ROAD, EXPERT, (seed,)) for seed in range(4)]
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(motorway_model, "EVERY", 10)
+
+
+def again(errs: bool, beyond: float = 0.0, seed: int = 9) -> Episode:
+    def learned(speed: Floats, leader_speed: Floats, gap: Floats, known: Floats) -> Floats:
+        return np.full(len(speed), beyond)
+
+    about = ReplayOptions([((seed,), (8,))], ROAD.horizon, errs, learned if beyond else None)
+    world = MotorwayBatch(ROAD, [(0,)], replay=about)
+    world.measured_fields = EXPERT.measured_fields
+    (episode,) = finish_drive(DriveLoop(world, EXPERT))
+    return episode
+
+
+@pytest.mark.long
+def test_the_same_people_come_at_the_same_times_and_err_anew(actual: list[Episode]) -> None:
+    one, other = again(True), again(True, seed=10)
+    for episode in (one, other):
+        assert set(episode.vehicle_ids[:40]) == set(actual[0].vehicle_ids[:40])
+        assert episode.cav_ids[:3] == actual[0].cav_ids[:3]
+    moments = min(len(each.speeds) for each in (one, other)) // 2
+    assert np.nanmean(one.speeds[:moments]) == pytest.approx(np.nanmean(other.speeds[:moments]), rel=0.05)
+    assert np.nanmean(one.speeds) != np.nanmean(other.speeds)
+    np.testing.assert_array_equal(again(False).speeds, again(False, seed=10).speeds)
+
+
+@pytest.mark.long
+def test_what_is_learned_moves_people_by_so_much_in_a_decision() -> None:
+    calm, pushed = again(False), again(False, beyond=-0.05)
+    assert np.nanmean(pushed.speeds[40:]) < np.nanmean(calm.speeds[40:]) - 0.2
+    assert np.nanmean(again(False, beyond=1e-9).speeds) == pytest.approx(np.nanmean(calm.speeds), rel=1e-6)
+
+
+@pytest.mark.usefixtures("often")
+def test_a_step_of_the_base_is_what_people_did_but_for_what_they_misjudge(actual: list[Episode]) -> None:
+    kept = motorway_samples(actual[0], 0, ROAD)
+    wrong = kept.human_rows.next_speed - kept.human_rows.base_speed
+    assert len(wrong) > 200
+    change = float((kept.human_rows.next_speed - kept.human_rows.speed).std())
+    assert float(np.median(np.abs(wrong))) < 0.4 * change
+    assert 0.3 < kept.noise_variance / float(np.square(wrong).mean()) < 1.5
+
+
+@pytest.mark.usefixtures("often")
+def test_people_who_err_in_nothing_are_foreseen_but_for_what_they_remember() -> None:
+    kept = motorway_samples(replace(again(False), seed=(0,), trajectories=()), 0, ROAD)
+    wrong = np.abs(kept.human_rows.next_speed - kept.human_rows.base_speed)
+    # What they remember of lane changes, and when they last began to start, is not in the record.
+    assert float(np.median(wrong)) < 1e-3
+    assert float(np.quantile(wrong, 0.9)) < 0.2
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("often")
+def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual: list[Episode]) -> None:
+    task = Task(ROAD, EXPERT)
+    imagination = MotorwayRollouts(replace(VIRTUAL, model_ratio=2.0), task, POLICY, 0)
+    imagination.learn(actual, 1)
+    assert imagination.k_star == 160
+    network = replace(network_of(0.05, POLICY), lasts=True)
+    found = imagination.roll_out(network, 1, 0, 1, HOW)
+    assert found is not None
+    assert imagination.model_steps == 2 * len(actual) * 160
+    assert imagination.facts["return_virtual"] == pytest.approx(imagination.facts["return_actual"], rel=0.1)
+    assert imagination.facts["crash_share"] == 0.0
+    facts, tensors = imagination.state()
+    other = MotorwayRollouts(replace(VIRTUAL, model_ratio=2.0), task, POLICY, 0)
+    other.restore(facts, tensors)
+    other._first_new_episode, other.k_star = 0, imagination.k_star
+    repeated = other.roll_out(network, 1, 0, 1, HOW)
+    assert repeated is not None
+    np.testing.assert_array_equal(repeated.observations, found.observations)
+    np.testing.assert_array_equal(repeated.rewards, found.rewards)
+    driver = full_policy(task, POLICY, network)
+    seeds = [((1,), (2,)), ((1,), (2,))]
+    one, mirrored = imagination.simulate(driver, imagination.samples[:1] * 2, 20, seeds, [1.0, -1.0])
+    first, second = one.trajectories[0], mirrored.trajectories[0]
+    calm = network(first.observations[:1])
+    assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * calm[0])
+
+
+@pytest.mark.usefixtures("often")
+def test_for_a_while_there_are_more_of_them_and_none_where_no_cav_comes(actual: list[Episode]) -> None:
+    imagination = MotorwayRollouts(replace(VIRTUAL, k_max=80), Task(ROAD, EXPERT), POLICY, 0)
+    imagination.learn(actual[:2], 1)
+    network = replace(network_of(0.05, POLICY), lasts=True)
+    assert imagination.roll_out(network, 1, 0, 1, HOW) is not None
+    assert imagination.model_steps == 2 * 160
+    imagination.k_star = 5
+    assert imagination.roll_out(network, 2, 0, 64, HOW) is None
+
+
+def test_twins_meet_the_same_people_and_are_held_out_together(
+    actual: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = list[NDArray[np.int64]]()
+    monkeypatch.setattr(motorway_model, "fit_human_model", lambda model, rows, *_, **__: seen.append(rows.episode))
+    kept = [motorway_samples(actual[0], number, ROAD, "idm") for number in (6, 7, 8)]
+    for twins, numbers in ((1, {6, 7, 8}), (2, {3, 4})):
+        motorway_model.fit_motorway_model(RoadModel(VIRTUAL, (0,)), kept, VIRTUAL, (0,), twins)
+        assert set(seen[-1].tolist()) == numbers
+
+
+def test_who_knows_nothing_of_following_takes_people_to_go_on_as_fast_as_they_are() -> None:
+    model = RoadModel(replace(VIRTUAL, base="none"), (0,))
+    model.noise.fill_(0.3)
+    speed, known = np.linspace(5.0, 25.0, 4000), np.linspace(25.0, 5.0, 4000)
+    calm, noisy = (
+        learned_correction(model, torch_generator((0,), "cpu"), ROAD.steps_per_control_step, noise)
+        for noise in (False, True)
+    )
+    assert calm is not None
+    assert noisy is not None
+    np.testing.assert_allclose(known + calm(speed, speed, speed, known), speed, atol=1e-12)
+    per_step = (known + noisy(speed, speed, speed, known) - speed) / ROAD.steps_per_control_step
+    assert per_step.std() * ROAD.steps_per_control_step**0.5 == pytest.approx(0.3, rel=0.05)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("often")
+def test_networks_count_beside_wrong_people_and_not_beside_those_who_are_known(actual: list[Episode]) -> None:
+    others = {"time_headways": (1.6, 1.6), "accelerations": (0.73, 0.73), "decelerations": (1.67, 1.67)}
+    for people, learned in (({}, []), (others, ["speed"])):
+        imagination = MotorwayRollouts(replace(VIRTUAL, epochs=60), Task(ROAD, EXPERT), POLICY, 0)
+        imagination.scenario = replace(ROAD, **people)
+        imagination.learn(actual, 1)
+        assert imagination.facts["learned"] == learned
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("often")
+def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
+    settings = replace(VIRTUAL, base="none", epochs=60)
+    imagination = MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
+    imagination.learn(actual, 1)
+    step = imagination.facts["one_step"]["speed"]
+    assert imagination.facts["learned"] == ["speed"]
+    assert step["base"] == pytest.approx(step["change"], rel=0.05)  # the base: nothing changes
+    assert step["model"] < 0.9 * step["base"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (replace(VIRTUAL, begin="newest"), "model.rollout_starts: newest is not allowed"),
+        (replace(VIRTUAL, base="acc"), "model.base: acc is not allowed; allowed: idm"),
+        (replace(VIRTUAL, calibrate=True), "model.calibrate_base: true is not allowed"),
+    ],
+)
+def test_what_cannot_be_imagined_is_refused(settings: ModelSettings, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
+
+
+@pytest.mark.long
+def test_the_base_expects_of_people_in_sumo_what_it_expects_of_those_in_the_batch(
+    actual: list[Episode], in_sumo: list[Episode], often: None
+) -> None:
+    squares, counts, noises = list[float](), list[int](), list[float]()
+    for episodes in (actual, in_sumo):
+        kept = [motorway_samples(episode, 0, ROAD) for episode in episodes]
+        wrong = np.concatenate([one.human_rows.next_speed - one.human_rows.base_speed for one in kept])
+        squares.append(float(np.square(wrong).mean()))
+        counts.append(len(wrong))
+        noises.append(float(np.mean([one.noise_variance for one in kept])))
+    assert counts[1] == pytest.approx(counts[0], rel=0.2)
+    assert noises[1] == pytest.approx(noises[0], rel=0.2)
+    assert squares[1] < 1.3 * squares[0]
+
+
+def test_a_record_that_skips_moments_is_refused(in_sumo: list[Episode]) -> None:
+    with pytest.raises(InputError, match="skips moments"):
+        motorway_samples(replace(in_sumo[0], every=2), 0, ROAD)

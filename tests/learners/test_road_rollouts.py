@@ -1,0 +1,151 @@
+"""Whole roads that are imagined: they are what would have happened."""
+
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from unjam.drivers import IDM, PISaturation
+from unjam.drivers.network import Network
+from unjam.drivers.observation import observation_size
+from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.sensors import Sensors
+from unjam.learners.experience import Experience, make_experience
+from unjam.learners.model_rollouts import ExperienceFactory, full_policy
+from unjam.learners.road_rollouts import RoadRollouts
+from unjam.learners.settings import PolicySettings
+from unjam.models.comparison import ReplayDriver
+from unjam.models.road_model import base_human_model
+from unjam.models.settings import ModelSettings
+from unjam.scenarios import FigureEight, Ring
+from unjam.scenarios.ring import LoopScenario
+from unjam.worlds.batch.run import run_batch
+from unjam.worlds.episode import Task
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask
+
+DECISIONS = 100
+RING = Ring(length=(220, 240), vehicles=20, cavs=2, horizon=400, warmup=0)
+EIGHT = FigureEight(cavs=2, horizon=400)
+"""those who must yield wait, and go"""
+WRONG = replace(RING, sensors=Sensors(0.5, 0.5, dropout=0.1), safety=SafetyFilter(gap_error=0.5, speed_error=0.5))
+POLICY = PolicySettings(hidden=(8,))
+VIRTUAL = ModelSettings(kind="road", k_max=DECISIONS, model_ratio=1.0)
+
+
+def network_of(exploration_std: float, policy: PolicySettings = POLICY) -> Network:
+    generator = np.random.default_rng(3)
+    sizes = [observation_size(policy.inputs, PISaturation()), 8, 1]
+    layers = [
+        (0.3 * generator.normal(size=(before, after)), 0.1 * generator.normal(size=after))
+        for before, after in itertools.pairwise(sizes)
+    ]
+    return Network(tuple(layers), 1.0, exploration_std)
+
+
+def as_drawn(road: LoopScenario) -> ExperienceFactory:
+    """How imagined episodes become experience whose critic sees what they drew."""
+
+    def of_episodes(episodes: Sequence[Episode]) -> Experience:
+        pairs = [(episode, each) for episode in episodes for each in episode.trajectories]
+        drawn = np.array([road.scale_drawn_values(episode.drawn_values) for episode, _ in pairs])
+        return make_experience([each for _, each in pairs], drawn)
+
+    return ExperienceFactory(lambda drawn: drawn, of_episodes)
+
+
+def imagined(road: LoopScenario, network: Network) -> tuple[RoadRollouts, list[Episode]]:
+    """What a virtual environment has learned from four episodes, and these."""
+    task = Task(road, PISaturation())
+    imagination = RoadRollouts(VIRTUAL, task, POLICY, 0)
+    driver = full_policy(task, POLICY, network)
+    tasks = [EpisodeTask(road, driver, (seed,), explore=True) for seed in range(4)]
+    episodes = run_batch(tasks, allow_statistical=True)
+    imagination.learn(episodes, 1)
+    return imagination, episodes
+
+
+@pytest.mark.parametrize(
+    "road", [RING, replace(RING, warmup=300), EIGHT], ids=["a ring", "a ring with a wave", "a figure eight"]
+)
+def test_without_noise_it_is_what_happened(road: LoopScenario) -> None:
+    imagination, episodes = imagined(replace(road, noise=0.0), network_of(0.0))
+    people = base_human_model("idm", road)
+    memory = ReplayDriver(np.zeros((0, 2))).initial_memory(2)
+    for recording, decision in ((0, 0), (2, 130), (4, 20), (6, 290)):  # each with its neighbour, two CAVs
+        did = [imagination.data.recordings[row].applied_acceleration[decision:] for row in (recording, recording + 1)]
+        (found,) = imagination.simulate(
+            *(ReplayDriver(np.stack(did, 1)), memory, np.array([[recording, decision]])), DECISIONS, people, (1,)
+        )
+        actual, during = episodes[recording // 2], slice(decision, decision + DECISIONS + 1)
+        np.testing.assert_allclose(found.speeds, actual.speeds[during], atol=1e-6)
+        np.testing.assert_allclose(found.gaps, actual.gaps[during], atol=1e-5)
+
+
+def test_the_policy_goes_on_with_what_it_remembered() -> None:
+    network = network_of(0.0)
+    imagination, episodes = imagined(replace(RING, noise=0.0), network)
+    imagination.k_star = DECISIONS
+    found = imagination.roll_out(network, 1, 0, 1, as_drawn(RING))
+    assert found is not None
+    actual = [each.actions_and_rewards[1] for episode in episodes for each in episode.trajectories]
+    same = 0
+    for earned in found.rewards.reshape(-1, DECISIONS // 10):
+        windows = [one[at : at + 10] for one in actual for at in range(len(one) - 9)]
+        same += min(np.abs(window - earned).max() for window in windows) < 1e-6
+    # A quarter begins so late that the record ends before.
+    assert same > 0.5 * len(found.starts)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("road", [RING, WRONG, EIGHT], ids=["exact sensors", "wrong sensors", "a figure eight"])
+def test_with_noise_returns_are_those_of_the_road(road: LoopScenario) -> None:
+    imagination, _ = imagined(road, network_of(0.05))
+    found = imagination.roll_out(network_of(0.05), 1, 0, 1, as_drawn(road))
+    assert found is not None
+    assert len(found.rewards) == 2 * 4 * 400 / 10
+    assert found.observations.shape[1] == observation_size(POLICY.inputs, PISaturation()) + 1
+    facts = imagination.facts
+    assert facts["return_virtual"] == pytest.approx(facts["return_actual"], rel=0.1)
+    assert facts["k_star"] == DECISIONS
+    assert imagination.model_steps == 4 * 400
+
+
+def test_each_imagined_road_misreads_in_its_own_way() -> None:
+    imagination, _ = imagined(replace(WRONG, noise=0.0), network_of(0.0))
+    twice, people = np.array([[0, 0], [0, 0]]), base_human_model("idm", RING)
+    one, other = imagination.simulate(IDM(), {}, twice, DECISIONS, people, (1,))
+    assert np.abs(one.speeds - other.speeds).max() > 0.01
+
+
+def test_a_model_that_is_not_trusted_imagines_nothing() -> None:
+    imagination, _ = imagined(RING, network_of(0.0))
+    imagination.k_star = 9
+    assert imagination.roll_out(network_of(0.0), 1, 0, 1, as_drawn(RING)) is None
+
+
+@pytest.mark.parametrize("road", [RING, EIGHT], ids=["a ring", "a figure eight"])
+def test_it_survives_a_stop(road: LoopScenario) -> None:
+    one, _ = imagined(road, network_of(0.05))
+    other = RoadRollouts(VIRTUAL, Task(road, PISaturation()), POLICY, 0)
+    facts, tensors = one.state()
+    other.restore(json.loads(json.dumps(facts)), tensors)
+    assert len(other.samples) == 4
+    for restored, kept in zip(other.samples, one.samples, strict=True):
+        np.testing.assert_array_equal(restored.speeds, kept.speeds)
+        assert restored.size == kept.size
+        np.testing.assert_equal(restored.crossing_memory, kept.crossing_memory)
+    assert float(other.model.noise) == float(one.model.noise) > 0.0
+
+
+def test_rings_that_an_earlier_version_kept_are_read() -> None:
+    one, episodes = imagined(RING, network_of(0.05))
+    facts, tensors = one.state()
+    for kept in facts["moments"]:
+        del kept["size"], kept["waits"]
+    one.restore(facts, tensors)
+    assert [kept.size for kept in one.samples] == [episode.drawn_values["length"] for episode in episodes]
+    assert all(kept.crossing_memory is None for kept in one.samples)

@@ -1,0 +1,138 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unjam.drivers import LocalState
+from unjam.drivers.check import random_state
+from unjam.drivers.local_state import COMMON_FIELDS, MAX_OBSERVED_GAP
+from unjam.drivers.network import Network
+from unjam.models.row_model import BASE_DRIVERS, base_reward, base_step, missing_neighbors
+from unjam.physics.idm import IDMParameters
+from unjam.scenarios import Ring, make_scenario
+from unjam.scenarios.population import Population, write_population
+from unjam.worlds.reward import make_reward
+
+MERGE_LIKE = Ring(simulation_step=0.2, steps_per_control_step=5, humans=IDMParameters(time_headway=1.4))
+
+
+def literal_step(row: dict[str, float], applied: float, ring: Ring) -> dict[str, float]:
+    """One decision written down for one row: IDM behind, constant speed ahead, Euler steps."""
+    p, dt = ring.humans, ring.simulation_step
+    own, behind, gap, gap_behind = row["speed"], row["follower_speed"], row["leader_gap"], row["follower_gap"]
+    for _ in range(ring.steps_per_control_step):
+        wanted = p.minimum_gap + max(
+            0.0,
+            behind * p.time_headway
+            + behind * (behind - own) / (2 * (p.max_acceleration * p.comfortable_deceleration) ** 0.5),
+        )
+        push = p.max_acceleration * (
+            1 - (behind / p.desired_speed) ** p.exponent - (wanted / max(gap_behind, 0.01)) ** 2
+        )
+        own, behind = max(0.0, own + dt * applied), max(0.0, behind + dt * push)
+        gap += dt * (row["leader_speed"] - own)
+        gap_behind += dt * (own - behind)
+    return {**row, "speed": own, "follower_speed": behind, "leader_gap": gap, "follower_gap": gap_behind}
+
+
+@given(st.integers(0, 10**6), st.sampled_from([Ring(), MERGE_LIKE]))
+def test_moves_as_equations_5_and_6_and_euler_steps_say(seed: int, ring: Ring) -> None:
+    generator = np.random.default_rng(seed)
+    state, applied = random_state(generator, 3), generator.uniform(-1, 1, 3)
+    found = base_step("idm", ring, state, applied)
+    for row in range(3):
+        expected = literal_step(
+            {name: float(values[row]) for name, values in zip(COMMON_FIELDS, state, strict=False)},
+            float(applied[row]),
+            ring,
+        )
+        for name, value in expected.items():
+            assert getattr(found, name)[row] == pytest.approx(value, abs=1e-9), name
+
+
+@pytest.mark.parametrize("base", BASE_DRIVERS)
+@pytest.mark.parametrize("ring", [Ring(), MERGE_LIKE])
+def test_tensors_move_as_arrays_do(base: str, ring: Ring) -> None:
+    generator = np.random.default_rng(1)
+    state, applied = with_nobody(random_state(generator, 8)), generator.uniform(-1, 1, 8)
+    expected = base_step(base, ring, state, applied)
+    tensors = state.map(lambda values: torch.tensor(values))
+    found = base_step(base, ring, tensors, torch.tensor(applied))
+    for name in COMMON_FIELDS:
+        np.testing.assert_allclose(getattr(found, name).numpy(), getattr(expected, name), atol=1e-12)
+
+
+def with_nobody(state: LocalState) -> LocalState:
+    """The same on an open road; nobody is ahead of the first row, and nobody behind the second."""
+    gaps, behind = state.leader_gap.copy(), state.follower_gap.copy()
+    gaps[0] = behind[1] = MAX_OBSERVED_GAP
+    leader, follower = state.leader_speed.copy(), state.follower_speed.copy()
+    leader[0], follower[1] = state.speed[0], state.speed[1]
+    nowhere = np.full_like(gaps, np.nan)
+    return LocalState(state.speed, leader, gaps, follower, behind, nowhere, nowhere)
+
+
+def test_where_nobody_is_nobody_comes() -> None:
+    state = with_nobody(random_state(np.random.default_rng(2), 4))
+    found = base_step("idm", MERGE_LIKE, state, np.array([1.0, -1.0, 0.5, 0.0]))
+    assert found.leader_gap[0] == MAX_OBSERVED_GAP
+    assert found.leader_speed[0] == found.speed[0]
+    assert found.follower_gap[1] == MAX_OBSERVED_GAP
+    assert found.follower_speed[1] == found.speed[1]
+    ahead, behind = missing_neighbors(found)
+    assert ahead.tolist() == [True, False, False, False]
+    assert behind.tolist() == [False, True, False, False]
+
+
+def test_a_far_leader_on_a_closed_road_is_a_leader() -> None:
+    state = random_state(np.random.default_rng(3), 1)._replace(leader_gap=np.array([150.0]))
+    assert base_step("idm", Ring(), state, np.array([0.0])).leader_gap[0] != 150.0
+    assert not missing_neighbors(state)[0].any()
+
+
+def test_no_knowledge_expects_no_change() -> None:
+    state = random_state(np.random.default_rng(4), 2)
+    assert base_step("none", Ring(), state, np.ones(2)) is state
+    nothing = base_reward("none", make_reward("released"), state, np.ones(2), np.zeros(2, bool))
+    np.testing.assert_array_equal(nothing, 0.0)
+
+
+def expected_reward(name: str, speeds: list[float], headway: float, applied: float) -> float:
+    mean = sum(speeds) / len(speeds)
+    if name == "released":
+        return 4 * mean / 20 - 4 * abs(applied)
+    return 30 - abs(30 - mean) - 0.1 * max(1 - headway, 0) - 0.1 * abs(applied)
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+@pytest.mark.parametrize("name", ["released", "eq16"])
+def test_the_reward_takes_the_mean_speed_of_those_that_are_there(name: str, kind: Any) -> None:
+    state = with_nobody(random_state(np.random.default_rng(5), 3))
+    applied = np.array([0.5, -1.0, 0.0])
+    on_kind = state.map(lambda values: kind(values))
+    found = base_reward("idm", make_reward(name), on_kind, kind(applied), kind([False, False, False]))
+    for row, absentee in enumerate(["leader_speed", "follower_speed", ""]):
+        names = [n for n in ("speed", "leader_speed", "follower_speed") if n != absentee]
+        headway = state.leader_gap[row] / max(state.speed[row], 1e-3)
+        speeds = [float(getattr(state, n)[row]) for n in names]
+        assert float(found[row]) == pytest.approx(expected_reward(name, speeds, headway, applied[row]))
+
+
+def test_the_typical_person_of_a_population_follows_with_its_residual(tmp_path: Path) -> None:
+    quarter = Network(((np.zeros((3, 1)), np.array([np.arctanh(0.5)])),), 0.5)
+    typical = IDMParameters(time_headway=1.3)
+    states = random_state(np.random.default_rng(0), 6)
+    applied, gentle = (np.zeros(6), states._replace(follower_speed=states.speed, follower_gap=states.speed * 2 + 3))
+    moved = {}
+    for residual in (None, quarter):
+        path = tmp_path / "drivers.json"
+        write_population(path, Population(typical, (typical,), (-4.0, 2.0), residual))
+        road = make_scenario("ring", {"population": str(path)})
+        moved[residual] = base_step("population", road, gentle, applied)
+    plain = base_step("idm", Ring(humans=typical), gentle, applied)
+    np.testing.assert_allclose(moved[None].follower_speed, plain.follower_speed)
+    np.testing.assert_allclose(moved[quarter].follower_speed, plain.follower_speed + 0.025)

@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+
+from tests.conftest import random_network
+from tests.models.little_world import RING, LittleWorld, actual_data
+from unjam.drivers import IDM, ResidualDriver
+from unjam.models.comparison import (
+    ReturnGap,
+    one_step_errors,
+    open_loop_errors,
+    recorded_states,
+    replay_accelerations,
+    return_gap,
+)
+from unjam.models.ensemble import torch_generator
+from unjam.models.environment_data import EnvironmentData
+from unjam.models.fitting import fit_row_model
+from unjam.models.rollouts import prepare_starts, roll_out
+from unjam.models.row_model import STATE_FIELDS, RowModel
+from unjam.models.settings import ModelSettings
+
+DRIVER = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
+SETTINGS = ModelSettings(members=3, hidden=(32,), epochs=20, batch_size=128, learning_rate=1e-2)
+
+
+def alone() -> RowModel:
+    return RowModel(SETTINGS, 1, (1,))
+
+
+def known_ahead(world: LittleWorld) -> EnvironmentData:
+    return actual_data(world, DRIVER, 30, 60)
+
+
+def test_a_model_that_is_the_truth_is_never_off() -> None:
+    data = known_ahead(LittleWorld(leader=0.0))
+    found = open_loop_errors(alone(), data, data.start_indices(40), 40, RING)
+    for name in STATE_FIELDS:
+        assert found.error[name].shape == found.spread[name].shape == (40,)
+        assert found.error[name].max() < 1e-3, name
+        assert found.spread[name].max() < 1e-5
+    assert found.change["leader_gap"][-1] > 1.0
+
+
+def test_errors_are_those_of_the_base_written_out() -> None:
+    """The base believes that the leader keeps its speed."""
+    data = known_ahead(LittleWorld())
+    choices = data.start_indices(30)
+    found = open_loop_errors(alone(), data, choices, 30, RING)
+    for step in (1, 10, 30):
+        off, moved = [], []
+        for place, at in choices:
+            speeds = data.recordings[place].states.leader_speed
+            off.append(speeds[at + step] - speeds[at])
+            gaps = data.recordings[place].states.leader_gap
+            moved.append(gaps[at + step] - gaps[at])
+        assert found.error["leader_speed"][step - 1] == pytest.approx(np.sqrt(np.mean(np.square(off))), abs=1e-5)
+        assert found.change["leader_gap"][step - 1] == pytest.approx(np.sqrt(np.mean(np.square(moved))))
+
+
+def test_learning_brings_virtual_and_actual_together() -> None:
+    data = known_ahead(LittleWorld())
+    choices, model = data.start_indices(30), alone()
+    before = open_loop_errors(model, data, choices, 30, RING)
+    fit_row_model(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
+    after = open_loop_errors(model, data, choices, 30, RING)
+    for name in ("leader_speed", "leader_gap"):
+        assert after.error[name][-1] < 0.6 * before.error[name][-1]
+        assert 0.0 < after.spread[name][-1] < 2 * after.error[name][-1]
+    assert after.error["speed"].max() < 1e-3
+
+
+def test_each_member_drives_alone_from_what_was_recorded() -> None:
+    data = known_ahead(LittleWorld())
+    model = alone()
+    fit_row_model(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
+    choices = data.start_indices(30)[:5]
+    actual, virtual = recorded_states(data, choices, 30), replay_accelerations(model, data, choices, 30, RING)
+    for name in STATE_FIELDS:
+        assert virtual[name].shape == (3, 5, 30)
+        assert actual[name].shape == (5, 31)
+        np.testing.assert_array_equal(actual[name][:, 0], getattr(data.states_at(choices), name))
+    assert np.ptp(virtual["leader_speed"], axis=0)[:, -1].min() > 0.0
+    np.testing.assert_allclose(
+        virtual["leader_speed"][1, :1],
+        replay_accelerations(model, data, choices[:1], 30, RING)["leader_speed"][1],
+        rtol=1e-4,
+    )
+
+
+def test_errors_one_step_ahead_are_those_of_the_fit() -> None:
+    data, model = known_ahead(LittleWorld()), alone()
+    actual = data.transitions(0.2)
+    found = fit_row_model(model, actual, SETTINGS, RING, "", (2,))
+    errors = one_step_errors(model, actual.select(np.flatnonzero(actual.is_holdout)), RING, "")
+    assert errors.model.shape == (3, found.holdout_rows, 6)
+    for name, error in errors.rmse_by_target().items():
+        assert error == pytest.approx(found.one_step[name], rel=1e-6, abs=1e-9), name
+
+
+def test_a_new_model_is_as_wrong_as_its_base() -> None:
+    errors = one_step_errors(alone(), known_ahead(LittleWorld()).transitions(0.2), RING, "")
+    for member in errors.model:
+        np.testing.assert_array_equal(member, errors.base)
+
+
+def gap_of(driver: ResidualDriver, world: LittleWorld, data: EnvironmentData) -> ReturnGap:
+    starts = prepare_starts(data, data.start_indices(20), driver.expert, "cpu")
+    rollouts = roll_out(driver, world, starts, 20, torch_generator((1,), "cpu"))
+    found = return_gap(rollouts.rewards.sum(1).double().numpy(), rollouts.start_indices, data, 18)
+    assert found is not None
+    return found
+
+
+def test_in_the_true_world_there_is_no_gap_between_returns() -> None:
+    world = LittleWorld()
+    data = actual_data(world, DRIVER, 6, 60, explore=False)
+    quiet = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
+    object.__setattr__(quiet.network, "exploration_std", 0.0)
+    found = gap_of(quiet, world, data)
+    choices = data.start_indices(20)
+    actual = [data.recordings[place].reward[at : at + 18].sum() for place, at in choices]
+    assert found.environment_return == pytest.approx(np.mean(actual))
+    assert found.model_return == pytest.approx(found.environment_return, abs=2e-3)
+    assert found.standard_error < 1e-3
+
+
+def test_a_world_that_pays_more_has_a_gap() -> None:
+    data = actual_data(LittleWorld(), DRIVER, 6, 60)
+    found = gap_of(DRIVER, LittleWorld(bonus=5.0), data)
+    assert found.model_return - found.environment_return > 5 * found.standard_error

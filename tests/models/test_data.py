@@ -1,0 +1,145 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.conftest import random_network
+from tests.models.little_world import LittleWorld, actual_data
+from tests.worlds.test_record import fingerprint
+from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver
+from unjam.drivers.local_state import COMMON_FIELDS
+from unjam.errors import InputError
+from unjam.models.environment_data import EnvironmentData, is_holdout_episode, pack_data, unpack_data
+from unjam.scenarios import Ring
+from unjam.worlds.record import Episode, Trajectory
+
+RING = Ring()
+
+
+def trajectory(number: int, decisions: int, hold: int = 1, terminated: bool = False) -> Trajectory:
+    """A trajectory in which every number tells where it comes from."""
+    steps = np.arange(decisions + 1, dtype=np.float64) + 1000.0 * number
+    nothing = np.zeros(decisions)
+    return Trajectory(
+        vehicle="cav_0",
+        start_step=0,
+        states=LocalState(*(steps + 0.1 * field for field in range(len(COMMON_FIELDS)))),
+        observations=np.zeros((1, 0)),
+        expert_acceleration=nothing,
+        residual=nothing,
+        applied_acceleration=steps[:-1] / 1e6,
+        filter_braking=nothing,
+        shield_braking=nothing,
+        reward_terms={"one": steps[:-1], "two": nothing + 1},
+        initial_memory={"number": np.array(float(number))},
+        action_repeat=hold,
+        terminated=terminated,
+    )
+
+
+def episode(*trajectories: Trajectory, length: float = 245.0, status: str = "completed") -> Episode:
+    return Episode(seed=(1,), status=status, drawn_values={"length": length}, trajectories=trajectories)
+
+
+def filled(*decisions: int, rows: int = 10**6, hold: int = 1) -> EnvironmentData:
+    data = EnvironmentData(rows)
+    data.add([episode(trajectory(number, count, hold)) for number, count in enumerate(decisions)], RING)
+    return data
+
+
+def test_rows_are_the_decisions_in_order() -> None:
+    data = EnvironmentData(100)
+    two_cavs = episode(trajectory(0, 3), trajectory(1, 2, terminated=True), length=270.0)
+    data.add([two_cavs, episode(trajectory(2, 4), length=220.0)], RING)
+    found = data.transitions(0.2)
+    assert len(data) == 9
+    np.testing.assert_array_equal(found.states.speed, [0, 1, 2, 1000, 1001, 2000, 2001, 2002, 2003])
+    np.testing.assert_array_equal(found.next_states.speed, found.states.speed + 1)
+    np.testing.assert_allclose(found.next_states.leader_gap, found.next_states.speed + 0.2)
+    np.testing.assert_allclose(found.acceleration, found.states.speed / 1e6)
+    np.testing.assert_array_equal(found.reward, found.states.speed + 1)
+    np.testing.assert_array_equal(found.drawn_values[:, 0], [1.0] * 5 + [-1.0] * 4)
+    np.testing.assert_array_equal(np.flatnonzero(found.crashed), [4])
+
+
+def test_failed_episodes_leave_nothing() -> None:
+    data = EnvironmentData(100)
+    data.add([Episode(seed=(1,), status="failed"), episode(trajectory(0, 3))], RING)
+    assert len(data) == 3
+    assert data.recordings[0].episode == 1
+
+
+@given(st.lists(st.integers(1, 30), min_size=1, max_size=12), st.integers(1, 60))
+def test_keeps_the_newest_episodes_whole(decisions: list[int], rows: int) -> None:
+    data = filled(*decisions, rows=rows)
+    kept = [recording.episode for recording in data.recordings]
+    assert kept == list(range(len(decisions)))[-len(kept) :]
+    assert len(data) == sum(decisions[-len(kept) :])
+    assert len(data) >= min(rows, sum(decisions))
+    assert len(data) - decisions[kept[0]] < rows  # without the oldest there would be too few
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.5])
+def test_a_share_of_the_episodes_is_held_out_from_the_first_on(share: float) -> None:
+    held = np.array([is_holdout_episode(number, share) for number in range(1000)])
+    assert held[0]
+    for first in range(0, 900, 90):
+        assert held[first : first + 100].mean() == pytest.approx(share, abs=0.02)
+    for parts in (2, 4, 5, 8):  # episodes take turns over as many parts of the road's range
+        assert all(held[part::parts].any() for part in range(parts))
+
+
+def test_a_held_out_episode_stays_whole_and_held_out() -> None:
+    data = filled(*[10] * 8, rows=60)
+    for _ in range(2):
+        found = data.transitions(0.2)
+        numbers = (found.states.speed // 1000).astype(int)
+        assert set(numbers[found.is_holdout]) == {5}
+        assert 5 not in numbers[~found.is_holdout]
+        data.add([episode(trajectory(9, 1))], RING)
+
+
+@pytest.mark.parametrize("decisions", [(10,), (10, 1)])
+def test_of_a_single_episode_the_end_is_held_out(decisions: tuple[int, ...]) -> None:
+    data = filled(*decisions)
+    data.recordings = [replace(recording, episode=0) for recording in data.recordings]
+    found = data.transitions(0.2)
+    np.testing.assert_array_equal(found.states.speed[found.is_holdout], [8, 9])
+
+
+def test_without_data_there_is_nothing_to_learn_from() -> None:
+    with pytest.raises(InputError, match="no actual decisions"):
+        EnvironmentData(10).transitions(0.2)
+
+
+def test_looks_are_where_a_residual_was_due_and_enough_follows() -> None:
+    data = filled(7, 3, hold=3)
+    assert data.start_indices().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0]]
+    assert data.start_indices(3).tolist() == [[0, 0], [0, 3], [1, 0]]
+    assert data.start_indices(8).tolist() == []
+    found = data.states_at(data.start_indices()[[3, 1, 1]])
+    np.testing.assert_array_equal(found.speed, [1000, 3, 3])
+    np.testing.assert_allclose(found.leader_gap, np.array([1000, 3, 3]) + 0.2)
+
+
+def test_unpacked_data_are_what_was_packed() -> None:
+    driver = ResidualDriver(PISaturation(window=2.0), random_network(), 1.0, action_repeat=4)
+    data = actual_data(LittleWorld(), driver, 2, 30)
+    again = unpack_data(*pack_data(data))
+    assert fingerprint(tuple(again.recordings)) == fingerprint(tuple(data.recordings))
+    assert (again.capacity, again.episode_count) == (data.capacity, data.episode_count)
+    assert again.recordings[0].initial_memory.keys() == {"window", "total", "seen", "command"}
+
+
+def test_chosen_rows_are_those_of_each_column() -> None:
+    actual = actual_data(LittleWorld(), ResidualDriver(IDM(), random_network(), 1.0), 2, 30).transitions(0.2)
+    rows = np.array([7, 3, 41])
+    found = actual.select(rows)
+    for name, values in actual._asdict().items():
+        pairs = [(values, getattr(found, name))]
+        if isinstance(values, LocalState):
+            pairs = list(zip(values[:7], getattr(found, name)[:7], strict=True))
+        for all_of_them, chosen in pairs:
+            np.testing.assert_array_equal(chosen, all_of_them[rows])

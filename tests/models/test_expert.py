@@ -1,0 +1,129 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.conftest import random_network
+from unjam.drivers import IDM, Driver, LocalState, PISaturation, ResidualDriver
+from unjam.drivers.check import random_state
+from unjam.drivers.driver import Memory
+from unjam.drivers.local_state import COMMON_FIELDS, state_of_ones
+from unjam.drivers.user_driver import FileDriver
+from unjam.errors import InputError
+from unjam.models.dynamics import NumPyDriverAdapter, tensor_driver, tensor_memory
+from unjam.models.environment_data import EnvironmentData, reconstruct_memory
+from unjam.scenarios import Ring
+from unjam.tree import leaves, map_leaves
+from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.simulation import Simulation
+
+RING = Ring(length=(60, 70), vehicles=5, cavs=2, horizon=90)
+
+
+def watch(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> list[Memory]:
+    """Write down the memories with which a driver acts from now on."""
+    memories: list[Memory] = []
+    kind, act = type(driver), type(driver).act
+
+    def watched(self: Driver, state: LocalState, memory: Memory) -> tuple:
+        if self is driver:
+            memories.append(map_leaves(np.array, memory))
+        return act(self, state, memory)
+
+    monkeypatch.setattr(kind, "act", watched)
+    return memories
+
+
+def experts(my_drivers: Path) -> list[Driver]:
+    return [
+        PISaturation(window=3.0),
+        FileDriver(my_drivers, "Keeper"),
+        ResidualDriver(PISaturation(window=2.0), random_network(seed=3), 1.0, action_repeat=4),
+    ]
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+@pytest.mark.parametrize("warmup", [0, 40])
+def test_remembers_what_the_driver_really_did(
+    number: int, warmup: int, my_drivers: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two episodes with two CAVs each, driven with exploration; every choice of all four trajectories."""
+    expert = experts(my_drivers)[number]
+    driver = ResidualDriver(expert, random_network(), 1.0, action_repeat=3)
+    ring, data, memories = replace(RING, warmup=warmup), EnvironmentData(1000), []
+    for seed in range(2):
+        with monkeypatch.context() as patch:
+            seen = watch(expert, patch)
+            data.add([run_episode(ring, driver, (seed,), explore=True, simulation=simulation)], ring)
+        memories += [seen, seen]
+    choices = np.random.default_rng(0).permutation(data.start_indices())[:40]
+    found = reconstruct_memory(expert, data.recordings, choices)
+    for row, (place, decision) in enumerate(choices):
+        really = memories[place][decision]
+        flat, expected = dict(leaves(found)), dict(leaves(really))
+        assert flat.keys() == expected.keys()
+        for key, values in expected.items():
+            np.testing.assert_allclose(flat[key][row], values[place % 2], atol=1e-10)
+
+
+def test_remembers_nothing_of_what_came_later_or_elsewhere() -> None:
+    """A window goes back to the start of its own trajectory, and no further."""
+    expert = PISaturation(window=100.0)
+    data = EnvironmentData(1000)
+    driver = ResidualDriver(expert, random_network(), 1.0, action_repeat=10)
+    with Simulation() as simulation:
+        episodes = [run_episode(RING, driver, (seed,), simulation=simulation) for seed in range(3)]
+    data.add(episodes, RING)
+    choices = data.start_indices()
+    found = reconstruct_memory(expert, data.recordings, choices)
+    for row, (place, decision) in enumerate(choices):
+        speeds = data.recordings[place].states.speed[:decision]
+        assert found["seen"][row] == decision
+        np.testing.assert_array_equal(found["window"][row, :decision], speeds)
+        assert not found["window"][row, decision:].any()
+
+
+def test_a_driver_without_memory_needs_none() -> None:
+    data = EnvironmentData(1000)
+    driver = ResidualDriver(IDM(), random_network(), 1.0)
+    data.add([run_episode(RING, driver, (1,))], RING)
+    assert reconstruct_memory(IDM(), data.recordings, data.start_indices()[:5]) == {}
+
+
+def test_built_in_drivers_take_tensors_as_they_are(my_drivers: Path) -> None:
+    pi = PISaturation()
+    assert tensor_driver(pi, "cpu") is pi
+    assert isinstance(tensor_driver(FileDriver(my_drivers, "Keeper"), "cpu"), NumPyDriverAdapter)
+    on_a_users = ResidualDriver(FileDriver(my_drivers, "Keeper"), random_network(), 1.0)
+    assert isinstance(tensor_driver(on_a_users, "cpu"), NumPyDriverAdapter)
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_on_tensors_it_drives_as_on_arrays(number: int, my_drivers: Path) -> None:
+    expert = experts(my_drivers)[number]
+    on_world = tensor_driver(expert, "cpu")
+    generator = np.random.default_rng(1)
+    memory = expert.initial_memory(4)
+    tensors = tensor_memory(on_world, memory, "cpu")
+    for _ in range(50):
+        state = random_state(generator, 4)
+        expected, memory = expert.act(state, memory)
+        in_world = state.map(lambda values: torch.tensor(values, dtype=torch.float32))
+        found, tensors = on_world.act(in_world, tensors)
+        assert found.dtype == torch.float32
+        np.testing.assert_allclose(found.numpy(), expected, atol=1e-4)
+        features = on_world.memory_features(tensors)
+        expected_features = expert.memory_features(memory)
+        assert (features is None) == (expected_features is None)
+        if features is not None and expected_features is not None:
+            np.testing.assert_allclose(features.numpy(), expected_features, atol=1e-4)
+
+
+def test_an_acceleration_that_is_not_finite_is_told(my_drivers: Path) -> None:
+    state = state_of_ones(COMMON_FIELDS, torch.ones, 3)
+    with pytest.raises(InputError, match="virtual environment: acceleration is nan; allowed: finite"):
+        tensor_driver(FileDriver(my_drivers, "broken"), "cpu").act(state, {})
+    with pytest.raises(InputError, match=r"shape \(4,\); allowed: \(3,\)"):
+        tensor_driver(FileDriver(my_drivers, "short"), "cpu").act(state, {})

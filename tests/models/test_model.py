@@ -1,0 +1,103 @@
+import numpy as np
+import torch
+from torch.testing import assert_close
+
+from unjam.drivers import LocalState
+from unjam.drivers.check import random_state
+from unjam.models.ensemble import ROWS_PER_MEMBER, predict, random_members, torch_generator
+from unjam.models.row_model import STATE_FIELDS, TARGET_NAMES, RowModel, model_inputs
+from unjam.models.settings import ModelSettings
+
+SETTINGS = ModelSettings(members=3, hidden=(16, 8))
+
+
+def shaken(seed: int = 0) -> RowModel:
+    """A model whose networks answer something."""
+    model = RowModel(SETTINGS, 1, (seed,))
+    generator = torch_generator((seed, 1), "cpu")
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.3 * torch.randn(parameter.shape, generator=generator)
+    model.output_mask.fill_(1.0)
+    return model
+
+
+def some_inputs(rows: int) -> torch.Tensor:
+    state = random_state(np.random.default_rng(1), rows).map(lambda v: torch.tensor(v).float())
+    return model_inputs(state, torch.linspace(-1, 1, rows), torch.full((rows, 1), 0.4))
+
+
+def test_sees_the_state_the_acceleration_and_what_was_drawn() -> None:
+    state = LocalState(*(torch.tensor([float(value)]) for value in range(7)))
+    found = model_inputs(state, torch.tensor([0.5]), torch.tensor([[0.25]]))
+    assert STATE_FIELDS == ("speed", "leader_speed", "follower_speed", "leader_gap", "follower_gap")
+    assert found.tolist() == [[0.0, 1.0, 3.0, 2.0, 4.0, 0.5, 0.25]]
+
+
+def test_a_new_model_adds_nothing_to_its_base() -> None:
+    model = RowModel(SETTINGS, 1, (1,))
+    model.output_mask.fill_(1.0)
+    found = predict(model.layers(), some_inputs(9), torch.tensor([0, 1, 2]))
+    assert_close(found, torch.zeros(9, len(TARGET_NAMES)))
+
+
+def test_networks_begin_different_and_the_same_for_a_seed() -> None:
+    one, again, other = (RowModel(SETTINGS, 1, (seed,)) for seed in (1, 1, 2))
+    assert torch.equal(one.weights[0], again.weights[0])
+    assert not torch.equal(one.weights[0], other.weights[0])
+    assert not torch.equal(one.weights[0][0], one.weights[0][1])
+
+
+def test_new_units_leave_the_answers_as_they_were() -> None:
+    model, inputs = shaken(), some_inputs(50)
+    members = torch.tensor([2, 0])
+    before = predict(model.layers(), inputs, members)
+    generator = torch_generator((3,), "cpu")
+    targets = torch.rand((50, len(TARGET_NAMES)), generator=generator, dtype=torch.float64) * 7 + 3
+    for scale in (1.0, 0.1):
+        model.set_normalization(inputs.double() * scale, targets * scale, 1e-4)
+        assert_close(predict(model.layers(), inputs, members), before, atol=2e-4, rtol=2e-4)
+    assert_close(model.target_mean, targets.mean(0).float() * 0.1)
+
+
+def test_each_block_of_rows_asks_its_member() -> None:
+    model, inputs = shaken(), some_inputs(10)
+    found = predict(model.layers(), inputs, torch.tensor([2, 0, 1]))  # blocks of four rows, but for the last
+    every = model(inputs.expand(3, -1, -1)).detach()
+    for rows, member in ((slice(0, 4), 2), (slice(4, 8), 0), (slice(8, 10), 1)):
+        assert_close(found[rows], every[member, rows])
+
+
+def test_rows_at_once_are_answered_as_single_rows() -> None:
+    layers, inputs = shaken().layers(), some_inputs(7)
+    together = predict(layers, inputs, torch.tensor([1]))
+    for row in range(7):
+        assert_close(predict(layers, inputs[row : row + 1], torch.tensor([1]))[0], together[row])
+
+
+def test_what_is_not_learned_is_left_to_the_base() -> None:
+    model, inputs = shaken(), some_inputs(5)
+    before = predict(model.layers(), inputs, torch.tensor([0]))
+    model.output_mask[1] = 0.0
+    found = predict(model.layers(), inputs, torch.tensor([0]))
+    assert (found[:, 1] == 0.0).all()
+    assert_close(found[:, 2:], before[:, 2:])
+
+
+def test_all_members_are_asked_equally_often() -> None:
+    found = random_members(5, 10_000 * ROWS_PER_MEMBER, torch_generator((1,), "cpu"))
+    assert len(found) == 10_000
+    shares = torch.bincount(found, minlength=5) / len(found)
+    assert_close(shares, torch.full((5,), 0.2), atol=0.02, rtol=0)
+    assert len(random_members(5, 1, torch_generator((1,), "cpu"))) == 1
+
+
+def test_state_dict_is_all_of_it() -> None:
+    model = shaken(1)
+    model.set_normalization(some_inputs(20).double(), torch.rand((20, 6), dtype=torch.float64), 1e-4)
+    other = RowModel(SETTINGS, 1, (9,))
+    other.load_state_dict(model.state_dict())
+    members = torch.tensor([0, 1, 2])
+    assert torch.equal(
+        predict(other.layers(), some_inputs(9), members), predict(model.layers(), some_inputs(9), members)
+    )

@@ -1,0 +1,116 @@
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from unjam.drivers import PISaturation
+from unjam.errors import InputError
+from unjam.models.ensemble import torch_generator
+from unjam.models.fitting import ModelFit
+from unjam.models.road_model import (
+    RoadModel,
+    base_human_model,
+    check_road_model,
+    fit_road_model,
+    learned_human_model,
+    road_samples,
+)
+from unjam.models.settings import ModelSettings
+from unjam.scenarios import FigureEight, Merge, Ring
+from unjam.scenarios.ring import LoopScenario
+from unjam.worlds.batch.run import run_batch
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask
+
+RING = Ring(length=(120, 130), vehicles=8, horizon=600, warmup=0)
+EIGHT = FigureEight(horizon=600, warmup=0)
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list[Episode]:
+    return run_batch([EpisodeTask(RING, PISaturation(), (seed,)) for seed in range(10)])
+
+
+@pytest.fixture(scope="module")
+def eights() -> list[Episode]:
+    tasks = [EpisodeTask(EIGHT, PISaturation(), (seed,)) for seed in range(10)]
+    return run_batch(tasks, allow_statistical=True)
+
+
+def fitted(episodes: list[Episode], road: LoopScenario = RING, **changes: Any) -> tuple[RoadModel, ModelFit]:
+    settings = ModelSettings(kind="road", **changes)
+    model = RoadModel(settings, (0,))
+    kept = [road_samples(episode, number, road) for number, episode in enumerate(episodes)]
+    return model, fit_road_model(model, kept, settings, road, (1,))
+
+
+def test_where_people_are_known_only_their_noise_is_left(episodes: list[Episode]) -> None:
+    model, found = fitted(episodes)
+    assert found.learned_targets == ()
+    assert found.errors["unexplained"] < 1e-9
+    assert found.errors["transitions"] < 1e-6
+    assert found.errors["total_variation"] == 0.0
+    assert float(model.noise) == pytest.approx(RING.noise_per_step * RING.simulation_step, rel=0.05)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("base", ["none", "ovm"])
+def test_what_a_base_does_not_know_the_networks_learn(episodes: list[Episode], base: str) -> None:
+    _, found = fitted(episodes, base=base, epochs=20)
+    step = found.one_step["speed"]
+    assert found.learned_targets == ("speed",)
+    assert step.model < step.base / 3
+    assert found.errors["unexplained"] == pytest.approx((step.model / step.change) ** 2)
+
+
+@pytest.mark.long
+def test_on_a_figure_eight_the_right_of_way_is_known_and_noise_no_ignorance(eights: list[Episode]) -> None:
+    model, found = fitted(eights, EIGHT)
+    sigma = EIGHT.noise_per_step * EIGHT.simulation_step
+    assert found.one_step["speed"].base == pytest.approx(sigma, rel=0.05)
+    assert found.errors["unexplained"] < 0.02
+    assert float(model.noise) == sigma
+
+
+@pytest.mark.long
+def test_on_a_figure_eight_the_networks_learn_what_a_base_does_not_know(eights: list[Episode]) -> None:
+    _, found = fitted(eights, EIGHT, base="none", epochs=20)
+    sigma, step = EIGHT.noise_per_step * EIGHT.simulation_step, found.one_step["speed"]
+    assert found.learned_targets == ("speed",)
+    assert step.base > 2 * sigma
+    assert step.model == pytest.approx(sigma, rel=0.2)
+
+
+def test_too_few_episodes_are_held_out_in_part(episodes: list[Episode]) -> None:
+    assert fitted(episodes[:1])[1].holdout_rows > 0
+
+
+def test_moments_are_what_was_recorded_and_what_came_next(episodes: list[Episode]) -> None:
+    episode = episodes[3]
+    kept = road_samples(episode, 7, RING)
+    assert (kept.episode, kept.interval, kept.is_human.sum()) == (7, 1, 7)
+    np.testing.assert_array_equal(kept.next_speeds, episode.speeds[1:])
+    drivers = kept.is_human > 0
+    noise = (kept.next_speeds - kept.intended_speeds)[:, drivers][kept.intended_speeds[:, drivers] > 0.5]
+    assert abs(noise.mean()) < 0.002
+    assert np.abs((kept.next_speeds - kept.intended_speeds)[:, ~drivers]).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("road", "why"), [(Merge(), "it is no ring"), (replace(RING, steps_per_control_step=2), "steps_per_decision is 2")]
+)
+def test_other_roads_are_refused_in_one_line(road: Any, why: str) -> None:
+    with pytest.raises(InputError, match=f"model.kind: road is not allowed; allowed: row, for .*{why}"):
+        check_road_model(road)
+
+
+def test_people_with_networks_drive_on_tensors_as_on_arrays(episodes: list[Episode]) -> None:
+    model, _ = fitted(episodes, base="none", epochs=5)
+    seen = [np.array([[3.0, 9.0], [0.0, 25.0]]), np.array([[4.0, 2.0], [1.0, 20.0]])]
+    seen.append(np.array([[5.0, 12.0], [2.0, 30.0]]))
+    on_arrays, on_tensors = (learned_human_model(model, RING, torch_generator((1,), "cpu")) for _ in range(2))
+    found = on_tensors(*map(torch.from_numpy, seen))
+    assert torch.equal(found, torch.from_numpy(on_arrays(*seen)))
+    assert not torch.equal(found, base_human_model("none", RING)(*map(torch.from_numpy, seen)))

@@ -1,0 +1,257 @@
+from dataclasses import replace
+from math import inf, nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from tests.conftest import random_network
+from tests.models.little_world import RING, LittleWorld, actual_data
+from unjam.drivers import IDM, Constant, Driver, LocalState, PISaturation, ResidualDriver
+from unjam.drivers.observation import FeatureName, observation_size
+from unjam.drivers.user_driver import FileDriver
+from unjam.errors import UnjamError
+from unjam.models.dynamics import CLIPPED_QUANTITIES, ModelDynamics, ModelTransition
+from unjam.models.ensemble import torch_generator
+from unjam.models.environment_data import EnvironmentData
+from unjam.models.rollouts import RolloutBatch, draw_starts, prepare_starts, return_bound, roll_out, rollout_length
+from unjam.models.row_model import RowModel
+from unjam.models.settings import ModelSettings
+
+PARTS: tuple[FeatureName, ...] = ("local", "expert_acceleration", "expert_memory")
+
+
+def residual_driver(expert: Driver, hold: int = 1, limit: float = 1.0) -> ResidualDriver:
+    network = random_network(observation_size(PARTS, expert))
+    return ResidualDriver(expert, network, limit, PARTS, hold)
+
+
+@given(
+    st.one_of(st.floats(0, 1e-2), st.floats(0, 50), st.sampled_from([0.01, 0.004, 2.0, 2.0000001])),
+    st.integers(0, 600),
+    st.floats(0.01, 10),
+)
+def test_rollout_length_is_equation_15(eps_m: float, k_max: int, kappa: float) -> None:
+    found = rollout_length(eps_m, ModelSettings(k_max=k_max, kappa=kappa))
+    expected = 0  # the most decisions whose error adds up to kappa at most, counted one by one
+    while expected < k_max and (eps_m == 0.0 or kappa / eps_m >= expected + 1):
+        expected += 1
+    assert found == expected
+
+
+@pytest.mark.parametrize(("eps_m", "expected"), [(0.01, 200), (0.04, 50), (0.0, 500), (2.5, 0), (inf, 0), (nan, 0)])
+def test_rollout_length_at_known_errors(eps_m: float, expected: int) -> None:
+    assert rollout_length(eps_m, ModelSettings(kappa=2.0, k_max=500)) == expected
+
+
+@given(st.floats(0, 1), st.floats(0, 1), st.integers(0, 500), st.floats(0.5, 0.999), st.floats(0, 10))
+def test_bound_is_the_sum_of_its_three_parts(eps_pi: float, eps_m: float, k: int, gamma: float, largest: float) -> None:
+    power = 1.0
+    for _ in range(k):
+        power *= gamma
+    far = sum(gamma**step for step in range(40_000)) if gamma < 0.99 else 1 / (1 - gamma)
+    expected = 2 * largest * (gamma * power * eps_pi * far * far + power * eps_pi * far + k * eps_m * far)
+    assert return_bound(eps_pi, eps_m, k, gamma, largest) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def experts(my_drivers: Path) -> list[Driver]:
+    return [
+        PISaturation(window=1.5),
+        FileDriver(my_drivers, "Keeper"),
+        ResidualDriver(PISaturation(window=2.0), random_network(seed=5), 1.0, action_repeat=7),
+    ]
+
+
+def value(observations: np.ndarray) -> np.ndarray:
+    """Some value function."""
+    return 3.0 + observations @ np.linspace(-1, 1, observations.shape[-1])
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+@pytest.mark.parametrize("hold", [1, 4])
+def test_with_the_true_dynamics_virtual_is_actual(number: int, hold: int, my_drivers: Path) -> None:
+    """From any actual row: the same observations, residuals, rewards, and value targets."""
+    world, gamma, decisions = LittleWorld(), 0.97, 41
+    driver = residual_driver(experts(my_drivers)[number], hold)
+    data = actual_data(world, driver, 3, 120, explore=False)
+    choices = data.start_indices(min_control_steps=decisions)
+    found = roll_out(driver, world, prepare_starts(data, choices, driver.expert, "cpu"), decisions, None)
+    made = decisions // hold
+    assert found.rewards.shape == (len(choices), made)
+    assert not found.terminated.any()
+    drives = [replay(driver, data, place) for place in range(3)]
+    for row, (place, at) in enumerate(choices):
+        recording, driven = data.recordings[place], drives[place]
+        seen = driven[0][at : at + made * hold + 1 : hold]
+        np.testing.assert_allclose(found.observations[row].numpy(), seen, atol=2e-4)
+        residuals = driven[1][at : at + made * hold : hold]
+        np.testing.assert_allclose(found.actions[row].numpy(), residuals, atol=2e-4)
+        earned = recording.reward[at : at + made * hold].reshape(made, hold).sum(1)
+        np.testing.assert_allclose(found.rewards[row].numpy(), earned, atol=1e-3)
+        powers = gamma ** np.arange(made + 1)
+        target = powers @ np.append(found.rewards[row], value(found.observations[row, -1:].numpy()))
+        assert target == pytest.approx(powers @ np.append(earned, value(seen[-1:])), abs=5e-3)
+
+
+def replay(driver: ResidualDriver, data: EnvironmentData, place: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the network saw, or would have seen, in every decision of a recording, and its residuals."""
+    recording = data.recordings[place]
+    memory, seen, residuals = driver.initial_memory(1), [], []
+    for step in range(len(recording.states.speed)):
+        state = recording.states.select(slice(step, step + 1))
+        seen.append(driver.observation(state, memory)[0])
+        decision = driver.decide(state, memory)
+        residuals.append(decision.residual[0])
+        memory = decision.memory
+    return np.array(seen), np.array(residuals)
+
+
+def crash_course(limit: float = 1.0) -> tuple[ResidualDriver, EnvironmentData]:
+    """A driver that does not brake, behind vehicles that do."""
+    gentle = actual_data(LittleWorld(), residual_driver(IDM(), 2), 4, 60)
+    return residual_driver(Constant(1.0), 2, limit), gentle
+
+
+def test_a_crash_ends_a_row_and_its_rewards() -> None:
+    driver, data = crash_course()
+    choices = data.start_indices()
+    found = roll_out(driver, LittleWorld(), prepare_starts(data, choices, driver.expert, "cpu"), 300, None)
+    assert found.terminated.all()
+    assert found.lengths.max() < 150
+    for row in range(len(choices)):
+        made = int(found.lengths[row])
+        assert made > 0
+        assert (found.rewards[row, made:] == 0.0).all()
+        assert found.rewards[row, :made].abs().sum() > 0.0
+    one = choices[:1]
+    alone = roll_out(driver, LittleWorld(), prepare_starts(data, one, driver.expert, "cpu"), 300, None)
+    assert alone.control_steps in (2 * int(alone.lengths[0]), 2 * int(alone.lengths[0]) - 1)
+    assert_close(alone.rewards[0], found.rewards[0])
+
+
+class Bounded(LittleWorld):
+    """Says that a bound was enforced: the first always, the second never, the third in the first step."""
+
+    steps = 0
+
+    def step(self, state: LocalState, acceleration: torch.Tensor, drawn_values: torch.Tensor) -> ModelTransition:
+        self.steps += 1
+        always = torch.ones_like(acceleration)
+        told = torch.stack([always, always * 0, always * (self.steps == 1)]) > 0
+        return super().step(state, acceleration, drawn_values)._replace(bounded=told)
+
+
+def test_bounds_count_until_the_crash() -> None:
+    driver, data = crash_course()
+    starts = prepare_starts(data, data.start_indices()[:50], driver.expert, "cpu")
+    found = roll_out(driver, Bounded(), starts, 300, None)
+    assert found.control_steps < 50 * 300
+    assert found.clipped_share == pytest.approx(
+        dict(zip(CLIPPED_QUANTITIES, [1.0, 0.0, 50 / found.control_steps], strict=True)), rel=1e-5
+    )
+
+
+@pytest.fixture(scope="module")
+def noisy() -> tuple[ResidualDriver, EnvironmentData, RowModel]:
+    driver = residual_driver(PISaturation(window=1.5), 5)
+    data = actual_data(LittleWorld(), driver, 3, 60)
+    model = RowModel(ModelSettings(members=2, hidden=(8,)), 1, (1,))
+    model.noise.normal_(0, 0.01, generator=torch_generator((4,), "cpu"))
+    model.reward_range.copy_(torch.tensor([-1.0, 1.0]))
+    return driver, data, model
+
+
+def run(noisy: tuple[ResidualDriver, EnvironmentData, RowModel], seed: int) -> RolloutBatch:
+    driver, data, model = noisy
+    generator = torch_generator((seed,), "cpu")
+    choices = draw_starts(data, 200, 1, (seed,))
+    starts = prepare_starts(data, choices, driver.expert, "cpu")
+    return roll_out(driver, ModelDynamics(model, RING, "", generator), starts, 23, generator)
+
+
+def test_the_same_seed_gives_the_same_bits(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+    one = run(noisy, 1)
+    torch.rand(3)
+    again, other = run(noisy, 1), run(noisy, 2)
+    for name in ("observations", "actions", "rewards", "made", "terminated", "drawn"):
+        assert torch.equal(getattr(one, name), getattr(again, name)), name
+    np.testing.assert_array_equal(one.start_indices, again.start_indices)
+    assert not torch.equal(one.rewards, other.rewards)
+
+
+def test_rollouts_are_whole_looks(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+    found = run(noisy, 1)
+    assert found.observations.shape == (200, 5, 8)
+    assert found.actions.shape == found.rewards.shape == (200, 4)
+    assert found.control_steps == 200 * 4 * 5
+    assert found.drawn_values.shape == (200, 1)
+    assert (found.drawn_values == 0.3).all()
+    assert found.observations.dtype == torch.float32
+
+
+def test_explores_with_the_networks_own_deviation(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+    driver = noisy[0]
+    found = run(noisy, 1)
+    mean = driver.network(found.observations[:, :-1].reshape(-1, 8)).view(200, 4)
+    noise = (found.actions - mean) / driver.network.exploration_std
+    assert noise.mean().item() == pytest.approx(0.0, abs=0.1)
+    assert noise.std().item() == pytest.approx(1.0, abs=0.1)
+
+
+def test_no_decisions_are_the_start_alone(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+    driver, data, _ = noisy
+    starts = prepare_starts(data, data.start_indices()[:7], driver.expert, "cpu")
+    found = roll_out(driver, LittleWorld(), starts, 4, None)
+    assert found.observations.shape == (7, 1, 8)
+    assert found.rewards.shape == found.actions.shape == (7, 0)
+    assert (found.control_steps, found.lengths.tolist(), found.terminated.any().item()) == (0, [0] * 7, False)
+
+
+def test_starts_are_looks_with_enough_ahead() -> None:
+    data = actual_data(LittleWorld(), residual_driver(IDM(), 4), 3, 50)
+    found = draw_starts(data, 500, 20, (1,))
+    assert found.shape == (500, 2)
+    assert set(found[:, 1].tolist()) == set(range(0, 31, 4))
+    assert set(found[:, 0].tolist()) == {0, 1, 2}
+    np.testing.assert_array_equal(found, draw_starts(data, 500, 20, (1,)))
+    assert draw_starts(data, 500, 51, (1,)).shape == (0, 2)
+
+
+def test_what_is_not_finite_is_told() -> None:
+    driver, data = residual_driver(IDM()), actual_data(LittleWorld(), residual_driver(IDM()), 1, 10)
+    starts = prepare_starts(data, data.start_indices(), driver.expert, "cpu")
+    with pytest.raises(UnjamError, match="rewards of a rollout are not finite"):
+        roll_out(driver, LittleWorld(bonus=inf), starts, 3, None)
+
+
+def test_the_action_limit_holds_for_expert_and_sum() -> None:
+    driver, data = crash_course(limit=0.25)
+    commands: list[torch.Tensor] = []
+
+    class Watching(LittleWorld):
+        def step(self, state: LocalState, acceleration: torch.Tensor, drawn_values: torch.Tensor) -> ModelTransition:
+            commands.append(acceleration)
+            return super().step(state, acceleration, drawn_values)
+
+    strong = replace(driver, expert=IDM(), network=random_network(6))
+    roll_out(strong, Watching(), prepare_starts(data, data.start_indices(), IDM(), "cpu"), 20, None)
+    assert torch.stack(commands).abs().max() == 0.25
+    assert torch.stack(commands).unique().numel() > 10
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_drives_on_a_gpu_as_on_the_processor(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+    driver, data, model = noisy
+    found = []
+    for device in ("cpu", "cuda"):
+        generator = torch_generator((1,), device)
+        world = ModelDynamics(model.to(device), RING, "", generator, add_noise=False)
+        found.append(
+            roll_out(driver, world, prepare_starts(data, data.start_indices(), driver.expert, device), 20, None)
+        )
+    model.to("cpu")
+    assert_close(found[1].rewards.cpu(), found[0].rewards, atol=1e-3, rtol=1e-3)

@@ -1,0 +1,33 @@
+from typing import get_args
+
+import pytest
+
+from unjam.errors import InputError
+from unjam.models.row_model import BASE_DRIVERS
+from unjam.models.settings import BaseName, ModelSettings
+from unjam.parameters import build_dataclass
+
+
+def test_every_base_can_be_chosen() -> None:
+    assert set(get_args(BaseName)) == set(BASE_DRIVERS)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (
+            {"base": "krauss"},
+            "model.base: 'krauss' is not allowed; allowed: 'idm', 'population', 'acc', 'ovm' or 'none'",
+        ),
+        ({"error": "loss"}, "model.error_estimator: 'loss' is not allowed; allowed: 'unexplained'"),
+        ({"members": 0}, "model.members: 0 is not allowed"),
+        ({"holdout": 1.0}, "model.holdout: 1.0 is not allowed"),
+        ({"hidden": ()}, "model.hidden"),
+        ({"epochs": 0}, "model.epochs: 0"),
+        ({"length": 3}, "model.length: unknown name"),
+        ({"members": 1, "error": "total_variation"}, "model.members: 1 is not allowed with total_variation"),
+    ],
+)
+def test_what_is_wrong_is_named(values: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        build_dataclass(ModelSettings, values, "virtual")

@@ -1,0 +1,81 @@
+"""A network written again: other types, more or less traffic, and the user's own files as they were."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.sumo_files.test_sumo_files import configuration
+from unjam.errors import InputError
+from unjam.sumo_files import read_sumo_files
+from unjam.sumo_files.variants import write_variant
+
+ROUTES = (
+    '<routes><vTypeDistribution id="all"><vType id="car" tau="1" length="4"/><vType id="van"/>'
+    '</vTypeDistribution><vehicle id="v" type="all"/><vehicle id="w"/></routes>'
+)
+
+
+def changed(folder: Path, types: dict[str, dict[str, str]], scale: float, inside: str = "") -> Path:
+    """A network written again, beside the one it comes from."""
+    (folder / "mine").mkdir()
+    (folder / "new").mkdir()
+    files = read_sumo_files(configuration(folder / "mine", inside, routes=ROUTES))
+    return write_variant(files, types, scale, folder / "new" / "other.sumocfg")
+
+
+def test_types_are_changed_wherever_they_are_defined(tmp_path: Path) -> None:
+    path = changed(tmp_path, {"car": {"tau": "1.5"}, "DEFAULT_VEHTYPE": {"accel": "2"}}, 1.0)
+    found = read_sumo_files(path)
+    assert found.types["car"] == {"id": "car", "tau": "1.5", "length": "4"}
+    assert found.types["van"] == {"id": "van"}
+    assert found.types["DEFAULT_VEHTYPE"] == {"id": "DEFAULT_VEHTYPE", "accel": "2"}
+    assert found.used_types == {"car", "van", "DEFAULT_VEHTYPE"}
+
+
+def test_the_network_stays_where_it_is_and_no_file_of_the_user_changes(tmp_path: Path) -> None:
+    path = changed(tmp_path, {"car": {"tau": "1.5"}}, 1.0)
+    assert read_sumo_files(path).network.resolve() == (tmp_path / "mine" / "road.net.xml").resolve()
+    assert (tmp_path / "mine" / "road.rou.xml").read_text() == ROUTES
+    assert sorted(file.name for file in path.parent.iterdir()) == ["0.rou.xml", "other.sumocfg"]
+
+
+def test_times_and_harmless_options_stay_and_traffic_is_scaled_once_more(tmp_path: Path) -> None:
+    inside = '<begin value="10"/><end value="100"/><step-length value="0.5"/><scale value="2"/>'
+    path = changed(tmp_path, {}, 0.75, inside + '<fcd-output value="big.xml"/>')
+    found = read_sumo_files(path)
+    assert (found.begin, found.end, found.step) == (10.0, 100.0, 0.5)
+    assert float(found.options["scale"]) == 1.5
+    assert found.dropped_items == ()
+
+
+@pytest.mark.parametrize("text", ["tau<5", 'a"b&c'])
+def test_signs_of_xml_within_attributes_stay_attributes(text: str, tmp_path: Path) -> None:
+    path = changed(tmp_path, {"car": {"imgFile2": text}, "DEFAULT_VEHTYPE": {"x": text}}, 1.0)
+    found = read_sumo_files(path).types
+    assert found["car"]["imgFile2"] == found["DEFAULT_VEHTYPE"]["x"] == text
+
+
+def test_a_scale_that_is_no_number_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"road\.sumocfg: scale: 'much' is not allowed; allowed: a number"):
+        changed(tmp_path, {}, 1.0, '<scale value="much"/>')
+
+
+def test_a_file_that_has_broken_since_is_told(tmp_path: Path) -> None:
+    files = read_sumo_files(configuration(tmp_path))
+    (tmp_path / "road.rou.xml").write_text("<routes><vTyp")
+    with pytest.raises(InputError, match=r"road\.rou\.xml: cannot be read"):
+        write_variant(files, {}, 1.0, tmp_path / "other.sumocfg")
+    assert not (tmp_path / "other.sumocfg").exists()
+
+
+def test_included_types_are_changed_too_and_weights_of_edges_are_kept(tmp_path: Path) -> None:
+    mine, new = tmp_path / "mine", tmp_path / "new"
+    mine.mkdir()
+    new.mkdir()
+    (mine / "types.xml").write_text('<routes><vType id="car" tau="1"/></routes>')
+    (mine / "w.xml").write_text('<m><edge id="a" traveltime="9"/></m>')
+    routes = '<routes><include href="types.xml"/><vehicle id="v" type="car"/></routes>'
+    files = read_sumo_files(configuration(mine, '<w value="w.xml"/>', routes=routes))
+    found = read_sumo_files(write_variant(files, {"car": {"tau": "1.5"}}, 1.0, new / "other.sumocfg"))
+    assert found.types["car"] == {"id": "car", "tau": "1.5"}
+    assert [path.read_text() for path in found.weight_files] == ['<m><edge id="a" traveltime="9"></edge></m>']

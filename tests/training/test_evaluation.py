@@ -1,0 +1,164 @@
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.pictures import empty_pictures
+from tests.training.test_run import STEPS, learn_with, small_config
+from unjam.controller import controller_bytes, load_controller
+from unjam.drivers import PISaturation, ResidualDriver
+from unjam.errors import InputError
+from unjam.reports.html import render_report
+from unjam.reports.results import read_results
+from unjam.training.config import RunConfig
+from unjam.training.evaluate import TRAINED_LABEL, drivers_to_compare, evaluate_run
+from unjam.training.seeds import make_test_seeds
+from unjam.worlds.episode import run_episode
+from unjam.worlds.worker_pool import WorkerPool
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[WorkerPool]:
+    with WorkerPool(1) as workers:
+        yield workers
+
+
+def learned(pool: WorkerPool, folder: Path, **changes: object) -> tuple[Path, RunConfig]:
+    """A run of one iteration that is not judged yet."""
+    config = small_config(**{"steps": STEPS, "evaluation__every": 0, **changes})
+    learn_with(pool, folder, config)
+    return folder, config
+
+
+@pytest.fixture(scope="module")
+def run(pool: WorkerPool, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunConfig]:
+    return learned(pool, tmp_path_factory.mktemp("runs") / "run")
+
+
+def test_compares_baselines_the_expert_and_what_was_trained(run: tuple[Path, RunConfig]) -> None:
+    folder, config = run
+    drivers = drivers_to_compare(config, folder, ["human", "pi:window=30"])
+    assert next(iter(drivers)) == "human"
+    assert list(drivers)[-2:] == ["pi", TRAINED_LABEL]
+    assert len(drivers) == 4
+    assert drivers["pi"] == PISaturation()
+    trained = drivers[TRAINED_LABEL]
+    assert isinstance(trained, ResidualDriver)
+    assert trained.expert == PISaturation()
+
+
+def test_results_and_their_report_name_the_hash_of_the_controller_that_was_judged(
+    run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
+) -> None:
+    folder, config = run
+    evaluate_run(folder, config, pool, baselines=[], episodes=1, out=tmp_path)
+    sha256 = hashlib.sha256((folder / "controller.unjam").read_bytes()).hexdigest()
+    found = read_results(tmp_path)
+    assert found.metadata["controllers"] == {TRAINED_LABEL: sha256}
+    with empty_pictures():
+        assert f"Controller {TRAINED_LABEL}: SHA-256 {sha256}" in render_report([found])
+
+
+def test_an_expert_among_the_baselines_is_compared_once(run: tuple[Path, RunConfig]) -> None:
+    folder, config = run
+    assert list(drivers_to_compare(config, folder, ["pi", "human"])) == ["pi", "human", TRAINED_LABEL]
+
+
+def test_a_shipped_baseline_has_its_short_name(run: tuple[Path, RunConfig]) -> None:
+    folder, config = run
+    name = "unjam:ring-jammed-tuned"
+    assert list(drivers_to_compare(config, folder, ["human", name])) == ["human", name, "pi", TRAINED_LABEL]
+
+
+def test_baselines_of_one_file_with_other_parameters_are_all_compared(
+    run: tuple[Path, RunConfig], my_drivers: Path
+) -> None:
+    folder, config = run
+    names = [f"{my_drivers}:Keeper:gain={gain}" for gain in (0.1, 0.2)]
+    assert len(drivers_to_compare(config, folder, names)) == 4
+
+
+def test_judges_on_the_held_out_seeds_and_saves_it(run: tuple[Path, RunConfig], pool: WorkerPool) -> None:
+    folder, config = run
+    found = evaluate_run(folder, config, pool)
+    assert list(found.rows) == ["human", "pi", TRAINED_LABEL]
+    for rows in found.rows.values():
+        assert [tuple(row["seed"]) for row in rows] == make_test_seeds(2)
+    saved = read_results(folder)
+    assert list(saved.rows) == list(found.rows)
+    assert saved.metadata["expert"] == "pi"
+    assert saved.metadata["manifest"]["unjam"]
+    scenario = config.make_scenario()
+    (trajectory,) = run_episode(scenario, load_controller(folder), make_test_seeds(1)[0]).trajectories
+    assert found.rows[TRAINED_LABEL][0]["return"] == trajectory.reward.sum()
+
+
+def test_baselines_and_episodes_can_be_others_than_the_configurations(
+    run: tuple[Path, RunConfig], pool: WorkerPool
+) -> None:
+    folder, config = run
+    found = evaluate_run(folder, config, pool, baselines=["idm"], episodes=1)
+    assert list(found.rows) == ["idm", "pi", TRAINED_LABEL]
+    assert {len(rows) for rows in found.rows.values()} == {1}
+    assert list(evaluate_run(folder, config, pool, baselines=[], episodes=1).rows) == ["pi", TRAINED_LABEL]
+
+
+def test_without_an_expert_none_is_compared(pool: WorkerPool, tmp_path: Path) -> None:
+    folder, config = learned(pool, tmp_path / "run", expert="none")
+    found = evaluate_run(folder, config, pool, episodes=1)
+    assert list(found.rows) == ["human", TRAINED_LABEL]
+    assert read_results(folder).metadata["expert"] == "none"
+
+
+def test_a_trained_controller_is_the_expert_of_the_next(
+    run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
+) -> None:
+    first, _ = run
+    folder, config = learned(pool, tmp_path / "next", expert=str(first), policy__hold=3)
+    found = evaluate_run(folder, config, pool, episodes=1)
+    assert list(found.rows) == ["human", "pi + residual", TRAINED_LABEL]
+    trained, expert = load_controller(folder), load_controller(first)
+    assert isinstance(trained, ResidualDriver)
+    assert controller_bytes(trained.expert, {}) == controller_bytes(expert, {})
+    (trajectory,) = run_episode(config.make_scenario(), expert, make_test_seeds(1)[0]).trajectories
+    assert found.rows["pi + residual"][0]["return"] == trajectory.reward.sum()
+
+
+def test_a_baseline_described_like_the_expert_is_not_lost(
+    run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
+) -> None:
+    first, _ = run
+    second, _ = learned(pool, tmp_path / "second", seed=1)
+    folder, config = learned(pool, tmp_path / "next", expert=str(first))
+    assert len(drivers_to_compare(config, folder, [str(second)])) == 3
+
+
+def test_an_expert_and_a_reward_of_the_users_own(pool: WorkerPool, tmp_path: Path, my_drivers: Path) -> None:
+    changes = {"expert": f"{my_drivers}:gentle", "reward": f"{my_drivers}:calm"}
+    folder, config = learned(pool, tmp_path / "run", **changes)
+    found = evaluate_run(folder, config, pool, episodes=1)
+    assert list(found.rows) == ["human", "mine.py:gentle", TRAINED_LABEL]
+    about = json.loads((folder / "evaluation.json").read_text())
+    assert about["reward"] == f"{my_drivers}:calm"
+    driver, seed = load_controller(folder), make_test_seeds(1)[0]
+    (trajectory,) = run_episode(config.make_scenario(), driver, seed, config.reward).trajectories
+    assert set(trajectory.reward_terms) == {"speed", "push"}
+    assert found.rows[TRAINED_LABEL][0]["return"] == trajectory.reward.sum()
+
+
+def test_a_baseline_at_fault_is_told_and_the_rest_is_saved(
+    run: tuple[Path, RunConfig], pool: WorkerPool, my_drivers: Path
+) -> None:
+    folder, config = run
+    with pytest.raises(InputError, match="acceleration of cav_0 is nan"):
+        evaluate_run(folder, config, pool, baselines=[f"{my_drivers}:broken"], episodes=1)
+    rows = read_results(folder).rows
+    assert [row["status"] for row in rows["mine.py:broken"]] == ["failed"]
+    assert [row["status"] for row in rows[TRAINED_LABEL]] == ["completed"]
+
+
+def test_a_folder_without_a_controller_cannot_be_judged(tmp_path: Path, pool: WorkerPool) -> None:
+    with pytest.raises(InputError, match=r"controller\.unjam' does not exist"):
+        evaluate_run(tmp_path, small_config(), pool)

@@ -1,0 +1,129 @@
+"""A checkpoint goes on with the training that made it, and with no other."""
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.training.test_run import small_config
+from tests.worlds.sumo.own_roads import straight
+from unjam.errors import InputError
+from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.training.export import ControllerStore
+from unjam.training.fingerprint import check_fingerprint, fingerprint
+from unjam.training.run_folder import (
+    MANIFEST_FILE,
+    append_lineage,
+    check_run_files,
+    create_run_folder,
+    restore_newest_checkpoint,
+    save_checkpoint,
+)
+
+EXPERT = "def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n"
+
+
+def with_checkpoint(folder: Path, config: RunConfig) -> None:
+    create_run_folder(folder, config)
+    (folder / "progress.jsonl").write_text('{"iteration": 1}\n{"iteration": 2}\n')
+    save_checkpoint(folder / "checkpoint", {"iteration": 1, "belongs": fingerprint(config)}, {})
+
+
+def refused(folder: Path, config: RunConfig) -> str:
+    before = (folder / "progress.jsonl").read_bytes()
+    with pytest.raises(InputError, match=r"^resume: ") as caught:
+        restore_newest_checkpoint(folder, {folder}, fingerprint(config))
+    assert (folder / "progress.jsonl").read_bytes() == before
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seed": 5}, "seed: 5 is not allowed; allowed: 0, as in the checkpoint"),
+        ({"trpo__gamma": 0.5}, "trpo.gamma: 0.5 is not allowed"),
+        ({"road__vehicles": 9}, "scenario_options.vehicles: 9 is not allowed"),
+    ],
+)
+def test_a_checkpoint_of_another_configuration_is_refused_and_nothing_changed(
+    changes: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    with_checkpoint(tmp_path, small_config())
+    (tmp_path / "config.toml").write_text(to_toml(small_config(**changes)))
+    assert words in refused(tmp_path, small_config(**changes))
+
+
+def test_more_steps_and_other_workers_are_the_same_training(tmp_path: Path) -> None:
+    with_checkpoint(tmp_path, small_config())
+    assert restore_newest_checkpoint(tmp_path, {tmp_path}, fingerprint(small_config(steps=9000, workers=2))) is not None
+
+
+def of_expert(folder: Path) -> RunConfig:
+    (folder / "mine.py").write_text(EXPERT)
+    return small_config(expert=f"{folder}/mine.py:gentle")
+
+
+def of_reward(folder: Path) -> RunConfig:
+    (folder / "mine.py").write_text("def gold(outcome):\n    return {'speed': outcome.speeds.mean(1)}\n")
+    return small_config(reward=f"{folder}/mine.py:gold")
+
+
+def of_network(folder: Path) -> RunConfig:
+    path = straight(folder, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
+    road = {"penetration_rate": 0.5, "horizon": 100}
+    return load_config(changes={"scenario": str(path), "road": road, "steps": 100})
+
+
+@pytest.mark.parametrize(
+    ("make", "file"), [(of_expert, "mine.py"), (of_reward, "mine.py"), (of_network, "demand.rou.xml")]
+)
+def test_what_a_training_is_made_of_cannot_change(make: Callable[[Path], RunConfig], file: str, tmp_path: Path) -> None:
+    config, run = make(tmp_path), tmp_path / "run"
+    with_checkpoint(run, config)
+    assert restore_newest_checkpoint(run, {run}, fingerprint(config)) is not None
+    check_run_files(run, config)
+    (run / "progress.jsonl").write_text('{"iteration": 1}\n{"iteration": 2}\n')
+    (tmp_path / file).write_text((tmp_path / file).read_text() + " ")
+    with pytest.raises(InputError, match=r"evaluate: .* has changed since the checkpoint"):
+        check_run_files(run, config)
+    assert "has changed since the checkpoint" in refused(run, config)
+    for state in (run / "checkpoint").rglob("state.json"):
+        state.write_text("{ torn")
+    check_run_files(run, config)  # what is damaged does not tell
+
+
+def test_other_packages_and_kernels_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    now = fingerprint(small_config())
+    check_fingerprint(now, now)
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        check_fingerprint({**now, "packages": {"numpy": "0"}, "kernels": {}}, now)
+    assert ["packages" in caplog.messages[0], "kernels" in caplog.messages[1]] == [True, True]
+
+
+def test_a_manifest_says_by_what_a_run_went_on(tmp_path: Path) -> None:
+    create_run_folder(tmp_path, small_config())
+    for iteration in (3, 7):
+        append_lineage(tmp_path, iteration)
+    lineage = json.loads((tmp_path / MANIFEST_FILE).read_text())["lineage"]
+    assert [each["iteration"] for each in lineage] == [3, 7]
+    assert {"packages", "kernels", "command", "started"} <= lineage[0].keys()
+
+
+@pytest.mark.parametrize(("ended", "content"), [(True, b"last"), (False, b"best")])
+def test_a_longer_run_goes_on_from_the_controller_that_it_would_have_had(
+    ended: bool, content: bytes, tmp_path: Path
+) -> None:
+    controllers = ControllerStore([tmp_path])
+    controllers.save([b"best"], is_best=True)
+    controllers.save([b"last"], is_best=False)
+    assert (tmp_path / "controller.unjam").read_bytes() == b"last"
+    (tmp_path / "controller.unjam").write_bytes(b"somebody else's")
+    tensors = {**controllers.tensors(), "weight": torch.zeros(1)}
+    ControllerStore([tmp_path]).restore(tensors, ended)
+    assert (tmp_path / "controller.unjam").read_bytes() == content
+    assert tensors.keys() == {"weight"}
