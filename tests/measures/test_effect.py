@@ -18,18 +18,18 @@ from unjam.measures.statistics import Estimate, estimate
 
 USUAL: dict[str, Any] = {
     "status": "completed",
-    "floor": 1.0,
+    "required_time_gap": 1.0,
     "collisions": 0.0,
     "min_time_gap": 0.95,
     "cav_min_ttc": 1.5,
     "cav_max_braking": 5.0,
-    "overridden": 0.0,
+    "override_share": 0.0,
     "mean_speed": 20.0,
     "travel_time": 100.0,
     "delay": 40.0,
     "outflow_veh_per_h": 2000.0,
     "fuel_ml_per_km": 80.0,
-    "people_beyond_4_5": 30.0,
+    "human_braking_beyond_4_5": 30.0,
 }
 
 
@@ -50,7 +50,7 @@ GOOD = Effect(
     hard_braking=between(-9.0, 3.0),
     collisions=0.0,
     failed_episodes=0,
-    feasibility="drivable",
+    feasibility="feasible",
     baseline_travel_time=100.0,
     baseline_flow=2000.0,
     delay_reduction=Estimate(nan, nan, nan, 0),
@@ -102,7 +102,7 @@ def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:
 
 
 def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -> None:
-    rows = rows_of([99.0, 98.0, nan], people_beyond_4_5=500.0)
+    rows = rows_of([99.0, 98.0, nan], human_braking_beyond_4_5=500.0)
     rows[0] |= {"status": "collision", "collisions": 2.0}
     rows[2] |= {"status": "failed", "collisions": nan}
     found = effect_of(rows, rows_of([100.0] * 3))
@@ -110,7 +110,7 @@ def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -
     assert (found.travel_time.count, found.travel_time.mean) == (1, -2.0), "of the complete episode"
     assert found.feasibility == "2 vehicles in contact (1 of 3)"
     assert found.hard_braking.mean == 470.0
-    assert effect_of(rows_of([99.0], people_beyond_4_5=500.0), rows_of([100.0])).feasibility == "drivable"
+    assert effect_of(rows_of([99.0], human_braking_beyond_4_5=500.0), rows_of([100.0])).feasibility == "feasible"
 
 
 def test_more_confidence_is_a_wider_interval() -> None:
@@ -136,8 +136,8 @@ def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
         ),
         ({"flow": between(-8, -2)}, "flow is lower than that of the human baseline: -5 [-8, -2] veh/h"),
         ({"flow": between(-21, 40)}, "flow may be lower by more than 1 %: +10 [-21, +40] veh/h"),
-        ({"drivable": "brakes with 7 m/s2 (1 of 9)"}, "infeasible: brakes with 7 m/s2 (1 of 9)"),
-        ({"drivable": ""}, "infeasible: no CAV drove"),
+        ({"feasibility": "brakes with 7 m/s2 (1 of 9)"}, "infeasible: brakes with 7 m/s2 (1 of 9)"),
+        ({"feasibility": ""}, "infeasible: no CAV drove"),
         (
             {"hard_braking": between(-1, 9)},
             "human drivers brake beyond 4.5 m/s² more often than in the human baseline: +4 [-1, +9] times "
@@ -167,7 +167,7 @@ def test_a_difference_that_may_be_half_a_percent_is_not_too_small(time: Estimate
 
 
 def test_speed_does_not_excuse_a_loss_of_flow_and_all_reasons_are_told() -> None:
-    found = replace(GOOD, travel_time=between(-60, -50), flow=between(-99, -50), drivable="2 in contact")
+    found = replace(GOOD, travel_time=between(-60, -50), flow=between(-99, -50), feasibility="2 in contact")
     assert [reason.split(":")[0] for reason in rejection_reasons(found)] == [
         "flow is lower than that of the human baseline",
         "infeasible",

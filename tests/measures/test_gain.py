@@ -18,18 +18,18 @@ from unjam.measures.statistics import estimate
 
 CLOSED: dict[str, Any] = {
     "status": "completed",
-    "floor": 1.0,
+    "required_time_gap": 1.0,
     "collisions": 0.0,
     "min_time_gap": 1.1,
     "cav_min_ttc": 1.5,
     "cav_max_braking": 3.0,
-    "overridden": 0.0,
+    "override_share": 0.0,
     "mean_speed": 3.5,
     "speed_limit_ratio": 0.7,
     "travel_time": nan,
     "delay": nan,
     "outflow_veh_per_h": 1000.0,
-    "people_beyond_4_5": 0.0,
+    "human_braking_beyond_4_5": 0.0,
 }
 
 
@@ -72,7 +72,7 @@ def test_a_gain_is_bounded_on_both_sides() -> None:
     [
         {"min_time_gap": 0.3},
         {"status": "collision", "collisions": 2.0},
-        {"overridden": 0.01},
+        {"override_share": 0.01},
         {"outflow_veh_per_h": 900.0},
     ],
 )

@@ -330,10 +330,10 @@ def test_a_row_has_the_episode_what_was_drawn_and_every_metric() -> None:
         "vehicles",
         "steps",
         "length",
-        "floor",
-        "lanes",
+        "required_time_gap",
+        "has_lanes",
         *("teleports", "contacts"),
-        "drivable",
+        "feasible",
     }
     assert set(row) == about | set(METRICS)
     assert row["seed"] == [7, 1]

@@ -36,7 +36,7 @@ class PolicySettings:
     """standard deviation of the exploration noise at the start, as a share of the action limit"""
     learn_exploration_std: bool = True
     """whether the standard deviation is learned, or stays what it is at the start (sac always learns it)"""
-    exploration: Literal["anew", "lasting", "mirrored"] = "anew"
+    exploration: Literal["per_step", "per_episode", "antithetic"] = "per_step"
     """`anew`: noise for each look of a CAV. `episode_noise`: one change of what the last hidden layer is weighed
     with, of which `exploration_std` is that of each weight, for all CAVs all episode long: what many do for
     minutes shows in what everybody gains, where single commands vanish in people's noise (trpo and ppo; it
@@ -59,12 +59,12 @@ class PolicySettings:
     @property
     def episode_noise(self) -> bool:
         """Whether exploration stays as it is all episode long."""
-        return self.exploration != "anew"
+        return self.exploration != "per_step"
 
     @property
     def exploration_signs(self) -> list[float]:
         """By how much exploration counts in episodes that are alike but for that."""
-        return [1.0, -1.0] if self.exploration == "mirrored" else [1.0]
+        return [1.0, -1.0] if self.exploration == "antithetic" else [1.0]
 
     def action_repeat(self, control_step: float) -> int:
         """Return for how many decisions a residual is held where one takes `control_step` seconds."""

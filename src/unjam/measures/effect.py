@@ -40,7 +40,7 @@ MIN_VERDICT_SEEDS = 10
 """seeds without which nothing is recommended: an interval of fewer is too narrow to be trusted"""
 
 TIME_METRIC, FLOW_METRIC, FUEL_METRIC = "travel_time", "outflow_veh_per_h", "fuel_ml_per_km"
-HARD_BRAKING_METRIC = "people_beyond_4_5"
+HARD_BRAKING_METRIC = "human_braking_beyond_4_5"
 NO_RECOMMENDATION = "No controller is recommended on this road"
 TOO_SMALL = f"less than {100 * SMALLEST_EFFECT:g} %, which is too small to matter"
 

@@ -25,7 +25,7 @@ MAX_FEASIBLE_BRAKING = 6.0
 """[m/s2]"""
 FEASIBILITY_TOLERANCE = 1e-6
 
-FEASIBLE = "drivable"
+FEASIBLE = "feasible"
 
 
 def min_time_gap(episode: Episode) -> float:
@@ -95,18 +95,17 @@ def human_max_braking(episode: Episode) -> float:
     return episode.audit.human_braking.max_braking
 
 
-def braking_beyond_metric(group: Literal["people", "cavs"], limit: float) -> Callable[[Episode], float]:
+def braking_beyond_metric(group: Literal["humans", "cavs"], limit: float) -> Callable[[Episode], float]:
     """Return the metric of how often people or CAVs brake beyond one of BEYOND [m/s2]."""
 
     def beyond(episode: Episode) -> float:
-        brakings = episode.audit.human_braking if group == "people" else episode.audit.cav_braking
+        brakings = episode.audit.human_braking if group == "humans" else episode.audit.cav_braking
         moments = brakings.samples
         return 1e6 * brakings.exceedances[BRAKING_THRESHOLDS.index(limit)] / moments if moments else nan
 
-    whose = {"people": "People's", "cavs": "CAVs'"}[group]
     beyond.__doc__ = (
-        f"{whose} moments (vehicles times simulation steps) of braking beyond {limit:g} m/s2 [per million]. "
-        "ISO 15622 allows 3.5 above 20 m/s; dry asphalt hardly 9."
+        f"{group.capitalize()}: vehicle-steps with braking beyond {limit:g} m/s2 [per million]. ".replace("Cavs", "CAVs")
+        + "ISO 15622 allows 3.5 above 20 m/s; dry asphalt allows hardly 9."
     )
     return beyond
 
@@ -136,7 +135,7 @@ def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> s
     if row["status"] == "failed" or isnan(row["cav_max_braking"]):
         return ""
     alone = "not driven" if baseline_braking is None else f"{baseline_braking:.0f}"
-    floor, lanes = row.get("floor") or DEFAULT_REQUIRED_TIME_GAP, row.get("lanes", False)
+    floor, lanes = row.get("required_time_gap") or DEFAULT_REQUIRED_TIME_GAP, row.get("has_lanes", False)
     smallest = MIN_TIME_GAP_WITH_LANES if lanes else MIN_TIME_GAP_FRACTION * floor
     checks = [
         (row["status"] == "collision", f"{row['collisions']:.0f} vehicles in contact"),
@@ -151,10 +150,10 @@ def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> s
             row["cav_max_braking"] > MAX_FEASIBLE_BRAKING + FEASIBILITY_TOLERANCE,
             f"brakes with {row['cav_max_braking']:.1f} m/s2",
         ),
-        (row["overridden"] > 0, f"SUMO overrides {100 * row['overridden']:.2g} % of its commands"),
+        (row["override_share"] > 0, f"SUMO overrides {100 * row['override_share']:.2g} % of its commands"),
         (
-            row["people_beyond_4_5"] > (baseline_braking or 0.0),
-            f"people brake beyond 4.5 m/s2 {row['people_beyond_4_5']:.0f} times in a million moments "
+            row["human_braking_beyond_4_5"] > (baseline_braking or 0.0),
+            f"people brake beyond 4.5 m/s2 {row['human_braking_beyond_4_5']:.0f} times in a million moments "
             f"(without CAVs: {alone})",
         ),
     ]
@@ -192,9 +191,9 @@ def overall_feasibility(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[
     `people` are the episodes of the same road in which nobody is automated: what people do there is no
     driver's fault.
     """
-    alone = [row["people_beyond_4_5"] for row in baseline if row["status"] == "completed"]
+    alone = [row["human_braking_beyond_4_5"] for row in baseline if row["status"] == "completed"]
     share = sum(alone) / len(alone) if alone else None
-    verdicts = [feasibility({**row, "people_beyond_4_5": 0.0}) for row in rows]
+    verdicts = [feasibility({**row, "human_braking_beyond_4_5": 0.0}) for row in rows]
     wrong = [verdict for verdict in verdicts if verdict not in ("", FEASIBLE)]
     if wrong:
         return f"{wrong[0]} ({len(wrong)} of {len(verdicts)})"
@@ -202,5 +201,5 @@ def overall_feasibility(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[
     judged = [row for row, verdict in pairs if verdict and row["status"] == "completed"]
     if not judged:
         return ""
-    mean = sum(row["people_beyond_4_5"] for row in judged) / len(judged)
-    return feasibility({**judged[0], "people_beyond_4_5": mean}, share)
+    mean = sum(row["human_braking_beyond_4_5"] for row in judged) / len(judged)
+    return feasibility({**judged[0], "human_braking_beyond_4_5": mean}, share)

@@ -74,7 +74,7 @@ def metric_table(rows_by_driver: RowsByDriver, baseline: str) -> list[TableRow]:
     pairs = {label: len(pair_rows(rows, rows_by_driver[baseline])) for label, rows in compared.items()}
     said = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]
     about = "The first reason against it; docs: What a car can drive."
-    table = [TableRow("could a car drive so?", "", about, [*said, *(TableCell("") for _ in compared)])]
+    table = [TableRow("feasible", "", about, [*said, *(TableCell("") for _ in compared)])]
     if compared:
         about = f"Share of seeds on which it earns more than {baseline}, a tie counting half; Wilson's interval."
         found = [

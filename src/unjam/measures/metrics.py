@@ -284,11 +284,11 @@ class Metric:
     """what it can be"""
 
 
-def _braking_metrics(group: Literal["people", "cavs"], key_prefix: str, label_prefix: str) -> dict[str, Metric]:
+def _braking_metrics(group: Literal["humans", "cavs"], key_prefix: str, label_prefix: str) -> dict[str, Metric]:
     """Return the metrics of how often somebody brakes hard."""
     return {
-        f"{key_prefix}_beyond_{limit:g}".replace(".", "_"): Metric(
-            braking_beyond_metric(group, limit), f"{label_prefix} brakings beyond {limit:g} m/s2", "per million", 0
+        f"{key_prefix}_braking_beyond_{limit:g}".replace(".", "_"): Metric(
+            braking_beyond_metric(group, limit), f"{label_prefix} braking beyond {limit:g} m/s2", "per million", 0
         )
         for limit in BRAKING_THRESHOLDS
     }
@@ -296,47 +296,47 @@ def _braking_metrics(group: Literal["people", "cavs"], key_prefix: str, label_pr
 
 METRICS: dict[str, Metric] = {
     "mean_speed": Metric(mean_speed, "mean speed", "m/s"),
-    "mean_speed_step_average": Metric(mean_speed_step_average, "mean speed, moments alike", "m/s"),
+    "mean_speed_step_average": Metric(mean_speed_step_average, "mean speed, average over steps", "m/s"),
     "mean_speed_steady": Metric(mean_speed_steady, "mean speed, steady", "m/s"),
     "mean_speed_second_half": Metric(mean_speed_second_half, "mean speed, second half", "m/s"),
     "speed_limit_ratio": Metric(speed_limit_ratio, "mean speed / limit", "", 3),
     "speed_limit_ratio_steady": Metric(speed_limit_ratio_steady, "mean speed / limit, steady", "", 3),
     "speed_std_fleet": Metric(speed_std_fleet, "speed std across vehicles", "m/s"),
     "speed_std_fleet_steady": Metric(speed_std_fleet_steady, "speed std across vehicles, steady", "m/s"),
-    "share_standing": Metric(share_standing, "share of time standing", "", 3, SHARE_BOUNDS),
-    "time_to_dissolve": Metric(time_to_dissolve, "time until the wave is dissolved", "s", 0),
+    "share_standing": Metric(share_standing, "share of time stopped", "", 3, SHARE_BOUNDS),
+    "time_to_dissolve": Metric(time_to_dissolve, "time to dissolve the wave", "s", 0),
     "cav_mean_speed": Metric(cav_mean_speed, "CAV's mean speed", "m/s"),
     "speed_std_cav": Metric(speed_std_cav, "CAV's speed std over time", "m/s"),
     "return": Metric(episode_return, "return", "", 0, UNBOUNDED),
     "return_eq16": Metric(return_eq16, "return, Eq. 16", "", 0, UNBOUNDED),
     "mean_abs_accel": Metric(mean_abs_accel, "CAV's mean |acceleration|", "m/s2", 3),
     "mean_abs_jerk": Metric(mean_abs_jerk, "CAV's mean |jerk|", "m/s3", 3),
-    "min_ttc": Metric(min_ttc, "smallest time to collision", "s"),
-    "min_time_gap": Metric(min_time_gap, "smallest time headway", "s"),
-    "cav_min_ttc": Metric(cav_min_ttc, "CAV's smallest time to collision", "s"),
-    "share_short_time_gap": Metric(share_short_time_gap, "CAV's share of time below one second", "", 4, SHARE_BOUNDS),
-    "max_drac": Metric(max_drac, "CAV's largest braking needed (DRAC)", "m/s2"),
-    "max_jerk": Metric(max_jerk, "CAV's largest jerk", "m/s3", 1),
-    "cav_max_braking": Metric(cav_max_braking, "CAV's hardest braking", "m/s2"),
-    "cut_in_max_braking": Metric(cut_in_max_braking, "CAV's hardest braking after a cut-in", "m/s2"),
-    **_braking_metrics("cavs", "cav", "CAV's"),
-    "human_max_braking": Metric(human_max_braking, "people's hardest braking", "m/s2"),
-    **_braking_metrics("people", "people", "people's"),
-    "filter_override_share": Metric(filter_override_share, "decisions in which the filter braked", "", 4, SHARE_BOUNDS),
-    "overridden": Metric(override_share, "commands overridden in following", "", 4, SHARE_BOUNDS),
-    "yielded": Metric(yield_share, "commands overridden at a crossing", "", 4, SHARE_BOUNDS),
+    "min_ttc": Metric(min_ttc, "minimum time to collision", "s"),
+    "min_time_gap": Metric(min_time_gap, "minimum time gap", "s"),
+    "cav_min_ttc": Metric(cav_min_ttc, "CAV's minimum time to collision", "s"),
+    "share_short_time_gap": Metric(share_short_time_gap, "CAV's share of time with a time gap below 1 s", "", 4, SHARE_BOUNDS),
+    "max_drac": Metric(max_drac, "CAV's maximum DRAC", "m/s2"),
+    "max_jerk": Metric(max_jerk, "CAV's maximum jerk", "m/s3", 1),
+    "cav_max_braking": Metric(cav_max_braking, "CAV's maximum braking", "m/s2"),
+    "cut_in_max_braking": Metric(cut_in_max_braking, "CAV's maximum braking after a cut-in", "m/s2"),
+    **_braking_metrics("cavs", "cav", "CAV"),
+    "human_max_braking": Metric(human_max_braking, "human drivers' maximum braking", "m/s2"),
+    **_braking_metrics("humans", "human", "human"),
+    "filter_override_share": Metric(filter_override_share, "control steps in which the safety filter braked", "", 4, SHARE_BOUNDS),
+    "override_share": Metric(override_share, "commands overridden by SUMO in car following", "", 4, SHARE_BOUNDS),
+    "yield_share": Metric(yield_share, "commands overridden by SUMO at a crossing", "", 4, SHARE_BOUNDS),
     "collisions": Metric(collisions, "vehicles in collisions", "", 0),
-    "shield_override_share": Metric(shield_override_share, "commands overridden", "", 4, SHARE_BOUNDS),
-    "shield_max_braking": Metric(shield_max_braking, "hardest braking added", "m/s2"),
+    "shield_override_share": Metric(shield_override_share, "commands overridden by SUMO", "", 4, SHARE_BOUNDS),
+    "shield_max_braking": Metric(shield_max_braking, "maximum braking added by SUMO", "m/s2"),
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
     "outflow_veh_per_h": Metric(outflow_veh_per_h, "flow", "veh/h", 0),
-    "travel_time": Metric(mean_travel_time, "travel time, waiting included", "s", 1),
+    "travel_time": Metric(mean_travel_time, "travel time, departure delay included", "s", 1),
     **{
         f"travel_time_{group}": Metric(travel_time_metric(group), f"travel time of {group}", "s", 1)
         for group in VEHICLE_GROUPS
     },
-    "delay": Metric(delay, "delay, waiting included", "s", 1, UNBOUNDED),
-    "insertion_backlog_veh": Metric(insertion_backlog_veh, "vehicles waiting to enter", "", 0),
+    "delay": Metric(delay, "delay, departure delay included", "s", 1, UNBOUNDED),
+    "insertion_backlog_veh": Metric(insertion_backlog_veh, "insertion backlog", "", 0),
 }
 
 
@@ -347,13 +347,13 @@ def measure(episode: Episode) -> dict[str, Any]:
     """
     row = {
         "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),
-        **{name: getattr(episode, name) for name in ("status", "reason", "error", "steps")},
-        **{"teleports": episode.teleports, "contacts": episode.contacts},
+        **{name: getattr(episode, name) for name in ("status", "reason", "error", "teleports", "contacts")},
+        "steps": episode.control_steps,
         "warnings": [asdict(each) for each in episode.warnings],
         "vehicles": len(episode.vehicle_ids),
         **episode.drawn_values,
-        "floor": episode.audit.required_time_gap,
-        "lanes": episode.audit.has_lanes,
+        "required_time_gap": episode.audit.required_time_gap,
+        "has_lanes": episode.audit.has_lanes,
         **{name: metric.function(episode) if episode.has_run else np.nan for name, metric in METRICS.items()},
     }
-    return {**row, "drivable": feasibility(row)}
+    return {**row, "feasibility": feasibility(row)}

@@ -130,7 +130,7 @@ class RunConfig(AgentSettings):
         scenarios = [road.make_scenario() for road in self.task_configs().values()]
         whys = [why_none(scenario) for scenario in scenarios]
         if self.simulator == "batch" and all(whys):
-            raise ValueError(f"world: batch is not allowed; allowed: sumo, for {whys[0]}")
+            raise ValueError(f"simulator: batch is not allowed; allowed: sumo, for {whys[0]}")
         imagines = self.model.kind if self.model.model_ratio > 0 else ""
         if self.policy.reward_after_exit and imagines == "row":
             raise ValueError("policy.reward_after_exit: true is not allowed; allowed: false where rows are imagined")
@@ -147,13 +147,13 @@ class RunConfig(AgentSettings):
             raise ValueError(f"model.device: {self.model.device} is not allowed; allowed: cpu, for whole roads")
         if self.policy.episode_noise and self.agent not in ("trpo", "ppo"):
             kind = self.policy.exploration
-            raise ValueError(f"policy.exploration: {kind} is not allowed; allowed: anew, for {self.agent}")
+            raise ValueError(f"policy.exploration: {kind} is not allowed; allowed: per_step, for {self.agent}")
         on_ramps = imagines == "road" and all(isinstance(road, OnRamp) for road in scenarios)
-        if self.policy.exploration == "mirrored" and imagines and not on_ramps:
-            allowed = "anew, lasting, for what is imagined here has no twins"
-            raise ValueError(f"policy.exploration: mirrored is not allowed; allowed: {allowed}")
+        if self.policy.exploration == "antithetic" and imagines and not on_ramps:
+            allowed = "per_step, per_episode, for these model rollouts have no antithetic pairs"
+            raise ValueError(f"policy.exploration: antithetic is not allowed; allowed: {allowed}")
         if self.task_sampling == "regret" and (len(self.tasks) < 2 or self.evaluation.validation_interval == 0):
-            raise ValueError("sampling: regret is not allowed; allowed: weights, but for several validated tasks")
+            raise ValueError("task_sampling: regret is not allowed; allowed: weights, but for several validated tasks")
         return self
 
     def task_configs(self) -> dict[str, "RunConfig"]:
@@ -171,15 +171,15 @@ class RunConfig(AgentSettings):
             road = replace(
                 self,
                 scenario=scenario,
-                road=merge_changes(self.scenario_options, task.scenario_options),
+                scenario_options=merge_changes(self.scenario_options, task.scenario_options),
                 expert=task.expert or self.expert,
                 reward=task.reward or self.reward,
                 tasks=(),
-                sampling="weights",
-                world="sumo",
+                task_sampling="weights",
+                simulator="sumo",
             )
             batched = self.simulator == "batch" and not unsupported_reason(road.make_scenario())
-            found[name] = replace(road, world="batch") if batched else road
+            found[name] = replace(road, simulator="batch") if batched else road
         return found
 
     def make_tasks(self) -> list[Task]:
@@ -242,7 +242,7 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
     road = SCENARIOS.get(str(given.get("scenario", RunConfig.scenario)), Scenario)
     for name in given.keys() - {each.name for each in fields(RunConfig)}:
         if hasattr(road, name):
-            raise InputError(f"{name}: unknown name; did you mean 'road.{name}'?")
+            raise InputError(f"{name}: unknown name; did you mean 'scenario_options.{name}'?")
     if preset:
         started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
         if "tasks" in started and "tasks" not in given:
@@ -250,7 +250,7 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
         values = {**started, "preset": preset}
     wanted = merge_changes(values, given)
     virtual = wanted.get("model", {})
-    if road.actuation == "cruise" and isinstance(virtual, dict) and virtual.get("model", "row") == "row":
+    if road.actuation == "cruise" and isinstance(virtual, dict) and virtual.get("kind", "row") == "row":
         # Virtual rows know no ACC of a CAV's own: without a model, unless one is asked for.
         wanted = merge_changes({"model": {"model_ratio": 0.0}}, wanted)
     return build_dataclass(RunConfig, wanted, "")
@@ -270,7 +270,7 @@ def _check_preset_conflicts(preset: str, tasks: Sequence[dict[str, Any]], user_v
     """Raise `InputError` where the user says what every task of a preset says otherwise."""
     said = {name: value for name, value in user_values.items() if name in ("scenario", "reward")}
     changes = user_values.get("scenario_options", {})
-    said |= {f"road.{name}": value for name, value in changes.items()} if isinstance(changes, dict) else {}
+    said |= {f"scenario_options.{name}": value for name, value in changes.items()} if isinstance(changes, dict) else {}
     for name, value in said.items():
         if all(flatten_keys(task).get(name, "") not in ("", value) for task in tasks):
             raise invalid_value(name, value, f"none with the preset {preset}, whose roads have their own")

@@ -13,19 +13,19 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "expert": "pi:time_constant=0",
         "steps": 4_000_000,
-        "spread": False,
+        "stratified": False,
         "policy": {
-            "observe": ["local"],
+            "inputs": ["local"],
             "exploration_std": 1.0,
-            "hold": 0,
+            "action_duration": 0,
             "privileged_critic": False,
             "normalize_value": False,
         },
-        "trpo": {"batch_steps": 6000, "gamma": 0.995, "target_kl": 0.01},
+        "trpo": {"steps_per_iteration": 6000, "gamma": 0.995, "target_kl": 0.01},
         "ppo": {
-            "batch_steps": 6000,
+            "steps_per_iteration": 6000,
             "gamma": 0.99,
-            "clip": 0.2,
+            "clip_range": 0.2,
             "epochs": 80,
             "actor_learning_rate": 3e-4,
             "critic_learning_rate": 1e-3,
@@ -33,29 +33,29 @@ PRESETS: dict[str, dict[str, Any]] = {
         "sac": {
             "gamma": 0.99,
             "tau": 5e-3,
-            "rate": 3e-4,
+            "learning_rate": 3e-4,
             "temperature": 0.2,
             "learn_temperature": False,
             "reward_scale": 1.0,
-            "batch": 256,
+            "batch_size": 256,
             "learning_starts": 10_000,
-            "start": "uniform",
+            "start_policy": "uniform",
         },
-        "virtual": {"k_max": 500, "kappa": 2.0, "model_ratio": 1.0},
+        "model": {"k_max": 500, "kappa": 2.0, "model_ratio": 1.0},
     },
     # Also where it says less, as it would have been done: one network as it was drawn, whose mean is taken,
     # no best of several looks, and an end where nothing gets better.
     "paper-exact": {},
     # Ends within about five minutes on two cores, evaluation included.
-    "demo": {"steps": 300_000, "evaluation": {"every": 2}},
+    "demo": {"steps": 300_000, "evaluation": {"validation_interval": 2}},
 }
 
 PRESETS["paper-exact"] = merge_changes(
     PRESETS["paper"],
     {
         "policy": {"zero_init": False},
-        "virtual": {"members": 1, "fallback_to_base": False, "noise": False, "error": "transitions"},
-        "evaluation": {"every": 0, "converged": 50},
+        "model": {"members": 1, "fallback_to_base": False, "add_noise": False, "error_estimator": "transitions"},
+        "evaluation": {"validation_interval": 0, "convergence_window": 50},
     },
 )
 
@@ -78,7 +78,7 @@ def _family_task(name: str, scenario: Scenario) -> dict[str, Any]:
         limits = [scenario.limit_speed(size) for size in scenario.drawn_ranges[scenario.size_parameter]]
         speed = round(5.0 * len(limits) / sum(limits), 4)
         reward = f"released:speed={speed},acceleration={BRAKING_COST}"
-    found = {"scenario": FAMILY[name].scenario, "road": FAMILY[name].options, "reward": reward, "name": name}
+    found = {"scenario": FAMILY[name].scenario, "scenario_options": FAMILY[name].options, "reward": reward, "name": name}
     return found if isinstance(scenario, LoopScenario) else {**found, "weight": ON_RAMP_TASK_WEIGHT}
 
 
@@ -88,13 +88,13 @@ def _family_task(name: str, scenario: Scenario) -> dict[str, Any]:
 PRESETS["rings"] = {
     "expert": RINGS_EXPERT,
     "steps": 4_800_000,
-    "world": "batch",
-    "policy": {"remember": True},
-    "trpo": {"batch_steps": 120_000, "gamma": 0.996, "target_kl": 0.02},
-    "ppo": {"batch_steps": 120_000, "gamma": 0.996},
-    "virtual": {"model_ratio": 0.0},
-    "evaluation": {"every": 10, "validation_episodes": 8, "episodes": 10, "baselines": ["human", "pi"]},
-    "tasks": [_family_task(name, ring) for name, ring in family_scenarios("rings", "seen").items()],
+    "simulator": "batch",
+    "policy": {"history_features": True},
+    "trpo": {"steps_per_iteration": 120_000, "gamma": 0.996, "target_kl": 0.02},
+    "ppo": {"steps_per_iteration": 120_000, "gamma": 0.996},
+    "model": {"model_ratio": 0.0},
+    "evaluation": {"validation_interval": 10, "validation_episodes": 8, "episodes": 10, "baselines": ["human", "pi"]},
+    "tasks": [_family_task(name, ring) for name, ring in family_scenarios("rings", "training").items()],
 }
 
 # Where several CAVs share a ring: a residual on all rings helps them and harms one that is alone. On the law
@@ -105,34 +105,34 @@ PRESETS["shared-rings"] = merge_changes(
     {
         "expert": SHARED_RINGS_EXPERT,
         "steps": 1_440_000,
-        "trpo": {"batch_steps": 240_000},
-        "ppo": {"batch_steps": 240_000},
-        "evaluation": {"every": 2, "validation_episodes": 16},
-        "tasks": [_family_task(name, ring) for name, ring in family_scenarios(SHARED_RINGS_GROUP, "seen").items()],
+        "trpo": {"steps_per_iteration": 240_000},
+        "ppo": {"steps_per_iteration": 240_000},
+        "evaluation": {"validation_interval": 2, "validation_episodes": 16},
+        "tasks": [_family_task(name, ring) for name, ring in family_scenarios(SHARED_RINGS_GROUP, "training").items()],
     },
 )
 
 # One residual for all roads of the family that may be seen, on the law for each: what such roads have in
 # common is what the CAV sees next to it, and how many others there are.
-PRESETS["everywhere"] = {
+PRESETS["all-roads"] = {
     "expert": "unjam:best",
     "steps": 1_000_000,
-    "world": "batch",
-    "policy": {"observe": ["local", "expert_acceleration", "penetration_rate"]},
-    "trpo": {"batch_steps": 75_000, "gamma": 0.996, "target_kl": 0.01, "critic_batch_size": 1000},
-    "ppo": {"batch_steps": 75_000, "gamma": 0.996},
-    "virtual": {"model_ratio": 0.0},
-    "evaluation": {"every": 5, "validation_episodes": 4, "episodes": 10, "baselines": ["human"]},
-    "tasks": [_family_task(name, road) for name, road in family_scenarios(ALL_ROADS_GROUP, "seen").items()],
+    "simulator": "batch",
+    "policy": {"inputs": ["local", "expert_acceleration", "penetration_rate"]},
+    "trpo": {"steps_per_iteration": 75_000, "gamma": 0.996, "target_kl": 0.01, "critic_batch_size": 1000},
+    "ppo": {"steps_per_iteration": 75_000, "gamma": 0.996},
+    "model": {"model_ratio": 0.0},
+    "evaluation": {"validation_interval": 5, "validation_episodes": 4, "episodes": 10, "baselines": ["human"]},
+    "tasks": [_family_task(name, road) for name, road in family_scenarios(ALL_ROADS_GROUP, "training").items()],
 }
 
 FIGURE_EIGHT_PACER = "pacer:use_tuned=true,gathering_speed=1.934,gathering_gap=0.445,regathering_gap=0.6469"
 """the expert that was tuned on the figure eight, but for its time constant"""
 
 ON_RAMP_JAM_AHEAD = (
-    "jam-ahead:first=3,last=4,margin=-1.536,margin_by_share=19.83,lowest=2.568,slowing=1.106,time_constant=1.681"
+    "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,max_deceleration=1.106,time_constant=1.681"
 )
-"""what `unjam tune on-ramp --expert jam-ahead --set cav_share=0.05 --steps 4608000` finds, mostly in batches;
+"""what `unjam tune on-ramp --expert jam-ahead --set penetration_rate=0.05 --steps 4608000` finds, mostly in batches;
 with 710,400 steps, all in SUMO, it is `unjam:on-ramp-tuned`"""
 
 MERGE_JAM_ABSORBER = "jam-absorber:gap_gain=0,extra_acceleration=0.9,speed_gain=0.8"
@@ -149,23 +149,23 @@ BEST_BY_SCENARIO: dict[str, dict[str, Any]] = {
     # The expert knows how to start; a residual on PI spends twice the steps on learning just that.
     "ring": {
         "steps": 6_000_000,
-        "world": "batch",
+        "simulator": "batch",
         "expert": "unjam:ring-gap-tuned",
-        "policy": {"remember": True, **LOW_EXPLORATION},
-        "trpo": {"batch_steps": 96_000, "target_kl": 0.02},
-        "virtual": {"model_ratio": 0.0},
-        "evaluation": {"every": 5, "validation_episodes": 32},
+        "policy": {"history_features": True, **LOW_EXPLORATION},
+        "trpo": {"steps_per_iteration": 96_000, "target_kl": 0.02},
+        "model": {"model_ratio": 0.0},
+        "evaluation": {"validation_interval": 5, "validation_episodes": 32},
     },
     # A wave that has grown: what ends it sooner may leave a slower flow for minutes, so it takes whole
     # episodes, and hardly any noise. Settings that a search found: results/tried/ring-jammed-search.
     "ring-jammed": {
         "steps": 6_000_000,
-        "world": "batch",
+        "simulator": "batch",
         "expert": "unjam:ring-jammed-tuned",
-        "policy": {"remember": True, "exploration_std": 0.013, "learn_exploration_std": False, "hold": 2.1},
-        "trpo": {"batch_steps": 192_000, "target_kl": 0.0086, "gamma": 0.99, "gae_lambda": 0.966},
-        "virtual": {"model_ratio": 0.0},
-        "evaluation": {"every": 6, "validation_episodes": 32},
+        "policy": {"history_features": True, "exploration_std": 0.013, "learn_exploration_std": False, "action_duration": 2.1},
+        "trpo": {"steps_per_iteration": 192_000, "target_kl": 0.0086, "gamma": 0.99, "gae_lambda": 0.966},
+        "model": {"model_ratio": 0.0},
+        "evaluation": {"validation_interval": 6, "validation_episodes": 32},
     },
     # The pacer alone holds the queue; the residual gathers it sooner. It needs room: with the time constant
     # that was tuned the pacer cancels whatever is added. What is done to gather them shows half a lap later,
@@ -175,55 +175,55 @@ BEST_BY_SCENARIO: dict[str, dict[str, Any]] = {
         "reward": "eq16",
         "steps": 4_860_000,
         "policy": {
-            "observe": [*EXPERT_INPUTS, "place"],
-            "remember": True,
+            "inputs": [*EXPERT_INPUTS, "lap_position"],
+            "history_features": True,
             "exploration_std": 0.2,
             "learn_exploration_std": False,
         },
-        "trpo": {"batch_steps": 45_000, "gamma": 0.998, "target_kl": 0.02},
-        "virtual": {"model_ratio": 0.0},
-        "evaluation": {"every": 6, "validation_episodes": 64},
+        "trpo": {"steps_per_iteration": 45_000, "gamma": 0.998, "target_kl": 0.02},
+        "model": {"model_ratio": 0.0},
+        "evaluation": {"validation_interval": 6, "validation_episodes": 64},
     },
     # One CAV in twenty, whose commands all vanish in people's noise: an episode explores with one change for
     # all of them, and another with its opposite. What they did shows when they have left. Four episodes
     # tell little: seven times as many are imagined, and learned from in turn.
     "on-ramp": {
         "steps": 28_800,
-        "road": {"penetration_rate": 0.05},
+        "scenario_options": {"penetration_rate": 0.05},
         "expert": "unjam:on-ramp-tuned",
         "policy": {
-            "observe": ["approach"],
-            "exploration": "mirrored",
+            "inputs": ["merge_proximity"],
+            "exploration": "antithetic",
             "exploration_std": 0.12,
             "learn_exploration_std": False,
-            "afterwards": True,
-            "hold": 5.0,
+            "reward_after_exit": True,
+            "action_duration": 5.0,
         },
         "trpo": {
-            "batch_steps": 9_600,
+            "steps_per_iteration": 9_600,
             "gamma": 0.995,
             "gae_lambda": 0.99,
             "target_kl": 0.05,
             "critic_batch_size": 2000,
         },
-        "virtual": {
-            "model": "road",
+        "model": {
+            "kind": "road",
             "model_ratio": 7.0,
-            "begin": "first",
+            "rollout_starts": "first",
             "k_max": 2400,
             "kappa": 10_000.0,
-            "update": "sequential",
+            "update_mode": "sequential",
         },
-        "evaluation": {"every": 3, "validation_episodes": 16},
+        "evaluation": {"validation_interval": 3, "validation_episodes": 16},
     },
     # A jam comes or does not: what a CAV did shows minutes later, and only in the mean of many episodes.
     "merge": {
         "expert": MERGE_JAM_ABSORBER,
         "steps": 300_000,
-        "policy": {"observe": EXPERT_INPUTS, "exploration_std": 0.4},
-        "trpo": {"batch_steps": 6000, "gamma": 0.998, "gae_lambda": 0.99},
-        "virtual": {"model_ratio": 0.0},
-        "evaluation": {"every": 10, "validation_episodes": 32},
+        "policy": {"inputs": EXPERT_INPUTS, "exploration_std": 0.4},
+        "trpo": {"steps_per_iteration": 6000, "gamma": 0.998, "gae_lambda": 0.99},
+        "model": {"model_ratio": 0.0},
+        "evaluation": {"validation_interval": 10, "validation_episodes": 32},
     },
 }
 """the preset `best`: what is known to reach furthest, road by road"""
@@ -244,17 +244,17 @@ QUICK_BY_SCENARIO: dict[str, dict[str, Any]] = {
     "ring-jammed": {
         "steps": 600_000,
         "trpo": {"target_kl": 0.01},
-        "virtual": {"model_ratio": 0.0},
-        "evaluation": {"every": 3, "validation_episodes": 8},
+        "model": {"model_ratio": 0.0},
+        "evaluation": {"validation_interval": 3, "validation_episodes": 8},
     },
     # The virtual environment of rows does not know the crossing.
     "figure-eight": {
         "expert": "pacer:use_tuned=true,time_constant=1",
         "reward": "eq16",
         "steps": 300_000,
-        "policy": {"observe": [*EXPERT_INPUTS, "place"], "exploration_std": 0.3},
-        "virtual": {"model_ratio": 0.0},
-        "evaluation": {"every": 2, "validation_episodes": 8},
+        "policy": {"inputs": [*EXPERT_INPUTS, "lap_position"], "exploration_std": 0.3},
+        "model": {"model_ratio": 0.0},
+        "evaluation": {"validation_interval": 2, "validation_episodes": 8},
     },
 }
 """the preset `quick`: what reaches furthest within a million actual steps or so, road by road"""
@@ -265,12 +265,12 @@ DEMO_BY_SCENARIO: dict[str, dict[str, Any]] = {
     # iterations are large, for the batch affords them.
     "ring-jammed": {
         "steps": 288_000,
-        "world": "batch",
-        "road": {"horizon": 1500},
-        "trpo": {"batch_steps": 48_000},
-        "virtual": {"model_ratio": 0.0},
+        "simulator": "batch",
+        "scenario_options": {"horizon": 1500},
+        "trpo": {"steps_per_iteration": 48_000},
+        "model": {"model_ratio": 0.0},
         "evaluation": {
-            "every": 2,
+            "validation_interval": 2,
             "validation_episodes": 16,
             "episodes": 8,
             "baselines": ["human", "unjam:ring-jammed-tuned"],

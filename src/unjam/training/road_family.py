@@ -13,7 +13,7 @@ from unjam.drivers.road_type_switch import MIN_SHARED_PENETRATION_RATE
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 
-FamilyPart = Literal["seen", "combination", "axis"]
+FamilyPart = Literal["training", "combination", "axis"]
 
 SHORT_WARM_UP, LONG_WARM_UP = 750, 6000
 """all-human simulation steps before the CAVs take over: a wave begins, or is there"""
@@ -43,8 +43,8 @@ class FamilyRoad:
 
     scenario: str
     options: dict[str, Any] = field(default_factory=dict)
-    part: FamilyPart = "seen"
-    """`seen` in training and tuning; held out: a new `combination` of what is seen, or a whole `axis`"""
+    part: FamilyPart = "training"
+    """`training` in training and tuning; held out: a new `combination` of what is seen, or a whole `axis`"""
 
     def make_scenario(self) -> Scenario:
         """Return the road."""
@@ -60,7 +60,7 @@ def ring_options(
 
 
 FAMILY: dict[str, FamilyRoad] = {
-    "ring-22-standing": FamilyRoad("ring", ring_options(22, 1, 0)),
+    "ring-22-no-warm-up": FamilyRoad("ring", ring_options(22, 1, 0)),
     "ring-22-growing": FamilyRoad("ring", ring_options(22, 1, SHORT_WARM_UP)),
     "ring-22-grown": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP)),
     "ring-33-growing-3-cavs": FamilyRoad("ring", ring_options(33, 3, SHORT_WARM_UP)),
@@ -68,8 +68,8 @@ FAMILY: dict[str, FamilyRoad] = {
     "ring-44-growing-2-cavs": FamilyRoad("ring", ring_options(44, 2, SHORT_WARM_UP)),
     "ring-66-grown-4-cavs": FamilyRoad("ring", ring_options(66, 4, LONG_WARM_UP)),
     "ring-22-wide": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, (13.0, 16.0))),
-    "ring-22-hurried": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=AGGRESSIVE_IDM)),
-    "ring-22-late": FamilyRoad("ring", ring_options(22, 1, SHORT_WARM_UP, actuator=ACTUATOR_LATENCY)),
+    "ring-22-aggressive": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=AGGRESSIVE_IDM)),
+    "ring-22-delayed": FamilyRoad("ring", ring_options(22, 1, SHORT_WARM_UP, actuator=ACTUATOR_LATENCY)),
     "figure-eight-14": FamilyRoad("figure-eight"),
     "figure-eight-12": FamilyRoad("figure-eight", {"vehicles": 12}),
     "on-ramp-5": FamilyRoad("on-ramp", {"penetration_rate": 0.05}),
@@ -77,21 +77,21 @@ FAMILY: dict[str, FamilyRoad] = {
     "on-ramp-10-less-demand": FamilyRoad("on-ramp", {"penetration_rate": 0.1, "inflow": 2900.0}),
     "ring-33-grown": FamilyRoad("ring", ring_options(33, 1, LONG_WARM_UP), "combination"),
     "ring-66-growing-2-cavs": FamilyRoad("ring", ring_options(66, 2, SHORT_WARM_UP), "combination"),
-    "ring-44-late-hurried": FamilyRoad(
+    "ring-44-delayed-aggressive": FamilyRoad(
         "ring", ring_options(44, 2, LONG_WARM_UP, humans=AGGRESSIVE_IDM, actuator=ACTUATOR_LATENCY), "combination"
     ),
     "on-ramp-10": FamilyRoad("on-ramp", {"penetration_rate": 0.1}, "combination"),
     "ring-22-dense": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, (9.1, 9.8)), "axis"),
     "ring-88-grown": FamilyRoad("ring", ring_options(88, 1, LONG_WARM_UP), "axis"),
     "ring-44-grown-5-cavs": FamilyRoad("ring", ring_options(44, 5, LONG_WARM_UP), "axis"),
-    "ring-22-measured": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=NGSIM_IDM), "axis"),
+    "ring-22-ngsim-idm": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=NGSIM_IDM), "axis"),
     "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38)}, "axis"),
     "on-ramp-10-more-demand": FamilyRoad(
         "on-ramp", {"penetration_rate": 0.1, "inflow": 3400.0, "ramp_flow": 600.0}, "axis"
     ),
     "one-lane-10": FamilyRoad("on-ramp-1", {"penetration_rate": 0.1}, "axis"),
-    "ring-22-very-late": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, actuator=LONG_ACTUATOR_LATENCY), "axis"),
-    "ring-22-unsure": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NOISY_SENSORS), "axis"),
+    "ring-22-long-delay": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, actuator=LONG_ACTUATOR_LATENCY), "axis"),
+    "ring-22-noisy-sensors": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NOISY_SENSORS), "axis"),
     "ring-22-ngsim": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NGSIM_DRIVERS), "axis"),
     "ring-22-astazero": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **ASTAZERO_DRIVERS), "axis"),
     "figure-eight-ngsim": FamilyRoad("figure-eight", NGSIM_DRIVERS, "axis"),
@@ -108,7 +108,7 @@ FAMILY: dict[str, FamilyRoad] = {
 
 GROUP_BY_SCENARIO = {"ring": "rings", "figure-eight": "figure-eights", "on-ramp": "motorways", "on-ramp-1": "motorways"}
 """for each scenario the group of roads that one law can be written for"""
-SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "everywhere"
+SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "all-roads"
 """names of the rings that several CAVs share, and of the whole family"""
 ROAD_GROUPS = (*dict.fromkeys(GROUP_BY_SCENARIO.values()), SHARED_RINGS_GROUP, ALL_ROADS_GROUP)
 """names of several roads"""
