@@ -101,7 +101,7 @@ def calm(outcome):
     return {"speed": np.nanmean(outcome.speeds, axis=-1), "push": -np.abs(outcome.accelerations).sum(-1)}
 
 def wrong_reward(outcome):
-    return {"speed": np.full(len(outcome.crashed), np.nan)}
+    return {"speed": np.full(len(outcome.has_crashed), np.nan)}
 
 not_callable = 3
 """

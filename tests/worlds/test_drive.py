@@ -37,7 +37,7 @@ def test_it_keeps_what_was_decided_and_what_would_be_seen_at_the_end() -> None:
     np.testing.assert_allclose(applied, (experts + residuals).clip(-1.0, 1.0))
     assert seen.shape == (40, 3, 5)
     assert driven.last_observation is not None
-    np.testing.assert_allclose(driven.last_observation[:, 0], world.perceive().speed / 10.0)
+    np.testing.assert_allclose(driven.last_observation[:, 0], world.local_state().speed / 10.0)
     assert len(driven.initial_memories) == 3
     assert driven.action_repeat == 4
 
@@ -50,7 +50,7 @@ def test_it_explores_only_when_asked_to() -> None:
 
 
 def test_noise_that_lasts_is_the_same_in_all_decisions_and_counts_the_other_way_too() -> None:
-    lasting = replace(RESIDUAL, network=replace(random_network(), lasts=True), action_limit=100.0)
+    lasting = replace(RESIDUAL, network=replace(random_network(), episode_noise=True), action_limit=100.0)
     told = [drive_world(MockWorld(decisions=4), lasting, explore)[0] for explore in (0.0, 1.0, -1.0)]
     (calm, one, other), again = told, drive_world(MockWorld(decisions=4), lasting, 1.0)[0]
     np.testing.assert_array_equal(one, again)
@@ -63,14 +63,14 @@ def test_memory_goes_with_the_vehicle_where_some_leave_and_others_enter(driver: 
     world = MockWorld(turnover=5)
     driving = DriveLoop(world, driver)
     for _ in driving:
-        assert np.asarray(world.perceive().speed).shape == (3,)
-    assert world.entered == 3 + 40 // 5
-    assert len(driving.initial_memories) == world.entered
+        assert np.asarray(world.local_state().speed).shape == (3,)
+    assert world.entered_count == 3 + 40 // 5
+    assert len(driving.initial_memories) == world.entered_count
 
 
 def test_a_newcomer_remembers_nothing() -> None:
     driving = DriveLoop(MockWorld(turnover=5), PI)
-    seen = [driving.memory["seen"].tolist() for _ in driving]
+    seen = [driving.memory["count"].tolist() for _ in driving]
     assert seen[3:6] == [[4, 4, 4], [5, 5, 0], [6, 6, 1]]
 
 

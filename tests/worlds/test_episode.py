@@ -113,7 +113,7 @@ def test_all_that_is_recorded_has_a_row_for_each_decision_and_one_for_the_end(
     warmup: int, held: int, hold: int, cavs: int, simulation: Simulation
 ) -> None:
     ring = replace(RING, horizon=60, warmup=warmup, steps_per_control_step=held, cavs=cavs)
-    driver = replace(RESIDUAL, hold=hold)
+    driver = replace(RESIDUAL, action_repeat=hold)
     episode = run_episode(ring, driver, (0,), simulation=simulation)
     assert episode.control_steps == 60
     for array in (episode.speeds, episode.positions, episode.gaps):
@@ -201,7 +201,7 @@ def test_a_residual_drivers_record_adds_up(cavs: int, hold: int, expert: Driver,
 @pytest.mark.parametrize("cavs", [1, 2])
 @pytest.mark.parametrize("hold", [1, 5])
 def test_exploration_adds_noise_of_the_networks_spread(cavs: int, hold: int, simulation: Simulation) -> None:
-    driver = replace(RESIDUAL, hold=hold)
+    driver = replace(RESIDUAL, action_repeat=hold)
     ring = replace(RING, cavs=cavs, horizon=1000 * hold)
     episode = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
     noises = []
@@ -273,7 +273,7 @@ def test_the_reward_is_the_scenarios_own_where_none_is_named(simulation: Simulat
 def test_a_named_reward_and_ones_own_are_used(my_drivers: Path, simulation: Simulation) -> None:
     ring = replace(UNFILTERED, cavs=2)
     found = run_episode(ring, Constant(0.2), (0,), "eq16", simulation=simulation).trajectories
-    assert set(found[0].reward_terms) == {"speed", "headway", "acceleration"}
+    assert set(found[0].reward_terms) == {"speed", "time_gap", "acceleration"}
     episode = run_episode(ring, Constant(0.2), (0,), f"{my_drivers}:calm", simulation=simulation)
     for trajectory in episode.trajectories:
         assert set(trajectory.reward_terms) == {"speed", "push"}
@@ -286,8 +286,8 @@ def test_the_headways_of_a_reward_are_those_after_each_step(simulation: Simulati
     trajectory = episode.trajectories[0]
     gap, speed = trajectory.states.leader_gap[1:], trajectory.states.speed[1:]
     expected = [-0.1 * max(1.0 - g / max(v, 1e-3), 0.0) for g, v in zip(gap, speed, strict=True)]
-    np.testing.assert_allclose(trajectory.reward_terms["headway"], expected, atol=1e-12)
-    assert trajectory.reward_terms["headway"].min() < 0.0
+    np.testing.assert_allclose(trajectory.reward_terms["time_gap"], expected, atol=1e-12)
+    assert trajectory.reward_terms["time_gap"].min() < 0.0
 
 
 BAD_REWARDS = """
@@ -304,7 +304,7 @@ def each_vehicle(outcome):
     return {"speed": outcome.speeds}
 
 def listed(outcome):
-    return {"speed": [1] * len(outcome.crashed)}
+    return {"speed": [1] * len(outcome.has_crashed)}
 """
 
 
@@ -353,8 +353,8 @@ def test_a_trajectory_begins_with_what_its_expert_remembered_of_the_warmup(simul
     warm = Ring(length=(230, 230), vehicles=8, horizon=20, warmup=30)
     driver = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=5)
     trajectory = run_episode(warm, driver, (3,), simulation=simulation).trajectories[0]
-    assert set(trajectory.initial_memory) == {"window", "total", "seen", "command"}
-    assert trajectory.initial_memory["seen"] == 30
+    assert set(trajectory.initial_memory) == {"window", "total", "count", "command"}
+    assert trajectory.initial_memory["count"] == 30
     memory = {name: values[None] for name, values in trajectory.initial_memory.items()}
     for step in range(20):
         seen = trajectory.states.select(slice(step, step + 1))

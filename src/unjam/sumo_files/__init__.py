@@ -1,6 +1,6 @@
 """What the user's own SUMO files say, read before SUMO starts: SUMO crashes on some that are broken.
 
-Such files may come from anywhere. So that none can harm who asks, `program.py` reads them in a process of its
+Such files may come from anywhere. So that none can harm who asks, `reader_program.py` reads them in a process of its
 own that `unjam.sandbox` limits, and answers one JSON document. What SUMO would write, and where it would
 listen, is never passed on to it: see `write_harmless_copy`.
 """
@@ -16,7 +16,7 @@ from unjam.child_processes import child_environment, python_command
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.sumo_files.reader import FILE_ATTRIBUTES, FILE_PARAMETER_PARTS, file_stamp
 
-READER_PROGRAM = Path(__file__).with_name("program.py")
+READER_PROGRAM = Path(__file__).with_name("reader_program.py")
 MAX_READER_MEMORY = 4 * 2**30
 """bytes that reading may take"""
 MAX_READER_TIME = 120

@@ -149,7 +149,7 @@ def add_reward_terms(episode: Episode, reward: Reward) -> Episode:
     crashed = episode.status == "collision"
     terms = episode_reward_terms(reward, episode.speeds, episode.trajectories, crashed, episode.backlog)
     trajectories = tuple(
-        replace(each, terms={name: values[each.step_slice] for name, values in terms.items()})
+        replace(each, reward_terms={name: values[each.step_slice] for name, values in terms.items()})
         for each in episode.trajectories
     )
-    return replace(episode, terms=terms, trajectories=trajectories)
+    return replace(episode, reward_terms=terms, trajectories=trajectories)

@@ -89,7 +89,7 @@ def printed_eq16_reward(outcome: Outcome) -> dict[str, Array]:
 
 def _eq16_costs(outcome: Outcome) -> dict[str, Array]:
     return {
-        "headway": TIME_GAP_WEIGHT * time_gap_penalty(outcome),
+        "time_gap": TIME_GAP_WEIGHT * time_gap_penalty(outcome),
         "acceleration": -ACCELERATION_WEIGHT * _nan_sum(abs(outcome.accelerations)),
     }
 
@@ -108,7 +108,7 @@ def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
     )
     speed = clamp_min(1.0 - square_root(missed), 0.0) * there.any(-1) * running
     headway = TIME_GAP_WEIGHT * time_gap_penalty(outcome) * running
-    return {"speed": speed, "headway": headway, "floor": clamp_min(-speed - headway, 0.0)}
+    return {"speed": speed, "time_gap": headway, "lower_bound": clamp_min(-speed - headway, 0.0)}
 
 
 def power_reward(outcome: Outcome) -> dict[str, Array]:
@@ -130,7 +130,7 @@ def travel_time_reward(outcome: Outcome) -> dict[str, Array]:
     """
     there = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1) + outcome.backlog
     closed = CRASH_CLOSURE_STEPS * clamp_min(there, MIN_CRASH_BACKLOG) * outcome.has_crashed
-    return {"travel": -(there + closed) / 100.0}
+    return {"travel_time": -(there + closed) / 100.0}
 
 
 def time_gap_penalty(outcome: Outcome) -> Array:
@@ -150,7 +150,7 @@ def speed_variation_penalty(outcome: Outcome) -> Array:
 
 
 REWARD_TERMS: dict[str, Callable[[Outcome], Array]] = {
-    "headway": time_gap_penalty,
+    "time_gap": time_gap_penalty,
     "comfort": acceleration_penalty,
     "smoothness": speed_variation_penalty,
 }
@@ -174,8 +174,8 @@ def time_gap(gap: Array, speed: Array) -> Array:
 def make_reward(text: str) -> Reward:
     """Return the reward for a name, with weights of its terms, or for a function of the user's own.
 
-    `released:acceleration=2,headway=0.5` is the reward `released_reward` with its term `acceleration` counted twice,
-    and with half of the term `headway` of TERMS besides; `path.py:name` a function that takes an `Outcome`
+    `released:acceleration=2,time_gap=0.5` is the reward `released_reward` with its term `acceleration` counted twice,
+    and with half of the term `time_gap` of TERMS besides; `path.py:name` a function that takes an `Outcome`
     and returns its terms by name, or one array.
 
     Raises:

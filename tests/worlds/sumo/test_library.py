@@ -100,7 +100,7 @@ def test_a_users_traci_connection_stays_the_active_one(command: list[str]) -> No
         road = sumo_inputs(RING, RING.draw_from_seed((0,))[0])
         with Simulation("traci") as simulation:
             with pytest.raises(EpisodeError):
-                simulation.load(road._replace(traffic="<routes"), 0.1, 0)
+                simulation.load(road._replace(traffic_xml="<routes"), 0.1, 0)
             simulation.load(road, 0.1, 0)
             assert traci.getLabel() == "default"
 

@@ -108,7 +108,7 @@ def test_pictures_of_what_is_thinned_show_the_moments_that_are_kept(whole: Episo
     column = dict(zip(thinned.vehicle_ids, thinned.vehicle_columns, strict=True))
     for number, name in enumerate(whole.vehicle_ids):
         there = ~np.isnan(whole.speeds[::every, number])
-        for quantity in ("positions", "lanes", "places"):
+        for quantity in ("positions", "lane_indices", "poses"):
             kept, all_of_it = getattr(other, quantity), getattr(one, quantity)[::every]
             np.testing.assert_array_equal(kept[there, column[name]], all_of_it[there, number])
     read = unpack_episode(pack_episode(other))

@@ -78,8 +78,8 @@ def test_other_traffic_on_the_same_road_needs_no_other_network(cache: Path, monk
 def test_whatever_changes_the_network_makes_another_file(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     road = road_of(230)
     other = road_of(240)
-    plain = tuple(node._replace(priority=False) for node in road.nodes)
-    changed = (road, other, replace(road, speed=20.0), replace(road, nodes=plain), replace(road, links=True))
+    plain = tuple(node._replace(has_priority=False) for node in road.nodes)
+    changed = (road, other, replace(road, speed_limit=20.0), replace(road, nodes=plain), replace(road, has_internal_links=True))
     made = [network_file(each) for each in changed]
     monkeypatch.setattr(networks, "sumo_version", lambda: "9.99.0")
     made.append(network_file(road))

@@ -280,5 +280,5 @@ def test_fuel_and_places_are_recorded_only_when_asked_for_and_change_nothing_els
     assert (full.fuel.shape, full.poses.shape) == ((steps - 1,), (steps, vehicles, 3))
     assert (full.fuel > 0).all()
     np.testing.assert_array_equal(np.isnan(full.poses[..., 0]), np.isnan(full.speeds))
-    same = replace(full, fuel=plain.fuel, places=plain.poses, lines=plain.lane_lines)
+    same = replace(full, fuel=plain.fuel, poses=plain.poses, lane_lines=plain.lane_lines)
     assert fingerprint(same) == fingerprint(plain)

@@ -117,7 +117,7 @@ def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
     if loaded_before:
         simulation.load(road, 0.1, 0)
     with pytest.raises(EpisodeError) as caught:
-        simulation.load(road._replace(traffic=traffic), 0.1, 0)
+        simulation.load(road._replace(traffic_xml=traffic), 0.1, 0)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -125,7 +125,7 @@ def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
 def test_sumos_own_words_come_from_the_child_process_too(road: SumoInputs) -> None:
     for traffic, words in list(BROKEN_TRAFFIC.items())[:2]:
         with Simulation("traci") as simulation, pytest.raises(EpisodeError) as caught:
-            simulation.load(road._replace(traffic=traffic), 0.1, 0)
+            simulation.load(road._replace(traffic_xml=traffic), 0.1, 0)
         assert words in str(caught.value)
 
 
@@ -149,7 +149,7 @@ def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
 def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: SumoInputs, simulation: Simulation) -> None:
     for traffic, words in BROKEN_TRAFFIC.items():
         with pytest.raises(EpisodeError) as caught:
-            simulation.load(road._replace(traffic=traffic), 0.1, 0)
+            simulation.load(road._replace(traffic_xml=traffic), 0.1, 0)
         others = [other for other in BROKEN_TRAFFIC.values() if other != words]
         assert not any(other in str(caught.value) for other in others)
 
@@ -160,10 +160,10 @@ def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: 
     first, second, *_ = BROKEN_TRAFFIC
     with Simulation(backend) as simulation:
         with pytest.raises(EpisodeError):
-            simulation.load(road._replace(traffic=first), 0.1, 0)
+            simulation.load(road._replace(traffic_xml=first), 0.1, 0)
         simulation.load(road, 0.1, 0)
         with pytest.raises(EpisodeError):
-            simulation.load(road._replace(traffic=second), 0.1, 0)
+            simulation.load(road._replace(traffic_xml=second), 0.1, 0)
         assert fingerprint(run_episode(RING, IDM(), (0,), simulation=simulation)) == fingerprint(expected)
 
 

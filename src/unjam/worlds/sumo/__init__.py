@@ -37,6 +37,6 @@ def make_traffic(
     """
     road, seeds = scenario.draw_from_seed(seed)
     traffic = TRAFFIC_CLASSES[type(road)](scenario, road, SeedTree(tuple(seed), seeds), simulation, record_details)
-    traffic.asked = measured_fields
+    traffic.measured_fields = measured_fields
     traffic.is_scalar = is_scalar and isinstance(traffic, ClosedTraffic) and traffic.cav_count == 1
     return traffic

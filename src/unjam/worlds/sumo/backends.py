@@ -101,7 +101,7 @@ class Libsumo:
         self._reset_step_count()
 
     def _reset_step_count(self) -> None:
-        self._begin, self._steps, self.has_refused = self._time(), 0, False
+        self._begin_time, self._step_count, self.has_refused = self._get_time(), 0, False
 
     def step(self) -> None:
         """Simulate one time step."""

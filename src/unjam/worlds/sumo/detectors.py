@@ -43,7 +43,7 @@ def load_with_loops(
         {"id": loop_name(number), "lane": loop.lane, "pos": loop.position, "period": 3600, "file": "NUL"}
         for number, loop in enumerate(loops)
     ]
-    files = sumo_inputs(scenario, road)._replace(traffic=xml_document("additional", "inductionLoop", places))
+    files = sumo_inputs(scenario, road)._replace(traffic_xml=xml_document("additional", "inductionLoop", places))
     simulation.load(files, scenario.simulation_step, int(sumo_seed.generate_state(1)[0]) % 2**31)
 
 

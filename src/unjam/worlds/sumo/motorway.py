@@ -83,7 +83,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         ahead = self._leader
         gaps = np.where(ahead >= 0, self._leader_gaps(np.arange(len(ahead)), ahead), np.nan)
         places = self._position - self.road.merge_position  # as on the merge: zero where the ways meet
-        return {"positions": places, "gaps": gaps, "lanes": len(self.road.lane_names) - 1 - self._lane}
+        return {"positions": places, "gaps": gaps, "lane_indices": len(self.road.lane_names) - 1 - self._lane}
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
         rows = np.array([self._row_of_name[name] for name in names], np.intp)
@@ -145,8 +145,8 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         return [routes[name] for name in vehicles]
 
     def _snapshot_fields(self, columns: NDArray[np.intp]) -> dict[str, Any]:
-        lanes = {"lanes": self._traffic_log.snapshots("lanes", columns), "lane_names": self.road.lane_names[::-1]}
+        lanes = {"lane_indices": self._traffic_log.snapshots("lane_indices", columns), "lane_names": self.road.lane_names[::-1]}
         before = self.scenario.warmup * self.scenario.simulation_step
         begin, end = (max(0.0, moment - before) for moment in self.road.peak)
-        road = {"peak": (begin, end), "free_flow_time": self.road.free_flow_time}
+        road = {"demand_peak": (begin, end), "free_flow_time": self.road.free_flow_time}
         return {**super()._snapshot_fields(columns), **road, **lanes}

@@ -275,7 +275,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._traffic_log.add(names, self.speeds)
         if self._traffic_log.needs_snapshot:
             pictured = self._snapshot(names)
-            places = {"places": simulation.poses(names)} if self.record_details else {}
+            places = {"poses": simulation.poses(names)} if self.record_details else {}
             self._traffic_log.add_snapshot({**pictured, **places})
         self._trip_log.cav_ids.append(self.cav_ids)
         self._trip_log.states.append(self._local_states(self.cav_ids))
@@ -295,18 +295,18 @@ class OpenTraffic(Traffic[OpenRoadT]):
         facts: dict[str, Any] = {
             "vehicle_ids": vehicles,
             "cav_ids": tuple(cavs),
-            "columns": tuple(columns.tolist()) if len(of_column) < len(vehicles) else (),
+            "vehicle_columns": tuple(columns.tolist()) if len(of_column) < len(vehicles) else (),
             "branches": tuple(of_column[column] for column in sorted(of_column)) if any(branches) else (),
             "speeds": log.speeds(columns),
-            "every": log.snapshot_stride,
+            "snapshot_stride": log.snapshot_stride,
             "fuel": held if self.record_details else np.zeros((0, 0)),
-            "arrived": self._arrival_count,
+            "arrivals": self._arrival_count,
             "teleports": self._teleport_count,
             "collisions": len(self._collided_vehicles),
-            "waiting": np.array(self._logged_backlog, np.float64),
-            "lifted": len(self._teleported_vehicles.keys() & set(vehicles)),
-            "planned": self.scenario.horizon * self.scenario.control_step,
-            "lines": self._lane_lines() if self.record_details else np.zeros((0, 2)),
+            "backlog": np.array(self._logged_backlog, np.float64),
+            "teleported": len(self._teleported_vehicles.keys() & set(vehicles)),
+            "planned_duration": self.scenario.horizon * self.scenario.control_step,
+            "lane_lines": self._lane_lines() if self.record_details else np.zeros((0, 2)),
             "trajectories": trajectories,
             "audit": self._audit(trajectories),
         }
@@ -318,7 +318,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     def _snapshot_fields(self, columns: NDArray[np.intp]) -> dict[str, Any]:
         """Return what pictures show, as the record has it, and what else it says of the road."""
-        names = ("positions", "gaps", "places") if self.record_details else ("positions", "gaps")
+        names = ("positions", "gaps", "poses") if self.record_details else ("positions", "gaps")
         return {name: self._traffic_log.snapshots(name, columns) for name in names}
 
     def _audit(self, trajectories: Sequence[Trajectory]) -> Audit:

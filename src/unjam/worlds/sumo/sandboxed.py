@@ -108,7 +108,7 @@ class SandboxedSimulation:
         """Start an episode, as `Simulation.load` does."""
         named = {option: list(map(str, paths)) for option, paths in inputs.existing_files.items()}
         to_copy = {str(path): list(map(str, made_from)) for path, made_from in inputs.copied_files.items()}
-        self._call("load", {**inputs._asdict(), "named": named, "to_copy": to_copy}, step, seed)
+        self._call("load", {**inputs._asdict(), "existing_files": named, "copied_files": to_copy}, step, seed)
 
     def _call(self, name: str, *arguments: Any) -> Any:
         assert self._process.stdin is not None
@@ -174,9 +174,9 @@ def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
         return passages(simulation, [InductionLoop(*each) for each in loops], steps)
     if name == "load":
         files = arguments[0]
-        named = {option: tuple(map(Path, paths)) for option, paths in files["named"].items()}
-        to_copy = {Path(path): tuple(map(Path, made)) for path, made in files["to_copy"].items()}
-        parts = {"options": tuple(files["options"]), "named": named, "to_copy": to_copy}
+        named = {option: tuple(map(Path, paths)) for option, paths in files["existing_files"].items()}
+        to_copy = {Path(path): tuple(map(Path, made)) for path, made in files["copied_files"].items()}
+        parts = {"options": tuple(files["options"]), "existing_files": named, "copied_files": to_copy}
         arguments[0] = SumoInputs(**{**files, **parts})
     return getattr(simulation, name)(*arguments)
 

@@ -196,8 +196,8 @@ class Traffic(World[Episode], Generic[RoadT]):
             "seed": self.seed,
             "status": "collision" if self.has_crashed else "teleports" if self.stop_reason else "completed",
             "reason": "" if self.has_crashed else self.stop_reason,
-            "step": self.scenario.control_step,
+            "control_step": self.scenario.control_step,
             "warmup": self.scenario.warmup,
-            "drawn": self.road.drawn_values,
+            "drawn_values": self.road.drawn_values,
             "limit_speed": self.road.limit_speed,
         }

@@ -108,7 +108,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
         # SUMO does not expect the vehicles that calibrators will bring.
         until, simulation = self.road.files.calibrated_until, self._simulation
-        self.over = not simulation.expects_vehicles() and (not until or simulation.now() >= until)
+        self.is_finished = not simulation.expects_vehicles() and (not until or simulation.now() >= until)
         if self.record_details:
             self._route_counts.update(self._simulation.route_of(name) for name in entered_names)
 
@@ -200,7 +200,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
             number = float(number or -1)  # nowhere, where SUMO has lifted a vehicle off the road
             rows.append((self._edge_numbers.setdefault(edge, len(self._edge_numbers)), number, along))
         edge, lane, along = np.array(rows, np.float64).reshape(-1, 3).T
-        return {"edge": edge, "lane": lane, "along": along, "gaps": unknown}
+        return {"edge": edge, "lane_index": lane, "lane_position": along, "gaps": unknown}
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
         found = [self._neighbors(name)[1:] for name in names]
@@ -243,8 +243,8 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         """
         if not self.record_details:
             return super()._snapshot_fields(columns)
-        gaps, places, edge = (self._traffic_log.snapshots(name, columns) for name in ("gaps", "places", "edge"))
-        shown = {"gaps": gaps, "places": places, "positions": np.full(edge.shape, np.nan)}
+        gaps, places, edge = (self._traffic_log.snapshots(name, columns) for name in ("gaps", "poses", "edge"))
+        shown = {"gaps": gaps, "poses": places, "positions": np.full(edge.shape, np.nan)}
         shown["limit_speed"] = (
             self._allowed_speed_sum / self._allowed_speed_count if self._allowed_speed_count else float("nan")
         )
@@ -261,11 +261,11 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         facts = [(begins.get(name, np.nan), counts.get(name, 0)) for name in self._edge_numbers]
         nobody = (np.nan, np.nan)
         begin, lanes = np.array([*facts, nobody]).T[:, np.nan_to_num(edge, nan=-1).astype(int)]
-        shown["positions"] = begin + self._traffic_log.snapshots("along", columns)
+        shown["positions"] = begin + self._traffic_log.snapshots("lane_position", columns)
         most = max(counts[edge] for edge in route)
         if most == 1:
             return shown
-        lane = np.where(np.isnan(begin), np.nan, lanes - 1 - self._traffic_log.snapshots("lane", columns))
+        lane = np.where(np.isnan(begin), np.nan, lanes - 1 - self._traffic_log.snapshots("lane_index", columns))
         further = ("2nd", "3rd", *(f"{number}th" for number in range(4, most + 1)))
         named = ("left lane", *(f"{ordinal} lane" for ordinal in further[: most - 1]))
-        return {**shown, "lanes": lane, "lane_names": named}
+        return {**shown, "lane_indices": lane, "lane_names": named}
