@@ -128,7 +128,7 @@ def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
     ("changes", "reason"),
     [
         ({"travel_time": between(-6, -2, MIN_VERDICT_SEEDS - 1)}, "9 test seeds are too few"),
-        ({"failed": 3}, "3 episodes failed"),
+        ({"failed_episodes": 3}, "3 episodes failed"),
         ({"travel_time": between(1, 3)}, "travel time is longer than that of the human baseline: +2.0 [+1.0, +3.0] s"),
         (
             {"travel_time": between(-6, 0)},
@@ -152,18 +152,18 @@ def test_each_failing_is_one_reason(changes: dict[str, Any], reason: str) -> Non
 @pytest.mark.parametrize("time", [between(0.1, 0.4), between(-0.4, -0.1), between(-0.3, 0.4)])
 def test_a_difference_below_half_a_percent_is_no_gain_and_no_harm(time: Estimate) -> None:
     found = replace(GOOD, travel_time=time)  # of 100 s
-    assert harm_of(found) == ""
-    (reason,) = reasons_against(found)
+    assert describe_harm(found) == ""
+    (reason,) = rejection_reasons(found)
     assert reason.startswith("travel time differs from that of the human baseline by less than 0.5 %, which is ")
     lower = replace(found, flow=between(-150.0, -50.0))
-    assert harm_of(lower) == "flow is lower than that of the human baseline: -100 [-150, -50] veh/h"
+    assert describe_harm(lower) == "flow is lower than that of the human baseline: -100 [-150, -50] veh/h"
 
 
 @pytest.mark.parametrize("time", [between(0.1, 0.6), between(-0.6, -0.1), Estimate(0.1, nan, nan, 1)])
 def test_a_difference_that_may_be_half_a_percent_is_not_too_small(time: Estimate) -> None:
     found = replace(GOOD, travel_time=time)
     assert not found.is_too_small
-    assert bool(harm_of(found)) == (time.low > 0)
+    assert bool(describe_harm(found)) == (time.low > 0)
 
 
 def test_speed_does_not_excuse_a_loss_of_flow_and_all_reasons_are_told() -> None:

@@ -26,17 +26,17 @@ def trajectory_of(states: LocalState, applied: ArrayLike = 0.0, **changes: Any) 
     steps = len(states.speed) - 1
     values: dict[str, Any] = {
         "vehicle": "cav_0",
-        "start": 0,
+        "start_step": 0,
         "states": states,
         "observations": np.zeros((1, 0)),
-        "expert": np.zeros(steps),
+        "expert_acceleration": np.zeros(steps),
         "residual": np.zeros(steps),
-        "applied": np.zeros(steps) + np.asarray(applied),
-        "filtered": np.zeros(steps),
-        "shield": np.zeros(steps),
-        "terms": {"reward": np.zeros(steps)},
-        "memory": {},
-        "hold": 1,
+        "applied_acceleration": np.zeros(steps) + np.asarray(applied),
+        "filter_braking": np.zeros(steps),
+        "shield_braking": np.zeros(steps),
+        "reward_terms": {"reward": np.zeros(steps)},
+        "initial_memory": {},
+        "action_repeat": 1,
         "terminated": False,
     }
     return Trajectory(**{**values, **changes})
@@ -61,8 +61,8 @@ def episode_of(
     values: dict[str, Any] = {
         "seed": (0,),
         "status": "completed",
-        "step": step,
-        "drawn": {"length": LENGTH},
+        "control_step": step,
+        "drawn_values": {"length": LENGTH},
         "loop_length": LENGTH,
         "limit_speed": LIMIT,
         "vehicle_ids": tuple(f"{'cav' if n < cavs else 'human'}_{n}" for n in range(vehicles)),
@@ -267,9 +267,9 @@ def test_fuel_that_was_not_recorded_is_not_a_number() -> None:
 
 def test_return_is_the_sum_of_all_terms_once_however_many_cavs_share_it() -> None:
     terms = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1.0, 0.0, 0.0])}
-    shares = tuple(trajectory_of(seen(speed=[5.0] * 4), terms=terms) for _ in range(2))
+    shares = tuple(trajectory_of(seen(speed=[5.0] * 4), reward_terms=terms) for _ in range(2))
     for cavs in ((), shares[:1], shares):
-        episode = episode_of(steady(5.0, 3), trajectories=cavs, terms=terms)
+        episode = episode_of(steady(5.0, 3), trajectories=cavs, reward_terms=terms)
         assert metric("return", episode) == pytest.approx(5.0)
 
 
@@ -282,7 +282,7 @@ def test_return_by_eq16_pays_for_speed_and_charges_for_push_and_closeness() -> N
 def test_shield_counts_what_was_overridden_and_how_hard() -> None:
     states = seen(speed=[5.0] * 5)
     first, second = np.array([0.0, 1e-9, 0.5, 3.0]), np.array([0.0, 0.0, 0.0, 1.0])
-    cavs = tuple(trajectory_of(states, shield=shield) for shield in (first, second))
+    cavs = tuple(trajectory_of(states, shield_braking=shield) for shield in (first, second))
     episode = episode_of(steady(5.0, 4), trajectories=cavs)
     assert metric("shield_override_share", episode) == pytest.approx(3 / 8)
     assert metric("shield_max_braking", episode) == pytest.approx(3.0)
@@ -333,7 +333,7 @@ def test_a_row_has_the_episode_what_was_drawn_and_every_metric() -> None:
         "required_time_gap",
         "has_lanes",
         *("teleports", "contacts"),
-        "feasible",
+        "feasibility",
     }
     assert set(row) == about | set(METRICS)
     assert row["seed"] == [7, 1]
@@ -423,15 +423,15 @@ def open_episode(speeds: ArrayLike, **changes: Any) -> Episode:
     values: dict[str, Any] = {
         "seed": (0,),
         "status": "completed",
-        "step": 1.0,
+        "control_step": 1.0,
         "limit_speed": LIMIT,
         "vehicle_ids": tuple(f"human_{n}" for n in range(vehicles)),
         "speeds": moved,
         "positions": np.full_like(moved, np.nan),
         "gaps": np.full_like(moved, np.nan),
-        "waiting": np.zeros(steps + 1),
+        "backlog": np.zeros(steps + 1),
         "fuel": np.where(np.isnan(moved[1:]), np.nan, 100.0),
-        "terms": {"speed": np.zeros(steps)},
+        "reward_terms": {"speed": np.zeros(steps)},
     }
     return Episode(**{**values, **changes})
 
@@ -448,17 +448,17 @@ def test_vehicles_count_while_they_are_on_the_road() -> None:
 
 
 def test_throughput_of_a_road_with_ends_is_who_left_it_and_backlog_who_waits_at_the_end() -> None:
-    episode = open_episode(np.full((121, 3), 5.0), arrived=7, waiting=np.arange(121.0))
+    episode = open_episode(np.full((121, 3), 5.0), arrivals=7, backlog=np.arange(121.0))
     assert metric("outflow_veh_per_h", episode) == pytest.approx(7 * 30.0)
     assert metric("insertion_backlog_veh", episode) == 120.0
     assert metric("insertion_backlog_veh", episode_of(steady(4.0))) == 0.0
 
 
 def test_a_collision_makes_nobody_quicker_who_is_still_under_way() -> None:
-    episode = open_episode(np.full((11, 2), 5.0), waiting=np.full(11, 3.0), planned=40.0)
+    episode = open_episode(np.full((11, 2), 5.0), backlog=np.full(11, 3.0), planned_duration=40.0)
     assert metric("travel_time", episode) == pytest.approx(10.0)
     assert metric("travel_time", replace(episode, status="collision")) == pytest.approx(40.0)
-    later = replace(episode, status="collision", planned=NAN)  # where no end was planned
+    later = replace(episode, status="collision", planned_duration=NAN)  # where no end was planned
     assert metric("travel_time", later) == pytest.approx(10.0)
 
 
@@ -488,4 +488,4 @@ def test_an_episode_in_which_nobody_came_is_measured_without_complaint() -> None
 def test_flow_of_a_peak_is_of_the_peak_alone(peak: tuple[float, float], flow: float) -> None:
     # Somebody leaves every second from the sixtieth on; where the peak never comes all of it counts.
     speeds = np.where(np.arange(101)[:, None] <= np.arange(60, 160), 10.0, np.nan)
-    assert metric("outflow_veh_per_h", open_episode(speeds, peak=peak)) == pytest.approx(flow)
+    assert metric("outflow_veh_per_h", open_episode(speeds, demand_peak=peak)) == pytest.approx(flow)

@@ -62,16 +62,16 @@ def test_what_a_controller_gains_beyond_acc_vehicles_must_matter() -> None:
         "travel time differs from that with ACC vehicles alone at this penetration rate by less than 0.5 %, "
         "which is too small to matter: -0.3 [-0.4, -0.2] s"
     ]
-    assert recommended([found]) is None
+    assert recommended_result([found]) is None
 
 
 @pytest.mark.parametrize("time", [between(0.1, 0.3), between(-0.3, -0.1)])
 def test_acc_vehicles_that_change_too_little_neither_shorten_nor_lengthen(time: Estimate) -> None:
     little = AccResult(0.2, replace(GOOD, travel_time=time))
     small = "by less than 0.5 %, which is too small to matter"
-    assert headline([], [little]).endswith(f" ACC vehicles alone change travel time {small}.")
-    assert f"travel time differs {small}, compared with the human baseline." in little.words
-    assert headline([], [little, ACC_HELPS]).endswith("-4.0 [-6.0, -2.0] s (-4.0 %) at 20 %.")
+    assert assessment_headline([], [little]).endswith(f" ACC vehicles alone change travel time {small}.")
+    assert f"travel time differs {small}, compared with the human baseline." in little.summary
+    assert assessment_headline([], [little, ACC_HELPS]).endswith("-4.0 [-6.0, -2.0] s (-4.0 %) at 20 %.")
 
 
 def test_the_answer_is_the_largest_gain_among_those_that_pass() -> None:
@@ -85,7 +85,7 @@ def test_the_answer_is_the_largest_gain_among_those_that_pass() -> None:
 
 
 def test_where_nothing_passes_nothing_is_recommended_and_the_quickest_is_shown() -> None:
-    judged = [QUICK_AND_WRONG, ControllerResult(0.2, "pi", replace(GOOD, failed=1), BEYOND)]
+    judged = [QUICK_AND_WRONG, ControllerResult(0.2, "pi", replace(GOOD, failed_episodes=1), BEYOND)]
     assert recommended_result(judged) is None
     assert assessment_headline(judged, [ACC_HELPS]) == (
         "No controller is recommended on this road: none passes the rule. ACC vehicles alone shorten travel "
@@ -104,13 +104,13 @@ def test_without_a_tested_controller_nothing_is_recommended_or_shown() -> None:
 
 
 def test_without_a_verdict_the_words_say_how_wide_the_interval_is_and_what_is_missing() -> None:
-    open_one = replace(HELPS, difference_to_acc=between(-5.0, 3.0), missing=300.0)
+    open_one = replace(HELPS, difference_to_acc=between(-5.0, 3.0), missing_seeds=300.0)
     assert open_one.summary.endswith(
         "; no verdict yet: the interval is ±4.0 s, and a verdict needs about 300 more test seeds (900 episodes)."
     )
     assert assessment_headline([open_one], []).startswith("No controller is recommended on this road so far: ")
-    assert "too few for an interval" in replace(open_one, missing=inf).summary
-    assert replace(ACC_CHANGES_NOTHING, missing=7.0).summary.endswith("about 7 more test seeds (14 episodes).")
+    assert "too few for an interval" in replace(open_one, missing_seeds=inf).summary
+    assert replace(ACC_CHANGES_NOTHING, missing_seeds=7.0).summary.endswith("about 7 more test seeds (14 episodes).")
 
 
 @pytest.mark.parametrize(

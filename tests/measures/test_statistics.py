@@ -29,7 +29,7 @@ from unjam_paper.results_file import read_part
 
 COUNTS = (3, 5, 10, 20)
 REPEATS = 500
-DRIVABLE = Path(__file__).parents[2] / "results" / "drivable.json"
+FEASIBLE_RING = Path(__file__).parents[2] / "results" / "feasible-ring.json"
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=12)
 
 
@@ -56,7 +56,7 @@ def test_intervals_of_ratios_cover_what_they_say(count: int) -> None:
 
 def returns_on_ring() -> dict[str, np.ndarray]:
     """The returns of each driver that was measured on the ring, a row per length of it."""
-    found = read_part(DRIVABLE, "ring")
+    found = read_part(FEASIBLE_RING, "ring")
     return {
         driver: np.array([[row["return"] for row in lengths[driver]["episodes"]] for lengths in found.values()])
         for driver in found["220"]
