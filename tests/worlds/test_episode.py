@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import random_network
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, Constant, Driver, FollowerStopper, Human, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.observation import local_observation

@@ -12,7 +12,7 @@ import sumo
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from tests.worlds.sumo.own_roads import game, straight
+from tests.worlds.sumo.user_networks import game, straight
 from unjam.drivers import Human
 from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.own_roads import grid, straight
+from tests.worlds.sumo.user_networks import grid, straight
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState
 from unjam.drivers.road_experts import Cruise, JamAhead

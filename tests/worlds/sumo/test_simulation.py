@@ -6,7 +6,7 @@ import numpy as np
 import psutil
 import pytest
 
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import EpisodeError, InputError, UnjamError

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.worlds.sumo.own_roads import STANDING, TELEPORTS, UNSORTED, straight
+from tests.worlds.sumo.user_networks import STANDING, TELEPORTS, UNSORTED, straight
 from unjam.drivers import Human
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.own_roads import STANDING, TELEPORTS, crossing, straight, two_way
+from tests.worlds.sumo.user_networks import STANDING, TELEPORTS, crossing, straight, two_way
 from unjam.drivers import Constant, Human
 from unjam.errors import EpisodeError
 from unjam.scenarios import make_scenario

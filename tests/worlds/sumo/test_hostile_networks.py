@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 import unjam
-from tests.worlds.sumo.own_roads import game, straight
+from tests.worlds.sumo.user_networks import game, straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM
 from unjam.scenarios import make_scenario

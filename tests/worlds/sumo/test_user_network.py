@@ -8,7 +8,7 @@ import libsumo
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.own_roads import game, grid, straight
+from tests.worlds.sumo.user_networks import game, grid, straight
 from tests.worlds.test_record import fingerprint, travelled
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.command import Command

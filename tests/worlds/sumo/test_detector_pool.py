@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.own_roads import game, straight
+from tests.worlds.sumo.user_networks import game, straight
 from unjam.errors import EpisodeError, LostWorkerError
 from unjam.scenarios.user_network import UserNetwork, load_user_network
 from unjam.worlds.sumo.detector_pool import MAX_DETECTOR_ATTEMPTS, DetectorPool

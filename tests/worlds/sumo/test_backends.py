@@ -16,7 +16,7 @@ import pytest
 import traci
 
 import unjam
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import LocalState
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import EpisodeError, LostWorkerError, UnjamError
@@ -183,7 +183,7 @@ def test_an_episode_within_an_episode_of_the_same_simulation_is_refused(simulati
 AS_USERS_DO = """
 import json, traci, unjam, warnings
 warnings.simplefilter("ignore")
-from tests.worlds.sumo.test_library import environment_rewards, episode_speeds
+from tests.worlds.sumo.test_backends import environment_rewards, episode_speeds
 from unjam.environments.gymnasium_env import RoadEnv
 environment = RoadEnv(warmup=0)
 environment.reset(seed=0)

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.networks import count_teleports
-from tests.worlds.sumo.own_roads import STANDING, TELEPORTS, built, network, straight
+from tests.worlds.sumo.user_networks import STANDING, TELEPORTS, built, network, straight
 from unjam import sumo_files
 from unjam.drivers import IDM, Human
 from unjam.errors import InputError, SumoInputError

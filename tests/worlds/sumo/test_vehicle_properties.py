@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.own_roads import SPARSE, network
+from tests.worlds.sumo.user_networks import SPARSE, network
 from unjam.controller import make_driver
 from unjam.drivers import Constant, Human
 from unjam.drivers.command import Command

@@ -10,7 +10,7 @@ import pytest
 
 from tests.test_processes import soon
 from tests.test_sandbox import kept
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from tests.worlds.test_record import fingerprint
 from unjam import drive
 from unjam.drivers import IDM, LocalState
@@ -51,7 +51,8 @@ def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, sim
         for each in (simulation, apart):
             make_traffic(road, (0,), each).start(is_controlled=False)  # pyright: ignore[reportArgumentType]
             names = ["0", "1"]
-            arguments = {"neighbours": ("1", 100.0), "left": (), "expects_vehicles": (), "lanes": ()}
+            arguments = dict[str, tuple[object, ...]]({"neighbours": ("1", 100.0), "left": (), "expects_vehicles": ()})
+            arguments |= dict.fromkeys(("lanes", "now", "has_refused"), ())
             arguments |= dict.fromkeys(("type_of", "route_of"), ("1",))
             answers.append(
                 {name: getattr(each, name)(*arguments.get(name, (names,))) for name, _ in asked if name not in told}

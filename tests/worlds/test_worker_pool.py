@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import random_network
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
 from unjam.drivers.safety import SafetyFilter
