@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.training.test_run import small_config
-from tests.worlds.test_workers import has_ended
+from tests.worlds.test_worker_pool import has_ended
 from unjam.errors import InputError
 from unjam.folders import PROTECTED_FOLDERS_VARIABLE
 from unjam.processes import (

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.test_processes import soon
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam import sandbox
 from unjam.drivers.user_driver import FileDriver
 from unjam.processes import kernel_protections

@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import unjam
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import IDM, Constant
 from unjam.drivers.registry import driver_from_name
 from unjam.environments.gymnasium_env import RoadEnv

@@ -9,7 +9,7 @@ import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import unjam
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import Constant
 from unjam.environments.gymnasium_env import RoadStepResult
 from unjam.environments.threads import CopyableLock

@@ -15,10 +15,10 @@ import psutil
 
 from tests.faults.files import any_mutation
 from tests.faults.outcome import Outcome, one_line
-from tests.worlds.sumo.own_roads import straight
-from tests.worlds.sumo.test_hostile import OPTIONS, WRITING
+from tests.worlds.sumo.user_networks import straight
+from tests.worlds.sumo.test_hostile_networks import OPTIONS, WRITING
 from tests.worlds.test_record import fingerprint
-from tests.worlds.test_workers import processes
+from tests.worlds.test_worker_pool import processes
 from unjam.drivers import IDM, PISaturation
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario

@@ -24,9 +24,9 @@ from tests.test_user_code import LATE, plant_bytecode
 from tests.training.test_belonging import of_expert, of_network, of_reward, with_checkpoint
 from tests.training.test_crash_points import Moment, content_of, crash, run
 from tests.training.test_run import small_config
-from tests.worlds.sumo.own_roads import straight
-from tests.worlds.sumo.test_hostile import OPTIONS
-from tests.worlds.sumo.test_network_files import edges_of
+from tests.worlds.sumo.user_networks import straight
+from tests.worlds.sumo.test_hostile_networks import OPTIONS
+from tests.worlds.sumo.test_networks import edges_of
 from tests.worlds.test_episode import insists
 from tests.worlds.test_record import fingerprint
 from unjam import sandbox

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.errors import InputError
 from unjam.following.loaders import METERS_PER_FOOT, ReadOptions, read_pairs
 from unjam.worlds.sumo.networks import sumo_program

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario

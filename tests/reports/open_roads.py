@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.worlds.sumo.own_roads import game
+from tests.worlds.sumo.user_networks import game
 from unjam.controller import make_driver
 from unjam.drivers import Human, PISaturation
 from unjam.reports.results import PLOT_ARRAYS, PlotEpisode, to_plot_episode

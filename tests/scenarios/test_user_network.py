@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.sumo_files.test_sumo_files import configuration
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import Human
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe

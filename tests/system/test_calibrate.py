@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.conftest import Run
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 
 PEOPLE = '<flow id="f" type="car" route="along" begin="0" end="60" period="5" departSpeed="max"/>'
 ROWS = ["lane,position,begin,end,flow_veh_per_h,speed", "road_0,100,0,30,480,15", "road_0,100,30,60,600,"]

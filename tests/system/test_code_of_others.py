@@ -9,7 +9,7 @@ from tests.controller.test_file import residual
 from tests.system.conftest import Run
 from tests.system.test_wrong_inputs import one_line
 from tests.training.test_run import small_config
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.cli import CODE_RUNNING_COMMANDS
 from unjam.controller import controller_bytes
 from unjam.training.config import to_toml

@@ -13,7 +13,7 @@ import pytest
 from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.controller import controller_bytes, packaged_file
 from unjam.controller.file import SAMPLE_PART, replay_states, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation

@@ -10,7 +10,7 @@ from tests.system.conftest import Run
 from tests.system.test_wrong_inputs import one_line
 from tests.test_processes import holder
 from tests.training.test_tasks import mixture
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.controller.file import GRAPH_PART
 from unjam.drivers import Constant
 from unjam.training.run_folder import create_run_folder

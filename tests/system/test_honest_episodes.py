@@ -8,7 +8,7 @@ import pytest
 
 import unjam as package
 from tests.system.conftest import Run
-from tests.worlds.sumo.own_roads import LATE, STANDING, TELEPORTS, UNSORTED, crossing, straight, two_way
+from tests.worlds.sumo.user_networks import LATE, STANDING, TELEPORTS, UNSORTED, crossing, straight, two_way
 from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario

@@ -12,7 +12,7 @@ import pytest
 
 from tests.system.conftest import UNJAM, Run
 from tests.training.test_run import small_config
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.training.config import to_toml
 
 FOUND_AT_START = {"sitecustomize", "usercustomize", "unjam", "planted", "no_such_module_anywhere"}

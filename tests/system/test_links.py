@@ -16,7 +16,7 @@ from tests.paper.test_field import table
 from tests.system.conftest import PLAIN, UNJAM, Run
 from tests.system.test_calibrate import CALIBRATE, PEOPLE, ROWS
 from tests.system.test_verbs import SMALL, TINY_RUN
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.processes import LOCK_FILE
 
 ROAD = {

@@ -11,7 +11,7 @@ import pytest
 
 from tests.following.made_up import write_table
 from tests.system.conftest import ROOT, Run
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 
 README = (ROOT / "README.md").read_text()
 TINY_TRAINING = shlex.split(

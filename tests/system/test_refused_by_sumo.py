@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.conftest import Run
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 
 LATE = (
     '<flow id="f" type="car" from="road" to="road" begin="0" end="690" period="9"/>'

@@ -15,7 +15,7 @@ from PIL import Image
 from tests.faults.processes import SETTINGS, TINY
 from tests.paper.test_field import table
 from tests.system.conftest import UNJAM, Run
-from tests.worlds.sumo.own_roads import game, straight
+from tests.worlds.sumo.user_networks import game, straight
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=80"]
 TINY_RUN = [

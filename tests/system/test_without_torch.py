@@ -9,7 +9,7 @@ import pytest
 
 from tests.following.made_up import write_table
 from tests.system.conftest import PLAIN
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.errors import TRAIN_PACKAGES
 
 # Python runs a file of this name first, in workers too.

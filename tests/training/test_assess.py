@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.worlds.sumo.own_roads import SPARSE, network, straight
+from tests.worlds.sumo.user_networks import SPARSE, network, straight
 from unjam.errors import InputError
 from unjam.reports.assessment import render_assessment
 from unjam.reports.results import read_results, read_rows

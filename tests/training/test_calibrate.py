@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import PISaturation
 from unjam.errors import InputError, LostWorkerError, UnjamError
 from unjam.measures.detectors import DETECTOR_COLUMNS, aggregate_passages, compute_agreement

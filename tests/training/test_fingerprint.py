@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.training.test_run import small_config
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.errors import InputError
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.export import ControllerStore

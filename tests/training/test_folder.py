@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.training.test_run import STEPS, small_config
-from tests.worlds.sumo.own_roads import straight
+from tests.worlds.sumo.user_networks import straight
 from unjam.errors import InputError
 from unjam.training.config import load_config
 from unjam.training.run_folder import check_config, create_run_folder, read_config, resume_run_folder
