@@ -53,7 +53,7 @@ docs: $(VENV)/.installed-dev
 	$(BIN)/python -m sphinx -q -E -W -b html docs docs/_build/html
 	@echo docs/_build/html/index.html
 
-# Thousands of injected faults, half an hour: results/soak/soak.json
+# Thousands of injected faults, half an hour: results/soak.json
 soak: $(VENV)/.installed-dev
 	$(BIN)/python tests/faults/soak.py
 

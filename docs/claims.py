@@ -1,11 +1,10 @@
 """The paper's claims beside what the studies found, from files under results/."""
 
-import json
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from tables import RESULTS
+from tables import results_part
 
 from studies import beyond_own_expert, rows_of
 from unjam.measures.statistics import over_trainings
@@ -96,7 +95,7 @@ def fastest_on(road: str) -> Claim:
 
 def tenths(study: str, road: str, variant: str, name: str) -> np.ndarray:
     """Return a learning curve as means over tenths of the training and over the trainings, shape (10,)."""
-    curves = json.loads((RESULTS / study / "curves.json").read_text())
+    curves = results_part(f"{study}/curves")
     return np.mean(curves[road][variant][name], axis=0).reshape(TENTHS, -1).mean(axis=1)
 
 
@@ -145,7 +144,7 @@ def collisions() -> Claim:
 
 def trpo_slowest() -> Claim:
     """Do the other variants of Table 2 reach TRPO's own final return before it does?"""
-    curves = json.loads((RESULTS / "table-2" / "curves.json").read_text())["ring"]
+    curves = results_part("table-2/curves")["ring"]
     goal = 0.9 * tenths("table-2", "ring", "trpo", "return_mean")[-1]
     arrivals = {}
     for variant in ("trpo", "mb-trpo", "no-initial-policy", "proposed"):
@@ -209,8 +208,7 @@ def volumes() -> Claim:
 def training_time() -> Claim:
     """Does the paper's method take 37 % longer than TRPO, and less than PPO and SAC?"""
     words = "37 % more training time than TRPO, 4.6 % less than PPO and SAC"
-    path = RESULTS / "figure-8/time.json"
-    over = json.loads(path.read_text())["over_trpo"]
+    over = results_part("figure-8/time")["over_trpo"]
     held = abs(over["proposed"] - 1.37) < 0.1 and over["proposed"] < min(over["ppo"], over["sac"])
     numbers = ", ".join(f"{name} {over[name]:.2f}" for name in ("proposed", "ppo", "sac"))
     return words, verdict(held), f"times TRPO's, side by side: {numbers}"
@@ -218,8 +216,7 @@ def training_time() -> Claim:
 
 def model_error() -> Claim:
     """Does eps_m fall during training?"""
-    words, path = "the model error falls during training", RESULTS / "theory/theory.json"
-    runs = json.loads(path.read_text())["model"]["proposed"]
+    words, runs = "the model error falls during training", results_part("theory/theory")["model"]["proposed"]
     fell = [run[-1]["eps_m"] < run[0]["eps_m"] for run in runs]
     ends = "; ".join(f"{run[0]['eps_m']:.2f} to {run[-1]['eps_m']:.2f}" for run in runs)
     return words, verdict(all(fell)), f"eps_m, first to last iteration: {ends}"

@@ -1,6 +1,5 @@
 """Learning with the virtual environment and without it, from what `unjam reproduce` made."""
 
-import json
 from io import BytesIO
 
 import numpy as np
@@ -8,7 +7,7 @@ import pandas as pd
 from IPython.display import Image
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
-from tables import RESULTS
+from tables import results_part
 
 from studies import rows_of
 from unjam.studies.comparison import interval
@@ -33,7 +32,7 @@ def validations(variant: str, study: str = "table-2", road: str = "ring") -> tup
 
     Before a training was validated for the first time there is nothing.
     """
-    curves = json.loads((RESULTS / study / "curves.json").read_text())[road][variant]
+    curves = results_part(f"{study}/curves")[road][variant]
     steps, values = np.array(curves["steps"]), np.array(curves["return_validation"])
     known = (values != values[:, :1]).any(0)  # until then the first is all that is known
     first = int(np.argmax(known)) if known.any() else len(steps)

@@ -1,12 +1,10 @@
-"""Cards of the gallery, made from results/gallery/gallery.json: no number is typed in."""
-
-import json
+"""Cards of the gallery, made from results/gallery.json: no number is typed in."""
 
 import pandas as pd
 from IPython.display import HTML
-from tables import RESULTS, show
+from tables import results_part, show
 
-CARDS = json.loads((RESULTS / "gallery/gallery.json").read_text())["cards"]
+CARDS = results_part("gallery/cards")
 
 
 def card(name: str) -> HTML:

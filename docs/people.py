@@ -1,12 +1,11 @@
-"""Tables of how people drive, from files under results/figure-6/ and results/field/."""
+"""Tables of how people drive, from results/figure-6.json and results/field.json."""
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from tables import RESULTS
+from tables import results_part
 
 from unjam.measures.statistics import estimate
 from unjam.measures.table import cell_of
@@ -30,13 +29,13 @@ MODELS = {
 
 
 def rows_of(name: str) -> pd.DataFrame:
-    """Return the rows of a results file."""
-    return pd.DataFrame(json.loads((RESULTS / name).read_text())["rows"])
+    """Return the rows of a part of a results file, FILE/PART."""
+    return pd.DataFrame(results_part(name)["rows"])
 
 
 def figure_6(**chosen: Any) -> pd.DataFrame:
     """Return the rows of the study of Fig. 6 with these values, by size, network, repeat."""
-    rows = rows_of("figure-6/figure-6.json")
+    rows = rows_of("figure-6/figure-6")
     for name, value in chosen.items():
         rows = rows[rows[name] == value]
     return rows.sort_values(["size", "network", "repeat"])
@@ -71,7 +70,7 @@ def leaks() -> pd.DataFrame:
 
 def field(data: str, test: str, models: Sequence[str] = tuple(MODELS)) -> pd.DataFrame:
     """Return errors on a test set: of a single seed with its interval, of several their mean and range."""
-    rows = rows_of("field/field.json")
+    rows = rows_of("field/field")
     rows = rows[(rows["data"] == data) & (rows["test"] == test)]
     table = []
     for model in models:
@@ -99,7 +98,7 @@ def _cell(found: pd.DataFrame, name: str) -> str:
 
 def gap_error(model: str, data: str = "ngsim", test: str = "test") -> float:
     """Return the error of the gap, mean over seeds [m]."""
-    rows = rows_of("field/field.json")
+    rows = rows_of("field/field")
     chosen = (rows["data"] == data) & (rows["test"] == test) & (rows["model"] == model)
     return float(rows[chosen]["gap"].mean())
 
@@ -107,7 +106,7 @@ def gap_error(model: str, data: str = "ngsim", test: str = "test") -> float:
 def ring() -> pd.DataFrame:
     """Return what happens on the ring, by who the people are and who drives the CAV."""
     table = []
-    for (people, driver), found in rows_of("field/ring.json").groupby(["people", "driver"], sort=False):
+    for (people, driver), found in rows_of("field/ring").groupby(["people", "driver"], sort=False):
         table.append(
             {
                 "people": people,
@@ -176,7 +175,7 @@ def _sizes(rows: pd.DataFrame, words: str, how: str) -> tuple[str, str, str]:
 
 
 def _one_step() -> tuple[str, str, str]:
-    rows = rows_of("field/field.json")
+    rows = rows_of("field/field")
     rows = rows[(rows["data"] == "ngsim") & (rows["test"] == "others")]
     means = rows.groupby("model")["one_step"].mean()
     knowledge, alone = means["knowledge, paper's IDM clipped"], means["vanilla"]

@@ -1,11 +1,10 @@
 """Tables of the studies that `unjam reproduce` made, from files under results/."""
 
-import json
 import shlex
 from typing import Any
 
 import pandas as pd
-from tables import RESULTS, metrics_of
+from tables import RESULTS, metrics_of, results_part
 from tables import rows_of as rows_of_file
 
 from unjam.measures.drivable import DRIVABLE
@@ -13,6 +12,7 @@ from unjam.measures.statistics import over_trainings
 from unjam.measures.table import unbroken
 from unjam.studies import STUDIES
 from unjam.studies.comparison import HONEST, entries, estimates, interval, number
+from unjam.studies.results_file import read_parts
 from unjam.studies.references import REFERENCES, TUNED
 from unjam.studies.study import ROADS, VARIANTS
 
@@ -23,7 +23,7 @@ PAPER = {"reward": "return", "speed": "CAV's speed [m/s]", "std": "its std [m/s]
 
 def page_table(study: str, name: str) -> pd.DataFrame:
     """Return a table that a study itself makes for its page."""
-    return STUDIES[study].tables[name](RESULTS / study)
+    return STUDIES[study].tables[name](RESULTS / f"{study}.json")
 
 
 def rows_of(study: str, road: str) -> list[dict[str, Any]]:
@@ -31,15 +31,17 @@ def rows_of(study: str, road: str) -> list[dict[str, Any]]:
 
     Tables of before have percentile intervals: they are made anew from the trainings' gains, where these are.
     """
-    rows = json.loads((RESULTS / study / "table.json").read_text())
+    rows = results_part(f"{study}/table")
     for row in rows:
         if "gains" in row and "smallest" not in row["beyond_best_expert"]:
             row["beyond_best_expert"] = entries(over_trainings(row["gains"]))
             row["probability_of_improvement"] = {"mean": row["probability_of_improvement"]["mean"]}
     rows = [row for row in rows if row["road"] == road]
-    path = RESULTS / f"experts/tuned-on-{road}.json"
     known = any(row["name"].startswith("tuned ") for row in rows)
-    return rows if known or not path.is_file() else beside_tuned(rows, rows_of_file(str(path)))
+    later = f"tuned-on-{road}"
+    if known or later not in read_parts(RESULTS / "experts.json"):
+        return rows
+    return beside_tuned(rows, rows_of_file(f"experts/{later}"))
 
 
 def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -146,9 +148,11 @@ def merge_capacity() -> pd.DataFrame:
     """Return how people alone fare on the merge, by how many want to enter and how the road begins."""
     names = ("mean_speed", "mean_speed_steady", "throughput_veh_per_h", "backlog_veh")
     tables = []
-    for path in sorted((RESULTS / "tried" / "merge-capacity").glob("*.json")):
-        standing, inflow = (int(part) for part in path.stem.split("-"))
-        table = metrics_of(str(path.relative_to(RESULTS)), names)
+    for part in read_parts(RESULTS / "research-notes.json"):
+        if not part.startswith("merge-capacity-"):
+            continue
+        standing, inflow = (int(number) for number in part.split("-")[-2:])
+        table = metrics_of(f"research-notes/{part}", names)
         table.insert(0, "highway [veh/h]", f"{inflow:,}")
         table.insert(0, "start", f"{standing} standing" if standing else "empty")
         tables.append(table)
@@ -158,10 +162,10 @@ def merge_capacity() -> pd.DataFrame:
 def closing_absorber() -> pd.DataFrame:
     """Return what closing up is worth to the jam absorber, and in how many episodes no jam stays."""
     names = ("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "backlog_veh")
-    table = metrics_of("tried/merge-closing.json", names)
+    table = metrics_of("research-notes/merge-closing", names)
     table["without a jam"] = [
         f"{sum(row['mean_speed'] > FREE for row in rows)} of {len(rows)}"
-        for rows in rows_of_file("tried/merge-closing.json").values()
+        for rows in rows_of_file("research-notes/merge-closing").values()
     ]
     return table
 

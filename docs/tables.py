@@ -1,9 +1,9 @@
 """Tables of the documentation, made from the measured files under results/: no number is typed in."""
 
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,14 +14,21 @@ from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, estimate_of, paired_difference
 from unjam.measures.table import baseline_of, cell_of, unbroken
 from unjam.reports.model import error_text
+from unjam.studies.results_file import read_part
 
 RESULTS = Path(__file__).parent.parent / "results"
 
 
+def results_part(name: str) -> Any:
+    """Return a part of a results file; its name is FILE/PART."""
+    file, _, part = name.partition("/")
+    return read_part(RESULTS / f"{file}.json", part)
+
+
 def rows_of(name: str) -> dict[str, list[dict]]:
-    """Return the rows of a results file, by driver."""
+    """Return the rows of a part of a results file, FILE/PART, by driver."""
     rows: dict[str, list[dict]] = {}
-    for row in json.loads((RESULTS / name).read_text())["rows"]:
+    for row in results_part(name)["rows"]:
         rows.setdefault(row["driver"], []).append(
             {key: float("nan") if value is None else value for key, value in row.items()}
         )
@@ -29,7 +36,7 @@ def rows_of(name: str) -> dict[str, list[dict]]:
 
 
 def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.DataFrame:
-    """Return a table of a results file: a row per driver, mean and 95 % interval per metric.
+    """Return a table of a part of a results file: a row per driver, mean and 95 % interval per metric.
 
     Last comes, where it is `compared`, the first metric beyond people alone, else beyond the best expert.
     """
@@ -54,7 +61,7 @@ def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.D
 
 
 def mean_of(name: str, driver: str, metric: str) -> float:
-    """Return the mean of one metric of one driver in a results file."""
+    """Return the mean of one metric of one driver in a part of a results file."""
     return estimate_of(rows_of(name)[driver], metric).mean
 
 
@@ -62,7 +69,7 @@ def batch_sizes() -> pd.DataFrame:
     """Return how many steps vehicles make in a second, by how many rings are stepped at once and on what."""
     columns = {}
     for name in ("cpu", "gpu"):
-        measured = json.loads((RESULTS / f"batch/sizes-{name}.json").read_text())
+        measured = results_part(f"batch/sizes-{name}")
         for people, found in measured["batches"].items():
             columns[f"{measured['device']}, {people} [million/s]"] = {
                 entry["rings"]: f"{entry['vehicle_steps_per_s'] / 1e6:,.1f}" for entry in found
@@ -74,7 +81,7 @@ def batch_sizes() -> pd.DataFrame:
 
 def knowledge_rows(road: str) -> pd.DataFrame:
     """Return what the study of knowledge measured on a road: a row per model, number of steps and seed."""
-    rows = json.loads((RESULTS / "model/knowledge.json").read_text())["rows"]
+    rows = results_part("model/knowledge")["rows"]
     return pd.json_normalize([row for row in rows if row["road"] == road])
 
 
@@ -119,7 +126,7 @@ def roads_known(road: str) -> pd.DataFrame:
     Of a step, and of whole episodes: speed of all, and how unlike speeds are in the second half, beyond the
     actual ones, where PI drives and where a CAV follows as people do; in brackets the range of the seeds.
     """
-    rows = json.loads((RESULTS / "model/whole_roads.json").read_text())["rows"]
+    rows = results_part("model/whole_roads")["rows"]
     drivers = {"PI": "PI", "a CAV that follows as people do": "as people"}
     metrics = {"speed": ("speed", "m/s", 2), "wave": ("spread", "m/s", 2)}
     return _known([row for row in rows if row["road"] == road], drivers, metrics)
@@ -127,7 +134,7 @@ def roads_known(road: str) -> pd.DataFrame:
 
 def on_ramps_known() -> pd.DataFrame:
     """Return how wrong imagined on-ramps are, as `roads_known`: travel time and flow beyond the actual."""
-    rows = json.loads((RESULTS / "model/on_ramps.json").read_text())["rows"]
+    rows = results_part("model/on_ramps")["rows"]
     drivers = {"the expert of the data": "the expert", "people alone": "people alone"}
     metrics = {"travel_time": ("travel time", "s", 1), "throughput_veh_per_h": ("flow", "veh/h", 0)}
     return _known(rows, drivers, metrics)
@@ -167,11 +174,11 @@ LEVELS = {
 
 
 def levels(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.DataFrame:
-    """Return what drivers that never learned earn, of `results/tried/NAME.json`.
+    """Return what drivers that never learned earn, of the part NAME of `results/research-notes.json`.
 
     `columns` has headings of what tells rows apart, `chosen` the values of them that are shown.
     """
-    rows = json.loads((RESULTS / f"tried/{name}.json").read_text())["rows"]
+    rows = results_part(f"research-notes/{name}")["rows"]
     return pd.DataFrame(
         {heading: row[key] for key, heading in columns.items()}
         | {heading: cell_of(Estimate(**row[key]), digits) for key, (heading, digits) in LEVELS.items()}
@@ -193,7 +200,7 @@ def _steps_of(text: str) -> int:
 
 def guesses() -> pd.DataFrame:
     """Return what a car can guess of its road, by what it remembers: on seen rings; on held-out ones."""
-    explained = json.loads((RESULTS / "tried/memory/memory.json").read_text())["explained"]
+    explained = results_part("research-notes/memory")["explained"]
     seen, held_out = next(iter(explained.values()))
     rows = []
     for form, of in explained.items():
@@ -206,13 +213,30 @@ def guesses() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-SOAK = "soak/soak.json"
+def notes_table() -> dict[str, pd.DataFrame]:
+    """Return what was tried without success, a table for each topic."""
+    tables: dict[str, list[dict[str, str]]] = {}
+    for row in results_part("research-notes/notes"):
+        number = "–" if row["mean"] is None else f"{row['mean']:,g}"
+        if row["low"] is not None:
+            number += f" [{row['low']:,g}, {row['high']:,g}]"
+        tables.setdefault(row["topic"], []).append(
+            {
+                "what was tried": row["tried"],
+                "measured": row["metric"],
+                "number": number,
+                "based on": row["basis"],
+                "conclusion": row["conclusion"],
+                "source": row["source"],
+            }
+        )
+    return {topic: pd.DataFrame(rows) for topic, rows in tables.items()}
 
 
 def networks_table() -> pd.DataFrame:
     """Return how the human baseline compares with plain SUMO on public networks: a row for each."""
     rows = {}
-    for name, found in json.loads((RESULTS / "networks.json").read_text())["networks"].items():
+    for name, found in results_part("networks/networks").items():
         about = {"simulated [s]": f"{found['seconds']:.0f}"}
         if "refused" in found:
             rows[name] = {**about, "result": f"refused: {found['refused']}"}
@@ -240,7 +264,7 @@ def networks_table() -> pd.DataFrame:
 def soak_table() -> pd.DataFrame:
     """Return what was injected in the last soak, how often, and what happened."""
     table = []
-    for row in json.loads((RESULTS / SOAK).read_text())["rows"]:
+    for row in results_part("soak/rows"):
         happened = [f"{count:,}: {words}" for words, count in row["happened"].items()]
         facts = [f"{name}: {value}" for name, value in row["facts"].items()]
         table.append(
@@ -255,8 +279,8 @@ def soak_table() -> pd.DataFrame:
 
 def soak_origin() -> str:
     """Return with what the rows of the soak were made."""
-    soak = json.loads((RESULTS / SOAK).read_text())
-    made, commits = soak["manifest"], dict.fromkeys(row["commit"] for row in soak["rows"])
+    made = results_part("soak/manifest")
+    commits = dict.fromkeys(row["commit"] for row in results_part("soak/rows"))
     return f"SUMO {made['packages']['libsumo']}, commit {', '.join(commits)}, {made['started'][:10]}"
 
 

@@ -1,11 +1,10 @@
-"""Tables of what was measured of the paper's theorems, from results/theory/."""
+"""Tables of what was measured of the paper's theorems, from results/theory.json."""
 
-import json
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from tables import RESULTS
+from tables import results_part
 
 from unjam.measures.statistics import over_trainings
 from unjam.studies.comparison import entries, interval
@@ -14,7 +13,7 @@ from unjam.studies.study import VARIANTS
 
 def measured() -> dict[str, Any]:
     """Return all that the study wrote."""
-    return json.loads((RESULTS / "theory" / "theory.json").read_text())
+    return results_part("theory/theory")
 
 
 def untrained() -> pd.DataFrame:
