@@ -65,7 +65,7 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     trained = manifest.get("scenario")
     if not isinstance(trained, dict):
         return ""
-    made = "tuned" if "tuned" in manifest else "trained"
+    made = "tuned" if "tuning" in manifest else "trained"
     if trained.get("kind") != road["kind"]:
         return f"was {made} on the {_printable(trained.get('kind'))}, not on the {road['kind']}"
     there, here = flatten_keys(trained), flatten_keys(road)
@@ -84,7 +84,7 @@ def step_mismatch(driver: Driver, road: dict[str, Any]) -> str:
     `road` is the recipe of the scenario. Of a driver by kind of road it is not known which of them drives.
     """
     step, recipe = road["simulation_step"] * road["steps_per_control_step"], driver.recipe()
-    steps = set(_time_steps(recipe)) if recipe["kind"] != "by-road" else set()
+    steps = set(_time_steps(recipe)) if recipe["kind"] != "road-type-switch" else set()
     if not steps or any(abs(each - step) < 1e-9 for each in steps):
         return ""
     counted = ", ".join(f"{each:g}" for each in sorted(steps))

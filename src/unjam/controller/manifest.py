@@ -16,7 +16,7 @@ from unjam.files import parse_json
 from unjam.parameters import STRICT, build_dataclass
 from unjam.tree import leaves
 
-MANIFEST_FORMAT = 3
+MANIFEST_FORMAT = 4
 """version of the schema; only this one is read"""
 PROVENANCE_ENTRIES = (
     *("summary", "scenario", "time_step", "action_limit", "expert", "versions"),
@@ -152,4 +152,4 @@ def _memory_entry(name: str, value: Any) -> JsonObject:
     values = np.asarray(value, np.float64)
     different = np.unique(values)  # NaN is one value
     first = different[0].item() if len(different) == 1 else values.tolist()
-    return {"name": name, "shape": list(values.shape), "first": None if first != first else first}
+    return {"name": name, "shape": list(values.shape), "initial": None if first != first else first}

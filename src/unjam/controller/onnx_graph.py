@@ -46,7 +46,7 @@ class ControllerModule(nn.Module):
 def _writable_windows(memory: Memory) -> Memory:
     """Return the memory with each window of speeds in the form that a graph can be drawn of."""
     windows = [name for name in memory if name.rpartition(".")[2] == "window"]
-    seen = {name: memory[f"{name.removesuffix('window')}seen"] for name in windows}
+    seen = {name: memory[f"{name.removesuffix('window')}count"] for name in windows}
     return {**memory, **{name: CircularWindow(memory[name], rows) for name, rows in seen.items()}}
 
 

@@ -249,7 +249,7 @@ def _check_certificate(controller: Controller) -> PartCheck:
     said = parse_json(controller.parts[CERTIFICATE_PART])
     found = _json_roundtrip(make_certificate(controller))
     _require_same("certificate", first_difference(said, found, CERTIFICATE_TOLERANCE))
-    worst = found["worst"]
+    worst = found["worst_cases"]
     tried = f"{worst['steps']:,} steps behind leaders that brake and attack, {worst['contacts']} contacts"
     gap = f"smallest gap {worst['min_gap']:.2f} m"
     return PartCheck("certificate", "checked", f"{tried}, {gap}: tried again with this driver, as certified")

@@ -51,7 +51,7 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
     required_fields: ClassVar[tuple[str, ...]] = ("allowed_speed", "distance_to_merge")
     memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
         ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
-        ScaledInput("it leaves a jam", 1.0, ""),
+        ScaledInput("leaves a jam", 1.0, ""),
     )
 
     time_headway: Positive = 1.5
@@ -77,17 +77,17 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
 
     def initial_memory(self, n: int) -> Memory:
         """Return that no speed is known yet (NaN), and that nobody leaves a jam."""
-        return {"mean": np.full(n, np.nan), "leaves": np.zeros(n)}
+        return {"mean_speed": np.full(n, np.nan), "leaves_jam": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the model with parameters that fit the traffic, and the new memory."""
-        speed, last = state.speed, memory["mean"]
+        speed, last = state.speed, memory["mean_speed"]
         xp = namespace(speed)
         last = xp.where(xp.isnan(last), speed, last)
         mean = last + (1.0 - exp(-self.time_step / self.averaging_time)) * (speed - last)
         approaches, faster = speed - mean < -self.jam_front_speed_change, speed - mean > self.jam_front_speed_change
         ends = approaches | (mean > self.free_speed) | (mean < self.jam_speed)
-        leaves = xp.where(faster, speed * 0.0 + 1.0, xp.where(ends, speed * 0.0, memory["leaves"]))
+        leaves = xp.where(faster, speed * 0.0 + 1.0, xp.where(ends, speed * 0.0, memory["leaves_jam"]))
 
         near = speed < 0.0
         if state.distance_to_merge is not None:
@@ -101,7 +101,7 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
             (leaves > 0.0, JAM_HEAD_STRATEGY),
         ):
             factors = [xp.where(holds, speed * 0.0 + new, old) for new, old in zip(strategy, factors, strict=True)]
-        return self._idm_acceleration(state, *factors), {"mean": mean, "leaves": leaves}
+        return self._idm_acceleration(state, *factors), {"mean_speed": mean, "leaves_jam": leaves}
 
     def _idm_acceleration(
         self, state: LocalState, time_headway_factor: Array, acceleration_factor: Array, deceleration_factor: Array
@@ -123,4 +123,4 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
 
     def memory_features(self, memory: Memory) -> Array:
         """Return the mean own speed, scaled, and whether it leaves a jam, shape (n, 2)."""
-        return stack_columns((memory["mean"] / SPEED_SCALE, memory["leaves"]))
+        return stack_columns((memory["mean_speed"] / SPEED_SCALE, memory["leaves_jam"]))

@@ -98,7 +98,7 @@ def lap_position(state: LocalState) -> Array:
 
 def _section_speed_feature(field: str, location: str) -> Feature:
     """Return the feature of a state's field with a speed for each section ahead, less the own speed."""
-    words = (f"speed {location} {ROAD_SECTION_LENGTH * number:g} m ahead - own" for number in range(SECTIONS_AHEAD))
+    words = (f"mean speed {location} {ROAD_SECTION_LENGTH * number:g} m ahead - own speed" for number in range(SECTIONS_AHEAD))
     return Feature(
         lambda seen: (getattr(seen.state, field) - seen.state.speed[..., None]) / SPEED_SCALE,
         tuple(ScaledInput(each, SPEED_SCALE, "m/s") for each in words),
@@ -131,59 +131,59 @@ FEATURES: dict[str, Feature] = {
         lambda seen: local_observation(seen.state),
         (
             ScaledInput("own speed", SPEED_SCALE, "m/s"),
-            ScaledInput("leader's speed - own", RELATIVE_SPEED_SCALE, "m/s"),
-            ScaledInput("gap to the leader", GAP_SCALE, "m"),
-            ScaledInput("follower's speed - own", RELATIVE_SPEED_SCALE, "m/s"),
-            ScaledInput("gap to the follower", GAP_SCALE, "m"),
+            ScaledInput("leader speed - own speed", RELATIVE_SPEED_SCALE, "m/s"),
+            ScaledInput("leader gap", GAP_SCALE, "m"),
+            ScaledInput("follower speed - own speed", RELATIVE_SPEED_SCALE, "m/s"),
+            ScaledInput("follower gap", GAP_SCALE, "m"),
         ),
     ),
     "expert_acceleration": Feature(
         lambda seen: as_column(seen.expert_acceleration / ACCELERATION_SCALE),
-        (ScaledInput("expert's acceleration", ACCELERATION_SCALE, "m/s2"),),
+        (ScaledInput("expert acceleration", ACCELERATION_SCALE, "m/s2"),),
     ),
     "expert_memory": Feature(lambda seen: seen.expert.memory_features(seen.memory), None),
     "loop_length": Feature(
         lambda seen: as_column(seen.state.loop_length / LOOP_LENGTH_SCALE),
-        (ScaledInput("length of the closed road", LOOP_LENGTH_SCALE, "m"),),
+        (ScaledInput("loop length", LOOP_LENGTH_SCALE, "m"),),
         road_requirement="loop",
     ),
-    "place": Feature(
+    "lap_position": Feature(
         lambda seen: lap_position(seen.state),
-        (ScaledInput("cosine of the place on the lap", 1.0, ""), ScaledInput("sine of the same", 1.0, "")),
+        (ScaledInput("cosine of lap position", 1.0, ""), ScaledInput("sine of lap position", 1.0, "")),
         road_requirement="loop",
     ),
     "route_position": Feature(
         lambda seen: as_column(seen.state.route_position / ROUTE_POSITION_SCALE),
-        (ScaledInput("position along the road", ROUTE_POSITION_SCALE, "m"),),
+        (ScaledInput("route position", ROUTE_POSITION_SCALE, "m"),),
         road_requirement="coordinate",
     ),
     "allowed_speed": Feature(
         lambda seen: as_column((seen.state.allowed_speed - seen.state.speed) / SPEED_SCALE),
-        (ScaledInput("wanted speed - own", SPEED_SCALE, "m/s"),),
+        (ScaledInput("allowed speed - own speed", SPEED_SCALE, "m/s"),),
         required_fields=("allowed_speed",),
     ),
     "distance_to_merge": Feature(
         lambda seen: as_column(clip(seen.state.distance_to_merge / MERGE_DISTANCE_SCALE, -1.0, 2.0)),
-        (ScaledInput("way to where a ramp joins", MERGE_DISTANCE_SCALE, "m"),),
+        (ScaledInput("distance to merge", MERGE_DISTANCE_SCALE, "m"),),
         required_fields=("distance_to_merge",),
     ),
-    "approach": Feature(
+    "merge_proximity": Feature(
         lambda seen: merge_proximity(seen.state),
-        tuple(ScaledInput(f"nearness to {way:g} m before a ramp joins", 1.0, "") for way in PROXIMITY_DISTANCES),
+        tuple(ScaledInput(f"proximity to {way:g} m before the merge", 1.0, "") for way in PROXIMITY_DISTANCES),
         required_fields=("distance_to_merge",),
         accepts_floats=False,
     ),
-    "lane_speeds": _section_speed_feature("lane_speeds", "in its lane"),
-    "road_speeds": _section_speed_feature("road_speeds", "on the road"),
+    "lane_speeds": _section_speed_feature("lane_speeds", "in own lane"),
+    "road_speeds": _section_speed_feature("road_speeds", "on all lanes"),
     "penetration_rate": Feature(
         lambda seen: as_column(seen.state.penetration_rate),
-        (ScaledInput("share of CAVs", 1.0, ""),),
+        (ScaledInput("penetration rate", 1.0, ""),),
         required_fields=("penetration_rate",),
     ),
-    "beside": Feature(
+    "adjacent_lanes": Feature(
         lambda seen: _adjacent_lane_features(seen.state),
         (
-            *(ScaledInput(f"speed {where} - own", RELATIVE_SPEED_SCALE, "m/s") for where in ADJACENT_POSITIONS),
+            *(ScaledInput(f"speed {where} - own speed", RELATIVE_SPEED_SCALE, "m/s") for where in ADJACENT_POSITIONS),
             *(ScaledInput(f"gap {where}", GAP_SCALE, "m") for where in ADJACENT_POSITIONS),
         ),
         required_fields=("adjacent_gaps", "adjacent_speeds"),
@@ -268,7 +268,7 @@ def observation_inputs(names: Sequence[str], expert: Driver) -> tuple[ScaledInpu
     """Return what the network sees with this expert, in the order of `observe`."""
     known = sum(len(feature(name).inputs or ()) for name in names)
     remembered = observation_size(names, expert) - known
-    unnamed = tuple(ScaledInput(f"expert's memory {number}", 1.0, "") for number in range(remembered))
+    unnamed = tuple(ScaledInput(f"expert memory {number}", 1.0, "") for number in range(remembered))
     own = expert.memory_inputs or unnamed
     return tuple(number for name in names for number in (feature(name).inputs or own))
 

@@ -113,21 +113,21 @@ class PIFromGap(PISaturation):
 
     def initial_memory(self, n: int) -> Memory:
         """Return that of the plain one, that the first speed is not known (NaN), and that none faded."""
-        return {**super().initial_memory(n), "first": np.full(n, np.nan), "moments": np.zeros(n)}
+        return {**super().initial_memory(n), "initial_speed": np.full(n, np.nan), "steps": np.zeros(n)}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` with the own speeds of the warm-up in its window, and where it begins then."""
         recalled = super().recall(memory, history)
-        return {**recalled, "first": self.history_factor * window_mean_speed(recalled)}
+        return {**recalled, "initial_speed": self.history_factor * window_mean_speed(recalled)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
         xp = namespace(state.speed)
         allowed = clamp_min((state.leader_gap - self.human_standstill_gap) / self.human_time_headway, 0.0)
-        first = xp.where(xp.isnan(memory["first"]), allowed, memory["first"])
+        first = xp.where(xp.isnan(memory["initial_speed"]), allowed, memory["initial_speed"])
         window = slide_window(memory, state.speed)
-        left = clip(1.0 - memory["moments"] * (self.time_step / self.fade_time), 0.0, 1.0)
+        left = clip(1.0 - memory["steps"] * (self.time_step / self.fade_time), 0.0, 1.0)
         mean = window_mean_speed(window)
         acceleration, command = self._acceleration_and_command(mean + left * (first - mean), state, memory["command"])
-        begun = {"first": first, "moments": memory["moments"] + 1.0}
+        begun = {"initial_speed": first, "steps": memory["steps"] + 1.0}
         return acceleration, {**window, "command": command, **begun}

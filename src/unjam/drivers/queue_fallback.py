@@ -17,7 +17,7 @@ MAX_GATHERING_TIME = 30.0
 """time in which all gather, where their queue fits [s]"""
 PRIMARY_KEY, FALLBACK_KEY = "primary", "fallback"
 """names of both drivers in the memory"""
-ELAPSED_KEY, GATHERED_KEY, GAVE_UP_KEY = "waited", "queue", "given_up"
+ELAPSED_KEY, GATHERED_KEY, GAVE_UP_KEY = "elapsed", "has_gathered", "gave_up"
 """names in the memory: time since it began [s]; whether all had gathered; whether the other one drives"""
 
 
@@ -85,9 +85,9 @@ class QueueFallback(CompositeDriver):
 
     def describe(self) -> str:
         """Return both."""
-        return f"{self.primary.describe()} while all gather, else {self.fallback.describe()}"
+        return f"{self.primary.describe()} while the queue holds, else {self.fallback.describe()}"
 
     def recipe(self) -> Recipe:
         """Return what both are made from, and the time between two decisions."""
         drivers = {name: held.recipe() for name, held in self.inner_drivers.items()}
-        return {"kind": "while-gathered", "drivers": drivers, "time_step": self.time_step}
+        return {"kind": "queue-fallback", "drivers": drivers, "time_step": self.time_step}

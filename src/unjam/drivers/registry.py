@@ -159,7 +159,7 @@ def _build_impaired(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBui
 class _QueueFallbackRecipe:
     """How a driver that leads while all are gathered is written down, with who drives otherwise."""
 
-    kind: Literal["while-gathered"]
+    kind: Literal["queue-fallback"]
     drivers: dict[str, dict[str, Any]]
     time_step: Positive
 
@@ -174,7 +174,7 @@ def _build_queue_fallback(recipe: Recipe, weights: Arrays, build_inner: InnerDri
 class _HistoryRecipe:
     """How a driver that remembers means is written down."""
 
-    kind: Literal["remembering"]
+    kind: Literal["history"]
     driver: dict[str, Any]
     time_step: Positive
 
@@ -211,11 +211,11 @@ RECIPE_BUILDERS: dict[str, Callable[[Recipe, Arrays, InnerDriverBuilder], Driver
     ),
     "impaired": _build_impaired,
     "filtered": _build_filtered,
-    "by-road": lambda recipe, arrays, held: RoadTypeSwitch(
+    "road-type-switch": lambda recipe, arrays, held: RoadTypeSwitch(
         **{kind: held(recipe["drivers"][kind], kind) for kind in ROAD_TYPES if kind in recipe["drivers"]}
     ),
-    "while-gathered": _build_queue_fallback,
-    "remembering": _build_history,
+    "queue-fallback": _build_queue_fallback,
+    "history": _build_history,
 }
 """how each kind of recipe becomes a driver again"""
 
@@ -242,7 +242,7 @@ def _check_user_features_listed(recipe: Recipe) -> None:
             reference = FileReference.parse(name)
             if (str(reference.path), reference.name) not in listed:
                 allowed = "features whose files the recipe lists with their hashes"
-                raise invalid_value("driver recipe: part", name, allowed)
+                raise invalid_value("driver recipe: input", name, allowed)
 
 
 def _iterate_recipes(recipe: Any) -> Iterator[Recipe]:

@@ -144,10 +144,10 @@ class ResidualDriver(CompositeDriver):
             "expert": self.expert.recipe(),
             "action_limit": self.action_limit,
             "inputs": list(self.inputs),
-            "hold": self.action_repeat,
+            "action_repeat": self.action_repeat,
             "authority": self.network.authority,
             "exploration_std": self.network.exploration_std,
-            **({"lasts": True} if self.network.episode_noise else {}),
+            **({"episode_noise": True} if self.network.episode_noise else {}),
             **({"files": files} if files else {}),
         }
 

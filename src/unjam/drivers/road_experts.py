@@ -66,7 +66,7 @@ class Pacer(FormulaDriver):
 
     name: ClassVar[str] = "pacer"
     needs_loop: ClassVar[bool] = True
-    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("all have gathered", 1.0, ""),)
+    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("queue has gathered", 1.0, ""),)
 
     lap_time: Positive = 69.0
     """time for a lap [s]: 6.5 m/s at a radius of 32 m, 7.1 m/s at 35 m"""
@@ -97,7 +97,7 @@ class Pacer(FormulaDriver):
 
     def initial_memory(self, n: int) -> Memory:
         """Return that nobody has gathered yet."""
-        return {"gathered": np.zeros(n)}
+        return {"has_gathered": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the pace, and whether all have gathered by now."""
@@ -110,9 +110,9 @@ class Pacer(FormulaDriver):
             found, after = self._tuned_pacers[lap].act(state, memory)
             closer = abs(loop - lap) < nearest
             acceleration = xp.where(closer, found, acceleration)
-            gathered = xp.where(closer, after["gathered"], gathered)
+            gathered = xp.where(closer, after["has_gathered"], gathered)
             nearest = xp.where(closer, abs(loop - lap), nearest)
-        return acceleration, {"gathered": gathered}
+        return acceleration, {"has_gathered": gathered}
 
     def _nearest_laps(self, loop_length: Array) -> Iterable[float]:
         """Return the laps of those pacers that drive somebody; of tensors, which may be traced, all."""
@@ -125,17 +125,17 @@ class Pacer(FormulaDriver):
 
     @cached_property
     def _tuned_pacers(self) -> dict[float, "Pacer"]:
-        return {lap: replace(self, varying=False, **values) for lap, values in TUNED_PACERS.items()}
+        return {lap: replace(self, use_tuned=False, **values) for lap, values in TUNED_PACERS.items()}
 
     def _lead_queue(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         loop, free = state.loop_length, state.leader_gap
         xp = namespace(state.speed)
         ready, broken = free >= self.gathering_gap * loop, free < self.regathering_gap * loop
-        gathered = xp.where(ready, free * 0.0 + 1.0, xp.where(broken, free * 0.0, memory["gathered"]))
+        gathered = xp.where(ready, free * 0.0 + 1.0, xp.where(broken, free * 0.0, memory["has_gathered"]))
         pace = self._pace(state) + self.gap_gain * (free - self.target_gap * loop)
         pace = clamp_min(pace, MIN_PACE)
         wanted = xp.where(gathered > 0.0, pace, free * 0.0 + self.gathering_speed)
-        return (wanted - state.speed) / self.time_constant, {"gathered": gathered}
+        return (wanted - state.speed) / self.time_constant, {"has_gathered": gathered}
 
     def _pace(self, state: LocalState) -> Array:
         """Return the pace where the vehicles are, before what the free road ahead changes."""
@@ -151,7 +151,7 @@ class Pacer(FormulaDriver):
 
     def memory_features(self, memory: Memory) -> Array:
         """Return whether all have gathered, shape (n, 1)."""
-        return as_column(memory["gathered"])
+        return as_column(memory["has_gathered"])
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -165,7 +165,7 @@ class JamAbsorber(FormulaDriver):
     """
 
     name: ClassVar[str] = "jam-absorber"
-    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("it waits for a jam to go", 1.0, ""),)
+    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("waits for the jam to dissolve", 1.0, ""),)
 
     jam_speed: NonNegative = 10.0
     """a leader slower than this is caught in a jam [m/s]"""
@@ -192,7 +192,7 @@ class JamAbsorber(FormulaDriver):
 
     def initial_memory(self, n: int) -> Memory:
         """Return that nobody waits."""
-        return {"waits": np.zeros(n)}
+        return {"is_waiting": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration, and who waits from now on."""
@@ -200,18 +200,18 @@ class JamAbsorber(FormulaDriver):
         place, gap, ahead = state.route_position, state.leader_gap, state.leader_speed
         within = (place > self.first_position) & (place < self.last_position)
         jam = within & (ahead < self.jam_speed) & (gap < MAX_JAM_DISTANCE)
-        waits = xp.where(jam, zero + 1.0, memory["waits"])
+        waits = xp.where(jam, zero + 1.0, memory["is_waiting"])
         gone = ((gap >= self.release_gap) & (ahead >= self.release_speed)) | (gap >= FREE_ROAD_GAP)
         too_far = place > self.last_position + MAX_OVERRUN
         waits = xp.where(gone | too_far, zero, waits)
         excess = gap - self.standstill_gap - self.time_gap * state.speed
         follow = self.gap_gain * excess + self.speed_gain * (ahead - state.speed) + self.extra_acceleration
         crawl = xp.minimum(self.crawl_speed - state.speed, follow)
-        return xp.where(waits > 0.0, crawl, follow), {"waits": waits}
+        return xp.where(waits > 0.0, crawl, follow), {"is_waiting": waits}
 
     def memory_features(self, memory: Memory) -> Array:
         """Return whether it waits, shape (n, 1)."""
-        return as_column(memory["waits"])
+        return as_column(memory["is_waiting"])
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -275,7 +275,7 @@ class JamAhead(FormulaDriver):
     @model_validator(mode="after")
     def _check_section_order(self) -> "JamAhead":
         if self.last_section < self.first_section:
-            raise ValueError(f"last: {self.last_section} is not allowed; allowed: >= first, {self.first_section}")
+            raise ValueError(f"last_section: {self.last_section} is not allowed; allowed: >= first_section, {self.first_section}")
         return self
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:

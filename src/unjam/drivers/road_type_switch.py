@@ -70,7 +70,7 @@ class RoadTypeSwitch(CompositeDriver):
     def recipe(self) -> Recipe:
         """Return what all of them are made from."""
         drivers = {kind: held.recipe() for kind, held in self.inner_drivers.items()}
-        return {"kind": "by-road", "drivers": drivers}
+        return {"kind": "road-type-switch", "drivers": drivers}
 
     def _road_type(self, state: LocalState) -> str:
         """Return on what kind of road the CAVs are."""

@@ -152,7 +152,7 @@ class UserDriver(Driver):
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return what the user's driver asks of its cars' ACCs, if it asks for anything."""
-        asked = getattr(self.implementation, "time_headways", None)
+        asked = getattr(self.implementation, "time_gaps", None)
         return self.call_user_code(asked, state, memory) if asked and np.size(state.speed) else None
 
     def memory_features(self, memory: Memory) -> Array | None:

@@ -16,18 +16,18 @@ from unjam.errors import InputError
 from unjam.parameters import NonNegative, Positive
 from unjam.physics.arrays import Array, clamp_min, join_columns, namespace, square_root, stack_columns
 
-DRIVER_INDEX_KEY = "kind"
+DRIVER_INDEX_KEY = "driver_index"
 """name in the memory of a mixture: which driver a CAV has"""
-INNER_KEY, STEP_KEY, PENDING_KEY = "inner", "age", "sent"
+INNER_KEY, STEP_KEY, PENDING_KEY = "inner", "step", "pending"
 """names in the memory of a wrapper: the other driver's own; of an impaired one besides: decisions made so
 far; what was said and not yet done"""
 AVERAGING_TIMES = (10.0, 40.0, 160.0)
 """time constants of the means [s]: within a wave, of a wave, of several"""
 SPEED_STD_SCALE, MEAN_GAP_SCALE = 2.0, 20.0
 """of the spread of speeds [m/s] and of the mean gap [m], before a network sees them"""
-HISTORY_STEPS_KEY = "watched"
+HISTORY_STEPS_KEY = "steps"
 """name in the memory: moments that were watched"""
-MEAN_SPEED_KEY, MEAN_SQUARE_KEY, MEAN_GAP_KEY = "speed", "square", "room"
+MEAN_SPEED_KEY, MEAN_SQUARE_KEY, MEAN_GAP_KEY = "mean_speed", "mean_square", "mean_gap"
 """names of the means in the memory, by their span"""
 
 
@@ -170,7 +170,7 @@ class ImpairedDriver(DriverWrapper):
 
     def describe(self) -> str:
         """Return the other driver, and what is worse about it."""
-        worse = (("late", self.delay, "s"), ("gap noise", self.gap_noise, "m"))
+        worse = (("delay", self.delay, "s"), ("gap noise", self.gap_noise, "m"))
         words = [f"{name} {value:g} {unit}" for name, value, unit in worse if value]
         return f"{self.driver.describe()} ({', '.join(words) or 'unimpaired'})"
 
@@ -239,8 +239,8 @@ class HistoryDriver(DriverWrapper):
         mine: list[ScaledInput] = []
         for span in AVERAGING_TIMES:
             mine += [
-                ScaledInput(f"own mean speed over {span:g} s", SPEED_SCALE, "m/s"),
-                ScaledInput(f"spread of own speed over {span:g} s", SPEED_STD_SCALE, "m/s"),
+                ScaledInput(f"mean own speed over {span:g} s", SPEED_SCALE, "m/s"),
+                ScaledInput(f"standard deviation of own speed over {span:g} s", SPEED_STD_SCALE, "m/s"),
                 ScaledInput(f"mean gap over {span:g} s", MEAN_GAP_SCALE, "m"),
             ]
         return (*self.driver.memory_inputs, *mine)
@@ -297,8 +297,8 @@ class HistoryDriver(DriverWrapper):
 
     def describe(self) -> str:
         """Return the other driver, and that it remembers."""
-        return f"{self.driver.describe()}, remembering"
+        return f"{self.driver.describe()}, with history"
 
     def recipe(self) -> Recipe:
         """Return what the other driver is made from, and the time between two decisions."""
-        return {"kind": "remembering", "driver": self.driver.recipe(), "time_step": self.time_step}
+        return {"kind": "history", "driver": self.driver.recipe(), "time_step": self.time_step}
