@@ -7,9 +7,9 @@ import pandas as pd
 from tables import results_part
 
 from studies import beyond_own_expert, rows_of
-from unjam.measures.statistics import over_trainings
-from unjam.studies.comparison import interval
-from unjam.studies.study import VARIANTS
+from unjam.measures.statistics import estimate_over_trainings
+from unjam_paper.comparison import interval_text
+from unjam_paper.study import VARIANTS
 
 Claim = tuple[str, str, str]
 """what the paper says, whether it held, by which numbers"""
@@ -65,7 +65,7 @@ def together(verdicts: list[str]) -> str:
 def earns_more(rows: dict[str, dict[str, Any]], name: str, *others: str) -> str:
     """Say whether one earns more than all others, trainings of the same seed paired, 95 % interval."""
     gain = {one: np.array(rows[one]["gains"]) for one in (name, *others)}
-    found = [over_trainings(gain[name] - gain[other]) for other in others]
+    found = [estimate_over_trainings(gain[name] - gain[other]) for other in others]
     trainings = f"({len(gain[name])} trainings)"
     if all(difference.low > 0 for difference in found):
         return f"held {trainings}"

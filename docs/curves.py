@@ -10,9 +10,9 @@ from matplotlib.ticker import LogLocator, NullLocator
 from tables import results_part
 
 from studies import rows_of
-from unjam.studies.comparison import interval
-from unjam.studies.imagined import compared_with
-from unjam.studies.study import PlannedRun
+from unjam_paper.comparison import interval_text
+from unjam_paper.road_model import compared_variants
+from unjam_paper.study import PlannedRun
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
 COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
@@ -20,7 +20,7 @@ COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
 
 def imagined(prefix: str, road: str = "ring") -> dict[str, str]:
     """Return the labels of the variants that a study of imagined roads compares, large iterations first."""
-    modelled, *others = compared_with(prefix)
+    modelled, *others = compared_variants(prefix)
     sizes = {name: PlannedRun(road, name, 0).config.learner.batch_steps for name in others}
     labels = {name: f"without, in iterations of {size:,}" for name, size in sizes.items()}
     ordered = sorted(labels, key=lambda name: -sizes[name])
@@ -88,7 +88,7 @@ def judged() -> pd.DataFrame:
             {
                 "": label,
                 "trainings": len(curves),
-                "beyond the best tuned expert": interval(row["beyond_best_expert"], 0, "+"),
+                "beyond the best tuned expert": interval_text(row["beyond_best_expert"], 0, "+"),
                 "each": ", ".join(f"{gain:+.0f}" for gain in row["gains"]),
                 f"reach {level:.0f}": f"{len(there)} of {len(curves)}",
                 "after actual steps": ", ".join(f"{count:,}" for count in sorted(there)),

@@ -8,7 +8,7 @@ import pandas as pd
 from tables import results_part
 
 from unjam.measures.statistics import estimate
-from unjam.measures.table import cell_of
+from unjam.measures.metric_table import estimate_cell
 
 NETWORKS = {"knowledge": "IDM + residual", "vanilla": "network alone", "nearest row": "nearest row"}
 MODELS = {
@@ -122,7 +122,7 @@ def ring() -> pd.DataFrame:
 
 def _mean(values: pd.Series, digits: int) -> str:
     found = estimate([float("nan") if value is None else float(value) for value in values])
-    return str(cell_of(found, digits, len(values))) if found.count else "no wave"
+    return str(estimate_cell(found, digits, len(values))) if found.count else "no wave"
 
 
 def claims() -> pd.DataFrame:

@@ -7,14 +7,14 @@ import pandas as pd
 from tables import RESULTS, metrics_of, results_part
 from tables import rows_of as rows_of_file
 
-from unjam.measures.drivable import DRIVABLE
-from unjam.measures.statistics import over_trainings
-from unjam.measures.table import unbroken
-from unjam.studies import STUDIES
-from unjam.studies.comparison import HONEST, entries, estimates, interval, number
-from unjam.studies.results_file import read_parts
-from unjam.studies.references import REFERENCES, TUNED
-from unjam.studies.study import ROADS, VARIANTS
+from unjam.measures.feasibility import FEASIBLE
+from unjam.measures.statistics import estimate_over_trainings
+from unjam.measures.metric_table import with_no_break_spaces
+from unjam_paper import STUDIES
+from unjam_paper.comparison import COMPARISON_METRICS, estimate_entries, estimate_metrics, interval_text, number_text
+from unjam_paper.results_file import read_parts
+from unjam_paper.references import REFERENCE_DRIVERS, TUNED_REFERENCES
+from unjam_paper.study import STUDY_ROADS, VARIANTS
 
 FREE = 15.0
 """mean speed of an episode on the merge in which no jam stayed [m/s]"""
@@ -34,7 +34,7 @@ def rows_of(study: str, road: str) -> list[dict[str, Any]]:
     rows = results_part(f"{study}/table")
     for row in rows:
         if "gains" in row and "smallest" not in row["beyond_best_expert"]:
-            row["beyond_best_expert"] = entries(over_trainings(row["gains"]))
+            row["beyond_best_expert"] = estimate_entries(estimate_over_trainings(row["gains"]))
             row["probability_of_improvement"] = {"mean": row["probability_of_improvement"]["mean"]}
     rows = [row for row in rows if row["road"] == road]
     known = any(row["name"].startswith("tuned ") for row in rows)
@@ -50,9 +50,9 @@ def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any
     Episodes of its trainings are not kept, so intervals are over the trainings' means alone.
     """
     metric = next(row["beyond"]["metric"] for row in rows if row["learns"])
-    names = {name: label for label, name in TUNED[rows[0]["road"]].items()}
+    names = {name: label for label, name in TUNED_REFERENCES[rows[0]["road"]].items()}
     driven = [
-        {"name": names[name], "learns": False, "trainings": 0, **estimates(found, HONEST)}
+        {"name": names[name], "learns": False, "trainings": 0, **estimate_metrics(found, COMPARISON_METRICS)}
         for name, found in tuned.items()
         if name in names
     ]
@@ -62,7 +62,7 @@ def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any
     if more <= 0:
         return rows
     learned = [
-        {**row, "beyond_best_expert": entries(over_trainings([gain - more for gain in row["gains"]]))}
+        {**row, "beyond_best_expert": estimate_entries(estimate_over_trainings([gain - more for gain in row["gains"]]))}
         for row in rows
         if row["learns"]
     ]
@@ -76,7 +76,7 @@ def beyond_own_expert(rows: dict[str, dict[str, Any]], name: str, expert: str) -
     row = rows[name]
     metric, best = row["beyond"]["metric"], row["beyond"]["expert"]
     more = rows[best][metric]["mean"] - rows[expert][metric]["mean"]
-    return entries(over_trainings([gain + more for gain in row["gains"]]))
+    return estimate_entries(estimate_over_trainings([gain + more for gain in row["gains"]]))
 
 
 def paper_convention(study: str, road: str) -> pd.DataFrame:
@@ -87,7 +87,7 @@ def paper_convention(study: str, road: str) -> pd.DataFrame:
         for key, heading in PAPER.items():
             ours, reported = row["paper_convention"][key], (row.get("paper") or {}).get(key)
             digits = 0 if key == "reward" else 2
-            cells[heading] = unbroken(f"{ours['mean']:.{digits}f} ± {ours['std']:.{digits}f}")
+            cells[heading] = with_no_break_spaces(f"{ours['mean']:.{digits}f} ± {ours['std']:.{digits}f}")
             cells[f"{heading}, paper"] = "" if reported is None else f"{reported:.{digits}f}"
         table.append(cells)
     return pd.DataFrame(table)
@@ -100,9 +100,9 @@ COLUMNS = {
     "steady [m/s]": ("mean_speed_steady", 2),
     "of the limit, steady": ("speed_limit_ratio_steady", 3),
     "std across vehicles [m/s]": ("speed_std_fleet", 2),
-    "smallest headway [s]": ("min_headway", 2),
-    "leave [veh/h]": ("throughput_veh_per_h", 0),
-    "wait [veh]": ("backlog_veh", 0),
+    "smallest headway [s]": ("min_time_gap", 2),
+    "leave [veh/h]": ("outflow_veh_per_h", 0),
+    "wait [veh]": ("insertion_backlog_veh", 0),
 }
 """what the honest tables show: a metric and its digits"""
 OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
@@ -127,12 +127,12 @@ def honest(
         }
         for name in columns:
             key, digits = COLUMNS[name]
-            cells[name] = number(row[key]["mean"], digits)
+            cells[name] = number_text(row[key]["mean"], digits)
         if "drivable" in row:
             cells["drivable"] = _drivable(row["drivable"])
         nothing = beyond is None or row.get("best_expert")
-        cells["beyond"] = "" if nothing else interval(beyond, 0, "+")
-        cells["better"] = "" if better is None else interval({"low": None, "high": None, **better}, 2)
+        cells["beyond"] = "" if nothing else interval_text(beyond, 0, "+")
+        cells["better"] = "" if better is None else interval_text({"low": None, "high": None, **better}, 2)
         table.append(cells)
     return pd.DataFrame(table)
 
@@ -140,18 +140,18 @@ def honest(
 def _drivable(verdicts: str | list[str]) -> str:
     """Return whether a driver is drivable, or how many trainings are; a dash for people alone."""
     if isinstance(verdicts, str):
-        return {"": "–", DRIVABLE: "yes"}.get(verdicts, "no")
+        return {"": "–", FEASIBLE: "yes"}.get(verdicts, "no")
     return f"{verdicts.count(DRIVABLE)} of {len(verdicts)}"
 
 
 def merge_capacity() -> pd.DataFrame:
     """Return how people alone fare on the merge, by how many want to enter and how the road begins."""
-    names = ("mean_speed", "mean_speed_steady", "throughput_veh_per_h", "backlog_veh")
+    names = ("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "insertion_backlog_veh")
     tables = []
     for part in read_parts(RESULTS / "research-notes.json"):
         if not part.startswith("merge-capacity-"):
             continue
-        standing, inflow = (int(number) for number in part.split("-")[-2:])
+        standing, inflow = (int(number_text) for number_text in part.split("-")[-2:])
         table = metrics_of(f"research-notes/{part}", names)
         table.insert(0, "highway [veh/h]", f"{inflow:,}")
         table.insert(0, "start", f"{standing} standing" if standing else "empty")
@@ -161,7 +161,7 @@ def merge_capacity() -> pd.DataFrame:
 
 def closing_absorber() -> pd.DataFrame:
     """Return what closing up is worth to the jam absorber, and in how many episodes no jam stays."""
-    names = ("return", "mean_speed", "mean_speed_steady", "throughput_veh_per_h", "backlog_veh")
+    names = ("return", "mean_speed", "mean_speed_steady", "outflow_veh_per_h", "insertion_backlog_veh")
     table = metrics_of("research-notes/merge-closing", names)
     table["without a jam"] = [
         f"{sum(row['mean_speed'] > FREE for row in rows)} of {len(rows)}"
@@ -175,7 +175,7 @@ def commands() -> pd.DataFrame:
     table = {}
     for name, study in STUDIES.items():
         for run in study.runs(1):
-            variant, road = VARIANTS[run.variant], ROADS[run.road]
+            variant, road = VARIANTS[run.variant], STUDY_ROADS[run.road]
             words = ["unjam", "train", str(road["scenario"]), "--preset", variant.preset, "--seed", "0"]
             words += ["--steps", str(variant.steps)] if variant.steps else []
             changes = {key: value for key, value in road.items() if key != "scenario"} | dict(variant.changes)
@@ -188,10 +188,10 @@ def commands() -> pd.DataFrame:
 
 def drivers() -> pd.DataFrame:
     """Return how drivers that do not learn are named on the command line."""
-    on_all = [{"row": label, "--driver": name, "on": ""} for label, name in REFERENCES.items()]
+    on_all = [{"row": label, "--driver": name, "on": ""} for label, name in REFERENCE_DRIVERS.items()]
     tuned = [
         {"row": label, "--driver": name, "on": road}
-        for road, found in TUNED.items()
+        for road, found in TUNED_REFERENCES.items()
         for label, name in found.items()
     ]
     return pd.DataFrame([*on_all, *tuned])

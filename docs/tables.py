@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 from IPython.display import HTML
 
-from unjam.measures.drivable import drivable_in_all
+from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import Estimate, estimate_of, paired_difference
-from unjam.measures.table import baseline_of, cell_of, unbroken
+from unjam.measures.statistics import Estimate, metric_estimate, paired_difference
+from unjam.measures.metric_table import choose_baseline, estimate_cell, with_no_break_spaces
 from unjam.reports.model import error_text
-from unjam.studies.results_file import read_part
+from unjam_paper.results_file import read_part
 
 RESULTS = Path(__file__).parent.parent / "results"
 
@@ -42,19 +42,19 @@ def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.D
     """
     table = {}
     by_driver = rows_of(name)
-    baseline = baseline_of(by_driver) if compared else ""
+    baseline = choose_baseline(by_driver) if compared else ""
     for driver, rows in by_driver.items():
         cells = {}
         for metric in metrics:
-            found, about = estimate_of(rows, metric), METRICS[metric]
+            found, about = metric_estimate(rows, metric), METRICS[metric]
             heading = f"{about.label} [{about.unit}]" if about.unit else about.label
-            cells[heading] = str(cell_of(found, about.digits, len(rows))) if found.count else "never"
+            cells[heading] = str(estimate_cell(found, about.digits, len(rows))) if found.count else "never"
         first = METRICS[metrics[0]]
         if "human" in by_driver and len(by_driver) > 1 and "cav_max_braking" in rows[0]:
-            cells["could a car drive so?"] = drivable_in_all(rows)
+            cells["could a car drive so?"] = overall_feasibility(rows)
         if baseline:
             beyond = paired_difference(rows, by_driver[baseline], metrics[0])
-            shown = "" if driver == baseline else str(cell_of(beyond, first.digits, sign="+"))
+            shown = "" if driver == baseline else str(estimate_cell(beyond, first.digits, sign="+"))
             cells[f"{first.label} − {baseline}"] = shown
         table[driver] = cells
     return pd.DataFrame.from_dict(table, orient="index")
@@ -62,7 +62,7 @@ def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.D
 
 def mean_of(name: str, driver: str, metric: str) -> float:
     """Return the mean of one metric of one driver in a part of a results file."""
-    return estimate_of(rows_of(name)[driver], metric).mean
+    return metric_estimate(rows_of(name)[driver], metric).mean
 
 
 def batch_sizes() -> pd.DataFrame:
@@ -136,7 +136,7 @@ def on_ramps_known() -> pd.DataFrame:
     """Return how wrong imagined on-ramps are, as `roads_known`: travel time and flow beyond the actual."""
     rows = results_part("model/on_ramps")["rows"]
     drivers = {"the expert of the data": "the expert", "people alone": "people alone"}
-    metrics = {"travel_time": ("travel time", "s", 1), "throughput_veh_per_h": ("flow", "veh/h", 0)}
+    metrics = {"travel_time": ("travel time", "s", 1), "outflow_veh_per_h": ("flow", "veh/h", 0)}
     return _known(rows, drivers, metrics)
 
 
@@ -181,7 +181,7 @@ def levels(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.D
     rows = results_part(f"research-notes/{name}")["rows"]
     return pd.DataFrame(
         {heading: row[key] for key, heading in columns.items()}
-        | {heading: cell_of(Estimate(**row[key]), digits) for key, (heading, digits) in LEVELS.items()}
+        | {heading: estimate_cell(Estimate(**row[key]), digits) for key, (heading, digits) in LEVELS.items()}
         for row in rows
         if all(row[key] in values for key, values in chosen.items())
     )
@@ -295,5 +295,5 @@ def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
         classes="docutils align-default",
         float_format=f"{{:.{digits}f}}".format,
     )
-    whole = re.sub(r"\[[^\[\]<>]*\]", lambda found: unbroken(found[0]), html)
+    whole = re.sub(r"\[[^\[\]<>]*\]", lambda found: with_no_break_spaces(found[0]), html)
     return HTML(f'<div class="table-wrapper">{whole}</div>')

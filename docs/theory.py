@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from tables import results_part
 
-from unjam.measures.statistics import over_trainings
-from unjam.studies.comparison import entries, interval
-from unjam.studies.study import VARIANTS
+from unjam.measures.statistics import estimate_over_trainings
+from unjam_paper.comparison import estimate_entries, interval_text
+from unjam_paper.study import VARIANTS
 
 
 def measured() -> dict[str, Any]:
@@ -22,7 +22,7 @@ def untrained() -> pd.DataFrame:
     for row in measured()["untrained"]:
         cells = table.setdefault(row["road"], {"": row["road"]})
         cells[row["policy"]] = (
-            interval(entries(over_trainings(row["returns"])), 0) if "returns" in row else f"{row['mean']:.0f}"
+            interval_text(estimate_entries(estimate_over_trainings(row["returns"])), 0) if "returns" in row else f"{row['mean']:.0f}"
         )
     return pd.DataFrame(table.values())
 
@@ -38,7 +38,7 @@ def convergence() -> pd.DataFrame:
                 "trainings": row["trainings"],
                 "arrive after [actual steps]": ", ".join(arrivals),
                 "are there at the end": f"{row['stayed']} of {row['trainings']}",
-                "return at the end, in training": interval(row["last"], 0),
+                "return at the end, in training": interval_text(row["last"], 0),
             }
         )
     return pd.DataFrame(table)
