@@ -19,7 +19,7 @@ from unjam.measures.effect import AccResult, ControllerResult, assessment_headli
 from unjam.measures.notes import check_baseline, episode_notes
 from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
-from unjam.scenarios import OLD_PARAMETER_NAMES, make_scenario, scenario_recipe
+from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
 from unjam.training.evaluate import Evaluation, evaluate_on_roads, raise_failure, save_evaluation
@@ -46,7 +46,7 @@ from unjam.worlds.worker_pool import WorkerPool
 
 DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
 """controllers that are tried where none is named: they fit roads with ends"""
-ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "overtake")
+ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "speed_gain")
 """settings of the CAVs' ACC that replace a property of the vehicle"""
 MIN_BASELINE_EPISODES = 20
 """episodes of the baseline for which early ends are counted before the last one: two of them are too many"""
@@ -54,11 +54,11 @@ PLOT_EPISODE_COUNT = 2
 """episodes of the budget that are kept for pictures"""
 ZERO_PENETRATION_RATE = 1e-12
 """share of CAVs where people are alone: a network without any is not allowed"""
-SELECTION_FOLDER = "choosing"
+SELECTION_FOLDER = "selection"
 """folder within the results: the rows of the seeds that chose"""
 CAV_SELECTION_OPTIONS = "penetration_rate", "cav_types", "cavs"
 """settings of a road that the penetration rates stand for"""
-BASELINE_METRICS = ("travel_time", "outflow_veh_per_h", "fuel_ml_per_km", "people_beyond_4_5", "collisions")
+BASELINE_METRICS = ("travel_time", "outflow_veh_per_h", "fuel_ml_per_km", "human_braking_beyond_4_5", "collisions")
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,8 @@ def make_request(
     """
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
-    for name in [name for name in options or {} if OLD_PARAMETER_NAMES.get(name, name) in CAV_SELECTION_OPTIONS]:
-        raise InputError(f"{name}: it is not allowed here: --shares says how many vehicles are CAVs")
+    for name in [name for name in options or {} if name in CAV_SELECTION_OPTIONS]:
+        raise InputError(f"{name}: it is not allowed here: --penetration-rates says how many vehicles are CAVs")
     for share in penetration_rates:
         if not 0 <= share <= 1:
             raise invalid_value("penetration_rates", share, ">= 0, <= 1")
@@ -259,8 +259,8 @@ def _assessment_document(
     tried = [
         {
             **option._asdict(),
-            "rejection_reasons": selection.rejection_reasons.get(option, ""),
-            "chosen": option in selection.finalists,
+            "rejection_reason": selection.rejection_reasons.get(option, ""),
+            "is_finalist": option in selection.finalists,
             "effect": asdict(selection.effect(option)),
         }
         for option in request.options
@@ -270,19 +270,19 @@ def _assessment_document(
         "headline": assessment_headline(
             findings.controller_results, findings.acc_results, findings.rows[HUMAN_BASELINE]
         ),
-        "recommended": best and {"share": best.penetration_rate, "driver": best.driver},
+        "recommended": best and {"penetration_rate": best.penetration_rate, "driver": best.driver},
         "controller_results": [
-            {**asdict(each), "reasons": each.reasons, "words": each.summary} for each in findings.controller_results
+            {**asdict(each), "reasons": each.reasons, "summary": each.summary} for each in findings.controller_results
         ],
-        "acc_results": [{**asdict(each), "driver": ACC_DRIVER, "words": each.summary} for each in findings.acc_results],
-        "tried": tried,
-        "people": {name: asdict(metric_estimate(findings.rows[HUMAN_BASELINE], name)) for name in BASELINE_METRICS},
+        "acc_results": [{**asdict(each), "driver": ACC_DRIVER, "summary": each.summary} for each in findings.acc_results],
+        "candidates": tried,
+        "baseline": {name: asdict(metric_estimate(findings.rows[HUMAN_BASELINE], name)) for name in BASELINE_METRICS},
         "road": {**scenario_recipe(request.network), "file": request.file},
-        "people_drive": request.network.human_description,
+        "human_drivers": request.network.human_description,
         "drivers": {name: driver.recipe().get("parameters", {}) for name, driver in request.drivers.items()},
         "penetration_rates": request.penetration_rates,
         "precision": request.precision,
         "budget": {"episodes": request.episodes, "minutes": request.minutes},
-        "episodes": {"choosing": selection_episodes, "all": budget.used_episodes},
-        "seeds": {"choosing": len(selection.rows[HUMAN_BASELINE]), "judging": len(findings.rows[HUMAN_BASELINE])},
+        "episodes": {"selection": selection_episodes, "total": budget.used_episodes},
+        "seeds": {"selection": len(selection.rows[HUMAN_BASELINE]), "test": len(findings.rows[HUMAN_BASELINE])},
     }

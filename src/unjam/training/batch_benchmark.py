@@ -113,7 +113,7 @@ def benchmark_batches(device: Device, on_message: MessageCallback = lambda line:
     model = RoadModel(BENCHMARK_MODEL, (0,)).to(device)
     model.output_mask.fill_(1.0)
     learned = learned_human_model(model, make_benchmark_ring(VEHICLES_PER_RING, 1), torch_generator((1,), device))
-    batches = {"people by IDM": None, "by IDM and networks": learned}
+    batches = {"human drivers by IDM": None, "human drivers by IDM and networks": learned}
     return {
         "device": torch.cuda.get_device_name() if device == "cuda" else "one core",
         "vehicles": VEHICLES_PER_RING,

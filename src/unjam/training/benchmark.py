@@ -89,7 +89,7 @@ def _run_rounds(rounds: int, on_message: MessageCallback) -> dict[str, Any]:
         make_benchmark_driver(PolicySettings().action_repeat(ring.control_step)),
         make_benchmark_driver(1),
     )
-    roads: dict[str, RatesByPart] = {name: {"bare": [], "episode": []} for name in ("ring", *OTHER_SCENARIOS)}
+    roads: dict[str, RatesByPart] = {name: {"sumo": [], "episode": []} for name in ("ring", *OTHER_SCENARIOS)}
     rates: RatesByPart = {name: [] for name in ("every_step", "unfiltered", "audit", "loop", "traci", *ROLLOUT_SIZES)}
     torch.set_num_threads(1)
     batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
@@ -105,7 +105,7 @@ def _run_rounds(rounds: int, on_message: MessageCallback) -> dict[str, Any]:
                 road = SCENARIOS[name]
                 make_traffic(road, (number,), simulation)
                 steps = road.horizon * road.steps_per_control_step
-                found["bare"].append(steps_per_second(partial(_step_sumo, simulation, steps), road.horizon))
+                found["sumo"].append(steps_per_second(partial(_step_sumo, simulation, steps), road.horizon))
                 found["episode"].append(_episode_rate(road, driver, number, simulation))
             rates["every_step"].append(_episode_rate(ring, every_step, number, simulation))
             bare = replace(ring, safety=replace(ring.safety, active=False))
@@ -129,38 +129,38 @@ def _run_rounds(rounds: int, on_message: MessageCallback) -> dict[str, Any]:
         **_scenario_result(on_ring),
         "traci_steps_per_s": median(rates["traci"]),
         "every_step_steps_per_s": median(rates["every_step"]),
-        "over_bare_every_step": _median_ratio(rates["every_step"], on_ring["bare"]),
-        "over_unfiltered": _median_ratio(on_ring["episode"], rates["unfiltered"]),
+        "relative_to_sumo_every_step": _median_ratio(rates["every_step"], on_ring["sumo"]),
+        "relative_to_unfiltered": _median_ratio(on_ring["episode"], rates["unfiltered"]),
         "audit_share": _median_ratio(on_ring["episode"], rates["audit"]),
-        "over_traci": _median_ratio(rates["loop"], rates["traci"]),
+        "relative_to_traci": _median_ratio(rates["loop"], rates["traci"]),
         "batch": {
             "rings": BATCH_VEHICLES // smallest,
             "steps_per_s": median(in_batch[smallest]),
-            "over_bare": _median_ratio(in_batch[smallest], on_ring["bare"]),
+            "relative_to_sumo": _median_ratio(in_batch[smallest], on_ring["sumo"]),
             "scaling": [{"vehicles": size, "us_per_vehicle_step": cost} for size, cost in batch_costs.items()],
-            "growth": max(batch_costs.values()) / batch_costs[smallest],
+            "cost_growth": max(batch_costs.values()) / batch_costs[smallest],
         },
-        "virtual": {
+        "model": {
             name: {
                 "rows": rows,
-                "decisions": decisions,
+                "control_steps": decisions,
                 "steps_per_s": median(rates[name]),
-                "over_actual": _median_ratio(rates[name], on_ring["episode"]),
+                "relative_to_environment": _median_ratio(rates[name], on_ring["episode"]),
             }
             for name, (rows, decisions) in ROLLOUT_SIZES.items()
         },
-        "roads": {name: _scenario_result(found) for name, found in roads.items()},
+        "scenarios": {name: _scenario_result(found) for name, found in roads.items()},
         "scaling": scaling,
-        "growth": max(costs) / costs[0],
+        "cost_growth": max(costs) / costs[0],
         "rounds": rounds,
     }
 
 
 def _scenario_result(rates: RatesByPart) -> dict[str, float]:
     return {
-        "bare_steps_per_s": median(rates["bare"]),
+        "sumo_steps_per_s": median(rates["sumo"]),
         "episode_steps_per_s": median(rates["episode"]),
-        "over_bare": _median_ratio(rates["episode"], rates["bare"]),
+        "relative_to_sumo": _median_ratio(rates["episode"], rates["sumo"]),
     }
 
 

@@ -154,7 +154,7 @@ def calibrate(
     types, file = scale_vehicle_types(corridor.files, best), folder / CALIBRATED_NETWORK_FILE
     calibrated = CalibrationResult(best, types, before, after, found, file)
     _write_network(corridor, best, file)
-    about = {**corridor.metadata(), "seed": seed, "seeds": {"trial": seeds_per_trial, "judged": CALIBRATION_TEST_SEEDS}}
+    about = {**corridor.metadata(), "seed": seed, "seeds": {"trial": seeds_per_trial, "test": CALIBRATION_TEST_SEEDS}}
     atomic_write(
         folder / CALIBRATION_FILE,
         to_json(

@@ -16,7 +16,7 @@ from unjam.training.search_space import NumericRange, SearchSpace, parse_search_
 from unjam.worlds.sumo.detectors import InductionLoop
 from unjam.worlds.sumo.networks import edge_lengths, lane_counts
 
-FLOW_FACTOR = "flows"
+FLOW_FACTOR = "flow"
 """factor on the number of vehicles, of all types"""
 FACTOR_RANGES: SearchSpace = {
     "tau": NumericRange(0.5, 2.0, log=True),
@@ -68,7 +68,7 @@ class Corridor:
             "files": [{"name": path.name, "sha256": sha256_of_file(path)} for path in (self.detectors, *files.sources)],
             "begin": self.begin,
             "end": self.end,
-            "intervals": {"used": len(self.measurements), "excluded_count": self.excluded_count},
+            "intervals": {"used": len(self.measurements), "excluded": self.excluded_count},
         }
 
 

@@ -105,7 +105,7 @@ class DriveResult:
             {
                 **self._document(driver, said[driver], effects.get(driver)),
                 "baseline": baseline or None,
-                "beyond_baseline": self._baseline_differences(driver, baseline),
+                "difference_to_baseline": self._baseline_differences(driver, baseline),
             }
             for driver in self.rows
         ]
@@ -123,12 +123,12 @@ class DriveResult:
         return {
             "scenario": self.scenario,
             "driver": driver,
-            "drivable": verdict,
+            "feasibility": verdict,
             "episodes": self.rows[driver],
             "mean": {name: summary[name].mean for name in METRICS},
-            "interval": {name: [summary[name].low, summary[name].high] for name in METRICS},
-            "effects_by_driver": _effect_document(effect) if effect else None,
-            "ended_early": count_early_ends(self.rows[driver]),
+            "ci95": {name: [summary[name].low, summary[name].high] for name in METRICS},
+            "effect": _effect_document(effect) if effect else None,
+            "early_ends": count_early_ends(self.rows[driver]),
             "notes": self.notes,
             "folder": str(self.folder) if self.folder else None,
             "report": str(self.report) if self.report else None,

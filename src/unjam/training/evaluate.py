@@ -85,7 +85,7 @@ def evaluate_on_roads(
     An episode of each is kept for pictures; not so where none are `pictured`, for it needs much memory.
     """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
-    how: dict[str, Any] = {"reward": reward, "full": True, "stop_at_contact": False}
+    how: dict[str, Any] = {"reward": reward, "record_details": True, "stop_at_contact": False}
     tasks = [EpisodeTask(*drivers[label], seeds[index], **how) for label, index in pairs]
 
     def on_progress(task: int, steps: int) -> None:
@@ -161,7 +161,7 @@ def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, An
     """Write an evaluation into a folder: what reports are made of.
 
     `evaluation.json` (rows, and `about`), `episodes.parquet` (the rows as a table), and
-    `shown.safetensors` with the episode that pictures show.
+    `plot_episodes.safetensors` with the episode that pictures show.
     """
     make_folder(folder)
     rows = [{"driver": label, **row} for label, found in evaluation.rows.items() for row in found]
@@ -170,7 +170,7 @@ def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, An
         f"{number}.{name}": array for number, each in enumerate(shown) for name, array in pack_episode(each).items()
     }
     about_shown = [{"driver": each.driver, **{name: getattr(each, name) for name in EPISODE_ENTRIES}} for each in shown]
-    atomic_write(folder / "shown.safetensors", save(arrays))
+    atomic_write(folder / "plot_episodes.safetensors", save(arrays))
     atomic_write(folder / "episodes.parquet", rows_to_frame(evaluation.rows).to_parquet())
     atomic_write(
         folder / "evaluation.json", to_json({**metadata, "rows": rows, "plot_episodes": about_shown}, indent=1)

@@ -213,7 +213,7 @@ def train_in_subprocess(
                     goes_on = on_iteration is None or on_iteration(row) is not False
                     with suppress(BrokenPipeError):  # it was killed: its code is told below
                         print(json.dumps(goes_on), file=child.stdin, flush=True)
-                case ["judged", driver, episode, steps] if progress is not None:
+                case ["evaluated", driver, episode, steps] if progress is not None:
                     progress((driver, episode), steps)
                 case ["error", kind, words]:
                     raise error_from_name(kind, words)
@@ -250,7 +250,7 @@ def train_from_stdin() -> None:
             Path(folder),
             resume,
             report_iteration,
-            lambda episode, steps: send("judged", *episode, steps),
+            lambda episode, steps: send("evaluated", *episode, steps),
         )
         send("done", rows)
     except UnjamError as error:

@@ -32,7 +32,7 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 if TYPE_CHECKING:
     from unjam.learners.learner import Tensors
 
-ControllerKind = Literal["best", "kept"]
+ControllerKind = Literal["best", "latest"]
 
 
 class ControllerStore:
@@ -48,8 +48,8 @@ class ControllerStore:
 
     def save(self, contents: list[bytes], is_best: bool) -> None:
         """Write a controller into each folder."""
-        self._contents |= {"kept": contents, **({"best": contents} if is_best else {})}
-        self._write("kept")
+        self._contents |= {"latest": contents, **({"best": contents} if is_best else {})}
+        self._write("latest")
 
     def tensors(self) -> "Tensors":
         """Return all of them for a checkpoint."""
@@ -66,12 +66,12 @@ class ControllerStore:
 
         What was in the folders may be of a later iteration, or somebody else's.
         """
-        for kind in ("best", "kept") if "best/0" in tensors else ():
+        for kind in ("best", "latest") if "best/0" in tensors else ():
             found = [tensors.pop(f"{kind}/{index}") for index in range(len(self._folders))]
             self._contents[kind] = [each.numpy().tobytes() for each in found]
         if not is_finished and "best" in self._contents:
-            self._contents["kept"] = self._contents["best"]
-        self._write("kept")
+            self._contents["latest"] = self._contents["best"]
+        self._write("latest")
 
     def _write(self, kind: ControllerKind) -> None:
         for folder, content in zip(self._folders, self._contents.get(kind, ()), strict=False):
@@ -110,10 +110,10 @@ def export_controller(source: str | Path, out: str | Path, onnx: bool = False, s
     """
     source, out = Path(source), Path(out)
     if out.suffix != SUFFIX:
-        raise invalid_value("to", str(out), f"a file that ends in {SUFFIX}")
+        raise invalid_value("out", str(out), f"a file that ends in {SUFFIX}")
     check_parent_folder(out)
     if _is_signed(out):
-        raise InputError(f"to: {str(out)!r} is a signed controller; allowed: another file")
+        raise InputError(f"out: {str(out)!r} is a signed controller; allowed: another file")
     road, driver, about = (
         _read_run_origin(source, scenario) if source.is_dir() else _read_driver_origin(str(source), scenario)
     )

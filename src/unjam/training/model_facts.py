@@ -104,7 +104,7 @@ def _wave_facts(rollouts: WholeRoadRollouts[Any], simulator: str) -> dict[str, A
     """Return what a road was like and what is imagined of it; actual episodes run in a world."""
     step, length, lane_names, seen = rollouts.waves(_run_in_batch if simulator == "batch" else _run_in_sumo)
     drawn = {label: each._asdict() for label, each in seen.items()}
-    return {"step": step, "loop_length": length, "lane_names": lane_names, "waves": drawn}
+    return {"control_step": step, "loop_length": length, "lane_names": lane_names, "waves": drawn}
 
 
 def _run_in_batch(task: EpisodeTask) -> Episode:
@@ -124,9 +124,9 @@ def _row_facts(rollouts: RowRollouts, config: RunConfig, progress_row: dict[str,
     return {
         "control_step": scenario.control_step,
         "k_star": progress_row["k_star"],
-        "held_out": int(actual.is_holdout.sum()),
+        "validation_steps": int(actual.is_holdout.sum()),
         "one_step": {name: found._asdict() for name, found in errors.rmse_by_target().items()},
-        "where": {name: _errors_by_bin(getattr(held_out.states, name), errors) for name in BINNED_FIELDS},
+        "by_state": {name: _errors_by_bin(getattr(held_out.states, name), errors) for name in BINNED_FIELDS},
         "replay": _replay_facts(rollouts, scenario, generator),
         "bound": _bound_facts(rollouts, progress_row, config.learner.gamma),
     }
@@ -146,8 +146,8 @@ def _errors_by_bin(values: Floats, errors: OneStepErrors) -> dict[str, Any]:
         }
 
     return {
-        "at": [values[rows].mean() for rows in bins],
-        "decisions": [int(rows.sum()) for rows in bins],
+        "values": [values[rows].mean() for rows in bins],
+        "control_steps": [int(rows.sum()) for rows in bins],
         "base": errors_of(errors.base),
         "model": errors_of(errors.model),
     }
@@ -169,7 +169,7 @@ def _replay_facts(rollouts: RowRollouts, scenario: Scenario, generator: np.rando
     starts = data.start_indices(decisions)
     starts = starts[[held_out[place][at] for place, at in starts]]
     starts = starts[np.sort(generator.permutation(len(starts))[:MAX_REPLAYS])]
-    single = replace(rollouts.settings, members=1, error="unexplained")
+    single = replace(rollouts.settings, members=1, error_estimator="unexplained_variance")
     alone = RowModel(single, len(scenario.drawn_ranges), (0,))
     moments = np.unique(np.linspace(0, decisions - 1, MAX_REPLAY_TIMES).round().astype(int))
     found, base = (open_loop_errors(each, data, starts, decisions, scenario) for each in (model, alone))
@@ -177,9 +177,9 @@ def _replay_facts(rollouts: RowRollouts, scenario: Scenario, generator: np.rando
     actual = recorded_states(data, examples, decisions)
     members, lone = (replay_accelerations(each, data, examples, decisions, scenario) for each in (model, alone))
     return {
-        "seconds": (moments + 1) * scenario.control_step,
+        "times": (moments + 1) * scenario.control_step,
         "starts": len(starts),
-        "numbers": {
+        "quantities": {
             name: {
                 "model": found.error[name][moments],
                 "spread": found.spread[name][moments],
@@ -190,11 +190,11 @@ def _replay_facts(rollouts: RowRollouts, scenario: Scenario, generator: np.rando
         },
         "examples": [
             {
-                "begins": at * scenario.control_step,
-                "drawn": data.recordings[place].drawn,
-                "numbers": {
+                "start_time": at * scenario.control_step,
+                "drawn_values": data.recordings[place].drawn_values,
+                "quantities": {
                     name: {
-                        "actual": actual[name][example, 1:][moments],
+                        "recorded": actual[name][example, 1:][moments],
                         "members": members[name][:, example, moments],
                         "base": lone[name][0, example, moments],
                     }
@@ -208,7 +208,7 @@ def _replay_facts(rollouts: RowRollouts, scenario: Scenario, generator: np.rando
 
 def _bound_facts(rollouts: RowRollouts, progress_row: dict[str, Any], gamma: float) -> dict[str, Any] | None:
     """Return the bound C by the length of rollouts for the newest row of progress; None without an eps_m."""
-    eps_m = progress_row["virtual"]["eps_m_by_estimator"].get("transitions")  # of runs of before there is none
+    eps_m = progress_row["model"]["eps_m_by_estimator"].get("transitions")  # of runs of before there is none
     if eps_m is None:
         return None
     eps_pi = progress_row["learner"]["eps_pi_max"]
@@ -219,7 +219,7 @@ def _bound_facts(rollouts: RowRollouts, progress_row: dict[str, Any], gamma: flo
         "max_reward": rollouts.max_reward,
         "largest_return": rollouts.max_reward / (1.0 - discount),
         "k": ROLLOUT_LENGTHS,
-        "C": [rollouts.bound_at(k, eps_pi, eps_m, gamma) for k in ROLLOUT_LENGTHS],
+        "bound": [rollouts.bound_at(k, eps_pi, eps_m, gamma) for k in ROLLOUT_LENGTHS],
     }
 
 

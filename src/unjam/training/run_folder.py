@@ -42,8 +42,8 @@ from unjam.worlds.reward import make_reward
 if TYPE_CHECKING:
     from unjam.learners.learner import Tensors
 
-CHECKPOINT_FORMAT = 4
-"""of what a checkpoint holds; one of another unjam is refused"""
+CHECKPOINT_FORMAT = 5
+"""format of run folders and their checkpoints; other formats are refused"""
 MAX_CHECKPOINTS = 2
 MANIFEST_FILE, PROGRESS_FILE = "manifest.json", "progress.jsonl"
 CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE = "state.json", "tensors.safetensors"
@@ -229,8 +229,8 @@ def restore_newest_checkpoint(
         InputError: none is whole, or it does not belong to what would go on with it, `belongs`.
     """
     found = load_checkpoint(folder / "checkpoint")
-    if found and expected and "belongs" in found[0]:
-        check_fingerprint(found[0]["belongs"], expected)
+    if found and expected and "fingerprint" in found[0]:
+        check_fingerprint(found[0]["fingerprint"], expected)
     _remove_old_checkpoints(folder / "checkpoint")
     for left in [path for place in progress_folders for path in place.glob(".*") if is_leftover(path)]:
         remove(left)
@@ -284,7 +284,7 @@ def check_run_files(folder: Path, config: RunConfig) -> None:
     Runs without a checkpoint that is whole do not tell.
     """
     newest = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
-    if before := newest.get("belongs"):
+    if before := newest.get("fingerprint"):
         check_file_hashes(before, fingerprint(config), "evaluate")
 
 

@@ -40,8 +40,8 @@ class Run:
         return {
             **{"name": self.name, "folder": str(self.folder), "scenario": config.scenario},
             **{"preset": config.preset, "expert": config.expert, "agent": config.agent, "seed": config.seed},
-            **{"state": self.state, "steps": self.steps, "steps_wanted": config.steps},
-            "gain": {road: asdict(gain) if gain else None for road, gain in self.gains.items()},
+            **{"state": self.state, "steps": self.steps, "steps_total": config.steps},
+            "test_gain": {road: asdict(gain) if gain else None for road, gain in self.gains.items()},
         }
 
 
@@ -53,7 +53,7 @@ def list_runs(root: Path | str = "runs", scenario: str = "") -> list[Run]:
     """
     root = Path(root)
     if not root.is_dir():
-        raise InputError(f"under: {str(root)!r} is not a folder; allowed: one that holds run folders")
+        raise InputError(f"root: {str(root)!r} is not a folder; allowed: one that holds run folders")
     found = [_read_listed_run(folder, str(folder.relative_to(root))) for folder in sorted(_run_folders(root))]
     return [
         run

@@ -119,7 +119,7 @@ def _trial_command(base: RunConfig, folder: Path, number: int, values: dict[str,
     """Return the command line of a trial."""
     config = trial_config(base, values)
     few = replace(config.evaluation, baselines=(), episodes=1)  # the held-out seeds decide nothing here
-    plan, log = (folder / "plans" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
+    plan, log = (folder / "configs" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
     config = replace(config, workers=1, evaluation=few)
     return training_command(config, _trial_folder(folder, number), plan, log)
 

@@ -55,7 +55,7 @@ class Option(NamedTuple):
 HUMAN_BASELINE = Option(0.0, "human")
 ACC_DRIVER = "cruise"
 """driver of ACC vehicles without a controller"""
-UNCHANGED_ACC_DRIVER = "cruise with unchanged vehicles"
+UNCHANGED_ACC_DRIVER = "acc with unchanged vehicles"
 """the same, where the user has set properties of CAVs: with those of the vehicles which they replace"""
 OptionRunner = Callable[[Sequence[Option], Sequence[EpisodeSeed]], dict[Option, OptionRows]]
 """drives all options on all seeds, and measures"""

@@ -193,9 +193,9 @@ class Trainer:
             ended = state["environment_steps"] >= config.steps or should_stop_early(config, read_progress(folder))
             self._controllers.restore(tensors, ended)
             self.training.restore(state, tensors)
-            self._best_validation = state["validation_best"]
+            self._best_validation = state["best_validation"]
             self._expert_returns = state["expert_returns"]
-            self._sampler.restore(state.get("sampler", {"reached": self._expert_returns}))
+            self._sampler.restore(state.get("sampler", {"best_returns": self._expert_returns}))
             append_lineage(folder, state["iteration"])
 
     def train(self) -> None:
@@ -256,8 +256,8 @@ class Trainer:
             append_line(place / PROGRESS_FILE, to_json(row))
         append_line(self.folder / PROGRESS_FILE, to_json(whole))
         counters, tensors = self.training.state()
-        state = {**counters, "belongs": self._fingerprint, "sampler": self._sampler.state()}
-        state |= {"validation_best": self._best_validation, "expert_returns": self._expert_returns}
+        state = {**counters, "fingerprint": self._fingerprint, "sampler": self._sampler.state()}
+        state |= {"best_validation": self._best_validation, "expert_returns": self._expert_returns}
         save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
         stopped = self._on_iteration(whole) is False
         if stopped and validation is None and not early:
@@ -300,7 +300,7 @@ class Trainer:
         whole = {
             **rows[0],
             **{name: self._sampler.weighted_mean([row[name] for row in rows]) for name in names},
-            **{"k_star": None, "eps_m": None, "virtual": {}},
+            **{"k_star": None, "eps_m": None, "model": {}},
             **{name: sum(row[name] for row in rows) for name in ("collisions", "episodes")},
             "tasks": {
                 task.name: {name: row[name] for name in (*PROGRESS_RETURNS, "episodes", "k_star", "eps_m")}
@@ -312,22 +312,22 @@ class Trainer:
     def _progress_row(self, iteration: Iteration, validation: ValidationReturns, index: int) -> dict[str, Any]:
         """Return the row of progress of one road."""
         measured = [measure(episode) for episode in iteration.episodes[index]]
-        virtual = iteration.model[index] if iteration.model else {}
+        model = iteration.model[index] if iteration.model else {}
         means = {name: float(np.mean([row[name] for row in measured])) for name in ("return", *PROGRESS_METRICS)}
         return {
             "iteration": iteration.number,
             "environment_steps": iteration.environment_steps,
             "episodes": len(measured),
             "model_steps": iteration.model_steps,
-            "k_star": virtual.get("k_star"),
-            "eps_m": virtual.get("eps_m"),
+            "k_star": model.get("k_star"),
+            "eps_m": model.get("eps_m"),
             "return_mean": means.pop("return"),
             "return_expert": self._expert_returns[index],
             "return_validation": validation[index] if validation else None,
             **means,
             "collisions": sum(row["collisions"] for row in measured),
             "learner": iteration.log,
-            "virtual": virtual,
+            "model": model,
             "seconds": iteration.seconds,
         }
 

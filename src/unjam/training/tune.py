@@ -244,7 +244,7 @@ def _score_rows(
         mean = float(np.mean([each.mean for each in gains.values()]))
         return mean, f"worst on {worst}: {gains[worst].mean:+.2f}"
     (rows,) = rows_by_road.values()
-    verdict = overall_feasibility([{**row, "people_beyond_4_5": 0.0} for row in rows])
+    verdict = overall_feasibility([{**row, "human_braking_beyond_4_5": 0.0} for row in rows])
     return float(np.mean([row["return"] for row in rows])) if verdict == FEASIBLE else None, verdict
 
 
@@ -276,7 +276,7 @@ def _write_result(
     }
     driver = driver_from_name(result.best.driver, scenario.control_step)
     tuned = {key: value for key, value in about.items() if key not in ("scenario", "expert")}
-    content = controller_bytes(driver, {**controller_origin(scenario, driver), "tuned": tuned})
+    content = controller_bytes(driver, {**controller_origin(scenario, driver), "tuning": tuned})
     atomic_write(result.file, content)
     rows = [asdict(one) for one in result.trials]
     atomic_write(
