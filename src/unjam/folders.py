@@ -15,7 +15,7 @@ from pathlib import Path
 
 from unjam.errors import DiskError, InputError
 
-PROTECTED_FOLDERS_VARIABLE = "UNJAM_HELD_FOLDERS"
+PROTECTED_FOLDERS_VARIABLE = "UNJAM_PROTECTED_FOLDERS"
 """the variable that tells a child process which folders are held by the processes that started it"""
 NO_FOLLOW_FLAGS = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
 """flags of `os.open`: follow no link, and wait for no pipe; not every system has all of them"""

@@ -1,7 +1,7 @@
 """The same bits on every x86-64 machine with AVX2: which kernels NumPy and torch compute with.
 
 Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin_kernels` asks all for
-those that every processor with AVX2 has; it must come before NumPy is imported. `UNJAM_KERNELS=own` leaves
+those that every processor with AVX2 has; it must come before NumPy is imported. `UNJAM_KERNELS=native` leaves
 all as it is. What was tried on which processors, and what still differs, is in docs/training.md.
 
 MKL's square roots begin with an estimate that each make of processor has its own of, in every mode: so Adam
@@ -69,7 +69,7 @@ def kernel_info() -> dict[str, Any]:
     return {
         "processor": processor_info().get("model name", platform.processor() or platform.machine()),
         "pinned": has_pinned_kernels(),
-        "unsupported_reason": _unpinned_reason,
+        "unpinned_reason": _unpinned_reason,
         "settings": {name: os.environ.get(name) for name in KERNEL_SETTINGS},
         "openblas": _openblas_core(numpy) if numpy else None,
         "numpy": _numpy_features() if numpy else None,
@@ -91,8 +91,8 @@ def processor_info() -> dict[str, str]:
 
 def _find_obstacle() -> str | None:
     """Return why nothing can be pinned here; None where it can."""
-    if os.environ.get(KERNELS_VARIABLE) == "own":
-        return f"{KERNELS_VARIABLE}=own"
+    if os.environ.get(KERNELS_VARIABLE) == "native":
+        return f"{KERNELS_VARIABLE}=native"
     if platform.machine() not in ("x86_64", "AMD64"):
         return f"the processor is no x86-64: {platform.machine()}"
     if not {"avx2", "fma"} <= set(processor_info().get("flags", "").split()):
@@ -116,4 +116,4 @@ def _numpy_features() -> list[str]:
     return [name for name in inside.__cpu_dispatch__ if inside.__cpu_features__.get(name)]
 
 
-_unpinned_reason: str | None = "pin() was not called"
+_unpinned_reason: str | None = "pin_kernels() was not called"

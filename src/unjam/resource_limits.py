@@ -18,7 +18,7 @@ from unjam.trust import TRUST_CODE_OPTION
 def verify_controller(path: Path | str, trust_code: bool = False, signer: Path | str | None = None) -> list[PartCheck]:
     """Return what is known of each part of a `.unjam` file or a run folder; only trusted code runs.
 
-    Each is `checked`, `missing_neighbors`, or `stated` by the maker alone; no part that is there is left unchecked.
+    Each is `checked`, `absent`, or `stated` by the maker alone; no part that is there is left unchecked.
 
     It is read as `unjam verify` reads it: in a process of its own, with little memory and time, which may
     neither write nor reach the network where the kernel sees to it.

@@ -57,7 +57,7 @@ def test_a_warmup_lasts_as_long_as_its_vehicles() -> None:
 
 
 def test_vehicles_enter_where_their_origin_says() -> None:
-    road = drawn(standing=3)
+    road = drawn(standing_vehicles=3)
     highway, ramp = JUNCTION_LENGTHS
     starts = {"from_inflow_highway": -(600.1 + highway), "from_highway": -(500 + highway)}
     starts |= {"from_inflow_ramp": -(200.1 + ramp)}
@@ -69,7 +69,7 @@ def test_vehicles_enter_where_their_origin_says() -> None:
 
 
 def test_nobody_stands_where_none_shall() -> None:
-    assert times_of(drawn(standing=0), r"human_s\d+") == []
+    assert times_of(drawn(standing_vehicles=0), r"human_s\d+") == []
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
@@ -81,18 +81,18 @@ def test_a_share_is_drawn_for_each_vehicle_by_itself(seed: int, cav_share: float
 
 @pytest.mark.parametrize("spacing", ["random", "even"])
 def test_none_or_all_of_the_highways_vehicles_are_cavs(spacing: str) -> None:
-    assert cavs(drawn(penetration_rate=0.0, spacing=spacing)) == []
-    assert cavs(drawn(penetration_rate=1.0, spacing=spacing)) == list(range(333))
+    assert cavs(drawn(penetration_rate=0.0, cav_spacing=spacing)) == []
+    assert cavs(drawn(penetration_rate=1.0, cav_spacing=spacing)) == list(range(333))
 
 
 def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
     for seed in range(3):
-        assert cavs(drawn(seed, spacing="even")) == list(range(0, 333, 10))
+        assert cavs(drawn(seed, cav_spacing="even")) == list(range(0, 333, 10))
 
 
 @given(st.floats(0, 1))
 def test_even_spacing_spreads_the_share_evenly(cav_share: float) -> None:
-    found = cavs(drawn(penetration_rate=cav_share, spacing="even"))
+    found = cavs(drawn(penetration_rate=cav_share, cav_spacing="even"))
     assert abs(len(found) - 333 * cav_share) <= 1.0
     assert len(np.unique(np.diff(found))) <= 2
 
@@ -171,15 +171,15 @@ def test_recipe_makes_the_same_scenario_again() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"standing": 81}, "standing: 81 is not allowed; allowed: <= 80"),
-        ({"standing": -1}, "standing"),
+        ({"standing_vehicles": 81}, "standing_vehicles: 81 is not allowed; allowed: <= 80"),
+        ({"standing_vehicles": -1}, "standing_vehicles"),
         ({"cavs": 167}, "cavs: 167 is not allowed; allowed: <= 166, who enter in the first half"),
         ({"cavs": 0}, "cavs"),
-        ({"penetration_rate": 1.1}, "cav_share: 1.1"),
-        ({"penetration_rate": -0.1}, "cav_share: -0.1"),
+        ({"penetration_rate": 1.1}, "penetration_rate: 1.1"),
+        ({"penetration_rate": -0.1}, "penetration_rate: -0.1"),
         ({"inflow": 0}, "inflow: 0"),
         ({"ramp_flow": -5}, "ramp_flow: -5"),
-        ({"spacing": "odd"}, "'random' or 'even'"),
+        ({"cav_spacing": "odd"}, "'random' or 'even'"),
         ({"human_control": "native"}, "human_control: 'native' is not allowed on the merge; allowed: 'commanded'"),
         ({"length": (230, 230)}, "length: unknown name"),
     ],

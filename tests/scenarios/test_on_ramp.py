@@ -80,10 +80,10 @@ def test_with_one_lane_and_with_a_steady_peak_it_has_names() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"penetration_rate": 1.2}, "cav_share: 1.2"),
+        ({"penetration_rate": 1.2}, "penetration_rate: 1.2"),
         ({"lanes": 3}, "lanes: 3"),
         ({"time_headways": [1.8, 1.0]}, r"time_headways: \(1.8, 1\) is not allowed; allowed: 0 < low <= high"),
-        ({"inflow": 9000}, "inflow: 9000 is not allowed; allowed: < 6545, by entry_headway"),
+        ({"inflow": 9000}, "inflow: 9000 is not allowed; allowed: < 6545, by min_entry_headway"),
         ({"ramp_flow": 1800}, "ramp_flow: 1800 is not allowed; allowed: < 1800"),
         ({"human_control": "commanded"}, "human_control: 'commanded' is not allowed on the on-ramp"),
         ({"roadside.loss_rate": 1.0}, "roadside.loss_rate: 1.0"),

@@ -92,10 +92,3 @@ def test_wrong_parameters_get_one_clear_line(changes: dict, words: str) -> None:
 def test_unknown_scenario_lists_the_known() -> None:
     with pytest.raises(InputError, match="'rong' is not allowed; allowed: ring, ring-warm, ring-jammed"):
         make_scenario("rong")
-
-
-def test_a_parameter_is_known_by_its_older_name() -> None:
-    assert make_scenario("ring", {"people": "commanded"}) == Ring(human_control="commanded")
-    recipe = scenario_recipe(Ring(human_control="commanded"))
-    older = {"people": recipe.pop("human_control"), **recipe}
-    assert scenario_from_recipe(older) == Ring(human_control="commanded")

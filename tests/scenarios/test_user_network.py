@@ -214,9 +214,9 @@ BIKES = '<routes><vType id="bike" vClass="bicycle"/><flow id="g" type="bike"/></
 @pytest.mark.parametrize(
     ("changes", "routes", "words"),
     [
-        ({"penetration_rate": 0.0}, TYPES, "cav_share: 0.0 is not allowed without cav_types"),
-        ({"penetration_rate": 1.5}, TYPES, "cav_share: 1.5"),
-        ({"penetration_rate": "some"}, TYPES, "cav_share: 'some'"),
+        ({"penetration_rate": 0.0}, TYPES, "penetration_rate: 0.0 is not allowed without cav_types"),
+        ({"penetration_rate": 1.5}, TYPES, "penetration_rate: 1.5"),
+        ({"penetration_rate": "some"}, TYPES, "penetration_rate: 'some'"),
         ({"cav_types": ["tank"]}, TYPES, "no vehicle has the type 'tank'; allowed: bike, car, truck"),
         ({"cav_types": ["unused"]}, TYPES, "no vehicle has the type 'unused'"),
         (
@@ -230,7 +230,7 @@ BIKES = '<routes><vType id="bike" vClass="bicycle"/><flow id="g" type="bike"/></
         ({"penetration_rate": 0.1, "noise": 0.2}, TYPES, "noise: 0.2"),
         ({"penetration_rate": 0.1, "simulation_step": 0}, TYPES, "simulation_step: 0"),
         ({"penetration_rate": 0.1, "simulation_step": "fast"}, TYPES, "simulation_step: 'fast'"),
-        ({"penetration_rate": 0.1, "steps_per_control_step": 0}, TYPES, "steps_per_decision: 0"),
+        ({"penetration_rate": 0.1, "steps_per_control_step": 0}, TYPES, "steps_per_control_step: 0"),
         ({"penetration_rate": 0.1, "length": 3}, TYPES, "length: unknown name"),
     ],
 )
@@ -257,7 +257,7 @@ def test_trains_ships_and_aircraft_never_become_cavs(attributes: str, tmp_path: 
     routes = f'<routes><vType id="train" {attributes}/><vType id="car"/>{{}}<trip id="t" type="train"/></routes>'
     with pytest.raises(InputError, match="cav_types: 'train' is not allowed, for it is no type of road"):
         own(tmp_path, routes=routes.format(""), cav_types=("train",))
-    with pytest.raises(InputError, match="cav_share: no vehicle has one of the classes"):
+    with pytest.raises(InputError, match="penetration_rate: no vehicle has one of the classes"):
         own(tmp_path, routes=routes.format(""), penetration_rate=1.0)
     found = own(tmp_path, routes=routes.format('<trip id="c" type="car"/>'), penetration_rate=1.0)
     files = read_sumo_files(tmp_path / "road.sumocfg")
@@ -282,7 +282,7 @@ def test_without_a_rate_a_tenth_of_the_vehicles_become_cavs_and_a_line_says_so(
     path = str(configuration(tmp_path))
     rates = [load_user_network(path, changes).penetration_rate for changes in ({}, {"cav_types": ["car"]})]
     assert rates == [0.1, 0.0]
-    assert "penetration rate: 10 %, as none is set; --cav-share sets another" in caplog.messages
+    assert "penetration rate: 10 %, as none is set; --penetration-rate sets another" in caplog.messages
 
 
 def test_what_differs_from_sumo_alone_is_noted(tmp_path: Path) -> None:

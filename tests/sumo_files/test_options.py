@@ -58,7 +58,7 @@ def test_every_option_of_sumo_is_passed_or_refused_unless_it_changes_no_vehicle(
         found = fate(name, kind)
         fates.setdefault(found, set()).add(name)
         if harmless and name not in REFUSED_OPTIONS:
-            assert found in ("not written", "ignored"), name
+            assert found in ("dropped", "ignored"), name
         else:
             assert found in ("passed", "replaced", "refused"), name
     assert fates["refused"] == {*REFUSED_OPTIONS}

@@ -12,8 +12,8 @@ import pytest
 from tests.sumo_files.test_sumo_files import NETWORK, ROUTES, configuration
 from unjam import sandbox, sumo_files
 from unjam.errors import InputError
-from unjam.sumo_files import program as reader
 from unjam.sumo_files import read_lanes, read_sumo_files, write_harmless_copy
+from unjam.sumo_files import reader_program as reader
 
 LAUGHS = "".join(f'<!ENTITY l{n} "{f"&l{n - 1};" * 10 if n else "lol"}">' for n in range(10))
 DEFINITIONS = {
@@ -58,20 +58,20 @@ def test_what_unpacks_to_too_much_is_refused_and_takes_no_memory_here(
 
 def test_what_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = configuration(tmp_path)
-    monkeypatch.setattr(sumo_files, "LONGEST_TIME", 0.001)
+    monkeypatch.setattr(sumo_files, "MAX_READER_TIME", 0.001)
     assert refused(path) == "road.sumocfg: its files cannot be read within 4 GiB, 0.001 s"
 
 
 def test_a_reader_that_is_lost_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = configuration(tmp_path)
-    monkeypatch.setattr(sumo_files, "PROGRAM", tmp_path / "none.py")
+    monkeypatch.setattr(sumo_files, "READER_PROGRAM", tmp_path / "none.py")
     assert "cannot be read within" in refused(path)
 
 
 def test_it_needs_pythons_own_library_alone(tmp_path: Path) -> None:
     program = [sys.executable, "-I", "-S", sandbox.__file__, str(2**30), "60", "", str(sumo_files.READER_PROGRAM)]
     ran = subprocess.run([*program, "configuration", str(configuration(tmp_path))], capture_output=True, check=True)
-    assert json.loads(ran.stdout)["found"]["used_types"] == ["car"]
+    assert json.loads(ran.stdout)["result"]["used_types"] == ["car"]
 
 
 def test_lanes_are_read_with_their_edges(tmp_path: Path) -> None:
@@ -92,9 +92,9 @@ def test_lanes_that_are_none_are_refused(lane: str, tmp_path: Path) -> None:
 def test_in_this_process_it_answers_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = configuration(tmp_path, routes=ROUTES)
     reader._main("configuration", str(path))
-    assert json.loads(capsys.readouterr().out)["found"]["network"] == str(tmp_path / "road.net.xml")
+    assert json.loads(capsys.readouterr().out)["result"]["network"] == str(tmp_path / "road.net.xml")
     reader._main("lanes", str(tmp_path / "none"))
-    assert "there is no such file" in json.loads(capsys.readouterr().out)["broken"]
+    assert "there is no such file" in json.loads(capsys.readouterr().out)["error"]
 
 
 INCLUDES = {

@@ -28,8 +28,6 @@ SCENARIOS: dict[str, Scenario] = {
 
 EXAMPLE_PENETRATION_RATE = 0.1
 """share of CAVs where a network of the user's own stands as an example"""
-OLD_PARAMETER_NAMES = {"people": "human_control", "penetration": "penetration_rate"}
-"""what parameters are called now, by what they were called"""
 SCENARIO_KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp, UserNetwork)}
 """All kinds of road, by their title."""
 
@@ -42,7 +40,7 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     Raises:
         InputError: unknown scenario or parameter, or a value out of range.
     """
-    changes = nest_keys(_current_names(changes or {}))
+    changes = nest_keys(changes or {})
     if name.endswith(".sumocfg"):
         return load_user_network(name, changes)
     if name not in SCENARIOS:
@@ -60,11 +58,6 @@ def example_scenario(name: str) -> Scenario:
     return make_scenario(name, {"penetration_rate": EXAMPLE_PENETRATION_RATE} if name.endswith(".sumocfg") else None)
 
 
-def _current_names(values: dict[str, Any]) -> dict[str, Any]:
-    """Return parameters of a scenario by the names that they have now; older files say others."""
-    return {OLD_PARAMETER_NAMES.get(key, key): value for key, value in values.items()}
-
-
 def _population_changes(file: str) -> dict[str, Any]:
     """Return what else changes with a population: who is typical, and who computes how people drive."""
     population = read_population(file)
@@ -80,4 +73,4 @@ def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
 def scenario_from_recipe(recipe: dict[str, Any]) -> Scenario:
     """Return the scenario that `scenario_recipe` wrote down."""
     values = {key: value for key, value in recipe.items() if key != "kind"}
-    return build_dataclass(SCENARIO_KINDS[recipe["kind"]], _current_names(values), "scenario")
+    return build_dataclass(SCENARIO_KINDS[recipe["kind"]], values, "scenario")

@@ -78,7 +78,7 @@ class Merge(Scenario):
         room = VEHICLE_LENGTH + max(self.humans.minimum_gap, self.sumo_human_gap)
         most = int((MERGE_HIGHWAY_LENGTH + MERGE_INFLOW_LENGTH) / room)
         if self.standing_vehicles > most:
-            raise ValueError(f"standing: {self.standing_vehicles} is not allowed; allowed: <= {most}")
+            raise ValueError(f"standing_vehicles: {self.standing_vehicles} is not allowed; allowed: <= {most}")
         early = len(self._first_half_times())
         if self.cavs is not None and self.cavs > early:
             raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= {early}, who enter in the first half")
@@ -159,7 +159,7 @@ class Merge(Scenario):
         return [
             ("road", "highway of 700 m with a ramp"),
             ("vehicles", f"{self.inflow:g} + {self.ramp_flow:g} veh/h ({share})"),
-            ("limit_speed", f"{self.limit_speed():.2f} m/s"),
+            ("limit", f"{self.limit_speed():.2f} m/s"),
             ("limit is", "the mean speed of the highway's traffic where nothing disturbs it"),
         ]
 

@@ -105,7 +105,7 @@ class OnRamp(Scenario):
         for name, flow in (("inflow", self.inflow), ("off_peak_inflow", self.off_peak_inflow)):
             most = 3600.0 * self.lanes / max(self.min_entry_headway, 1e-9)
             if flow >= most:
-                raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {most:.0f}, by entry_headway")
+                raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {most:.0f}, by min_entry_headway")
         for name, flow in (("ramp_flow", self.ramp_flow), ("off_peak_ramp_flow", self.off_peak_ramp_flow)):
             if flow >= 3600.0 / MIN_RAMP_HEADWAY:
                 raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {3600.0 / MIN_RAMP_HEADWAY:.0f}")
@@ -114,10 +114,10 @@ class OnRamp(Scenario):
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
         """Return the road with who wants to enter it; random are the people, when they come, who is a CAV."""
-        kinds = {f"person_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
+        kinds = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
         entries, draws = list[Entry](), dict[str, float]()
         for number, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
-            name, kind = f"vehicle_{number}", f"person_{generator.integers(HUMAN_TYPE_COUNT)}"
+            name, kind = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
             draws[name] = generator.random()
             entries.append(Entry(name, route, 0.0, speed, time, lane, kind))
         return MotorwayRoad(
@@ -165,7 +165,7 @@ class OnRamp(Scenario):
             time_headway=one.time_headway,
             acceleration=one.max_acceleration,
             deceleration=one.comfortable_deceleration,
-            gap=one.minimum_gap,
+            minimum_gap=one.minimum_gap,
         )
 
     def _arrivals(self, generator: np.random.Generator) -> Iterator[Arrival]:

@@ -25,7 +25,7 @@ from unjam.parameters import build_dataclass
 from unjam.physics.arrays import Array, clip, namespace
 from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMParameters
 
-PACKAGED_POPULATIONS = Path(str(files("unjam") / "scenarios/people"))
+PACKAGED_POPULATIONS = Path(str(files("unjam") / "scenarios/populations"))
 """populations that are part of the package, results/field/measure.sh: five parameters of each driver's own"""
 POPULATION_FORMAT = 1
 RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
@@ -33,7 +33,7 @@ RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
 MAX_POPULATION_BYTES = 64 * 2**20
 """bytes of a file"""
 POPULATION_KEYS = ("format", "unjam", "typical", "parameter_statistics", "limits", "drivers", "residual")
-"""keys of the file; others are `about`"""
+"""keys of the file; others are `metadata`"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,7 +132,7 @@ class LoopScenario(Scenario):
         return [
             ("road", self.description.format("-".join(map(str, ends)))),
             ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
-            ("limit_speed", "-".join(f"{self.limit_speed(size):.2f}" for size in ends) + " m/s"),
+            ("limit", "-".join(f"{self.limit_speed(size):.2f}" for size in ends) + " m/s"),
             ("limit is", self.limit_description),
         ]
 

@@ -46,8 +46,8 @@ SUMO makes room for who changes them, it is the one that works.
 HumanControl = Literal["native", "commanded"]
 """Who computes how people drive.
 
-`is_native`: SUMO's own IDM with the scenario's parameters, to whose speeds noise is added.
-`commanded_speeds`: the same IDM and noise as a speed command in every step, as Flow does it, over a quicker model
+`native`: SUMO's own IDM with the scenario's parameters, to whose speeds noise is added.
+`commanded`: the same IDM and noise as a speed command in every step, as Flow does it, over a quicker model
 of SUMO's that keeps vehicles safe and obeys the right of way. SUMO's IDM with the paper's parameters alone is
 far more timid where roads cross.
 """
@@ -173,7 +173,7 @@ class Scenario:
     """calibrated drivers, each of whom drives in its own way: a file of `unjam fit-drivers`, `unjam:ngsim` or
     `unjam:astazero`; empty: all drive as `humans` says"""
     human_control: HumanControl = "native"
-    """who computes how people drive: `is_native` SUMO's own IDM; `commanded_speeds` the same IDM as a speed command in
+    """who computes how people drive: `native` SUMO's own IDM; `commanded` the same IDM as a speed command in
     every step, as in Flow"""
     right_of_way: bool = True
     """whether vehicles obey the right of way where roads meet; if not, SUMO only keeps them from colliding"""

@@ -53,7 +53,7 @@ class UserNetwork(Scenario):
     SUMO's `max-num-teleports` always does.
     """
 
-    title: ClassVar[str] = "own-network"
+    title: ClassVar[str] = "user-network"
     reward: ClassVar[str] = "travel-time"
     is_closed: ClassVar[bool] = False
     has_coordinate: ClassVar[bool] = False
@@ -99,11 +99,11 @@ class UserNetwork(Scenario):
         if not self.cav_types:
             if self.penetration_rate == 0:
                 raise ValueError(
-                    "cav_share: 0.0 is not allowed without cav_types; allowed: > 0, <= 1, as --cav-share 0.1"
+                    "penetration_rate: 0.0 is not allowed without cav_types; allowed: > 0, <= 1, as --penetration-rate 0.1"
                 )
             if not self.eligible_types(files):
                 raise ValueError(
-                    f"cav_share: no vehicle has one of the classes {classes}; its types are "
+                    f"penetration_rate: no vehicle has one of the classes {classes}; its types are "
                     f"{_format_types(files, files.used_types)}; name cav_classes or cav_types"
                 )
         if self.emission_class != type(self).emission_class:
@@ -220,7 +220,7 @@ def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
         changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}
     if not changes.keys() & {"penetration_rate", "cav_types"}:
         changes = {**changes, "penetration_rate": DEFAULT_PENETRATION_RATE}
-        _log_once(f"penetration rate: {100 * DEFAULT_PENETRATION_RATE:g} %, as none is set; --cav-share sets another")
+        _log_once(f"penetration rate: {100 * DEFAULT_PENETRATION_RATE:g} %, as none is set; --penetration-rate sets another")
     values = {"file": str(files.path), "simulation_step": files.step, **changes}
     made = build_dataclass(UserNetwork, values, Path(file).name)
     if "horizon" not in changes:

@@ -159,14 +159,14 @@ def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
     options: dict[str, str] = found["options"]
     kinds = {name: classify_option(path.name, name, value) for name, value in options.items()}
     found["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
-    found["dropped_items"] = (*(f"option {name}" for name in options if kinds[name] == "not written"), *found["dropped_items"])
+    found["dropped_items"] = (*(f"option {name}" for name in options if kinds[name] == "dropped"), *found["dropped_items"])
     found["replaced_options"] = tuple(name for name in options if kinds[name] == "replaced")
     files = SumoFiles(path, **found)
     _read_files[path], _answers[file] = (stamps, files), answer
     return files
 
 
-def classify_option(file: str, name: str, value: str) -> Literal["passed", "ignored", "replaced", "not written"]:
+def classify_option(file: str, name: str, value: str) -> Literal["passed", "ignored", "replaced", "dropped"]:
     """Return what becomes of an option of a configuration.
 
     Raises:
@@ -179,7 +179,7 @@ def classify_option(file: str, name: str, value: str) -> Literal["passed", "igno
     if name in REPLACED_OPTIONS:
         return "replaced"
     if OUTPUT_OPTIONS.search(name):
-        return "not written"
+        return "dropped"
     if name not in REFUSED_OPTIONS:
         known = [*PASSED_OPTIONS, *IGNORED_OPTIONS, *REPLACED_OPTIONS, *REFUSED_OPTIONS]
         raise InputError(f"{file}: {name}: SUMO 1.28 has no such option{spelling_hint(name, known)}")
@@ -235,9 +235,9 @@ def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, 
     except (subprocess.TimeoutExpired, ValueError):
         limits = f"{MAX_READER_MEMORY / 2**30:g} GiB, {MAX_READER_TIME:g} s"
         raise InputError(f"{path.name}: its files cannot be read within {limits}") from None
-    if "broken" in answer:
-        raise InputError(answer["broken"])
-    return answer["found"]
+    if "error" in answer:
+        raise InputError(answer["error"])
+    return answer["result"]
 
 
 def is_passed_option(name: str) -> bool:

@@ -1,6 +1,6 @@
 """Reads SUMO's XML files in one pass: what vehicles and harmful elements they have, and a harmless copy.
 
-It uses Python's own library alone: `program.py` runs it in a process of its own.
+It uses Python's own library alone: `reader_program.py` runs it in a process of its own.
 """
 
 import os

@@ -83,7 +83,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     """Return what a .sumocfg file and the files that it names say, as JSON; the fields of `SumoFiles`.
 
     Raises:
-        Broken: one is missing or broken, the network has no version, or there are no vehicles.
+        BrokenFileError: one is missing or broken, the network has no version, or there are no vehicles.
     """
     check_file_exists(path)
     stamps = {path: file_stamp(path)}
@@ -135,7 +135,7 @@ def _read_options(path: Path) -> dict[str, str]:
     """Return the options of a configuration that have a value, by SUMO's own names for them.
 
     Raises:
-        Broken: an option is set twice, or has a text instead of a value.
+        BrokenFileError: an option is set twice, or has a text instead of a value.
     """
     options: dict[str, str] = {}
 
@@ -260,7 +260,7 @@ class _Demand:
     def _note_person_trip(self, attributes: XmlAttributes) -> None:
         modes = attributes.get("modes", "").replace(",", " ").split()
         own = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
-        self.wanted |= set(attributes.get("vTypes", "").split()) or own
+        self.used_names |= set(attributes.get("vTypes", "").split()) or own
 
     def _note_calibrator(self, attributes: XmlAttributes) -> None:
         self.calibrates = True
@@ -329,11 +329,11 @@ READER_COMMANDS: dict[str, Callable[..., Any]] = {
 def _main(command: str, *paths: str) -> None:
     """Print what a file says, or what is wrong with it."""
     try:
-        found = {"found": READER_COMMANDS[command](*map(Path, paths))}
+        found = {"result": READER_COMMANDS[command](*map(Path, paths))}
     except BrokenFileError as error:
-        found = {"broken": str(error)}
+        found = {"error": str(error)}
     except (MemoryError, RecursionError):
-        found = {"broken": f"{Path(paths[0]).name}: its files are too large to be read"}
+        found = {"error": f"{Path(paths[0]).name}: its files are too large to be read"}
     sys.stdout.write(json.dumps(found))
 
 
