@@ -14,12 +14,12 @@ import torch
 from tests.training.test_run import learn_with, small_config
 from unjam.worlds.worker_pool import WorkerPool
 
-DATA = ("virtual/data/", "replay/")
+DATA = ("model/data/", "replay/")
 """what was learned from, not what was learned"""
 LEARNERS = {
-    "trpo": {"virtual__virtual_ratio": 1.0, "virtual__epochs": 2, "virtual__members": 2},
-    "ppo": {"virtual__virtual_ratio": 0.0},
-    "sac": {"virtual__virtual_ratio": 0.0},
+    "trpo": {"model__model_ratio": 1.0, "model__epochs": 2, "model__members": 2},
+    "ppo": {"model__model_ratio": 0.0},
+    "sac": {"model__model_ratio": 0.0},
 }
 
 
@@ -29,7 +29,9 @@ def hashes(learners: list[str]) -> dict[str, str]:
     found = {}
     with tempfile.TemporaryDirectory() as place, WorkerPool(1) as workers:
         for learner in learners:
-            config = small_config(agent=learner, policy__hidden=[32, 32], evaluation__every=0, **LEARNERS[learner])
+            config = small_config(
+                agent=learner, policy__hidden=[32, 32], evaluation__validation_interval=0, **LEARNERS[learner]
+            )
             run = learn_with(workers, Path(place) / learner, config)
             total = hashlib.sha256()
             for name, tensor in sorted(run.training.state()[1].items()):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.learners.task import DECISIONS, INPUTS, Target, Toy, constant_target, mean_return, same, sloped_target
+from tests.learners.toy_task import DECISIONS, INPUTS, Target, Toy, constant_target, mean_return, same, sloped_target
 from unjam.errors import UnjamError
 from unjam.learners.algorithm_1 import environment_experience, return_after_exit, seed_iteration
 from unjam.learners.experience import make_experience
@@ -77,7 +77,7 @@ def test_an_iteration_tells_what_progress_needs(agent: str) -> None:
     (iteration,) = Toy(agent=agent).learn(1).iterations
     assert iteration.log
     assert all(type(value) is float and np.isfinite(value) for value in iteration.log.values())
-    assert set(iteration.seconds) == {"actual", "update"}
+    assert set(iteration.seconds) == {"collect", "update"}
     assert min(iteration.seconds.values()) > 0.0
     assert iteration.model_steps == 0
     assert len(iteration.episodes[0]) == 8
@@ -101,8 +101,8 @@ def test_what_is_earned_afterwards_is_discounted_look_by_look_to_the_last_one() 
     task = Toy(hold=2)
     (episode,) = task.collect(task.learner.network(), 1)[0][:1]
     (stays,) = episode.trajectories
-    left = replace(stays, residual=np.zeros(4), applied=np.zeros(4), hold=2)
-    whole = replace(episode, speeds=np.zeros((12, 1)), terms={"one": reward})
+    left = replace(stays, residual=np.zeros(4), applied_acceleration=np.zeros(4), action_repeat=2)
+    whole = replace(episode, speeds=np.zeros((12, 1)), reward_terms={"one": reward})
     expected = 0.9 * (5.0 + 6.0) + 0.9**2 * (7.0 + 8.0) + 0.9**3 * (9.0 + 10.0) + 0.9**4 * 11.0
     assert return_after_exit(whole, left, 0.9, 11) == pytest.approx(expected)
     assert return_after_exit(whole, replace(left, terminated=True), 0.9, 11) is None

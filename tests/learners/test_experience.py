@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 
-from tests.learners.task import make_policy, shake
+from tests.learners.toy_task import make_policy, shake
 from unjam.drivers import LocalState
 from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.learners.experience import (

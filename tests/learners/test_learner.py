@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 from torch.distributions import Normal
 
-from tests.learners.task import QUICK, Toy, same
+from tests.learners.toy_task import QUICK, Toy, same
 from unjam.learners.learner import policy_distance
 from unjam.learners.settings import AGENT_NAMES, LearnerSettings, PolicySettings, SACSettings
 

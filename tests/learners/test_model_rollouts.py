@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.conftest import random_network
-from tests.learners.task import same
+from tests.learners.toy_task import same
 from unjam.drivers import PISaturation
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
@@ -101,7 +101,7 @@ def policy_of(trained: Trained) -> dict[str, torch.Tensor]:
 def test_a_learner_that_was_stopped_goes_on_with_the_same_model_and_data(
     agent: str, update: str, shared: Simulation
 ) -> None:
-    virtual = replace(VIRTUAL, update=update, updates=2)
+    virtual = replace(VIRTUAL, update_mode=update, model_updates=2)
     expected = Trained(shared, agent, virtual).learn(3)
     stopped = Trained(shared, agent, virtual).learn(1)
     resumed = Trained(shared, agent, virtual)
@@ -114,12 +114,12 @@ def test_a_learner_that_was_stopped_goes_on_with_the_same_model_and_data(
 
 @pytest.mark.parametrize("agent", ["trpo", "ppo"])
 def test_the_ratio_is_exactly_one_before_each_update(agent: str, shared: Simulation) -> None:
-    trained = Trained(shared, agent, replace(VIRTUAL, update="sequential", updates=2))
+    trained = Trained(shared, agent, replace(VIRTUAL, update_mode="sequential", model_updates=2))
     learner = trained.learner
     seen: list[Update] = []
 
     def learn(update: Update) -> None:
-        learner.fill(
+        learner.fill_buffer(
             join_experience([part for part in (update.environment_rows, update.model_rows) if part is not None])
         )
         buffer = learner.sb3.rollout_buffer
@@ -164,7 +164,7 @@ def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(share
     learner = Trained(shared, "trpo", None).learner
     rollouts = rollouts_of(np.array([[1.0, 2.0], [3.0, 4.0]]), [2, 2], [False, True])
     rows = rollout_experience(rollouts, rollouts.drawn_values.numpy())
-    learner.fill(rows)
+    learner.fill_buffer(rows)
     with torch.no_grad():
         values, ends = (
             learner.sb3.policy.predict_values(torch.as_tensor(part)).numpy().ravel()
@@ -181,7 +181,7 @@ def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(share
 def test_rollouts_begin_in_the_episodes_asked_for_and_are_as_many(
     shared: Simulation, begin: Any, episodes_begun: set[int]
 ) -> None:
-    imagination = RowRollouts(replace(VIRTUAL, model_ratio=3.0, begin=begin), TASK, POLICY, 0)
+    imagination = RowRollouts(replace(VIRTUAL, model_ratio=3.0, rollout_starts=begin), TASK, POLICY, 0)
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, 10)
     for iteration in (1, 2):
@@ -207,9 +207,9 @@ def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() 
         rollout_experience(rollouts, rollouts.drawn_values.numpy())
         for rollouts in (rollouts_of(np.full((4, 3), reward), [3] * 4, [False] * 4) for reward in (1.0, 2.0))
     )
-    sac.fill(buffer, actual)
+    sac.add_rows(buffer, actual)
     assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
-    sac.fill(buffer.new_model_buffer(12), virtual)
+    sac.add_rows(buffer.new_model_buffer(12), virtual)
     buffer.real_ratio = 0.25
     found = buffer.sample(8).rewards.numpy().ravel()
     assert sorted(found) == pytest.approx([0.1] * 2 + [0.2] * 6)
@@ -220,12 +220,12 @@ def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() 
 def test_what_is_told_of_the_virtual_environment_is_whole(shared: Simulation) -> None:
     told = Trained(shared, "trpo", VIRTUAL).learn(1).told[0]
     (virtual,) = told.model
-    assert {"k_star", "eps_m", "eps_m_by_estimator", "one_step", "bound", "return_virtual", "return_actual"} <= set(
+    assert {"k_star", "eps_m", "eps_m_by_estimator", "one_step", "bound", "return_model", "return_environment"} <= set(
         virtual
     )
-    assert set(told.seconds) == {"actual", "fit", "imagine", "update"}
+    assert set(told.seconds) == {"collect", "fit", "roll_out", "update"}
     assert 0 < told.log["eps_pi_mean"] <= told.log["eps_pi_max"] <= 1
-    assert virtual["bound"] > abs(virtual["return_virtual"] - virtual["return_actual"])
+    assert virtual["bound"] > abs(virtual["return_model"] - virtual["return_environment"])
 
 
 def test_what_is_known_of_people_survives_a_stop(shared: Simulation) -> None:

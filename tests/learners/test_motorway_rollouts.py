@@ -29,7 +29,7 @@ from unjam.worlds.worker_pool import EpisodeTask
 
 ROAD = replace(ON_RAMP, horizon=160, peak=(20.0, 160.0), penetration_rate=0.2)
 EXPERT = driver_from_name("jam-ahead", 1.0)
-POLICY = PolicySettings(hidden=(8,), inputs=("local",), action_duration=5.0, exploration="mirrored")
+POLICY = PolicySettings(hidden=(8,), inputs=("local",), action_duration=5.0, exploration="antithetic")
 VIRTUAL = ModelSettings(kind="road", rollout_starts="first", k_max=160, model_ratio=1.0, max_fit_rows=2000)
 HOW = ExperienceFactory(
     lambda drawn: drawn,
@@ -51,7 +51,7 @@ def in_sumo() -> list[Episode]:
 
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(motorway_model, "EVERY", 10)
+    monkeypatch.setattr(motorway_model, "MAX_SAMPLE_INTERVAL", 10)
 
 
 def again(errs: bool, beyond: float = 0.0, seed: int = 9) -> Episode:
@@ -110,11 +110,11 @@ def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual:
     imagination = MotorwayRollouts(replace(VIRTUAL, model_ratio=2.0), task, POLICY, 0)
     imagination.learn(actual, 1)
     assert imagination.k_star == 160
-    network = replace(network_of(0.05, POLICY), lasts=True)
+    network = replace(network_of(0.05, POLICY), episode_noise=True)
     found = imagination.roll_out(network, 1, 0, 1, HOW)
     assert found is not None
     assert imagination.model_steps == 2 * len(actual) * 160
-    assert imagination.facts["return_virtual"] == pytest.approx(imagination.facts["return_actual"], rel=0.1)
+    assert imagination.facts["return_model"] == pytest.approx(imagination.facts["return_environment"], rel=0.1)
     assert imagination.facts["crash_share"] == 0.0
     facts, tensors = imagination.state()
     other = MotorwayRollouts(replace(VIRTUAL, model_ratio=2.0), task, POLICY, 0)
@@ -136,7 +136,7 @@ def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual:
 def test_for_a_while_there_are_more_of_them_and_none_where_no_cav_comes(actual: list[Episode]) -> None:
     imagination = MotorwayRollouts(replace(VIRTUAL, k_max=80), Task(ROAD, EXPERT), POLICY, 0)
     imagination.learn(actual[:2], 1)
-    network = replace(network_of(0.05, POLICY), lasts=True)
+    network = replace(network_of(0.05, POLICY), episode_noise=True)
     assert imagination.roll_out(network, 1, 0, 1, HOW) is not None
     assert imagination.model_steps == 2 * 160
     imagination.k_star = 5
@@ -177,7 +177,7 @@ def test_networks_count_beside_wrong_people_and_not_beside_those_who_are_known(a
         imagination = MotorwayRollouts(replace(VIRTUAL, epochs=60), Task(ROAD, EXPERT), POLICY, 0)
         imagination.scenario = replace(ROAD, **people)
         imagination.learn(actual, 1)
-        assert imagination.facts["learned"] == learned
+        assert imagination.facts["learned_targets"] == learned
 
 
 @pytest.mark.long
@@ -187,7 +187,7 @@ def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
     imagination = MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
     imagination.learn(actual, 1)
     step = imagination.facts["one_step"]["speed"]
-    assert imagination.facts["learned"] == ["speed"]
+    assert imagination.facts["learned_targets"] == ["speed"]
     assert step["base"] == pytest.approx(step["change"], rel=0.05)  # the base: nothing changes
     assert step["model"] < 0.9 * step["base"]
 
@@ -195,9 +195,9 @@ def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (replace(VIRTUAL, begin="newest"), "model.rollout_starts: newest is not allowed"),
+        (replace(VIRTUAL, rollout_starts="newest"), "model.rollout_starts: newest is not allowed"),
         (replace(VIRTUAL, base="acc"), "model.base: acc is not allowed; allowed: idm"),
-        (replace(VIRTUAL, calibrate=True), "model.calibrate_base: true is not allowed"),
+        (replace(VIRTUAL, calibrate_base=True), "model.calibrate_base: true is not allowed"),
     ],
 )
 def test_what_cannot_be_imagined_is_refused(settings: ModelSettings, words: str) -> None:
@@ -223,4 +223,4 @@ def test_the_base_expects_of_people_in_sumo_what_it_expects_of_those_in_the_batc
 
 def test_a_record_that_skips_moments_is_refused(in_sumo: list[Episode]) -> None:
     with pytest.raises(InputError, match="skips moments"):
-        motorway_samples(replace(in_sumo[0], every=2), 0, ROAD)
+        motorway_samples(replace(in_sumo[0], snapshot_stride=2), 0, ROAD)

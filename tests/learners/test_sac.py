@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.learners.task import INPUTS, Toy, make_policy, of_any_size, random_rows, residual_of, shake
+from tests.learners.toy_task import INPUTS, Toy, make_policy, of_any_size, random_rows, residual_of, shake
 from unjam.learners.sac import SquashedResidualPolicy, uniform_network
 from unjam.learners.settings import PolicySettings, SACSettings
 

@@ -14,16 +14,16 @@ from unjam.parameters import build_dataclass
         (PolicySettings, "hidden", (64, 0)),
         (PolicySettings, "hidden", ()),
         (PolicySettings, "hidden", 64),
-        (PolicySettings, "observe", ()),
-        (PolicySettings, "observe", ("local", "stars")),
+        (PolicySettings, "inputs", ()),
+        (PolicySettings, "inputs", ("local", "stars")),
         (PolicySettings, "authority", 0.0),
         (PolicySettings, "authority", float("inf")),
         (PolicySettings, "exploration_std", 0.0),
         (PolicySettings, "exploration_std", float("nan")),
-        (PolicySettings, "hold", -1.0),
+        (PolicySettings, "action_duration", -1.0),
         (PolicySettings, "learn_exploration_std", "perhaps"),
-        (TRPOSettings, "batch_steps", 0),
-        (TRPOSettings, "batch_steps", 10.5),
+        (TRPOSettings, "steps_per_iteration", 0),
+        (TRPOSettings, "steps_per_iteration", 10.5),
         (TRPOSettings, "gamma", 1.0),
         (TRPOSettings, "gamma", 0.0),
         (TRPOSettings, "gae_lambda", 1.1),
@@ -35,9 +35,9 @@ from unjam.parameters import build_dataclass
         (TRPOSettings, "critic_weight_decay", -1e-3),
         (TRPOSettings, "critic_batch_size", "many"),
         (TRPOSettings, "critic_batch_size", 1),
-        (PPOSettings, "batch_steps", 0),
-        (PPOSettings, "clip", 0.0),
-        (PPOSettings, "clip", 1.0),
+        (PPOSettings, "steps_per_iteration", 0),
+        (PPOSettings, "clip_range", 0.0),
+        (PPOSettings, "clip_range", 1.0),
         (PPOSettings, "epochs", 0),
         (PPOSettings, "minibatches", 0),
         (PPOSettings, "actor_learning_rate", 0.0),
@@ -46,7 +46,7 @@ from unjam.parameters import build_dataclass
         (SACSettings, "tau", 1.5),
         (SACSettings, "temperature", 0.0),
         (SACSettings, "target_entropy", 1.0),
-        (SACSettings, "start", "slowly"),
+        (SACSettings, "start_policy", "slowly"),
         (SACSettings, "learning_starts", -1),
         (SACSettings, "gradient_steps_per_step", 0.0),
         (SACSettings, "buffer_size", 0),
@@ -82,7 +82,7 @@ def test_settings_do_not_change_once_made(made: Any) -> None:
 
 
 def test_lists_of_a_toml_file_become_tuples() -> None:
-    made = build_dataclass(PolicySettings, {"hidden": [32, 16], "observe": ["local", "loop_length"]}, "")
+    made = build_dataclass(PolicySettings, {"hidden": [32, 16], "inputs": ["local", "loop_length"]}, "")
     assert made == PolicySettings(hidden=(32, 16), inputs=("local", "loop_length"))
 
 
@@ -91,6 +91,6 @@ def test_lists_of_a_toml_file_become_tuples() -> None:
     [(1.0, 0.1, 10), (1.0, 1.0, 1), (1.0, 0.2, 5), (0.0, 0.1, 1), (0.5, 1.0, 1), (0.3, 0.1, 3)],
 )
 def test_a_residual_is_held_for_so_many_seconds_whatever_a_decision_takes(
-    hold: float, decision_step: float, decisions: int
+    hold: float, control_step: float, decisions: int
 ) -> None:
-    assert PolicySettings(action_duration=hold).action_repeat(decision_step) == decisions
+    assert PolicySettings(action_duration=hold).action_repeat(control_step) == decisions

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from tests.learners.task import INPUTS, Toy, make_policy, of_any_size, random_rows, same, shake
+from tests.learners.toy_task import INPUTS, Toy, make_policy, of_any_size, random_rows, same, shake
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
@@ -134,7 +134,7 @@ def test_explores_at_the_start_with_the_standard_deviation_that_was_set(learned:
 
 
 def test_noise_that_lasts_is_as_wide_in_the_network_as_the_policy_reckons() -> None:
-    policy = fresh(PolicySettings(exploration_std=0.1, exploration="lasting"), action_limit=2.0)
+    policy = fresh(PolicySettings(exploration_std=0.1, exploration="per_episode"), action_limit=2.0)
     shake(policy, 3)
     network, rows = policy.network(), random_rows(6, 5)
     assert network.exploration_std == pytest.approx(0.2, rel=1e-6)
@@ -148,7 +148,7 @@ def test_noise_that_lasts_is_as_wide_in_the_network_as_the_policy_reckons() -> N
 
 
 def test_noise_that_lasts_tries_something_where_all_units_are_at_rest() -> None:
-    policy = fresh(PolicySettings(exploration_std=0.1, exploration="lasting"), action_limit=2.0)
+    policy = fresh(PolicySettings(exploration_std=0.1, exploration="per_episode"), action_limit=2.0)
     with torch.no_grad():
         at_rest = cast(Normal, policy.get_distribution(torch.zeros(1, 5)).distribution)
     assert float(at_rest.stddev) == pytest.approx(0.2, rel=1e-4)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import random_network
-from tests.models.little_world import RING, LittleWorld, actual_data
+from tests.models.toy_dynamics import RING, ToyDynamics, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.models.comparison import (
     ReturnGap,
@@ -27,12 +27,12 @@ def alone() -> RowModel:
     return RowModel(SETTINGS, 1, (1,))
 
 
-def known_ahead(world: LittleWorld) -> EnvironmentData:
+def known_ahead(world: ToyDynamics) -> EnvironmentData:
     return actual_data(world, DRIVER, 30, 60)
 
 
 def test_a_model_that_is_the_truth_is_never_off() -> None:
-    data = known_ahead(LittleWorld(leader=0.0))
+    data = known_ahead(ToyDynamics(leader=0.0))
     found = open_loop_errors(alone(), data, data.start_indices(40), 40, RING)
     for name in STATE_FIELDS:
         assert found.error[name].shape == found.spread[name].shape == (40,)
@@ -43,7 +43,7 @@ def test_a_model_that_is_the_truth_is_never_off() -> None:
 
 def test_errors_are_those_of_the_base_written_out() -> None:
     """The base believes that the leader keeps its speed."""
-    data = known_ahead(LittleWorld())
+    data = known_ahead(ToyDynamics())
     choices = data.start_indices(30)
     found = open_loop_errors(alone(), data, choices, 30, RING)
     for step in (1, 10, 30):
@@ -58,7 +58,7 @@ def test_errors_are_those_of_the_base_written_out() -> None:
 
 
 def test_learning_brings_virtual_and_actual_together() -> None:
-    data = known_ahead(LittleWorld())
+    data = known_ahead(ToyDynamics())
     choices, model = data.start_indices(30), alone()
     before = open_loop_errors(model, data, choices, 30, RING)
     fit_row_model(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
@@ -70,7 +70,7 @@ def test_learning_brings_virtual_and_actual_together() -> None:
 
 
 def test_each_member_drives_alone_from_what_was_recorded() -> None:
-    data = known_ahead(LittleWorld())
+    data = known_ahead(ToyDynamics())
     model = alone()
     fit_row_model(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
     choices = data.start_indices(30)[:5]
@@ -88,7 +88,7 @@ def test_each_member_drives_alone_from_what_was_recorded() -> None:
 
 
 def test_errors_one_step_ahead_are_those_of_the_fit() -> None:
-    data, model = known_ahead(LittleWorld()), alone()
+    data, model = known_ahead(ToyDynamics()), alone()
     actual = data.transitions(0.2)
     found = fit_row_model(model, actual, SETTINGS, RING, "", (2,))
     errors = one_step_errors(model, actual.select(np.flatnonzero(actual.is_holdout)), RING, "")
@@ -98,12 +98,12 @@ def test_errors_one_step_ahead_are_those_of_the_fit() -> None:
 
 
 def test_a_new_model_is_as_wrong_as_its_base() -> None:
-    errors = one_step_errors(alone(), known_ahead(LittleWorld()).transitions(0.2), RING, "")
+    errors = one_step_errors(alone(), known_ahead(ToyDynamics()).transitions(0.2), RING, "")
     for member in errors.model:
         np.testing.assert_array_equal(member, errors.base)
 
 
-def gap_of(driver: ResidualDriver, world: LittleWorld, data: EnvironmentData) -> ReturnGap:
+def gap_of(driver: ResidualDriver, world: ToyDynamics, data: EnvironmentData) -> ReturnGap:
     starts = prepare_starts(data, data.start_indices(20), driver.expert, "cpu")
     rollouts = roll_out(driver, world, starts, 20, torch_generator((1,), "cpu"))
     found = return_gap(rollouts.rewards.sum(1).double().numpy(), rollouts.start_indices, data, 18)
@@ -112,7 +112,7 @@ def gap_of(driver: ResidualDriver, world: LittleWorld, data: EnvironmentData) ->
 
 
 def test_in_the_true_world_there_is_no_gap_between_returns() -> None:
-    world = LittleWorld()
+    world = ToyDynamics()
     data = actual_data(world, DRIVER, 6, 60, explore=False)
     quiet = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
     object.__setattr__(quiet.network, "exploration_std", 0.0)
@@ -125,6 +125,6 @@ def test_in_the_true_world_there_is_no_gap_between_returns() -> None:
 
 
 def test_a_world_that_pays_more_has_a_gap() -> None:
-    data = actual_data(LittleWorld(), DRIVER, 6, 60)
-    found = gap_of(DRIVER, LittleWorld(bonus=5.0), data)
+    data = actual_data(ToyDynamics(), DRIVER, 6, 60)
+    found = gap_of(DRIVER, ToyDynamics(bonus=5.0), data)
     assert found.model_return - found.environment_return > 5 * found.standard_error

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.conftest import random_network
-from tests.models.little_world import RING, LittleWorld, actual_data
+from tests.models.toy_dynamics import RING, ToyDynamics, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.errors import UnjamError
 from unjam.models.ensemble import predict
@@ -20,7 +20,7 @@ DRIVER = ResidualDriver(IDM(), random_network(), 1.0)
 
 @pytest.fixture(scope="module")
 def data() -> EnvironmentData:
-    return actual_data(LittleWorld(), DRIVER, 40, 50)
+    return actual_data(ToyDynamics(), DRIVER, 40, 50)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_rows_are_counted(known: tuple[RowModel, ModelFit], actual: Transitions)
 
 def test_a_better_base_leaves_less_unexplained(known: tuple[RowModel, ModelFit], actual: Transitions) -> None:
     _, nothing_known = fitted(actual, replace(SETTINGS, base="none"))
-    assert known[1].errors["unexplained"] < nothing_known.errors["unexplained"]
+    assert known[1].errors["unexplained_variance"] < nothing_known.errors["unexplained_variance"]
     assert known[1].one_step["leader_gap"].base < nothing_known.one_step["leader_gap"].base
     assert set(nothing_known.learned_targets) == set(TARGET_NAMES)
 
@@ -82,7 +82,7 @@ def test_the_base_is_used_where_nothing_can_be_learned(actual: Transitions) -> N
     noise = np.random.default_rng(0).normal(size=len(actual.acceleration))
     following = actual.next_states._replace(follower_speed=actual.next_states.follower_speed + noise)
     known = actual.reward - residual_targets(actual, "idm", RING, "")[:, -1]
-    model, found = fitted(actual._replace(following=following, reward=known))
+    model, found = fitted(actual._replace(next_states=following, reward=known))
     assert "follower_speed" not in found.learned_targets
     assert "reward" not in found.learned_targets
     assert "leader_speed" in found.learned_targets
@@ -94,7 +94,7 @@ def test_the_base_is_used_where_nothing_can_be_learned(actual: Transitions) -> N
 def test_a_number_that_never_varied_misleads_nobody_where_it_does(actual: Transitions) -> None:
     """As the length of the ring, of which the first episodes may have a single one."""
     other = actual.drawn_values + np.where(actual.is_holdout, 0.5, 0.1 / 3.0)[:, None]
-    _, found = fitted(actual._replace(drawn=other))
+    _, found = fitted(actual._replace(drawn_values=other))
     for name in ("leader_speed", "leader_gap"):
         assert found.one_step[name].model < 0.5 * found.one_step[name].base, name
 
@@ -106,7 +106,7 @@ def test_noise_is_what_the_holdout_was_off_by(actual: Transitions) -> None:
         follower_speed=actual.next_states.follower_speed + 0.5 * error,
         follower_gap=actual.next_states.follower_gap - 0.1 * error,
     )
-    model, _ = fitted(actual._replace(following=following))
+    model, _ = fitted(actual._replace(next_states=following))
     assert model.noise.shape == (NOISE_SAMPLES, len(TARGET_NAMES))
     noise = dict(zip(TARGET_NAMES, model.noise.double().numpy().T, strict=True))
     assert noise["follower_speed"].std() == pytest.approx(0.5, rel=0.15)
@@ -143,26 +143,26 @@ def test_a_second_fit_goes_on_from_the_first(actual: Transitions) -> None:
 def test_bad_steps_are_taken_back(actual: Transitions, known: tuple[RowModel, ModelFit]) -> None:
     model = RowModel(SETTINGS, 1, (1,))
     model.load_state_dict(known[0].state_dict())
-    wild = replace(SETTINGS, rate=1.0, epochs=2)
+    wild = replace(SETTINGS, learning_rate=1.0, epochs=2)
     found = fit_row_model(model, actual, wild, RING, "", (6,))
     assert found.one_step["reward"].model == pytest.approx(known[1].one_step["reward"].model, rel=1e-3)
-    assert found.errors["released"] > known[1].errors["released"]
+    assert found.errors["training_loss"] > known[1].errors["training_loss"]
 
 
 def test_a_loss_that_is_not_finite_is_told(actual: Transitions) -> None:
     broken = actual.next_states.leader_gap.copy()
     broken[:] = np.inf
     with pytest.raises(UnjamError, match="loss in pass 1 of its fit is not finite"):
-        fitted(actual._replace(following=actual.next_states._replace(leader_gap=broken)))
+        fitted(actual._replace(next_states=actual.next_states._replace(leader_gap=broken)))
 
 
 def test_every_estimator_is_there(known: tuple[RowModel, ModelFit]) -> None:
     errors = known[1].errors
-    assert set(errors) == {"unexplained", "transitions", "total_variation", "released"}
+    assert set(errors) == {"unexplained_variance", "transitions", "total_variation", "training_loss"}
     assert 0 < errors["transitions"] < 1
-    assert 0 < errors["unexplained"] < 0.1
+    assert 0 < errors["unexplained_variance"] < 0.1
     assert 0 < errors["total_variation"] < 1
-    assert 0 < errors["released"] < 0.1
+    assert 0 < errors["training_loss"] < 0.1
 
 
 def test_networks_that_may_not_fall_back_are_always_added(actual: Transitions) -> None:

@@ -49,7 +49,7 @@ def fitted(episodes: list[Episode], road: LoopScenario = RING, **changes: Any) -
 def test_where_people_are_known_only_their_noise_is_left(episodes: list[Episode]) -> None:
     model, found = fitted(episodes)
     assert found.learned_targets == ()
-    assert found.errors["unexplained"] < 1e-9
+    assert found.errors["unexplained_variance"] < 1e-9
     assert found.errors["transitions"] < 1e-6
     assert found.errors["total_variation"] == 0.0
     assert float(model.noise) == pytest.approx(RING.noise_per_step * RING.simulation_step, rel=0.05)
@@ -62,7 +62,7 @@ def test_what_a_base_does_not_know_the_networks_learn(episodes: list[Episode], b
     step = found.one_step["speed"]
     assert found.learned_targets == ("speed",)
     assert step.model < step.base / 3
-    assert found.errors["unexplained"] == pytest.approx((step.model / step.change) ** 2)
+    assert found.errors["unexplained_variance"] == pytest.approx((step.model / step.change) ** 2)
 
 
 @pytest.mark.long
@@ -70,7 +70,7 @@ def test_on_a_figure_eight_the_right_of_way_is_known_and_noise_no_ignorance(eigh
     model, found = fitted(eights, EIGHT)
     sigma = EIGHT.noise_per_step * EIGHT.simulation_step
     assert found.one_step["speed"].base == pytest.approx(sigma, rel=0.05)
-    assert found.errors["unexplained"] < 0.02
+    assert found.errors["unexplained_variance"] < 0.02
     assert float(model.noise) == sigma
 
 

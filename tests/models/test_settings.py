@@ -19,15 +19,15 @@ def test_every_base_can_be_chosen() -> None:
             {"base": "krauss"},
             "model.base: 'krauss' is not allowed; allowed: 'idm', 'population', 'acc', 'ovm' or 'none'",
         ),
-        ({"error": "loss"}, "model.error_estimator: 'loss' is not allowed; allowed: 'unexplained'"),
+        ({"error_estimator": "loss"}, "model.error_estimator: 'loss' is not allowed; allowed: 'unexplained_variance'"),
         ({"members": 0}, "model.members: 0 is not allowed"),
         ({"holdout": 1.0}, "model.holdout: 1.0 is not allowed"),
         ({"hidden": ()}, "model.hidden"),
         ({"epochs": 0}, "model.epochs: 0"),
         ({"length": 3}, "model.length: unknown name"),
-        ({"members": 1, "error": "total_variation"}, "model.members: 1 is not allowed with total_variation"),
+        ({"members": 1, "error_estimator": "total_variation"}, "model.members: 1 is not allowed with total_variation"),
     ],
 )
 def test_what_is_wrong_is_named(values: dict, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        build_dataclass(ModelSettings, values, "virtual")
+        build_dataclass(ModelSettings, values, "model")

@@ -143,11 +143,11 @@ def algorithm_1(
     """
     learner, imaginations = training.learner, training.model_rollouts
     while training.environment_steps < max_environment_steps:
-        timed_parts = ("actual", "fit", "imagine", "update") if imaginations else ("actual", "update")
+        timed_parts = ("collect", "fit", "roll_out", "update") if imaginations else ("collect", "update")
         seconds: dict[str, float] = dict.fromkeys(timed_parts, 0.0)
 
         # Line 4: collect transitions from the actual environment using pi_theta and pi_H, ...
-        with _measure_seconds(seconds, "actual"):
+        with _measure_seconds(seconds, "collect"):
             network = learner.exploring_network(training.environment_steps)
             episodes = collect(network, training.iteration + 1)
         training.iteration += 1
@@ -168,7 +168,7 @@ def algorithm_1(
             # Line 7: collect virtual transitions using T, pi_theta as it is now, and pi_H: D_v.
             virtual = None
             if parts:
-                with _measure_seconds(seconds, "imagine"):
+                with _measure_seconds(seconds, "roll_out"):
                     virtual = model_experience(training, part, parts)
                 if virtual is None and not with_actual:
                     continue

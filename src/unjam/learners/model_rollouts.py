@@ -33,7 +33,7 @@ from unjam.worlds.worker_pool import EpisodeTask
 
 FIT_SEED, STARTS_SEED, NOISE_SEED, EXPLORATION_SEED = 2, 3, 4, 5
 """what the random numbers of an iteration are for, in their seeds"""
-_DATA_PREFIX, _SAMPLES_PREFIX = "data/", "moments/"
+_DATA_PREFIX, _SAMPLES_PREFIX = "data/", "samples/"
 """prefixes of tensors in checkpoints"""
 
 
@@ -71,7 +71,7 @@ class ModelRollouts(Generic[EnsembleT]):
         """
         check_device(settings.device, "model.device")
         self.settings = settings
-        self.name = f"virtual-{task_index}" if task_index else "virtual"
+        self.name = f"model-{task_index}" if task_index else "model"
         """in checkpoints"""
         self.data = EnvironmentData(settings.buffer_size)
         self.scenario = task.scenario
@@ -127,7 +127,7 @@ class ModelRollouts(Generic[EnsembleT]):
             "eps_m": eps_m,
             "eps_m_by_estimator": found.errors,
             "one_step": {name: error._asdict() for name, error in found.one_step.items()},
-            "learned": list(found.learned_targets),
+            "learned_targets": list(found.learned_targets),
             "epochs": found.epochs,
         }
 
@@ -145,8 +145,8 @@ class ModelRollouts(Generic[EnsembleT]):
         newest = [self.data.recordings[place].episode >= self._first_new_episode for place in start_indices[:, 0]]
         gap = return_gap(returns[newest], start_indices[newest], self.data, control_steps)
         self.facts |= {
-            "return_virtual": gap and gap.model_return,
-            "return_actual": gap and gap.environment_return,
+            "return_model": gap and gap.model_return,
+            "return_environment": gap and gap.environment_return,
             "crash_share": crash_share,
         }
 
@@ -172,14 +172,14 @@ class ModelRollouts(Generic[EnsembleT]):
         facts, arrays = pack_data(self.data)
         tensors = {f"{_DATA_PREFIX}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
         tensors |= {name: tensor.cpu() for name, tensor in self.model.state_dict().items()}
-        return {"model_steps": self.model_steps, "data": facts, "people": asdict(self.scenario.humans)}, tensors
+        return {"model_steps": self.model_steps, "data": facts, "humans": asdict(self.scenario.humans)}, tensors
 
     def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
         """Go on from what `state` returned."""
         arrays = {name: tensor.numpy() for name, tensor in tensors_with_prefix(_DATA_PREFIX, tensors).items()}
         self.data = unpack_data(facts["data"], arrays)
         self.model_steps = facts["model_steps"]
-        self.scenario = replace(self.scenario, humans=IDMParameters(**facts["people"]))
+        self.scenario = replace(self.scenario, humans=IDMParameters(**facts["humans"]))
         self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(_DATA_PREFIX)})
 
 
@@ -297,7 +297,7 @@ class RowRollouts(ModelRollouts[RowModel]):
         if part == 0:
             earned = rollouts.rewards.sum(1).double().cpu().numpy()
             self._note_returns(earned, rollouts.start_indices, driven, float(rollouts.terminated.double().mean()))
-            self.facts["bounded"] = rollouts.clipped_share
+            self.facts["clipped_share"] = rollouts.clipped_share
         return rollouts
 
 

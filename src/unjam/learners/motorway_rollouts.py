@@ -109,7 +109,7 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
         again = ReplayOptions([((1,), (2,))], road.horizon, self.settings.add_noise, learned)
         actual, every = run_episode(EpisodeTask(road, expert, seed)), max(1, round(WAVE_INTERVAL / road.control_step))
         roads = {"recorded": road_trajectories(actual, every)}
-        for label, otherwise in {"imagined": again, "base": again._replace(learned=base)}.items():
+        for label, otherwise in {"model": again, "base": again._replace(learned=base)}.items():
             world = MotorwayBatch(road, [seed], replay=otherwise)
             world.measured_fields = expert.measured_fields
             (episode,) = finish_drive(DriveLoop(world, expert))
@@ -162,4 +162,4 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
         both = [(value, each.episode_return) for value, each in newest if each.episode >= self._first_new_episode]
         whole = control_steps >= self.scenario.horizon and both
         virtual, actual = np.mean(both, 0).tolist() if whole else (None, None)
-        self.facts |= {"return_virtual": virtual, "return_actual": actual}
+        self.facts |= {"return_model": virtual, "return_environment": actual}

@@ -150,7 +150,7 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
         did = ReplayDriver(np.stack([recordings[row].applied_acceleration for row in rows], 1))
         begun = np.array([[rows[0], 0]])
         kinds = {
-            "imagined": learned_human_model(self.model, self.scenario, torch_generator((0,), "cpu")),
+            "model": learned_human_model(self.model, self.scenario, torch_generator((0,), "cpu")),
             "base": base_human_model(self.settings.base, self.scenario),
         }
         cavs, memory = np.flatnonzero(moments.is_human == 0.0).tolist(), did.initial_memory(len(rows))
@@ -173,9 +173,3 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
             for cav in range(cav_count)
         ]
         return map_leaves(lambda *values: np.concatenate(values), each[0], *each[1:])
-
-    def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
-        """Go on from what `state` returned."""
-        # Earlier versions imagined rings alone, where size is length and nobody waits.
-        kept = [{"size": round(each["length"]), "waits": None, **each} for each in facts["moments"]]
-        super().restore({**facts, "moments": kept}, tensors)

@@ -64,11 +64,11 @@ class ReplayDriver(Driver):
 
     def initial_memory(self, n: int) -> Memory:
         """Return that nothing was decided yet."""
-        return {"decision": np.zeros(n)}
+        return {"index": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return those of this decision."""
-        return self.accelerations[int(memory["decision"][0])], {"decision": memory["decision"] + 1.0}
+        return self.accelerations[int(memory["index"][0])], {"index": memory["index"] + 1.0}
 
 
 @torch.no_grad()
@@ -90,8 +90,8 @@ def replay_accelerations(
     device = model.input_mean.device
     each_member = np.tile(start_indices, (model.members, 1))
     states = data.states_at(each_member).map(lambda values: to_device(values, device))
-    drawn = np.stack([data.recordings[place].drawn for place in each_member[:, 0]])
-    applied = np.stack([data.recordings[place].applied[at : at + control_steps] for place, at in each_member], 1)
+    drawn = np.stack([data.recordings[place].drawn_values for place in each_member[:, 0]])
+    applied = np.stack([data.recordings[place].applied_acceleration[at : at + control_steps] for place, at in each_member], 1)
     starts = RolloutStarts(states, {}, to_device(drawn, device), each_member)
     generator = torch_generator((0,), device)  # nothing is drawn from it
     members = torch.arange(model.members, device=device)

@@ -166,13 +166,13 @@ def reconstruct_memory(expert: Driver, recordings: Sequence[Recording], start_in
     """
     places, rows = np.unique(start_indices[:, 0], return_inverse=True)
     used = [recordings[place] for place in places]
-    memory = map_leaves(lambda *each: np.stack(each), *(recording.memory for recording in used))
+    memory = map_leaves(lambda *each: np.stack(each), *(recording.initial_memory for recording in used))
     found = map_leaves(lambda values: np.empty((len(start_indices), *values.shape[1:])), memory)
     if not found:
         return found
     last = int(start_indices[:, 1].max())
-    steps = [np.arange(last).clip(0, len(recording.applied)) for recording in used]
-    states = [kept.states.at(at) for kept, at in zip(used, steps, strict=True)]
+    steps = [np.arange(last).clip(0, len(recording.applied_acceleration)) for recording in used]
+    states = [kept.states.select(at) for kept, at in zip(used, steps, strict=True)]
     order = np.argsort(start_indices[:, 1], kind="stable")
     bounds = np.searchsorted(start_indices[order, 1], np.arange(last + 2))
 
@@ -182,7 +182,7 @@ def reconstruct_memory(expert: Driver, recordings: Sequence[Recording], start_in
             map_leaves(lambda into, values: into.__setitem__(here, values[rows[here]]), found, memory)
 
     store(0, memory)
-    world = RecordedWorld(states[0].each(lambda *each: np.stack(each, 1), *states[1:]), Limits(-inf, inf))
+    world = RecordedWorld(states[0].map(lambda *each: np.stack(each, 1), *states[1:]), Limits(-inf, inf))
     for decision, done in enumerate(DriveLoop(world, expert, memory=memory), start=1):
         store(decision, done.memory if done else memory)
     return found

@@ -119,10 +119,10 @@ def fit_row_model(
     change = residual_targets(transitions.select(found.holdout_indices), "none", scenario, reward)
     steps = OneStepErrors(found.targets, found.predictions, change).rmse_by_target()
     errors = {
-        "unexplained": unexplained_variance([steps[name] for name in STATE_FIELDS]),
+        "unexplained_variance": unexplained_variance([steps[name] for name in STATE_FIELDS]),
         "transitions": _row_transition_variation(found, transitions.select(found.holdout_indices), scenario),
         "total_variation": total_variation(found.predictions[:, :, :-1], error[:, :-1].std(0)),
-        "released": found.loss,
+        "training_loss": found.loss,
     }
     names = tuple(itertools.compress(TARGET_NAMES, model.output_mask.tolist()))
     return ModelFit(errors, steps, names, found.training_rows, len(found.holdout_indices), found.epochs)

@@ -151,7 +151,7 @@ def _batch_vehicles(
     """Return the vehicles of moments as a batch has them, each moment a road; nobody errs or remembers."""
     numbers = {entry.name: number for number, entry in enumerate(road.entries)}
     entries = np.array([numbers[name] for name in episode.vehicle_ids])
-    people = np.array([driver_columns(road.vehicle_types[road.entries[number].kind]) for number in entries.tolist()])
+    people = np.array([driver_columns(road.vehicle_types[road.entries[number].vehicle_type]) for number in entries.tolist()])
     *follows, factor, extended = people[sampled.vehicle].T
     way = (len(road.lane_names) - 1 - episode.lane_indices[sample_index]).astype(np.intp)
     place, speed = episode.positions[sample_index] + road.merge_position, episode.speeds[sample_index]

@@ -154,7 +154,7 @@ def base_human_model(base: str, scenario: Scenario) -> HumanSpeedModel:
     make, step = BASE_DRIVERS[base], scenario.simulation_step
     if base == "idm":
         follow = commanded_speed if scenario.human_control == "commanded" else human_idm_speed
-        return partial(follow, people=scenario.humans, step=step)
+        return partial(follow, parameters=scenario.humans, step=step)
     if make is None:
         return lambda speed, leader_speed, gap: speed + 0.0  # the caller writes into what it gets
     person = make(scenario)
@@ -284,10 +284,10 @@ def fit_human_model(
     if not is_noise_known:
         wrong = np.sqrt((np.square(wrong).mean((0, 1)) - sigma**2).clip(0.0))
     errors = {
-        "unexplained": (root_mean_square(wrong) / max(step.change, MIN_CHANGE)) ** 2,
+        "unexplained_variance": (root_mean_square(wrong) / max(step.change, MIN_CHANGE)) ** 2,
         "transitions": transition_variation(wrong, sigma),
         "total_variation": total_variation(found.predictions * model.output_mask.numpy(), np.array([sigma])),
-        "released": found.loss,
+        "training_loss": found.loss,
     }
     learned = ("speed",) if model.output_mask.any() else ()
     return ModelFit(errors, {"speed": step}, learned, found.training_rows, len(found.holdout_indices), found.epochs)

@@ -109,7 +109,7 @@ def prepare_starts(
     data: EnvironmentData, start_indices: NDArray[np.int64], expert: Driver, device: torch.device | str
 ) -> RolloutStarts:
     """Return the start of virtual rollouts at `choices`, with what the expert remembered there."""
-    drawn = np.stack([data.recordings[place].drawn for place in start_indices[:, 0]])
+    drawn = np.stack([data.recordings[place].drawn_values for place in start_indices[:, 0]])
     memory = reconstruct_memory(expert, data.recordings, start_indices)
     return RolloutStarts(
         state=data.states_at(start_indices).map(lambda values: to_device(values, device)),

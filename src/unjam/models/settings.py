@@ -9,7 +9,7 @@ from unjam.parameters import STRICT, IntAboveOne, NonNegative, NonNegativeInt, P
 
 BaseName = Literal["idm", "population", "acc", "ovm", "none"]
 Device = Literal["cpu", "cuda"]
-ErrorEstimator = Literal["unexplained", "transitions", "total_variation", "released"]
+ErrorEstimator = Literal["unexplained_variance", "transitions", "total_variation", "training_loss"]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -55,7 +55,7 @@ class ModelSettings:
     """rollout length times model error, Eq. 15. The paper has 2; but on a road with noisy people most of the
     error that is measured is their noise, and virtual returns agree with actual ones over hundreds of
     decisions"""
-    error_estimator: ErrorEstimator = "unexplained"
+    error_estimator: ErrorEstimator = "unexplained_variance"
     """estimator of the model error eps_m that sets the rollout length, see unjam.models.fitting"""
     model_ratio: NonNegative = 5.0
     """virtual decisions for each actual one that the agent learns from, at least one whole rollout in each

@@ -80,7 +80,7 @@ def test_remembers_nothing_of_what_came_later_or_elsewhere() -> None:
     found = reconstruct_memory(expert, data.recordings, choices)
     for row, (place, decision) in enumerate(choices):
         speeds = data.recordings[place].states.speed[:decision]
-        assert found["seen"][row] == decision
+        assert found["count"][row] == decision
         np.testing.assert_array_equal(found["window"][row, :decision], speeds)
         assert not found["window"][row, decision:].any()
 

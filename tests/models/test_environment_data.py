@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.conftest import random_network
-from tests.models.little_world import LittleWorld, actual_data
+from tests.models.toy_dynamics import ToyDynamics, actual_data
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.local_state import COMMON_FIELDS
@@ -126,15 +126,15 @@ def test_looks_are_where_a_residual_was_due_and_enough_follows() -> None:
 
 def test_unpacked_data_are_what_was_packed() -> None:
     driver = ResidualDriver(PISaturation(window=2.0), random_network(), 1.0, action_repeat=4)
-    data = actual_data(LittleWorld(), driver, 2, 30)
+    data = actual_data(ToyDynamics(), driver, 2, 30)
     again = unpack_data(*pack_data(data))
     assert fingerprint(tuple(again.recordings)) == fingerprint(tuple(data.recordings))
     assert (again.capacity, again.episode_count) == (data.capacity, data.episode_count)
-    assert again.recordings[0].initial_memory.keys() == {"window", "total", "seen", "command"}
+    assert again.recordings[0].initial_memory.keys() == {"window", "total", "count", "command"}
 
 
 def test_chosen_rows_are_those_of_each_column() -> None:
-    actual = actual_data(LittleWorld(), ResidualDriver(IDM(), random_network(), 1.0), 2, 30).transitions(0.2)
+    actual = actual_data(ToyDynamics(), ResidualDriver(IDM(), random_network(), 1.0), 2, 30).transitions(0.2)
     rows = np.array([7, 3, 41])
     found = actual.select(rows)
     for name, values in actual._asdict().items():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from tests.conftest import random_network
-from tests.models.little_world import RING, LittleWorld, actual_data
+from tests.models.toy_dynamics import RING, ToyDynamics, actual_data
 from unjam.drivers import IDM, Constant, Driver, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.user_driver import FileDriver
@@ -75,7 +75,7 @@ def value(observations: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("hold", [1, 4])
 def test_with_the_true_dynamics_virtual_is_actual(number: int, hold: int, my_drivers: Path) -> None:
     """From any actual row: the same observations, residuals, rewards, and value targets."""
-    world, gamma, decisions = LittleWorld(), 0.97, 41
+    world, gamma, decisions = ToyDynamics(), 0.97, 41
     driver = residual_driver(experts(my_drivers)[number], hold)
     data = actual_data(world, driver, 3, 120, explore=False)
     choices = data.start_indices(min_control_steps=decisions)
@@ -112,14 +112,14 @@ def replay(driver: ResidualDriver, data: EnvironmentData, place: int) -> tuple[n
 
 def crash_course(limit: float = 1.0) -> tuple[ResidualDriver, EnvironmentData]:
     """A driver that does not brake, behind vehicles that do."""
-    gentle = actual_data(LittleWorld(), residual_driver(IDM(), 2), 4, 60)
+    gentle = actual_data(ToyDynamics(), residual_driver(IDM(), 2), 4, 60)
     return residual_driver(Constant(1.0), 2, limit), gentle
 
 
 def test_a_crash_ends_a_row_and_its_rewards() -> None:
     driver, data = crash_course()
     choices = data.start_indices()
-    found = roll_out(driver, LittleWorld(), prepare_starts(data, choices, driver.expert, "cpu"), 300, None)
+    found = roll_out(driver, ToyDynamics(), prepare_starts(data, choices, driver.expert, "cpu"), 300, None)
     assert found.terminated.all()
     assert found.lengths.max() < 150
     for row in range(len(choices)):
@@ -128,12 +128,12 @@ def test_a_crash_ends_a_row_and_its_rewards() -> None:
         assert (found.rewards[row, made:] == 0.0).all()
         assert found.rewards[row, :made].abs().sum() > 0.0
     one = choices[:1]
-    alone = roll_out(driver, LittleWorld(), prepare_starts(data, one, driver.expert, "cpu"), 300, None)
+    alone = roll_out(driver, ToyDynamics(), prepare_starts(data, one, driver.expert, "cpu"), 300, None)
     assert alone.control_steps in (2 * int(alone.lengths[0]), 2 * int(alone.lengths[0]) - 1)
     assert_close(alone.rewards[0], found.rewards[0])
 
 
-class Bounded(LittleWorld):
+class Bounded(ToyDynamics):
     """Says that a bound was enforced: the first always, the second never, the third in the first step."""
 
     steps = 0
@@ -142,7 +142,7 @@ class Bounded(LittleWorld):
         self.steps += 1
         always = torch.ones_like(acceleration)
         told = torch.stack([always, always * 0, always * (self.steps == 1)]) > 0
-        return super().step(state, acceleration, drawn_values)._replace(bounded=told)
+        return super().step(state, acceleration, drawn_values)._replace(clipped=told)
 
 
 def test_bounds_count_until_the_crash() -> None:
@@ -158,7 +158,7 @@ def test_bounds_count_until_the_crash() -> None:
 @pytest.fixture(scope="module")
 def noisy() -> tuple[ResidualDriver, EnvironmentData, RowModel]:
     driver = residual_driver(PISaturation(window=1.5), 5)
-    data = actual_data(LittleWorld(), driver, 3, 60)
+    data = actual_data(ToyDynamics(), driver, 3, 60)
     model = RowModel(ModelSettings(members=2, hidden=(8,)), 1, (1,))
     model.noise.normal_(0, 0.01, generator=torch_generator((4,), "cpu"))
     model.reward_range.copy_(torch.tensor([-1.0, 1.0]))
@@ -177,7 +177,7 @@ def test_the_same_seed_gives_the_same_bits(noisy: tuple[ResidualDriver, Environm
     one = run(noisy, 1)
     torch.rand(3)
     again, other = run(noisy, 1), run(noisy, 2)
-    for name in ("observations", "actions", "rewards", "made", "terminated", "drawn"):
+    for name in ("observations", "actions", "rewards", "lengths", "terminated", "drawn_values"):
         assert torch.equal(getattr(one, name), getattr(again, name)), name
     np.testing.assert_array_equal(one.start_indices, again.start_indices)
     assert not torch.equal(one.rewards, other.rewards)
@@ -205,14 +205,14 @@ def test_explores_with_the_networks_own_deviation(noisy: tuple[ResidualDriver, E
 def test_no_decisions_are_the_start_alone(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
     driver, data, _ = noisy
     starts = prepare_starts(data, data.start_indices()[:7], driver.expert, "cpu")
-    found = roll_out(driver, LittleWorld(), starts, 4, None)
+    found = roll_out(driver, ToyDynamics(), starts, 4, None)
     assert found.observations.shape == (7, 1, 8)
     assert found.rewards.shape == found.actions.shape == (7, 0)
     assert (found.control_steps, found.lengths.tolist(), found.terminated.any().item()) == (0, [0] * 7, False)
 
 
 def test_starts_are_looks_with_enough_ahead() -> None:
-    data = actual_data(LittleWorld(), residual_driver(IDM(), 4), 3, 50)
+    data = actual_data(ToyDynamics(), residual_driver(IDM(), 4), 3, 50)
     found = draw_starts(data, 500, 20, (1,))
     assert found.shape == (500, 2)
     assert set(found[:, 1].tolist()) == set(range(0, 31, 4))
@@ -222,17 +222,17 @@ def test_starts_are_looks_with_enough_ahead() -> None:
 
 
 def test_what_is_not_finite_is_told() -> None:
-    driver, data = residual_driver(IDM()), actual_data(LittleWorld(), residual_driver(IDM()), 1, 10)
+    driver, data = residual_driver(IDM()), actual_data(ToyDynamics(), residual_driver(IDM()), 1, 10)
     starts = prepare_starts(data, data.start_indices(), driver.expert, "cpu")
     with pytest.raises(UnjamError, match="rewards of a rollout are not finite"):
-        roll_out(driver, LittleWorld(bonus=inf), starts, 3, None)
+        roll_out(driver, ToyDynamics(bonus=inf), starts, 3, None)
 
 
 def test_the_action_limit_holds_for_expert_and_sum() -> None:
     driver, data = crash_course(limit=0.25)
     commands: list[torch.Tensor] = []
 
-    class Watching(LittleWorld):
+    class Watching(ToyDynamics):
         def step(self, state: LocalState, acceleration: torch.Tensor, drawn_values: torch.Tensor) -> ModelTransition:
             commands.append(acceleration)
             return super().step(state, acceleration, drawn_values)

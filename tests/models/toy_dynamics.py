@@ -19,7 +19,7 @@ LOOP = 230.0
 RING = Ring(length=(int(LOOP), int(LOOP)), safety=SafetyFilter(active=False))
 
 
-class LittleWorld:
+class ToyDynamics:
     """IDM behind; ahead a vehicle that settles at a speed that depends on its gap to the CAV.
 
     `leader` 0: it keeps its speed, so that the base model `idm` is all there is to know.
@@ -60,7 +60,7 @@ class LittleWorld:
 
 
 def drive(
-    world: LittleWorld, driver: ResidualDriver, seed: int, decisions: int, explore: bool = True, episode: int = 0
+    world: ToyDynamics, driver: ResidualDriver, seed: int, decisions: int, explore: bool = True, episode: int = 0
 ) -> Recording:
     """Drive from a random start to the last decision or a crash, and record it."""
     generator = np.random.default_rng(seed)
@@ -114,7 +114,7 @@ def recording(
 
 
 def actual_data(
-    world: LittleWorld, driver: ResidualDriver, episodes: int, decisions: int, explore: bool = True
+    world: ToyDynamics, driver: ResidualDriver, episodes: int, decisions: int, explore: bool = True
 ) -> EnvironmentData:
     """Return the data of some episodes, one trajectory each."""
     data = EnvironmentData(episodes * decisions)
