@@ -1,8 +1,9 @@
-"""The command line: `unjam VERB`. Verbs that are about the same share a file of this package."""
+"""The command line: `unjam COMMAND`. Commands on the same subject share a module of this package."""
 
 import os
 import signal
 import sys
+from importlib.metadata import entry_points
 from itertools import pairwise
 from types import FrameType
 from typing import Annotated
@@ -11,23 +12,9 @@ import typer
 
 from unjam import __version__
 from unjam.child_processes import isolate_children
-from unjam.cli.calibrate import calibrate_command
-from unjam.cli.catalog import drivers_command, fit_drivers_command, scenarios_command
-from unjam.cli.diagnostics import bench_command, doctor_command
-from unjam.cli.drive import assess_command, drive_command, watch_command
+from unjam.cli import calibrate, catalog, diagnostics, drive, results, sign, train, tune
 from unjam.cli.options import with_trust_option
-from unjam.cli.results import (
-    certify_command,
-    evaluate_command,
-    export_command,
-    model_command,
-    report_command,
-    verify_command,
-)
 from unjam.cli.runs import runs_app
-from unjam.cli.sign import keys_command, sign_command
-from unjam.cli.train import reproduce_command, search_command, train_command
-from unjam.cli.tune import tune_command
 from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, invalid_value, missing_package_error
 from unjam.processes import exit_with_parent, mark_as_command_line
 
@@ -39,7 +26,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong input, 3 missing part, 74 disk, 129/130/143 stopped.",
+    epilog="Exit codes: 0 success, 1 failure, 2 invalid input, 3 missing part, 74 disk error, 129/130/143 stopped.",
 )
 
 
@@ -58,52 +45,41 @@ def _root(
     pass
 
 
-CODE_RUNNING_COMMANDS = (
-    drive_command,
-    assess_command,
-    train_command,
-    evaluate_command,
-    model_command,
-    search_command,
-    export_command,
-    certify_command,
-    verify_command,
-    watch_command,
-)
-"""verbs that take folders which can name Python code"""
-for verb in (
-    *(
-        scenarios_command,
-        drivers_command,
-        drive_command,
-        assess_command,
-        calibrate_command,
-        train_command,
-        evaluate_command,
-        model_command,
-        fit_drivers_command,
-    ),
-    *(
-        report_command,
-        tune_command,
-        search_command,
-        reproduce_command,
-        export_command,
-        certify_command,
-        keys_command,
-        sign_command,
-        verify_command,
-        watch_command,
-        bench_command,
-        doctor_command,
-    ),
-):
-    app.command()(with_trust_option(verb) if verb in CODE_RUNNING_COMMANDS else verb)
+COMMANDS = {
+    "scenarios": catalog.scenarios_command,
+    "drivers": catalog.drivers_command,
+    "drive": drive.drive_command,
+    "assess": drive.assess_command,
+    "calibrate": calibrate.calibrate_command,
+    "train": train.train_command,
+    "evaluate": results.evaluate_command,
+    "model": results.model_command,
+    "fit-drivers": catalog.fit_drivers_command,
+    "report": results.report_command,
+    "tune": tune.tune_command,
+    "search": train.search_command,
+    "export": results.export_command,
+    "certify": results.certify_command,
+    "keys": sign.keys_command,
+    "sign": sign.sign_command,
+    "verify": results.verify_command,
+    "watch": drive.watch_command,
+    "bench": diagnostics.bench_command,
+    "doctor": diagnostics.doctor_command,
+}
+CODE_RUNNING_COMMANDS = {
+    *("drive", "assess", "train", "evaluate", "model", "search", "export", "certify", "verify", "watch")
+}
+"""commands that accept folders, which can name Python code"""
+for _name, _command in COMMANDS.items():
+    app.command(_name)(with_trust_option(_command) if _name in CODE_RUNNING_COMMANDS else _command)
+for _entry_point in entry_points(group="unjam.commands"):  # of other packages, such as unjam_paper
+    app.command(_entry_point.name)(_entry_point.load())
 app.add_typer(runs_app)
 
 
 class _Terminated(BaseException):
-    """The process was asked to end (SIGTERM), or its terminal is gone (SIGHUP)."""
+    """The process received SIGTERM, or SIGHUP because its terminal was closed."""
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
@@ -111,9 +87,9 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
 
 
 def main() -> None:
-    """Run the command line; every error that a user can mend is one line and an exit code."""
+    """Run the command line; print every error that a user can correct as one line, and exit with its code."""
     mark_as_command_line()
-    for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and under nohup nobody wants to be told
+    for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and nohup ignores it
         signum = getattr(signal, name, None)
         if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:
             signal.signal(signum, _terminate)
@@ -125,12 +101,11 @@ def main() -> None:
 def _run_app() -> int:
     try:
         for text in sys.argv[1:]:
-            if any("\ud800" <= letter <= "\udfff" for letter in text):  # bytes that are no letters
+            if any("\ud800" <= letter <= "\udfff" for letter in text):  # bytes that are not UTF-8
                 raise invalid_value("arguments", text, "text in UTF-8")
         code = app(standalone_mode=False) or 0
-        return (
-            _print_error("interrupted", code) if code == INTERRUPTED_EXIT_CODE else code
-        )  # which typer says without a word
+        # typer returns this code without a message
+        return _print_error("interrupted", code) if code == INTERRUPTED_EXIT_CODE else code
     except UnjamError as error:
         return _print_error(str(error), error.exit_code)
     except ModuleNotFoundError as error:
@@ -140,26 +115,25 @@ def _run_app() -> int:
         if error.errno in DISK_ERRNOS:
             return _print_error(str(disk_error(error, error.filename or "output")), 74)
         if error.filename is None and not _has_working_folder():
-            return _print_error("working folder: it was removed; allowed: one that is there", InputError.exit_code)
+            return _print_error("working folder: it was removed; allowed: an existing folder", InputError.exit_code)
         return _print_error(f"{error.filename or 'system'}: {error.strerror or error}", InputError.exit_code)
     except RecursionError:
-        return _print_error("input: it is nested too deep", InputError.exit_code)
+        return _print_error("input: it is nested too deeply", InputError.exit_code)
     except OverflowError as error:
         return _print_error(f"input: a number is too large: {error}", InputError.exit_code)
     except MemoryError:
-        return _print_error("memory: there is not enough for this", InputError.exit_code)
+        return _print_error("memory: there is not enough for this command", InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _print_error("interrupted", INTERRUPTED_EXIT_CODE)
-    except _Terminated as ended:
-        return _print_error("terminated", 128 + ended.args[0])
+    except _Terminated as error:
+        return _print_error("terminated", 128 + error.args[0])
     except Exception as error:
-        if hasattr(error, "format_message"):  # what typer says of a wrong command line
+        if hasattr(error, "format_message"):  # typer's errors about the command line
             return _print_error(f"{error.format_message()}{_given_value(error)}", 2)  # pyright: ignore[reportAttributeAccessIssue]
         raise
 
 
 def _has_working_folder() -> bool:
-    """Return whether the folder still is there that this process works in."""
     try:
         return os.path.isdir(os.getcwd())
     except FileNotFoundError:
@@ -167,16 +141,14 @@ def _has_working_folder() -> bool:
 
 
 def _given_value(error: Exception) -> str:
-    """Return what was given for the option that is wrong: typer's own words leave it out."""
-    for option in getattr(getattr(error, "param", None), "opts", []):
-        for word, following in pairwise([*sys.argv, ""]):
-            if word == option and following:
-                return f"; given: {following!r}"
-    return ""
+    """Return the value of the option that typer rejects, which its message leaves out."""
+    options = getattr(getattr(error, "param", None), "opts", [])
+    values = (value for word, value in pairwise(sys.argv) if word in options and value)
+    return next((f"; given: {value!r}" for value in values), "")
 
 
 def _print_error(message: str, code: int) -> int:
-    """Print one line of error; return the exit code."""
+    """Print an error as one line; return the exit code."""
     try:
         print(f"unjam: {' '.join(message.split())}", file=sys.stderr)
     except BrokenPipeError:

@@ -1,4 +1,4 @@
-"""What episodes are made of: `unjam scenarios`, `unjam drivers`, and people made by `unjam fit-drivers`."""
+"""Scenarios and drivers: `unjam scenarios`, `unjam drivers`, and calibrated human drivers of `unjam fit-drivers`."""
 
 import ast
 import inspect
@@ -16,17 +16,15 @@ from unjam.cli.output import ProgressReporter, console, err_console, new_table, 
 from unjam.errors import InputError
 
 PICTURE_SECONDS = 60.0
-"""seconds after which a road with ends is drawn: at the start it is all but empty"""
+"""time after which an open road is drawn [s]: at the start it is almost empty"""
 
 
 def scenarios_command(
-    name: Annotated[str | None, typer.Argument(help="One scenario, in full.")] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Draw its road with the vehicles at the start: a .png file.")
-    ] = None,
+    name: Annotated[str | None, typer.Argument(help="Scenario to describe in detail.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw its road with the first vehicles: a .png file.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """List the scenarios; of one, its road, observation, reward, limit and every parameter.
+    """List the scenarios, or describe one: road, observation, reward, speed limit and all parameters.
 
     Examples:
 
@@ -39,17 +37,17 @@ def scenarios_command(
     from unjam.scenarios import SCENARIOS, example_scenario, scenario_recipe
 
     if picture is not None and (name is None or picture.suffix.lower() != ".png"):
-        raise InputError("picture: wants the name of a scenario, and a file that ends in .png")
+        raise InputError("picture: it needs the name of a scenario, and a file that ends in .png")
     if name is None:
         if json:
             print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
             return
-        shown = ("road", "vehicles", "limit")
-        table = new_table(("scenario", *shown, "decisions", "warm-up"))
+        columns = ("road", "vehicles", "limit")
+        table = new_table(("scenario", *columns, "control steps", "warm-up"))
         for key, scenario in SCENARIOS.items():
             facts = dict(scenario.facts())
             warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
-            table.add_row(key, *(facts[fact] for fact in shown), f"{scenario.horizon:,}", warmup)
+            table.add_row(key, *(facts[column] for column in columns), f"{scenario.horizon:,}", warmup)
         console.print(table)
         return
     scenario = example_scenario(name)
@@ -68,7 +66,7 @@ def scenarios_command(
 
 
 def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
-    """Write a picture of the road that seed 0 draws: at the start, or a minute later where vehicles come."""
+    """Write a picture of the road that seed 0 draws: a loop at the start, an open road after a minute."""
     from unjam.files import atomic_write, check_parent_folder
     from unjam.reports.video import draw_road
     from unjam.scenarios.road import ClosedRoad
@@ -79,14 +77,14 @@ def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
     with open_simulation(scenario) as simulation:
         traffic = make_traffic(scenario, (0,), simulation)
         traffic.start(is_controlled=False)
-        closed = isinstance(traffic.road, ClosedRoad)
-        for _ in range(0 if closed else round(PICTURE_SECONDS / scenario.control_step)):
+        is_closed = isinstance(traffic.road, ClosedRoad)
+        for _ in range(0 if is_closed else round(PICTURE_SECONDS / scenario.control_step)):
             traffic.advance(None)
         scene = traffic.scene()
-    fastest = max(1.0, float(scene.speeds.max(initial=0.0)))
-    words = "\n".join([name, *(f"{key} {value:g} m" for key, value in traffic.road.drawn.items())])
+    max_speed = max(1.0, float(scene.speeds.max(initial=0.0)))
+    caption = "\n".join([name, *(f"{key} {value:g} m" for key, value in traffic.road.drawn_values.items())])
     content = BytesIO()
-    draw_road(scene, fastest, words).save(content, "PNG")
+    draw_road(scene, max_speed, caption).save(content, "PNG")
     atomic_write(path, content.getvalue())
 
 
@@ -94,12 +92,12 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     from unjam.drivers.observation import FEATURES
     from unjam.scenarios.user_network import UserNetwork
 
-    warmup, seconds = scenario.warmup, scenario.warmup * scenario.simulation_step
-    ends = "in training, a collision of a CAV" if isinstance(scenario, UserNetwork) else "a collision"
+    seconds = scenario.warmup * scenario.simulation_step
+    end = "in training, a collision of a CAV" if isinstance(scenario, UserNetwork) else "a collision"
     return [
-        ("episode", f"{scenario.horizon:,} decisions of {scenario.control_step:g} s; {ends} ends it"),
-        ("warm-up", f"{warmup} all-human steps ({seconds:g} s), before control, not counted"),
-        ("people", scenario.human_description),
+        ("episode", f"{scenario.horizon:,} control steps of {scenario.control_step:g} s; {end} ends it"),
+        ("warm-up", f"{scenario.warmup} human-only steps ({seconds:g} s) before control, not counted"),
+        ("human drivers", scenario.human_description),
         ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
         ("observation", "; ".join(map(str, FEATURES["local"].inputs or ()))),
         ("reward", scenario.reward),
@@ -107,7 +105,7 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
 
 
 def drivers_command(json: JsonOption = False) -> None:
-    """List the drivers and their parameters, as `--driver name:parameter=value` takes them.
+    """List the drivers and their parameters, which `--driver name:parameter=value` sets.
 
     Example:
 
@@ -116,19 +114,18 @@ def drivers_command(json: JsonOption = False) -> None:
     from unjam.controller import PACKAGED_PREFIX, packaged_names
     from unjam.drivers.registry import DRIVERS
 
-    listed: dict[str, dict[str, Any]] = {
-        name: {"about": (kind.__doc__ or "").strip().splitlines()[0], "parameters": parameter_entries(kind())}
+    entries: dict[str, dict[str, Any]] = {
+        name: {"description": (kind.__doc__ or "").strip().splitlines()[0], "parameters": parameter_entries(kind())}
         for name, kind in DRIVERS.items()
     }
     for name in packaged_names():
-        listed[f"{PACKAGED_PREFIX}{name}"] = {"about": _packaged_summary(name), "parameters": []}
+        entries[f"{PACKAGED_PREFIX}{name}"] = {"description": _packaged_summary(name), "parameters": []}
     if json:
-        print_json(listed)
+        print_json(entries)
         return
-    for name, entry in listed.items():
-        console.print(f"[bold]{name}[/bold]  {entry['about']}", markup=True)
-        rows = [row for row in entry["parameters"] if row["name"] != "time_step"]
-        if rows:
+    for name, entry in entries.items():
+        console.print(f"[bold]{name}[/bold]  {entry['description']}", markup=True)
+        if rows := [row for row in entry["parameters"] if row["name"] != "time_step"]:
             console.print(_parameter_table(rows, "parameter"))
         if name in DRIVERS:
             console.print()
@@ -136,39 +133,41 @@ def drivers_command(json: JsonOption = False) -> None:
 
 
 def _packaged_summary(name: str) -> str:
-    """Return what a shipped controller is, and what it was measured to do, from its manifest."""
+    """Return what a packaged controller is and its measured performance, from its manifest."""
     from unjam.controller import packaged_file
     from unjam.controller.file import read_controller
     from unjam.measures.gain import MEAN_GAIN
 
     manifest = read_controller(packaged_file(name)).manifest
-    if tuned := manifest.get("tuned"):
-        after, before = (f"{tuned[one]['score']:.4g}" for one in ("best", "default"))
-        what = tuned["reward"] if tuned["reward"] == MEAN_GAIN else "return"
-        return f"{manifest['expert']}, tuned: {what} {after} on tuning seeds, before {before}"
-    if about := manifest.get("about"):
-        return about
-    expert, metrics, road = manifest["expert"], manifest["metrics"], manifest["run"]["scenario"]
-    ours, theirs = (metrics[label]["mean_speed"]["mean"] for label in ("trained", expert))
+    if tuning := manifest.get("tuning"):
+        best, default = (f"{tuning[key]['score']:.4g}" for key in ("best", "default"))
+        score = tuning["reward"] if tuning["reward"] == MEAN_GAIN else "return"
+        return f"{manifest['expert']}, tuned: {score} {best} on tuning seeds, default parameters {default}"
+    if summary := manifest.get("summary"):
+        return summary
+    expert, metrics, scenario = manifest["expert"], manifest["metrics"], manifest["run"]["scenario"]
+    speed, expert_speed = (metrics[label]["mean_speed"]["mean"] for label in ("trained", expert))
     return (
-        f"{expert} + residual, trained on {road}: {ours:.2f} m/s of all vehicles on "
-        f"{metrics['trained']['episodes']} held-out seeds, its expert {theirs:.2f}"
+        f"{expert} + residual, trained on {scenario}: mean speed {speed:.2f} m/s on "
+        f"{metrics['trained']['episodes']} test seeds, expert {expert_speed:.2f} m/s"
     )
 
 
 def parameter_entries(instance: Any) -> list[dict[str, Any]]:
-    """Return name, value and meaning of each parameter of a parameter dataclass."""
+    """Return name, default and description of each parameter of a parameter dataclass."""
     if not is_dataclass(instance) or isinstance(instance, type):
         return []
-    about: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for base in reversed(type(instance).__mro__):
         if is_dataclass(base):
-            about |= _field_docstrings(base)
-    return [{"name": name, "default": value, "about": about.get(name, "")} for name, value in asdict(instance).items()]
+            texts |= _field_docstrings(base)
+    return [
+        {"name": name, "default": value, "description": texts.get(name, "")} for name, value in asdict(instance).items()
+    ]
 
 
 def _field_docstrings(kind: type) -> dict[str, str]:
-    """Return the text under each field of a class; read from its source only where somebody asks."""
+    """Return the docstring below each field of a class, from its source."""
     try:
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     except (OSError, TypeError):
@@ -186,11 +185,9 @@ def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
     for row in rows:
         value = row["default"]
         if isinstance(value, dict):
-            value = ", ".join(
-                f"{key}={f'{entry:g}' if type(entry) in (int, float) else str(entry).lower()}"
-                for key, entry in value.items()
-            )
-        table.add_row(f"  {row['name']}", str(value), " ".join(row["about"].split()))
+            texts = {k: f"{v:g}" if type(v) in (int, float) else str(v).lower() for k, v in value.items()}
+            value = ", ".join(f"{key}={text}" for key, text in texts.items())
+        table.add_row(f"  {row['name']}", str(value), " ".join(row["description"].split()))
     return table
 
 
@@ -202,32 +199,32 @@ def fit_drivers_command(
     format: Annotated[
         str,
         typer.Option(
-            help="table, ngsim, ngsim-reconstructed, highd, openacc, fcd.", show_default="told from the columns"
+            help="table, ngsim, ngsim-reconstructed, highd, openacc, fcd.", show_default="derived from the columns"
         ),
     ] = "",
     driver: Annotated[
-        str, typer.Option(help="Columns of a table that together name the driver: period,follower.")
+        str, typer.Option(help="Columns of a table that together identify the driver: period,follower.")
     ] = "",
     select: Annotated[
         list[str] | None, typer.Option(help="Only trajectories with column=value, like kind=human.")
     ] = None,
     residual: Annotated[
-        bool, typer.Option(help="Also learn what all drivers do beside their own IDM: minutes.")
+        bool, typer.Option(help="Also learn what all drivers do in addition to their own IDM; takes minutes.")
     ] = False,
     drop_bad_rows: Annotated[
-        bool, typer.Option("--cut-bad", help="Cut bad rows out of their trajectories instead of refusing.")
+        bool, typer.Option("--drop-bad-rows", help="Cut bad rows out of their trajectories instead of refusing.")
     ] = False,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="calibration.generations=200, multi_step.steps=500 and the like.")
+        list[str] | None, typer.Option("--set", help="Settings such as calibration.generations=200.")
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate how people drive on recorded trajectories: a population that any road can have.
+    """Calibrate human drivers to recorded trajectories: a population for any scenario.
 
-    All drivers get the IDM with which the simulated gaps are nearest to the recorded ones, each with a time
-    headway of its own (--set 'own=["time_headway","minimum_gap"]' says what else). What was read and what was
-    not is said line by line.
+    All drivers get the IDM whose simulated gaps are closest to the recorded ones; each has its own time headway
+    (--set 'individual=["time_headway","minimum_gap"]' adds parameters). The command lists what it read and what
+    it skipped.
 
     Examples:
 
@@ -242,23 +239,23 @@ def fit_drivers_command(
 
     changes: dict[str, Any] = {"residual": residual, "seed": seed, **parse_settings(settings)}
     columns = tuple(name for name in driver.split(",") if name)
-    chosen = {name: str(value) for name, value in parse_settings(select, "--only").items()}
-    with ProgressReporter("calibrating drivers") as counted:
-        found = fit_drivers_from_files(data, changes, format, drop_bad_rows, columns, chosen, out, counted)
-    write_population(out, found.population)
+    filters = {name: str(value) for name, value in parse_settings(select, "--select").items()}
+    with ProgressReporter("calibrating drivers") as reporter:
+        fit = fit_drivers_from_files(data, changes, format, drop_bad_rows, columns, filters, out, reporter)
+    write_population(out, fit.population)
     if json:
-        print_json({"population": str(out), "read": found.notes, **found.facts()})
+        print_json({"population": str(out), "read": fit.notes, **fit.facts()})
         return
-    for line in found.notes:
+    for line in fit.notes:
         err_console.print(line)
-    population: Any = found.population
+    population: Any = fit.population
     typical = asdict(population.typical)
     table = new_table(("parameter",), ("one for all", "mean", "std", "quartiles of the drivers"))
-    for name, spread in population.spread().items():
-        quartiles = "  ".join(f"{value:.2f}" for value in spread["quartiles"])
-        values = (typical[name], spread["mean"], spread["std"])
+    for name, statistics in population.parameter_statistics().items():
+        values = (typical[name], statistics["mean"], statistics["std"])
+        quartiles = "  ".join(f"{value:.2f}" for value in statistics["quartiles"])
         table.add_row(name, *(f"{value:.2f}" for value in values), quartiles)
     console.print(table)
-    for line in found.report_lines():
+    for line in fit.report_lines():
         console.print(line)
     err_console.print(f"population: {out}")

@@ -1,4 +1,4 @@
-"""`unjam runs`: the trainings that there are, compared, as CSV, removed."""
+"""Training runs: `unjam runs` lists, compares and removes them, and prints their progress as CSV."""
 
 import sys
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from unjam.cli.options import JsonOption
 from unjam.cli.output import console, err_console, new_table, print_json, print_next_command
 from unjam.errors import InputError
 
-RunsFolderOption = Annotated[Path, typer.Option("--under", help="The folder that holds the runs.")]
+RunsFolderOption = Annotated[Path, typer.Option("--folder", help="The folder that contains the runs.")]
 RunNamesArgument = Annotated[
     list[str], typer.Argument(help="Names of runs, as listed, or their folders.", metavar="NAME...")
 ]
@@ -24,16 +24,16 @@ runs_app = typer.Typer(name="runs", rich_markup_mode="markdown")
 def list_runs_command(
     context: typer.Context,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
-    scenario: Annotated[str, typer.Option(help="Only those that train on this scenario.")] = "",
+    scenario: Annotated[str, typer.Option(help="Only runs on this scenario.")] = "",
     json: JsonOption = False,
 ) -> None:
-    """List the training runs in a folder: how far each is, and what it gained on its expert.
+    """List the training runs in a folder: their progress, and their return relative to the expert.
 
     Examples:
 
       unjam runs
 
-      unjam runs --under studies --scenario ring --json
+      unjam runs --folder studies --scenario ring --json
 
       unjam runs compare ring-001 ring-002
 
@@ -43,26 +43,26 @@ def list_runs_command(
     """
     if context.invoked_subcommand is not None:
         if folder != DEFAULT_RUNS_FOLDER or scenario or json:
-            allowed = f"behind it, as in unjam runs {context.invoked_subcommand} --under studies"
+            allowed = f"after it, as in unjam runs {context.invoked_subcommand} --folder studies"
             raise InputError(f"runs: options are not allowed before the command; allowed: {allowed}")
         return
     from unjam.training.runs import list_runs
 
-    found = list_runs(folder, scenario) if folder != DEFAULT_RUNS_FOLDER or folder.is_dir() else []
+    runs = list_runs(folder, scenario) if folder != DEFAULT_RUNS_FOLDER or folder.is_dir() else []
     if json:
-        print_json([run.document() for run in found])
+        print_json([run.document() for run in runs])
         return
-    if not found:
-        of = f" of {scenario}" if scenario else ""
-        err_console.print(f"no runs{of} in {folder}; begin one: unjam train ring --preset demo")
+    if not runs:
+        kind = f" on {scenario}" if scenario else ""
+        err_console.print(f"no runs{kind} in {folder}; start one: unjam train ring --preset demo")
         return
-    table = new_table(("run", "scenario", "preset", "state"), ("steps", "beyond the expert"))
-    for run in found:
+    table = new_table(("run", "scenario", "preset", "state"), ("steps", "difference to expert"))
+    for run in runs:
         steps = f"{run.steps:,}" if run.state == "finished" else f"{run.steps:,} of {run.config.steps:,}"
         for number, (road, config) in enumerate(run.config.task_configs().items()):
-            about = ("", "", "") if number else (run.config.preset or "–", run.state, steps)
+            cells = ("", "", "") if number else (run.config.preset or "–", run.state, steps)
             name = f"  {road}" if number else run.name
-            table.add_row(name, Path(config.scenario).name, *about, _gain_text(run.gains[road]))
+            table.add_row(name, Path(config.scenario).name, *cells, _gain_text(run.gains[road]))
     console.print(table)
 
 
@@ -72,11 +72,11 @@ def _gain_text(gain: Any) -> str:
     return format_difference(gain) if gain else "–"
 
 
-@runs_app.command()
+@runs_app.command("compare")
 def compare_command(
     names: RunNamesArgument, folder: RunsFolderOption = DEFAULT_RUNS_FOLDER, json: JsonOption = False
 ) -> None:
-    """Compare runs: what each reached, and the settings in which they differ.
+    """Compare runs: their returns, and the settings in which they differ.
 
     Example:
 
@@ -86,33 +86,32 @@ def compare_command(
 
     if len(names) < 2:
         raise InputError("compare: one run is not allowed; allowed: two or more")
-    found = _find_runs(names, folder)
-    settings = config_differences(found)
+    runs = _find_runs(names, folder)
+    settings = config_differences(runs)
     if json:
-        print_json({"runs": [run.document() for run in found], "settings": settings})
+        print_json({"runs": [run.document() for run in runs], "settings": settings})
         return
-    table = new_table(("", *(run.name for run in found)))
-    table.add_row("state", *(run.state for run in found))
-    table.add_row("steps done", *(f"{run.steps:,}" for run in found))
-    roads = dict.fromkeys(road for run in found for road in run.gains)
-    for road in roads:
-        label = f"beyond the expert, {road}" if road else "beyond the expert"
-        table.add_row(label, *(_gain_text(run.gains.get(road)) for run in found))
+    table = new_table(("", *(run.name for run in runs)))
+    table.add_row("state", *(run.state for run in runs))
+    table.add_row("steps done", *(f"{run.steps:,}" for run in runs))
+    for road in dict.fromkeys(road for run in runs for road in run.gains):
+        label = f"difference to expert, {road}" if road else "difference to expert"
+        table.add_row(label, *(_gain_text(run.gains.get(road)) for run in runs))
     for name, values in settings.items():
         table.add_row(name, *("–" if value is None else str(value) for value in values))
     console.print(table)
     if not settings:
         console.print("their settings are the same")
-    print_next_command("on one page", "report", *(run.folder for run in found), "--out", "compared.html")
+    print_next_command("on one page", "report", *(run.folder for run in runs), "--out", "compared.html")
 
 
-@runs_app.command()
+@runs_app.command("progress")
 def progress_command(
     name: Annotated[str, typer.Argument(help="Name of a run, as listed, or its folder.")],
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     json: JsonOption = False,
 ) -> None:
-    """Print a run's progress as CSV: a row per iteration; names of what is within others have dots.
+    """Print a run's progress as CSV: a row per iteration; names of nested values contain dots.
 
     Example:
 
@@ -122,24 +121,23 @@ def progress_command(
 
     from unjam.reports.results import read_progress
 
-    (run,) = _find_runs([name], folder)
-    rows = read_progress(run.folder)
+    rows = read_progress(_find_runs([name], folder)[0].folder)
     if json:
         print_json(rows)
     else:
         pd.json_normalize(rows).to_csv(sys.stdout, index=False)
 
 
-@runs_app.command()
+@runs_app.command("remove")
 def remove_command(
     names: RunNamesArgument,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Remove runs for good, with all that is in their folders; asks first.
+    """Remove runs permanently, with their folders; asks for confirmation.
 
-    What is not a run folder, or is being trained into, is left as it is.
+    Folders that are not run folders, and runs that are being trained, are not removed.
 
     Example:
 
@@ -147,24 +145,23 @@ def remove_command(
     """
     from unjam.training.runs import remove_run
 
-    found = _find_runs(names, folder)
-    for run in found:
+    runs = _find_runs(names, folder)
+    for run in runs:
         if run.state == "running":
             raise InputError(f"run: {str(run.folder)!r} is being trained; allowed: runs that have ended")
     if not yes and (json or not sys.stdin.isatty()):
-        raise InputError("remove: there is nobody to ask; allowed: with --yes")
-    for run in found:
+        raise InputError("remove: confirmation needs a terminal; allowed: with --yes")
+    for run in runs:
         size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file()) / 1e6
-        question = f"Remove {run.folder} ({run.state}, {run.steps:,} steps, {size:.0f} MB)?"
-        if yes or typer.confirm(question):
+        if yes or typer.confirm(f"Remove {run.folder} ({run.state}, {run.steps:,} steps, {size:.0f} MB)?"):
             remove_run(run.folder)
             err_console.print(f"removed {run.folder}")
     if json:
-        print_json({"removed": [str(run.folder) for run in found]})
+        print_json({"removed": [str(run.folder) for run in runs]})
 
 
 def _find_runs(names: Sequence[str], folder: Path) -> list[Any]:
     from unjam.training.runs import find_run, read_run
 
-    found = (read_run(find_run(name, folder), name) for name in names)
-    return list({run.folder.resolve(): run for run in found}.values())
+    runs = (read_run(find_run(name, folder), name) for name in names)
+    return list({run.folder.resolve(): run for run in runs}.values())

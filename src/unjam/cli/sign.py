@@ -1,4 +1,4 @@
-"""Who made a controller: `unjam keys` makes a pair of keys, `sign_command` signs with the private one."""
+"""Signatures of controllers: `unjam keys` makes a key pair, `unjam sign` signs with the private key."""
 
 import os
 from pathlib import Path
@@ -12,12 +12,12 @@ from unjam.errors import invalid_value
 
 
 def keys_command(
-    name: Annotated[Path, typer.Argument(help="What the names of both files begin with.")], json: JsonOption = False
+    name: Annotated[Path, typer.Argument(help="Path of both files without their suffix.")], json: JsonOption = False
 ) -> None:
-    """Make keys to sign controllers with: NAME.key, which you keep for yourself, and NAME.pub for others.
+    """Make a key pair to sign controllers with: NAME.key, which you keep secret, and NAME.pub for others.
 
-    Files that are there already are never written over. Whoever has NAME.key can sign in your name: it has no
-    password, and is readable for you alone.
+    Existing files are never overwritten. Anyone with NAME.key can sign in your name: it has no password, and only
+    you can read it.
 
     Example:
 
@@ -25,27 +25,24 @@ def keys_command(
     """
     from unjam.controller.signature import make_keys
 
-    made = make_keys(name)
+    keys = make_keys(name)
     if json:
-        files = {"private": str(made.private), "public": str(made.public)}
-        print_json({**files, "fingerprint": made.fingerprint})
+        print_json({"private": str(keys.private), "public": str(keys.public), "fingerprint": keys.fingerprint})
         return
-    console.print(f"{made.private}: keep it for yourself", soft_wrap=True)
-    console.print(f"{made.public}: for who verifies; fingerprint {made.fingerprint}", soft_wrap=True)
+    console.print(f"{keys.private}: keep it secret", soft_wrap=True)
+    console.print(f"{keys.public}: for verification by others; fingerprint {keys.fingerprint}", soft_wrap=True)
 
 
 def sign_command(
-    file: Annotated[Path, typer.Argument(help="A .unjam file; it gets the signature.")],
+    file: Annotated[Path, typer.Argument(help="A .unjam file; the signature is added to it.")],
     key: Annotated[Path, typer.Option(help="Private key (.key) of `unjam keys`.")],
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Sign also where another key has signed; that is then gone.")
-    ] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the signature of another key.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Sign a controller, so that others can tell who made it, and that nothing in it has changed since.
+    """Sign a controller, so that others can verify its maker, and that nothing in it has changed since.
 
-    The signature becomes a part of the file, which every reader checks. Sign last: to certify a signed file
-    is refused.
+    The signature becomes a part of the file, which every reader checks. Sign last: a signed file cannot be
+    certified.
 
     Examples:
 
@@ -59,15 +56,14 @@ def sign_command(
     if os.path.isdir(file):
         raise invalid_value("file", str(file), "a .unjam file")
     private, controller = read_private_key(key), read_controller(file)
-    fingerprint, before = fingerprint_of(private.public_key()), controller.signed_by
-    if before not in (None, fingerprint) and not replace:
-        raise invalid_value(
-            "file", str(file), f"one that nobody else has signed (it is signed by {before}); or --replace"
-        )
+    fingerprint, previous = fingerprint_of(private.public_key()), controller.signed_by
+    if previous not in (None, fingerprint) and not replace:
+        allowed = f"a file without the signature of another key (it is signed by {previous}); or --replace"
+        raise invalid_value("file", str(file), allowed)
     add_signature(file, controller, private)
     if json:
-        print_json({"file": str(file), "fingerprint": fingerprint, "replaced": before})
+        print_json({"file": str(file), "fingerprint": fingerprint, "previous_fingerprint": previous})
         return
     console.print(f"{file}: signed by {fingerprint}", soft_wrap=True)
     if os.name == "posix" and key.stat().st_mode & 0o077:
-        err_console.print(f"note: others on this machine may use {key}: chmod 600", soft_wrap=True)
+        err_console.print(f"note: other users of this machine can read {key}: chmod 600", soft_wrap=True)
