@@ -114,7 +114,7 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "report of damaged results": ("damaged", ["report damaged"]),
     "share above one": ("cav_share: 2", ["drive merge --driver pi --set cav_share=2"]),
     "nobody a CAV": (
-        "no CAV was on the road in 5 decisions",
+        "no CAV was on the road in 5 control steps",
         ["drive merge --driver pi --set cav_share=0 --set horizon=5"],
     ),
     "share of CAVs on a road without one": ("cav_share: unknown name", ["drive ring --driver pi --cav-share 0.1"]),

@@ -25,9 +25,9 @@ def test_an_empty_folder_may_be_there(tmp_path: Path) -> None:
         {"expert": "nowhere.py:nothing"},
         {"reward": "gold"},
         {"evaluation__baselines": ["human", "nobody"]},
-        {"expert": "none", "policy__observe": ["expert_memory"]},
-        {"scenario": "merge", "road": {}, "policy__observe": ["local", "place"]},
-        {"scenario": "merge", "road": {}, "expert": "pacer"},
+        {"expert": "none", "policy__inputs": ["expert_memory"]},
+        {"scenario": "merge", "scenario_options": {}, "policy__inputs": ["local", "lap_position"]},
+        {"scenario": "merge", "scenario_options": {}, "expert": "pacer"},
     ],
     ids=["expert", "file of it", "reward", "baseline", "nothing to observe", "no place", "expert of loops"],
 )
@@ -58,7 +58,7 @@ def test_the_simulator_is_no_expert() -> None:
 def test_vehicles_on_a_network_of_ones_own_know_no_position(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     changes = {"scenario": str(file), "scenario_options.cav_types": ["car"], "policy.inputs": ["route_position"]}
-    with pytest.raises(InputError, match="'route_position' is not allowed on a network of one's own"):
+    with pytest.raises(InputError, match="'route_position' is not allowed on a user's network"):
         check_config(load_config(changes=changes))
 
 
@@ -103,7 +103,7 @@ def test_budget_and_workers_may_change_when_a_run_goes_on(tmp_path: Path) -> Non
 
 
 def test_a_run_that_gave_up_takes_no_more_steps(tmp_path: Path) -> None:
-    config = small_config(evaluation__every=1, evaluation__patience=2)
+    config = small_config(evaluation__validation_interval=1, evaluation__patience=2)
     create_run_folder(tmp_path, config)
     rows = [{"iteration": n, "return_expert": 5.0, "return_validation": 4.0} for n in (1, 2, 3)]
     (tmp_path / "progress.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -121,7 +121,7 @@ def test_a_run_beside_a_strangers_config_goes_on(words: str, tmp_path: Path) -> 
 
 
 def test_a_run_whose_road_was_given_in_python_goes_on(tmp_path: Path) -> None:
-    config = small_config(road__length=(120, 130))
+    config = small_config(scenario_options__length=(120, 130))
     create_run_folder(tmp_path, config)
     resume_run_folder(tmp_path, config)
     assert read_config(tmp_path).make_scenario() == config.make_scenario()

@@ -30,8 +30,8 @@ def test_headway_counts_while_a_car_moves_and_ttc_while_it_closes_in() -> None:
 
 def test_a_recovering_cav_counts_for_the_time_to_collision_and_not_for_time_gaps() -> None:
     speeds, ahead, gaps = column(10.0, 10.0), column(9.0, 10.0), column(5.0, 12.0)
-    found = following_statistics(speeds, ahead, gaps, 0.1, recovering=column(1.0, 0.0))
-    assert (found.headway, found.share_short_time_gap, found.min_time_to_collision) == (1.2, 0.0, 5.0)
+    found = following_statistics(speeds, ahead, gaps, 0.1, in_recovery=column(1.0, 0.0))
+    assert (found.min_time_gap, found.share_short_time_gap, found.min_time_to_collision) == (1.2, 0.0, 5.0)
 
 
 OPENING, CLOSING = FollowingPair(10.0, 10.5, 6.0), FollowingPair(10.0, 9.5, 5.4)

@@ -87,7 +87,7 @@ def test_released_is_four_times_mean_speed_over_twenty_less_four_times_mean_effo
 def test_released_merge_is_one_less_the_distance_from_twenty_and_lacking_headways(outcome: Outcome) -> None:
     for numbers in (outcome, Outcome(*(torch.from_numpy(values) for values in outcome))):
         terms = REWARDS["released-merge"](numbers)
-        assert set(terms) == {"speed", "headway", "floor"}
+        assert set(terms) == {"speed", "time_gap", "lower_bound"}
         for row, crashed in enumerate(outcome.has_crashed):
             speeds = there(outcome.speeds[row])
             missed = math.hypot(*(20.0 - speed for speed in speeds))
@@ -95,7 +95,7 @@ def test_released_merge_is_one_less_the_distance_from_twenty_and_lacking_headway
             lacking = sum(min(time - 1.0, 0.0) for time in there(outcome.time_gaps[row]))
             expected = max(1.0 - missed / wanted + 0.1 * lacking, 0.0) if speeds and not crashed else 0.0
             assert float(total(terms)[row]) == pytest.approx(expected, abs=1e-9)
-            assert float(terms["headway"][row]) == pytest.approx(0.0 if crashed else 0.1 * lacking, abs=1e-9)
+            assert float(terms["time_gap"][row]) == pytest.approx(0.0 if crashed else 0.1 * lacking, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_equation_16_term_by_term(outcome: Outcome, name: str) -> None:
         speed = max(30.0 - abs(30.0 - average), 0.0) if name == "eq16" else max(30.0 - average, 0.0)
         headway = -0.1 * sum(max(1.0 - time, 0.0) for time in there(outcome.time_gaps[row]))
         acceleration = -0.1 * sum(abs(push) for push in there(outcome.accelerations[row]))
-        expected = {"speed": speed, "headway": headway, "acceleration": acceleration}
+        expected = {"speed": speed, "time_gap": headway, "acceleration": acceleration}
         assert {key: values[row] for key, values in terms.items()} == pytest.approx(expected, abs=1e-9)
 
 
@@ -160,7 +160,7 @@ def test_tensors_earn_what_arrays_earn(outcome: Outcome, name: str) -> None:
 
 @given(outcomes())
 def test_travel_time_counts_who_is_there_and_who_waits(outcome: Outcome) -> None:
-    found = REWARDS["travel-time"](outcome)["travel"]
+    found = REWARDS["travel-time"](outcome)["travel_time"]
     for row, waiting in enumerate(outcome.backlog.tolist()):
         count = len(there(outcome.speeds[row])) + waiting
         closed = CRASH_CLOSURE_STEPS * max(count, MIN_CRASH_BACKLOG) if outcome.has_crashed[row] else 0

@@ -353,7 +353,7 @@ def test_a_road_that_sumo_refuses_fails_in_sumos_words_and_the_worker_goes_on(wo
     good = EpisodeTask(SHORT, IDM(), (0,))
     bad = EpisodeTask(replace(SHORT, emission_class="coal"), IDM(), (5,))
     _, failed, found = workers.run([good, bad, good])
-    assert (failed.status, failed.error) == ("failed", "RefusedError")
+    assert (failed.status, failed.error) == ("failed", "SumoInputError")
     assert "'coal' doesn't exist" in failed.reason
     assert fingerprint(found) == fingerprint(run_episode(SHORT, IDM(), (0,)))
 
@@ -520,10 +520,10 @@ def test_workers_end_when_the_process_that_wants_them_is_gone() -> None:
         "import os, signal\n"
         "from unjam.drivers import IDM\n"
         "from unjam.scenarios import Ring\n"
-        "from unjam.worlds.worker_pool import EpisodeTask, Workers\n"
+        "from unjam.worlds.worker_pool import EpisodeTask, WorkerPool\n"
         "workers = WorkerPool(1)\n"
         "workers.run([EpisodeTask(Ring(horizon=10), IDM(), (0,))])\n"
-        "print(workers._all[0]._process.pid, flush=True)\n"
+        "print(workers._workers[0]._process.pid, flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     parent = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Could cars and people have done that? The physics of all vehicles, in every simulation step."""
+"""Audit of the physics of all vehicles in every simulation step: braking, time gaps, jerk."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -9,58 +9,58 @@ from numpy.typing import NDArray
 from unjam.physics.arrays import Floats
 
 BRAKING_THRESHOLDS = (3.5, 4.5, 9.0)
-"""brakings that are counted [m/s2]: ISO 15622's above 20 m/s, a hard one, and what dry asphalt allows"""
+"""braking that is counted [m/s2]: limit of ISO 15622 above 20 m/s, hard braking, and the limit on dry asphalt"""
 BRAKING_TOLERANCE = 1e-6
-"""of a braking [m/s2]"""
+"""of a braking threshold [m/s2]"""
 OVERRIDE_TOLERANCE = 1e-4
-"""by how much SUMO changes a command that it lets pass: it takes some micrometres beyond the smallest gap for
-none, and holds who would creep there [m/s2]"""
+"""change of a command that does not count as an override [m/s2]: SUMO rounds gaps to micrometers near the minimum gap,
+and stops vehicles that would creep there"""
 MIN_TIME_GAP_SPEED = 1.0
-"""speed above which a time headway is a matter of safety [m/s]"""
+"""speed above which time gaps matter for safety [m/s]"""
 SHORT_TIME_GAP = 1.0
 """[s]"""
 HUMAN_DRIVER, CAV_DRIVER, CAV_AFTER_CUT_IN = 0, 1, 2
-"""whose braking it is; the last: of a CAV just after somebody else came before it"""
+"""driver kinds of a braking vehicle; the last one is a CAV just after another vehicle cut in"""
 CUT_IN_SECONDS = 3.0
-"""time after a change of leader in which braking is counted apart [s]"""
+"""time after a change of leader in which braking is counted separately [s]"""
 STEADY_FOLLOWING_SECONDS = 5.0
-"""time behind the same leader in which nothing is counted of how a CAV follows [s]"""
+"""time behind the same leader in which car following is not yet counted [s]"""
 BRAKING_BLOCK_STEPS = 1000
-"""steps that are counted together: one by one takes longer than they take to drive"""
+"""steps that are counted together: counting each step would take longer than simulating it"""
 
 
 @dataclass(frozen=True)
 class BrakingStatistics:
-    """How hard some vehicles braked; a moment is one vehicle in one simulation step."""
+    """Statistics of the braking of some vehicles; a sample is one vehicle in one simulation step."""
 
     max_braking: float = 0.0
-    """[m/s2]; zero where nobody braked"""
+    """[m/s2]; zero without braking"""
     exceedances: tuple[int, ...] = (0,) * len(BRAKING_THRESHOLDS)
-    """moments with more than each of BEYOND"""
+    """samples beyond each of `BRAKING_THRESHOLDS`"""
     samples: int = 0
 
     def __add__(self, other: "BrakingStatistics") -> "BrakingStatistics":
-        """Return how hard the vehicles of both braked."""
-        beyond = tuple(sum(both) for both in zip(self.exceedances, other.exceedances, strict=True))
-        return BrakingStatistics(max(self.max_braking, other.max_braking), beyond, self.samples + other.samples)
+        """Return the statistics of the vehicles of both."""
+        exceedances = tuple(sum(both) for both in zip(self.exceedances, other.exceedances, strict=True))
+        return BrakingStatistics(max(self.max_braking, other.max_braking), exceedances, self.samples + other.samples)
 
 
 @dataclass(frozen=True)
 class FollowingStatistics:
-    """How the CAVs followed those ahead, over all simulation steps."""
+    """Statistics of the CAVs' car following, over all simulation steps."""
 
     min_time_gap: float = np.inf
-    """smallest time gap while faster than 1 m/s, recovery after cut-ins excluded [s]"""
+    """minimum time gap above 1 m/s, without recovery after cut-ins [s]"""
     min_time_to_collision: float = np.inf
-    """smallest gap over closing speed [s]"""
+    """minimum of gap over closing speed [s]"""
     max_required_braking: float = 0.0
-    """largest deceleration rate to avoid a crash, closing speed squared over twice the gap [m/s2]"""
+    """maximum deceleration rate to avoid a crash: closing speed squared over twice the gap [m/s2]"""
     share_short_time_gap: float = 0.0
-    """share of the time faster than 1 m/s with a time gap below one second, recovery excluded likewise"""
+    """share of the time above 1 m/s with a time gap below 1 s, without recovery after cut-ins"""
     max_jerk: float = 0.0
-    """largest change of acceleration over time [m/s3]"""
+    """[m/s3]"""
     override_share: float = 0.0
-    """share of the commands that SUMO's safety check changed, but for the right of way"""
+    """share of the commands that SUMO's safety check changed, except for the right of way"""
     yield_share: float = 0.0
     """share of the commands that SUMO changed near a crossing, where vehicles yield"""
 
@@ -73,52 +73,51 @@ class Audit:
     cav_braking: BrakingStatistics = field(default_factory=BrakingStatistics)
     following: FollowingStatistics = field(default_factory=FollowingStatistics)
     required_time_gap: float = 0.0
-    """time headway that was demanded of CAVs [s]"""
+    """time gap that CAVs must keep [s]"""
     has_lanes: bool = False
-    """whether others may cut in: `following` is then of those who follow the same for long"""
+    """whether vehicles can cut in: then `following` only contains steady car following"""
     cut_in_braking: BrakingStatistics = field(default_factory=BrakingStatistics)
-    """how hard CAVs braked just after somebody else came before them; not part of `cavs`"""
+    """braking of CAVs just after another vehicle cut in; not part of `cav_braking`"""
 
 
 def braking_statistics(accelerations: Any) -> BrakingStatistics:
-    """Return how hard vehicles braked whose accelerations those are [m/s2], any shape."""
-    all_of_them = np.asarray(accelerations, np.float64).ravel()
-    if not all_of_them.size:
+    """Return the braking statistics of accelerations [m/s2], any shape."""
+    samples = np.asarray(accelerations, np.float64).ravel()
+    if not samples.size:
         return BrakingStatistics()
-    hard = all_of_them[all_of_them < -BRAKING_THRESHOLDS[0]]
-    beyond = tuple(int((hard < -limit - BRAKING_TOLERANCE).sum()) for limit in BRAKING_THRESHOLDS)
-    return BrakingStatistics(float(max(0.0, -all_of_them.min())), beyond, all_of_them.size)
+    hard = samples[samples < -BRAKING_THRESHOLDS[0]]
+    exceedances = tuple(int((hard < -limit - BRAKING_TOLERANCE).sum()) for limit in BRAKING_THRESHOLDS)
+    return BrakingStatistics(float(max(0.0, -samples.min())), exceedances, samples.size)
 
 
 class BrakingLog:
-    """Counts how hard several kinds of vehicles brake, step by step; hours of them need no more memory."""
+    """Counts the braking of several kinds of drivers, step by step, with constant memory."""
 
     def __init__(self, step: float) -> None:
-        """Begin with nothing; what is noted are changes of speed in `step` seconds."""
+        """Start without samples; `step` is the duration of a simulation step [s]."""
         self._step, self._statistics = step, dict[int, BrakingStatistics]()
         self._speed_changes: list[Floats] = []
         self._driver_kinds: list[NDArray[np.uint8]] = []
 
     def add(self, speed_changes: Floats, driver_kinds: NDArray[np.uint8]) -> None:
-        """Note how the speeds of n vehicles changed [m/s], and of which kind each is: shape (n,)."""
+        """Add the speed changes of n vehicles in one step [m/s], and their driver kinds: shape (n,)."""
         self._speed_changes.append(speed_changes)
         self._driver_kinds.append(driver_kinds)
         if len(self._speed_changes) == BRAKING_BLOCK_STEPS:
             self._count_block()
 
     def statistics(self, driver_kind: int) -> BrakingStatistics:
-        """Return how hard those of a kind braked so far."""
+        """Return the braking statistics of a driver kind so far."""
         self._count_block()
         return self._statistics.get(driver_kind, BrakingStatistics())
 
     def _count_block(self) -> None:
         if not self._speed_changes:
             return
-        accelerations, whose = np.concatenate(self._speed_changes) / self._step, np.concatenate(self._driver_kinds)
-        for kind in np.unique(whose).tolist():
-            self._statistics[kind] = self._statistics.get(kind, BrakingStatistics()) + braking_statistics(
-                accelerations[whose == kind]
-            )
+        accelerations, kinds = np.concatenate(self._speed_changes) / self._step, np.concatenate(self._driver_kinds)
+        for kind in np.unique(kinds).tolist():
+            block = braking_statistics(accelerations[kinds == kind])
+            self._statistics[kind] = self._statistics.get(kind, BrakingStatistics()) + block
         self._speed_changes.clear()
         self._driver_kinds.clear()
 
@@ -161,33 +160,40 @@ def following_statistics(
     leader_speed: Floats,
     gap: Floats,
     step: float,
-    overridden: Any = (),
-    yielding: Any = (),
-    recovering: Any = False,
+    is_overridden: Any = (),
+    is_yielding: Any = (),
+    in_recovery: Any = False,
 ) -> FollowingStatistics:
-    """Return how CAVs followed; arrays of shape (moments, CAVs) one `step` apart, NaN where one is not there.
+    """Return statistics of car following; arrays of shape (moments, CAVs), one `step` apart, NaN without a CAV.
 
-    `override_share` says which commands SUMO changed, `yielding` which were given near a crossing; any shape.
-    Moments of `recovering` CAVs, as `is_recovering` finds them, do not count for time gaps.
+    Args:
+        speed: of the CAVs [m/s].
+        leader_speed: [m/s].
+        gap: net gap [m].
+        step: time between two moments [s].
+        is_overridden: which commands SUMO changed, any shape.
+        is_yielding: which commands were given near a crossing, the same shape.
+        in_recovery: moments of `is_recovering`, which do not count for time gaps.
+
     Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        moving, closing = speed > MIN_TIME_GAP_SPEED, speed - leader_speed
-        headways = (gap / speed)[moving & ~np.asarray(recovering, bool)]
-        nearing = (closing > 0) & (gap > 0)
-        times, needed = (gap / closing)[nearing], (closing**2 / (2.0 * gap))[nearing]
+        is_moving, closing = speed > MIN_TIME_GAP_SPEED, speed - leader_speed
+        time_gaps = (gap / speed)[is_moving & ~np.asarray(in_recovery, bool)]
+        is_closing = (closing > 0) & (gap > 0)
+        times, required = (gap / closing)[is_closing], (closing**2 / (2.0 * gap))[is_closing]
         jerks = np.abs(np.diff(speed, 2, axis=0)) / step**2
+    overridden, yielding = np.asarray(is_overridden, bool), np.asarray(is_yielding, bool)
     return FollowingStatistics(
-        min_time_gap=float(headways.min(initial=np.inf)),
+        min_time_gap=float(time_gaps.min(initial=np.inf)),
         min_time_to_collision=0.0 if (gap <= 0).any() else float(times.min(initial=np.inf)),
-        max_required_braking=float(needed.max(initial=0.0)),
-        share_short_time_gap=_share(headways < SHORT_TIME_GAP),
+        max_required_braking=float(required.max(initial=0.0)),
+        share_short_time_gap=_share(time_gaps < SHORT_TIME_GAP),
         max_jerk=float(np.nanmax(jerks, initial=0.0)),
-        override_share=_share(np.asarray(overridden, bool) & ~np.asarray(yielding, bool)),
-        yield_share=_share(np.asarray(overridden, bool) & np.asarray(yielding, bool)),
+        override_share=_share(overridden & ~yielding),
+        yield_share=_share(overridden & yielding),
     )
 
 
 def _share(flags: NDArray[np.bool_]) -> float:
-    """Return the share of what is true; zero of nothing."""
     return float(flags.mean()) if flags.size else 0.0

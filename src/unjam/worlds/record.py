@@ -1,4 +1,4 @@
-"""What happened in an episode, and how it travels between processes."""
+"""The record of an episode: trajectories of CAVs, speeds and positions of all vehicles, and what was counted."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
@@ -16,56 +16,54 @@ from unjam.worlds.trips import Trips
 from unjam.worlds.world import DriverLog
 
 SHARED_COLUMN_FRAMES = 200
-"""an episode in so many frames has an empty one between two vehicles that share a column: else it would look
-as if one flew back"""
+"""frames of an episode: an empty one separates vehicles in a shared column, or one would seem to jump back"""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One stay of one CAV on the road; T decisions. Arrays of shape (T,) where nothing else is said."""
+    """One trip of one CAV: T control steps. Arrays have shape (T,) unless stated otherwise."""
 
     vehicle: str
     start_step: int
-    """decision of the episode at which it began"""
+    """control step of the episode at which the trip started"""
     states: LocalState
-    """what it perceived, shape (T + 1,): the last entry is where it ended"""
+    """states that the CAV observed, shape (T + 1,): the last entry is the state at the end"""
     observations: Floats
-    """what the residual network saw at each of its choices, and at the end, shape (choices + 1, inputs); it
-    chooses every `hold` decisions; (1, 0) without a network"""
+    """network observation at each action and at the end, shape (actions + 1, inputs); an action is held for
+    `action_repeat` control steps; (1, 0) without a network"""
     expert_acceleration: Floats
     """the expert's acceleration within the action limit [m/s2]"""
     residual: Floats
-    """the network's residual with its exploration noise, not clipped [m/s2]; zero without one"""
+    """the network's residual with its exploration noise, not clipped [m/s2]; zero without a network"""
     applied_acceleration: Floats
-    """the acceleration that was commanded, within the action limit, or harder braking where the safety filter
-    demanded it; the mean over the decision [m/s2]"""
+    """the commanded acceleration within the action limit, or harder braking that the safety filter demanded; mean over
+    the control step [m/s2]"""
     filter_braking: Floats
-    """the most that the safety filter took from what the driver wanted [m/s2]; zero where it let it pass"""
+    """largest reduction of the driver's acceleration by the safety filter [m/s2]; zero if it did not intervene"""
     shield_braking: Floats
-    """braking that SUMO's safety check added to the command [m/s2]; zero where it let it pass"""
+    """braking that SUMO's safety check added to the command [m/s2]; zero if it did not intervene"""
     initial_memory: dict[str, Any]
-    """what the expert remembered before the first decision, without the axis of rows; empty without a
-    network"""
+    """the expert's memory before the first control step, without the axis of rows; empty without a network"""
     action_repeat: int
-    """decisions for which one residual was held"""
+    """control steps for which one residual was held"""
     terminated: bool
-    """whether a collision ended it; otherwise it was cut by the horizon or by leaving the road"""
+    """whether a collision ended the trip; otherwise the horizon or the end of the road did"""
     reward_terms: dict[str, Floats] = field(default_factory=dict)
     """terms of the reward by name"""
 
     @property
     def step_slice(self) -> slice:
-        """Its decisions among those of the episode."""
+        """Its control steps among those of the episode."""
         return slice(self.start_step, self.start_step + len(self.applied_acceleration))
 
     @cached_property
     def reward(self) -> Floats:
-        """What each decision earned: the sum of the terms."""
+        """The reward of each control step: the sum of the terms."""
         return np.sum(list(self.reward_terms.values()), axis=0)
 
     @property
     def actions_and_rewards(self) -> tuple[Floats, Floats]:
-        """The residuals that the network chose, and what was earned while each was held; shape (choices,)."""
+        """The network's residuals, and the sum of rewards while each was held; shape (actions,)."""
         starts = np.arange(0, len(self.residual), self.action_repeat)
         return self.residual[starts], np.add.reduceat(self.reward, starts)
 
@@ -82,46 +80,37 @@ def make_trajectory(
     terminated: bool,
     driver_log: DriverLog,
 ) -> Trajectory:
-    """Return the trajectory of a stay, with what the driver decided; arrays as `Trajectory` has them.
+    """Return the trajectory of a trip with the driver's decisions; arguments not listed are as in `Trajectory`.
 
     Args:
-        vehicle: its name.
-        number: it was the so many-th CAV to enter, from 0.
-        start: decision of the episode at which it began.
-        rows: its row among the CAVs at each moment, shape (T + 1,); None: decisions are plain numbers.
-        states: what it perceived.
-        applied: its commands; of humans what they did.
-        filtered: most that the safety filter took from each.
-        shield: hardest braking that was added to each command.
-        terminated: whether a collision ended it.
-        driven: all that the driver decided.
+        entry_number: number of CAVs that entered before this one.
+        rows: its row among the CAVs at each moment, shape (T + 1,); None: decisions are floats.
+        applied_acceleration: its commands; the actual accelerations of human drivers.
+        driver_log: all decisions of the driver.
     """
-    about = (vehicle, start_step, states)
+    trip, commands = (vehicle, start_step, states), (applied_acceleration, filter_braking, shield_braking)
     if not driver_log.decisions:
-        nothing = np.zeros((1, 0)), applied_acceleration, np.zeros_like(applied_acceleration)
-        return Trajectory(*about, *nothing, applied_acceleration, filter_braking, shield_braking, {}, 1, terminated)
+        expert, residual = applied_acceleration, np.zeros_like(applied_acceleration)
+        return Trajectory(*trip, np.zeros((1, 0)), expert, residual, *commands, {}, 1, terminated)
 
     def select(values: Sequence[Any], steps: Sequence[int]) -> Floats:
-        """Return this CAV's of all values at some steps."""
+        """Return this CAV's values at some control steps."""
         return np.array([values[step] if rows is None else values[step][rows[step - start_step]] for step in steps])
 
-    experts, residuals, seen = zip(*driver_log.decisions, strict=True)
+    experts, residuals, observations = zip(*driver_log.decisions, strict=True)
+    observations = [*observations, driver_log.last_observation]
     steps = range(start_step, start_step + len(applied_acceleration))
-    choices = [*steps[:: driver_log.action_repeat], steps.stop]
-    looks = [*seen, driver_log.last_observation]
-    if np.size(looks[steps.stop]) == 0:  # it crashed while others drove on, between two looks of the network
-        choices[-1] = choices[-2]
-    observations = select(looks, choices).astype(np.float64).reshape(len(choices), -1)
-    decided = observations, select(experts, steps), select(residuals, steps)
-    commanded = applied_acceleration, filter_braking, shield_braking
-    return Trajectory(
-        *about, *decided, *commanded, driver_log.initial_memories[entry_number], driver_log.action_repeat, terminated
-    )
+    actions = [*steps[:: driver_log.action_repeat], steps.stop]
+    if np.size(observations[steps.stop]) == 0:  # a collision between two actions, after which other CAVs drove on
+        actions[-1] = actions[-2]
+    inputs = select(observations, actions).astype(np.float64).reshape(len(actions), -1)
+    decisions, memory = (select(experts, steps), select(residuals, steps)), driver_log.initial_memories[entry_number]
+    return Trajectory(*trip, inputs, *decisions, *commands, memory, driver_log.action_repeat, terminated)
 
 
 @dataclass(frozen=True)
 class SumoWarning:
-    """What SUMO warned of in an episode: one kind of message."""
+    """All of SUMO's warnings of one kind in an episode."""
 
     kind: str
     """the message with placeholders for names and numbers"""
@@ -132,94 +121,91 @@ class SumoWarning:
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened in one episode; T decisions, N vehicles. The warm-up is not part of it."""
+    """The record of one episode: T control steps, N vehicles or columns. The warm-up is not part of it."""
 
     seed: tuple[int, ...]
     status: str
-    """`completed`; `failed_episodes`; `collision`, or `teleports` beyond SUMO's max-num-teleports, ended it early"""
+    """`completed`; `failed`; `collision`, or `teleports` beyond SUMO's max-num-teleports, ended it early"""
     reason: str = ""
     """why it failed or ended early"""
     error: str = ""
-    """name of the error that made it fail"""
+    """name of the error if it failed"""
     control_step: float = 0.1
-    """time between two decisions [s]"""
+    """duration of a control step [s]"""
     warmup: int = 0
-    """simulation steps before the first decision"""
+    """simulation steps before the first control step"""
     drawn_values: dict[str, float] = field(default_factory=dict)
-    """what the seed has drawn, by name"""
+    """values that were drawn from the seed, by name"""
     loop_length: float = float("nan")
-    """of a closed road [m]; NaN of one with ends"""
+    """length of a closed road [m]; NaN of a road with ends"""
     crossings: tuple[tuple[float, float], ...] = ()
-    """where along the road it crosses itself [m]"""
+    """ranges along the road where it crosses itself [m]"""
     limit_speed: float = float("nan")
     """the scenario's own limit of speed [m/s]"""
     vehicle_ids: tuple[str, ...] = ()
     cav_ids: tuple[str, ...] = ()
     vehicle_columns: tuple[int, ...] = ()
-    """which of N columns each vehicle has, where those that are never there together share one: with an empty
-    moment between two, and CAVs with CAVs alone; empty: each vehicle its own, in order"""
+    """column of each vehicle if vehicles of different times share the N columns: with an empty moment between two, and
+    CAVs only with CAVs; empty: each vehicle has its own, in order"""
     snapshot_stride: int = 1
-    """where vehicles are is kept of every so many-th moment: not of all where many drive for long"""
+    """number of control steps between two snapshots of positions: more than 1 if many vehicles drive for long"""
     collisions: int = 0
-    """vehicles that collided: on a built-in road by contact, on a user's network as its settings say"""
+    """vehicles that collided: on a built-in road by contact, on a user's network according to its settings"""
     contacts: int = 0
-    """CAVs that were in contact with another vehicle on a user's network; on other roads contact ends it"""
+    """CAVs in contact with another vehicle on a user's network; on other roads contact ends the episode"""
     speeds: Floats = field(default_factory=lambda: np.zeros((1, 0)))
-    """[m/s], shape (T + 1, N); NaN where a vehicle is not on the road"""
+    """[m/s], shape (T + 1, N); NaN if a vehicle is not on the road"""
     positions: Floats = field(default_factory=lambda: np.zeros((1, 0)))
-    """front bumpers along the route, not wrapped [m], shape (T // every + 1, N)"""
+    """front bumpers along the route, not wrapped [m], shape (T // snapshot_stride + 1, N)"""
     gaps: Floats = field(default_factory=lambda: np.zeros((1, 0)))
-    """bumper to bumper to the vehicle ahead [m], shape (T // every + 1, N)"""
+    """net gap to the leader [m], shape (T // snapshot_stride + 1, N)"""
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """fuel rate in each step [mg/s], shape (T, N), of a road with ends of all together, (T,); (0, 0) where it
-    was not recorded"""
+    """fuel rate in each step [mg/s], shape (T, N), on a road with ends total (T,); (0, 0) if not recorded"""
     outline: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """a closed road's centre line: rows (coordinate along the route, x, y) [m]"""
+    """center line of a closed road: rows (coordinate along the route, x, y) [m]"""
     branches: tuple[str, ...] = ()
-    """where the vehicles of each column came from, on a road with several ways in"""
+    """origin of the vehicles of each column, on a road with several entrances"""
     arrivals: int = 0
     """vehicles that left at the end of their route"""
     teleports: int = 0
-    """times that SUMO took a vehicle that had stood for long or collided off the road; until it is put back
-    it waits"""
+    """number of teleports by SUMO, after long standing or a collision; a teleported vehicle waits to be reinserted"""
     demand_peak: tuple[float, float] = (0.0, 0.0)
-    """from when to when the most vehicles want to enter [s]; (0, 0) where there is no peak"""
+    """begin and end of the time of highest demand [s]; (0, 0) without a peak"""
     planned_duration: float = float("nan")
-    """how long a road with ends was to be driven [s], were nobody to touch; NaN of a closed one"""
+    """duration of an episode without collisions on a road with ends [s]; NaN of a closed road"""
     free_flow_time: float = float("nan")
-    """mean travel time where nobody disturbs anybody [s]; NaN where it is not known"""
+    """mean travel time in free flow [s]; NaN if unknown"""
     backlog: Floats = field(default_factory=lambda: np.zeros(0))
-    """vehicles that wanted to enter and could not, or were lifted off the road, at each moment, shape
-    (T + 1,); (0,) of a closed road"""
+    """insertion backlog, including teleported vehicles, at each moment, shape (T + 1,); (0,) of a closed road"""
     teleported: int = 0
-    """of those that wait at the end, how many were lifted off the road and not put back"""
+    """vehicles of the backlog at the end that were teleported and not reinserted"""
     lane_lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) where not recorded"""
+    """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) if not recorded"""
     poses: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T // every + 1, N, 3); no rows
-    where not recorded"""
+    """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T // snapshot_stride + 1, N, 3); no rows if
+    not recorded"""
     lane_indices: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """which of `lane_names` each vehicle is in, shape (T // every + 1, N), NaN where in none of them; (0, 0)
-    where not recorded"""
+    """index in `lane_names` of each vehicle's lane, shape (T // snapshot_stride + 1, N), NaN in no such lane; (0, 0) if
+    not recorded"""
     lane_names: tuple[str, ...] = ()
-    """of a road with lanes, from left to right as one drives"""
+    """of a road with lanes, from left to right in driving direction"""
     reward_terms: dict[str, Floats] = field(default_factory=dict)
     """terms of the reward by name, shape (T,)"""
     trajectories: tuple[Trajectory, ...] = ()
     trips: Trips = field(default_factory=Trips)
-    """of all vehicles, on a network of the user's own; empty elsewhere"""
+    """of all vehicles on a user's network; empty on other roads"""
     audit: Audit = field(default_factory=Audit)
     warnings: tuple[SumoWarning, ...] = ()
-    """what SUMO warned of, the warm-up included; teleports, collisions and braking are counted elsewhere"""
+    """SUMO's warnings, including the warm-up; without teleports, collisions and braking, which are counted above"""
 
     @property
     def reward(self) -> Floats:
-        """What each decision earned, shape (T,): the sum of the terms."""
+        """The reward of each control step, shape (T,): the sum of the terms."""
         return np.sum(list(self.reward_terms.values()), axis=0)
 
     @property
     def control_steps(self) -> int:
-        """How many decisions were made: the episode's actual steps."""
+        """Number of control steps: the environment steps of the episode."""
         return len(self.speeds) - 1
 
     @property
@@ -231,31 +217,31 @@ class Episode:
 
     @property
     def has_run(self) -> bool:
-        """Whether the episode ran, also where it ended early."""
+        """Whether the episode ran, even if it ended early."""
         return self.status != "failed"
 
 
 def assign_columns(
     first_moments: NDArray[np.intp], last_moments: NDArray[np.intp], groups: Sequence[Hashable], min_spacing: int = 1
 ) -> NDArray[np.intp]:
-    """Return a column for each of n stays, with at least `apart` empty moments between two in the same one.
+    """Return a column for each of n trips, given the first and last moment of each (inclusive).
 
-    `first` and `last` are the moments of each, both included; only stays of the same group share one.
+    Only trips of the same group share a column, with at least `min_spacing` empty moments between two of them.
     """
     columns, used = np.zeros(len(groups), np.intp), 0
-    busy: dict[Hashable, list[tuple[int, int]]] = {}
-    """of each group a heap: until which moment, which column"""
-    for stay in np.argsort(first_moments, kind="stable").tolist():
-        waiting = busy.setdefault(groups[stay], [])
-        if waiting and waiting[0][0] + min_spacing < first_moments[stay]:
-            _, column = heappop(waiting)
+    heaps: dict[Hashable, list[tuple[int, int]]] = {}
+    """of each group: last moment and column of its trips so far"""
+    for trip in np.argsort(first_moments, kind="stable").tolist():
+        heap = heaps.setdefault(groups[trip], [])
+        if heap and heap[0][0] + min_spacing < first_moments[trip]:
+            _, column = heappop(heap)
         else:
             column, used = used, used + 1
-        columns[stay] = column
-        heappush(waiting, (int(last_moments[stay]), column))
+        columns[trip] = column
+        heappush(heap, (int(last_moments[trip]), column))
     return columns
 
 
 def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:
-    """Return the row of an episode that did not run: every requested episode has one."""
+    """Return the record of an episode that did not run: every requested episode has a row."""
     return Episode(seed=seed, status="failed", reason=reason, error=error)

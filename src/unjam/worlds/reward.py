@@ -1,4 +1,4 @@
-"""Rewards: named terms, and their sum. One place for the actual and the virtual environment."""
+"""Rewards as sums of named terms, used both in the environment and in the learned model."""
 
 from collections.abc import Callable
 from sys import float_info
@@ -16,52 +16,50 @@ MAX_PENALIZED_TIME_GAP = 1.0
 MOBILITY_WEIGHT, TIME_GAP_WEIGHT, ACCELERATION_WEIGHT = 1.0, 0.1, 0.1
 """alpha, beta, gamma of Eq. 16"""
 MERGE_TARGET_SPEED = 20.0
-"""speed that the merge's reward wants, and the scale of speeds in power [m/s]"""
+"""target speed of the merge reward, and scale of speeds in the power reward [m/s]"""
 MERGE_FREE_FLOW_VEHICLES = 30.0
-"""scale of how many are on the road in power: about as many as on the merge in free flow"""
+"""scale of the number of vehicles in the power reward: about that on the merge in free flow"""
 CRASH_CLOSURE_STEPS = 2_400
-"""decisions for which a crash closes a road, to its reward: the whole of an on-ramp's episode"""
+"""control steps for which a crash closes a road in the travel-time reward: a whole on-ramp episode"""
 MIN_CRASH_BACKLOG = 200
-"""how many wait then, at least, for others were still to come: on an on-ramp, where 3,700 vehicles an hour
-take people's 154 s, some 160 are there"""
+"""minimum number of vehicles that a crash stops, as others were still to come: on an on-ramp with 3,700 veh/h and the
+154 s of human-only traffic, about 160 vehicles are on the road"""
 STANDSTILL_SPEED = 1e-3
-"""speed below which a time headway means nothing [m/s]"""
+"""lower limit of the speed in time gaps [m/s]"""
 
 
 class Outcome(NamedTuple):
-    """What one decision led to; a row per decision. NumPy arrays or torch tensors, SI units."""
+    """The outcome of control steps, one per row. NumPy arrays or torch tensors, SI units."""
 
     speeds: Array
-    """speeds after the step of all vehicles (in the virtual environment: of those seen) [m/s], shape
-    (rows, vehicles); NaN where a vehicle is not on the road"""
+    """speeds after the step of all vehicles (in a learned model: of the modeled ones) [m/s], shape (rows, vehicles);
+    NaN if a vehicle is not on the road"""
     accelerations: Array
-    """what the CAVs were told, within the action limit [m/s2], shape (rows, CAVs); NaN where one is not on
-    the road"""
+    """commands of the CAVs within the action limit [m/s2], shape (rows, CAVs); NaN if one is not on the road"""
     time_gaps: Array
-    """time headways of the CAVs after the step, gap over speed [s], shape (rows, CAVs); NaN likewise"""
+    """time gaps of the CAVs after the step [s], shape (rows, CAVs); NaN likewise"""
     has_crashed: Array
     """whether there was a collision, shape (rows,)"""
     backlog: Array
-    """vehicles that want to enter and cannot, shape (rows,)"""
+    """insertion backlog [vehicles], shape (rows,)"""
 
 
 Reward = Callable[[Outcome], dict[str, Array]]
-"""A reward: its terms by name, each of shape (rows,). What is earned is their sum."""
+"""A reward function: its terms by name, each of shape (rows,). The reward is their sum."""
 
 
 def _nan_mean(values: Array) -> Array:
-    """Mean over the last axis of those that are there (not NaN); 0 where nobody is."""
-    there = ~namespace(values).isnan(values)
-    return _nan_sum(values) / clamp_min(there.sum(-1), 1)
+    """Mean over the last axis without NaN; 0 if all are NaN."""
+    return _nan_sum(values) / clamp_min((~namespace(values).isnan(values)).sum(-1), 1)
 
 
 def _nan_sum(values: Array) -> Array:
-    """Sum over the last axis of those that are there (not NaN)."""
+    """Sum over the last axis without NaN."""
     return namespace(values).nan_to_num(values, nan=0.0).sum(-1)
 
 
 def released_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward behind Table 1 on ring and figure eight: 4 mean v / 20 - 4 mean |a|; 0 at a crash.
+    """Reward of Table 1 on ring and figure eight: 4 mean v / 20 - 4 mean |a|; 0 at a crash.
 
     Source: the authors' released code, after Flow's wave attenuation environment.
     """
@@ -73,7 +71,7 @@ def released_reward(outcome: Outcome) -> dict[str, Array]:
 
 
 def eq16_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward Eq. 16 of the paper with the sign of its first term mended: it pays for being near v_des."""
+    """Reward Eq. 16 of the paper with the sign of its first term corrected: it rewards speeds near v_des."""
     mean = _nan_mean(outcome.speeds)
     return {
         "speed": MOBILITY_WEIGHT * clamp_min(DESIRED_SPEED - abs(DESIRED_SPEED - mean), 0.0),
@@ -82,7 +80,7 @@ def eq16_reward(outcome: Outcome) -> dict[str, Array]:
 
 
 def printed_eq16_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward Eq. 16 as it is printed: its first term pays for being slow. Here to show just that."""
+    """Reward Eq. 16 as printed: its first term rewards low speeds. It is here to show this."""
     mean = _nan_mean(outcome.speeds)
     return {"speed": MOBILITY_WEIGHT * clamp_min(DESIRED_SPEED - mean, 0.0), **_eq16_costs(outcome)}
 
@@ -95,26 +93,25 @@ def _eq16_costs(outcome: Outcome) -> dict[str, Array]:
 
 
 def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward behind Table 1 on the merge; 0 at a crash, and never below 0.
+    """Reward of Table 1 on the merge; 0 at a crash, and never below 0.
 
-    1 - ||20 - v|| / ||20|| (norms over all vehicles), less 0.1 for each second that a CAV's headway lacks
-    to 1 s. Source: the authors' released code, after Flow's merge environment.
+    1 - ||20 - v|| / ||20|| (norms over all vehicles), minus 0.1 for each second by which a CAV's time gap is below 1 s.
+    Source: the authors' released code, after Flow's merge environment.
     """
     xp = namespace(outcome.speeds)
     running = ~outcome.has_crashed
-    there = ~xp.isnan(outcome.speeds)
-    missed = _nan_sum((MERGE_TARGET_SPEED - outcome.speeds) ** 2) / (
-        MERGE_TARGET_SPEED**2 * clamp_min(there.sum(-1), 1)
-    )
-    speed = clamp_min(1.0 - square_root(missed), 0.0) * there.any(-1) * running
-    headway = TIME_GAP_WEIGHT * time_gap_penalty(outcome) * running
-    return {"speed": speed, "time_gap": headway, "lower_bound": clamp_min(-speed - headway, 0.0)}
+    on_road = ~xp.isnan(outcome.speeds)
+    errors = _nan_sum((MERGE_TARGET_SPEED - outcome.speeds) ** 2)
+    relative = errors / (MERGE_TARGET_SPEED**2 * clamp_min(on_road.sum(-1), 1))
+    speed = clamp_min(1.0 - square_root(relative), 0.0) * on_road.any(-1) * running
+    gaps = TIME_GAP_WEIGHT * time_gap_penalty(outcome) * running
+    return {"speed": speed, "time_gap": gaps, "lower_bound": clamp_min(-speed - gaps, 0.0)}
 
 
 def power_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward flow and speed at once: the distance that all cover, times their mean speed; 0 at a crash.
+    """Reward flow and speed together: the distance that all vehicles cover, times their mean speed; 0 at a crash.
 
-    About 1 where the merge flows freely. Neither a jam that lets many through nor an empty road earns it.
+    About 1 if the merge flows freely; low in a jam with a high flow, and on an empty road.
     Source: throughput over delay, the power of Kleinrock 1979 (IEEE ICC, 43.1), in vehicles.
     """
     flow = _nan_sum(outcome.speeds) / (MERGE_TARGET_SPEED * MERGE_FREE_FLOW_VEHICLES)
@@ -122,19 +119,19 @@ def power_reward(outcome: Outcome) -> dict[str, Array]:
 
 
 def travel_time_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward short travel times: minus how many are on the road or wait to be, in hundreds.
+    """Reward short travel times: minus the number of vehicles on the road and in the backlog, in hundreds.
 
-    Whoever wants to drive is given by the demand, so that the sum over an episode is, but for its scale, the
-    mean travel time with waiting: nothing is earned by keeping vehicles out. Nor by a crash, which ends the
-    episode: who is there then, and at least `MIN_CRASH_BACKLOG`, wait for `CRASH_CLOSURE_STEPS` decisions.
+    As the demand is given, the return is proportional to the mean travel time including insertion delays: keeping
+    vehicles out of the road does not increase it. Neither does a crash, which ends the episode: all these vehicles, and
+    at least `MIN_CRASH_BACKLOG`, then wait for `CRASH_CLOSURE_STEPS` control steps.
     """
-    there = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1) + outcome.backlog
-    closed = CRASH_CLOSURE_STEPS * clamp_min(there, MIN_CRASH_BACKLOG) * outcome.has_crashed
-    return {"travel_time": -(there + closed) / 100.0}
+    vehicles = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1) + outcome.backlog
+    closed = CRASH_CLOSURE_STEPS * clamp_min(vehicles, MIN_CRASH_BACKLOG) * outcome.has_crashed
+    return {"travel_time": -(vehicles + closed) / 100.0}
 
 
 def time_gap_penalty(outcome: Outcome) -> Array:
-    """Term: minus the seconds that CAVs' time headways lack to 1 s."""
+    """Term: minus the seconds by which the CAVs' time gaps are below 1 s."""
     return -_nan_sum(clamp_min(MAX_PENALIZED_TIME_GAP - outcome.time_gaps, 0.0))
 
 
@@ -154,7 +151,7 @@ REWARD_TERMS: dict[str, Callable[[Outcome], Array]] = {
     "comfort": acceleration_penalty,
     "smoothness": speed_variation_penalty,
 }
-"""what any reward may ask for besides, with a weight"""
+"""terms that can be added to any reward, with a weight"""
 
 REWARDS: dict[str, Reward] = {
     "released": released_reward,
@@ -167,24 +164,24 @@ REWARDS: dict[str, Reward] = {
 
 
 def time_gap(gap: Array, speed: Array) -> Array:
-    """Return gap over speed [s]; of a standing vehicle a very large number."""
+    """Return gap over speed [s]; a very large number for a standing vehicle."""
     return gap / clamp_min(speed, STANDSTILL_SPEED)
 
 
 def make_reward(text: str) -> Reward:
-    """Return the reward for a name, with weights of its terms, or for a function of the user's own.
+    """Return the reward for a name, with weights of its terms, or for a user's function.
 
-    `released:acceleration=2,time_gap=0.5` is the reward `released_reward` with its term `acceleration` counted twice,
-    and with half of the term `time_gap` of TERMS besides; `path.py:name` a function that takes an `Outcome`
-    and returns its terms by name, or one array.
+    `released:acceleration=2,time_gap=0.5` is the reward `released` with double weight of its term `acceleration`, plus
+    half of the term `time_gap` of `REWARD_TERMS`. `path.py:name` is a function that takes an `Outcome` and returns
+    its terms by name, or one array.
 
     Raises:
-        InputError: unknown name or term, a weight that is no number, or the file has no such function.
+        InputError: unknown name or term, a weight that is not a number, or the file does not have this function.
     """
     name, weights = split_parameters(text)
     for term, weight in weights.items():
-        number = isinstance(weight, int | float) and not isinstance(weight, bool)
-        if not number or not abs(weight) <= float_info.max:  # NaN is not either
+        is_number = isinstance(weight, int | float) and not isinstance(weight, bool)
+        if not is_number or not abs(weight) <= float_info.max:  # refuses NaN, too
             raise invalid_value(f"reward {name}: {term}", weight, "a number")
     if is_file_reference(name):
         reward = _user_reward(name)
@@ -207,10 +204,10 @@ def _user_reward(name: str) -> Reward:
 
 
 def _weighted_reward(reward: Reward, weights: dict[str, float]) -> Reward:
-    """Return a reward whose terms count as `weights` says; those that it does not have come from TERMS."""
+    """Return a reward with weights of its terms; terms that it does not have come from `REWARD_TERMS`."""
 
     def weighted_reward(outcome: Outcome) -> dict[str, Array]:
-        terms = reward(outcome)
+        terms = dict(reward(outcome))
         for name, weight in weights.items():
             if name not in terms and name not in REWARD_TERMS:
                 raise invalid_value("reward: term", name, ", ".join(dict.fromkeys([*terms, *REWARD_TERMS])))

@@ -1,4 +1,4 @@
-"""Trips on a road with ends, as SUMO's own trip records have them."""
+"""Trips on a road with ends, as in SUMO's own trip records."""
 
 from dataclasses import dataclass, field
 
@@ -23,33 +23,33 @@ def _empty_array() -> Floats:
 class Trips:
     """The trips of all n vehicles that were to depart in an episode; arrays have shape (n,).
 
-    A trip that has not ended counts with what it has taken so far. Source:
+    A trip that has not ended counts with its duration so far. Source:
     https://sumo.dlr.de/docs/Simulation/Output/TripInfo.html
     """
 
     vehicle_ids: tuple[str, ...] = ()
     vehicle_classes: tuple[str, ...] = ()
-    """SUMO's vehicle class of each"""
+    """SUMO's vehicle class of each vehicle"""
     depart_delay: Floats = field(default_factory=_empty_array)
-    """time for which each waited for its insertion, `departDelay` [s]"""
+    """time that each vehicle waited for its insertion, `departDelay` [s]"""
     duration: Floats = field(default_factory=_empty_array)
-    """time since its insertion [s]; 0 of a vehicle that was not inserted"""
+    """time since insertion [s]; 0 of a vehicle that was not inserted"""
     time_loss: Floats = field(default_factory=_empty_array)
-    """time lost by driving below its desired speed, `timeLoss` [s]"""
+    """time lost by driving below the desired speed, `timeLoss` [s]"""
     has_arrived: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
-    """whether it has reached the end of its route"""
+    """whether the vehicle has reached the end of its route"""
 
     @property
     def delay(self) -> Floats:
-        """Delay of each trip: `timeLoss` and `departDelay` [s]."""
+        """Delay of each trip: `timeLoss` plus `departDelay` [s]."""
         return self.time_loss + self.depart_delay
 
     @property
     def travel_time(self) -> Floats:
-        """Travel time of each trip, with the time for which it waited for its insertion [s]."""
+        """Travel time of each trip, including the time that the vehicle waited for its insertion [s]."""
         return self.duration + self.depart_delay
 
     def mean_travel_time(self, group: str) -> float:
-        """Return the mean travel time of a group of `VEHICLE_GROUPS` [s]; NaN where it has no vehicles."""
-        chosen = np.isin(self.vehicle_classes, VEHICLE_GROUPS[group])
-        return float(self.travel_time[chosen].mean()) if chosen.any() else float("nan")
+        """Return the mean travel time of a group of `VEHICLE_GROUPS` [s]; NaN if it has no vehicles."""
+        is_in_group = np.isin(self.vehicle_classes, VEHICLE_GROUPS[group])
+        return float(self.travel_time[is_in_group].mean()) if is_in_group.any() else float("nan")

@@ -1,4 +1,4 @@
-"""A worker process: runs the episodes that it is asked for, one after the other. Free of torch.
+"""A worker process that runs episodes on request, one after the other. Free of torch.
 
 Started by `unjam.worlds.worker_pool` as `python -m unjam.worlds.worker`.
 """
@@ -33,26 +33,27 @@ PROGRESS_INTERVAL = 0.2
 def run_worker() -> None:
     """Answer requests from standard input until it is closed."""
     exit_with_parent(signal.SIGKILL)
-    answers = os.fdopen(os.dup(1), "wb")
+    output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
-    gc.freeze()  # what the imports made stays; searching it for garbage would cost every episode
-    # Either error: the parent wants no more, or is gone.
-    with ExitStack() as at_the_end, suppress(BrokenPipeError, EOFError):
-        simulation = cache(lambda: at_the_end.enter_context(Simulation(owns_stdout=True)))
+    gc.freeze()  # the imported objects stay; searching them for garbage would cost time in every episode
+    # Both errors mean that the parent has closed the pipe or has ended.
+    with ExitStack() as stack, suppress(BrokenPipeError, EOFError):
+        open_simulation = cache(lambda: stack.enter_context(Simulation(owns_stdout=True)))
         while True:
-            _answer_request(*read_message(sys.stdin.buffer), simulation, answers)
+            _answer_request(*read_message(sys.stdin.buffer), open_simulation, output)
 
 
 def _answer_request(
-    request: dict[str, Any], arrays: Arrays, simulation: Callable[[], Simulation], output: BinaryIO
+    request: dict[str, Any], arrays: Arrays, open_simulation: Callable[[], Simulation], output: BinaryIO
 ) -> None:
-    """Run an episode and send what happened; of hours of traffic nothing stays here."""
+    """Run an episode and send its record. The record of hours of traffic does not stay in memory here."""
     try:
-        answer, found = pack(_run_request(request, arrays, simulation(), output))
+        content, record_arrays = pack(_run_request(request, arrays, open_simulation(), output))
     except Exception as error:  # every requested episode has a row, also one that failed
-        known = as_unjam_error(error)
-        answer, found = pack(failed_episode(tuple(request["seed"]), str(known), type(known).__name__))
-    write_message(output, {"episode": answer}, found)
+        unjam_error = as_unjam_error(error)
+        failed = failed_episode(tuple(request["seed"]), str(unjam_error), type(unjam_error).__name__)
+        content, record_arrays = pack(failed)
+    write_message(output, {"episode": content}, record_arrays)
 
 
 def _run_request(request: dict[str, Any], arrays: Arrays, simulation: Simulation, output: BinaryIO) -> Any:
@@ -65,16 +66,16 @@ def _run_request(request: dict[str, Any], arrays: Arrays, simulation: Simulation
             try:
                 write_message(output, {"progress": control_steps})
             except BrokenPipeError:
-                sys.exit()  # the parent is gone
+                sys.exit()  # the parent has ended
 
-    if "files" in request:  # as the parent has read them; changed ones are read again
+    if "files" in request:  # what the parent has read of the files; changed files are read again
         take_answer(request["scenario"]["file"], request["files"])
     scenario = scenario_from_recipe(request["scenario"])
     if isinstance(scenario, UserNetwork):
         enter_sandbox()
     driver = driver_from_recipe(request["driver"], arrays)
-    how = {name: request[name] for name in ("seed", "reward", "explore", "record_details", "stop_at_contact")}
-    return run_episode(scenario, driver, **how, simulation=simulation, on_progress=send_progress)
+    options = {name: request[name] for name in ("seed", "reward", "explore", "record_details", "stop_at_contact")}
+    return run_episode(scenario, driver, **options, simulation=simulation, on_progress=send_progress)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Many episodes at once, each in a worker process, with the same result whatever happens to a worker."""
+"""Parallel episodes in worker processes; the results do not depend on what happens to a worker."""
 
 import queue
 import subprocess
@@ -23,9 +23,9 @@ from unjam.worlds.messages import read_message, write_message
 from unjam.worlds.record import Episode, failed_episode
 
 MAX_EPISODE_ATTEMPTS = 3
-"""how often an episode is tried before its row says that it failed"""
+"""attempts to run an episode before its row reports a failure"""
 WORKER_TIMEOUT = 30.0
-"""seconds without a sign of life after which a worker counts as hung"""
+"""seconds without a message after which a worker counts as hung"""
 
 ResultT = TypeVar("ResultT")
 Message = tuple[dict[str, Any], Arrays]
@@ -44,33 +44,27 @@ class EpisodeTask:
     stop_at_contact: bool = True
 
     def message(self) -> Message:
-        """Return the task as it travels to a worker."""
+        """Return the message that sends the task to a worker."""
         recipe, arrays = driver_recipe(self.driver)
-        how = {
-            "seed": list(self.seed),
-            "reward": self.reward,
-            "explore": self.explore,
-            "record_details": self.record_details,
-        }
-        how |= {"stop_at_contact": self.stop_at_contact}
-        return {"scenario": scenario_recipe(self.scenario), "driver": recipe, **how}, arrays
+        content = {name: getattr(self, name) for name in ("reward", "explore", "record_details", "stop_at_contact")}
+        content |= {"seed": list(self.seed), "scenario": scenario_recipe(self.scenario), "driver": recipe}
+        return content, arrays
 
 
 class WorkerPool:
-    """A fixed number of worker processes, started when first needed, replaced when they die or hang.
+    """A fixed number of worker processes, started when first needed, and replaced when they die or hang.
 
-    The episodes that come back depend on the tasks alone: not on the number of workers, on which of them
-    ran what, or on how often one had to be replaced.
+    The episodes depend only on the tasks: not on the number of workers, on the worker that ran a task, or on how
+    often a worker was replaced.
     """
 
     def __init__(
         self, count: int = 1, timeout: float = WORKER_TIMEOUT, max_attempts: int = MAX_EPISODE_ATTEMPTS
     ) -> None:
-        """Prepare `count` workers; nothing is started yet."""
+        """Prepare `count` workers; no process is started yet."""
         self.count, self._max_attempts, self._is_first = count, max_attempts, True
-        # Of all workers, so that nothing stays behind of one that was killed.
         remove_stale_private_folders()
-        self._temporary_folder = PrivateFolder()
+        self._temporary_folder = PrivateFolder()  # of all workers, so that a killed one leaves no files
         self._idle_workers: queue.LifoQueue[_Worker] = queue.LifoQueue()
         self._workers = [_Worker(timeout, self._temporary_folder.name) for _ in range(count)]
         self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-worker")
@@ -78,10 +72,10 @@ class WorkerPool:
             self._idle_workers.put(worker)
 
     def run(self, tasks: Sequence[EpisodeTask], on_progress: Callable[[int, int], None] | None = None) -> list[Episode]:
-        """Run all tasks and return their episodes, in the order of the tasks; one that failed says why.
+        """Run all tasks and return their episodes, in the order of the tasks; a failed one contains the reason.
 
-        Where SUMO refuses the files of the very first one, raise `SumoInputError`, as `run_and_map` does.
-        `on_progress` is called with a task's index and its decisions so far, from several threads.
+        `on_progress` is called with a task's index and its control steps so far, from several threads. Errors as in
+        `run_and_map`.
         """
         return self.run_and_map(tasks, lambda index, episode: episode, on_progress)
 
@@ -91,12 +85,12 @@ class WorkerPool:
         transform: Callable[[int, Episode], ResultT],
         on_progress: Callable[[int, int], None] | None = None,
     ) -> list[ResultT]:
-        """Run all tasks and return what `transform` makes of each index and episode: many need much memory.
+        """Run all tasks and return `transform(index, episode)` of each: many whole episodes would need much memory.
 
-        `transform` is called as an episode ends, from several threads.
+        `transform` is called when an episode ends, from several threads.
 
         Raises:
-            SumoInputError: SUMO refuses the files of the very first task: it would refuse those of others, too.
+            SumoInputError: SUMO refuses the files of the very first task, and would also refuse those of others.
         """
         is_first, self._is_first = self._is_first, False
 
@@ -108,7 +102,7 @@ class WorkerPool:
 
         futures = list[Future[ResultT]]()
         try:
-            for index, task in enumerate(tasks):  # it takes a while: an interrupt may come already
+            for index, task in enumerate(tasks):  # an interrupt may occur during this loop
                 futures.append(self._thread_pool.submit(run_one, index, task))
             return [future.result() for future in futures]
         except BaseException:
@@ -119,7 +113,7 @@ class WorkerPool:
 
     def _run_one(self, index: int, task: EpisodeTask, on_progress: Callable[[int, int], None] | None) -> Episode:
         worker = self._idle_workers.get()
-        problems = []
+        reasons = list[str]()
         try:
             for _ in range(self._max_attempts):
                 try:
@@ -129,8 +123,8 @@ class WorkerPool:
                         on_progress(index, episode.control_steps)
                     return episode
                 except _WorkerLostError as lost:
-                    problems.append(str(lost))
-            reason = f"{self._max_attempts} workers were lost on it: {'; '.join(dict.fromkeys(problems))}"
+                    reasons.append(str(lost))
+            reason = f"{self._max_attempts} workers were lost in this episode: {'; '.join(dict.fromkeys(reasons))}"
             return failed_episode(task.seed, reason, EpisodeError.__name__)
         finally:
             self._idle_workers.put(worker)
@@ -150,7 +144,7 @@ class WorkerPool:
 
 
 class _WorkerLostError(Exception):
-    """The worker died or fell silent."""
+    """The worker process died or did not answer."""
 
 
 class _Worker:
@@ -160,89 +154,88 @@ class _Worker:
         self._timeout, self._temporary_folder = timeout, temporary_folder
         self._process: subprocess.Popen[bytes] | None = None
         self._is_stopped = self._is_sandboxed = False
-        self._told = set[str]()
-        """the user's configurations that the process need not read"""
+        self._sent_files = set[str]()
+        """the user's configurations whose content the process already has"""
         self._start_lock = threading.Lock()
 
     def _start(self) -> subprocess.Popen[bytes]:
-        # A BLAS with threads of its own would fight with the other workers for the cores.
-        single = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        # BLAS threads would compete with the other workers for the cores.
+        one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         self._error_file = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
         process = subprocess.Popen(
             python_command("-m", "unjam.worlds.worker"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._error_file,
-            env=child_environment(**single, TMPDIR=self._temporary_folder),
-            start_new_session=True,  # an interrupt in the terminal is the parent's to handle
+            env=child_environment(**one_thread, TMPDIR=self._temporary_folder),
+            start_new_session=True,  # the parent handles an interrupt in the terminal
         )
-        self._told.clear()
+        self._sent_files.clear()
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         threading.Thread(target=_forward_messages, args=(process, self._messages), daemon=True).start()
         return process
 
     def set_sandboxed(self, is_sandboxed: bool) -> None:
-        """Note whether the next episode is one that takes the process its rights; it never has them again."""
+        """Store whether the next episode sandboxes the process; a process cannot leave its sandbox."""
         if self._is_sandboxed and not is_sandboxed:
             self._kill()
         self._is_sandboxed = is_sandboxed
 
     def run(self, task: Message, on_progress: Callable[[int], object]) -> Episode:
-        """Return the episode of a task; raise `_WorkerLostError` where the process dies or falls silent."""
+        """Return the episode of a task; raise `_WorkerLostError` if the process dies or does not answer."""
         with self._start_lock:
             if self._is_stopped:
                 raise _WorkerLostError("stopped")
             process = self._process = self._process or self._start()
-        # A network of the user's own is read, and loaded, before there is anything to tell.
-        patience = self._timeout + (MAX_READER_TIME if self._is_sandboxed else 0.0)
+        # The process reads and loads a user's network before its first message.
+        timeout = self._timeout + (MAX_READER_TIME if self._is_sandboxed else 0.0)
         try:
             self._send(process, self._with_files(task))
             while True:
-                message = self._messages.get(timeout=patience)
-                patience = self._timeout
+                message = self._messages.get(timeout=timeout)
+                timeout = self._timeout
                 if message is None:
                     raise _WorkerLostError(self._exit_reason(process))
-                facts, arrays = message
-                if "episode" in facts:
-                    return unpack(Episode, facts["episode"], arrays)
-                on_progress(facts["progress"])
+                content, arrays = message
+                if "episode" in content:
+                    return unpack(Episode, content["episode"], arrays)
+                on_progress(content["progress"])
         except queue.Empty:
             self._kill()
-            raise _WorkerLostError(f"no sign of life for {patience:g} s") from None
+            raise _WorkerLostError(f"no message for {timeout:g} s") from None
         except BrokenPipeError:
             raise _WorkerLostError(self._exit_reason(process)) from None
 
     def _with_files(self, task: Message) -> Message:
-        """Return a task with what was read of the user's files, the first time that the process needs it."""
-        facts, arrays = task
-        file = facts["scenario"].get("file")
-        answer = answer_of(file) if file and file not in self._told else None
+        """Add the content of the user's files to a task, the first time that the process needs it."""
+        content, arrays = task
+        file = content["scenario"].get("file")
+        answer = answer_of(file) if file and file not in self._sent_files else None
         if answer is None:
             return task
-        self._told.add(file)
-        return {**facts, "files": answer}, arrays
+        self._sent_files.add(file)
+        return {**content, "files": answer}, arrays
 
     def _send(self, process: subprocess.Popen[bytes], task: Message) -> None:
         assert process.stdin is not None
-        guard = threading.Timer(self._timeout, process.kill)  # a full pipe that nobody reads blocks for ever
-        guard.start()
+        timer = threading.Timer(self._timeout, process.kill)  # a full pipe without a reader blocks forever
+        timer.start()
         try:
-            facts, arrays = task
-            write_message(process.stdin, facts, dict(arrays))
+            content, arrays = task
+            write_message(process.stdin, content, dict(arrays))
         finally:
-            guard.cancel()
+            timer.cancel()
 
     def _exit_reason(self, process: subprocess.Popen[bytes]) -> str:
         try:
             code = process.wait(timeout=1.0)
-        except subprocess.TimeoutExpired:  # it lives, but what it says cannot be read
+        except subprocess.TimeoutExpired:  # the process runs, but its messages cannot be read
             process.kill()
             code = process.wait()
         self._process = None
         self._error_file.seek(0)
-        last = self._error_file.read().decode(errors="replace").strip().splitlines()[-1:]
-        how = f"killed by signal {-code}" if code < 0 else f"ended with code {code}"
-        return ": ".join([how, *last])
+        last_line = self._error_file.read().decode(errors="replace").strip().splitlines()[-1:]
+        return ": ".join([f"killed by signal {-code}" if code < 0 else f"ended with code {code}", *last_line])
 
     def _kill(self) -> None:
         process, self._process = self._process, None
@@ -251,17 +244,17 @@ class _Worker:
             process.wait()
 
     def stop(self) -> None:
-        """End the process, now and for good."""
+        """End the process; it is not started again."""
         with self._start_lock:
             self._is_stopped = True
             self._kill()
 
 
 def _forward_messages(process: subprocess.Popen[bytes], messages: "queue.SimpleQueue[Message | None]") -> None:
-    """Pass on what the process says; None when it says no more."""
+    """Put the messages of the process into a queue; None after the last one."""
     assert process.stdout is not None
     try:
         while True:
             messages.put(read_message(process.stdout))
-    except Exception:  # end of file, or a frame cut short by the process's death
+    except Exception:  # end of file, or a frame that was cut by the end of the process
         messages.put(None)

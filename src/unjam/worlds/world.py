@@ -1,4 +1,4 @@
-"""What a world is: where a driver drives. Two are here: a recording, and pairs of a CAV and its leader."""
+"""The interface between drivers and worlds, and two worlds without a simulator: recordings, and car-following pairs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,87 +17,98 @@ from unjam.tree import Arrays
 RecordT = TypeVar("RecordT", covariant=True)
 
 ProgressCallback = Callable[[int], None]
-"""called now and then with how many decisions have been made"""
+"""called now and then with the number of control steps made"""
 
 
 @dataclass(frozen=True)
 class DriverLog:
-    """What a driver decided in a world, decision by decision."""
+    """The decisions of a driver in a world, one per control step."""
 
     decisions: list[tuple[Array, Array, Array]] = field(default_factory=list)
-    """the expert's share, the residual, and what the network saw; nothing where there is no network"""
+    """the expert's acceleration, the residual, and the network's observation; empty without a network"""
     last_observation: Array | None = None
-    """what the network would have seen at the end"""
+    """the network's observation at the end"""
     initial_memories: list[Arrays] = field(default_factory=list)
-    """what the expert remembered before the first decision of each CAV by itself, in order of entry"""
+    """the expert's memory before the first control step of each CAV, in order of entry"""
     action_repeat: int = 1
-    """decisions for which one residual was held"""
+    """control steps for which one residual was held"""
 
 
 class World(Protocol[RecordT]):
-    """Moves n CAVs as they are told, and says what they perceive; `unjam.worlds.drive` alone calls it."""
+    """Moves n CAVs as commanded and provides their observations; only `unjam.worlds.drive` calls it."""
 
     limits: Limits
-    """within which accelerations are kept"""
+    """limits on the accelerations that are carried out"""
     is_scalar: bool
-    """whether its only CAV perceives and is driven in plain numbers instead of arrays of one row"""
+    """whether its only CAV has floats as state and command, instead of arrays with one row"""
     entered_count: int
-    """CAVs that the driver was given so far"""
+    """number of CAVs handed to the driver so far"""
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
-        """Begin, and hand the CAVs over, unless they stay human (`controlled` false).
+        """Start, and hand the CAVs to the driver unless they stay human (`is_controlled` false).
 
         Returns:
-            What the CAVs perceived before, for drivers that remember it: arrays of shape (CAVs, moments),
-            oldest first; None where there is nothing to remember.
+            The states of the CAVs before the start, for drivers with a memory: arrays of shape (CAVs, moments),
+            oldest first; None if there is no history.
         """
         ...
 
     @property
     def cav_count(self) -> int:
-        """CAVs on the road now: the rows of what drivers are given and answer."""
+        """Number of CAVs on the road now: the rows of states and commands."""
         ...
 
     @property
     def remaining_rows(self) -> Sequence[int] | None:
-        """Rows before the last decision that are still there, newcomers being behind them; None: the same."""
+        """Rows before the last control step that remain; new CAVs follow them. None: nothing has changed."""
         ...
 
     @property
     def has_ended(self) -> bool:
-        """Whether there is nothing more to decide."""
+        """Whether there are no further control steps."""
         ...
 
     def local_state(self) -> LocalState:
-        """Return what the CAVs perceive now: arrays of shape (CAVs,), or plain numbers of a single one."""
+        """Return the state that the CAVs observe now: arrays of shape (CAVs,), or floats of a single CAV."""
         ...
 
     def advance(self, command: Command | None) -> None:
-        """Carry out one decision of every CAV; None: they stay human.
+        """Carry out one control step of every CAV; None: the CAVs stay human.
 
         Raises:
-            InputError: a command cannot be carried out: it is not finite, or there are not as many as CAVs.
+            InputError: a command is not finite, or the number of commands differs from the number of CAVs.
         """
         ...
 
     def noise(self, episode_noise_size: int = 0) -> Array:
-        """Return standard normal noise for one look of a network: shape (CAVs,), or a plain number.
+        """Return standard normal noise for one action of a network: shape (CAVs,), or a float.
 
-        With `episode_noise`, so many numbers for each CAV, shape (CAVs, lasting), that are the same for all CAVs
-        of a road and in all looks.
+        With `episode_noise_size`, return that many numbers for each CAV, shape (CAVs, size). They are the same for
+        all CAVs of a road and for the whole episode.
         """
         ...
 
     def record(self, driver_log: DriverLog) -> RecordT:
-        """Return what happened, with what the driver decided."""
+        """Return the record of what happened, with the driver's decisions."""
         ...
 
 
-class RecordedWorld:
-    """States that were recorded go by, whatever a driver does: what would it do, what does it remember?"""
+class _OfflineWorld:
+    """Common part of the worlds without a simulator: always the same rows, no history and no exploration."""
 
-    is_scalar = False
-    remaining_rows = None
+    is_scalar, remaining_rows = False, None
+    cav_count: int
+
+    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
+        """Start without a history."""
+
+    def noise(self, episode_noise_size: int = 0) -> Floats:
+        """Return zeros: there is no exploration."""
+        return np.zeros((self.cav_count, episode_noise_size) if episode_noise_size else self.cav_count)
+
+
+class RecordedWorld(_OfflineWorld):
+    """A recording of states that does not depend on the driver: for the commands and memories that result."""
 
     def __init__(self, states: LocalState, limits: Limits) -> None:
         """Take the states of n CAVs at T moments, arrays of shape (T, n)."""
@@ -107,49 +118,43 @@ class RecordedWorld:
         self._accelerations: list[list[float]] = []
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Begin at the first moment; nothing was before."""
+        """Start at the first moment, without a history."""
         self._accelerations = []
 
     @property
     def has_ended(self) -> bool:
-        """Whether all moments have gone by."""
+        """Whether all moments have passed."""
         return len(self._accelerations) == len(self.states.speed)
 
     def local_state(self) -> LocalState:
-        """Return what was perceived at this moment; after the last one, at the last."""
+        """Return the state at this moment, read-only; at the end, that of the last moment."""
         moment = min(len(self._accelerations), len(self.states.speed) - 1)
-        return self.states.select(moment)
+        return self.states.select(moment).as_read_only()
 
     def advance(self, command: Command | None) -> None:
-        """Note what was asked for, and go on to the next moment."""
+        """Record the commands and go on to the next moment."""
         self._accelerations.append(
             commanded_accelerations(command, self.limits, self._row_names, len(self._accelerations))
         )
 
-    def noise(self, episode_noise_size: int = 0) -> Any:
-        """Return none: nobody explores here."""
-        return np.zeros((self.cav_count, episode_noise_size) if episode_noise_size else self.cav_count)
-
     def record(self, driver_log: DriverLog) -> NDArray[np.float64]:
-        """Return what was asked for, within the limits [m/s2], shape (T, n)."""
+        """Return the commanded accelerations within the limits [m/s2], shape (T, n)."""
         return np.array(self._accelerations)
 
 
 class CarFollowingRecord(NamedTuple):
-    """What happened to n pairs; T steps."""
+    """The motion of n car-following pairs in T steps; arrays of shape (T + 1, n)."""
 
     speed: Floats
-    """of the CAVs [m/s], shape (T + 1, n)"""
+    """of the CAVs [m/s]"""
     leader_speed: Floats
-    """[m/s], shape (T + 1, n)"""
+    """[m/s]"""
     gap: Floats
-    """[m], shape (T + 1, n)"""
+    """[m]"""
 
 
-class CarFollowingWorld:
-    """n CAVs behind leaders; who follows a CAV is as far behind and as fast as it is."""
-
-    is_scalar, remaining_rows = False, None
+class CarFollowingWorld(_OfflineWorld):
+    """n CAVs behind leaders; the follower of each CAV has the CAV's own speed and gap."""
 
     def __init__(
         self,
@@ -159,41 +164,33 @@ class CarFollowingWorld:
         step: float,
         loop_length: float = np.nan,
     ) -> None:
-        """Take where the pairs begin, arrays of shape (n,), and what leaders do [m/s2], shape (T, n)."""
+        """Take the pairs' initial state, arrays of shape (n,), and leaders' accelerations [m/s2], shape (T, n)."""
         self.limits, self._step = limits, step
         self._states = [FollowingState(*(np.array(values, np.float64) for values in initial_state))]
         self._leader_accelerations = np.asarray(leader_accelerations, np.float64)
         self.cav_count = self.entered_count = len(initial_state.speed)
         self._position, self._loop_length = np.zeros(self.cav_count), np.full(self.cav_count, loop_length)
 
-    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Begin; nothing was before."""
-
     @property
     def has_ended(self) -> bool:
-        """Whether leaders have nothing more to do."""
+        """Whether the leaders have no further accelerations."""
         return len(self._states) > len(self._leader_accelerations)
 
     def local_state(self) -> LocalState:
-        """Return what the CAVs perceive now, arrays of shape (n,)."""
+        """Return the state that the CAVs observe now, read-only arrays of shape (n,)."""
         speed, leader, gap = self._states[-1]
-        place = self._position if np.isnan(self._loop_length).all() else self._position % self._loop_length
-        return LocalState(speed, leader, gap, speed, gap, place, self._loop_length)
+        position = self._position if np.isnan(self._loop_length).all() else self._position % self._loop_length
+        return LocalState(speed, leader, gap, speed, gap, position, self._loop_length).as_read_only()
 
     def advance(self, command: Command | None) -> None:
         """Make one step of all pairs."""
         assert command is not None
         before, step = self._states[-1], self._step
-        told = self.limits.clip(np.asarray(command.acceleration))
-        speed = next_speed(before.speed, told, step)
+        speed = next_speed(before.speed, self.limits.clip(np.asarray(command.acceleration)), step)
         leader = next_speed(before.leader_speed, self._leader_accelerations[len(self._states) - 1], step)
         self._position = self._position + speed * step
         self._states.append(FollowingState(speed, leader, before.gap + (leader - speed) * step))
 
-    def noise(self, episode_noise_size: int = 0) -> Floats:
-        """Return none: nobody explores here."""
-        return np.zeros((self.cav_count, episode_noise_size) if episode_noise_size else self.cav_count)
-
     def record(self, driver_log: DriverLog) -> CarFollowingRecord:
-        """Return what happened."""
+        """Return the motion of all pairs."""
         return CarFollowingRecord(*(np.array(values) for values in zip(*self._states, strict=True)))

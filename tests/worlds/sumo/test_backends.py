@@ -121,7 +121,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("road", [RING, make_scenario("merge", {"cavs": 1, "standing": 0, "horizon": 60})])
+@pytest.mark.parametrize("road", [RING, make_scenario("merge", {"cavs": 1, "standing_vehicles": 0, "horizon": 60})])
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_other_code_does_to_an_episodes_simulation_is_an_error_in_one_line(
     change: str, road: Any, command: list[str]

@@ -225,7 +225,7 @@ def test_from_a_standing_start_people_stay_in_a_jam_and_pi_makes_it_worse(human:
 
 
 def test_from_an_empty_start_people_flow_freely(human: list[Episode]) -> None:
-    free = episodes_of(Human(), range(2), standing=0)
+    free = episodes_of(Human(), range(2), standing_vehicles=0)
     assert fleet_mean(free) == pytest.approx(19.9, rel=0.06)
     assert fleet_mean(free) < min(episode.limit_speed for episode in free)
     assert all(episode.backlog[-1] <= 1 for episode in free)
@@ -242,5 +242,5 @@ def test_nobody_collides_whoever_drives() -> None:
 def test_twenty_seeds_agree_with_flow() -> None:
     human = episodes_of(Human(), range(20))
     assert fleet_mean(human) == pytest.approx(11.0, rel=0.05)
-    assert fleet_mean(episodes_of(Human(), range(20), standing=0)) == pytest.approx(19.9, rel=0.03)
+    assert fleet_mean(episodes_of(Human(), range(20), standing_vehicles=0)) == pytest.approx(19.9, rel=0.03)
     assert fleet_mean(episodes_of(PISaturation(), range(20))) < fleet_mean(human)

@@ -165,7 +165,7 @@ def test_who_stands_and_is_asked_to_go_does_so_however_gently_in_sumo_and_in_a_b
 ) -> None:
     """SUMO's IDM stands for ever at set speeds below half a metre a second."""
     for world in (make_traffic(BUSY, (3,), simulation), MotorwayBatch(BUSY, [(3,)])):
-        world.start(controlled=True)
+        world.start(is_controlled=True)
         for _ in range(36):
             world.advance(Command(np.full(world.cav_count, -3.0)))
         assert world.local_state().speed.max() <= 0.1
@@ -201,11 +201,11 @@ def on_the_left(simulation: Simulation, **lanes: float) -> float:
 
 def test_cavs_keep_right_and_overtake_as_eagerly_as_their_road_says(simulation: Simulation) -> None:
     as_people = on_the_left(simulation)
-    assert on_the_left(simulation, keep_right=1.0, overtake=1.0) == as_people
+    assert on_the_left(simulation, keep_right=1.0, speed_gain=1.0) == as_people
     assert on_the_left(simulation, keep_right=10.0) < as_people - 0.05
-    assert on_the_left(simulation, overtake=5.0) > as_people + 0.05
+    assert on_the_left(simulation, speed_gain=5.0) > as_people + 0.05
     assert on_the_left(simulation, keep_right=0.0) > as_people + 0.05
-    assert on_the_left(simulation, overtake=0.0) < as_people - 0.05
+    assert on_the_left(simulation, speed_gain=0.0) < as_people - 0.05
 
 
 def test_the_message_is_the_mean_speed_of_the_lane_ahead(simulation: Simulation) -> None:
@@ -248,7 +248,7 @@ def test_the_audit_tells_cut_ins_from_following(capped: Episode) -> None:
     assert everybody == pytest.approx(2 * there, rel=0.02)
     assert 0.5 < audit.following.min_time_gap < 3.0
     row = measure(capped)
-    assert row["drivable"] == "drivable"
+    assert row["feasibility"] == "feasible"
     assert row["cav_max_braking"] < 4.0
 
 

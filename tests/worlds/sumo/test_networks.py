@@ -79,7 +79,13 @@ def test_whatever_changes_the_network_makes_another_file(cache: Path, monkeypatc
     road = road_of(230)
     other = road_of(240)
     plain = tuple(node._replace(has_priority=False) for node in road.nodes)
-    changed = (road, other, replace(road, speed_limit=20.0), replace(road, nodes=plain), replace(road, has_internal_links=True))
+    changed = (
+        road,
+        other,
+        replace(road, speed_limit=20.0),
+        replace(road, nodes=plain),
+        replace(road, has_internal_links=True),
+    )
     made = [network_file(each) for each in changed]
     monkeypatch.setattr(networks, "sumo_version", lambda: "9.99.0")
     made.append(network_file(road))

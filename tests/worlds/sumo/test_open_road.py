@@ -217,7 +217,7 @@ def test_time_goes_on_while_no_cav_is_on_the_road(driver: Driver, simulation: Si
 
 def test_where_no_cav_ever_comes_one_line_says_so(simulation: Simulation) -> None:
     empty = Merge(penetration_rate=0.0, horizon=10)
-    with pytest.raises(InputError, match="no CAV was on the road in 10 decisions"):
+    with pytest.raises(InputError, match="no CAV was on the road in 10 control steps"):
         run_episode(empty, Constant(), (0,), simulation=simulation)
     assert run_episode(empty, Human(), (0,), simulation=simulation).trajectories == ()
 

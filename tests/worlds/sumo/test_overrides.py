@@ -20,7 +20,7 @@ def test_a_car_that_may_not_creep_is_not_one_that_had_to_be_braked() -> None:
     road = FAMILY["ring-66-grown-4-cavs"].make_scenario().stratum(1, 10)
     row = measure(run_episode(replace(road, horizon=620), PISaturation(), make_test_seeds(2)[1]))
     assert 0.0 < row["shield_max_braking"] < OVERRIDE_TOLERANCE, "SUMO holds it, a micrometre from its place"
-    assert (row["overridden"], row["shield_override_share"]) == (0.0, 0.0)
+    assert (row["override_share"], row["shield_override_share"]) == (0.0, 0.0)
 
 
 def test_a_car_that_cannot_drive_as_fast_as_it_is_told_to_is_not_braked() -> None:
@@ -28,7 +28,7 @@ def test_a_car_that_cannot_drive_as_fast_as_it_is_told_to_is_not_braked() -> Non
     episode = run_episode(road, driver_from_name("constant:acceleration=0.9", 0.1), (1,))
     row = measure(episode)
     assert episode.trajectories[0].states.speed.max() == road.top_speed
-    assert (row["shield_max_braking"], row["overridden"], row["shield_override_share"]) == (0.0, 0.0, 0.0)
+    assert (row["shield_max_braking"], row["override_share"], row["shield_override_share"]) == (0.0, 0.0, 0.0)
 
 
 def test_a_car_at_the_speed_limit_of_a_road_with_ends_is_not_braked() -> None:

@@ -31,12 +31,12 @@ def test_an_acc_that_restores_its_gap_after_cut_ins_is_feasible(
     driver = make_driver("cruise", scenario.control_step)
     episode = run_episode(scenario, driver, (1,), simulation=simulation)
     found = episode.audit.following
-    assert 1.0 <= found.headway < 1.3
+    assert 1.0 <= found.min_time_gap < 1.3
     assert found.share_short_time_gap == 0.0
-    assert measure(episode)["drivable"] == FEASIBLE
+    assert measure(episode)["feasibility"] == FEASIBLE
     monkeypatch.setattr(multi_lane, "is_recovering", lambda *about: False)
     every = run_episode(scenario, driver, (1,), simulation=simulation).audit.following
-    assert every.headway < 0.8
+    assert every.min_time_gap < 0.8
     assert every.share_short_time_gap > 0.001
     assert every.min_time_to_collision == found.min_time_to_collision
 
@@ -44,7 +44,7 @@ def test_an_acc_that_restores_its_gap_after_cut_ins_is_feasible(
 def follow(gaps: list[float], speeds: list[float]) -> FollowingStatistics:
     """Return how a batch sees the CAV on the second of two roads, behind a leader at 20 m/s, step by step."""
     roads = [OnRamp().draw(np.random.default_rng(1))] * 2
-    log = MotorwayLog(roads, entries=2, step=0.5, control_step=1.0, planned=100.0)
+    log = MotorwayLog(roads, entry_count=2, simulation_step=0.5, control_step=1.0, planned_duration=100.0)
     length = roads[0].vehicle_length
     for gap, speed in zip(gaps, speeds, strict=True):
         column = np.array([0.0, 0.0])
@@ -62,8 +62,8 @@ def follow(gaps: list[float], speeds: list[float]) -> FollowingStatistics:
 def test_a_batch_excludes_the_recovery_and_nothing_after_it() -> None:
     opening = np.linspace(10.0, 25.0, 31).tolist()
     found = follow([*opening, 25.0, 25.0], [19.0] * 31 + [20.0, 20.0])
-    assert found.headway == pytest.approx(25.0 / 20.0, rel=0.2)
+    assert found.min_time_gap == pytest.approx(25.0 / 20.0, rel=0.2)
     assert found.share_short_time_gap == 0.0
     stays = follow([*opening[:15], *[17.0] * 5], [19.0] * 15 + [20.0] * 5)
-    assert stays.headway == pytest.approx(17.0 / 20.0)
+    assert stays.min_time_gap == pytest.approx(17.0 / 20.0)
     assert stays.share_short_time_gap == 1.0  # of the moments that count

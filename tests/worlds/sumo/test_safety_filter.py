@@ -29,7 +29,7 @@ def test_a_reckless_driver_touches_nobody_on_rings_of_all_kinds(
     episode = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
     row = measure(episode)
     assert (row["status"], row["collisions"]) == ("completed", 0.0)
-    assert row["drivable"] == FEASIBLE
+    assert row["feasibility"] == FEASIBLE
     assert row["filter_override_share"] > 0.1
     assert row["min_time_gap"] > 1.0
 
@@ -40,7 +40,7 @@ def test_sensors_that_err_and_miss_readings_touch_nobody(late: Actuator, simulat
     ring = replace(RAW, cavs=2, sensors=sensors, safety=knows, actuator=late)
     episode = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
     row = measure(episode)
-    assert (row["status"], row["collisions"], row["drivable"]) == ("completed", 0.0, FEASIBLE)
+    assert (row["status"], row["collisions"], row["feasibility"]) == ("completed", 0.0, FEASIBLE)
     assert row["min_time_gap"] > 1.0
     again = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
     np.testing.assert_array_equal(episode.speeds, again.speeds)
@@ -58,7 +58,7 @@ def test_within_a_held_decision_every_simulation_step_is_filtered(simulation: Si
     held = replace(RAW, steps_per_control_step=10, horizon=150)
     episode = run_episode(held, Constant(1.0), (0,), simulation=simulation)
     assert episode.audit.following.min_time_gap > 1.0
-    assert measure(episode)["drivable"] == FEASIBLE
+    assert measure(episode)["feasibility"] == FEASIBLE
 
 
 @pytest.mark.parametrize("road", [Ring(horizon=1500, warmup=3000), FigureEight(horizon=800)])
@@ -77,7 +77,7 @@ def test_on_the_figure_eight_sumo_makes_cars_yield_and_that_is_told_apart(simula
 @pytest.mark.long
 def test_people_on_a_published_merge_brake_as_no_car_can_and_elsewhere_they_do_not(simulation: Simulation) -> None:
     published = run_episode(Merge(), IDM(), (0,), simulation=simulation)
-    assert measure(published)["drivable"] not in ("", FEASIBLE)
+    assert measure(published)["feasibility"] not in ("", FEASIBLE)
     assert published.audit.human_braking.max_braking > 9.0
     bounded = Merge(safety=SafetyFilter(), enforce_human_limits=True, right_of_way=True)
     honest = run_episode(bounded, IDM(), (0,), simulation=simulation)

@@ -14,11 +14,11 @@ from unjam.measures.metrics import measure
 from unjam.reports.html import replay_data
 from unjam.reports.lanes import lane_map_figure
 from unjam.reports.results import pack_episode, to_plot_episode, unpack_episode
-from unjam.worlds import earned as earning
+from unjam.worlds import episode_reward
 from unjam.worlds.episode_reward import episode_reward_terms
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import REWARDS, make_reward
-from unjam.worlds.sumo import log as logging
+from unjam.worlds.sumo import traffic_log
 from unjam.worlds.sumo.traffic_log import TrafficLog
 
 Stays = list[tuple[int, int]]
@@ -29,10 +29,10 @@ Stays = list[tuple[int, int]]
 def small() -> Iterator[None]:
     """Limits that a minute of traffic is beyond."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(logging, "MOST_CELLS", 1000)
-        patch.setattr(logging, "MAX_SNAPSHOT_VEHICLES", 1500)
-        patch.setattr(logging, "FRAMES", 20)
-        patch.setattr(earning, "MAX_REWARD_CELLS", 500)
+        patch.setattr(traffic_log, "MAX_UNSHARED_CELLS", 1000)
+        patch.setattr(traffic_log, "MAX_SNAPSHOT_VEHICLES", 1500)
+        patch.setattr(traffic_log, "SHARED_COLUMN_FRAMES", 20)
+        patch.setattr(episode_reward, "MAX_REWARD_CELLS", 500)
         yield
 
 
@@ -50,8 +50,8 @@ def thinned(whole: Episode, small: None) -> Episode:
 def test_whoever_comes_and_goes_every_speed_is_kept_in_a_column_of_its_own_kind(stays: Stays, most: int) -> None:
     moments = max((first + more for first, more in stays), default=0) + 1
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(logging, "MOST_CELLS", 0)
-        patch.setattr(logging, "MAX_SNAPSHOT_VEHICLES", most)
+        patch.setattr(traffic_log, "MAX_UNSHARED_CELLS", 0)
+        patch.setattr(traffic_log, "MAX_SNAPSHOT_VEHICLES", most)
         log = TrafficLog()
         for time in range(moments):
             there = [number for number, (first, more) in enumerate(stays) if first <= time <= first + more]
@@ -119,12 +119,12 @@ def test_pictures_of_what_is_thinned_show_the_moments_that_are_kept(whole: Episo
 
 
 def test_a_reward_that_sees_an_episode_part_by_part_pays_the_same(whole: Episode, small: None) -> None:
-    assert whole.speeds.size > earning.MAX_REWARD_CELLS
+    assert whole.speeds.size > episode_reward.MAX_REWARD_CELLS
     seen = (whole.speeds, whole.trajectories, False, whole.backlog)
-    parts = {name: episode_reward_terms(make_reward(f"{name}:headway=1,comfort=1"), *seen) for name in REWARDS}
+    parts = {name: episode_reward_terms(make_reward(f"{name}:time_gap=1,comfort=1"), *seen) for name in REWARDS}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(earning, "MAX_REWARD_CELLS", 10**9)
-        at_once = {name: episode_reward_terms(make_reward(f"{name}:headway=1,comfort=1"), *seen) for name in REWARDS}
+        patch.setattr(episode_reward, "MAX_REWARD_CELLS", 10**9)
+        at_once = {name: episode_reward_terms(make_reward(f"{name}:time_gap=1,comfort=1"), *seen) for name in REWARDS}
     for name, terms in at_once.items():
         assert terms.keys() == parts[name].keys()
         for term, values in terms.items():
@@ -133,7 +133,7 @@ def test_a_reward_that_sees_an_episode_part_by_part_pays_the_same(whole: Episode
 
 def test_a_collision_ends_the_last_part_alone(whole: Episode, small: None) -> None:
     def crashes(outcome: object) -> dict[str, np.ndarray]:
-        return {"crashed": 1.0 * outcome.crashed}  # pyright: ignore[reportAttributeAccessIssue]
+        return {"crashed": 1.0 * outcome.has_crashed}  # pyright: ignore[reportAttributeAccessIssue]
 
     found = episode_reward_terms(crashes, whole.speeds, whole.trajectories, True, whole.backlog)["crashed"]
     assert np.flatnonzero(found).tolist() == [whole.control_steps - 1]

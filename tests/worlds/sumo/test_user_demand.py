@@ -61,7 +61,7 @@ def test_vehicles_of_a_calibrator_alone_are_waited_for_as_in_sumo(tmp_path: Path
     subprocess.run([*command, "--tripinfo-output.write-unfinished"], check=True, capture_output=True)
     alone = ElementTree.parse(tmp_path / "trips.xml").getroot().findall("tripinfo")
     assert 5 < len(human.vehicle_ids) == len(alone)
-    assert human.steps * human.step < 300.0, "it ends once all have arrived and none can follow"
+    assert human.control_steps * human.control_step < 300.0, "it ends once all have arrived and none can follow"
     assert len(run_episode(scenario, IDM(), (1,), simulation=simulation).cav_ids) > 5
 
 

@@ -137,7 +137,7 @@ def test_everyone_may_be_a_cav_and_nobody(file: Path, simulation: Simulation) ->
     everyone = run_episode(scenario_of(file, penetration_rate=1.0, horizon=60), IDM(), (0,), simulation=simulation)
     there = [name for name in everyone.vehicle_ids if stayed(everyone, name) > 1]
     assert set(everyone.cav_ids) == set(there)
-    with pytest.raises(InputError, match="no CAV was on the road in 5 decisions"):
+    with pytest.raises(InputError, match="no CAV was on the road in 5 control steps"):
         run_episode(scenario_of(file, penetration_rate=1e-9, horizon=5), IDM(), (0,), simulation=simulation)
 
 

@@ -24,7 +24,7 @@ class DetectorPool:
 
     def __init__(self, count: int = 1) -> None:
         """Prepare `count` processes; nothing is started yet."""
-        self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-counting")
+        self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-detectors")
         self._idle_simulations: queue.SimpleQueue[SandboxedSimulation | None] = queue.SimpleQueue()
         self._open_simulations: set[SandboxedSimulation] = set()
         for _ in range(count):

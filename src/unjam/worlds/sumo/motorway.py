@@ -145,7 +145,10 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         return [routes[name] for name in vehicles]
 
     def _snapshot_fields(self, columns: NDArray[np.intp]) -> dict[str, Any]:
-        lanes = {"lane_indices": self._traffic_log.snapshots("lane_indices", columns), "lane_names": self.road.lane_names[::-1]}
+        lanes = {
+            "lane_indices": self._traffic_log.snapshots("lane_indices", columns),
+            "lane_names": self.road.lane_names[::-1],
+        }
         before = self.scenario.warmup * self.scenario.simulation_step
         begin, end = (max(0.0, moment - before) for moment in self.road.peak)
         road = {"demand_peak": (begin, end), "free_flow_time": self.road.free_flow_time}

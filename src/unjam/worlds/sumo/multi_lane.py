@@ -138,7 +138,7 @@ class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
         people, cavs, cut_in = map(self._braking_log.statistics, (HUMAN_DRIVER, CAV_DRIVER, CAV_AFTER_CUT_IN))
         speed, ahead, gap, recovering = self._steady_following()
         step = self.scenario.simulation_step
-        found = following_statistics(speed, ahead, gap, step, recovering=recovering)
+        found = following_statistics(speed, ahead, gap, step, in_recovery=recovering)
         decided = self._following_statistics(trajectories)
         commands = {name: getattr(decided, name) for name in ("max_jerk", "override_share", "yield_share")}
         return Audit(people, cavs, replace(found, **commands), SHORT_TIME_GAP, has_lanes=True, cut_in_braking=cut_in)

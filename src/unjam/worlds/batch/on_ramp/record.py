@@ -281,6 +281,6 @@ class MotorwayLog:
         jerks = [np.abs(np.diff(each.states.speed, 2)).max(initial=0.0) for each in trips]
         jerk = max(jerks, default=0.0) / self.control_step**2
         speed, leader, gap, recovering = steady_following[:, None]
-        found = following_statistics(speed, leader, gap, self.simulation_step, recovering=recovering)
+        found = following_statistics(speed, leader, gap, self.simulation_step, in_recovery=recovering)
         found = replace(found, max_jerk=float(jerk))
         return Audit(people, cavs, found, SHORT_TIME_GAP, has_lanes=True, cut_in_braking=cut_in)
