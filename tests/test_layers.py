@@ -10,52 +10,47 @@ import pytest
 
 import unjam
 
-SOURCE = Path(unjam.__file__).parent
-MODULES = {path.relative_to(SOURCE).as_posix(): ast.parse(path.read_text()) for path in SOURCE.rglob("*.py")}
+SOURCE = Path(unjam.__file__).parents[1]
+TEXTS = {
+    path.relative_to(SOURCE).as_posix().removeprefix("unjam/"): path.read_text()
+    for package in ("unjam", "unjam_paper")
+    for path in (SOURCE / package).rglob("*.py")
+}
+"""sources of both packages, by path: `drivers/driver.py`, `unjam_paper/study.py`"""
+MODULES = {module: ast.parse(text) for module, text in TEXTS.items()}
 
 ORDER = (
-    *("sumo_files", "physics", "drivers", "scenarios", "worlds", "measures", "virtual", "learners"),
-    *("training", "studies", "cli"),
+    *("sumo_files", "physics", "drivers", "scenarios", "worlds", "measures", "models", "learners"),
+    *("training", "cli", "unjam_paper"),
 )
 """each may import those before it, and none after it"""
 EVERYWHERE = {
-    "",
-    "adam",
-    "children",
-    "errors",
-    "files",
-    "folders",
-    "kernels",
-    "manifest",
-    "parameters",
-    "processes",
-    "sandbox",
-    "tree",
-    "trust",
-    "user_code",
+    *("", "adam", "child_processes", "errors", "files", "folders", "kernels", "manifest", "parameters"),
+    *("plugins", "processes", "sandbox", "tree", "trust", "user_code"),
 }
-"""what has no place in the order: it imports none of the layers"""
+"""modules that every part may import: they import none of the layers"""
 ALLOWED = {
     "controller": {"physics", "drivers", "worlds"},
     "following": {"physics", "drivers", "scenarios"},
     "reports": {"physics", "drivers", "scenarios", "worlds", "measures"},
     "learners": {"following"},
     "training": {"controller", "reports"},
-    "studies": {"controller", "following", "reports"},
     "cli": {"controller", "following", "reports"},
+    "unjam_paper": {"controller", "following", "reports"},
     "environments": {"controller", "physics", "drivers", "scenarios", "worlds", "reports"},
 }
 """what else a part may import"""
 LAZY = {
     "__init__": {
-        *("controller", "drivers", "environments", "errors", "kernels", "limited", "measures", "scenarios"),
+        *("controller", "drivers", "environments", "errors", "kernels", "resource_limits", "measures", "scenarios"),
         *("training", "trust", "worlds"),
     },
     "__main__": {"cli"},
-    "limited": {"children", "controller", "errors", "trust"},
+    "resource_limits": {"child_processes", "controller", "errors", "trust"},
 }
+"""modules that import other parts when they are used"""
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
-LONGEST = 400
+MAX_MODULE_LINES = 400
 EXECUTABLE = ("sys.executable", "sys._base_executable", "executable", "_base_executable")
 
 
@@ -110,9 +105,9 @@ def importers(packages: set[str]) -> set[str]:
 
 
 def own_imports(tree: ast.AST) -> set[str]:
-    """The parts of the package that a file imports."""
-    names = [name for name in imported(tree) if name.partition(".")[0] == "unjam"]
-    return {(*name.split("."), "")[1] for name in names}
+    """The parts of both packages that a file imports."""
+    names = [name.split(".") for name in imported(tree)]
+    return {(*parts, "")[parts[0] == "unjam"] for parts in names if parts[0] in ("unjam", "unjam_paper")}
 
 
 def allowed_parts(part: str) -> set[str]:
@@ -140,7 +135,7 @@ def test_every_part_has_its_place() -> None:
 def test_reports_read_folders_and_know_neither_learners_nor_trainings() -> None:
     for module, tree in MODULES.items():
         if part_of(module) == "reports":
-            assert not own_imports(tree) & {"learners", "training", "studies", "controller", "cli"}, module
+            assert not own_imports(tree) & {"learners", "training", "controller", "cli"}, module
 
 
 def test_what_measures_draws_nothing() -> None:
@@ -154,26 +149,19 @@ def test_what_measures_draws_nothing() -> None:
 
 
 def test_sumo_is_imported_in_one_place() -> None:
-    assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/library.py"}
+    assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/backends.py"}
 
 
 def test_learning_libraries_are_imported_only_where_we_learn() -> None:
     found = importers(TORCH)
-    assert {part_of(module) for module in found} <= {
-        "adam",
-        "controller",
-        "following",
-        "learners",
-        "studies",
-        "training",
-        "virtual",
-    }
+    parts = {part_of(module) for module in found}
+    assert parts <= {"adam", "controller", "following", "learners", "models", "training", "unjam_paper"}
     assert "learners/trpo_ppo.py" in found
 
 
 def test_only_the_command_line_prints_with_its_libraries() -> None:
     found = importers({"typer", "rich", "click"})
-    assert {part_of(module) for module in found} == {"cli"}
+    assert {part_of(module) for module in found - {"unjam_paper/cli.py"}} == {"cli"}
 
 
 def test_signatures_are_checked_in_one_place() -> None:
@@ -220,31 +208,32 @@ READS = {"shutil.which", "shutil.disk_usage", "shutil.get_terminal_size"}
 PRIVATE = "in a private temporary folder, with a random name, that its user alone may enter"
 BUFFER = "into memory, or to the standard output"
 UNSAFE_BUT = {
-    "worlds/sumo/simulation.py: traffic.write_text(files.traffic)": PRIVATE,
+    "worlds/sumo/simulation.py: traffic.write_text(files.traffic_xml)": PRIVATE,
     "worlds/sumo/networks.py: (folder / name).write_text(content)": PRIVATE,
-    "studies/do_no_harm.py: files.mkdir()": PRIVATE,
-    "studies/harm_roads.py: (folder / 'road.rou.xml').write_text(_document('routes', traffic))": PRIVATE,
-    "studies/harm_roads.py: path.write_text(_document('configuration', lines))": PRIVATE,
-    "studies/assess_examples.py: (folder / 'road').mkdir()": PRIVATE,
-    "studies/assess_examples.py: (folder / 'road.rou.xml').write_text('\\n'.join(lines))": PRIVATE,
-    "studies/assess_examples.py: (folder / 'road.rou.xml').write_text(_document('routes', traffic))": PRIVATE,
-    "studies/assess_examples.py: path.write_text(_document('configuration', lines))": PRIVATE,
-    "studies/assess_examples.py: shutil.copy(network_file(scenario_options.network), folder / 'road.net.xml')": PRIVATE,
-    "sumo_files/program.py: open(copy, 'w', encoding='utf-8')": PRIVATE,
-    "reports/film.py: imageio_ffmpeg.write_frames(str(film), (SIZE, SIZE), fps=rate, "
+    "unjam_paper/do_no_harm.py: files.mkdir()": PRIVATE,
+    "unjam_paper/open_test_roads.py: (folder / 'road.rou.xml').write_text(_xml_document('routes', traffic))": PRIVATE,
+    "unjam_paper/open_test_roads.py: path.write_text(_xml_document('configuration', lines))": PRIVATE,
+    "unjam_paper/assess_examples.py: (folder / 'road').mkdir()": PRIVATE,
+    "unjam_paper/assess_examples.py: (folder / 'road.rou.xml').write_text('\\n'.join(lines))": PRIVATE,
+    "unjam_paper/assess_examples.py: (folder / 'road.rou.xml').write_text(_document('routes', traffic))": PRIVATE,
+    "unjam_paper/assess_examples.py: path.write_text(_document('configuration', lines))": PRIVATE,
+    "unjam_paper/assess_examples.py: shutil.copy(network_file(road.network), folder / 'road.net.xml')": PRIVATE,
+    "sumo_files/reader_program.py: open(copy, 'w', encoding='utf-8')": PRIVATE,
+    "reports/video.py: imageio_ffmpeg.write_frames(str(film), (FRAME_SIZE, FRAME_SIZE), fps=rate, "
     "ffmpeg_log_level='error')": PRIVATE,
     "training/tensorboard.py: SummaryWriter(str(place), filename_suffix=f'.{secrets.token_hex(8)}')": (
         "nobody can guess the name of its file, and its folder was made without following links"
     ),
+    "training/train.py: self._controllers.save(contents, is_best)": "through `unjam.files`",
     "cli/__init__.py: os.open(os.devnull, os.O_WRONLY)": "no file",
-    "cli/output.py: open(os.devnull, way)": "no file",
+    "cli/output.py: open(os.devnull, mode)": "no file",
     "sandbox.py: os.open(path, os.O_PATH | os.O_CLOEXEC)": "a handle, by which nothing can be written",
-    "cli/parts.py: draw_road(scene, fastest, words).save(content, 'PNG')": BUFFER,
+    "cli/catalog.py: draw_road(scene, max_speed, caption).save(content, 'PNG')": BUFFER,
     "cli/runs.py: pd.json_normalize(rows).to_csv(sys.stdout, index=False)": BUFFER,
     "reports/figures.py: figure.savefig(content, format='svg', dpi=DPI, metadata={'Date': None})": BUFFER,
     "reports/figures.py: figure.savefig(content, format='png', dpi=dpi)": BUFFER,
-    "reports/figures.py: opaque.quantize(256, Image.Quantize.MAXCOVERAGE).save(small, 'PNG')": BUFFER,
-    "reports/film.py: next(frames).save(film, kind, save_all=True, append_images=frames, "
+    "reports/figures.py: opaque.quantize(256, Image.Quantize.MAXCOVERAGE).save(content, 'PNG')": BUFFER,
+    "reports/video.py: next(frames).save(film, kind, save_all=True, append_images=frames, "
     "duration=durations, loop=0)": BUFFER,
 }
 """calls that change no file that a stranger's link could stand for, and why not"""
@@ -310,12 +299,12 @@ def test_python_children_start_in_one_way() -> None:
     for module, tree in MODULES.items():
         for node in ast.walk(tree):
             named = isinstance(node, ast.Attribute) and ast.unparse(node) in EXECUTABLE
-            assert not named or module == "children.py", module
+            assert not named or module == "child_processes.py", module
             assert not isinstance(node, ast.alias) or node.name not in EXECUTABLE, module
         called = {name_of(call.func) for call in calls(tree)}
         assert "python_command" not in called or "child_environment" in called, module
     started_by_a_library = importers({"multiprocessing", "ray"})
-    assert started_by_a_library == {"studies/parts.py", "training/executors.py"}
+    assert started_by_a_library == {"unjam_paper/parts.py", "training/executors.py"}
     for module in started_by_a_library:
         assert "isolated_start" in {name_of(call.func) for call in calls(MODULES[module])}
 
@@ -332,17 +321,17 @@ CHANGES_THE_PROCESS = {
     "sandbox": "functions for processes of unjam",
     "kernels": "when unjam is imported",
     "trust": "for the length of a block that the user writes, under a lock",
-    "children": "in the command line, and while Ray or multiprocessing starts processes",
-    "training/generators": "for the length of a training, under a lock, and restored",
-    "learners/algorithm_1": "within training/generators",
+    "child_processes": "in the command line, and while Ray or multiprocessing starts processes",
+    "training/random_state": "for the length of a training, under a lock, and restored",
+    "learners/algorithm_1": "within training/random_state",
     "training/executors": "in the process of a training",
-    "training/batch_speed": "in the command line",
-    "training/model_facts": "within training/generators, or in the command line",
-    "training/speed": "in the command line",
+    "training/batch_benchmark": "in the command line",
+    "training/model_facts": "within training/random_state, or in the command line",
+    "training/benchmark": "in the command line",
     "following/networks": "in the command line",
-    "studies/theory": "in the command line",
+    "unjam_paper/theory": "in the command line",
     "worlds/worker": "in a worker",
-    "worlds/sumo/apart": "in a process that runs SUMO",
+    "worlds/sumo/sandboxed": "in a process that runs SUMO",
     "cli/__init__": "in the command line",
     "cli/results": "in the command line",
 }
@@ -360,8 +349,8 @@ def test_what_holds_for_a_whole_process_is_changed_only_where_it_may_be() -> Non
 
 
 def test_a_file_can_be_read_at_one_sitting() -> None:
-    lengths = {module: len((SOURCE / module).read_text().splitlines()) for module in MODULES}
-    assert not {module: lines for module, lines in lengths.items() if lines > LONGEST}
+    lengths = {module: len(text.splitlines()) for module, text in TEXTS.items()}
+    assert not {module: lines for module, lines in lengths.items() if lines > MAX_MODULE_LINES}
 
 
 def loaded_by(program: str) -> set[str]:
@@ -390,7 +379,7 @@ def test_help_loads_nothing_that_takes_time() -> None:
 
 
 def test_what_learns_nothing_loads_no_learning_library() -> None:
-    of_training = [f"unjam.training.{name}" for name in ("evaluate", "folder", "config")]
+    of_training = [f"unjam.training.{name}" for name in ("evaluate", "run_folder", "config")]
     modules = ["unjam.worlds.worker", "unjam.controller", *of_training]
     found = loaded_by(f"import {', '.join(modules)}")
     assert found >= set(modules)
