@@ -142,7 +142,7 @@ def test_vehicles_that_are_not_on_the_road_are_left_out(outcome: Outcome, name: 
         present = alone._replace(
             speeds=alone.speeds[:, ~np.isnan(alone.speeds[0])],
             accelerations=alone.accelerations[:, on_road],
-            headways=alone.time_gaps[:, on_road],
+            time_gaps=alone.time_gaps[:, on_road],
         )
         for term, values in REWARDS[name](present).items():
             assert values[0] == pytest.approx(found[term][row], abs=1e-12)

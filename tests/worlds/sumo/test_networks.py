@@ -167,7 +167,7 @@ def test_processes_that_make_the_same_network_at_once_get_one_whole_file(cache: 
 
 def test_a_road_that_cannot_be_made_leaves_nothing_behind(cache: Path) -> None:
     first, *others = road_of(230).edges
-    road = replace(road_of(230), edges=(first._replace(begin="node_9"), *others))
+    road = replace(road_of(230), edges=(first._replace(from_node="node_9"), *others))
     for _ in range(2):
         with pytest.raises(EpisodeError, match="from-node 'node_9' is not known"):
             network_file(road)
@@ -240,7 +240,7 @@ def test_another_process_notices_too(cache: Path, monkeypatch: pytest.MonkeyPatc
     whole, stamp = made.read_bytes(), made.stat()
     made.write_bytes(whole.replace(b"57.5", b"58.5"))
     os.utime(made, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
-    monkeypatch.setattr(networks, "_whole", {})
+    monkeypatch.setattr(networks, "_intact_networks", {})
     assert edges_of(network_file(road_of(230))) == {f"edge_{index}": 57.5 for index in range(4)}
 
 

@@ -80,7 +80,7 @@ def check_same_trips(found: Trips, plain: Trips) -> None:
     assert sorted(found.vehicle_ids) == sorted(plain.vehicle_ids)
     of_plain = {name: number for number, name in enumerate(plain.vehicle_ids)}
     order = [of_plain[name] for name in found.vehicle_ids]
-    for name in ("depart_delay", "duration", "time_loss", "arrived"):
+    for name in ("depart_delay", "duration", "time_loss", "has_arrived"):
         np.testing.assert_array_equal(getattr(found, name), getattr(plain, name)[order], name)
 
 

@@ -51,7 +51,7 @@ def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, sim
         for each in (simulation, apart):
             make_traffic(road, (0,), each).start(is_controlled=False)  # pyright: ignore[reportArgumentType]
             names = ["0", "1"]
-            arguments = dict[str, tuple[object, ...]]({"neighbours": ("1", 100.0), "left": (), "expects_vehicles": ()})
+            arguments = dict[str, tuple[object, ...]]({"neighbors": ("1", 100.0), "left": (), "expects_vehicles": ()})
             arguments |= dict.fromkeys(("lanes", "now", "has_refused"), ())
             arguments |= dict.fromkeys(("type_of", "route_of"), ("1",))
             answers.append(
