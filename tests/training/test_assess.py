@@ -63,7 +63,7 @@ def test_acc_vehicles_are_the_baseline_of_controllers_that_drive_without_an_acc_
     assert (road.cruise.acceleration, road.cruise.deceleration) == (None, None)
 
 
-@pytest.mark.parametrize("name", ["acceleration", "deceleration", "keep_right", "overtake"])
+@pytest.mark.parametrize("name", ["acceleration", "deceleration", "keep_right", "speed_gain"])
 def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(name: str, file: str) -> None:
     plain = make_request(file, [0.1], 400, 0.02, None, ["pi"], {"cruise.time_gap": 1.5})
     assert not plain.has_acc_properties
@@ -77,24 +77,24 @@ def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(nam
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"shares": [0.1, 1.2]}, "shares: 1.2 is not allowed; allowed: >= 0, <= 1"),
-        ({"shares": [float("nan")]}, "shares: nan"),
-        ({"shares": [0.0]}, "shares: '0' is not allowed; allowed: one above 0"),
+        ({"penetration_rates": [0.1, 1.2]}, "penetration_rates: 1.2 is not allowed; allowed: >= 0, <= 1"),
+        ({"penetration_rates": [float("nan")]}, "penetration_rates: nan"),
+        ({"penetration_rates": [0.0]}, "penetration_rates: '0' is not allowed; allowed: one above 0"),
         ({"episodes": 23}, "episodes: 23 is not allowed; allowed: >= 24 for 2 penetration rates and 3 control"),
         ({"minutes": 0.0}, "minutes: 0.0"),
         ({"precision": 1.0}, "precision: 1.0"),
         ({"drivers": ["human"]}, "driver: 'human' is not allowed; allowed: the human baseline is driven anyway"),
         ({"drivers": ["pacer"]}, "driver: 'pacer' is not allowed; allowed: one that needs no closed road"),
         ({"drivers": ["ghost"]}, "driver: 'ghost'"),
-        ({"changes": {"penetration_rate": 0.5}}, "cav_share: it is not allowed here"),
-        ({"changes": {"cavs": 1}}, "cavs: it is not allowed here"),
-        ({"changes": {"penetration": 0.5}}, "penetration: it is not allowed here"),
-        ({"changes": {"ghost": 1}}, "ghost: unknown name"),
+        ({"options": {"penetration_rate": 0.5}}, "penetration_rate: it is not allowed here"),
+        ({"options": {"cavs": 1}}, "cavs: it is not allowed here"),
+        ({"options": {"penetration": 0.5}}, "penetration: unknown name"),
+        ({"options": {"ghost": 1}}, "ghost: unknown name"),
     ],
 )
 def test_what_is_wrong_is_told_at_once(changes: dict[str, Any], words: str, file: str) -> None:
     with pytest.raises(InputError, match=words.replace("+", r"\+")):
-        make_request(file, **{"shares": [0.1, 0.2], "episodes": 400, "precision": 0.02, **changes})
+        make_request(file, **{"penetration_rates": [0.1, 0.2], "episodes": 400, "precision": 0.02, **changes})
 
 
 def test_a_road_of_the_package_is_refused() -> None:
@@ -111,7 +111,7 @@ def test_all_rows_are_kept_those_that_chose_apart(asked: AssessmentRequest, answ
     assert set(judged) == {"human", "cruise, 50 %", f"{found.driver}, 50 %"}
     assert not {str(row["seed"]) for row in chose["human"]} & {str(row["seed"]) for row in judged["human"]}
     driven = sum(map(len, [*chose.values(), *judged.values()])) + 2
-    assert answer.document["episodes"]["all"] == driven <= asked.episodes
+    assert answer.document["episodes"]["total"] == driven <= asked.episodes
     assert all(row["status"] == "completed" for rows in judged.values() for row in rows)
     assert [*read_results(folder).plot_episodes] == ["human", f"{found.driver}, 50 %"]
 
@@ -120,14 +120,14 @@ def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Asse
     written = json.loads((answer.page.parent / "assessment.json").read_text())
     assert written == answer.document
     (found,) = answer.controller_results
-    (said,) = written["judged"]
-    assert (said["driver"], said["reasons"], said["words"]) == (found.driver, found.reasons, found.summary)
+    (said,) = written["controller_results"]
+    assert (said["driver"], said["reasons"], said["summary"]) == (found.driver, found.reasons, found.summary)
     assert said["effect"]["travel_time"]["mean"] == found.effect.travel_time.mean
     assert said["difference_to_acc"]["mean"] == found.difference_to_acc.mean
-    (acc,) = written["acc"]
-    assert (acc["share"], acc["words"]) == (0.5, answer.acc_results[0].summary)
+    (acc,) = written["acc_results"]
+    assert (acc["penetration_rate"], acc["summary"]) == (0.5, answer.acc_results[0].summary)
     assert (written["recommended"] is None) == bool(found.reasons)
-    assert written["people"]["travel_time"]["count"] == written["seeds"]["judging"] >= 5
+    assert written["baseline"]["travel_time"]["count"] == written["seeds"]["test"] >= 5
     assert written["manifest"]["packages"]["libsumo"]
     assert written["notes"] == ["straight.sumocfg: unjam has a value of its own for: seed"]
     page = render_assessment(answer.page.parent)
@@ -145,7 +145,7 @@ def test_the_answer_does_not_depend_on_the_number_of_workers(
     with WorkerPool(1) as workers:
         again = assess(asked, tmp_path / "again", workers)
     assert repr(again.controller_results) == repr(answer.controller_results)  # NaN, of what is not known, is not itself
-    assert again.document["tried"] == answer.document["tried"]
+    assert again.document["candidates"] == answer.document["candidates"]
 
 
 @pytest.mark.parametrize(

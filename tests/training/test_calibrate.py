@@ -63,7 +63,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Corridor:
     return load_corridor(str(road(folder / "mine")), detectors)
 
 
-SPACE = {"speedFactor": FACTOR_RANGES["speedFactor"], "flows": FACTOR_RANGES["flows"]}
+SPACE = {"speedFactor": FACTOR_RANGES["speedFactor"], "flow": FACTOR_RANGES["flow"]}
 TRIALS = 10
 
 
@@ -72,7 +72,7 @@ def done(asked: Corridor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     """The folder of a calibration, and what it found."""
     folder = tmp_path_factory.mktemp("calibration")
     with pytest.MonkeyPatch.context() as patched, DetectorPool(2) as counting:
-        patched.setattr("unjam.training.calibrate.JUDGED", 4)
+        patched.setattr("unjam.training.calibrate.CALIBRATION_TEST_SEEDS", 4)
         return folder, calibrate(asked, folder, counting, SPACE, TRIALS, seeds_per_trial=1)
 
 
@@ -83,11 +83,11 @@ def test_a_calibrated_road_comes_nearer_to_its_detectors(asked: Corridor, done: 
     for name in ("geh", "flow_rmse", "speed_rmse", "score"):
         assert estimates[name]["difference"].high < 0, name
     assert found.factors["speedFactor"] == pytest.approx(TRUE_SPEED, abs=0.06)
-    assert found.factors["flows"] == pytest.approx(TRUE_FLOW / FLOW_NOW, abs=0.1)
+    assert found.factors["flow"] == pytest.approx(TRUE_FLOW / FLOW_NOW, abs=0.1)
     written = json.loads((folder / CALIBRATION_FILE).read_text())
     assert written["factors"] == found.factors
     assert written["manifest"]["starts"]
-    assert written["trials"][0]["factors"] == {"speedFactor": 1.0, "flows": 1.0}
+    assert written["trials"][0]["factors"] == {"speedFactor": 1.0, "flow": 1.0}
     assert len(written["trials"]) == TRIALS
     assert read_sumo_files(asked.files.path) == asked.files  # nobody's files have changed
 
@@ -118,7 +118,7 @@ def test_a_calibration_that_was_stopped_goes_on_where_it_was(
     rows = (folder / TRIALS_FILE).read_text().splitlines(keepends=True)
     (tmp_path / REQUEST_FILE).write_bytes((folder / REQUEST_FILE).read_bytes())
     (tmp_path / TRIALS_FILE).write_text("".join(rows[:-1]) + rows[-1][:9])  # killed while it wrote
-    monkeypatch.setattr("unjam.training.calibrate.JUDGED", 4)
+    monkeypatch.setattr("unjam.training.calibrate.CALIBRATION_TEST_SEEDS", 4)
     driven: list[int] = []
 
     class Watched(DetectorPool):
@@ -159,13 +159,13 @@ EACH = "".join(
 
 def test_factors_multiply_what_each_passenger_type_says_or_sumo_has(tmp_path: Path) -> None:
     files = read_sumo_files(straight(tmp_path, TYPES + EACH))
-    assert scale_vehicle_types(files, {"tau": 0.5, "speedFactor": 0.9, "accel": 1.0, "flows": 2.0}) == {
+    assert scale_vehicle_types(files, {"tau": 0.5, "speedFactor": 0.9, "accel": 1.0, "flow": 2.0}) == {
         "drawn": {"tau": "0.6", "speedFactor": "normc(0.9,0.09,0.45,1.35)"},
         "bare": {"tau": "0.5", "speedFactor": "0.9"},
         "quick": {"tau": "0.05", "speedFactor": "0.9"},  # not below the step
     }
     assert scale_vehicle_types(files, {"tau": 0.05})["bare"] == {"tau": "0.1"}
-    assert scale_vehicle_types(files, {"tau": 1.0, "flows": 2.0}) == {}
+    assert scale_vehicle_types(files, {"tau": 1.0, "flow": 2.0}) == {}
 
 
 def test_an_attribute_that_is_no_number_is_told(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from unjam.errors import DiskError, InputError
-from unjam.training import folder as run_folder
+from unjam.training import run_folder
 from unjam.training.run_folder import CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE, load_checkpoint, save_checkpoint
 
 Content = tuple[dict[str, Any], dict[str, torch.Tensor]]
@@ -23,7 +23,7 @@ def content_of(iteration: int) -> Content:
     state = {
         "iteration": iteration,
         "environment_steps": 300 * iteration,
-        "validation_best": 1 / 3,
+        "best_validation": 1 / 3,
         "expert_returns": [-1e9],
     }
     generator = torch.Generator().manual_seed(iteration)
@@ -50,11 +50,11 @@ def test_gives_back_what_was_saved(tmp_path: Path) -> None:
 
 
 def test_numbers_that_json_does_not_know_come_back(tmp_path: Path) -> None:
-    state = {"iteration": 1, "validation_best": float("-inf"), "expert_returns": [float("nan")]}
+    state = {"iteration": 1, "best_validation": float("-inf"), "expert_returns": [float("nan")]}
     save_checkpoint(tmp_path, state, {})
     found = load_checkpoint(tmp_path)
     assert found is not None
-    assert found[0]["validation_best"] == float("-inf")
+    assert found[0]["best_validation"] == float("-inf")
     (expert,) = found[0]["expert_returns"]
     assert expert != expert
 
@@ -80,7 +80,7 @@ def test_what_else_lies_in_the_folder_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_what_another_version_made_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_folder, "FORMAT", 1)
+    monkeypatch.setattr(run_folder, "CHECKPOINT_FORMAT", 1)
     save_all(tmp_path, 1)
     monkeypatch.undo()
     with pytest.raises(InputError, match=r"000001 has format 1, of another version of unjam; allowed: \d+$"):

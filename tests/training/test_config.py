@@ -42,7 +42,7 @@ def test_later_sources_go_before_earlier_ones(tmp_path: Path) -> None:
 
 
 def test_a_change_of_one_key_leaves_the_rest_of_its_table() -> None:
-    made = load_config(changes={"policy": {"hold": 3}, "policy.authority": 0.5, "road": {"vehicles": 20}})
+    made = load_config(changes={"policy": {"action_duration": 3}, "policy.authority": 0.5, "scenario_options": {"vehicles": 20}})
     assert made.policy == PolicySettings(action_duration=3, authority=0.5)
     assert made.make_scenario().vehicles == 20  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -74,7 +74,7 @@ def test_merging_changes_neither_side() -> None:
         ({"sed": 1}, "sed: unknown name; did you mean 'seed'?"),
         ({"horizon": 100}, "horizon: unknown name; did you mean 'scenario_options.horizon'?"),
         ({"length": 230}, "length: unknown name; did you mean 'scenario_options.length'?"),
-        ({"evaluation.nope": 1}, "evaluation.nope: unknown name; allowed: baselines, converged, episodes, every"),
+        ({"evaluation.nope": 1}, "evaluation.nope: unknown name; allowed: baselines, convergence_window, episodes, patience"),
         ({"trpo.gama": 0.9}, "trpo.gama: unknown name"),
         ({"evaluation.evry": 1}, "evaluation.evry: unknown name"),
         ({"trpo.gamma": 1.5}, "trpo.gamma: 1.5 is not allowed; allowed: less than 1"),
@@ -95,22 +95,22 @@ def test_merging_changes_neither_side() -> None:
         ({"evaluation.validation_interval": -1}, "evaluation.validation_interval: -1 is not allowed"),
         ({"evaluation.baselines": "pi"}, "evaluation.baselines: 'pi' is not allowed"),
         ({"policy.hidden": 16}, "policy.hidden: 16 is not allowed; allowed: a list: [1, 2]"),
-        ({"policy.inputs": ["stars"]}, "policy.observe.0: 'stars' is not allowed"),
+        ({"policy.inputs": ["stars"]}, "policy.inputs.0: 'stars' is not allowed"),
         ({"scenario": "rong"}, "scenario: 'rong' is not allowed; allowed: ring, ring-warm, ring-jammed"),
-        ({"road": {"lenght": [220, 230]}}, "scenario ring.lenght: unknown name"),
+        ({"scenario_options": {"lenght": [220, 230]}}, "scenario ring.lenght: unknown name"),
         ({"tasks": [{"weight": 0}]}, "tasks.0.weight: 0 is not allowed"),
         ({"tasks": [{"name": "../up"}]}, "tasks.0.name: '../up' is not allowed"),
         ({"tasks": [{"scenario": "rong"}]}, "scenario: 'rong' is not allowed"),
-        ({"tasks": [{"road": {"lenght": 3}}]}, "scenario ring.lenght: unknown name"),
+        ({"tasks": [{"scenario_options": {"lenght": 3}}]}, "scenario ring.lenght: unknown name"),
         ({"scenario_options.vehicles": 1}, "scenario ring.vehicles: 1 is not allowed"),
         ({"scenario_options.length": [250, 230]}, "scenario ring.length: 230 m is not allowed as the largest"),
         (
-            {"policy.exploration": "mirrored", "agent": "sac"},
-            "policy.exploration: mirrored is not allowed; allowed: anew, for sac",
+            {"policy.exploration": "antithetic", "agent": "sac"},
+            "policy.exploration: antithetic is not allowed; allowed: per_step, for sac",
         ),
         (
-            {"policy.exploration": "mirrored", "model.kind": "road"},
-            "policy.exploration: mirrored is not allowed; allowed: anew, lasting, for what is imagined here",
+            {"policy.exploration": "antithetic", "model.kind": "road"},
+            "policy.exploration: antithetic is not allowed; allowed: per_step, per_episode, for these model rollouts",
         ),
         (
             {"policy.reward_after_exit": True},
@@ -124,10 +124,10 @@ def test_merging_changes_neither_side() -> None:
             {"scenario_options.simulation_step": 0.0333},
             "scenario ring.simulation_step: 0.0333 is not allowed; allowed: a whole number of milliseconds",
         ),
-        ({"scenario": "merge", "world": "batch"}, "world: batch is not allowed; allowed: sumo, for merge"),
+        ({"scenario": "merge", "simulator": "batch"}, "simulator: batch is not allowed; allowed: sumo, for merge"),
         (
-            {"world": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},
-            "world: batch is not allowed; allowed: sumo, for figure-eight",
+            {"simulator": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},
+            "simulator: batch is not allowed; allowed: sumo, for figure-eight",
         ),
         (
             {"evaluation.patience": 5, "evaluation.validation_interval": 0},
@@ -231,14 +231,14 @@ def test_any_configuration_survives_being_written(made: RunConfig, tmp_path_fact
 
 @pytest.mark.parametrize("agent", AGENT_NAMES)
 def test_each_learner_has_its_own_settings(agent: str) -> None:
-    made = load_config(changes={"agent": agent, f"{agent}.gamma": 0.7, f"{agent}.batch_steps": 77})
+    made = load_config(changes={"agent": agent, f"{agent}.gamma": 0.7, f"{agent}.steps_per_iteration": 77})
     assert (made.learner.gamma, made.learner.steps_per_iteration) == (0.7, 77)
     assert made.learner == getattr(made, agent)
 
 
 def test_every_key_is_written_out() -> None:
     text = to_toml(RunConfig())
-    for key in ("steps", "seed", "expert", "gamma", "critic_learning_rate", "hold", "observe", "baselines", "preset"):
+    for key in ("steps", "seed", "expert", "gamma", "critic_learning_rate", "action_duration", "inputs", "baselines", "preset"):
         assert f"\n{key} = " in f"\n{text}"
 
 

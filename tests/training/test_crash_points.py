@@ -17,7 +17,7 @@ from unjam import files
 from unjam.errors import DiskError
 from unjam.files import append_line, to_json
 from unjam.folders import Folder
-from unjam.training import folder as run_folder
+from unjam.training import run_folder
 from unjam.training.run_folder import (
     PROGRESS_FILE,
     create_run_folder,

@@ -26,7 +26,7 @@ ROAD: dict[str, Any] = {"length": (120, 130), "vehicles": 8, "horizon": 60}
 def compared(tmp_path_factory: pytest.TempPathFactory) -> DriveResult:
     """Two drivers on the same three episodes, written into a folder."""
     out = tmp_path_factory.mktemp("drives") / "new" / "folder"
-    return drive("ring", ["pi", IDM()], episodes=3, seed=4, scenario_options=ROAD, worker_pool=1, out=out)
+    return drive("ring", ["pi", IDM()], episodes=3, seed=4, scenario_options=ROAD, workers=1, out=out)
 
 
 def test_every_driver_has_a_row_for_every_seed(compared: DriveResult) -> None:
@@ -44,7 +44,7 @@ def test_a_row_measures_the_episode_of_its_seed(compared: DriveResult) -> None:
 
 
 def test_held_out_seeds_are_those_that_judge_trainings() -> None:
-    judged = drive("ring", "pi", episodes=2, scenario_options=ROAD, worker_pool=1, test_seeds=True).rows["pi"]
+    judged = drive("ring", "pi", episodes=2, scenario_options=ROAD, workers=1, test_seeds=True).rows["pi"]
     again = [run_episode(Ring(**ROAD), PISaturation(), seed).trajectories[0] for seed in make_test_seeds(2)]
     assert [row["return"] for row in judged] == [trajectory.reward.sum() for trajectory in again]
 
@@ -54,7 +54,7 @@ def test_what_was_driven_is_written_with_a_report(compared: DriveResult) -> None
     assert {path.name for path in compared.folder.iterdir()} == {
         "evaluation.json",
         "episodes.parquet",
-        "shown.safetensors",
+        "plot_episodes.safetensors",
         "report.html",
     }
     assert compared.report == compared.folder / "report.html"
@@ -79,28 +79,28 @@ def test_the_document_of_several_drivers_is_a_list_of_such(compared: DriveResult
     assert [entry["driver"] for entry in document["drivers"]] == ["pi", "idm"]
     for entry in document["drivers"]:
         assert len(entry["episodes"]) == 3
-        assert entry["mean"].keys() == entry["interval"].keys() == METRICS.keys()
+        assert entry["mean"].keys() == entry["ci95"].keys() == METRICS.keys()
         assert entry["report"] == str(compared.report)
     expert = document["drivers"][0]["baseline"]
     assert expert in ("pi", "idm")
     for entry in document["drivers"]:
         assert entry["baseline"] == expert
-        assert (entry["beyond_baseline"] is None) == (entry["driver"] == expert)
+        assert (entry["difference_to_baseline"] is None) == (entry["driver"] == expert)
 
 
 def test_the_document_of_one_driver_is_strict_json_with_null_for_nan() -> None:
-    result = drive("ring", "pi", episodes=1, scenario_options=ROAD, worker_pool=1)
+    result = drive("ring", "pi", episodes=1, scenario_options=ROAD, workers=1)
     document = json.loads(to_json(result.document()), parse_constant=lambda name: pytest.fail(name))
     assert document["driver"] == "pi"
     assert document["mean"]["mean_speed"] == result.mean["mean_speed"]
     assert document["mean"]["time_to_dissolve"] is None  # 6 s are too short for traffic to be calm for a minute
-    assert document["interval"]["mean_speed"] == [None, None]  # one episode has no spread
+    assert document["ci95"]["mean_speed"] == [None, None]  # one episode has no spread
     assert document["folder"] is None
 
 
 def test_without_out_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    result = drive("ring", "idm", episodes=1, scenario_options=ROAD, worker_pool=1)
+    result = drive("ring", "idm", episodes=1, scenario_options=ROAD, workers=1)
     assert (result.folder, result.report) == (None, None)
     assert not list(tmp_path.iterdir())
 
@@ -108,12 +108,12 @@ def test_without_out_nothing_is_written(tmp_path: Path, monkeypatch: pytest.Monk
 def test_no_temporary_file_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)  # where Python remembers what TMPDIR was
-    drive("ring", "idm", episodes=1, scenario_options=ROAD, worker_pool=1)
+    drive("ring", "idm", episodes=1, scenario_options=ROAD, workers=1)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_number_of_workers_changes_nothing(compared: DriveResult) -> None:
-    other = drive("ring", ["pi", "idm"], episodes=3, seed=4, scenario_options=ROAD, worker_pool=2)
+    other = drive("ring", ["pi", "idm"], episodes=3, seed=4, scenario_options=ROAD, workers=2)
     assert to_json(other.rows) == to_json(compared.rows)
 
 
@@ -124,7 +124,7 @@ def test_progress_is_told_by_driver_and_episode() -> None:
         ["pi", "idm"],
         1,
         scenario_options=ROAD,
-        worker_pool=1,
+        workers=1,
         progress=lambda key, steps: told.append((key, steps)),
     )
     assert (("pi", 0), 60) in told
@@ -133,7 +133,7 @@ def test_progress_is_told_by_driver_and_episode() -> None:
 
 def test_a_reward_of_the_users_own(my_drivers: Path, tmp_path: Path) -> None:
     name = f"{my_drivers}:calm"
-    result = drive("ring", "idm", 1, scenario_options=ROAD, reward=name, worker_pool=1, out=tmp_path / "out")
+    result = drive("ring", "idm", 1, scenario_options=ROAD, reward=name, workers=1, out=tmp_path / "out")
     (trajectory,) = run_episode(Ring(**ROAD), IDM(), (0,), name).trajectories
     assert result.rows["idm"][0]["return"] == trajectory.reward.sum()
     assert read_results(tmp_path / "out").metadata["reward"] == name
@@ -141,7 +141,7 @@ def test_a_reward_of_the_users_own(my_drivers: Path, tmp_path: Path) -> None:
 
 def test_a_driver_that_fails_has_rows_that_say_so_and_can_be_raised(my_drivers: Path, tmp_path: Path) -> None:
     bad = f"{my_drivers}:broken"
-    result = drive("ring", ["idm", bad], episodes=2, scenario_options=ROAD, worker_pool=1, out=tmp_path / "out")
+    result = drive("ring", ["idm", bad], episodes=2, scenario_options=ROAD, workers=1, out=tmp_path / "out")
     assert [row["status"] for row in result.rows[bad]] == ["failed", "failed"]
     assert [row["status"] for row in result.rows["idm"]] == ["completed", "completed"]
     assert (tmp_path / "out" / "report.html").is_file()
@@ -180,7 +180,7 @@ def follow(state: LocalState) -> Any:
 
 def test_functions_and_objects_of_the_program_drive_beside_the_others() -> None:
     result = drive(
-        "ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, scenario_options=ROAD, worker_pool=1
+        "ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, scenario_options=ROAD, workers=1
     )
     assert list(result.rows) == ["follow", "Follows", "Follows (2)", "Stays", "idm"]
     raise_failures(result)
@@ -194,15 +194,15 @@ def test_functions_and_objects_of_the_program_drive_beside_the_others() -> None:
 
 def test_an_error_in_a_function_of_the_program_is_raised_as_it_is() -> None:
     with pytest.raises(ZeroDivisionError):
-        drive("ring", lambda state: 1 / 0, 1, scenario_options=ROAD, worker_pool=1)
+        drive("ring", lambda state: 1 / 0, 1, scenario_options=ROAD, workers=1)
 
 
 def test_it_drives_while_an_environment_is_open_and_warns() -> None:
     with closing(RoadEnv(**ROAD)) as environment:
         environment.reset(seed=0)
         with pytest.warns(UserWarning, match="runs in a process of its own"):
-            beside = drive("ring", follow, 1, scenario_options=ROAD, worker_pool=1)
-    assert beside.mean["return"] == drive("ring", follow, 1, scenario_options=ROAD, worker_pool=1).mean["return"]
+            beside = drive("ring", follow, 1, scenario_options=ROAD, workers=1)
+    assert beside.mean["return"] == drive("ring", follow, 1, scenario_options=ROAD, workers=1).mean["return"]
 
 
 def test_a_result_is_a_table_of_pandas_and_shows_itself_in_a_notebook(compared: DriveResult) -> None:
@@ -244,14 +244,14 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
         {"driver": 3},
         {"driver": [Stays]},
         {"driver": []},
-        {"road": {"lenght": (120, 130)}},
-        {"road": {"vehicles": 1}},
+        {"scenario_options": {"lenght": (120, 130)}},
+        {"scenario_options": {"vehicles": 1}},
         {"reward": "gold"},
         {"reward": "nowhere.py:gold"},
         {"episodes": 0},
         {"seed": -1},
         {"seed": 999_999, "episodes": 2},
-        {"seed": 3, "held_out": True},
+        {"seed": 3, "test_seeds": True},
         {"workers": -1},
     ],
     ids=str,
@@ -259,7 +259,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
 def test_wrong_arguments_are_told_before_anything_starts(
     tmp_path: Path, started: Callable[[], bool], wrong: dict[str, Any]
 ) -> None:
-    arguments = {"driver": "pi", "episodes": 1, "road": ROAD, "workers": 1, "out": tmp_path / "out", **wrong}
+    arguments = {"driver": "pi", "episodes": 1, "scenario_options": ROAD, "workers": 1, "out": tmp_path / "out", **wrong}
     with pytest.raises(InputError) as caught:
         drive(**arguments)
     assert "\n" not in str(caught.value)
@@ -280,7 +280,7 @@ def test_what_is_already_there_is_left_alone(tmp_path: Path, started: Callable[[
 
 def test_started_notices_a_worker(started: Callable[[], bool]) -> None:
     assert not started()
-    drive("ring", "idm", 1, scenario_options=ROAD, worker_pool=1)
+    drive("ring", "idm", 1, scenario_options=ROAD, workers=1)
     assert started()
 
 
@@ -288,11 +288,11 @@ def test_two_drivers_of_the_same_description_are_both_driven(my_drivers: Path) -
     from unjam.controller import make_driver
 
     drivers = [make_driver(f"{my_drivers}:Keeper:gain={gain}", 0.1) for gain in (0.1, 0.2)]
-    assert len(drive("ring", drivers, 1, scenario_options=ROAD, worker_pool=1).rows) == 2
+    assert len(drive("ring", drivers, 1, scenario_options=ROAD, workers=1).rows) == 2
 
 
 def test_a_drive_of_which_every_episode_failed_leaves_no_folder(tmp_path: Path, my_drivers: Path) -> None:
     road = {"horizon": 20}
-    result = drive("ring", f"{my_drivers}:broken", 1, scenario_options=road, worker_pool=1, out=tmp_path / "drive")
+    result = drive("ring", f"{my_drivers}:broken", 1, scenario_options=road, workers=1, out=tmp_path / "drive")
     assert (result.folder, result.report) == (None, None)
     assert not (tmp_path / "drive").exists()

@@ -158,7 +158,7 @@ def test_a_saved_evaluation_can_be_read_again(found: Evaluation, tmp_path: Path)
     assert {path.name for path in (tmp_path / "new").iterdir()} == {
         "evaluation.json",
         "episodes.parquet",
-        "shown.safetensors",
+        "plot_episodes.safetensors",
     }
     document = strict((tmp_path / "new" / "evaluation.json").read_text())
     assert document["scenario"] == "ring"

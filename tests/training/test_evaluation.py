@@ -27,7 +27,7 @@ def pool() -> Iterator[WorkerPool]:
 
 def learned(pool: WorkerPool, folder: Path, **changes: object) -> tuple[Path, RunConfig]:
     """A run of one iteration that is not judged yet."""
-    config = small_config(**{"steps": STEPS, "evaluation__every": 0, **changes})
+    config = small_config(**{"steps": STEPS, "evaluation__validation_interval": 0, **changes})
     learn_with(pool, folder, config)
     return folder, config
 
@@ -116,7 +116,7 @@ def test_a_trained_controller_is_the_expert_of_the_next(
     run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
 ) -> None:
     first, _ = run
-    folder, config = learned(pool, tmp_path / "next", expert=str(first), policy__hold=3)
+    folder, config = learned(pool, tmp_path / "next", expert=str(first), policy__action_duration=3)
     found = evaluate_run(folder, config, pool, episodes=1)
     assert list(found.rows) == ["human", "pi + residual", TRAINED_LABEL]
     trained, expert = load_controller(folder), load_controller(first)

@@ -18,7 +18,7 @@ from unjam.training import executors
 from unjam.training.config import RunConfig
 from unjam.training.executors import CommandLine, LocalExecutor, run_all, training_command
 
-FAST = small_config(evaluation__every=0, evaluation__episodes=1, evaluation__baselines=[])
+FAST = small_config(evaluation__validation_interval=0, evaluation__episodes=1, evaluation__baselines=[])
 
 
 def command_of(folder: Path, config: RunConfig = FAST) -> CommandLine:
@@ -57,7 +57,7 @@ def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytes
         "file.write_text((file.read_text() if file.exists() else '') + 'x')\n"
         "if len(file.read_text()) < int(sys.argv[2]): os.kill(os.getpid(), 9)\n"
     )
-    monkeypatch.setattr(CommandLine, "line", lambda self: [sys.executable, str(script), *self.words])
+    monkeypatch.setattr(CommandLine, "argv", lambda self: [sys.executable, str(script), *self.arguments])
     for times, code in ((2, 0), (3, 0), (9, -9)):
         counted = tmp_path / f"{times}"
         assert LocalExecutor().run(CommandLine([str(counted), str(times)], tmp_path / "log")) == code
@@ -65,7 +65,7 @@ def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_stop_ends_what_runs_and_starts_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CommandLine, "line", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"])
+    monkeypatch.setattr(CommandLine, "argv", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"])
     processes, codes = LocalExecutor(), []
     thread = threading.Thread(target=lambda: codes.append(processes.run(CommandLine([], tmp_path / "log"))))
     thread.start()
@@ -115,7 +115,7 @@ def test_a_cluster_ends_with_the_bytes_of_this_machine(tmp_path: Path, cluster: 
 def test_a_training_whose_machine_is_lost_goes_on_elsewhere(tmp_path: Path, cluster: Any) -> None:
 
     lost = cluster.add_node(num_cpus=1)
-    config = small_config(steps=6000, evaluation__every=0, evaluation__baselines=[])
+    config = small_config(steps=6000, evaluation__validation_interval=0, evaluation__baselines=[])
     commands = {name: command_of(tmp_path / name, config) for name in ("one", "two")}
     failures: list[BaseException] = []
 

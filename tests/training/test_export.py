@@ -32,7 +32,7 @@ def manifest_of(path: Path) -> dict[str, Any]:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
     with empty_pictures():
-        train(small_config(steps=300, virtual__virtual_ratio=0.0), folder)
+        train(small_config(steps=300, model__model_ratio=0.0), folder)
     return folder
 
 
@@ -132,7 +132,7 @@ def test_a_file_that_does_not_verify_leaves_the_one_before(tmp_path: Path, monke
     def refuse(path: Path) -> None:
         raise InputError(f"{path}: is another")
 
-    monkeypatch.setattr("unjam.training.export.verify_controller", refuse)
+    monkeypatch.setattr("unjam.training.export.verify_controller_file", refuse)
     with pytest.raises(InputError, match="is another"):
         export_controller("idm", to, scenario="ring")
     assert [path.name for path in tmp_path.iterdir()] == ["pi.unjam"]
@@ -140,7 +140,7 @@ def test_a_file_that_does_not_verify_leaves_the_one_before(tmp_path: Path, monke
 
 
 def test_a_car_that_obeys_late_gets_no_file_whose_filter_does_not_know_it(tmp_path: Path) -> None:
-    config = small_config(steps=100, virtual__virtual_ratio=0.0, road__actuator__lag=0.5)
+    config = small_config(steps=100, model__model_ratio=0.0, scenario_options__actuator__lag=0.5)
     with empty_pictures():
         train(config, tmp_path / "late")
     with pytest.raises(InputError, match=r"export: actuator.delay 0, actuator.lag 0.5 is not allowed"):
@@ -157,7 +157,7 @@ def test_no_graph_is_drawn_of_a_driver_that_looks_at_what_its_road_does_not_tell
 def test_a_controllers_file_keeps_its_road_and_origin(tmp_path: Path) -> None:
     shipped = manifest_of(packaged_file("figure-eight-tuned"))
     again = manifest_of(export_controller("unjam:figure-eight-tuned", tmp_path / "again.unjam").file)
-    for name in ("scenario", "tuned", "expert", "versions"):
+    for name in ("scenario", "tuning", "expert", "versions"):
         assert again[name] == shipped[name]
     states, _ = read_sample(unpack_parts(tmp_path / "again.unjam")[SAMPLE_PART])
     assert len(states.speed) == MAX_SAMPLE_STEPS

@@ -30,7 +30,7 @@ EXPERT = "def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed
 def with_checkpoint(folder: Path, config: RunConfig) -> None:
     create_run_folder(folder, config)
     (folder / "progress.jsonl").write_text('{"iteration": 1}\n{"iteration": 2}\n')
-    save_checkpoint(folder / "checkpoint", {"iteration": 1, "belongs": fingerprint(config)}, {})
+    save_checkpoint(folder / "checkpoint", {"iteration": 1, "fingerprint": fingerprint(config)}, {})
 
 
 def refused(folder: Path, config: RunConfig) -> str:
@@ -46,7 +46,7 @@ def refused(folder: Path, config: RunConfig) -> str:
     [
         ({"seed": 5}, "seed: 5 is not allowed; allowed: 0, as in the checkpoint"),
         ({"trpo__gamma": 0.5}, "trpo.gamma: 0.5 is not allowed"),
-        ({"road__vehicles": 9}, "scenario_options.vehicles: 9 is not allowed"),
+        ({"scenario_options__vehicles": 9}, "scenario_options.vehicles: 9 is not allowed"),
     ],
 )
 def test_a_checkpoint_of_another_configuration_is_refused_and_nothing_changed(
@@ -75,7 +75,7 @@ def of_reward(folder: Path) -> RunConfig:
 def of_network(folder: Path) -> RunConfig:
     path = straight(folder, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     road = {"penetration_rate": 0.5, "horizon": 100}
-    return load_config(changes={"scenario": str(path), "road": road, "steps": 100})
+    return load_config(changes={"scenario": str(path), "scenario_options": road, "steps": 100})
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from unjam.training.model_facts import measure_model, replay_length, update_mode
 from unjam.training.run_folder import read_config
 from unjam.worlds.worker_pool import WorkerPool
 
-CONFIG = small_config(virtual__virtual_ratio=1.0, virtual__epochs=4, virtual__members=3, steps=2 * STEPS)
+CONFIG = small_config(model__model_ratio=1.0, model__epochs=4, model__members=3, steps=2 * STEPS)
 NUMBERS = ["speed", "leader_speed", "follower_speed", "leader_gap", "follower_gap"]
 
 
@@ -39,28 +39,28 @@ def facts(run: Path) -> dict[str, Any]:
 
 def test_only_decisions_that_no_network_learned_from_count(facts: dict[str, Any]) -> None:
     held_out = [0, 5]
-    assert facts["held_out"] == 100 * len(held_out)
-    for found in facts["where"].values():
-        assert sum(found["decisions"]) == facts["held_out"]
+    assert facts["validation_steps"] == 100 * len(held_out)
+    for found in facts["by_state"].values():
+        assert sum(found["control_steps"]) == facts["validation_steps"]
 
 
 def test_errors_in_bins_make_up_the_error_of_all(facts: dict[str, Any]) -> None:
-    for found in facts["where"].values():
-        assert found["at"] == sorted(found["at"])
+    for found in facts["by_state"].values():
+        assert found["values"] == sorted(found["values"])
         for name, error in facts["one_step"].items():
             for kind in ("base", "model"):
                 squares = np.square(found[kind][name])
-                whole = np.sqrt(np.average(squares, weights=found["decisions"]))
+                whole = np.sqrt(np.average(squares, weights=found["control_steps"]))
                 assert whole == pytest.approx(error[kind], rel=5e-3, abs=1e-12), (name, kind)
 
 
 def test_replays_go_over_half_of_a_stay(facts: dict[str, Any]) -> None:
     replay = facts["replay"]
-    assert replay["seconds"][-1] == pytest.approx(5.0)
-    assert list(replay["numbers"]) == NUMBERS
-    for found in replay["numbers"].values():
-        assert {len(values) for values in found.values()} == {len(replay["seconds"])}
-    assert max(replay["numbers"]["speed"]["base"]) < 1e-4
+    assert replay["times"][-1] == pytest.approx(5.0)
+    assert list(replay["quantities"]) == NUMBERS
+    for found in replay["quantities"].values():
+        assert {len(values) for values in found.values()} == {len(replay["times"])}
+    assert max(replay["quantities"]["speed"]["base"]) < 1e-4
     assert 0 < replay["starts"] <= model_facts.MAX_REPLAYS
 
 
@@ -68,17 +68,17 @@ def test_examples_begin_where_they_were_recorded(facts: dict[str, Any]) -> None:
     examples = facts["replay"]["examples"]
     assert len(examples) == model_facts.EXAMPLE_COUNT
     for example in examples:
-        for found in example["numbers"].values():
+        for found in example["quantities"].values():
             assert len(found["members"]) == 3
-            assert all(abs(member[0] - found["actual"][0]) < 0.2 for member in found["members"])
-            assert {len(line) for line in (found["actual"], found["base"], *found["members"])} == {50}
+            assert all(abs(member[0] - found["recorded"][0]) < 0.2 for member in found["members"])
+            assert {len(line) for line in (found["recorded"], found["base"], *found["members"])} == {50}
 
 
 def test_the_bound_is_that_of_the_run(run: Path, facts: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     newest = read_progress(run)[-1]
-    monkeypatch.setattr(model_facts, "LENGTHS", (newest["k_star"],))
+    monkeypatch.setattr(model_facts, "ROLLOUT_LENGTHS", (newest["k_star"],))
     found = measure_model(run, CONFIG)["bound"]
-    assert found["C"][0] == pytest.approx(newest["virtual"]["bound"], rel=1e-3)
+    assert found["bound"][0] == pytest.approx(newest["model"]["bound"], rel=1e-3)
     assert facts["bound"]["largest_return"] > found["max_reward"]
     assert facts["k_star"] == newest["k_star"]
 
@@ -86,7 +86,7 @@ def test_the_bound_is_that_of_the_run(run: Path, facts: dict[str, Any], monkeypa
 def test_runs_of_before_that_do_not_know_the_error_have_no_bound(run: Path, tmp_path: Path) -> None:
     lone = shutil.copytree(run, tmp_path / "lone")
     rows = read_progress(lone)
-    del rows[-1]["virtual"]["eps_m_by_estimator"]["transitions"]
+    del rows[-1]["model"]["eps_m_by_estimator"]["transitions"]
     (lone / "progress.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     assert measure_model(lone, CONFIG)["bound"] is None
 
@@ -110,7 +110,7 @@ def test_newest_facts_are_read(run: Path) -> None:
 
 
 def without_virtual() -> RunConfig:
-    return small_config(virtual__virtual_ratio=0.0)
+    return small_config(model__model_ratio=0.0)
 
 
 def test_a_run_without_a_virtual_environment_says_so(run: Path) -> None:
@@ -132,33 +132,33 @@ def test_at_least_half_of_the_stays_are_long_enough_to_be_replayed(stays: list[i
 
 
 def test_a_run_that_imagines_whole_roads_shows_waves(tmp_path: Path) -> None:
-    changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__base": "none"}
-    config = small_config(**changes, virtual__members=2, steps=STEPS)
+    changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__base": "none"}
+    config = small_config(**changes, model__members=2, steps=STEPS)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = json.loads(to_json(measure_model(tmp_path / "run", config)))
     shapes = [np.shape(found["waves"]["recorded"][name]) for name in ("speeds", "positions")]
     assert shapes == [(10, 8)] * 2  # a moment a second, for ten seconds
-    assert found["step"] == pytest.approx(1.0)
+    assert found["control_step"] == pytest.approx(1.0)
     assert len(found["waves"]["recorded"]["cavs"]) == 1
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in wave_figure(found).axes[:3]]
-    assert titles == ["recorded", "imagined", "nothing changes"]
+    assert titles == ["recorded", "model", "nothing changes"]
     assert update_model_facts(tmp_path / "run", config) == found
     rows = dict(wave_rows(found))
-    speeds = np.array(found["waves"]["imagined"]["speeds"])
+    speeds = np.array(found["waves"]["model"]["speeds"])
     speeds = speeds[len(speeds) // 2 :]
-    assert rows["imagined"] == [f"{n:.2f}" for n in (speeds.mean(), speeds.std(1).mean(), speeds.min(1).mean())]
+    assert rows["model"] == [f"{n:.2f}" for n in (speeds.mean(), speeds.std(1).mean(), speeds.min(1).mean())]
 
 
 RAMP: dict[str, Any] = {
     "scenario": "on-ramp",
-    "road": {"horizon": 30, "penetration_rate": 0.5, "peak": [0, 30]},
+    "scenario_options": {"horizon": 30, "penetration_rate": 0.5, "peak": [0, 30]},
     "expert": "jam-ahead",
-    "world": "batch",
-    "policy__observe": ["local"],
-    "policy__exploration": "mirrored",
-    "policy__afterwards": True,
-    "virtual__begin": "first",
+    "simulator": "batch",
+    "policy__inputs": ["local"],
+    "policy__exploration": "antithetic",
+    "policy__reward_after_exit": True,
+    "model__rollout_starts": "first",
     "evaluation__baselines": [],
 }
 
@@ -166,22 +166,22 @@ RAMP: dict[str, Any] = {
 @pytest.mark.long
 @pytest.mark.parametrize("world", ["batch", "sumo"])
 def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str, tmp_path: Path) -> None:
-    changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2, **RAMP}
-    config = small_config(**{**changes, "world": world}, steps=STEPS)
+    changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__members": 2, **RAMP}
+    config = small_config(**{**changes, "simulator": world}, steps=STEPS)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = json.loads(to_json(measure_model(tmp_path / "run", config)))
-    assert found["step"] == pytest.approx(10.0)
+    assert found["control_step"] == pytest.approx(10.0)
     roads = {label: np.array(road["speeds"], float) for label, road in found["waves"].items()}
-    assert list(roads) == ["recorded", "imagined", "base"]
+    assert list(roads) == ["recorded", "model", "base"]
     came = {label: (~np.isnan(speeds)).sum() for label, speeds in roads.items()}
-    assert came["imagined"] == came["base"] > 0  # the same people at the same times
+    assert came["model"] == came["base"] > 0  # the same people at the same times
     alike = 0.0 if world == "batch" else 0.1  # SUMO lets some enter a second sooner or later than the batch
     assert came["recorded"] == pytest.approx(came["base"], rel=alike)
     assert not np.array_equal(roads["recorded"], roads["base"], equal_nan=True)  # who misjudge anew
     drawn = wave_figure(found)
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in drawn.axes]
-    assert [title for title in titles if title] == ["recorded", "imagined", "IDM alone"]
+    assert [title for title in titles if title] == ["recorded", "model", "IDM alone"]
     assert {axes.get_ylabel() for axes in drawn.axes} >= {f"{name}\n[m]" for name in found["lane_names"]}
     assert all("nan" not in cell for _, row in wave_rows(found) for cell in row)
 
@@ -191,13 +191,13 @@ def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str,
 def test_a_run_that_imagines_whole_roads_goes_on_as_if_it_had_not_been_stopped(
     road: dict[str, Any], tmp_path: Path
 ) -> None:
-    changes = {"virtual__virtual_ratio": 1.0, "virtual__model": "road", "virtual__members": 2, **road}
+    changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__members": 2, **road}
     ends = []
     for stops in ([2 * STEPS], [STEPS, 2 * STEPS]):
         folder = tmp_path / str(len(stops))
         for steps in stops:
             with WorkerPool(1) as workers:
                 learn_with(workers, folder, small_config(**changes, steps=steps), resume=steps != stops[0])
-        ends.append([row["virtual"]["return_virtual"] for row in read_progress(folder)])
+        ends.append([row["model"]["return_model"] for row in read_progress(folder)])
     assert ends[0] == ends[1]
     assert len(ends[0]) == 2

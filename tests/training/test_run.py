@@ -39,13 +39,13 @@ STEPS = 300
 def small_config(**changes: Any) -> RunConfig:
     """A run of two iterations on a ring of eight vehicles; with a dot in a key written as two underscores."""
     small = {
-        "road": {"length": [120, 130], "vehicles": 8, "horizon": 100},
+        "scenario_options": {"length": [120, 130], "vehicles": 8, "horizon": 100},
         "policy": {"hidden": [8]},
-        "trpo": {"batch_steps": STEPS, "critic_epochs": 2, "critic_batch_size": 16},
-        "ppo": {"batch_steps": STEPS, "epochs": 3},
-        "sac": {"batch_steps": STEPS, "learning_starts": 400, "gradient_steps_per_step": 0.02, "batch": 8},
-        "td3": {"batch_steps": STEPS, "learning_starts": 400, "gradient_steps_per_step": 0.02, "batch": 8},
-        "evaluation": {"every": 1, "validation_episodes": 2, "episodes": 2, "baselines": ["human"]},
+        "trpo": {"steps_per_iteration": STEPS, "critic_epochs": 2, "critic_batch_size": 16},
+        "ppo": {"steps_per_iteration": STEPS, "epochs": 3},
+        "sac": {"steps_per_iteration": STEPS, "learning_starts": 400, "gradient_steps_per_step": 0.02, "batch_size": 8},
+        "td3": {"steps_per_iteration": STEPS, "learning_starts": 400, "gradient_steps_per_step": 0.02, "batch_size": 8},
+        "evaluation": {"validation_interval": 1, "validation_episodes": 2, "episodes": 2, "baselines": ["human"]},
         "steps": 2 * STEPS,
         "workers": 1,
     }
@@ -145,8 +145,8 @@ def test_a_row_of_progress_is_whole(uninterrupted: Path) -> None:
             row[name] for name in ("return_mean", "return_expert", "return_validation", "mean_speed", "mean_abs_accel")
         ]
         assert np.isfinite(numbers).all()
-        assert set(row["seconds"]) == {"actual", "fit", "imagine", "update", "validation"}
-        assert row["eps_m"] == row["virtual"]["eps_m_by_estimator"]["unexplained"] > 0
+        assert set(row["seconds"]) == {"collect", "fit", "roll_out", "update", "validation"}
+        assert row["eps_m"] == row["model"]["eps_m_by_estimator"]["unexplained_variance"] > 0
         assert 0.0 < row["learner"]["kl_divergence_loss"] <= 0.03
         assert row["collisions"] == 0
         assert 0.0 <= row["shield_override_share"] <= 1.0
@@ -154,7 +154,7 @@ def test_a_row_of_progress_is_whole(uninterrupted: Path) -> None:
 
 
 def test_steps_are_rounded_up_to_whole_episodes_and_whole_iterations(tmp_path: Path, learn: Learn) -> None:
-    run = learn(tmp_path / "run", small_config(trpo__batch_steps=101, steps=201))
+    run = learn(tmp_path / "run", small_config(trpo__steps_per_iteration=101, steps=201))
     assert [row["environment_steps"] for row in progress(tmp_path / "run")] == [200, 400]
     assert run.training.environment_steps == 400
 
@@ -247,7 +247,7 @@ def test_a_run_does_not_go_back_to_fewer_steps_than_are_made(tmp_path: Path, lea
 def test_validating_at_the_end_of_a_smaller_budget_does_not_change_what_is_learned(
     tmp_path: Path, learn: Learn
 ) -> None:
-    longer, folder = small_config(steps=4 * STEPS, evaluation__every=2), tmp_path / "run"
+    longer, folder = small_config(steps=4 * STEPS, evaluation__validation_interval=2), tmp_path / "run"
     learn(folder, replace(longer, steps=3 * STEPS))
     learn(folder, longer, resume=True)
     learn(tmp_path / "one go", longer)
@@ -309,7 +309,7 @@ def test_a_controller_from_before_a_stop_stays_where_nothing_later_beats_it(tmp_
     before = (tmp_path / "controller.unjam").read_bytes()
     found = load_checkpoint(tmp_path / "checkpoint")
     assert found is not None
-    save_checkpoint(tmp_path / "checkpoint", {**found[0], "validation_best": 1e9}, found[1])
+    save_checkpoint(tmp_path / "checkpoint", {**found[0], "best_validation": 1e9}, found[1])
     learn(tmp_path, small_config(steps=2 * STEPS), resume=True)
     assert (tmp_path / "controller.unjam").read_bytes() == before
     assert len(progress(tmp_path)) == 2
@@ -326,7 +326,7 @@ def test_the_expert_stays_the_controller_where_nothing_beats_it(tmp_path: Path, 
 
 def test_before_the_first_iteration_the_controller_is_the_expert(tmp_path: Path, learn: Learn) -> None:
     with pytest.raises(Stop):
-        learn(tmp_path / "run", small_config(evaluation__every=5), stop_after(1))
+        learn(tmp_path / "run", small_config(evaluation__validation_interval=5), stop_after(1))
     loaded = load_controller(tmp_path / "run")
     assert isinstance(loaded, ResidualDriver)
     assert loaded.expert == PISaturation()
@@ -334,7 +334,7 @@ def test_before_the_first_iteration_the_controller_is_the_expert(tmp_path: Path,
 
 
 def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, learn: Learn) -> None:
-    run = learn(tmp_path / "run", small_config(evaluation__every=0))
+    run = learn(tmp_path / "run", small_config(evaluation__validation_interval=0))
     assert {row["return_validation"] for row in progress(tmp_path / "run")} == {None}
     loaded = load_controller(tmp_path / "run")
     assert isinstance(loaded, ResidualDriver)
@@ -346,7 +346,7 @@ def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, le
 
 @pytest.mark.long
 def test_validates_now_and_then_and_at_the_end(tmp_path: Path, learn: Learn) -> None:
-    learn(tmp_path / "run", small_config(evaluation__every=2, steps=3 * STEPS))
+    learn(tmp_path / "run", small_config(evaluation__validation_interval=2, steps=3 * STEPS))
     validated = [row["return_validation"] is not None for row in progress(tmp_path / "run")]
     assert validated == [False, True, True]
 
@@ -355,7 +355,7 @@ def test_validates_now_and_then_and_at_the_end(tmp_path: Path, learn: Learn) -> 
 def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
     tmp_path: Path, spread: bool, learn: Learn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = small_config(spread=spread, trpo__batch_steps=11 * 20, steps=20, road__horizon=20, evaluation__every=0)
+    config = small_config(stratified=spread, trpo__steps_per_iteration=11 * 20, steps=20, scenario_options__horizon=20, evaluation__validation_interval=0)
     episodes = collected(monkeypatch)
     learn(tmp_path / "run", config)
     lengths = [episode.drawn_values["length"] for episode in episodes]

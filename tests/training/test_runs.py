@@ -35,7 +35,7 @@ CONFIG = load_config(changes={"steps": 1000, "preset": ""})
 @pytest.fixture
 def under(tmp_path: Path) -> Path:
     made(tmp_path / "ring-001", CONFIG, 1000, gain=7.0)
-    made(tmp_path / "deep" / "ring-002", replace(CONFIG, seed=3, road={"cavs": 2}), 400)
+    made(tmp_path / "deep" / "ring-002", replace(CONFIG, seed=3, scenario_options={"cavs": 2}), 400)
     made(tmp_path / "merge-001", replace(CONFIG, scenario="merge", expert="acc"), 0)
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "config.toml").write_text("mine = 1")

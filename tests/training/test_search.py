@@ -24,7 +24,7 @@ from unjam.training.search import (
 )
 from unjam.training.search_space import Categorical, NumericRange, parse_search_space
 
-BASE = small_config(evaluation__every=1)
+BASE = small_config(evaluation__validation_interval=1)
 SPACE = parse_search_space(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch_size=8,16", "trpo.critic_epochs=1..9"])
 
 
@@ -59,12 +59,12 @@ def test_nothing_to_vary_is_refused() -> None:
         ({}, "trpo.nothing=1..2", "trpo.nothing: unknown name"),
         ({}, "trpo.gamma=0.9..1.5", "trpo.gamma: 1.5 is not allowed"),
         ({}, "expert=pi,nobody", "nobody"),
-        ({"evaluation__every": 0}, "trpo.gamma=0.9..0.99", "judged by validations"),
+        ({"evaluation__validation_interval": 0}, "trpo.gamma=0.9..0.99", "judged by validations"),
     ],
 )
 def test_what_cannot_work_is_told_before_anything_is_trained(changes: dict[str, Any], text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        check_search_space(small_config(**{"evaluation__every": 1, **changes}), parse_search_space([text]))
+        check_search_space(small_config(**{"evaluation__validation_interval": 1, **changes}), parse_search_space([text]))
 
 
 def test_a_trial_differs_from_the_base_in_its_values_alone() -> None:
@@ -151,7 +151,7 @@ def test_the_best_comes_first_and_is_there_to_be_trained_with(tmp_path: Path, tr
     assert abs(math.log10(best.trpo.target_kl) + 2) < 0.2
     written = json.loads((tmp_path / "search" / "search.json").read_text())
     assert [row["gain"] for row in written["trials"]] == pytest.approx(gains)
-    assert all(row["last"] <= row["gain"] for row in written["trials"])
+    assert all(row["last_gain"] <= row["gain"] for row in written["trials"])
     assert written["manifest"]["packages"]["torch"]
 
 

@@ -23,9 +23,9 @@ from unjam.worlds.worker_pool import WorkerPool
 torch.set_num_threads(1)  # as a training does
 
 EIGHT = {"radius": [30, 31], "vehicles": 8}
-SHORT = {"road": {"length": [90, 100], "vehicles": 6}, "name": "short"}
+SHORT = {"scenario_options": {"length": [90, 100], "vehicles": 6}, "name": "short"}
 MIXTURE: list[dict[str, Any]] = [{"weight": 2.0}, SHORT]
-VIRTUAL = {"virtual__members": 2, "virtual__epochs": 2, "virtual__hidden": [8]}
+VIRTUAL = {"model__members": 2, "model__epochs": 2, "model__hidden": [8]}
 
 
 def mixture(**changes: Any) -> RunConfig:
@@ -128,7 +128,7 @@ def test_progress_is_of_all_roads_and_of_each(tmp_path: Path) -> None:
 @pytest.mark.parametrize("sees_road", [True, False])
 def test_the_critic_sees_which_road_it_is_and_what_that_has_drawn(tmp_path: Path, sees_road: bool) -> None:
     with WorkerPool(1) as workers:
-        trainer = Trainer(tmp_path, mixture(policy__critic_sees_road=sees_road), workers)
+        trainer = Trainer(tmp_path, mixture(policy__privileged_critic=sees_road), workers)
         training = trainer.training
         episodes = trainer.collect(training.learner.network(), 1)
         rows = environment_experience(training, episodes)
@@ -171,14 +171,14 @@ def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("agent", "exploration"), [("trpo", "anew"), ("trpo", "mirrored"), ("ppo", "mirrored")])
+@pytest.mark.parametrize(("agent", "exploration"), [("trpo", "per_step"), ("trpo", "antithetic"), ("ppo", "antithetic")])
 def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, tmp_path: Path) -> None:
-    mixture = {"tasks": [{"road": {"length": [120, 125]}}, {"road": {"vehicles": 7}, "name": "fewer"}]}
+    mixture = {"tasks": [{"scenario_options": {"length": [120, 125]}}, {"scenario_options": {"vehicles": 7}, "name": "fewer"}]}
     runs = {}
     for world in ("sumo", "batch"):
         with WorkerPool(1) as workers:
-            how = {"world": world, "agent": agent, "policy.exploration": exploration}
-            how |= {"model.model_ratio": 0.0} if exploration == "mirrored" else {}
+            how = {"simulator": world, "agent": agent, "policy.exploration": exploration}
+            how |= {"model.model_ratio": 0.0} if exploration == "antithetic" else {}
             learn_with(workers, tmp_path / world, small_config(**mixture, **how))
         runs[world] = read_progress(tmp_path / world)
     for one, other in zip(runs["sumo"], runs["batch"], strict=True):
@@ -191,13 +191,13 @@ def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, t
 
 def test_roads_that_cannot_be_batched_are_driven_in_sumo_beside_those_that_can(tmp_path: Path) -> None:
     ring = {"length": [120, 130], "vehicles": 8}
-    tasks = [{"road": ring}, {"scenario": "figure-eight", "road": EIGHT}, {"road": ring, "name": "other"}]
-    small = {"tasks": tasks, "road": {"horizon": 100}, "trpo.steps_per_iteration": 300, "policy.hidden": [8]}
+    tasks = [{"scenario_options": ring}, {"scenario": "figure-eight", "scenario_options": EIGHT}, {"scenario_options": ring, "name": "other"}]
+    small = {"tasks": tasks, "scenario_options": {"horizon": 100}, "trpo.steps_per_iteration": 300, "policy.hidden": [8]}
     folders = {world: tmp_path / world for world in ("sumo", "batch")}
     driven = {}
     for world, folder in folders.items():
         with WorkerPool(1) as workers:
-            trainer = Trainer(folder, load_config(changes=small | {"world": world}), workers)
+            trainer = Trainer(folder, load_config(changes=small | {"simulator": world}), workers)
             driven[world] = trainer.collect(trainer.training.learner.network(), 1)
     for one, other in zip(driven["sumo"], driven["batch"], strict=True):
         assert [episode.seed for episode in one] == [episode.seed for episode in other]
@@ -215,7 +215,7 @@ def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(
         return [1.0, 1.0 if trainer.training.iteration else 1e6]  # the expert's were better
 
     monkeypatch.setattr(Trainer, "validation_returns", validated)
-    config = mixture(sampling="regret", tasks=[{}, SHORT], trpo__batch_steps=600, steps=1800)
+    config = mixture(task_sampling="regret", tasks=[{}, SHORT], trpo__steps_per_iteration=600, steps=1800)
     places = [tmp_path / "one go", tmp_path / "run"]
     with WorkerPool(1) as workers:
         learn_with(workers, places[0], config)
@@ -229,14 +229,14 @@ def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(
     assert [row["episodes"] for row in one] == [6, 7, 7]
 
 
-@pytest.mark.parametrize("changes", [{"tasks": []}, {"evaluation__every": 0}], ids=["one road", "no validation"])
+@pytest.mark.parametrize("changes", [{"tasks": []}, {"evaluation__validation_interval": 0}], ids=["one road", "no validation"])
 def test_sampling_by_regret_wants_several_roads_that_are_validated(changes: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="sampling: regret is not allowed; allowed: weights"):
-        mixture(sampling="regret", **changes)
+    with pytest.raises(InputError, match="task_sampling: regret is not allowed; allowed: weights"):
+        mixture(task_sampling="regret", **changes)
 
 
 def test_a_network_acts_within_the_narrowest_limits_of_its_roads(tmp_path: Path) -> None:
-    config = mixture(tasks=[{"road": {"action_limit": 2.0}}, {"road": {"action_limit": 0.5}, "name": "gentle"}])
+    config = mixture(tasks=[{"scenario_options": {"action_limit": 2.0}}, {"scenario_options": {"action_limit": 0.5}, "name": "gentle"}])
     with WorkerPool(1) as workers:
         trainer = Trainer(tmp_path, config, workers)
         strong, gentle = trainer.make_drivers(trainer.training.learner.network())

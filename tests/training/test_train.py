@@ -18,7 +18,7 @@ from unjam.errors import InputError, UnjamError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_progress, read_results
 from unjam.training.config import RunConfig
-from unjam.training.evaluate import test_gain
+from unjam.training.evaluate import gain_over_expert
 from unjam.training.run_folder import read_config
 from unjam.training.seeds import make_test_seeds
 from unjam.training.train import TrainResult, train
@@ -37,7 +37,7 @@ CONTENT = {
     "model.json",
     "progress.jsonl",
     "report.html",
-    "shown.safetensors",
+    "plot_episodes.safetensors",
 }
 
 
@@ -164,7 +164,7 @@ def same_rows(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> bool:
 
 @pytest.mark.slow
 def test_a_network_learns_without_an_expert(tmp_path: Path) -> None:
-    config = small_config(expert="none", evaluation__baselines=(), evaluation__every=0)
+    config = small_config(expert="none", evaluation__baselines=(), evaluation__validation_interval=0)
     result = train(config, tmp_path / "run")
     assert result.gain is None
     assert list(result.rows) == ["trained"]
@@ -199,6 +199,6 @@ def test_the_gain_is_that_over_an_expert_with_parameters() -> None:
         expert: [{"seed": (1, 0), "return": 5.0}, {"seed": (1, 1), "return": 6.0}],
         "trained": [{"seed": (1, 1), "return": 9.0}, {"seed": (1, 0), "return": 6.0}],
     }
-    gain = test_gain(config, rows)
+    gain = gain_over_expert(config, rows)
     assert gain is not None
     assert gain.mean == pytest.approx(2.0)

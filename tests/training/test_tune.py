@@ -36,7 +36,7 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 SMALL = Ring(horizon=60)
 FINAL = (TUNING_FINALISTS + 1) * 2 * TUNING_EPISODES * 60
 STEPS = FINAL + 4 * TUNING_EPISODES * 60
-RAMP_SPACE: SearchSpace = {"margin": NumericRange(-4.0, 4.0)}
+RAMP_SPACE: SearchSpace = {"speed_margin": NumericRange(-4.0, 4.0)}
 SPACE = {"catch_up_speed": NumericRange(0.5, 3.0), "safe_gap_rule": Categorical(("constant", "closing"))}
 
 
@@ -55,7 +55,7 @@ def test_a_tuned_expert_is_written_and_no_worse_than_it_was(tmp_path: Path) -> N
     assert found.best.values.items() <= vars(driver).items()
     written = json.loads((tmp_path / TUNING_FILE).read_text())
     assert written["best"]["driver"] == found.best.driver
-    assert len(written["settings"]) == 4
+    assert len(written["trials"]) == 4
 
 
 @pytest.mark.long
@@ -86,7 +86,7 @@ def test_a_tuning_that_was_stopped_goes_on_where_it_was(tmp_path: Path, monkeypa
             WorkerPool, "run_and_map", lambda pool, tasks, keep: driven.append(len(tasks)) or run(pool, tasks, keep)
         )
         with (folder / TRIALS_FILE).open("a") as file:
-            file.write('{"first": 0, "driver": "cut sho')
+            file.write('{"first_seed": 0, "driver": "cut sho')
         found = tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers)
         assert (found.trials, found.best, found.default) == (whole.trials, whole.best, whole.default)
         assert driven == [
@@ -116,7 +116,7 @@ def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simula
         assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-9)
         assert setting.verdict == overall_feasibility(rows)
     written = json.loads((tmp_path / TUNING_FILE).read_text())
-    assert written["batch_steps"] == found.batch_steps
+    assert written["steps_per_iteration"] == found.batch_steps
 
 
 def test_roads_that_cannot_be_stepped_in_a_batch_are_not_screened(tmp_path: Path) -> None:
@@ -128,8 +128,8 @@ def test_roads_that_cannot_be_stepped_in_a_batch_are_not_screened(tmp_path: Path
 def test_on_ramps_are_screened_in_batches_where_each_setting_has_roads_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("unjam.training.tune.EPISODES", 2)
-    monkeypatch.setattr("unjam.training.tune.FINALISTS", 1)
+    monkeypatch.setattr("unjam.training.tune.TUNING_EPISODES", 2)
+    monkeypatch.setattr("unjam.training.tune.TUNING_FINALISTS", 1)
     road = replace(ON_RAMP, horizon=60, penetration_rate=0.5)
     with WorkerPool(1) as workers:
         found = tune({"on-ramp": road}, "jam-ahead", RAMP_SPACE, (8 + 4) * 60, tmp_path, workers, screen=None)
@@ -151,8 +151,8 @@ def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:
     assert space["catch_up_speed"] == NumericRange(0.25, 4.0, log=True)
     assert space["safe_gap_rule"] == Categorical(("constant", "closing"))
     assert "time_step" not in space
-    assert default_search_space("pacer", 0.1)["varying"] == Categorical((False, True))
-    first = default_search_space("jam-ahead", 1.0)["first"]  # zero by default
+    assert default_search_space("pacer", 0.1)["use_tuned"] == Categorical((False, True))
+    first = default_search_space("jam-ahead", 1.0)["first_section"]  # zero by default
     assert first == NumericRange(0, 4)
     assert isinstance(first, NumericRange)
     assert first.is_integer
@@ -162,11 +162,11 @@ def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:
 
 
 def test_whole_ends_of_a_parameter_that_is_none_are_no_integers() -> None:
-    asked = ["gathering_speed=1..3", "varying=true,false"]
+    asked = ["gathering_speed=1..3", "use_tuned=true,false"]
     space = expert_search_space(asked, default_search_space("pacer", 0.1))
-    assert space == {"gathering_speed": NumericRange(1.0, 3.0), "varying": Categorical((True, False))}
+    assert space == {"gathering_speed": NumericRange(1.0, 3.0), "use_tuned": Categorical((True, False))}
     first, speed = (
-        expert_search_space(["first=1..3"], default_search_space("jam-ahead", 1.0))["first"],
+        expert_search_space(["first_section=1..3"], default_search_space("jam-ahead", 1.0))["first_section"],
         space["gathering_speed"],
     )
     assert isinstance(first, NumericRange)
@@ -242,7 +242,7 @@ def test_finalists_are_different_settings_and_none_is_driven_twice(
         driven.extend(f"{rest[0]} {driver}" for driver in drivers)
         return actual(roads, drivers, *rest)
 
-    monkeypatch.setattr(tuning, "_driven", noted)
+    monkeypatch.setattr(tuning, "_run_drivers", noted)
     two: SearchSpace = {"safe_gap_rule": Categorical(("constant", "closing"))}
     with WorkerPool(1) as workers:
         found = tune({"ring": SMALL}, "pi", two, STEPS, tmp_path, workers)

@@ -37,7 +37,7 @@ def evaluate_command(
     """
     from unjam.drivers.registry import DRIVERS
     from unjam.reports.results import read_results
-    from unjam.training.evaluate import evaluate_run, evaluation_steps, test_gain
+    from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
     from unjam.training.run_folder import check_run_files, lock_new_folder, read_config
     from unjam.worlds.worker_pool import WorkerPool
 
@@ -61,7 +61,7 @@ def evaluate_command(
         page = write_report_page([target], target / "report.html")
     results = read_results(target)
     if json:
-        gain, means = test_gain(config, evaluation.rows), evaluation.means()
+        gain, means = gain_over_expert(config, evaluation.rows), evaluation.means()
         facts = {"run": str(run), "scenario": config.scenario, "gain": asdict(gain) if gain else None}
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in evaluation.rows.items()]
         print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})

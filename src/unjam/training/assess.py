@@ -35,7 +35,7 @@ from unjam.training.selection import (
     OptionMessageCallback,
     OptionRows,
     Selection,
-    TestFindings,
+    AssessmentFindings,
     compare_on_test_seeds,
     format_duration,
     min_episodes,
@@ -250,7 +250,7 @@ def assess(
 def _assessment_document(
     request: AssessmentRequest,
     selection: Selection,
-    findings: TestFindings,
+    findings: AssessmentFindings,
     selection_episodes: int,
     budget: EpisodeBudget,
 ) -> dict[str, Any]:

@@ -235,7 +235,7 @@ def evaluate_run(
     return found
 
 
-def test_gain(config: RunConfig, rows: RowsByDriver) -> Estimate | None:
+def gain_over_expert(config: RunConfig, rows: RowsByDriver) -> Estimate | None:
     """Return what the trained controller earns beyond its expert, same seeds paired."""
     if config.expert == "none":
         return None

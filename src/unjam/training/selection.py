@@ -159,7 +159,7 @@ def select_controllers(
 
 
 @dataclass(frozen=True)
-class TestFindings:
+class AssessmentFindings:
     """What the test seeds have shown."""
 
     rows: dict[Option, OptionRows]
@@ -175,7 +175,7 @@ def compare_on_test_seeds(
     budget: EpisodeBudget,
     precision: float,
     on_message: OptionMessageCallback,
-) -> TestFindings:
+) -> AssessmentFindings:
     """Compare human baseline, ACC vehicles and the chosen controllers on test seeds.
 
     An option is driven until its intervals are narrower than `precision`, a share of the travel time of the
@@ -220,7 +220,7 @@ def compare_on_test_seeds(
     driven = [row for option in baselines for row in rows[option]]
     if all(row["status"] == "failed" for row in driven):
         raise_failure(driven)
-    return TestFindings(rows, judged, acc)
+    return AssessmentFindings(rows, judged, acc)
 
 
 def _controller_result(

@@ -25,7 +25,7 @@ from unjam.reports.html import write_report_page
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, to_toml
 from unjam.training.early_stopping import should_stop_early
-from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, raise_failure, test_gain
+from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, raise_failure, gain_over_expert
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
 from unjam.training.fingerprint import fingerprint
@@ -114,7 +114,7 @@ def train(
     train_it = train_in_subprocess if needs_new_process() else train_in_process
     rows = train_it(config, folder, resume, on_iteration, progress)
     results = {
-        name: TrainResult(folder / name, rows[name], test_gain(road, rows[name]))
+        name: TrainResult(folder / name, rows[name], gain_over_expert(road, rows[name]))
         for name, road in config.task_configs().items()
     }
     return TrainResult(folder, {}, None, results) if config.tasks else results[""]

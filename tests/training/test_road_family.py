@@ -5,7 +5,7 @@ import pytest
 from unjam.scenarios.ring import Ring
 from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
 
-SEEN, HELD_OUT = family_scenarios("everywhere", "seen"), family_scenarios("everywhere", "combination", "axis")
+SEEN, HELD_OUT = family_scenarios("all-roads", "training"), family_scenarios("all-roads", "combination", "axis")
 
 
 def test_no_road_that_is_held_out_is_seen() -> None:
@@ -25,10 +25,10 @@ def test_each_held_out_axis_lies_beyond_what_is_seen() -> None:
 
 @pytest.mark.parametrize("group", ROAD_GROUPS)
 def test_every_group_has_roads_of_both_kinds(group: str) -> None:
-    assert family_scenarios(group, "seen")
+    assert family_scenarios(group, "training")
     assert family_scenarios(group, "combination", "axis")
 
 
 def test_rings_are_shared_where_six_in_a_hundred_are_cavs() -> None:
-    assert list(family_scenarios("shared-rings", "seen")) == ["ring-33-growing-3-cavs", "ring-66-grown-4-cavs"]
+    assert list(family_scenarios("shared-rings", "training")) == ["ring-33-growing-3-cavs", "ring-66-grown-4-cavs"]
     assert list(family_scenarios("shared-rings", "combination", "axis")) == ["ring-44-grown-5-cavs"]

@@ -11,17 +11,17 @@ from unjam.training import batch_benchmark, benchmark
 from unjam.training.batch_benchmark import benchmark_batches, make_benchmark_driver
 from unjam.training.benchmark import benchmark_episodes
 
-RATES = ("bare_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_step_steps_per_s")
+RATES = ("sumo_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_step_steps_per_s")
 
 
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measures less, and so less exactly."""
     monkeypatch.setattr(benchmark, "TRACI_STEPS", 50)
-    monkeypatch.setattr(benchmark, "VIRTUAL", {"long": (500, 20), "short": (50, 10)})
-    monkeypatch.setattr(benchmark, "SIZES", {22: 200, 66: 100})
-    monkeypatch.setattr(benchmark, "BATCH", 2200)
-    monkeypatch.setattr(batch_benchmark, "DECISIONS", 20)
+    monkeypatch.setattr(benchmark, "ROLLOUT_SIZES", {"long": (500, 20), "short": (50, 10)})
+    monkeypatch.setattr(benchmark, "RING_SIZES", {22: 200, 66: 100})
+    monkeypatch.setattr(benchmark, "BATCH_VEHICLES", 2200)
+    monkeypatch.setattr(batch_benchmark, "STEPS_PER_ROUND", 20)
 
 
 @pytest.fixture(autouse=True)
@@ -52,21 +52,21 @@ def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_no
     found = benchmark_episodes(1, told.append)
     assert found["rounds"] == 1
     assert min(found[name] for name in RATES) > 0
-    assert found["over_bare"] == pytest.approx(found["episode_steps_per_s"] / found["bare_steps_per_s"])
-    assert found["over_bare_every_step"] == pytest.approx(found["every_step_steps_per_s"] / found["bare_steps_per_s"])
-    assert found["over_traci"] > 2.0
-    for rollouts in found["virtual"].values():
-        assert rollouts["over_actual"] == pytest.approx(rollouts["steps_per_s"] / found["episode_steps_per_s"])
-    assert found["virtual"]["long"]["over_actual"] > 2.0
+    assert found["relative_to_sumo"] == pytest.approx(found["episode_steps_per_s"] / found["sumo_steps_per_s"])
+    assert found["relative_to_sumo_every_step"] == pytest.approx(found["every_step_steps_per_s"] / found["sumo_steps_per_s"])
+    assert found["relative_to_traci"] > 2.0
+    for rollouts in found["model"].values():
+        assert rollouts["relative_to_environment"] == pytest.approx(rollouts["steps_per_s"] / found["episode_steps_per_s"])
+    assert found["model"]["long"]["relative_to_environment"] > 2.0
     batch = found["batch"]
     assert batch["rings"] == 100
-    assert batch["over_bare"] == pytest.approx(batch["steps_per_s"] / found["bare_steps_per_s"])
+    assert batch["relative_to_sumo"] == pytest.approx(batch["steps_per_s"] / found["sumo_steps_per_s"])
     assert [entry["vehicles"] for entry in batch["scaling"]] == [22, 66]
-    for road in found["roads"].values():
-        assert road["over_bare"] == pytest.approx(road["episode_steps_per_s"] / road["bare_steps_per_s"])
+    for road in found["scenarios"].values():
+        assert road["relative_to_sumo"] == pytest.approx(road["episode_steps_per_s"] / road["sumo_steps_per_s"])
     costs = [entry["us_per_vehicle_step"] for entry in found["scaling"]]
     assert [entry["vehicles"] for entry in found["scaling"]] == [22, 66]
-    assert found["growth"] == max(costs) / costs[0]
+    assert found["cost_growth"] == max(costs) / costs[0]
     assert told == ["round 1 of 1", "larger roads"]
     assert cores is None or os.sched_getaffinity(0) == cores
 
@@ -74,12 +74,12 @@ def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_no
 def test_batches_of_growing_size_are_measured_with_people_who_have_networks_and_without(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(batch_benchmark, "DECISIONS", 3)
-    monkeypatch.setattr(batch_benchmark, "RINGS", {"cpu": (2, 5)})
+    monkeypatch.setattr(batch_benchmark, "STEPS_PER_ROUND", 3)
+    monkeypatch.setattr(batch_benchmark, "BATCH_SIZES", {"cpu": (2, 5)})
     told: list[str] = []
     found = benchmark_batches("cpu", told.append)
     assert found["device"] == "one core"
-    assert list(found["batches"]) == ["people by IDM", "by IDM and networks"]
+    assert list(found["batches"]) == ["human drivers by IDM", "human drivers by IDM and networks"]
     for rates in found["batches"].values():
         assert [entry["rings"] for entry in rates] == [2, 5]
         assert all(entry["vehicle_steps_per_s"] == pytest.approx(22 * entry["steps_per_s"]) for entry in rates)
@@ -88,5 +88,5 @@ def test_batches_of_growing_size_are_measured_with_people_who_have_networks_and_
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU")
 def test_batches_on_a_graphics_card_that_is_not_there_are_refused() -> None:
-    with pytest.raises(MissingPartError, match="device: cuda is not there; use cpu"):
+    with pytest.raises(MissingPartError, match="device: cuda is not available; allowed: cpu"):
         benchmark_batches("cuda")

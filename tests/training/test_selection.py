@@ -21,7 +21,7 @@ from unjam.training.selection import (
     EpisodeSeed,
     Option,
     OptionRows,
-    TestFindings,
+    AssessmentFindings,
     compare_on_test_seeds,
     min_episodes,
     select_controllers,
@@ -65,7 +65,7 @@ def shifted(mean: float, spread: float = 0.3, **changes: Any) -> Change:
     return lambda generator: {"travel_time": generator.normal(mean, spread), **changes}
 
 
-def run_judge(drive: MadeUp, finalists: Sequence[Option], precision: float = 0.01, split: bool = False) -> TestFindings:
+def run_judge(drive: MadeUp, finalists: Sequence[Option], precision: float = 0.01, split: bool = False) -> AssessmentFindings:
     shares = tuple(dict.fromkeys(option.penetration_rate for option in finalists)) or (0.1,)
     return compare_on_test_seeds(finalists, shares, split, drive, drive.budget, precision, quiet)
 
@@ -104,7 +104,7 @@ def test_less_flow_is_a_loss_however_quick() -> None:
 
 
 def test_feasible_controllers_come_before_quick_ones() -> None:
-    drive = MadeUp({IDM: shifted(-9, 20.0, min_headway=0.1), PI: shifted(0, 20.0)})
+    drive = MadeUp({IDM: shifted(-9, 20.0, min_time_gap=0.1), PI: shifted(0, 20.0)})
     assert select_controllers([IDM, PI], drive, drive.budget, quiet).finalists == [PI]
 
 
@@ -164,7 +164,7 @@ def test_the_same_gain_as_that_of_acc_vehicles_is_no_gain_of_the_controller() ->
     [
         shifted(5.0),
         shifted(-9.0, outflow_veh_per_h=1900.0),
-        shifted(-9.0, min_headway=0.1),
+        shifted(-9.0, min_time_gap=0.1),
         shifted(-0.01, 30.0),
         lambda generator: {"status": "failed", "reason": "lost", "error": "EpisodeError"},
     ],

@@ -48,11 +48,11 @@ def test_patience_counts_validations_since_the_best(validations: list[float | No
 )
 def test_converged_is_who_earns_no_more_than_before(returns: list[float], span: int, over: bool) -> None:
     rows = [{"return_mean": value} for value in returns]
-    assert has_converged(small_config(evaluation__converged=span), rows) is over
+    assert has_converged(small_config(evaluation__convergence_window=span), rows) is over
 
 
 def test_the_policy_that_has_converged_is_the_controller(tmp_path: Path) -> None:
-    config = small_config(steps=20 * STEPS, evaluation__every=0, evaluation__converged=1)
+    config = small_config(steps=20 * STEPS, evaluation__validation_interval=0, evaluation__convergence_window=1)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     returns = [row["return_mean"] for row in read_progress(tmp_path / "run")]
@@ -65,7 +65,7 @@ def test_the_validation_of_what_has_converged_is_in_its_progress_and_judges_a_tr
 ) -> None:
     returns = iter([5.0, 7.5])  # of the expert, and where it ends: before any validation was due
     monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
-    config = small_config(steps=20 * STEPS, evaluation__every=50, evaluation__converged=1)
+    config = small_config(steps=20 * STEPS, evaluation__validation_interval=50, evaluation__convergence_window=1)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = [row["return_validation"] for row in read_progress(tmp_path / "run")]
@@ -90,7 +90,7 @@ def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
 ) -> None:
     returns = iter([5.0, 4.0, 6.0])  # of the expert, after two iterations, and where it ends
     monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
-    config = small_config(steps=20 * STEPS, evaluation__every=2)
+    config = small_config(steps=20 * STEPS, evaluation__validation_interval=2)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config, lambda row: row["iteration"] < 3)
     assert [row["return_validation"] for row in read_progress(tmp_path / "run")] == [None, 4.0, None]
@@ -99,7 +99,7 @@ def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
 
 @pytest.mark.long
 def test_what_a_callback_ended_goes_on_as_if_it_never_had(tmp_path: Path) -> None:
-    config = small_config(steps=2 * STEPS, evaluation__every=2)
+    config = small_config(steps=2 * STEPS, evaluation__validation_interval=2)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "stopped", config, lambda row: False)
         learn_with(workers, tmp_path / "stopped", config, resume=True)
@@ -136,7 +136,7 @@ def test_who_has_converged_or_given_up_stays_so_when_it_is_resumed(
     monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
     for name, settings in (
         ("gave up", {"evaluation__patience": 2}),
-        ("converged", {"evaluation__every": 0, "evaluation__converged": 1}),
+        ("converged", {"evaluation__validation_interval": 0, "evaluation__convergence_window": 1}),
     ):
         config, folder = small_config(steps=20 * STEPS, **settings), tmp_path / name
         with WorkerPool(1) as workers:
@@ -150,4 +150,4 @@ def test_a_validation_at_an_end_that_a_longer_run_would_not_make_counts_for_no_p
     rows = [{"iteration": number, "return_expert": 10.0} for number in range(1, 5)]
     for row, found in zip(rows, (None, 12.0, 11.0, 11.5), strict=True):
         row["return_validation"] = found  # pyright: ignore[reportArgumentType]
-    assert not is_out_of_patience(small_config(evaluation__every=2, evaluation__patience=2), rows)
+    assert not is_out_of_patience(small_config(evaluation__validation_interval=2, evaluation__patience=2), rows)
