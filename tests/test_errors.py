@@ -14,7 +14,7 @@ from unjam.worlds.reward import make_reward
     [
         (lambda: make_scenario("rign-jammed"), "ring-jammed"),
         (lambda: make_scenario("ring", {"vehicels": 3}), "vehicles"),
-        (lambda: make_scenario("ring", {"safety.time_headwy": 1}), "time_headway"),
+        (lambda: make_scenario("ring", {"safety.time_gp": 1}), "time_gap"),
         (lambda: driver_from_name("folower-stopper", 0.1), "follower-stopper"),
         (lambda: driver_from_name("pi:time_constnt=1", 0.1), "time_constant"),
         (lambda: make_reward("relased"), "released"),

@@ -63,11 +63,11 @@ def test_a_write_that_the_system_cuts_short_leaves_what_was_there(tmp_path: Path
 import resource, signal
 from pathlib import Path
 from unjam.errors import DiskError
-from unjam.files import write_whole
+from unjam.files import atomic_write
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 try:
-    write_whole(Path({str(path)!r}), b"x" * 5000)
+    atomic_write(Path({str(path)!r}), b"x" * 5000)
 except DiskError as error:
     print(error)
 """
@@ -209,8 +209,8 @@ def test_a_child_process_follows_no_link_in_what_its_parent_holds(outside: Path,
     (tmp_path / "results" / "trials").mkdir(parents=True)
     code = (
         "import sys\nfrom pathlib import Path\nfrom unjam.errors import InputError\n"
-        "from unjam.files import write_whole\n"
-        "try:\n    write_whole(Path(sys.argv[1]), 'new')\nexcept InputError as error:\n    print(error)\n"
+        "from unjam.files import atomic_write\n"
+        "try:\n    atomic_write(Path(sys.argv[1]), 'new')\nexcept InputError as error:\n    print(error)\n"
     )
     with lock_folder(tmp_path / "results"):
         (tmp_path / "results" / "trials" / "0").symlink_to(outside)

@@ -36,7 +36,7 @@ OF = {
 """what each may change"""
 
 needs_avx2 = pytest.mark.skipif(
-    not kernels.has_pinned_kernels(), reason=f"not pinned: {kernels.kernel_info()['unsupported_reason']}"
+    not kernels.has_pinned_kernels(), reason=f"not pinned: {kernels.kernel_info()['unpinned_reason']}"
 )
 
 
@@ -57,7 +57,7 @@ def run(program: str, **variables: str) -> dict[str, Any]:
 
 
 OPERATIONS = "import unjam, json; from tests.kernels import operations; print(json.dumps(operations.hashes()))"
-STATE = "import {first}, json; import unjam; from unjam.kernels import kernels; print(json.dumps(kernels()))"
+STATE = "import {first}, json; import unjam; from unjam.kernels import kernel_info; print(json.dumps(kernel_info()))"
 
 
 @pytest.mark.long
@@ -70,7 +70,7 @@ def test_whatever_the_shell_says_the_bits_are_the_committed_ones() -> None:
 @needs_avx2
 @pytest.mark.parametrize("variable", UNPINNED)
 def test_each_variable_matters_and_changes_nothing_else(variable: str) -> None:
-    varied = {**kernels.kernel_settings(), variable: UNPINNED[variable], kernels.KERNELS_VARIABLE: "own"}
+    varied = {**kernels.kernel_settings(), variable: UNPINNED[variable], kernels.KERNELS_VARIABLE: "native"}
     found = run(OPERATIONS, **varied)
     moved = {kind for kind, value in found.items() if value != GOLDEN["operations"][kind]}
     assert moved <= OF[variable]
@@ -95,7 +95,7 @@ def test_trainings_of_all_learners_end_with_the_committed_bits() -> None:
 def test_says_what_is_in_force() -> None:
     found = run(STATE.format(first="unjam, torch"))
     assert found["pinned"]
-    assert found["unsupported_reason"] is None
+    assert found["unpinned_reason"] is None
     assert (found["openblas"], found["torch"]) == ("Haswell", "AVX2")
     assert not [name for name in found["numpy"] if "512" in name or name == "X86_V4"]
     assert found["settings"] == kernels.kernel_settings()
@@ -106,12 +106,12 @@ def test_says_what_is_in_force() -> None:
 def test_says_that_numpy_came_first() -> None:
     found = run(STATE.format(first="numpy"))
     assert not found["pinned"]
-    assert found["unsupported_reason"] == "numpy was imported before unjam"
+    assert found["unpinned_reason"] == "numpy was imported before unjam"
     assert run(STATE.format(first="numpy"), **kernels.kernel_settings())["pinned"]
 
 
 def test_leaves_all_as_it_is_where_asked() -> None:
-    found = run(STATE.format(first="unjam"), **{kernels.KERNELS_VARIABLE: "own"})
+    found = run(STATE.format(first="unjam"), **{kernels.KERNELS_VARIABLE: "native"})
     assert not found["pinned"]
     assert set(found["settings"].values()) == {None}
 
@@ -123,7 +123,7 @@ def test_asks_nothing_of_other_processors(
     machine: str, flags: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "machine", lambda: machine)
-    monkeypatch.setattr(kernels, "processor", lambda: {"flags": flags})
+    monkeypatch.setattr(kernels, "processor_info", lambda: {"flags": flags})
     assert words in (kernels._find_obstacle() or "")
 
 
@@ -132,12 +132,12 @@ import numpy, json, sys
 import unjam
 from unjam.errors import InputError
 from unjam.training.config import RunConfig
-from unjam.kernels import pinned
-from unjam.parameters import build
-assert not pinned()
+from unjam.kernels import has_pinned_kernels
+from unjam.parameters import build_dataclass
+assert not has_pinned_kernels()
 values, folder = json.loads({given!r})
 rows, judged = [], []
-config = build(RunConfig, values, "")
+config = build_dataclass(RunConfig, values, "")
 
 def first_alone(row):
     rows.append(row)
@@ -148,7 +148,7 @@ print(json.dumps([[row["iteration"] for row in rows], len(judged) > 0, result.ga
 """
 REFUSED = """
 try:
-    unjam.train(build(RunConfig, values, ""), folder)
+    unjam.train(build_dataclass(RunConfig, values, ""), folder)
 except InputError as error:
     print(json.dumps(str(error)))
 """

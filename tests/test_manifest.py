@@ -43,7 +43,7 @@ def test_names_the_command_without_the_place_of_the_program(monkeypatch: pytest.
 
 
 def test_a_package_that_is_missing_has_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PACKAGES", ("numpy", "no-such-package-of-ours"))
+    monkeypatch.setattr(module, "RECORDED_PACKAGES", ("numpy", "no-such-package-of-ours"))
     assert manifest()["packages"] == {"numpy": version("numpy"), "no-such-package-of-ours": None}
 
 

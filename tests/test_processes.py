@@ -33,8 +33,8 @@ from unjam.training.train import train
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux tells a process that its parent is gone")
 HOLD = (
-    "import sys\nfrom pathlib import Path\nfrom unjam.processes import owned\n"
-    "with owned(Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
+    "import sys\nfrom pathlib import Path\nfrom unjam.processes import lock_folder\n"
+    "with lock_folder(Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
 )
 
 
@@ -92,8 +92,8 @@ def test_what_a_killed_owner_left_of_a_folder_is_a_new_one(tmp_path: Path) -> No
 
 
 CHILD = (
-    "import os, signal, time\nfrom unjam.processes import end_with_parent\n"
-    "end_with_parent(signal.SIGKILL)\nprint(os.getpid(), flush=True)\n"
+    "import os, signal, time\nfrom unjam.processes import exit_with_parent\n"
+    "exit_with_parent(signal.SIGKILL)\nprint(os.getpid(), flush=True)\n"
     "while True:\n    pass\n"
 )
 
@@ -101,9 +101,9 @@ CHILD = (
 @linux
 def test_a_busy_process_ends_with_the_one_that_started_it() -> None:
     code = (
-        "import os, signal, subprocess, sys\nfrom unjam.processes import bound\n"
+        "import os, signal, subprocess, sys\nfrom unjam.processes import bind_to_parent\n"
         f"child = subprocess.Popen([sys.executable, '-c', {CHILD!r}], stdout=subprocess.PIPE, text=True,\n"
-        "    env=bound(os.environ))\n"
+        "    env=bind_to_parent(os.environ))\n"
         "print(child.stdout.readline(), flush=True)\nos.kill(os.getpid(), signal.SIGKILL)\n"
     )
     parent = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -131,8 +131,8 @@ def test_nobody_else_is_bound(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_training_that_was_started_for_another_ends_with_it(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys, threading, time\nfrom pathlib import Path\n"
-        "from unjam.training.executors import CommandLine, Processes\n"
-        "processes, folder = Processes(), Path(sys.argv[1])\n"
+        "from unjam.training.executors import CommandLine, LocalExecutor\n"
+        "processes, folder = LocalExecutor(), Path(sys.argv[1])\n"
         "words = ['train', 'ring', '--steps', '100000000', '--workers', '1', '--out', str(folder / 'run')]\n"
         "command = CommandLine(words, folder / 'log')\n"
         "threading.Thread(target=processes.run, args=(command,), daemon=True).start()\n"
@@ -192,7 +192,7 @@ def test_an_owner_on_another_machine_holds_a_folder_while_its_heart_beats(tmp_pa
 
 
 def test_the_heart_of_an_owner_beats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("unjam.processes.HEARTBEAT", 0.01)
+    monkeypatch.setattr("unjam.processes.HEARTBEAT_INTERVAL", 0.01)
     with lock_folder(tmp_path):
         os.utime(tmp_path / LOCK_FILE, (1, 1))
         patience = time.monotonic() + 5

@@ -89,7 +89,7 @@ def test_networks_of_others_are_read_under_a_smaller_limit_of_memory(tmp_path: P
     code = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (2**31, 2**31))\n"
         "from unjam.drivers import IDM\nfrom unjam.scenarios import make_scenario\n"
-        "from unjam.worlds.worker_pool import EpisodeTask, Workers\n"
+        "from unjam.worlds.worker_pool import EpisodeTask, WorkerPool\n"
         "own = make_scenario(sys.argv[1], {'cav_types': ['car'], 'horizon': 5})\n"
         "with WorkerPool(1) as workers:\n"
         "    print(workers.run([EpisodeTask(own, IDM(), (0,))])[0].status)\n"
@@ -100,8 +100,8 @@ def test_networks_of_others_are_read_under_a_smaller_limit_of_memory(tmp_path: P
 
 LIMITED = (
     "import os, sys, time\nfrom unjam import processes\nfrom unjam.errors import InputError\n"
-    "processes.LARGEST_MEMORY, processes.LONGEST_TIME = 2**30, 1\n"
-    "try:\n    processes.go_on_limited('it')\nexcept InputError as error:\n    sys.exit(str(error))\n"
+    "processes.MAX_CHILD_MEMORY, processes.MAX_CHILD_TIME = 2**30, 1\n"
+    "try:\n    processes.continue_in_limited_child('it')\nexcept InputError as error:\n    sys.exit(str(error))\n"
     "print(os.getpid(), flush=True)\n"
 )
 TOO_LONG = "it: cannot be read within 1 GiB and 1 s: signal "

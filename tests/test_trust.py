@@ -152,7 +152,7 @@ def test_code_that_changes_after_it_was_checked_does_not_run(changed: str, code:
     file.write_text(f"open({str(canary)!r}, 'w').close()\n{file.read_text()}")
     with pytest.raises(InputError, match=r"^code\+1\.py: has changed since the configuration was checked"):
         config.make_expert()
-    child = 'from unjam.drivers.user_driver import FileReference; FileReference.of(f"{PATH}:late").load()()'
+    child = 'from unjam.drivers.user_driver import FileReference; FileReference.parse(f"{PATH}:late").load_object()()'
     command = python_command("-c", f"PATH = {str(code)!r}; {child}")
     ran = subprocess.run(command, env=child_environment(), capture_output=True, text=True, check=False)
     assert "InputError: code+1.py: has changed since" in ran.stderr

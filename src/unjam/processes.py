@@ -80,7 +80,7 @@ def exit_with_parent(signum: int) -> None:
 
 
 @contextmanager
-def redirect_stderr(path: Path) -> Iterator[None]:
+def capture_stderr(path: Path) -> Iterator[None]:
     """Let a file have what this process, its libraries included, prints as errors meanwhile."""
     before, descriptor = os.dup(2), open_in_place(path, os.O_WRONLY | os.O_CREAT)
     os.ftruncate(descriptor, 0)

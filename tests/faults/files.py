@@ -184,7 +184,7 @@ def results(count: int, folder: Path, generator: np.random.Generator) -> Outcome
     outcome, whole = Outcome(), folder / "whole"
     drive("ring", "pi", 1, scenario_options={"horizon": 20, "warmup": 0}, workers=1, out=whole)
     (whole / "config.toml").write_text(to_toml(load_config()))
-    (whole / "progress.jsonl").write_text('{"iteration": 1, "actual_steps": 5}\n')
+    (whole / "progress.jsonl").write_text('{"iteration": 1, "environment_steps": 5}\n')
     (whole / "manifest.json").write_text("{}")
     for number in range(count):
         place = folder / str(number)

@@ -69,7 +69,7 @@ def a_place(generator: np.random.Generator, name: str) -> Words:
         ("sign", "it.unjam", "--key", f"{name}.key"),
         ("certify", f"{name}.unjam"),
         ("report", name),
-        ("runs", "--under", name),
+        ("runs", "--folder", name),
         ("fit-drivers", f"{name}.csv"),
     )
     return places[int(generator.integers(len(places)))]
@@ -167,7 +167,7 @@ def strange_weights(folder: Path, generator: np.random.Generator) -> Try:
     """A controller with weights of a kind that no network has."""
     kind = (np.complex64, np.bool_)[int(generator.integers(2))]
     (folder / "strange.unjam").write_bytes(with_weights_of(kind))
-    words = ((*DRIVE, "strange.unjam"), ("verify", "strange.unjam"), ("export", "strange.unjam", "--to", "x.unjam"))
+    words = ((*DRIVE, "strange.unjam"), ("verify", "strange.unjam"), ("export", "strange.unjam", "--out", "x.unjam"))
     more: tuple[Words, ...] = (*words, ("certify", "strange.unjam"), ("sign", "strange.unjam", "--key", "maker.key"))
     return Try("complex or boolean weights", more[int(generator.integers(len(more)))])
 
@@ -194,7 +194,7 @@ def special_files(folder: Path, generator: np.random.Generator) -> Try:
         ("train", "ring", "--steps", "10", "--out", f"{place}/new"),
         ("search", "ring", "--vary", "trpo.gamma=0.9,0.99", "--out", f"{place}/new"),
         ("tune", "ring", "--steps", "8000", *small, "--out", f"{place}/new"),
-        ("export", "pi", "--to", f"{place}/it.unjam"),
+        ("export", "pi", "--out", f"{place}/it.unjam"),
         ("keys", f"{place}/maker"),
         ("report", ".", "--out", f"{place}/page.html"),
         ("watch", *RING, "--driver", "pi", "--video", f"{place}/film.gif"),

@@ -12,7 +12,7 @@ from tests.faults.outcome import Outcome, one_line
 from tests.training.test_crash_points import crash, run
 from unjam.errors import UnjamError
 from unjam.processes import LOCK_FILE, lock_folder
-from unjam.training import folder as run_folder
+from unjam.training import run_folder
 
 KINDS = ("a file", "a folder", "nothing", "hard link")
 """what a planted link leads to"""

@@ -15,8 +15,8 @@ import psutil
 
 from tests.faults.files import any_mutation
 from tests.faults.outcome import Outcome, one_line
-from tests.worlds.sumo.user_networks import straight
 from tests.worlds.sumo.test_hostile_networks import OPTIONS, WRITING
+from tests.worlds.sumo.user_networks import straight
 from tests.worlds.test_record import fingerprint
 from tests.worlds.test_worker_pool import processes
 from unjam.drivers import IDM, PISaturation
@@ -167,7 +167,7 @@ TINY = {
     "ring": ["ring", "--length", "60", "--vehicles", "5", "--set", "scenario_options.horizon=100"],
     "figure-eight": ["figure-eight", "--set", "scenario_options.horizon=100"],
     "merge": ["merge", "--set", "scenario_options.horizon=40", "--set", "scenario_options.penetration_rate=0.5"],
-    "own-network": ["straight.sumocfg", "--cav-types", "car", "--set", "scenario_options.horizon=100"],
+    "user-network": ["straight.sumocfg", "--cav-types", "car", "--set", "scenario_options.horizon=100"],
 }
 LEARNERS = ("trpo", "sac", "ppo")
 SETTINGS = [

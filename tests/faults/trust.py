@@ -21,14 +21,14 @@ from tests.system.test_code_of_others import VERBS
 from tests.test_processes import holder
 from tests.test_sandbox import TRIES
 from tests.test_user_code import LATE, plant_bytecode
-from tests.training.test_belonging import of_expert, of_network, of_reward, with_checkpoint
+from tests.training.test_fingerprint import of_expert, of_network, of_reward, with_checkpoint
 from tests.training.test_crash_points import Moment, content_of, crash, run
 from tests.training.test_run import small_config
-from tests.worlds.sumo.user_networks import straight
 from tests.worlds.sumo.test_hostile_networks import OPTIONS
 from tests.worlds.sumo.test_networks import edges_of
+from tests.worlds.sumo.user_networks import straight
 from tests.worlds.test_episode import insists
-from tests.worlds.test_record import fingerprint
+from tests.worlds.test_record import fingerprint as episode_fingerprint
 from unjam import sandbox
 from unjam.cli import app
 from unjam.controller import controller_bytes
@@ -39,7 +39,7 @@ from unjam.drivers.wrappers import HistoryDriver, MixedDriver
 from unjam.errors import EpisodeError, InputError
 from unjam.processes import lock_folder
 from unjam.scenarios import Ring, make_scenario
-from unjam.training import folder as run_folder
+from unjam.training import run_folder
 from unjam.training.fingerprint import fingerprint
 from unjam.training.run_folder import CHECKPOINT_STATE_FILE, create_run_folder, restore_newest_checkpoint
 from unjam.trust import check_trusted_values, expecting_code, remember_trusted
@@ -129,7 +129,7 @@ class _Run:
 
 def _another_setting(at: _Run, generator: np.random.Generator) -> Any:
     with_checkpoint(at.folder, small_config())
-    changes = [{"seed": 5}, {"trpo__gamma": 0.5}, {"road__vehicles": 9}, {"expert": "idm"}, {"agent": "ppo"}]
+    changes = [{"seed": 5}, {"trpo__gamma": 0.5}, {"scenario_options__vehicles": 9}, {"expert": "idm"}, {"agent": "ppo"}]
     return small_config(**changes[int(generator.integers(len(changes)))])
 
 
@@ -229,7 +229,7 @@ def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     for number in range(count):
         place = folder / str(number)
         run, code, ran = place / "run", place / "run" / "code.py", place / "ran"
-        create_run_folder(run, small_config(expert=f"{code}:gentle", road__horizon=20))
+        create_run_folder(run, small_config(expert=f"{code}:gentle", scenario_options__horizon=20))
         (run / "best.toml").write_text((run / "config.toml").read_text())
         straight(place, CARS)
         code.write_text(f"{GENTLE}seen = gentle\n")
@@ -323,8 +323,8 @@ def cheats(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
             seed = int(generator.integers(10))
             if (name, seed) not in honest_ones:
                 driven = run_episode(road, honest, seed, simulation=simulation)
-                honest_ones[name, seed] = fingerprint(driven)
+                honest_ones[name, seed] = episode_fingerprint(driven)
             cheated = run_episode(road, insists, seed, simulation=simulation)
-            assert fingerprint(cheated) == honest_ones[name, seed]
+            assert episode_fingerprint(cheated) == honest_ones[name, seed]
             outcome.happened[f"{name}: measured as if it had not"] += 1
     return outcome

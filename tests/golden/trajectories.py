@@ -26,7 +26,7 @@ ROADS = {
     "figure-eight": ("figure-eight", {"horizon": 400}),
     "merge": ("merge", {"horizon": 60}),
     "on-ramp": ("on-ramp", {"horizon": 150, "peak": [0, 150], "penetration_rate": 0.3}),
-    "own-network": ("", {"horizon": 250, "cav_types": ["van"]}),
+    "user-network": ("", {"horizon": 250, "cav_types": ["van"]}),
 }
 ON_MOTORWAYS = ("cruise", "jam-ahead", "gap-maker", "adaptive-acc")
 VANS = "".join(
@@ -51,7 +51,7 @@ def cases() -> list[tuple[str, str]]:
     closed = ("ring", "ring-warm", "figure-eight")
     found = [
         (road, driver)
-        for road in (*closed, "merge", "own-network")
+        for road in (*closed, "merge", "user-network")
         for driver, kind in DRIVERS.items()
         if driver not in ON_MOTORWAYS and (road in closed or not kind.needs_loop)
     ]

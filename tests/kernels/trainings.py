@@ -14,7 +14,7 @@ import torch
 from tests.training.test_run import learn_with, small_config
 from unjam.worlds.worker_pool import WorkerPool
 
-DATA = ("virtual/data/", "replay/")
+DATA = ("model/data/", "replay/")
 """hashed names of what was learned from, not what was learned"""
 LEARNERS = {
     "trpo": {"model__model_ratio": 1.0, "model__epochs": 2, "model__members": 2},

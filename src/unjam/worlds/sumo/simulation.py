@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, SumoInputError, invalid_value
-from unjam.processes import PrivateFolder, redirect_stderr
+from unjam.processes import PrivateFolder, capture_stderr
 from unjam.sumo_files import file_stamp, write_harmless_copy
 from unjam.worlds.record import SumoWarning
 from unjam.worlds.sumo.backends import Backend, Libsumo, NeighborStates, Traci, sumo_function
@@ -136,7 +136,7 @@ class Simulation(VehicleControl):
         if files.records_trips:
             options += trip_options(self._trip_file)
         try:
-            with redirect_stderr(self._stdout_log) if self._stdout_log else nullcontext():
+            with capture_stderr(self._stdout_log) if self._stdout_log else nullcontext():
                 if self._library.is_running:
                     self._library.load(options)
                 else:
