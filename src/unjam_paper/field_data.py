@@ -64,7 +64,7 @@ KNOWLEDGE_MODELS: dict[str, AccelerationBounds | None] = {
 """the paper's IDM within these limits, alone and below a network"""
 FIELD_CALIBRATION = CalibrationSettings(limits=ACCELERATION_LIMITS, segment_seconds=MAX_SEGMENT_SECONDS)
 CALIBRATED_MODELS = {
-    "IDM, every moment": replace(FIELD_CALIBRATION, every="moment"),
+    "IDM, every moment": replace(FIELD_CALIBRATION, weighting="sample"),
     "IDM": FIELD_CALIBRATION,
     "IDM, headway kept": replace(FIELD_CALIBRATION, initial_headway_weight=(0.0, 1.0)),
 }

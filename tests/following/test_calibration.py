@@ -50,10 +50,10 @@ def groups() -> list[list[Pair]]:
     return made
 
 
-@pytest.mark.parametrize("every", ["trajectory", "moment"])
-def test_each_driver_gets_its_own_headway_and_what_is_typical(every: Literal["trajectory", "moment"]) -> None:
+@pytest.mark.parametrize("weighting", ["trajectory", "sample"])
+def test_each_driver_gets_its_own_headway_and_what_is_typical(weighting: Literal["trajectory", "sample"]) -> None:
     told: list[int] = []
-    settings = CalibrationSettings(weighting=every)
+    settings = CalibrationSettings(weighting=weighting)
     found = calibrate_groups(groups(), PAPER_IDM, ("time_headway",), settings, told.append)
     assert [one.parameters.time_headway for one in found] == pytest.approx(HEADWAYS, abs=5e-3)
     assert all(one.parameters.minimum_gap == PAPER_IDM.minimum_gap for one in found)
@@ -85,10 +85,10 @@ def test_a_headway_beyond_what_is_searched_is_named() -> None:
     assert (found.parameters.time_headway, found.parameters_at_bounds) == (1.0, ("time_headway",))
 
 
-@pytest.mark.parametrize("every", ["trajectory", "moment"])
-def test_a_short_rest_of_a_long_trajectory_weighs_little(every: Literal["trajectory", "moment"]) -> None:
+@pytest.mark.parametrize("weighting", ["trajectory", "sample"])
+def test_a_short_rest_of_a_long_trajectory_weighs_little(weighting: Literal["trajectory", "sample"]) -> None:
     whole = idm_driver(DRIVER, seconds=20.0)
     wrong = np.array([[30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T
     cut = [make_segments([whole], seconds) for seconds in (20.0, 19.8)]
-    errors = [gap_objective(each, (-4.0, 2.0), every)(wrong)[0] for each in cut]
+    errors = [gap_objective(each, (-4.0, 2.0), weighting)(wrong)[0] for each in cut]
     assert errors[1] == pytest.approx(errors[0], rel=0.02)

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from tests.following.made_up import idm_driver
-from tests.paper.test_field import table
+from tests.paper.test_field_data import table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings
 from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files, unit_warnings
@@ -32,7 +32,7 @@ def test_every_driver_has_its_headway_and_what_suits_all(pairs: list[Pair]) -> N
     assert headways == sorted(headways)
     assert all(one.max_acceleration == found.typical.max_acceleration for one in found.drivers)
     assert [detail["name"] for detail in found.details] == [pair.driver for pair in pairs]
-    assert all(detail["gap_error"] < found.metadata["fit"]["together"]["gap_error"] for detail in found.details)
+    assert all(detail["gap_error"] < found.metadata["fit"]["common"]["gap_error"] for detail in found.details)
     assert found.residual is None
     assert told[-1] == (5, 5)
     assert headways[0] < found.typical.time_headway < headways[-1]
@@ -62,7 +62,7 @@ def test_a_residual_is_kept_where_it_is_better(pairs: list[Pair]) -> None:
 def test_what_cannot_be_fitted(pairs: list[Pair]) -> None:
     with pytest.raises(InputError, match=r"drivers: 2 is not allowed; allowed: >= 5 for a residual"):
         fit_drivers(pairs[:2], FitDriversSettings(residual=True))
-    with pytest.raises(InputError, match="own: 'exponent' is not allowed"):
+    with pytest.raises(InputError, match="individual: 'exponent' is not allowed"):
         fit_drivers(pairs, FitDriversSettings(individual=("exponent",)))
 
 
@@ -111,8 +111,8 @@ def test_drivers_of_several_files_are_told_apart(data: Path, tmp_path: Path) -> 
     ("changes", "more", "words"),
     [
         ({"calibration.speed": 2}, {}, "calibration.speed: unknown name"),
-        ({}, {"only": {"kind": "robot"}}, "no trajectory has kind 'robot'; there are: ACC, human"),
-        ({}, {"only": {"colour": "red"}}, "only: 'colour' is not allowed"),
+        ({}, {"filters": {"kind": "robot"}}, "no trajectory has kind 'robot'; there are: ACC, human"),
+        ({}, {"filters": {"color": "red"}}, "select: 'color' is not allowed"),
         ({}, {"out": Path("drivers.toml")}, "out: 'drivers.toml' is not allowed"),
     ],
 )

@@ -88,7 +88,7 @@ def highd(path: Path, sign: int = 1) -> Path:
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_highd_is_read_on_both_carriageways(tmp_path: Path, sign: int) -> None:
-    (pair,) = read_pairs(highd(tmp_path / "01_tracks.csv", sign), options=replace(SHORT, shortest=1.0)).pairs
+    (pair,) = read_pairs(highd(tmp_path / "01_tracks.csv", sign), options=replace(SHORT, min_seconds=1.0)).pairs
     assert pair.step == 0.04
     np.testing.assert_allclose(pair.speed, SPEED)
     np.testing.assert_allclose(pair.leader_speed, LEADER)
@@ -104,7 +104,7 @@ def test_who_stands_on_highd_stands_where_it_was(tmp_path: Path, sign: int) -> N
     table.loc[stands, "x"] = table.loc[leader & (table["frame"] == half), "x"].item()
     table.loc[stands, "xVelocity"] = 0.0
     table.to_csv(path, index=False)
-    (pair,) = read_pairs(path, options=replace(SHORT, shortest=1.0)).pairs
+    (pair,) = read_pairs(path, options=replace(SHORT, min_seconds=1.0)).pairs
     assert np.abs(np.diff(pair.gap)).max() < 0.04 * max(SPEED, LEADER) + 1e-6
 
 
@@ -151,7 +151,7 @@ def test_who_has_nobody_ahead_is_counted(tmp_path: Path) -> None:
     found = read_pairs(ngsim(tmp_path / "data.csv"), options=SHORT)
     assert found.summary_lines() == [
         "1 trajectories with 30 of 60 rows",
-        "left out: 30 rows: nobody ahead, or not recorded",
+        "left out: 30 rows: no leader, or leader not recorded",
     ]
 
 

@@ -47,9 +47,9 @@ class CalibrationSettings:
     """s0 [m]"""
     initial_headway_weight: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """share of the headway with which a driver was found that it keeps, see `individual_idm`"""
-    weighting: Literal["trajectory", "moment"] = "trajectory"
-    """what counts alike: `make_trajectory`: the mean of their root mean squared errors, of all stretches of each;
-    `moment`: one root mean square over all of them, in which the few who leave very large gaps decide"""
+    weighting: Literal["trajectory", "sample"] = "trajectory"
+    """what counts alike: `trajectory`: the mean of their root mean squared errors, of all stretches of each;
+    `sample`: one root mean square over all of them, in which the few who leave very large gaps decide"""
     limits: AccelerationBounds = (-4.0, 2.0)
     """within which the acceleration is kept [m/s2]: where a gap is nearly used up the IDM alone brakes beyond
     all bounds"""
@@ -238,7 +238,7 @@ def _calibrate_one_parameter(
     values = _minimize_on_grid(errors, np.linspace(low, high, CALIBRATION_GRID_SIZE), len(groups))
     drove = simulate_open_loop(model(values), stretches)
     gap_errors, speed_errors = (
-        _group_errors(squares, stretches, group, "moment") for squares in (drove.gap_mse, drove.speed_mse)
+        _group_errors(squares, stretches, group, "sample") for squares in (drove.gap_mse, drove.speed_mse)
     )
     collided = np.bincount(group, drove.has_collided, len(groups))
     return [

@@ -73,7 +73,7 @@ class FittedDrivers:
         """Return what matters about it, as JSON."""
         population = self.population
         fit = {key: value for key, value in population.metadata["fit"].items() if key != "settings"}
-        return {"drivers": len(population.drivers), "spread": population.parameter_statistics(), **fit}
+        return {"drivers": len(population.drivers), "parameter_statistics": population.parameter_statistics(), **fit}
 
     def report_lines(self) -> list[str]:
         """Return in words how near the drivers come to the recorded gaps."""
@@ -82,15 +82,15 @@ class FittedDrivers:
         own = np.sqrt(np.average(np.square(errors), weights=seconds))
         lines = [
             "error of the simulated gap, root mean square: "
-            f"one IDM for all {fit['together']['gap_error']:.2f} m, each driver's own {own:.2f} m"
+            f"one IDM for all {fit['common']['gap_error']:.2f} m, each driver's own {own:.2f} m"
         ]
-        unknown = fit["together"]["bounds"]
+        unknown = fit["common"]["parameters_at_bounds"]
         if len(unknown) >= MIN_SUSPICIOUS_PARAMETERS:
             lines.append(
                 f"warning: {len(unknown)} of {len(CALIBRATED_PARAMETERS)} parameters lie at the end of what was searched "
                 f"({', '.join(unknown)}): these are no people; are speeds in m/s and gaps in m?"
             )
-        collided = sum(one["collided"] > 0 for one in details)
+        collided = sum(one["collisions"] > 0 for one in details)
         if collided:
             lines.append(f"{collided} drivers use up their gap in the simulation")
         if "residual_gap_errors" in fit:
@@ -118,7 +118,7 @@ def fit_drivers_from_files(
         format: of `unjam.following.loaders.FORMATS`; empty: told from the columns.
         cut_bad: whether bad rows are cut out instead of refused.
         driver: columns of a plain table that together name the driver.
-        only: which trajectories, by a name in FILTERS.
+        filters: values of `kind`, `split` or `driver` that select trajectories.
         out: where the population will be written; checked before anything is calibrated.
         on_progress: told how many drivers are done, and of how many.
 
@@ -140,18 +140,18 @@ def fit_drivers_from_files(
         pairs += [replace(pair, name=prefix + pair.name, driver=prefix + pair.driver) for pair in found.pairs]
     for name, value in (filters or {}).items():
         if name not in PAIR_FILTERS:
-            raise unknown_name("only", name, PAIR_FILTERS)
+            raise unknown_name("select", name, PAIR_FILTERS)
         there = sorted({str(getattr(pair, name)) for pair in pairs} - {""})
         pairs = [pair for pair in pairs if getattr(pair, name) == value]
         if not pairs:
-            raise InputError(f"only: no trajectory has {name} {value!r}; there are: {', '.join(there) or 'none'}")
+            raise InputError(f"select: no trajectory has {name} {value!r}; there are: {', '.join(there) or 'none'}")
     words += unit_warnings(pairs)
     population = fit_drivers(pairs, settings, on_progress)
     made = manifest()
     # It is given away: no folder of this machine is named.
     made["command"] = [Path(word).name if "/" in word else word for word in made["command"]]
-    about = {"data": [file.name for file in files], "only": filters or {}, "manifest": made}
-    return FittedDrivers(replace(population, about={**population.metadata, **about}), words)
+    about = {"data": [file.name for file in files], "filters": filters or {}, "manifest": made}
+    return FittedDrivers(replace(population, metadata={**population.metadata, **about}), words)
 
 
 def _name_prefixes(files: Sequence[Path]) -> list[str]:
@@ -216,7 +216,7 @@ def fit_drivers(
         limits=calibration.limits,
         residual=residual,
         details=tuple({"name": name, **_calibration_details(one)} for name, one in found.items()),
-        metadata={"fit": {"settings": asdict(settings), "together": _calibration_details(together), **learned}},
+        metadata={"fit": {"settings": asdict(settings), "common": _calibration_details(together), **learned}},
     )
 
 

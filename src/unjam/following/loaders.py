@@ -89,17 +89,17 @@ def _read_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadRe
 def _read_ngsim(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of the public NGSIM file, which is in feet and milliseconds."""
     frame = frame.rename(columns=str.lower)
-    place = frame["location"].astype(str) if "location" in frame else ""
+    site = frame["location"].astype(str) if "location" in frame else ""
     vehicles = _select_columns(frame, NGSIM_COLUMNS, path)
     lengths = {name: vehicles[name] * METERS_PER_FOOT for name in ("front", "speed", "length")}
-    vehicles = vehicles.assign(place=place, time=vehicles["time"] / 1000.0, **lengths)
+    vehicles = vehicles.assign(site=site, time=vehicles["time"] / 1000.0, **lengths)
     return _pairs_from_vehicles(vehicles, path, options)
 
 
 def _read_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of the reconstructed NGSIM I-80, in metres and tenths of a second."""
     vehicles = _select_columns(frame.rename(columns=_alphanumeric), RECONSTRUCTED_COLUMNS, path)
-    vehicles = vehicles.assign(place=path.stem, time=vehicles["time"] / 10.0)
+    vehicles = vehicles.assign(site=path.stem, time=vehicles["time"] / 10.0)
     return _pairs_from_vehicles(vehicles, path, options)
 
 
@@ -113,7 +113,7 @@ def _read_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadRe
     onwards = vehicles.groupby("lane")["speed"].transform("sum").to_numpy() >= 0
     front = (vehicles["front"] + vehicles["length"]).where(onwards, -vehicles["front"])
     moving = {"front": front, "speed": vehicles["speed"].abs(), "time": vehicles["time"] / HIGHD_FRAME_RATE}
-    return _pairs_from_vehicles(vehicles.assign(place=path.stem, **moving), path, options)
+    return _pairs_from_vehicles(vehicles.assign(site=path.stem, **moving), path, options)
 
 
 def _read_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
@@ -125,7 +125,7 @@ def _read_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResu
     vehicles = vehicles.assign(
         pair=_join_columns(frame, told), driver=frame["vehicle_id"].astype(str), kind="simulated"
     )
-    return _split_trajectories(vehicles.loc[~alone], path, options, {"nobody ahead": int(np.count_nonzero(alone))})
+    return _split_trajectories(vehicles.loc[~alone], path, options, {"no leader": int(np.count_nonzero(alone))})
 
 
 def _pairs_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
@@ -137,28 +137,28 @@ def _pairs_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOption
             f"{path.name}: the median length of its vehicles would be {typical:.1f} m; allowed: {low:g} to "
             f"{high:g} m; are the units those of this format?"
         )
-    key = ["place", "time", "leader"]
-    leaders = vehicles.loc[:, ["place", "time", "vehicle", "front", "speed", "length"]]
+    key = ["site", "time", "leader"]
+    leaders = vehicles.loc[:, ["site", "time", "vehicle", "front", "speed", "length"]]
     leaders = leaders.rename(columns={"vehicle": "leader"}).drop_duplicates(key)
     vehicles = vehicles.merge(leaders, on=key, how="left", suffixes=("", "_ahead"))
     alone = vehicles["front_ahead"].isna() & vehicles["front"].notna()
     vehicles = vehicles.loc[~alone]
     frame = vehicles.assign(
-        pair=_join_columns(vehicles, ("place", "vehicle", "leader", "lane")),
+        pair=_join_columns(vehicles, ("site", "vehicle", "leader", "lane")),
         driver=_join_columns(
-            vehicles.assign(anew=_reused_number_suffix(vehicles)), ("place", "vehicle", "anew")
+            vehicles.assign(suffix=_reused_number_suffix(vehicles)), ("site", "vehicle", "suffix")
         ).str.rstrip("-"),
         kind="human",
         leader_speed=vehicles["speed_ahead"],
         gap=vehicles["front_ahead"] - vehicles["length_ahead"] - vehicles["front"],
     )
-    return _split_trajectories(frame, path, options, {"nobody ahead, or not recorded": int(np.count_nonzero(alone))})
+    return _split_trajectories(frame, path, options, {"no leader, or leader not recorded": int(np.count_nonzero(alone))})
 
 
 def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
     """Return "2" for the second with a number, and so on: NGSIM's begin anew every quarter of an hour."""
     ordered = vehicles.sort_values(by="time", kind="stable")
-    who = [ordered["place"], ordered["vehicle"]]
+    who = [ordered["site"], ordered["vehicle"]]
     longer = ordered["time"].groupby(who, dropna=False).diff() > MAX_VEHICLE_ABSENCE
     before = longer.groupby(who, dropna=False).cumsum().to_numpy(int)
     return pd.Series(np.where(before > 0, (before + 1).astype(str), ""), ordered.index)
@@ -287,7 +287,7 @@ def _split_trajectories(
     (wrong, bad), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
     if bad and not options.drop_bad_rows:
         more = f" ({len(bad)} bad rows)" if len(bad) > 1 else ""
-        raise InputError(f"{path.name}: line {bad[0].line}: {bad[0].reason}{more}; --cut-bad leaves them out")
+        raise InputError(f"{path.name}: line {bad[0].line}: {bad[0].reason}{more}; --drop-bad-rows leaves them out")
     good = frame.loc[~wrong].sort_values(by=["pair", "time"], kind="stable")
     passed = good.groupby("pair", sort=False, dropna=False)["time"].diff()
     if passed.isna().all():

@@ -141,7 +141,7 @@ class Segments:
         """Return the chosen stretches, as long as the longest of them."""
         long = int(self.is_present[:, indices].sum(0).max())
         cut = {name: getattr(self, name)[:long, indices] for name in (*SEGMENT_FIELDS, "is_present")}
-        return replace(self, **cut, owner=self.pair_index[indices])
+        return replace(self, **cut, pair_index=self.pair_index[indices])
 
 
 def make_segments(pairs: Sequence[Pair], segment_seconds: float | None = None) -> Segments:

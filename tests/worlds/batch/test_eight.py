@@ -102,7 +102,7 @@ def test_who_waits_is_known_from_the_record(monkeypatch: pytest.MonkeyPatch) -> 
         seen.append([each[:, 0] for each in movement.memory])
         return moved(movement, *arguments)
 
-    monkeypatch.setattr(FigureEightMovement, "moved", watched)
+    monkeypatch.setattr(FigureEightMovement, "next_speeds", watched)
     (episode,) = run_batch(tasks(SHORT, "human", range(1)), allow_statistical=True)
     road = cast(ClosedRoad, SHORT.draw_from_seed((0,))[0])
     waited, entered = np.stack(seen, 1)
@@ -143,7 +143,7 @@ def test_who_covers_the_crossing_with_another_one_collides() -> None:
     [
         (replace(SHORT, human_control="native"), "SUMO drives people"),
         (replace(SHORT, right_of_way=False), "right_of_way"),
-        (replace(SHORT, bounded=False), "bounded"),
+        (replace(SHORT, enforce_human_limits=False), "enforce_human_limits"),
         (replace(SHORT, radius=(20, 22), vehicles=5, free_length=30.0), "radius"),
         (replace(SHORT, actuation="raw"), "raw"),
         (replace(SHORT, actuation="flow"), "SUMO's own check"),
@@ -166,5 +166,5 @@ def test_it_is_no_exact_road_and_driven_only_where_that_is_asked_for() -> None:
 
 def test_a_training_on_it_may_be_batched() -> None:
     assert RunConfig(scenario="figure-eight", simulator="batch").simulator == "batch"
-    with pytest.raises(ValueError, match="world"):
+    with pytest.raises(ValueError, match="simulator"):
         RunConfig(scenario="merge", simulator="batch")

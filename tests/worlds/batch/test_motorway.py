@@ -156,7 +156,7 @@ def test_who_changes_lanes_is_who_does_in_sumo(simulation: Simulation) -> None:
     time_headway, most, braking, gap, factor = drawn.T
     road = MotorwayGeometry(4000.0, 4000.0, 4000.0, LIMIT, LIMIT, 2, LENGTH)
     nothing, free = np.zeros(160), np.full(160, NO_ADVICE)
-    wishes = dict.fromkeys(("gain", "keep", "look"), nothing)
+    wishes = dict.fromkeys(("speed_gain", "keep_right", "look_ahead_speed"), nothing)
     before = {"speed": nothing, "way": nothing - 1.0}
     changes, alike, others, moments = 0, 0, 0, 0
     for _ in range(320):
@@ -172,10 +172,10 @@ def test_who_changes_lanes_is_who_does_in_sumo(simulation: Simulation) -> None:
             dict.fromkeys(MotorwayVehicles._fields, nothing)
             | wishes
             | {
-                **{"road": np.zeros(160, int), "entry": np.arange(160), "way": before["way"].astype(int)},
-                **{"place": place, "speed": speed, "acceleration": (speed - before["speed"]) / STEP},
-                **{"time_headway": time_headway, "most": most, "braking": braking, "gap": gap, "factor": factor},
-                **{"extended": np.ones(160, bool), "cap": free, "wish": LIMIT * factor},
+                **{"road": np.zeros(160, int), "entry": np.arange(160), "lane": before["way"].astype(int)},
+                **{"position": place, "speed": speed, "acceleration": (speed - before["speed"]) / STEP},
+                **{"time_headway": time_headway, "max_acceleration": most, "braking": braking, "minimum_gap": gap, "speed_factor": factor},
+                **{"is_eidm": np.ones(160, bool), "speed_cap": free, "desired_speed": LIMIT * factor},
             }
         )
         if known:
@@ -271,7 +271,7 @@ def test_each_road_has_its_own_driver_and_exploration() -> None:
     for task, together in zip(tasks, run_batch(tasks, allow_statistical=True), strict=True):
         (alone,) = run_batch([task], allow_statistical=True)
         np.testing.assert_array_equal(together.speeds, alone.speeds)
-    noises = [replace(random_network(3), lasts=lasts) for lasts in (False, True)]
+    noises = [replace(random_network(3), episode_noise=lasts) for lasts in (False, True)]
     for network in noises:
         driver = ResidualDriver(
             driver_of("jam-ahead"), network, 2.5, ("distance_to_merge", "allowed_speed", "penetration_rate")
@@ -329,7 +329,7 @@ def test_neighbours_are_those_next_on_each_way_of_the_same_road() -> None:
     road, way = np.sort(generator.integers(0, 3, count)), generator.integers(0, 3, count)
     place = generator.uniform(0.0, 3000.0, count)
     order = np.lexsort((-place, road))
-    columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(count)) | {"road": road, "way": way, "place": place}
+    columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(count)) | {"road": road, "lane": way, "position": place}
     vehicles = MotorwayVehicles(**columns).select(order)
     near = find_neighbors(vehicles, 3)
     for row in range(count):
@@ -363,9 +363,9 @@ REFUSED: dict[str, dict[str, Any]] = {
     "actuation": {"actuation": "shielded"},
     "simulation_step": {"simulation_step": 0.25, "steps_per_control_step": 4},
     "warmup": {"warmup": 100},
-    "roadside.loss_rate": {"roadside": replace(SHORT.roadside, loss=0.1)},
+    "roadside.loss_rate": {"roadside": replace(SHORT.roadside, loss_rate=0.1)},
     "cruise.keep_right": {"cruise": replace(SHORT.cruise, keep_right=5.0)},
-    "cruise.keep_right and cruise.speed_gain": {"cruise": replace(SHORT.cruise, overtake=0.0)},
+    "cruise.keep_right and cruise.speed_gain": {"cruise": replace(SHORT.cruise, speed_gain=0.0)},
     "sensors": {"actuator": replace(SHORT.actuator, lag=0.3)},
 }
 

@@ -163,7 +163,7 @@ def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.Monkey
         still, noise = np.zeros(3), NoiseState({}, np.zeros((0, 2)))
         return {ring: WarmUpState(still, still[1:], still[1:], False, noise, None) for ring in rings}
 
-    monkeypatch.setattr("unjam.worlds.batch.ring.warm_up.MOST_KEPT", 4)
+    monkeypatch.setattr("unjam.worlds.batch.ring.warm_up.MAX_CACHED_CAVS", 4)
     kept = WarmUpCache[str]()
     first, second, same = kept.get_states(["a", "b", "a"], ["b", "c"], warm_up)
     assert first is same is kept["a"]
@@ -193,7 +193,7 @@ def test_a_network_sees_explores_and_is_recorded_as_in_sumo(
         actual = run_episode(ring, driver, seed, explore=True, simulation=simulation)
         assert_alike(found, actual)
         for one, other in zip(found.trajectories, actual.trajectories, strict=True):
-            for name in ("observations", "expert", "residual", "applied", "filtered", "reward"):
+            for name in ("observations", "expert_acceleration", "residual", "applied_acceleration", "filter_braking", "reward"):
                 assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-9), name
             for name, values in other.initial_memory.items():
                 assert one.initial_memory[name] == pytest.approx(values, abs=1e-9, nan_ok=True), name
@@ -281,13 +281,13 @@ def test_sums_are_those_of_the_episodes() -> None:
     rings = finish_drive(start_batch_drive(RingBatch([ring] * 2, seeds, keep_record=False), driver))
     assert rings.episodes == ()
     for number, episode in enumerate(kept):
-        assert rings.decisions[number] == episode.control_steps
-        assert rings.crashed[number] == 0
+        assert rings.control_steps[number] == episode.control_steps
+        assert rings.has_crashed[number] == 0
         assert rings.mean_speed[number] == pytest.approx(episode.speeds[1:].mean())
-        assert rings.headway[number] == pytest.approx(episode.audit.following.min_time_gap)
-        assert rings.braking[number] == pytest.approx(episode.audit.cav_braking.max_braking)
+        assert rings.min_time_gap[number] == pytest.approx(episode.audit.following.min_time_gap)
+        assert rings.max_braking[number] == pytest.approx(episode.audit.cav_braking.max_braking)
         for name, terms in episode.reward_terms.items():
-            assert rings.terms[name][number] == pytest.approx(terms.sum())
+            assert rings.reward_terms[name][number] == pytest.approx(terms.sum())
 
 
 def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
@@ -300,7 +300,7 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
     world = RingBatch([replace(ring, warmup=60)] * 50, [(seed,) for seed in range(50)], singles("cpu"), draw=draw)
     episodes = finish_drive(start_batch_drive(world, Constant(0.2), singles("cpu"))).episodes
     noise = [
-        each.speeds[1:] - np.diff(each.positions, axis=0) / each.step for each in episodes if each.speeds.min() > 0.5
+        each.speeds[1:] - np.diff(each.positions, axis=0) / each.control_step for each in episodes if each.speeds.min() > 0.5
     ]
     cav = episodes[0].vehicle_ids.index("cav_0")
     added = np.array(noise)
@@ -360,7 +360,7 @@ def test_rings_on_which_somebody_touched_within_a_decision_have_collided() -> No
     world = RingBatch(scenarios, seeds)  # pyright: ignore[reportArgumentType]
     rings = finish_drive(start_batch_drive(world, Constant(3.0)))
     crashed = [episode.status == "collision" for episode in rings.episodes]
-    assert crashed == [bool(each) for each in rings.crashed]
+    assert crashed == [bool(each) for each in rings.has_crashed]
     assert all(episode.collisions >= 2 for episode in rings.episodes if episode.status == "collision")
     assert any(crashed)
 

@@ -39,7 +39,7 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     if scenario.human_control != "commanded":
         return "human_control: SUMO drives people"
     if not scenario.right_of_way or not scenario.enforce_human_limits:
-        return f"{'bounded' if scenario.right_of_way else 'right_of_way'}: false; allowed: true"
+        return f"{'enforce_human_limits' if scenario.right_of_way else 'right_of_way'}: false; allowed: true"
     if scenario.radius[0] <= MIN_LOOK_AHEAD:
         return f"radius: {scenario.radius[0]} m, where people look past a lane; allowed: > {MIN_LOOK_AHEAD:g} m"
     if scenario.population:

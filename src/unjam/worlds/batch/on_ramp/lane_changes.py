@@ -48,7 +48,7 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     kept = 1.0 - (1.0 - LOOK_AHEAD_RETENTION) * step
     look = xp.where(speed > vehicles.look_ahead_speed, speed, kept * vehicles.look_ahead_speed + (1.0 - kept) * speed)
     vehicles = vehicles._replace(
-        own_advice=none, cooperative_advice=none + 0.0, adjacent_advice=none + 0.0, leans=speed * 0.0, look=look
+        own_advice=none, cooperative_advice=none + 0.0, adjacent_advice=none + 0.0, speed_bias=speed * 0.0, look_ahead_speed=look
     )
     scene = lane_change_context(vehicles, geometry, step)
     vehicles, urgent, help_wanted = mandatory_lane_changes(vehicles, scene, geometry)
@@ -58,7 +58,7 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     goes = (urgent | wants | helps) & free
     held = helps & ~free
     leans = xp.where(held, xp.where(scene.is_leader_blocking, -1.0, 1.0), vehicles.speed_bias)
-    vehicles = vehicles._replace(leans=leans)
+    vehicles = vehicles._replace(speed_bias=leans)
     goes = goes & ~_has_change_conflict(vehicles, scene, goes, geometry)
     return _apply_changes(vehicles, goes, scene.target_lane)
 
@@ -139,7 +139,7 @@ def _speed_gain_changes(
     gain = gain + xp.where(left & (this < that), step * relative, 0.0 * gain)
     wants = wants | (left & (gain > LEFT_GAIN_THRESHOLD) & ((relative > 1e-3) | soon) & lasts)
     wants = wants | (left & (vehicles.lane == 0) & (relative >= 0.0) & (gain > 0.0))
-    return vehicles._replace(gain=gain, keep=keep, adjacent_advice=advice), wants
+    return vehicles._replace(speed_gain=gain, keep_right=keep, adjacent_advice=advice), wants
 
 
 def _speed_behind_left_leader(
@@ -169,7 +169,7 @@ def _has_change_conflict(
     coming = changes_lane & (vehicles.lane == 0)
     if not bool(coming.any()):
         return coming
-    joined = vehicles._replace(way=xp.where(coming, 1, vehicles.lane))
+    joined = vehicles._replace(lane=xp.where(coming, 1, vehicles.lane))
     near = find_neighbors(joined, 2)
     there = 1 + 0 * vehicles.lane
     ahead, behind = neighbors_on_lane(near.leaders, there), neighbors_on_lane(near.followers, there)
@@ -188,12 +188,12 @@ def _apply_changes(vehicles: MotorwayVehicles, changes_lane: Array, target_lane:
         return xp.where(changes_lane, 0.0 * values + value, values)
 
     return vehicles._replace(
-        way=xp.where(changes_lane, target_lane, vehicles.lane),
-        gain=reset(vehicles.speed_gain, 0.0),
-        keep=reset(vehicles.keep_right, 0.0),
-        look=reset(vehicles.look_ahead_speed, 0.0),
+        lane=xp.where(changes_lane, target_lane, vehicles.lane),
+        speed_gain=reset(vehicles.speed_gain, 0.0),
+        keep_right=reset(vehicles.keep_right, 0.0),
+        look_ahead_speed=reset(vehicles.look_ahead_speed, 0.0),
         own_advice=reset(vehicles.own_advice, NO_ADVICE),
         cooperative_advice=reset(vehicles.cooperative_advice, NO_ADVICE),
         adjacent_advice=reset(vehicles.adjacent_advice, NO_ADVICE),
-        leans=reset(vehicles.speed_bias, 0.0),
+        speed_bias=reset(vehicles.speed_bias, 0.0),
     )

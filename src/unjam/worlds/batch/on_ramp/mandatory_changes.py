@@ -54,7 +54,7 @@ def mandatory_lane_changes(
     helps[one.target_follower.row[wishes]] = True
     stuck = one.is_leader_blocking | one.is_follower_blocking
     leans[rows[stuck]] = 1.0
-    vehicles = vehicles._replace(own_advice=own, cooperative_advice=told, leans=leans)
+    vehicles = vehicles._replace(own_advice=own, cooperative_advice=told, speed_bias=leans)
     return _yield_to_stuck(vehicles, context, geometry, rows[stuck]), urgent, helps
 
 

@@ -101,7 +101,7 @@ class InsertionQueue:
             last[road[there]] = there  # in order: the last one written is the last on the road
             for each in np.flatnonzero(ready).tolist():
                 entry = self._roads[each].entries[self._queues[number][each][self._next[number, each]]]
-                person, own = self._roads[each].vehicle_types[entry.kind], last[each]
+                person, own = self._roads[each].vehicle_types[entry.vehicle_type], last[each]
                 room = place[own] - self._roads[each].vehicle_length - begins if own >= 0 else np.inf
                 if room < person.minimum_gap:
                     continue
@@ -135,7 +135,7 @@ def make_vehicles(*columns: np.ndarray) -> MotorwayVehicles:
     *known, extended, allowed = columns
     none = 0.0 * allowed
     advice = dict.fromkeys(("own_advice", "cooperative_advice", "adjacent_advice"), none + NO_ADVICE)
-    named = {"cap": none + NO_SPEED_CAP, "wish": allowed, "started": none + LONG_BEFORE_START, **advice}
+    named = {"speed_cap": none + NO_SPEED_CAP, "desired_speed": allowed, "start_time": none + LONG_BEFORE_START, **advice}
     nothing = dict.fromkeys(MotorwayVehicles._fields, none)
     first = dict(zip(MotorwayVehicles._fields, [*known, extended.astype(bool)], strict=False))
     return MotorwayVehicles(**(nothing | named | first))
@@ -158,7 +158,7 @@ def _convert_like(column: np.ndarray, reference: Array, to_array: ArrayFactory) 
 def empty_vehicles(to_array: ArrayFactory) -> MotorwayVehicles:
     """Return empty roads."""
     xp = namespace(to_array(np.zeros(0)))
-    integers, truths = ("road", "entry", "way"), ("extended",)
+    integers, truths = ("road", "entry", "lane"), ("is_eidm",)
     empty = {name: to_array(np.zeros(0)) for name in MotorwayVehicles._fields}
     empty |= {name: xp.zeros(0, dtype=xp.int64) for name in integers}
     empty |= {name: xp.zeros(0, dtype=xp.bool) if xp is not np else np.zeros(0, bool) for name in truths}
@@ -227,7 +227,7 @@ class BatchMotorways:
         allowed = xp.where(on_ramp, stretch.ramp_speed_limit, stretch.speed_limit) * vehicles.speed_factor
         allowed = xp.minimum(allowed, vehicles.speed_cap)
         wish = self._desired_speeds(on_ramp)
-        vehicles = vehicles._replace(wish=xp.where(vehicles.is_eidm, wish, allowed))
+        vehicles = vehicles._replace(desired_speed=xp.where(vehicles.is_eidm, wish, allowed))
         drivers = vehicles.drivers
         leader = xp.where(there, speed[row], allowed)
         gap = xp.where(there, place[row] - stretch.vehicle_length - place, FREE_DRIVING_GAP + vehicles.minimum_gap)
@@ -262,10 +262,10 @@ class BatchMotorways:
             new = self._corrected_speeds(new, row)
         errors = drivers.errors.next_errors(new, self._draw((3, len(speed))), step)
         return vehicles._replace(
-            place=place + new * step,
+            position=place + new * step,
             speed=new,
             acceleration=(new - speed) / step,
-            started=started,
+            start_time=started,
             gap_error=errors.gap,
             leader_error=errors.leader_speed,
             driving_error=errors.driving,

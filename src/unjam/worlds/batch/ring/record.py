@@ -117,14 +117,14 @@ class RingLog:
         facts = {
             "seed": tuple(seed),
             "status": "collision" if has_crashed else "completed",
-            "step": scenario.control_step,
+            "control_step": scenario.control_step,
             "warmup": scenario.warmup,
-            "drawn": road.drawn_values,
+            "drawn_values": road.drawn_values,
             "collisions": max(2 * has_crashed, int((collided | hit).sum())),
             "limit_speed": road.limit_speed,
         }
         rows = np.arange(len(road.cav_ids)) * self.start_positions.shape[1] + ring_index
-        return replace(log, crashed=has_crashed).episode(moments, facts, driver_log, rows)
+        return replace(log, has_crashed=has_crashed).episode(moments, facts, driver_log, rows)
 
 
 def as_numpy(values: Any) -> Floats:

@@ -190,7 +190,7 @@ class RingBatch:
             self._figure_eight.restore_memory(waits)
         if seen[0] is None:
             return None
-        return seen[0].each(lambda *values: np.stack(values, 1).reshape(self.cav_count, -1), *seen[1:])
+        return seen[0].map(lambda *values: np.stack(values, 1).reshape(self.cav_count, -1), *seen[1:])
 
     @property
     def has_ended(self) -> bool:
