@@ -49,7 +49,7 @@ def test_every_expert_has_one_and_almost_all_differ(episodes: dict[str, Episode]
     assert hashes.keys() == episodes.keys() == {path.stem for path in folder().glob("*.csv")}
     for road in ROADS:
         own = [hashes["-".join(case)] for case in cases() if case[0] == road]
-        assert len(set(own)) >= len(own) - 1, road  # without noise, people and idm are one
+        assert len(set(own)) >= len(own) - 1, road  # without noise, `human` and `idm` are the same
 
 
 def test_each_blessing_has_its_line_in_the_changelog() -> None:

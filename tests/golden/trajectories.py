@@ -34,8 +34,8 @@ VANS = "".join(
     f'depart="{2 * number}" departSpeed="8"/>'
     for number in range(9)
 )
-SHOWN_EVERY = 25
-"""decisions between two rows of a CSV"""
+ROW_INTERVAL = 25
+"""control steps between two rows of a CSV"""
 GRAIN = 1e-4
 """[m/s] and [m]: what is finer than this may differ from one processor to another"""
 SEED = (20,)
@@ -85,10 +85,10 @@ def hash_of(episode: Episode) -> str:
 
 def table_of(episode: Episode) -> str:
     """Return the speeds of all vehicles [m/s] now and then, as CSV; empty where one is not on the road."""
-    lines = [",".join(["decision", *episode.vehicle_ids])]
-    for decision in range(0, len(episode.speeds), SHOWN_EVERY):
-        speeds = ("" if np.isnan(speed) else f"{speed:.4f}" for speed in episode.speeds[decision])
-        lines.append(",".join([str(decision), *speeds]))
+    lines = [",".join(["control_step", *episode.vehicle_ids])]
+    for step in range(0, len(episode.speeds), ROW_INTERVAL):
+        speeds = ("" if np.isnan(speed) else f"{speed:.4f}" for speed in episode.speeds[step])
+        lines.append(",".join([str(step), *speeds]))
     return "\n".join(lines) + "\n"
 
 
