@@ -43,9 +43,9 @@ from unjam.training.run_folder import controller_origin
 
 @pytest.fixture(autouse=True)
 def few_attacks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(certificates, "ATTACKS", 24)
-    monkeypatch.setattr(certificates, "GENERATIONS", 3)
-    monkeypatch.setattr(certificates, "FREQUENCIES", OSCILLATION_FREQUENCIES[::4])
+    monkeypatch.setattr(certificates, "ATTACK_POPULATION", 24)
+    monkeypatch.setattr(certificates, "ATTACK_GENERATIONS", 3)
+    monkeypatch.setattr(certificates, "OSCILLATION_FREQUENCIES", OSCILLATION_FREQUENCIES[::4])
 
 
 def filtered(driver: Driver, **changes: Any) -> FilteredDriver:
@@ -128,9 +128,9 @@ def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_pa
     file = written(tmp_path)
     controller = read_controller(file)
     found = make_certificate(controller)
-    found["worst"]["min_gap"] += 0.5
+    found["worst_cases"]["min_gap"] += 0.5
     add_certificate(file, controller, found)
-    with pytest.raises(InputError, match=r"its certificate says of worst.smallest_gap: 1.5"):
+    with pytest.raises(InputError, match=r"its certificate says of worst_cases.min_gap: 1.5"):
         verify_controller_file(file)
     parts = {**read_controller(file).parts, CERTIFICATE_PART: b"{}"}
     manifest = json.loads(parts.pop(MANIFEST_PART))
@@ -145,8 +145,8 @@ def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash
     other = make_certificate(read_controller(file))
     file = written(tmp_path)
     own = make_certificate(read_controller(file))
-    assert own["worst"]["contacts"] == other["worst"]["contacts"], "both say that nothing was touched"
-    for copied in (other, {**own, "worst": other["worst"]}):
+    assert own["worst_cases"]["contacts"] == other["worst_cases"]["contacts"], "both say that nothing was touched"
+    for copied in (other, {**own, "worst_cases": other["worst_cases"]}):
         add_certificate(written(tmp_path), read_controller(file), copied)
         with pytest.raises(InputError, match="its certificate says of "):
             verify_controller_file(file)
@@ -155,8 +155,8 @@ def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash
 def test_counts_and_answers_of_a_certificate_are_compared_exactly(tmp_path: Path) -> None:
     file = written(tmp_path)
     for change in (
-        lambda found: found["worst"].update(steps=found["worst"]["steps"] + 1),
-        lambda found: found["worst"].update(contacts=False),
+        lambda found: found["worst_cases"].update(steps=found["worst_cases"]["steps"] + 1),
+        lambda found: found["worst_cases"].update(contacts=False),
         lambda found: found["comfort"].update(meets_iso_15622=int(found["comfort"]["meets_iso_15622"])),
         lambda found: found.update(another=1),
     ):

@@ -35,7 +35,7 @@ def test_another_road_than_that_of_the_training_is_told(road: Scenario, words: s
 
 
 def test_a_tuned_controller_was_not_trained_and_an_unknown_road_is_no_other() -> None:
-    told = road_mismatch({**TRAINED, "tuned": {}}, scenario_recipe(make_scenario("merge")))
+    told = road_mismatch({**TRAINED, "tuning": {}}, scenario_recipe(make_scenario("merge")))
     assert told == "was tuned on the ring, not on the merge"
     assert road_mismatch({}, scenario_recipe(Ring())) == ""
     assert road_description(TRAINED) == "ring, length 220-270, vehicles 22, cavs 1, warmup 0"

@@ -31,7 +31,7 @@ from unjam.errors import InputError
 from unjam.trust import trusting_code
 
 ALL_PARTS: tuple[FeatureName, ...] = (
-    *("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position"),
+    *("local", "expert_acceleration", "expert_memory", "loop_length", "lap_position", "route_position"),
 )
 ABOUT = {"scenario": {"kind": "ring"}, "iteration": 3}
 
@@ -211,7 +211,7 @@ def test_a_feature_whose_file_is_not_listed_is_never_run(
     with pytest.raises(InputError) as caught:
         load_controller(tmp_path if own else written(tmp_path, content))
     assert str(caught.value) == (
-        f"driver recipe: part: '{code}:look' is not allowed; allowed: features whose files the recipe lists "
+        f"driver recipe: input: '{code}:look' is not allowed; allowed: features whose files the recipe lists "
         f"with their hashes"
     )
     assert not (tmp_path / "sprung").exists()
@@ -354,14 +354,14 @@ def test_a_manifest_that_is_none_is_refused(tmp_path: Path, manifest: str) -> No
     refused(written(tmp_path, content))
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, 4, -3])
+@pytest.mark.parametrize("number", [0, 1, 2, 3, -4])
 def test_another_format_is_refused_with_the_version_that_wrote_it(tmp_path: Path, number: int) -> None:
     content = with_manifest(lambda manifest: manifest.update(format=number, unjam="9.8.7"))
     line = refused(written(tmp_path, content))
     assert f"format {number}, written by unjam '9.8.7', is not allowed; allowed: format {MANIFEST_FORMAT}, " in line
 
 
-@pytest.mark.parametrize("number", [True, 2.0, 3.0, "3", None, [3], {}], ids=str)
+@pytest.mark.parametrize("number", [True, 2.0, 4.0, "4", None, [4], {}], ids=str)
 def test_a_format_that_is_no_integer_is_refused(tmp_path: Path, number: object) -> None:
     content = with_manifest(lambda manifest: manifest.update(format=number))
     assert f"manifest.format: {number!r} is not allowed" in refused(written(tmp_path, content))
@@ -369,7 +369,7 @@ def test_a_format_that_is_no_integer_is_refused(tmp_path: Path, number: object) 
 
 DEEP = '"driver": ' + "[" * 100_000 + "]" * 100_000
 NO_STRICT_JSON = {
-    "a key twice": ('"format": 3', "it names 'format' twice"),
+    "a key twice": ('"format": 4', "it names 'format' twice"),
     "a nested key twice": ('"scenario": {"kind": "ring", "kind": "merge"}', "it names 'kind' twice"),
     "NaN": ('"time_step": NaN', "the number NaN is not finite"),
     "infinity": ('"time_step": -Infinity', "the number -Infinity is not finite"),
@@ -377,7 +377,7 @@ NO_STRICT_JSON = {
     "a huge integer": (f'"iteration": {2**63}', "has more than 64 bits"),
     "a number of many digits": (f'"iteration": {"9" * 5000}', "has more than 64 bits"),
     "nesting": (DEEP, "it is nested too deep"),
-    "no UTF-8": ('"about": "\udcff"', "'utf-8' codec"),
+    "no UTF-8": ('"summary": "\udcff"', "'utf-8' codec"),
 }
 
 
@@ -390,7 +390,7 @@ def test_a_manifest_in_loose_json_is_refused(tmp_path: Path, name: str) -> None:
 
 
 def test_a_manifest_that_is_too_large_is_not_read(tmp_path: Path) -> None:
-    content = with_manifest(lambda manifest: manifest.update(about="x" * 2**20))
+    content = with_manifest(lambda manifest: manifest.update(summary="x" * 2**20))
     assert "part 'manifest.json' has " in refused(written(tmp_path, content))
 
 
@@ -416,12 +416,12 @@ def test_statements_that_contradict_the_scenario_are_refused(tmp_path: Path, key
         {"expert": None},
         {"expert": "pi"},
         {"expert": []},
-        {"parts": ["stars"]},
-        {"parts": []},
-        {"parts": 3},
-        {"hold": 0},
-        {"hold": 2.5},
-        {"hold": "long"},
+        {"inputs": ["stars"]},
+        {"inputs": []},
+        {"inputs": 3},
+        {"action_repeat": 0},
+        {"action_repeat": 2.5},
+        {"action_repeat": "long"},
         {"action_limit": -1.0},
         {"action_limit": float("nan")},
         {"action_limit": "much"},

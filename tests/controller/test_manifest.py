@@ -30,7 +30,7 @@ def test_memory_is_what_the_driver_starts_with(name: str) -> None:
     memory = dict(leaves(driver.initial_memory(1)))
     assert [entry["name"] for entry in said] == list(memory)
     for entry in said:
-        first = np.nan if entry["first"] is None else entry["first"]
+        first = np.nan if entry["initial"] is None else entry["initial"]
         np.testing.assert_array_equal(np.full((1, *entry["shape"]), first), memory[entry["name"]])
 
 
@@ -51,21 +51,21 @@ def test_what_a_network_sees_is_told_with_its_scale() -> None:
     said = driver_interface(residual(PISaturation()))["networks"]
     assert list(said) == [""]
     scales = {entry["name"]: entry["scale"] for entry in said[""]}
-    speed, loop = np.array([scales["own speed"]]), np.array([scales["length of the closed road"]])
+    speed, loop = np.array([scales["own speed"]]), np.array([scales["loop length"]])
     state = LocalState(
         speed,
-        speed + scales["leader's speed - own"],
-        np.array([scales["gap to the leader"]]),
-        speed + scales["follower's speed - own"],
-        np.array([scales["gap to the follower"]]),
-        np.array([scales["position along the road"]]),
+        speed + scales["leader speed - own speed"],
+        np.array([scales["leader gap"]]),
+        speed + scales["follower speed - own speed"],
+        np.array([scales["follower gap"]]),
+        np.array([scales["route position"]]),
         loop,
     )
     driver = residual(PISaturation())
     seen = driver.observation(state, driver.initial_memory(1))[0]
     expected = [1.0] * len(said[""])
     for index, entry in enumerate(said[""]):
-        if "sine" in entry["name"] or entry["name"] in ("expert's acceleration", "commanded speed"):
+        if "sine" in entry["name"] or entry["name"] in ("expert acceleration", "commanded speed"):
             expected[index] = seen[index]  # what the expert makes of it; the mean of one speed is that speed
     np.testing.assert_allclose(seen, expected)
 
@@ -94,8 +94,8 @@ def test_what_a_users_own_expert_remembers_has_numbers_for_names(tmp_path: Path)
     )
     expert = FileDriver(tmp_path / "own.py", "Own")
     assert [str(number) for number in observation_inputs(("expert_memory",), expert)] == [
-        "expert's memory 0 / 1",
-        "expert's memory 1 / 1",
+        "expert memory 0 / 1",
+        "expert memory 1 / 1",
     ]
 
 
@@ -108,4 +108,4 @@ def test_the_bounds_are_the_drivers_own_or_the_roads() -> None:
         "high": 1.5,
     }
     assert driver_interface(IDM())["action"]["low"] is None
-    assert driver_interface(residual(IDM(), hold=7))["hold"] == 7
+    assert driver_interface(residual(IDM(), hold=7))["action_repeat"] == 7

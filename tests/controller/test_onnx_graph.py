@@ -10,8 +10,8 @@ import torch
 from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
-from tests.learners.toy_task import make_policy, shake
 from tests.learners.test_trpo_ppo import mean_of
+from tests.learners.toy_task import make_policy, shake
 from unjam.controller.file import replay_states
 from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.onnx_graph import onnx_graph

@@ -168,7 +168,7 @@ def test_a_part_that_was_added_is_noticed(tmp_path: Path) -> None:
     [
         lambda manifest: manifest.update(scenario={"kind": "merge"}),
         lambda manifest: manifest.update(metrics={"gain": 1e9}),
-        lambda manifest: manifest["driver"].update(hold=1),
+        lambda manifest: manifest["driver"].update(action_repeat=1),
         lambda manifest: manifest.pop("iteration"),
     ],
 )
@@ -314,7 +314,7 @@ def test_a_weak_key_is_refused_in_a_file_and_as_signer(tmp_path: Path, key: byte
 
 
 def test_a_weak_key_would_sign_anything_without_that_check(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("unjam.controller.signature.is_weak", lambda point: False)
+    monkeypatch.setattr("unjam.controller.signature.is_weak_point", lambda point: False)
     identity = (1).to_bytes(32, "little")
     assert verify_controller_file(signed_with(tmp_path, identity, FOR_ANY_MESSAGE))
 
@@ -322,7 +322,7 @@ def test_a_weak_key_would_sign_anything_without_that_check(tmp_path: Path, monke
 def test_a_weak_private_key_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
     """No seed is known that has one; so every key counts as weak here."""
     made = make_keys(tmp_path / "maker")
-    monkeypatch.setattr("unjam.controller.signature.is_weak", lambda point: True)
+    monkeypatch.setattr("unjam.controller.signature.is_weak_point", lambda point: True)
     with pytest.raises(InputError, match=r"^key: .*: a weak Ed25519 key, .* is not allowed; allowed: "):
         read_private_key(made.private)
 

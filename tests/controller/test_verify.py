@@ -136,8 +136,8 @@ def test_a_formula_without_any_statement_is_said_to_have_none(tmp_path: Path) ->
         (lambda said: said["memory"].pop(), "memory"),
         (lambda said: said["memory"][0].update(shape=[3]), "memory"),
         (lambda said: said["action"].update(high=3.0), "action"),
-        (lambda said: said.update(hold=4), "hold"),
-        (lambda said: said.pop("hold"), "hold"),
+        (lambda said: said.update(action_repeat=4), "action_repeat"),
+        (lambda said: said.pop("action_repeat"), "action_repeat"),
     ],
 )
 def test_a_manifest_that_says_something_else_is_refused(

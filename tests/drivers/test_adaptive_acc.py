@@ -56,9 +56,9 @@ def expected(strategy: DrivingStrategy, speed: float, gap: float = 40.0) -> floa
     ],
 )
 def test_it_follows_with_the_parameters_of_the_state_of_traffic(
-    speeds: tuple[float, ...], to_merge: float, strategy: DrivingStrategy
+    speeds: tuple[float, ...], distance_to_merge: float, strategy: DrivingStrategy
 ) -> None:
-    assert after(*speeds, distance_to_merge=to_merge) == pytest.approx(expected(strategy, speeds[-1]))
+    assert after(*speeds, to_merge=distance_to_merge) == pytest.approx(expected(strategy, speeds[-1]))
 
 
 def test_it_leaves_a_jam_until_its_mean_is_a_free_roads() -> None:
@@ -69,9 +69,9 @@ def test_it_leaves_a_jam_until_its_mean_is_a_free_roads() -> None:
 
 def test_it_brakes_earlier_at_a_jams_tail_than_people_of_its_headway() -> None:
     closing = state(20.0)._replace(leader_speed=np.array([5.0]))
-    memory = {"mean": np.array([25.0]), "leaves": np.zeros(1)}
+    memory = {"mean_speed": np.array([25.0]), "leaves_jam": np.zeros(1)}
     early = DRIVER.act(closing, memory)[0][0]
-    late = DRIVER.act(closing, {**memory, "mean": np.array([20.0])})[0][0]
+    late = DRIVER.act(closing, {**memory, "mean_speed": np.array([20.0])})[0][0]
     assert early < late
 
 

@@ -45,7 +45,7 @@ def test_a_warm_up_that_is_recalled_counts_as_if_it_had_been_driven() -> None:
     memory = driver.initial_memory(2)
     for moment in range(30):
         _, memory = driver.act(history.select(np.s_[:, moment]), memory)
-    for name in ("watched", "speed_10", "square_40", "room_160"):
+    for name in ("steps", "mean_speed_10", "mean_square_40", "mean_gap_160"):
         assert np.array_equal(recalled[name], memory[name])
 
 

@@ -12,7 +12,7 @@ def test_it_follows_linearly_where_traffic_flows() -> None:
     driver = JamAbsorber(time_gap=1.0, standstill_gap=2.0, gap_gain=0.1, speed_gain=0.5)
     found, memory = driver.act(before(-400.0, 18.0, 20.0, 30.0), driver.initial_memory(1))
     assert found == 0.1 * (30.0 - 2.0 - 18.0) + 0.5 * 2.0
-    assert memory["waits"] == 0.0
+    assert memory["is_waiting"] == 0.0
 
 
 def test_it_crawls_before_a_jam_until_there_is_room_and_the_leader_is_off() -> None:
@@ -20,29 +20,29 @@ def test_it_crawls_before_a_jam_until_there_is_room_and_the_leader_is_off() -> N
     told = []
     for leader_speed, gap in [(4.0, 20.0), (9.0, 20.0), (4.0, 50.0), (9.0, 50.0), (12.0, 30.0)]:
         acceleration, memory = driver.act(before(-400.0, 8.0, leader_speed, gap), memory)
-        told.append((memory["waits"][0], acceleration[0] <= 3.5 - 8.0))
+        told.append((memory["is_waiting"][0], acceleration[0] <= 3.5 - 8.0))
     assert told == [(1.0, True), (1.0, True), (1.0, True), (0.0, False), (0.0, False)]
 
 
 def test_while_it_waits_it_also_keeps_off_its_leader() -> None:
     driver = JamAbsorber(crawl_speed=9.0)
     crawling, memory = driver.act(before(-400.0, 8.0, 0.0, 5.0), driver.initial_memory(1))
-    assert memory["waits"] == 1.0
+    assert memory["is_waiting"] == 1.0
     assert crawling < -8.0
 
 
 def test_it_begins_to_wait_within_its_stretch_alone_and_ends_beyond_it() -> None:
     for position, waits in [(-600.0, 0.0), (-500.0, 1.0), (-260.0, 0.0), (np.nan, 0.0)]:
         _, memory = JamAbsorber().act(before(position, 8.0, 4.0, 20.0), JamAbsorber().initial_memory(1))
-        assert memory["waits"] == waits
+        assert memory["is_waiting"] == waits
     for position, waits in [(-230.0, 1.0), (-210.0, 0.0)]:
-        _, memory = JamAbsorber().act(before(position, 3.0, 4.0, 20.0), {"waits": np.ones(1)})
-        assert memory["waits"] == waits
+        _, memory = JamAbsorber().act(before(position, 3.0, 4.0, 20.0), {"is_waiting": np.ones(1)})
+        assert memory["is_waiting"] == waits
 
 
 def test_who_has_nobody_ahead_does_not_wait() -> None:
-    _, memory = JamAbsorber().act(before(-400.0, 8.0, 8.0, 100.0), {"waits": np.ones(1)})
-    assert memory["waits"] == 0.0
+    _, memory = JamAbsorber().act(before(-400.0, 8.0, 8.0, 100.0), {"is_waiting": np.ones(1)})
+    assert memory["is_waiting"] == 0.0
 
 
 def test_with_a_push_and_no_wanted_gap_it_closes_up_unless_its_leader_is_slower() -> None:
@@ -50,4 +50,4 @@ def test_with_a_push_and_no_wanted_gap_it_closes_up_unless_its_leader_is_slower(
     for leader_speed, gap, expected in [(20.0, 60.0, 0.9), (20.0, 3.0, 0.9), (19.0, 3.0, 0.1), (17.0, 60.0, -1.5)]:
         found, memory = driver.act(before(-400.0, 20.0, leader_speed, gap), driver.initial_memory(1))
         np.testing.assert_allclose(found, expected)
-        assert memory["waits"] == 0.0
+        assert memory["is_waiting"] == 0.0

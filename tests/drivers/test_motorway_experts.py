@@ -37,7 +37,7 @@ def test_it_drives_towards_the_mean_speed_ahead_and_never_brakes_hard_for_it() -
     assert answer(driver, 20.0, 10.0) == -1.5
     assert answer(driver, 4.0, 1.0) == pytest.approx(1.0)  # towards the lowest, 5 m/s
     assert answer(replace(AT_ONCE, time_constant=2.0), 20.0, 19.0) == pytest.approx(-0.5)
-    assert answer(replace(AT_ONCE, margin=0.4), 20.0, 19.5) == pytest.approx(-0.1)
+    assert answer(replace(AT_ONCE, speed_margin=0.4), 20.0, 19.5) == pytest.approx(-0.1)
 
 
 def test_the_more_cavs_there_are_the_less_each_holds_back() -> None:
@@ -91,22 +91,22 @@ def test_behind_the_merge_and_without_a_message_it_holds_nobody_back() -> None:
 
 def test_sections_and_lanes_are_the_users_to_choose() -> None:
     mixed = (3 * 10.0 + 2 * 28.0) / 5  # sections 2 to 6, of which 2, 3 and 4 are slow
-    assert answer(replace(AT_ONCE, first=2, last=6), 17.0, 10.0) == pytest.approx(mixed - 17.0)
+    assert answer(replace(AT_ONCE, first_section=2, last_section=6), 17.0, 10.0) == pytest.approx(mixed - 17.0)
     assert answer(replace(AT_ONCE, all_lanes=True), 20.0, 20.0) == pytest.approx(-1.0)
-    with pytest.raises(InputError, match="last: 2 is not allowed; allowed: >= first, 3"):
+    with pytest.raises(InputError, match="last_section: 2 is not allowed; allowed: >= first_section, 3"):
         driver_from_name("jam-ahead:first_section=3,last_section=2", 1.0)
 
 
 @pytest.mark.parametrize(
-    ("distance_to_merge", "right", "headway"),
+    ("to_merge", "right", "time_gap"),
     [(200.0, 10.0, 2.0), (200.0, -3.0, 2.0), (200.0, 50.0, np.nan), (400.0, 10.0, np.nan), (-1.0, 10.0, np.nan)],
 )
 def test_room_is_made_just_before_the_merge_for_those_on_the_right(
-    to_merge: float, right: float, headway: float
+    to_merge: float, right: float, time_gap: float
 ) -> None:
     beside = np.array([[1.0, 1.0, right, 100.0]])
     driver, seen = GapMaker(merge_time_gap=2.0), state(20.0, 19.0, to_merge)._replace(adjacent_gaps=beside)
-    np.testing.assert_array_equal(driver.time_gaps(seen, {}), [headway])
+    np.testing.assert_array_equal(driver.time_gaps(seen, {}), [time_gap])
     np.testing.assert_array_equal(driver.act(seen, {})[0], JamAhead().act(seen, {})[0])
 
 
@@ -122,7 +122,7 @@ def test_it_says_what_it_must_be_told() -> None:
 
 
 def test_a_network_may_see_who_drives_beside() -> None:
-    driver = ResidualDriver(Cruise(), random_network(8), 2.5, ("beside",))
+    driver = ResidualDriver(Cruise(), random_network(8), 2.5, ("adjacent_lanes",))
     assert driver.input_fields == (*COMMON_FIELDS, "adjacent_gaps", "adjacent_speeds")
     gaps, speeds = np.array([[10.0, 100.0, -2.0, 40.0]]), np.array([[25.0, 20.0, 15.0, 20.0]])
     near = state(20.0, 20.0)._replace(adjacent_gaps=gaps, adjacent_speeds=speeds)

@@ -52,7 +52,7 @@ def test_exploration_adds_scaled_noise() -> None:
 
 
 def test_noise_that_lasts_changes_what_the_last_hidden_layer_is_weighed_with() -> None:
-    network = replace(random_network(5), lasts=True)
+    network = replace(random_network(5), episode_noise=True)
     generator = np.random.default_rng(1)
     observation, noise = generator.normal(size=(7, 5)), generator.normal(size=(7, 17))
     hidden = observation

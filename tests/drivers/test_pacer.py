@@ -79,4 +79,4 @@ def test_varying_rows_are_each_led_at_the_pace_of_their_own_lap() -> None:
     pacer = Pacer(use_tuned=True)
     acceleration, memory = pacer.act(rows, pacer.initial_memory(len(laps)))
     assert acceleration * pacer.time_constant == pytest.approx(one_by_one)
-    assert memory["gathered"].tolist() == [1.0] * len(laps)
+    assert memory["has_gathered"].tolist() == [1.0] * len(laps)

@@ -62,7 +62,7 @@ def test_each_car_gives_up_by_itself_and_the_other_law_begins_then() -> None:
         wanted, memory = watching.act(seen(*look), memory)
         driven.append((wanted == LEADS).tolist())
     assert driven == [[True, True], [True, False], [False, False]]
-    assert memory["otherwise"]["seen"].tolist() == [1.0, 2.0], "as long as each has driven by it"
+    assert memory["fallback"]["count"].tolist() == [1.0, 2.0], "as long as each has driven by it"
 
 
 def test_it_keeps_the_contract_of_drivers() -> None:

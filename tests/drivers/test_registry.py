@@ -57,7 +57,7 @@ def test_a_class_of_ones_own_must_come_from_a_file() -> None:
         {"kind": "impaired", "delay": -3.0, "gap_noise": 0.0, "time_step": 0.1},
         {"kind": "impaired", "delay": 1e6, "gap_noise": 0.0, "time_step": 0.1},
         {"kind": "impaired", "delay": 1.0, "gap_noise": 0.0, "time_step": 0.0},
-        {"kind": "remembering", "time_step": float("nan")},
+        {"kind": "history", "time_step": float("nan")},
     ],
 )
 def test_a_recipe_of_what_no_driver_is_is_refused(wrong: dict[str, Any]) -> None:

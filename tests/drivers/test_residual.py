@@ -13,7 +13,7 @@ from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.wrappers import FilteredDriver, HistoryDriver
 from unjam.tree import map_leaves
 
-ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "place", "route_position")
+ALL_PARTS = ("local", "expert_acceleration", "expert_memory", "loop_length", "lap_position", "route_position")
 
 
 def zero_network(inputs: int) -> Network:

@@ -26,15 +26,15 @@ def near(**more: object) -> LocalState:
     ("state", "kind"),
     [
         (near(lane_speeds=np.ones((3, 11))), "motorway"),
-        (near(distance_to_crossing=np.ones(3)), "crossing"),
+        (near(distance_to_crossing=np.ones(3)), "crossing_loop"),
         (near(), "loop"),
-        (near(loop_length=np.full(3, np.nan)), "elsewhere"),
+        (near(loop_length=np.full(3, np.nan)), "open_road"),
         (near().map(lambda values: float(values[0])), "loop"),
         (near(penetration_rate=np.full(3, 0.05)), "loop"),
-        (near(penetration_rate=np.full(3, 0.06)), "shared"),
-        (near(penetration_rate=np.full(3, 0.2)).map(lambda values: float(values[0])), "shared"),
-        (near(penetration_rate=np.full(3, 0.2), distance_to_crossing=np.ones(3)), "crossing"),
-        (near().map(lambda values: values[:0])._replace(loop_length=np.full(0, np.nan)), "elsewhere"),
+        (near(penetration_rate=np.full(3, 0.06)), "shared_loop"),
+        (near(penetration_rate=np.full(3, 0.2)).map(lambda values: float(values[0])), "shared_loop"),
+        (near(penetration_rate=np.full(3, 0.2), distance_to_crossing=np.ones(3)), "crossing_loop"),
+        (near().map(lambda values: values[:0])._replace(loop_length=np.full(0, np.nan)), "open_road"),
     ],
 )
 def test_what_a_car_can_know_of_the_road_chooses_its_law(state: LocalState, kind: str) -> None:
@@ -47,8 +47,8 @@ def test_only_the_law_that_drives_remembers() -> None:
     driver = RoadTypeSwitch(*(PISaturation() for _ in ROAD_TYPES))
     before = driver.initial_memory(3)
     _, after = driver.act(near(), before)
-    assert after["crossing"] is before["crossing"]
-    assert np.all(after["loop"]["seen"] == 1.0)
+    assert after["crossing_loop"] is before["crossing_loop"]
+    assert np.all(after["loop"]["count"] == 1.0)
 
 
 def test_where_nobody_is_for_shared_roads_they_are_as_others() -> None:
@@ -67,7 +67,7 @@ def test_it_is_made_again_from_its_recipe_and_from_its_file(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("road", "changes", "right"),
-    [("ring", {}, "loop"), ("ring", {"cavs": 2}, "shared"), ("figure-eight", {}, "crossing")],
+    [("ring", {}, "loop"), ("ring", {"cavs": 2}, "shared_loop"), ("figure-eight", {}, "crossing_loop")],
 )
 def test_closed_roads_are_told_apart_by_what_a_map_and_a_service_say(
     road: str, changes: dict[str, int], right: str

@@ -50,7 +50,7 @@ def test_the_ramp_is_no_part_of_the_road_and_beyond_the_end_all_is_free() -> Non
 
 
 def test_a_message_arrives_late_and_smoothed() -> None:
-    late, smooth = messages(age=2.0), messages(smoothing=10.0)
+    late, smooth = messages(latency=2.0), messages(smoothing_time=10.0)
     for step in range(6):
         speed = 20.0 if step == 0 else 10.0
         for told in (late, smooth):
@@ -61,7 +61,7 @@ def test_a_message_arrives_late_and_smoothed() -> None:
 
 
 def test_a_lost_message_leaves_the_one_before() -> None:
-    told, heard = messages(loss=0.5), []
+    told, heard = messages(loss_rate=0.5), []
     for step in range(400):
         measure(told, (RIGHT, 50.0, float(step)))
         heard.append(ahead(told, RIGHT, 0.0)[0][0])

@@ -203,8 +203,8 @@ def test_a_car_with_lag_drives_no_farther_than_its_equivalent(
     ("values", "line"),
     [
         ({"leader_braking": 5.0}, "leader_braking: 5 is not allowed; allowed: >= braking, 6"),
-        ({"time_gap_braking": 7.0}, "headway_braking: 7 is not allowed; allowed: <= braking, 6"),
-        ({"time_headway": -1.0}, "time_headway: -1.0 is not allowed; allowed: greater than or equal to 0"),
+        ({"time_gap_braking": 7.0}, "time_gap_braking: 7 is not allowed; allowed: <= braking, 6"),
+        ({"time_gap": -1.0}, "time_gap: -1.0 is not allowed; allowed: greater than or equal to 0"),
     ],
 )
 def test_brakes_that_prove_nothing_are_refused(values: dict[str, float], line: str) -> None:

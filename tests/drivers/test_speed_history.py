@@ -64,7 +64,7 @@ def test_rows_that_share_nothing_remember_what_arrays_do(before: int) -> None:
     expected = watched(7, generator.uniform(0, 9, (before, ROWS)))
     found = tensors(expected)
     for speed in generator.uniform(0, 9, (30, ROWS)):
-        rows, kept = CircularWindow(found["window"], found["seen"]), found["window"].clone()
+        rows, kept = CircularWindow(found["window"], found["count"]), found["window"].clone()
         after = slide_window({**found, "window": rows}, torch.tensor(speed))
         expected = slide_window(expected, speed)
         np.testing.assert_allclose(window_mean_speed(after).numpy(), window_mean_speed(expected), atol=1e-12)

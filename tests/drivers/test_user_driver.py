@@ -110,7 +110,7 @@ def test_only_the_command_line_keeps_what_a_file_prints_off_its_results(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("unjam.processes._is_own", is_own)
+    monkeypatch.setattr("unjam.processes._is_command_line", is_own)
     path = tmp_path / "loud.py"
     path.write_text("print('loading')\n\ndef gentle(state):\n    return 0.0 * state.speed\n")
     FileReference(path, "gentle").load_object()

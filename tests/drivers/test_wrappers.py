@@ -63,7 +63,7 @@ class AsksForTwoSeconds:
     def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
         return state.speed * 0.0, memory
 
-    def time_headways(self, state: LocalState, memory: Memory) -> Any:
+    def time_gaps(self, state: LocalState, memory: Memory) -> Any:
         return np.full(len(state.speed), 2.0)
 
 
@@ -157,5 +157,5 @@ def test_it_sees_gaps_with_noise_of_its_own_for_each_vehicle_and_moment() -> Non
 
 def test_an_impaired_driver_travels_to_another_process() -> None:
     late = ImpairedDriver(make_driver("pi:window=10+idm", 0.1), delay=0.3, gap_noise=0.5)
-    assert late.describe() == "pi:window=10.0+idm (late 0.3 s, gap noise 0.5 m)"
+    assert late.describe() == "pi:window=10.0+idm (delay 0.3 s, gap noise 0.5 m)"
     assert driver_from_recipe(*driver_recipe(late)) == late

@@ -30,7 +30,7 @@ NAMES = {
     "unjam/Merge-v0": "merge",
     "unjam/OnRamp-v0": "on-ramp",
 }
-OWN = "unjam/OwnNetwork-v0"
+OWN = "unjam/UserNetwork-v0"
 OPEN = ("unjam/Merge-v0", "unjam/OnRamp-v0")
 SHORT: Any = {"horizon": 60}
 
@@ -68,7 +68,7 @@ def test_steps_the_very_episode_that_run_episode_runs(name: str, warmup: int) ->
         done = terminated or truncated
         speeds.append(environment.unwrapped._road.traffic.speeds)  # pyright: ignore[reportAttributeAccessIssue]
         rewards.append(reward)
-        assert sum(info["terms"].values()) == reward
+        assert sum(info["reward_terms"].values()) == reward
     environment.close()
     (stay,) = expected.trajectories
     decided = len(stay.applied_acceleration)
@@ -99,7 +99,7 @@ def test_the_horizon_truncates_and_does_not_terminate(name: str) -> None:
     horizon = 20 if name in OPEN else 60
     environment = gymnasium.make(name, horizon=horizon)
     environment.reset(seed=1)
-    decided = environment.unwrapped._road.traffic.decisions  # pyright: ignore[reportAttributeAccessIssue]
+    decided = environment.unwrapped._road.traffic.control_steps  # pyright: ignore[reportAttributeAccessIssue]
     ends = [environment.step(np.zeros(1))[2:4] for _ in range(horizon - decided)]
     environment.close()
     assert len(ends) > 5
@@ -159,10 +159,10 @@ def test_a_collision_terminates_and_does_not_truncate() -> None:
 
 def test_the_same_seed_starts_the_same_episode_and_later_ones_differ() -> None:
     environment = RoadEnv(**SHORT)
-    first = environment.reset(seed=5)[1]["drawn"]
-    following = [environment.reset()[1]["drawn"] for _ in range(6)]
-    assert environment.reset(seed=5)[1]["drawn"] == first
-    assert [environment.reset()[1]["drawn"] for _ in range(6)] == following
+    first = environment.reset(seed=5)[1]["drawn_values"]
+    following = [environment.reset()[1]["drawn_values"] for _ in range(6)]
+    assert environment.reset(seed=5)[1]["drawn_values"] == first
+    assert [environment.reset()[1]["drawn_values"] for _ in range(6)] == following
     assert len({entry["length"] for entry in following}) > 1
     environment.close()
 
@@ -209,7 +209,7 @@ def test_a_window_without_a_display_is_refused_in_one_line(
 
 def test_one_number_is_a_range_of_one() -> None:
     environment = RoadEnv(length=231, **SHORT)
-    assert environment.reset(seed=0)[1]["drawn"] == {"length": 231.0}
+    assert environment.reset(seed=0)[1]["drawn_values"] == {"length": 231.0}
     environment.close()
 
 
@@ -277,8 +277,8 @@ def test_rewards_are_for_what_happens_and_not_for_what_sensors_read() -> None:
 @pytest.mark.parametrize(
     ("name", "shown", "words"),
     [
-        ("merge", "place", "observe: 'place' is not allowed on a road with ends"),
-        ("ring", "distance_to_merge", "observe: 'to_merge' is not allowed on ring"),
+        ("merge", "lap_position", "features: 'lap_position' is not allowed on a road with ends"),
+        ("ring", "distance_to_merge", "features: 'distance_to_merge' is not allowed on ring"),
     ],
 )
 def test_what_the_road_does_not_tell_is_not_shown(name: str, shown: str, words: str) -> None:
@@ -288,7 +288,7 @@ def test_what_the_road_does_not_tell_is_not_shown(name: str, shown: str, words: 
 
 def test_a_feature_of_ones_own_is_told_what_the_road_tells(tmp_path: Path) -> None:
     file = tmp_path / "share.py"
-    file.write_text("def share(state):\n    return state.cav_share\n")
+    file.write_text("def share(state):\n    return state.penetration_rate\n")
     with closing(RoadEnv("ring", features=("local", f"{file}:share"))) as environment:
         observation, _ = environment.reset(seed=0)
     assert observation[-1] == np.float32(1 / 22)
@@ -306,9 +306,9 @@ def test_a_reward_that_is_not_finite_is_refused_as_in_an_episode(tmp_path: Path)
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"observe": "local"}, "observe: 'local' is not allowed; allowed: a list of features"),
-        ({"observe": []}, r"observe: \[\] is not allowed; allowed: a list of features"),
-        ({"observe": ["locla"]}, "observe: 'locla' is not allowed; .* did you mean 'local'"),
+        ({"features": "local"}, "features: 'local' is not allowed; allowed: a list of features"),
+        ({"features": []}, r"features: \[\] is not allowed; allowed: a list of features"),
+        ({"features": ["locla"]}, "features: 'locla' is not allowed; .* did you mean 'local'"),
         ({"expert": "human"}, "expert: 'human' is not allowed; .* idm drives like people"),
     ],
 )

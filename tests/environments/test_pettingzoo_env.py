@@ -97,10 +97,10 @@ def test_the_merge_passes_the_checks_of_pettingzoo_without_warnings(capsys: pyte
 
 
 def test_agents_of_the_merge_enter_and_leave_as_in_the_very_episode_that_run_episode_runs() -> None:
-    scenario = make_scenario("merge", {**MERGE, "horizon": 100, "standing": 0})
+    scenario = make_scenario("merge", {**MERGE, "horizon": 100, "standing_vehicles": 0})
     expected = run_episode(scenario, Constant(acceleration=0.2), (4,))
     stays = {each.vehicle: each for each in expected.trajectories}
-    environment = unjam.parallel_env("merge", **{**MERGE, "horizon": 100, "standing": 0})
+    environment = unjam.parallel_env("merge", **{**MERGE, "horizon": 100, "standing_vehicles": 0})
     last, _ = environment.reset(seed=4)
     left, earned = [], {name: [] for name in stays}
     truncated: dict[str, bool] = {}
@@ -130,7 +130,7 @@ def test_agents_of_the_merge_enter_and_leave_as_in_the_very_episode_that_run_epi
 
 
 def test_time_goes_on_by_itself_until_the_first_agent_enters_and_ends_with_the_last() -> None:
-    environment = unjam.parallel_env("merge", cavs=2, standing=0, horizon=300)
+    environment = unjam.parallel_env("merge", cavs=2, standing_vehicles=0, horizon=300)
     environment.reset(seed=1)
     assert len(environment.agents) == 1
     assert environment._road.traffic.control_steps > 0
@@ -146,7 +146,7 @@ def test_time_goes_on_by_itself_until_the_first_agent_enters_and_ends_with_the_l
 
 
 def test_a_collision_terminates_everybody_who_is_there() -> None:
-    environment = unjam.parallel_env("merge", penetration_rate=1.0, actuation="raw", standing=0)
+    environment = unjam.parallel_env("merge", penetration_rate=1.0, actuation="raw", standing_vehicles=0)
     environment.reset(seed=0)
     terminated: dict[str, bool] = {}
     truncated: dict[str, bool] = {}
@@ -175,13 +175,13 @@ def test_a_vehicle_that_comes_back_is_no_agent_again() -> None:
     class Road:
         """Its second CAV leaves in the first decision, and is back after the second."""
 
-        lock, traffic = CopyableLock(), SimpleNamespace(cavs=there[0])
+        lock, traffic = CopyableLock(), SimpleNamespace(cav_ids=there[0])
 
         def step(self, actions: list[float]) -> RoadStepResult:
             before, now = there[len(told)], there[len(told) + 1]
             told.append(actions)
             left = {name: np.zeros(5, np.float32) for name in before if name not in now}
-            self.traffic.cavs = now
+            self.traffic.cav_ids = now
             return RoadStepResult(now, np.zeros((len(now), 5), np.float32), left, 1.0, {}, False, False)
 
     environment._road = Road()  # pyright: ignore[reportAttributeAccessIssue]

@@ -98,7 +98,10 @@ def lap_position(state: LocalState) -> Array:
 
 def _section_speed_feature(field: str, location: str) -> Feature:
     """Return the feature of a state's field with a speed for each section ahead, less the own speed."""
-    words = (f"mean speed {location} {ROAD_SECTION_LENGTH * number:g} m ahead - own speed" for number in range(SECTIONS_AHEAD))
+    words = (
+        f"mean speed {location} {ROAD_SECTION_LENGTH * number:g} m ahead - own speed"
+        for number in range(SECTIONS_AHEAD)
+    )
     return Feature(
         lambda seen: (getattr(seen.state, field) - seen.state.speed[..., None]) / SPEED_SCALE,
         tuple(ScaledInput(each, SPEED_SCALE, "m/s") for each in words),
@@ -210,7 +213,7 @@ def check_features(names: Sequence[str]) -> None:
     """Raise `InputError` where one of the names is not that of a feature, or of a function of one's own."""
     for name in names:
         if not _is_feature(name):
-            raise unknown_name("observe", name, [*FEATURES, "path.py:name"])
+            raise unknown_name("features", name, [*FEATURES, "path.py:name"])
 
 
 FeatureName = Annotated[str, AfterValidator(_check_feature_name)]

@@ -275,7 +275,9 @@ class JamAhead(FormulaDriver):
     @model_validator(mode="after")
     def _check_section_order(self) -> "JamAhead":
         if self.last_section < self.first_section:
-            raise ValueError(f"last_section: {self.last_section} is not allowed; allowed: >= first_section, {self.first_section}")
+            raise ValueError(
+                f"last_section: {self.last_section} is not allowed; allowed: >= first_section, {self.first_section}"
+            )
         return self
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:

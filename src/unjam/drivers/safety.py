@@ -118,7 +118,9 @@ class SafetyFilter:
         if self.leader_braking < own:  # else the gap may be smallest before both stand
             raise ValueError(f"leader_braking: {self.leader_braking:g} is not allowed; allowed: >= braking, {own:g}")
         if self.time_gap_braking > own:
-            raise ValueError(f"time_gap_braking: {self.time_gap_braking:g} is not allowed; allowed: <= braking, {own:g}")
+            raise ValueError(
+                f"time_gap_braking: {self.time_gap_braking:g} is not allowed; allowed: <= braking, {own:g}"
+            )
         return self
 
     def limit(

@@ -7,7 +7,7 @@ ENVIRONMENT_ARGUMENTS = {
     "unjam/FigureEight-v0": {"scenario": "figure-eight"},
     "unjam/Merge-v0": {"scenario": "merge", "cavs": 1},
     "unjam/OnRamp-v0": {"scenario": "on-ramp", "cavs": 1},
-    "unjam/OwnNetwork-v0": {"scenario": "my.sumocfg", "cavs": 1},
+    "unjam/UserNetwork-v0": {"scenario": "my.sumocfg", "cavs": 1},
 }
 """what each environment that Gymnasium makes by name is made of"""
 

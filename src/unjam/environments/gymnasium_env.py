@@ -124,9 +124,9 @@ class RoadStepper:
         self._driver = ExternalDriver(driver, features, self.scenario.acceleration_limits)
         check_can_drive(driver, self.scenario)
         if isinstance(features, str) or not features:
-            raise invalid_value("observe", features, "a list of features, like ('local', 'expert_acceleration')")
+            raise invalid_value("features", features, "a list of features, like ('local', 'expert_acceleration')")
         check_features(features)
-        check_policy_inputs(self._driver.features, self.scenario, "observe")
+        check_policy_inputs(self._driver.features, self.scenario, "features")
         self._backend: Backend = backend
         self._simulation: Simulation | None = None
         self._traffic: Traffic | None = None
@@ -235,7 +235,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     ``"unjam/OnRamp-v0"``; every parameter of
     the scenario can be given: ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
     On a network of your own the CAV is the first that the share picks, in a confined process:
-    ``gymnasium.make("unjam/OwnNetwork-v0", scenario="my.sumocfg", cav_share=0.1)``.
+    ``gymnasium.make("unjam/UserNetwork-v0", scenario="my.sumocfg", penetration_rate=0.1)``.
 
     ===========  ===================================================================================
     Action       ``Box(-limit, limit, (1,), float32)``: acceleration [m/s2], limit 1 by default; with
@@ -243,7 +243,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     Observation  ``Box(-50, 50, (5,), float32)``: own speed / 10 m/s; leader's speed - own / 5 m/s; gap
                  to the leader / 20 m; follower's speed - own / 5 m/s; gap to the follower / 20 m; more
                  with ``observe``
-    Reward       the scenario's, or ``reward``; its terms are in ``info["terms"]``
+    Reward       the scenario's, or ``reward``; its terms are in ``info["reward_terms"]``
     Start        ``reset(seed=s)`` starts the very episode that ``unjam drive --seed s`` runs, warm-up
                  included
     Terminated   at a collision
@@ -293,7 +293,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self.render_mode = render_mode
         backend = "gui" if render_mode == "human" else "libsumo"
         self._road = RoadStepper(scenario, changes, reward, expert, features, backend)
-        if getattr(self._road.scenario, "cav_ids", None) != 1:
+        if getattr(self._road.scenario, "cavs", None) != 1:
             raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space
@@ -305,7 +305,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         """Start an episode: that of `seed`; without one, the next after the last seed's."""
         super().reset(seed=seed)
         observations = self._road.reset(seed, self.np_random)
-        return observations[0], {"drawn": dict(self._road.traffic.road.drawn)}
+        return observations[0], {"drawn_values": dict(self._road.traffic.road.drawn_values)}
 
     @synchronized
     def step(self, action: Any) -> tuple[Observations, float, bool, bool, dict[str, Any]]:

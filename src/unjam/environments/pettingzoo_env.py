@@ -93,7 +93,7 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
             {agent: done.reward if agent in acted else 0.0 for agent in agents},
             dict.fromkeys(agents, done.terminated),
             {agent: done.truncated or (agent in left and not done.terminated) for agent in agents},
-            {agent: {"terms": done.reward_terms} for agent in agents},
+            {agent: {"reward_terms": done.reward_terms} for agent in agents},
         )
 
     def _agents_of(self, vehicles: Iterable[str]) -> list[str]:
