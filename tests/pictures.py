@@ -6,4 +6,4 @@ from unittest.mock import patch
 
 def empty_pictures() -> AbstractContextManager[object]:
     """Leave the pictures of reports empty: drawing them takes five seconds, and few tests look at them."""
-    return patch("unjam.reports.html.data_uri", lambda figure: "data:image/svg+xml;base64,")
+    return patch("unjam.reports.figures.data_uri", lambda figure: "data:image/svg+xml;base64,")

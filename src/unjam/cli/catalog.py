@@ -222,9 +222,9 @@ def fit_drivers_command(
 ) -> None:
     """Calibrate human drivers to recorded trajectories: a population for any scenario.
 
-    All drivers get the IDM whose simulated gaps are closest to the recorded ones; each has its own time headway
-    (--set 'individual=["time_headway","minimum_gap"]' adds parameters). The command lists what it read and what
-    it skipped.
+    All drivers get the IDM with the smallest gap errors in simulation; each has its own time headway (--set
+    'individual=["time_headway","minimum_gap"]' adds parameters). The command lists the data that it read and the
+    data that it skipped.
 
     Examples:
 

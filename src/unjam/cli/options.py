@@ -57,7 +57,7 @@ DEFAULT_WORKERS = os.cpu_count() or 1
 def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of whole groups.
 
-    A group is a function whose parameters are options. They replace the command's parameter that has the
+    A group is a function with options as its parameters. They replace the command's parameter that has the
     group's name; the command gets the return value of the function as its argument.
     """
     members = {name: inspect.signature(group).parameters for name, group in groups.items()}

@@ -170,7 +170,7 @@ def export_command(
         bool, typer.Option("--onnx", help="Add the ONNX graph of the whole controller, also as a separate file.")
     ] = False,
     scenario: Annotated[
-        str, typer.Option(help="Scenario whose control step and limits a plain driver gets.", show_default="ring")
+        str, typer.Option(help="Scenario that defines control step and limits of a plain driver.", show_default="ring")
     ] = "",
     json: JsonOption = False,
 ) -> None:

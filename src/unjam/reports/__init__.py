@@ -1,1 +1,1 @@
-"""Metrics, statistics, pictures, the report: what is said of results."""
+"""Reports of results: pages, figures, tables and videos."""

@@ -1,47 +1,45 @@
-"""The page of a certificate: what is proven of a controller, what was tried, and where it was seen."""
+"""The page of a certificate: proven properties of a controller, tested worst cases, and its operating domain."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.files import atomic_write
 from unjam.reports.figures import CAV_PLOT_COLOR, LINE_COLORS, MUTED_COLOR, PLOT_STYLE, data_uri, new_figure
-from unjam.reports.html import read_page_file, render_template
+from unjam.reports.html import render_template
 
-DOMAIN_QUANTITIES = (
-    ("own speed", "speed", "m/s"),
-    ("leader's speed", "leader_speed", "m/s"),
-    ("gap", "leader_gap", "m"),
-)
+DOMAIN_QUANTITIES = (("own speed", "speed", "m/s"), ("leader speed", "leader_speed", "m/s"), ("gap", "leader_gap", "m"))
 
 
 def write_certificate_page(name: str, driver: FilteredDriver, certificate: dict[str, Any], target: Path) -> None:
     """Write the page of a controller; `certificate` is that of its file."""
-    worst, comfort = certificate["worst"], certificate["comfort"]
+    worst, strings = certificate["worst_cases"], certificate["string_stability"]
     cards = [
-        ("Smallest gap", f"{worst['min_gap']:.2f} m", "in all that was tried"),
-        ("Smallest headway", f"{worst['min_time_gap']:.2f} s", "while the leader brakes hard"),
-        ("Hardest braking", f"{worst['max_braking']:.1f} m/s²", "in all that was tried"),
-        ("Riding along", f"{comfort['acceleration']:.2f} m/s²", "r.m.s.; below 0.315 is comfortable"),
+        ("Min gap", f"{worst['min_gap']:.2f} m", "in all tests"),
+        ("Min time gap", f"{worst['min_time_gap']:.2f} s", "while the leader brakes hard"),
+        ("Max braking", f"{worst['max_braking']:.1f} m/s²", "in all tests"),
+        (
+            "Ride comfort",
+            f"{certificate['comfort']['rms_acceleration']:.2f} m/s²",
+            "r.m.s.; below 0.315 is comfortable",
+        ),
     ]
     text = render_template(
         "certificate.html",
         name=name,
         driver=driver.describe(),
-        worst=worst,
+        worst_cases=worst,
         cards=cards,
         notes=_certificate_notes(certificate),
         safety=driver.safety,
         step=f"{driver.time_step:g}",
-        strings=certificate["strings"],
-        attack=data_uri(_attack_figure(worst["attack"])),
-        strings_picture=data_uri(_string_figure(certificate["strings"])),
-        downloads=Markup(read_page_file("downloads.js")),
+        string_stability=strings,
+        attack_figure=data_uri(_attack_figure(worst["attack"])),
+        string_figure=data_uri(_string_figure(strings)),
         domain=[(label, certificate["domain"][key], unit) for label, key, unit in DOMAIN_QUANTITIES],
     )
     atomic_write(target, text)
@@ -50,13 +48,13 @@ def write_certificate_page(name: str, driver: FilteredDriver, certificate: dict[
 def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
     notes = []
     if not certificate["comfort"]["meets_iso_15622"]:
-        notes.append("On its road it brakes or speeds up harder than ISO 15622 lets a cruise control.")
-    for each in certificate["strings"]:
-        if each["amplified"]:
-            low, high = each["amplified"]
+        notes.append("In its sample it brakes or accelerates harder than ISO 15622 allows for ACC.")
+    for each in certificate["string_stability"]:
+        if each["amplified_band"]:
+            low, high = each["amplified_band"]
             notes.append(
-                f"At {each['speed']:g} m/s it amplifies sway between {low:.2f} and {high:.2f} rad/s, up to "
-                f"{max(each['gains']):.2f} times; so no people behind it are stabilised there."
+                f"At {each['speed']:g} m/s it amplifies oscillations between {low:.2f} and {high:.2f} rad/s, by up to "
+                f"{max(each['gains']):.2f} times; so it stabilizes no human drivers behind it there."
             )
     return notes
 
@@ -66,19 +64,20 @@ def _attack_figure(accelerations: list[float]) -> Figure:
     figure = new_figure(2.2)
     axes = figure.subplots()
     axes.stairs(accelerations, np.arange(len(accelerations) + 1.0), color=CAV_PLOT_COLOR)
-    axes.set(xlabel="time [s]", ylabel="m/s²", title="The manoeuvre that came closest: leader's acceleration")
+    axes.set(xlabel="time [s]", ylabel="m/s²", title="Leader acceleration in the maneuver with the smallest gap")
     return figure
 
 
 @rc_context(PLOT_STYLE)
 def _string_figure(string_stability: list[dict[str, Any]]) -> Figure:
     figure = new_figure(2.8)
-    found = figure.subplots(1, max(1, len(string_stability)), sharey=True, squeeze=False)[0]
-    for axes, each in zip(found, string_stability, strict=False):
+    panels = figure.subplots(1, max(1, len(string_stability)), sharey=True, squeeze=False)[0]
+    for axes, each in zip(panels, string_stability, strict=False):
         axes.axhline(1.0, color=MUTED_COLOR, lw=0.8)
         axes.semilogx(each["frequencies"], each["gains"], color=CAV_PLOT_COLOR, label="controller")
-        axes.semilogx(each["frequencies"], each["people"], color=LINE_COLORS[2], ls="--", label="people (IDM)")
+        human = {"color": LINE_COLORS[2], "ls": "--", "label": "human driver (IDM)"}
+        axes.semilogx(each["frequencies"], each["human_gains"], **human)
         axes.set(xlabel="frequency [rad/s]", title=f"{each['speed']:g} m/s")
-    found[0].set_ylabel("gain")
-    found[0].legend()
+    panels[0].set_ylabel("gain")
+    panels[0].legend()
     return figure

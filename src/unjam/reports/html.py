@@ -1,4 +1,4 @@
-"""The report: one HTML page with everything in it, no network needed."""
+"""The report: one self-contained HTML page that works offline."""
 
 import base64
 import json
@@ -18,40 +18,21 @@ from unjam import __version__
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder
 from unjam.measures.metric_table import metric_table, table_headings
 from unjam.measures.statistics import metric_estimate
-from unjam.reports.figures import (
-    color_table,
-    data_uri,
-    learning_curve_figure,
-    short_label,
-    speed_scale,
-    time_series_figure,
-    training_time_figure,
-)
+from unjam.reports import figures, summary
 from unjam.reports.lanes import has_lane_maps, space_time_figure
 from unjam.reports.model import error_figure, example_figure, model_section, rollout_figure, wave_figure
 from unjam.reports.results import PlotEpisode, Results, damaged_results_error, original_command, read_results
-from unjam.reports.summary import (
-    baseline_differences,
-    common_baseline,
-    episodes_as_csv,
-    folder_names,
-    key_figures,
-    main_finding,
-    report_columns,
-    report_notes,
-    report_title,
-)
 from unjam.reports.video import split_lines
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.record import assign_columns
 
 MAX_PANELS = 6
 MAX_REPLAY_FRAMES = 600
-"""of a replay: between two, vehicles go straight on"""
+"""of a replay, which interpolates between frames"""
 MAX_REPLAY_VALUES = 600_000
-"""vehicles times frames of a replay's drivers together: some three megabytes"""
+"""vehicles times frames of all drivers of a replay: about three megabytes"""
 REPLAY_NAN = 65535
-"""stands for NaN among the numbers of a replay"""
+"""code of NaN in the arrays of a replay"""
 REPLAY_STEP = 0.5
 """time between two frames of the replay [s]"""
 
@@ -60,68 +41,69 @@ def write_report_page(folders: Sequence[Path], target: Path) -> Path:
     """Write the report of one folder of results, or a comparison of several; return its path.
 
     Raises:
-        InputError: a folder holds no results.
-        DiskError: the page cannot be written, or there is no folder for it.
+        InputError: a folder contains no results.
+        DiskError: the page cannot be written, or its folder does not exist.
     """
     check_parent_folder(target)
     results = [read_results(folder) for folder in folders]
     try:
         page = render_report(results)
     except INVALID_DATA_ERRORS as error:
-        raise damaged_results_error(_damaged_folder(folders, results), error) from error
+        raise damaged_results_error(_damaged_folder(results), error) from error
     atomic_write(target, page)
     return target
 
 
-def _damaged_folder(folders: Sequence[Path], results: Sequence[Results]) -> Path:
-    """Return the first folder whose results cannot be shown alone."""
-    for folder, found in zip(folders, results, strict=True):
+def _damaged_folder(results: Sequence[Results]) -> Path:
+    """Return the first folder that cannot be rendered on its own."""
+    for result in results:
         try:
-            render_report([found])
+            render_report([result])
         except INVALID_DATA_ERRORS:
-            return folder
-    return folders[0]
+            return result.folder
+    return results[0].folder
 
 
 def render_template(template: str, **values: Any) -> str:
-    """Return a page of the folder `page/`, with the style of all, as text: what `values` say is escaped."""
-    loader = PackageLoader("unjam.reports", "page")
+    """Return a page of the folder `page/` as text, with the common style and script; `values` are escaped."""
     environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("unjam.reports", "page"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    style = Markup(read_page_file("report.css"))
-    return environment.get_template(template).render(version=__version__, style=style, **values)
+    common = {"version": __version__, "style": _page_file("report.css"), "downloads": _page_file("downloads.js")}
+    return environment.get_template(template).render(**common, **values)
 
 
-def read_page_file(name: str) -> str:
-    """Return a file of the folder `page/`."""
-    return (files("unjam.reports") / "page" / name).read_text(encoding="utf-8")
+def _page_file(name: str) -> Markup:
+    return Markup((files("unjam.reports") / "page" / name).read_text(encoding="utf-8"))
 
 
 def render_report(results: Sequence[Results]) -> str:
     """Return the page as text."""
-    columns = report_columns(results)
+    columns = summary.report_columns(results)
     panels = [replace(column.episode, driver=column.name) for column in columns if column.episode is not None]
     panels = panels[:MAX_PANELS]
     single = results[0] if len(results) == 1 else None
-    sources = list(zip(folder_names(results), results, strict=True))
+    sources = list(zip(summary.folder_names(results), results, strict=True))
     counts = [len(column.rows) for column in columns]
-    rows, baseline = {column.name: column.rows for column in columns}, common_baseline(results)
-    drawn = [", ".join(f"{key} {value:g} m" for key, value in episode.drawn_values.items()) for episode in panels]
+    rows, baseline = {column.name: column.rows for column in columns}, summary.common_baseline(results)
+    roads = (", ".join(f"{key} {value:g} m" for key, value in episode.drawn_values.items()) for episode in panels)
     return render_template(
         "report.html",
-        title=report_title(results),
+        title=summary.report_title(results),
         single=single is not None,
-        leads=[(name, main_finding(result)) for name, result in sources],
-        notes=[(name, note) for name, result in sources for note in report_notes(result)],
-        cards=key_figures(single) if single else [],
-        pictures={name: data_uri(figure) for name, figure in _report_figures(results, panels).items()},
+        findings=[(name, summary.main_finding(result)) for name, result in sources],
+        notes=[(name, note) for name, result in sources for note in summary.report_notes(result)],
+        cards=summary.key_figures(single) if single else [],
+        figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, panels).items()},
         panels=panels,
-        drawn=list(dict.fromkeys(drawn)),
-        by_lane=has_lane_maps(panels),
-        against=baseline_differences(columns),
-        episodes_csv=episodes_as_csv(columns),
-        downloads=Markup(read_page_file("downloads.js")),
+        road_values=list(dict.fromkeys(roads)),
+        has_lane_maps=has_lane_maps(panels),
+        baseline_differences=summary.baseline_differences(columns),
+        episodes_csv=summary.episodes_as_csv(columns),
         model=model_section(single) if single else None,
         columns=columns,
         episodes=list(dict.fromkeys((min(counts), max(counts)))),
@@ -129,69 +111,69 @@ def render_report(results: Sequence[Results]) -> str:
         baseline=baseline,
         table=metric_table(rows, baseline),
         sources=[(name, result, original_command(result)) for name, result in sources],
-        script=Markup(read_page_file("replay.js")),
+        script=_page_file("replay.js"),
         replay_data=Markup(json.dumps(replay_data(panels)).replace("<", "\\u003c")),
     )
 
 
-def _report_figures(results: Sequence[Results], panels: Sequence[PlotEpisode]) -> dict[str, Figure]:
-    """Return the pictures that there are, by name."""
-    pictures: dict[str, Figure] = {}
+def _report_figures(sources: Sequence[tuple[str, Results]], panels: Sequence[PlotEpisode]) -> dict[str, Figure]:
+    """Return the available figures by name."""
+    found: dict[str, Figure] = {}
     if panels:
-        pictures |= {"trajectory_figure": space_time_figure(panels), "time_series_figure": time_series_figure(panels)}
-    named = zip(folder_names(results), results, strict=True)
-    runs = {name: result.progress for name, result in named if result.progress}
-    if runs:
-        pictures["learning_curve_figure"] = learning_curve_figure(runs, _reference_returns(results))
+        found |= {"space_time": space_time_figure(panels), "time_series": figures.time_series_figure(panels)}
+    results = [result for _, result in sources]
+    if runs := {name: result.progress for name, result in sources if result.progress}:
+        found["learning_curve"] = figures.learning_curve_figure(runs, _reference_returns(results))
     if len(results) == 1 and results[0].progress:
         progress, model = results[0].progress, results[0].model
-        pictures["training_time_figure"] = training_time_figure(progress)
+        found["training_time"] = figures.training_time_figure(progress)
         if model is not None and "waves" in model:
-            pictures["model_waves"] = wave_figure(model)
+            found["model_waves"] = wave_figure(model)
         elif model is not None:
-            pictures["model_examples"] = example_figure(model)
-            pictures["transition_model_errors"] = error_figure(model)
-            pictures["model_trust"] = rollout_figure(progress, model)
-    return pictures
+            found |= {"model_examples": example_figure(model), "model_errors": error_figure(model)}
+            found["model_rollouts"] = rollout_figure(progress, model)
+    return found
 
 
 def _reference_returns(results: Sequence[Results]) -> dict[str, float]:
     """Return the returns of drivers that do not learn.
 
-    The expert's is that on the validation seeds, from which the curve starts; the others were never driven
-    there, and have those of the held-out seeds.
+    The expert's is that on the validation seeds, where the curve starts; other drivers did not run on those and
+    have their return on the test seeds.
     """
-    found: dict[str, float] = {}
-    several = len({result.metadata.get("scenario") for result in results}) > 1
+    returns: dict[str, float] = {}
+    has_several_roads = len({result.metadata.get("scenario") for result in results}) > 1
     for result in results:
         expert = result.metadata.get("expert", "none")
-        where = f" ({result.metadata.get('scenario')})" if several else ""
+        road = f" ({result.metadata.get('scenario')})" if has_several_roads else ""
         if result.progress and expert != "none":
-            found.setdefault(f"{short_label(expert)}, validation{where}", result.progress[0]["return_expert"])
+            label = f"{figures.short_label(expert)}, validation{road}"
+            returns.setdefault(label, result.progress[0]["return_expert"])
         for label, rows in result.rows.items():
             if label not in (result.trained_label, expert):
-                found.setdefault(f"{short_label(label)}, held-out{where}", metric_estimate(rows, "return").mean)
-    return found
+                mean = metric_estimate(rows, "return").mean
+                returns.setdefault(f"{figures.short_label(label)}, test seeds{road}", mean)
+    return returns
 
 
 def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
-    """Return what the page's replay needs: positions and speeds at a few frames a second.
+    """Return the data of the page's replay: positions and speeds at a few frames per second.
 
-    Of a crowd there are fewer frames, for the page has to be sent.
+    With many vehicles there are fewer frames, to limit the size of the page.
     """
     if not panels:
         return {"drivers": []}
     longest = max(episode.times[-1] for episode in panels)
-    crowd = sum(int((~np.isnan(episode.speeds)).sum(axis=1).max()) for episode in panels)
-    most = min(MAX_REPLAY_FRAMES, max(1, MAX_REPLAY_VALUES // max(1, crowd)))
-    step = max(REPLAY_STEP, longest / most, *(episode.control_step for episode in panels))
+    vehicles = sum(int((~np.isnan(episode.speeds)).sum(axis=1).max()) for episode in panels)
+    max_frames = min(MAX_REPLAY_FRAMES, max(1, MAX_REPLAY_VALUES // max(1, vehicles)))
+    step = max(REPLAY_STEP, longest / max_frames, *(episode.control_step for episode in panels))
     frames = 1 + int(longest / step + 1e-9)
     return {
         "step": step,
         "frames": frames,
         "start": 0,
-        "fastest": speed_scale(panels).vmax,
-        "colours": color_table(),
+        "max_speed": figures.speed_scale(panels).vmax,
+        "colors": figures.color_table(),
         "vehicle_length": VEHICLE_LENGTH,
         "no_value": REPLAY_NAN,
         "drivers": [{"name": episode.driver, **_replay_track(episode, step, frames)} for episode in panels],
@@ -199,29 +181,29 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
 
 
 def _replay_track(episode: PlotEpisode, step: float, frames: int) -> dict[str, Any]:
-    """Return where the vehicles are and how fast, along a loop or on the plane, and the road's lines.
+    """Return positions, along a loop or on the plane, and speeds of the vehicles, and the lines of the road.
 
-    A line is rows (coordinate along the road, x, y) [m]. An episode that ended before stays as at its end.
+    A line has rows (coordinate along the road, x, y) [m]. After an early end the vehicles stand still.
     """
-    moments = np.round(np.arange(frames) * step / episode.control_step).astype(int)
-    moments = moments.clip(max=len(episode.speeds) - 1)
-    speeds = episode.speeds[moments]
+    indices = np.round(np.arange(frames) * step / episode.control_step).astype(int)
+    indices = indices.clip(max=len(episode.speeds) - 1)
+    speeds = episode.speeds[indices]
     if episode.is_closed:
         return {
             "vehicles": speeds.shape[1],
             "cavs": episode.cav_columns,
             "loop_length": episode.loop_length,
             "speeds": [_encode_array(speeds)],
-            "positions": [_encode_array(episode.positions[moments])],
+            "positions": [_encode_array(episode.positions[indices])],
             "lines": [np.round(episode.outline, 2).tolist()],
         }
     vehicles = np.flatnonzero(~np.isnan(speeds).all(axis=0))
-    there, is_cav = ~np.isnan(speeds[:, vehicles]), np.isin(vehicles, episode.cav_columns)
-    first, last = there.argmax(axis=0), frames - 1 - there[::-1].argmax(axis=0)
+    is_present, is_cav = ~np.isnan(speeds[:, vehicles]), np.isin(vehicles, episode.cav_columns)
+    first, last = is_present.argmax(axis=0), frames - 1 - is_present[::-1].argmax(axis=0)
     columns = assign_columns(first, last, is_cav.tolist())
-    values = np.concatenate([episode.poses[moments], speeds[..., None]], axis=-1)
+    values = np.concatenate([episode.poses[indices], speeds[..., None]], axis=-1)
     packed = np.full((frames, int(columns.max(initial=-1)) + 1, 4), np.nan, np.float32)
-    for vehicle, column, present in zip(vehicles, columns, there.T, strict=True):
+    for vehicle, column, present in zip(vehicles, columns, is_present.T, strict=True):
         packed[present, column] = values[present, vehicle]
     lines = split_lines(episode.lane_lines)
     return {
@@ -229,16 +211,17 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int) -> dict[str, A
         "cavs": np.unique(columns[is_cav]).tolist(),
         "loop_length": None,
         "speeds": [_encode_array(packed[..., 3])],
-        "places": [_encode_array(packed[..., axis]) for axis in range(3)],
+        "poses": [_encode_array(packed[..., axis]) for axis in range(3)],
         "lines": [np.column_stack([np.zeros(len(line)), line]).round(1).tolist() for line in lines],
     }
 
 
 def _encode_array(array: np.ndarray) -> dict[str, Any]:
-    """Return values of shape (frames, columns) for the page: a twentieth of what they take in memory.
+    """Return values of shape (frames, columns) for the page, in a twentieth of their size in memory.
 
-    They are 65,534 steps from the lowest to the highest, `REPLAY_NAN` for NaN; each frame is the difference to
-    the one before, modulo 65,536, in zlib's format, as base64. On three kilometres a step is 5 cm.
+    They are quantized to 65,534 steps from the lowest to the highest, `REPLAY_NAN` for NaN; each frame is stored
+    as the difference to the previous one, modulo 65,536, in zlib's format, as base64. On three kilometers a step
+    is 5 cm.
     """
     low, high = (float(end(array, initial=0.0)) for end in (np.nanmin, np.nanmax))
     scale = (high - low) / (REPLAY_NAN - 1) or 1.0

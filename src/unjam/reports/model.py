@@ -1,4 +1,4 @@
-"""What the report says and draws of a run's virtual environment."""
+"""Texts, tables and figures about the learned model of a run."""
 
 from collections.abc import Sequence
 from math import nan
@@ -15,83 +15,77 @@ from unjam.reports.results import PlotEpisode, Results
 
 PREDICTED_QUANTITIES = {
     "speed": ("own speed", "m/s"),
-    "leader_speed": ("leader's speed", "m/s"),
-    "leader_gap": ("gap to the leader", "m"),
-    "follower_speed": ("follower's speed", "m/s"),
-    "follower_gap": ("gap of the follower", "m"),
+    "leader_speed": ("leader speed", "m/s"),
+    "leader_gap": ("leader gap", "m"),
+    "follower_speed": ("follower speed", "m/s"),
+    "follower_gap": ("follower gap", "m"),
     "reward": ("reward", ""),
 }
-"""what is predicted: its words and its unit"""
+"""label and unit"""
 ERROR_KINDS = ("change", "base", "model")
-"""root mean squares: of what there was to predict, of the base's error, of the model's"""
-_PHYSICS = "physics, with a follower that drives as"
+"""root mean squares: of the predicted changes, of the base model's errors, of the learned model's errors"""
 BASE_LABELS = {
-    "idm": ("IDM alone", f"{_PHYSICS} the IDM"),
-    "population": ("typical driver alone", f"{_PHYSICS} the typical one of a calibrated population"),
-    "acc": ("ACC alone", f"{_PHYSICS} adaptive cruise control"),
-    "ovm": ("OVM alone", f"{_PHYSICS} the optimal velocity model"),
-    "none": ("nothing changes", "nothing known but that nothing changes"),
+    "idm": ("IDM alone", "physics with an IDM follower"),
+    "population": (
+        "typical driver alone",
+        "physics with a follower like the typical driver of a calibrated population",
+    ),
+    "acc": ("ACC alone", "physics with an adaptive cruise control follower"),
+    "ovm": ("OVM alone", "physics with a follower of the optimal velocity model"),
+    "none": ("no change", "the assumption that nothing changes"),
 }
-"""what the base alone is called, and what it is"""
+"""label and description of each base model"""
 WAVE_HEADINGS = ("mean speed [m/s]", "std across vehicles [m/s]", "slowest vehicle [m/s]")
 ERROR_PRECISION = 1e-5
 """errors below this are those of single precision [m/s, m, reward]"""
 
 MODEL_COLOR, BASE_COLOR, CHANGE_COLOR, RECORDED_COLOR = LINE_COLORS[2], LINE_COLORS[1], LINE_COLORS[0], TEXT_COLOR
-"""colours"""
-ESTIMATOR_COLORS = dict(
-    zip(("unexplained", "transitions", "total_variation", "released"), LINE_COLORS[2:], strict=False)
-)
+ESTIMATORS = ("unexplained_variance", "transitions", "total_variation", "training_loss")
 REPLAYED_QUANTITIES = ("leader_speed", "leader_gap", "follower_gap")
-"""numbers whose errors are drawn over the time ahead"""
+"""quantities with errors drawn over the time ahead"""
 ERROR_BINS = (("leader_speed", "leader_gap"), ("leader_speed", "speed"), ("reward", "leader_gap"))
-"""what is drawn over what"""
+"""a quantity, and the state over which its errors are drawn"""
+STEPS_LABEL = "environment steps [thousands]"
 
 
 def error_rows(facts: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the errors of base and model by number: one step ahead, and at the end of the replay.
+    """Return the errors by quantity, one control step ahead and, with `final_`, at the end of the replay.
 
-    Each has its `KINDS`, and with `later_` before the name the same at the end; None for the reward, which is
-    not replayed.
+    Each row has its label, its unit, the `ERROR_KINDS`, and them as text in `cells`. The reward is not replayed:
+    its final errors are None.
     """
     rows = []
     for name, (label, unit) in PREDICTED_QUANTITIES.items():
-        later = facts["replay"]["numbers"].get(name)
-        at_end = {f"later_{kind}": later[kind][-1] if later else None for kind in ERROR_KINDS}
-        rows.append({"number": label, "unit": unit, **facts["one_step"][name], **at_end})
+        replayed = facts["replay"]["quantities"].get(name)
+        final = {f"final_{kind}": replayed[kind][-1] if replayed else None for kind in ERROR_KINDS}
+        errors = facts["one_step"][name] | final
+        cells = [error_text(errors[f"{prefix}{kind}"]) for prefix in ("", "final_") for kind in ERROR_KINDS]
+        rows.append({"label": label, "unit": unit, **errors, "cells": cells})
     return rows
 
 
 def error_headings(facts: dict[str, Any]) -> list[str]:
-    """Return the headings of the table of `error_rows`, after the number's own."""
-    names = ("change", BASE_LABELS[facts["base"]][0], "model")
-    return [
-        f"{name}, {after:g} s" for after in (facts["control_step"], facts["replay"]["seconds"][-1]) for name in names
-    ]
+    """Return the headings of the cells of `error_rows`."""
+    names = ("change", _base_label(facts), "model")
+    return [f"{name}, {after:g} s" for after in (facts["control_step"], facts["replay"]["times"][-1]) for name in names]
 
 
 def wave_rows(facts: dict[str, Any]) -> list[tuple[str, list[str]]]:
-    """Return what an actual road and those imagined from its start on are like: label and cells of each.
+    """Return label and cells of a recorded episode and of the rollouts from its start.
 
-    The cells are those of `WAVE_HEADINGS`: means over the second half, when what is wrong has had time to
-    grow.
+    The cells are those of `WAVE_HEADINGS`: means over the second half, where errors have had time to grow.
     """
-    found: list[tuple[str, list[str]]] = []
+    rows: list[tuple[str, list[str]]] = []
     for label, road in facts["waves"].items():
         speeds = np.array(road["speeds"], np.float64)
         later = speeds[len(speeds) // 2 :]
-        numbers = (np.nanmean(later), np.nanstd(later, 1).mean(), np.nanmin(later, 1).mean())
-        found.append((BASE_LABELS[facts["base"]][0] if label == "base" else label, [f"{n:.2f}" for n in numbers]))
-    return found
-
-
-def error_cells(row: dict[str, Any]) -> list[str]:
-    """Return the cells of a row of `error_rows`, as `error_headings` has them."""
-    return [error_text(row[f"{prefix}{kind}"]) for prefix in ("", "later_") for kind in ERROR_KINDS]
+        values = (np.nanmean(later), np.nanstd(later, 1).mean(), np.nanmin(later, 1).mean())
+        rows.append((_base_label(facts) if label == "base" else label, [f"{value:.2f}" for value in values]))
+    return rows
 
 
 def error_text(value: float | None) -> str:
-    """Return an error to two digits, or that there is none."""
+    """Return an error with two significant digits, or a dash for None."""
     if value is None:
         return "–"
     if abs(value) < ERROR_PRECISION:
@@ -100,214 +94,209 @@ def error_text(value: float | None) -> str:
 
 
 def error_verdict(facts: dict[str, Any]) -> str:
-    """Return where the model is better than its base, one step ahead and at the end, and where not."""
+    """Return which errors of the model are smaller and larger than its base's, one step ahead and at the end."""
     sentences = []
-    for prefix, after in (("", "One step"), ("later_", f"{facts['replay']['seconds'][-1]:g} s")):
-        better, worse = [], []
+    for prefix, time in (("", "One step"), ("final_", f"{facts['replay']['times'][-1]:g} s")):
+        smaller, larger = [], []
         for row in error_rows(facts):
             base, model = row[f"{prefix}base"], row[f"{prefix}model"]
             if base is None or max(base, model) < ERROR_PRECISION:
                 continue
-            change = row["number"]
-            if base >= ERROR_PRECISION:  # a base that knows it exactly is left behind by no share
+            change = row["label"]
+            if base >= ERROR_PRECISION:  # relative to an exact base there is no percentage
                 change += f" (by {100 * abs(1.0 - model / base):.0f}\u00a0%)"
             if model < 0.98 * base:
-                better.append(change)
+                smaller.append(change)
             elif model > 1.02 * base:
-                worse.append(change)
-        found = (("less wrong than the base in ", better), ("more wrong in ", worse))
-        words = ", and ".join(start + ", ".join(changes) for start, changes in found if changes)
-        sentences.append(f"{after} ahead the model is {words or 'as wrong as its base'}.")
+                larger.append(change)
+        parts = (("smaller for ", smaller), ("larger for ", larger))
+        text = ", and ".join(start + ", ".join(changes) for start, changes in parts if changes)
+        sentences.append(f"{time} ahead, the model's errors relative to its base are {text or 'equal'}.")
     return " ".join(sentences)
 
 
 def rollout_summary(progress: Sequence[dict[str, Any]]) -> str:
-    """Return how far the model was trusted in the last iteration, and what came of it."""
-    newest = progress[-1]["virtual"]
-    words = (
-        f"In the last iteration rollouts are k* = {newest['k_star']} decisions long: the model error "
-        f"eps_m is {newest['eps_m']:.3g}."
+    """Return length and returns of the model rollouts in the last iteration."""
+    last = progress[-1]["model"]
+    text = (
+        f"In the last iteration rollouts are k* = {last['k_star']} control steps long: the model error "
+        f"eps_m is {last['eps_m']:.3g}."
     )
-    virtual, actual = newest.get("return_virtual"), newest.get("return_actual")
-    if virtual is None or actual is None:
-        return words
+    in_model, in_environment = last.get("return_model"), last.get("return_environment")
+    if in_model is None or in_environment is None:
+        return text
     return (
-        f"{words} In so many decisions from the same actual states the same policy earns {virtual:.2f} in "
-        f"the virtual environment, and earned {actual:.2f} in the actual one."
+        f"{text} Over k* control steps from the same states, the return of the same policy is {in_model:.2f} in "
+        f"the model and {in_environment:.2f} in the environment."
     )
 
 
 def bound_summary(facts: dict[str, Any]) -> str:
-    """Return what the bound C says: nothing, at these discounts, and how it moves with k."""
-    bound = facts["bound"]
-    if bound is None:
+    """Return the values of the bound C for different rollout lengths, relative to the largest possible return."""
+    if (bound := facts["bound"]) is None:
         return ""
-    k, values, most = bound["k"], bound["C"], bound["largest_return"]
+    k, values, max_return = bound["k"], bound["bound"], bound["largest_return"]
     smallest = min(values)
     verdict = (
-        f"even at its best it is {smallest / most:,.0f} times that, so it says nothing"
-        if smallest > most
-        else f"at its best it is {smallest / most:.2f} of that"
+        f"even the smallest bound is {smallest / max_return:,.0f} times as large, so it is not informative"
+        if smallest > max_return
+        else f"the smallest bound is {smallest / max_return:.2f} of it"
     )
     return (
-        f"The paper's bound C, by which the actual return may fall short of the virtual one, moves with the "
-        f"length of rollouts from {values[0]:,.0f} (k = {k[0]}) over {smallest:,.0f} "
-        f"(k = {k[values.index(smallest)]:,}) to {values[-1]:,.0f} (k = {k[-1]:,}). No discounted return is "
-        f"larger than R_max / (1 - gamma) = {most:,.0f}: {verdict}."
+        f"The paper's bound C limits how much the return in the environment may be below that in the model. With the "
+        f"length of rollouts it changes from {values[0]:,.0f} (k = {k[0]}) over {smallest:,.0f} "
+        f"(k = {k[values.index(smallest)]:,}) to {values[-1]:,.0f} (k = {k[-1]:,}). The largest possible discounted "
+        f"return is R_max / (1 - gamma) = {max_return:,.0f}: {verdict}."
     )
 
 
 def model_section(result: Results) -> dict[str, Any] | None:
-    """Return what the page says of the virtual environment; None without one."""
+    """Return the page's content about the learned model; None without one."""
     facts = result.model
     if facts is None or not result.progress:
         return None
+    networks = f"plus an ensemble of {facts['members']} networks for the remaining errors"
     if "waves" in facts:
-        known = BASE_LABELS[facts["base"]][0].removesuffix(" alone")
+        base = _base_label(facts).removesuffix(" alone")
         return {
-            "about": (
-                "Between actual episodes the agent also learns on imagined roads, on which everybody drives: "
-                f"people by what is known ({known}), plus an ensemble of {facts['members']} networks for "
-                f"what that leaves. {_wave_caption(facts)}"
-            )
+            "description": "Between episodes in the environment the agent also learns from model rollouts of whole "
+            f"roads, with all vehicles: the human drivers follow a base model ({base}), {networks}. "
+            f"{_wave_caption(facts)}"
         }
     return {
-        "about": (
-            "Between actual episodes the agent also learns in a virtual environment: "
-            f"{BASE_LABELS[facts['base']][1]}, plus an ensemble of {facts['members']} networks for what "
-            f"that leaves. All that follows is measured on {facts['held_out']:,} decisions of episodes that "
-            "no network learned from."
-        ),
+        "description": "Between episodes in the environment the agent also learns from rollouts in a learned model "
+        f"(the virtual environment of the paper): {BASE_LABELS[facts['base']][1]}, {networks}. All errors are measured "
+        f"on {facts['validation_steps']:,} control steps of episodes that no network was trained on.",
         "replay": facts["replay"],
         "verdict": error_verdict(facts),
-        "trust": f"{rollout_summary(result.progress)} {bound_summary(facts)}",
+        "rollouts": f"{rollout_summary(result.progress)} {bound_summary(facts)}",
         "headings": error_headings(facts),
-        "table": [
-            {"label": row["number"], "unit": row["unit"], "cells": error_cells(row)} for row in error_rows(facts)
-        ],
+        "table": error_rows(facts),
     }
 
 
+def _base_label(facts: dict[str, Any]) -> str:
+    return BASE_LABELS[facts["base"]][0]
+
+
 def _wave_caption(facts: dict[str, Any]) -> str:
-    """Return what is on the pictures of waves."""
-    left, where = "an actual episode that no network learned from", "from its start on"
-    who = "CAVs do what they did, and noise"
+    """Return the caption of `wave_figure`."""
+    left, start = "an episode in the environment that no network was trained on", "from its start"
+    cavs = "CAVs repeat their recorded accelerations, but noise"
     if facts.get("lane_names"):
-        left = "the actual road with the people of an episode that no network learned from"
-        where, who = "where they come once more", "The expert alone drives CAVs, and what people misjudge"
+        left += ", with its traffic demand"
+        start, cavs = (
+            "with the same demand",
+            "Only the expert drives the CAVs, and the perception error of human drivers",
+        )
     return (
-        f"Left {left}; then what is imagined {where}, with what was learned and by what was known alone. "
-        f"{who} is drawn anew: waves come as often and travel as fast, not at the same moment."
+        f"Left: {left}; then rollouts {start}, with the learned model and with the base model alone. {cavs} is drawn "
+        "again: waves are as frequent and as fast, but occur at other times."
     )
 
 
 def wave_figure(facts: dict[str, Any]) -> Figure:
-    """Draw an actual road beside those imagined from its start on: waves are dark bands."""
-    shown, lane_names = list[PlotEpisode](), tuple(facts.get("lane_names", ()))
+    """Draw a recorded episode and rollouts from its start; waves are dark bands."""
+    lane_names, episodes = tuple(facts.get("lane_names", ())), list[PlotEpisode]()
     for label, road in facts["waves"].items():
-        names, none = ("speeds", "positions", "lanes"), np.zeros((0, 0))
-        speeds, positions, lanes = (np.array(road.get(name, none), np.float64) for name in names)
+        arrays = (road.get(name, np.zeros((0, 0))) for name in ("speeds", "positions", "lanes"))
+        speeds, positions, lanes = (np.array(array, np.float64) for array in arrays)
         columns = tuple(str(column) for column in range(speeds.shape[1]))
-        cavs = road.get("cavs", facts.get("cavs", []))  # earlier versions wrote them once
-        shown.append(
+        episodes.append(
             PlotEpisode(
-                driver=BASE_LABELS[facts["base"]][0] if label == "base" else label,
-                control_step=facts["step"],
+                driver=_base_label(facts) if label == "base" else label,
+                control_step=facts["control_step"],
                 loop_length=nan if facts["loop_length"] is None else facts["loop_length"],
                 lane_names=lane_names,
                 outline=np.zeros((0 if lane_names else 1, 3)),
                 vehicle_ids=columns,
-                cav_ids=tuple(columns[cav] for cav in cavs),
+                cav_ids=tuple(columns[cav] for cav in road["cav_columns"]),
                 speeds=speeds,
                 positions=positions,
                 lane_indices=lanes,
             )
         )
-    return space_time_figure(shown)
+    return space_time_figure(episodes)
 
 
 @rc_context(PLOT_STYLE)
 def rollout_figure(progress: Sequence[dict[str, Any]], facts: dict[str, Any]) -> Figure:
-    """Draw over training how far the model is trusted, why, and what came of it; and the bound by length."""
+    """Draw over training rollout length, model error and returns; and the bound over the rollout length."""
     figure, (lengths, estimates, returns, bounds) = _panels(2, 2, 2.3)
     steps = np.array([row["environment_steps"] for row in progress]) / 1000
-    virtual = [row["virtual"] for row in progress]
+    rows = [row["model"] for row in progress]
 
     def plot_over_steps(axes: Axes, values: list[Any], color: str, label: str, **style: Any) -> None:
-        known = np.array(values, float)  # None becomes NaN
-        axes.plot(steps, known, color=color, lw=1.4, marker="o", ms=2.5, label=label, **style)
+        axes.plot(steps, np.array(values, float), color=color, lw=1.4, marker="o", ms=2.5, label=label, **style)
 
-    plot_over_steps(lengths, [each["k_star"] for each in virtual], MODEL_COLOR, "k*")
-    lengths.set_ylim(bottom=0)
-    _label_axes(lengths, "rollout length k* [decisions]", "actual steps [thousands]")
-    for name, colour in ESTIMATOR_COLORS.items():
-        found = [each["eps_m_by_estimator"].get(name) for each in virtual]
-        plot_over_steps(estimates, found, colour, name.replace("_", " "))
-    estimates.set_ylim(bottom=0)
+    plot_over_steps(lengths, [row["k_star"] for row in rows], MODEL_COLOR, "k*")
+    _label_axes(lengths, "rollout length k* [control steps]", STEPS_LABEL, bottom=0)
+    for name, color in zip(ESTIMATORS, LINE_COLORS[2:], strict=False):
+        values = [row["eps_m_by_estimator"].get(name) for row in rows]
+        plot_over_steps(estimates, values, color, name.replace("_", " "))
     estimates.legend(fontsize=8)
-    _label_axes(estimates, "model error eps_m, by estimator", "actual steps [thousands]")
-    plot_over_steps(returns, [each.get("return_actual") for each in virtual], RECORDED_COLOR, "actual")
-    plot_over_steps(returns, [each.get("return_virtual") for each in virtual], MODEL_COLOR, "virtual", ls="--")
+    _label_axes(estimates, "model error eps_m, by estimator", STEPS_LABEL, bottom=0)
+    plot_over_steps(returns, [row.get("return_environment") for row in rows], RECORDED_COLOR, "environment")
+    plot_over_steps(returns, [row.get("return_model") for row in rows], MODEL_COLOR, "model", ls="--")
     returns.legend(fontsize=8)
-    _label_axes(returns, "earned in k* decisions from the same states", "actual steps [thousands]")
+    _label_axes(returns, "return over k* control steps from the same states", STEPS_LABEL)
     bound = facts["bound"]
     if bound is None:
         bounds.set_visible(False)
         return figure
-    most = bound["largest_return"]
-    bounds.plot(bound["k"], bound["C"], color=MODEL_COLOR, lw=1.4, label="bound C")
-    bounds.axhline(most, color=MUTED_COLOR, lw=1.1, ls="--", label="largest return there can be")
-    bounds.set_xscale("log")
-    bounds.set_yscale("log")
-    bounds.set_ylim(bottom=most / 3)
+    max_return = bound["largest_return"]
+    bounds.plot(bound["k"], bound["bound"], color=MODEL_COLOR, lw=1.4, label="bound C")
+    bounds.axhline(max_return, color=MUTED_COLOR, lw=1.1, ls="--", label="largest possible return")
+    bounds.set(xscale="log", yscale="log")
     bounds.legend(fontsize=8)
-    _label_axes(bounds, "the paper's bound C on virtual less actual return", "rollout length k [decisions]")
+    title = "the paper's bound C on return in the model minus in the environment"
+    _label_axes(bounds, title, "rollout length k [control steps]", bottom=max_return / 3)
     return figure
 
 
 @rc_context(PLOT_STYLE)
 def error_figure(facts: dict[str, Any]) -> Figure:
-    """Draw how wrong model and base are: the longer ahead; and one step ahead, by gap and by speed."""
+    """Draw the errors of model and base: over the time ahead; and one step ahead over gap and speed."""
     figure, panels = _panels(2, 3, 2.4)
-    seconds = facts["replay"]["seconds"]
+    base = {"color": BASE_COLOR, "lw": 1.4, "ls": "--"}
+    model = {"color": MODEL_COLOR, "lw": 1.6}
+    times = facts["replay"]["times"]
     for axes, name in zip(panels[:3], REPLAYED_QUANTITIES, strict=True):
-        found = facts["replay"]["numbers"][name]
-        axes.plot(seconds, found["change"], color=CHANGE_COLOR, lw=1.1, ls=":", label="how far it changes")
-        axes.plot(seconds, found["base"], color=BASE_COLOR, lw=1.4, ls="--", label=BASE_LABELS[facts["base"]][0])
-        axes.plot(seconds, found["model"], color=MODEL_COLOR, lw=1.6, label="model, a member")
-        axes.plot(seconds, found["spread"], color=MODEL_COLOR, lw=0.9, ls="-.", label="spread of the members")
+        errors = facts["replay"]["quantities"][name]
+        axes.plot(times, errors["change"], color=CHANGE_COLOR, lw=1.1, ls=":", label="size of the change")
+        axes.plot(times, errors["base"], **base, label=_base_label(facts))
+        axes.plot(times, errors["model"], **model, label="model, one member")
+        axes.plot(times, errors["spread"], color=MODEL_COLOR, lw=0.9, ls="-.", label="spread of the members")
         if facts["k_star"]:
-            trusted = facts["k_star"] * facts["control_step"]
-            axes.axvline(trusted, color=MUTED_COLOR, lw=0.9, label="k*, the end of rollouts")
-        axes.set_ylim(bottom=0)
-        _label_axes(axes, f"error: {_quantity_label(name)}", "time ahead [s]")
-    for axes, (name, by) in zip(panels[3:], ERROR_BINS, strict=True):
-        found = facts["where"][by]
-        axes.plot(found["at"], found["base"][name], color=BASE_COLOR, lw=1.4, ls="--", marker="o", ms=3)
-        axes.plot(found["at"], found["model"][name], color=MODEL_COLOR, lw=1.6, marker="o", ms=3)
-        axes.set_ylim(bottom=0)
-        _label_axes(axes, f"error one step ahead: {PREDICTED_QUANTITIES[name][0]}", _quantity_label(by))
+            length = facts["k_star"] * facts["control_step"]
+            axes.axvline(length, color=MUTED_COLOR, lw=0.9, label="k*, the end of rollouts")
+        _label_axes(axes, f"error: {_quantity_label(name)}", "time ahead [s]", bottom=0)
+    for axes, (name, state) in zip(panels[3:], ERROR_BINS, strict=True):
+        errors = facts["by_state"][state]
+        axes.plot(errors["values"], errors["base"][name], **base, marker="o", ms=3)
+        axes.plot(errors["values"], errors["model"][name], **model, marker="o", ms=3)
+        title = f"error one step ahead: {PREDICTED_QUANTITIES[name][0]}"
+        _label_axes(axes, title, _quantity_label(state), bottom=0)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
     return figure
 
 
 @rc_context(PLOT_STYLE)
 def example_figure(facts: dict[str, Any]) -> Figure:
-    """Draw virtual against actual: the same accelerations from the same start, each member a thin line."""
-    found, seconds = facts["replay"]["examples"], facts["replay"]["seconds"]
-    numbers = list(found[0]["numbers"])
-    figure, panels = _panels(len(numbers), len(found), 2.1)
-    pairs = [(name, each) for name in numbers for each in found]
-    for axes, (name, each) in zip(panels, pairs, strict=True):
-        example = each["numbers"][name]
-        for number, member in enumerate(example["members"]):
+    """Draw model and recording with the same accelerations from the same start; each member is a thin line."""
+    examples, times = facts["replay"]["examples"], facts["replay"]["times"]
+    quantities = list(examples[0]["quantities"])
+    figure, panels = _panels(len(quantities), len(examples), 2.1)
+    pairs = [(name, example) for name in quantities for example in examples]
+    for axes, (name, example) in zip(panels, pairs, strict=True):
+        values = example["quantities"][name]
+        for number, member in enumerate(values["members"]):
             label = "model, each member" if number == 0 else None
-            axes.plot(seconds, member, color=MODEL_COLOR, lw=0.9, alpha=0.8, label=label)
-        axes.plot(seconds, example["base"], color=BASE_COLOR, lw=1.1, ls="--", label=BASE_LABELS[facts["base"]][0])
-        axes.plot(seconds, example["actual"], color=RECORDED_COLOR, lw=1.6, label="actual")
-        if name == "leader_gap":
-            axes.set_ylim(bottom=0)
-        _label_axes(axes, f"{_quantity_label(name)}, from {each['begins']:.0f} s on", "time ahead [s]")
+            axes.plot(times, member, color=MODEL_COLOR, lw=0.9, alpha=0.8, label=label)
+        axes.plot(times, values["base"], color=BASE_COLOR, lw=1.1, ls="--", label=_base_label(facts))
+        axes.plot(times, values["recorded"], color=RECORDED_COLOR, lw=1.6, label="recorded")
+        title = f"{_quantity_label(name)}, from {example['start_time']:.0f} s on"
+        _label_axes(axes, title, "time ahead [s]", bottom=0 if name == "leader_gap" else None)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
 
@@ -323,7 +312,8 @@ def _quantity_label(name: str) -> str:
     return f"{label} [{unit}]" if unit else label
 
 
-def _label_axes(axes: Axes, title: str, x_label: str) -> None:
-    axes.set_title(title)
-    axes.set_xlabel(x_label)
+def _label_axes(axes: Axes, title: str, x_label: str, bottom: float | None = None) -> None:
+    axes.set(title=title, xlabel=x_label)
     axes.margins(x=0.02)
+    if bottom is not None:
+        axes.set_ylim(bottom=bottom)

@@ -1,4 +1,4 @@
-"""What a folder of results says: reports read folders, and nothing else."""
+"""The content of result folders, which all reports read."""
 
 import json
 import shlex
@@ -20,28 +20,29 @@ from unjam.worlds.record import Episode
 Float32s = NDArray[np.float32]
 
 EVALUATION_FILE = "evaluation.json"
-"""what was measured of each driver"""
+"""metrics of each driver"""
+PLOT_EPISODES_FILE = "plot_episodes.safetensors"
+"""arrays of the episodes that figures show"""
 MODEL_FILE = "model.json"
-"""what there is to see of a run's virtual environment"""
-PLOT_ARRAYS = ("speeds", "positions", "gaps", "outline", "waiting", "lines", "places", "lanes")
-"""arrays of an episode that pictures are made of"""
-VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "places", "lanes")
-"""those with a row per moment and a column per vehicle"""
-FULL_RATE_ARRAYS = ("speeds", "waiting")
-"""those of which an episode has more moments than are pictured"""
+"""facts about the learned model of a run"""
+VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "poses", "lane_indices")
+"""arrays with a row per time and a column per vehicle"""
+PLOT_ARRAYS = (*VEHICLE_ARRAYS, "outline", "backlog", "lane_lines")
+"""arrays of an episode that figures need"""
+FULL_RATE_ARRAYS = ("speeds", "backlog")
+"""arrays that an episode has for every control step, not only for snapshots"""
 NO_LANE = -1
 """lanes are stored as small integers, which have no NaN"""
-STORED_ARRAYS = (*PLOT_ARRAYS, "there")
 EPISODE_ENTRIES = (
-    *("step", "seed", "drawn", "loop_length", "crossings", "branches", "limit_speed"),
-    *("vehicle_ids", "cav_ids", "columns", "lane_names"),
+    *("control_step", "seed", "drawn_values", "loop_length", "crossings", "branches", "limit_speed"),
+    *("vehicle_ids", "cav_ids", "vehicle_columns", "lane_names"),
 )
-"""what is written of an episode that pictures show, beside its arrays"""
+"""fields of an episode that figures need, without the arrays"""
 
 
 @dataclass(frozen=True)
 class PlotEpisode(Episode):
-    """What pictures show of one driver's episode; all drivers of a folder share one seed."""
+    """Data of one driver's episode for figures; all drivers of a folder have the same seed."""
 
     seed: tuple[int, ...] = ()
     status: str = ""
@@ -59,44 +60,47 @@ class PlotEpisode(Episode):
 
 
 def to_plot_episode(driver: str, episode: Episode) -> PlotEpisode:
-    """Return what pictures show of an episode that was just driven."""
-    shown = {name: getattr(episode, name) for name in (*EPISODE_ENTRIES, *PLOT_ARRAYS)}
-    thinned = {name: shown[name][:: episode.snapshot_stride] for name in FULL_RATE_ARRAYS}
-    return PlotEpisode(**{**shown, **thinned, "step": episode.control_step * episode.snapshot_stride}, driver=driver)
+    """Return the data of an episode for figures; its control step is then that of snapshots."""
+    values = {name: getattr(episode, name) for name in (*EPISODE_ENTRIES, *PLOT_ARRAYS)}
+    values |= {name: values[name][:: episode.snapshot_stride] for name in FULL_RATE_ARRAYS}
+    return PlotEpisode(**{**values, "control_step": episode.control_step * episode.snapshot_stride}, driver=driver)
 
 
 def pack_episode(episode: PlotEpisode) -> dict[str, Float32s]:
-    """Return the arrays of pictures in single precision, where vehicles come and go without the gaps.
+    """Return the arrays for figures in single precision, without entries of absent vehicles.
 
-    On a road with ends each vehicle is there for a few of all moments: `is_present` says when, and the arrays
-    that have a row per moment and a column per vehicle keep those entries alone.
+    On an open road each vehicle is present for a small part of the time: `is_present` has those times, and
+    `VEHICLE_ARRAYS` contain only those entries.
     """
     arrays = {name: getattr(episode, name).astype(np.float32) for name in PLOT_ARRAYS}
-    there = ~np.isnan(episode.speeds)
-    if there.all():
+    is_present = ~np.isnan(episode.speeds)
+    if is_present.all():
         return arrays
-    kept = {name: array[there] for name, array in arrays.items() if array.shape[:2] == there.shape}
-    if "lanes" in kept:
-        kept["lanes"] = np.nan_to_num(kept["lanes"], nan=NO_LANE).astype(np.int8)
-    return {**arrays, **kept, "there": there}
+    packed = {name: array[is_present] for name, array in arrays.items() if array.shape[:2] == is_present.shape}
+    if "lane_indices" in packed:
+        packed["lane_indices"] = np.nan_to_num(packed["lane_indices"], nan=NO_LANE).astype(np.int8)
+    return {**arrays, **packed, "is_present": is_present}
 
 
 def unpack_episode(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Return the arrays of pictures that `pack_episode` took apart, or older ones as they are."""
-    there = arrays.pop("there", None)
-    if there is None:
+    """Return the arrays that `pack_episode` was given."""
+    is_present = arrays.get("is_present")
+    if is_present is None:
         return arrays
-    whole = {}
-    for name, array in arrays.items():
-        if len(array) == there.sum() and name in VEHICLE_ARRAYS:
-            whole[name] = np.full((*there.shape, *array.shape[1:]), np.nan, np.float32)
-            whole[name][there] = np.where(array == NO_LANE, np.nan, array) if name == "lanes" else array
-    return {**arrays, **whole}
+    unpacked = {name: array for name, array in arrays.items() if name != "is_present"}
+    for name in VEHICLE_ARRAYS:
+        packed = arrays.get(name)
+        if packed is not None and len(packed) == is_present.sum():
+            unpacked[name] = np.full((*is_present.shape, *packed.shape[1:]), np.nan, np.float32)
+            unpacked[name][is_present] = (
+                np.where(packed == NO_LANE, np.nan, packed) if name == "lane_indices" else packed
+            )
+    return unpacked
 
 
 @dataclass(frozen=True)
 class Results:
-    """The content of a run folder, or of one that `unjam drive` wrote."""
+    """The content of a run folder, or of a folder of `unjam drive`."""
 
     folder: Path
     metadata: dict[str, Any]
@@ -106,62 +110,60 @@ class Results:
     plot_episodes: dict[str, PlotEpisode]
     """by driver"""
     progress: list[dict[str, Any]] = field(default_factory=list)
-    """a row per iteration of training; empty without one"""
+    """a row per iteration of training; empty without training"""
     config: str = ""
-    """the run's configuration, as TOML"""
+    """configuration of the run, as TOML"""
     model: dict[str, Any] | None = None
-    """what there is to see of the virtual environment; None without one"""
+    """facts about the learned model; None without one"""
 
     @property
     def trained_label(self) -> str | None:
         """Label of the trained controller, if there is one."""
-        return self.metadata.get("trained_label")
+        return self.metadata.get("trained")
 
 
 def read_results(folder: Path) -> Results:
-    """Return what a folder of results says.
+    """Return the content of a folder of results.
 
     Raises:
         InputError: it is not such a folder, or not finished.
     """
-    path, recorded = (folder / name for name in (EVALUATION_FILE, "shown.safetensors"))
-    for file in (path, recorded):
-        if not file.is_file():
+    for name in (EVALUATION_FILE, PLOT_EPISODES_FILE):
+        if not (folder / name).is_file():
             hint = resume_hint(folder) if (folder / "config.toml").exists() else ""
-            raise InputError(f"report: {str(folder)!r} has no {file.name}{hint}")
+            raise InputError(f"report: {str(folder)!r} has no {name}{hint}")
+    metadata, rows = read_evaluation(folder)
     try:
-        about, arrays = json.loads(path.read_text()), load_file(recorded)
-        rows, shown = rows_by_driver(about.pop("rows")), {}
-        for number, entry in enumerate(about.pop("plot_episodes")):
-            pictured = unpack_episode(
-                {name: arrays[key] for name in STORED_ARRAYS if (key := f"{number}.{name}") in arrays}
-            )
-            shown[entry["driver"]] = PlotEpisode(**_replace_null(entry), **pictured)
+        stored, episodes = load_file(folder / PLOT_EPISODES_FILE), {}
+        for number, entry in enumerate(metadata.pop("plot_episodes")):
+            names = (name for name in (*PLOT_ARRAYS, "is_present") if f"{number}.{name}" in stored)
+            arrays = unpack_episode({name: stored[f"{number}.{name}"] for name in names})
+            episodes[entry["driver"]] = PlotEpisode(**replace_null(entry), **arrays)
         config = _read_text(folder / "config.toml")
-        return Results(folder, about, rows, shown, read_progress(folder), config, read_model_facts(folder))
+        return Results(folder, metadata, rows, episodes, read_progress(folder), config, read_model_facts(folder))
     except INVALID_DATA_ERRORS as error:
         raise damaged_results_error(folder, error) from None
 
 
 def damaged_results_error(folder: Path, error: Exception) -> InputError:
-    """Return the error for results that are not what unjam writes."""
+    """Return the error for results that unjam cannot have written."""
     return InputError(f"report: {str(folder)!r} cannot be read: {type(error).__name__}: {error}")
 
 
 def rows_by_driver(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of an `evaluation.json` by driver, NaN where it has null or no such metric."""
-    unknown = dict.fromkeys(METRICS, float("nan"))
-    found: dict[str, list[dict[str, Any]]] = {}
+    """Return the rows of an `evaluation.json` by driver; null and missing metrics become NaN."""
+    undefined = dict.fromkeys(METRICS, float("nan"))
+    drivers: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        found.setdefault(row["driver"], []).append({**unknown, **_replace_null(row)})
-    return found
+        drivers.setdefault(row["driver"], []).append({**undefined, **replace_null(row)})
+    return drivers
 
 
 def read_evaluation(folder: Path) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
-    """Return what a folder of results is about, and its rows of metrics by driver."""
+    """Return the metadata of a folder of results, and its rows of metrics by driver."""
     try:
-        about = json.loads((folder / EVALUATION_FILE).read_text())
-        return about, rows_by_driver(about.pop("rows"))
+        metadata = json.loads((folder / EVALUATION_FILE).read_text())
+        return metadata, rows_by_driver(metadata.pop("rows"))
     except INVALID_DATA_ERRORS as error:
         raise damaged_results_error(folder, error) from None
 
@@ -172,18 +174,18 @@ def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of a run's progress; one that is damaged, or cut short by a crash, is left out."""
+    """Return the rows of a run's progress without damaged rows, such as one that a crash truncated."""
     return [row for row in read_json_lines(folder / "progress.jsonl") if isinstance(row.get("iteration"), int)]
 
 
 def validation_gains(progress: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
-    """Return the best return and the last on the validation seeds, beyond the expert's; None without any.
+    """Return the best and the last return on the validation seeds minus the expert's; None without any.
 
-    Where the best is not above zero the untrained network was kept, which earns what the expert does.
+    If the best is not positive, the run kept the untrained network, which has the return of the expert.
     """
-    validated = [row["return_validation"] for row in progress if row["return_validation"] is not None]
+    returns = [row["return_validation"] for row in progress if row["return_validation"] is not None]
     expert = progress[0]["return_expert"] or 0.0 if progress else 0.0
-    return (max(validated) - expert, validated[-1] - expert) if validated else None
+    return (max(returns) - expert, returns[-1] - expert) if returns else None
 
 
 def seconds_by_part(progress: Sequence[dict[str, Any]]) -> dict[str, float]:
@@ -193,22 +195,22 @@ def seconds_by_part(progress: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 
 def read_model_facts(folder: Path) -> dict[str, Any] | None:
-    """Return what a run's `model.json` says; None where there is none, or none that can be read."""
+    """Return the content of a run's `model.json`; None if there is none, or it cannot be read."""
     try:
-        found = json.loads(_read_text(folder / MODEL_FILE))
+        facts = json.loads(_read_text(folder / MODEL_FILE))
     except (ValueError, RecursionError):
         return None
-    return found if isinstance(found, dict) else None
+    return facts if isinstance(facts, dict) else None
 
 
 def original_command(results: Results) -> str:
-    """Return the command line that made a folder; of one that went on the first, with the last budget."""
+    """Return the command line that made a folder; of a resumed run the first, with the last step budget."""
     command = [str(word) for word in results.metadata.get("manifest", {}).get("command", [])]
     if results.trained_label is None or "--resume" not in command:
         return shlex.join(command)
     try:
-        made = json.loads(_read_text(results.folder / "manifest.json"))
-        first, *others = (each["command"] for each in (made, *made["lineage"]))
+        manifest = json.loads(_read_text(results.folder / "manifest.json"))
+        first, *others = (each["command"] for each in (manifest, *manifest["lineage"]))
     except INVALID_DATA_ERRORS:
         return shlex.join(command)
     budgets = [["--steps", after] for each in others for word, after in pairwise(each) if word == "--steps"]
@@ -219,6 +221,6 @@ def _read_text(path: Path) -> str:
     return path.read_text(errors="replace") if path.is_file() else ""
 
 
-def _replace_null(entry: dict[str, Any]) -> dict[str, Any]:
-    """JSON has no NaN; null stands for it."""
+def replace_null(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return a JSON object with NaN for null, as JSON has no NaN."""
     return {key: float("nan") if value is None else value for key, value in entry.items()}

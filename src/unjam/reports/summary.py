@@ -1,4 +1,4 @@
-"""What the report says in words, figures and tables, from the results of one folder or of several."""
+"""Texts, key figures and tables of the report, from the results of one or several folders."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,73 +16,62 @@ from unjam.measures.statistics import format_difference, gain_verdict, metric_es
 from unjam.reports.results import PlotEpisode, Results
 
 CLOSE_TIME_GAP = 1.0
-"""time headway below which the report says so [s]; the paper's h_max"""
-
+"""time gap below which the report has a note [s]; the paper's h_max"""
 MAX_LIMIT_RATIO = 1.01
-"""share of the limit above which the report explains how that can be"""
+"""ratio of mean speed to the limit above which the report has a note"""
 LOWER_IS_BETTER, HIGHER_IS_BETTER = "less", "more"
 METRIC_DIRECTIONS = {
     **dict.fromkeys(("mean_speed", "mean_speed_steady", "outflow_veh_per_h"), HIGHER_IS_BETTER),
-    **dict.fromkeys(
-        ("travel_time", "delay", "insertion_backlog_veh", "fuel_ml_per_km", "share_standing"), LOWER_IS_BETTER
-    ),
+    **dict.fromkeys(("travel_time", "delay", "insertion_backlog_veh"), LOWER_IS_BETTER),
+    **dict.fromkeys(("fuel_ml_per_km", "share_standing"), LOWER_IS_BETTER),
     **dict.fromkeys(("speed_std_fleet", "speed_std_fleet_steady", "time_to_dissolve"), LOWER_IS_BETTER),
     "min_ttc": HIGHER_IS_BETTER,
-    **dict.fromkeys(
-        ("human_max_braking", "people_beyond_3_5", "people_beyond_4_5", "people_beyond_9"), LOWER_IS_BETTER
-    ),
-    "collisions": LOWER_IS_BETTER,
+    **dict.fromkeys(("human_max_braking", "human_braking_beyond_3_5"), LOWER_IS_BETTER),
+    **dict.fromkeys(("human_braking_beyond_4_5", "human_braking_beyond_9", "collisions"), LOWER_IS_BETTER),
 }
-"""metrics that say the same of people alone and of traffic with CAVs, in the order of the table, and what is
-better of each"""
+"""metrics with the same meaning in the human baseline and with CAVs, in the order of the table, and which direction
+is better"""
 
 
 @dataclass(frozen=True)
 class ReportColumn:
-    """One driver of one folder, as tables and pictures name it."""
+    """One driver of one folder, as named in tables and figures."""
 
     name: str
     rows: list[dict[str, Any]]
     episode: PlotEpisode | None
     human_rows: list[dict[str, Any]] | None = None
-    """those of people alone in the same folder; of themselves none"""
+    """rows of the human baseline in the same folder; None for the baseline itself"""
 
 
 def report_columns(results: Sequence[Results]) -> list[ReportColumn]:
-    """Return the drivers to show: all of a single folder; of several, what each folder is about."""
-    if len(results) == 1:
-        return [_make_column(results[0], label, label) for label in results[0].rows]
+    """Return all drivers of a single folder; of several folders, shared baselines only once."""
     columns: dict[str, ReportColumn] = {}
     for result, folder in zip(results, folder_names(results), strict=True):
         for label, rows in result.rows.items():
-            mine = label == result.trained_label or result.trained_label is None
-            name = f"{folder}: {label}" if mine else label
-            if name in columns and _episode_keys(columns[name].rows) != _episode_keys(rows):
-                name = f"{folder}: {label}"
-            columns.setdefault(name, _make_column(result, label, name))
+            is_own = len(results) > 1 and result.trained_label in (None, label)
+            is_other = label in columns and _episode_keys(columns[label].rows) != _episode_keys(rows)
+            name = f"{folder}: {label}" if is_own or is_other else label
+            human = None if label == HUMAN_LABEL else result.rows.get(HUMAN_LABEL)
+            columns.setdefault(name, ReportColumn(name, rows, result.plot_episodes.get(label), human))
     return list(columns.values())
 
 
-def _make_column(result: Results, label: str, name: str) -> ReportColumn:
-    people = None if label == HUMAN_LABEL else result.rows.get(HUMAN_LABEL)
-    return ReportColumn(name, result.rows[label], result.plot_episodes.get(label), people)
-
-
 def common_baseline(results: Sequence[Results]) -> str:
-    """Return beside whom the table of `report_columns` sets the drivers; of several folders who is in all."""
+    """Return the baseline of the table of `report_columns`; empty if the folders do not share one."""
     first, *others = (choose_baseline(result.rows) for result in results)
-    same = {tuple(_episode_keys(result.rows.get(first, []))) for result in results}
-    own = len(results) > 1 and any(result.trained_label in (None, first) for result in results)
-    return first if all(other == first for other in others) and len(same) == 1 and not own else ""
+    is_same = len({tuple(_episode_keys(result.rows.get(first, []))) for result in results}) == 1
+    is_own = len(results) > 1 and any(result.trained_label in (None, first) for result in results)
+    return first if all(other == first for other in others) and is_same and not is_own else ""
 
 
 def _episode_keys(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Return what tells the episodes of one driver from those on another road."""
+    """Return keys that differ between the episodes of a driver on different roads."""
     return [(str(row["seed"]), str(row["return"])) for row in rows]
 
 
 def folder_names(results: Sequence[Results]) -> list[str]:
-    """Return a name for each folder: as much of the end of its path as tells it from the others."""
+    """Return a name for each folder: the shortest end of its path that is unique."""
     paths = [result.folder.resolve().parts for result in results]
     for length in range(1, max(map(len, paths)) + 1):
         names = ["/".join(parts[-length:]) for parts in paths]
@@ -95,39 +84,36 @@ def report_title(results: Sequence[Results]) -> str:
     """Return the page's title."""
     names = ", ".join(dict.fromkeys(result.metadata["scenario"] for result in results))
     if len(results) > 1:
-        return f"{names}: {len(results)} results compared"
-    only = results[0]
-    if only.trained_label is None:
-        return f"{names}: {', '.join(only.rows)}"
-    expert = only.metadata["expert"]
+        return f"{names}: comparison of {len(results)} results"
+    if results[0].trained_label is None:
+        return f"{names}: {', '.join(results[0].rows)}"
+    expert = results[0].metadata["expert"]
     return f"{names}: a trained " + ("network" if expert == "none" else f"residual on {expert}")
 
 
 def main_finding(result: Results) -> str:
-    """Return the main finding of a folder in a few sentences, whichever way it went."""
-    if result.trained_label is None:
+    """Return the main finding of a folder in a few sentences, positive or negative."""
+    if (trained := result.trained_label) is None:
         return _drive_finding(result)
-    rows, effect = result.rows[result.trained_label], effects_by_driver(result.rows).get(result.trained_label)
-    if effect:
-        scenario, words = (
-            result.metadata["scenario"],
-            _effect_text(effect, feasibility_by_driver(result.rows)[result.trained_label]),
-        )
-        said = f"Beside people alone on {scenario}, {_pair_count(effect)} held-out seeds paired: {words}."
+    rows = result.rows[trained]
+    if effect := effects_by_driver(result.rows).get(trained):
+        text = _effect_text(effect, feasibility_by_driver(result.rows)[trained])
+        road, count = result.metadata["scenario"], _pair_count(effect)
+        finding = f"Compared with the human baseline on {road}, {count} paired test seeds: {text}."
     else:
-        earned = metric_estimate(rows, "return").mean
-        said = f"On {len(rows)} held-out seeds the trained controller earns {earned:.0f} an episode."
-    experts = {label: of for label, of in result.rows.items() if label not in (result.trained_label, HUMAN_LABEL)}
-    returns = {label: metric_estimate(of, "return").mean for label, of in experts.items()}
+        mean = metric_estimate(rows, "return").mean
+        finding = f"On {len(rows)} test seeds the mean return of the trained controller is {mean:.0f}."
+    experts = {label: other for label, other in result.rows.items() if label not in (trained, HUMAN_LABEL)}
+    returns = {label: metric_estimate(other, "return").mean for label, other in experts.items()}
     expert = result.metadata["expert"]
     best = max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default=expert)
     if expert in experts:
         gain = paired_difference(rows, experts[expert], "return")
-        said += f" Return beyond its expert, {expert}: {format_difference(gain)}. {gain_verdict(gain)}"
+        finding += f" Return difference to its expert, {expert}: {format_difference(gain)}. {gain_verdict(gain)}"
     if best != expert:
         gain = paired_difference(rows, experts[best], "return")
-        said += f" Beyond {best}, the expert that earns most: {format_difference(gain)}."
-    return said
+        finding += f" Return difference to {best}, the expert with the highest return: {format_difference(gain)}."
+    return finding
 
 
 def _pair_count(effect: Effect) -> int:
@@ -136,43 +122,40 @@ def _pair_count(effect: Effect) -> int:
 
 
 def _effect_text(effect: Effect, verdict: str) -> str:
-    """Return what everybody on the road gains, and whether a car could drive so, as `verdict` says, too."""
-    able = "; a car could drive so" + ("" if verdict == FEASIBLE else f", but {verdict}")
-    safe = {"": "", FEASIBLE: able}
-    return effect.summary + safe.get(effect.feasibility, f"; no car could drive so: {effect.feasibility}")
+    """Return the effect on all vehicles, and feasibility: of the CAVs, and of all vehicles as the `verdict`."""
+    feasible = "; feasible" + ("" if verdict == FEASIBLE else f", but {verdict}")
+    texts = {"": "", FEASIBLE: feasible}
+    return effect.summary + texts.get(effect.feasibility, f"; infeasible: {effect.feasibility}")
 
 
 def _drive_finding(result: Results) -> str:
-    """Return how fast all vehicles drive with each driver."""
+    """Return the effect of each driver, or without a human baseline the mean speed."""
     scenario, effects = result.metadata["scenario"], effects_by_driver(result.rows)
     if effects:
-        count, found = max(_pair_count(effect) for effect in effects.values()), feasibility_by_driver(result.rows)
-        said = "; ".join(f"{label}: {_effect_text(effect, found[label])}" for label, effect in effects.items())
-        seeds = f"{count} episodes with the same seeds paired" if count > 1 else "one seed, which proves nothing"
-        return f"Beside people alone on {scenario}, {seeds}: {said}."
+        count, verdicts = max(map(_pair_count, effects.values())), feasibility_by_driver(result.rows)
+        text = "; ".join(f"{label}: {_effect_text(effect, verdicts[label])}" for label, effect in effects.items())
+        seeds = f"{count} episodes on paired seeds" if count > 1 else "a single seed, which proves nothing"
+        return f"Compared with the human baseline on {scenario}, {seeds}: {text}."
     ratios = {label: metric_estimate(rows, "speed_limit_ratio_steady") for label, rows in result.rows.items()}
+    percent = {label: f"{100 * ratio.mean:.0f}\u00a0%" for label, ratio in ratios.items()}
     if len(ratios) > 1:
-        words = ", ".join(
-            f"{label} {100 * ratio.mean:.0f}\u00a0%" if ratio.count else f"{label} failed"
-            for label, ratio in ratios.items()
-        )
-        return f"Mean speed of all vehicles in steady state on {scenario}, of the limit: {words}."
+        text = ", ".join(f"{label} {percent[label] if ratios[label].count else 'failed'}" for label in ratios)
+        return f"Mean speed of all vehicles in steady state on {scenario}, relative to the limit: {text}."
     [(label, rows)] = result.rows.items()
     speed = metric_estimate(rows, "mean_speed")
     if speed.count == 0:
         return f"{label} on {scenario}: all {len(rows)} episodes failed."
     return (
-        f"{label} on {scenario}, {len(rows)} episodes: all vehicles drive {speed.mean:.2f} m/s on average, "
-        f"and in steady state {100 * ratios[label].mean:.0f}\u00a0% of the limit."
+        f"{label} on {scenario}, {len(rows)} episodes: the mean speed of all vehicles is {speed.mean:.2f} m/s, "
+        f"and in steady state {percent[label]} of the limit."
     )
 
 
 def report_notes(result: Results) -> list[str]:
-    """Return what a reader should know before trusting the main finding."""
+    """Return caveats of the main finding."""
     labels = [result.trained_label] if result.trained_label else list(result.rows)
-    early = early_end_notes(result.rows)
-    said = [f"{note}." for note in dict.fromkeys([*result.metadata.get("notes", []), *early])]
-    return [*said, *(note for label in labels for note in _driver_notes(result, label))]
+    notes = dict.fromkeys([*result.metadata.get("notes", []), *early_end_notes(result.rows)])
+    return [*(f"{note}." for note in notes), *(note for label in labels for note in _driver_notes(result, label))]
 
 
 def _driver_notes(result: Results, label: str) -> list[str]:
@@ -180,78 +163,77 @@ def _driver_notes(result: Results, label: str) -> list[str]:
     notes = []
     closest = min((row["min_time_gap"] for row in rows if np.isfinite(row["min_time_gap"])), default=np.inf)
     if closest < CLOSE_TIME_GAP:
-        released = result.metadata["reward"] == "released"
-        blamed = " The reward (released) does not ask for distance." if released else ""
-        notes.append(f"{label} drives close: its smallest time headway is {closest:.2f} s.{blamed}")
+        is_released = result.metadata["reward"] == "released"
+        reason = " The reward (released) has no term for distance." if is_released else ""
+        notes.append(f"{label} follows closely: its min time gap is {closest:.2f} s.{reason}")
     ratio = metric_estimate(rows, "speed_limit_ratio_steady").mean
     if ratio > MAX_LIMIT_RATIO:
         notes.append(
-            f"With {label} all vehicles drive at {100 * ratio:.0f} % of the limit, which is how fast people "
-            "alone could drive alike: the CAV keeps a smaller gap than they would."
+            f"With {label} the mean speed is {100 * ratio:.0f} % of the limit, which is the equilibrium speed of human "
+            "drivers: the CAV keeps a smaller gap than they would."
         )
-    leaning = metric_estimate(rows, "shield_override_share").mean
-    if leaning > 0.01:
+    share = metric_estimate(rows, "shield_override_share").mean
+    if share > 0.01:
         hardest = max(row["shield_max_braking"] for row in rows)
         notes.append(
-            f"{label} leans on the simulator's safety check: it overrides {100 * leaning:.1f} % of commands, "
-            f"braking up to {hardest:.1f} m/s² harder than asked."
+            f"{label} relies on SUMO's safety check: it overrides {100 * share:.1f} % of commands, and adds up to "
+            f"{hardest:.1f} m/s² of braking."
         )
     return notes
 
 
 def key_figures(result: Results) -> list[dict[str, str]]:
-    """Return the key figures of a folder, for its trained controller or its only driver; of several none."""
+    """Return the key figures of the trained controller or the only driver of a folder; of several drivers none."""
     if result.trained_label is None and len(result.rows) > 1:
         return []
     label = result.trained_label or next(iter(result.rows))
     rows = result.rows[label]
-    human = [] if label == "human" else result.rows.get("human", [])
-    closed = all(episode.is_closed for episode in result.plot_episodes.values())
+    human = [] if label == HUMAN_LABEL else result.rows.get(HUMAN_LABEL, [])
+    is_closed = all(episode.is_closed for episode in result.plot_episodes.values())
     figures = (
         ("Mean speed / limit, steady", "speed_limit_ratio_steady", 0, "%", 100.0),
         ("Speed std across vehicles, steady", "speed_std_fleet_steady", 2, "m/s", 1.0)
-        if closed
-        else ("Vehicles that left the road", "outflow_veh_per_h", 0, "per hour", 1.0),
+        if is_closed
+        else ("Outflow", "outflow_veh_per_h", 0, "veh/h", 1.0),
         ("Fuel", "fuel_ml_per_km", 0, "ml/km", 1.0),
     )
     cards = []
     for title, name, digits, unit, scale in figures:
-        found, people = (metric_estimate(of, name) for of in (rows, human))
-        value, beside = (f"{scale * each.mean:.{digits}f} {unit}" if each.count else "–" for each in (found, people))
-        detail = f"all-human: {beside}" if human else label
-        cards.append({"label": title, "value": value, "detail": detail})
+        estimates = (metric_estimate(each, name) for each in (rows, human))
+        value, baseline = (f"{scale * each.mean:.{digits}f} {unit}" if each.count else "–" for each in estimates)
+        cards.append({"label": title, "value": value, "detail": f"human baseline: {baseline}" if human else label})
     expert = result.rows.get(result.metadata.get("expert", ""))
     if result.trained_label and expert is not None:
         gain = paired_difference(rows, expert, "return")
-        beyond = estimate_cell(gain, 0, sign="+")
-        detail = f"95 % interval {beyond.interval}" if gain.low < gain.high else f"of {gain.count} seeds"
-        cards.append({"label": "Return beyond the expert", "value": beyond.mean, "detail": detail})
+        cell = estimate_cell(gain, 0, sign="+")
+        detail = f"95 % CI {cell.interval}" if gain.low < gain.high else f"{gain.count} seeds"
+        cards.append({"label": "Return difference to expert", "value": cell.mean, "detail": detail})
     return cards
 
 
 def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
-    """Return the table of differences to people alone in the same folder, seeds paired; empty without them.
+    """Return the table of paired differences to the human baseline of the same folder; empty without baselines.
 
-    A cell is marked better or worse where its interval lies on one side of zero, of all pairs: each for
-    itself, so that of twenty cells one is marked by chance.
+    A cell is marked as better or worse if its confidence interval excludes zero and all pairs count. There is no
+    correction for multiple comparisons: of twenty cells, one is marked by chance.
     """
-    others = [(column, column.human_rows) for column in columns if column.human_rows is not None]
-    if not others:
+    compared = [(column, column.human_rows) for column in columns if column.human_rows is not None]
+    if not compared:
         return {}
     rows = []
-    for name, better in METRIC_DIRECTIONS.items():
-        metric = METRICS[name]
-        gains = [paired_difference(column.rows, people, name) for column, people in others]
-        if not any(gain.count for gain in gains):
-            continue
-        cells = []
-        for gain, (column, people) in zip(gains, others, strict=True):
-            pairs = len(pair_rows(column.rows, people))
-            shown = (gain.low > 0 or gain.high < 0) and gain.count == pairs
-            mark = ("better" if (gain.mean > 0) == (better is HIGHER_IS_BETTER) else "worse") if shown else ""
-            cells.append({"text": str(estimate_cell(gain, metric.digits, pairs, "+")), "mark": mark})
-        rows.append({"label": metric.label, "unit": metric.unit, "cells": cells})
-    return {"names": [column.name for column, _ in others], "rows": rows}
+    for name, direction in METRIC_DIRECTIONS.items():
+        metric, cells = METRICS[name], []
+        for column, human in compared:
+            gain, pairs = paired_difference(column.rows, human, name), len(pair_rows(column.rows, human))
+            is_marked = (gain.low > 0 or gain.high < 0) and gain.count == pairs
+            is_better = (gain.mean > 0) == (direction is HIGHER_IS_BETTER)
+            mark = ("better" if is_better else "worse") if is_marked else ""
+            cells.append(
+                {"text": str(estimate_cell(gain, metric.digits, pairs, "+")), "mark": mark, "count": gain.count}
+            )
+        if any(cell["count"] for cell in cells):
+            rows.append({"label": metric.label, "unit": metric.unit, "cells": cells})
+    return {"names": [column.name for column, _ in compared], "rows": rows}
 
 
 def episodes_as_csv(columns: Sequence[ReportColumn]) -> str:

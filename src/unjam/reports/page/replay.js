@@ -1,4 +1,4 @@
-// Plays the shown episodes side by side: vehicles on their road, coloured by speed.
+// Plays the episodes of all drivers side by side: vehicles on their road, colored by speed.
 (async () => {
   const data = JSON.parse(document.getElementById("replay-data").textContent);
   const section = document.getElementById("replay");
@@ -6,15 +6,15 @@
   const find = (name) => section.querySelector(name);
   const [play, slider, clock, pace, zoom] = [".play", ".time", ".clock", ".pace", ".zoom"].map(find);
 
-  // Values of all frames, NaN where there is none; the page holds steps from frame to frame, deflated.
-  async function numbers({ data: text, low, scale }, width) {
+  // Decodes the values of all frames, NaN where there is none; the page contains compressed differences between frames.
+  async function decode({ data: text, low, scale }, width) {
     const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-    const plain = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    const steps = new Uint16Array(await new Response(plain).arrayBuffer());
+    const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const steps = new Uint16Array(await new Response(inflated).arrayBuffer());
     for (let index = width; index < steps.length; index++) steps[index] += steps[index - width];
     return Float32Array.from(steps, (step) => step === data.no_value ? NaN : low + scale * step);
   }
-  async function shown(driver) {
+  async function addRoad(driver) {
     const figure = document.createElement("figure");
     const canvas = document.createElement("canvas");
     canvas.setAttribute("role", "img");
@@ -24,26 +24,26 @@
     caption.append(driver.name, mean);
     figure.append(canvas, caption);
     find(".roads").append(figure);
-    const all = (name) => Promise.all((driver[name] || []).map((each) => numbers(each, driver.vehicles)));
-    const [[speeds], [positions], places] = await Promise.all([all("speeds"), all("positions"), all("places")]);
-    return { ...driver, speeds, positions, places, canvas, mean, cavs: new Set(driver.cavs) };
+    const all = (name) => Promise.all((driver[name] || []).map((each) => decode(each, driver.vehicles)));
+    const [[speeds], [positions], poses] = await Promise.all([all("speeds"), all("positions"), all("poses")]);
+    return { ...driver, speeds, positions, poses, canvas, mean, cavs: new Set(driver.cavs) };
   }
   if (!window.DecompressionStream) {
-    find(".roads").textContent = "The replay needs a browser of 2023 or later.";
+    find(".roads").textContent = "The replay needs a browser from 2023 or later.";
     return;
   }
   const roads = [];
-  for (const driver of data.drivers) roads.push(await shown(driver));
+  for (const driver of data.drivers) roads.push(await addRoad(driver));
   const end = (data.frames - 1) * data.step;
   slider.max = end;
 
-  const table = data.colours;
-  const colour = (speed) => table[Math.max(0, Math.min(table.length - 1, Math.round(speed / data.fastest * (table.length - 1))))];
+  const table = data.colors;
+  const color = (speed) => table[Math.max(0, Math.min(table.length - 1, Math.round(speed / data.max_speed * (table.length - 1))))];
   find(".bar").style.background = `linear-gradient(to right, ${table.join(",")})`;
-  find(".fastest").textContent = data.fastest;
+  find(".max-speed").textContent = data.max_speed;
 
-  // Where on the plane a coordinate along the route lies, and which way it points.
-  function place(outline, coordinate) {
+  // Returns position and direction in the plane of a coordinate along the route.
+  function locate(outline, coordinate) {
     let low = 0, high = outline.length - 1;
     while (high - low > 1) {
       const middle = (low + high) >> 1;
@@ -54,14 +54,14 @@
     return [x0 + part * (x1 - x0), y0 + part * (y1 - y0), Math.atan2(y1 - y0, x1 - x0)];
   }
 
-  // Where a vehicle's middle is between two frames, and which way it points; nothing where it is not there.
-  function spot(road, a, b, part) {
+  // Returns center and direction of a vehicle between two frames.
+  function pose(road, a, b, part) {
     const mix = (values) => Number.isNaN(values[b]) ? values[a] : values[a] + part * (values[b] - values[a]);
     if (road.positions) {
       const middle = mix(road.positions) - data.vehicle_length / 2;
-      return place(road.lines[0], (middle % road.loop_length + road.loop_length) % road.loop_length);
+      return locate(road.lines[0], (middle % road.loop_length + road.loop_length) % road.loop_length);
     }
-    const [x, y, headings] = road.places, half = data.vehicle_length / 2, angle = headings[a];
+    const [x, y, headings] = road.poses, half = data.vehicle_length / 2, angle = headings[a];
     return [mix(x) - half * Math.cos(angle), mix(y) - half * Math.sin(angle), angle];
   }
 
@@ -80,22 +80,22 @@
     road.canvas.parentElement.classList.toggle("wide", right - left > 2 * (high - low));
   });
 
-  // What is in the middle of the pictures, as a share of the roads' width and height: the same on all.
+  // Center of the view, relative to width and height of the road: the same for all roads.
   const view = { x: 0.5, y: 0.5 };
   roads.forEach((road) => road.canvas.addEventListener("pointermove", (event) => {
     if (!event.buttons || zoom.value === "1") return;
-    const share = (value, moved, from, to) => Math.max(0, Math.min(1, value + moved / road.metre / Math.max(to - from, 1)));
+    const share = (value, moved, from, to) => Math.max(0, Math.min(1, value + moved / road.meter / Math.max(to - from, 1)));
     view.x = share(view.x, -event.movementX, road.box[0], road.box[1]);
     view.y = share(view.y, event.movementY, road.box[2], road.box[3]);
     show();
   }));
-  // Who zooms in is shown the slowest vehicle: that is where the wave is.
+  // Zooming in centers the slowest vehicle, which is in a wave.
   function goToSlowest(road, frame) {
-    const there = [...Array(road.vehicles).keys()].map((vehicle) => frame * road.vehicles + vehicle)
-      .filter((at) => !Number.isNaN(road.speeds[at]));
-    if (!there.length) return;
-    const at = there.reduce((one, other) => road.speeds[other] < road.speeds[one] ? other : one);
-    const [x, y] = spot(road, at, at, 0), [left, right, low, high] = road.box;
+    const present = [...Array(road.vehicles).keys()].map((vehicle) => frame * road.vehicles + vehicle)
+      .filter((index) => !Number.isNaN(road.speeds[index]));
+    if (!present.length) return;
+    const slowest = present.reduce((one, other) => road.speeds[other] < road.speeds[one] ? other : one);
+    const [x, y] = pose(road, slowest, slowest, 0), [left, right, low, high] = road.box;
     [view.x, view.y] = [(x - left) / Math.max(right - left, 1), (y - low) / Math.max(high - low, 1)];
   }
   zoom.addEventListener("change", () => {
@@ -108,16 +108,16 @@
   function draw(road, time) {
     const [left, right, low, high] = road.box;
     const width = Math.round(road.canvas.clientWidth * (window.devicePixelRatio || 1));
-    const metre = width / (right - left + 12);
-    const near = Number(zoom.value), across = high - low + 12;
-    const height = Math.round(Math.max(Math.min(1.2 * width, metre * across), Math.min(0.15 * width, near * metre * across)));
+    const meter = width / (right - left + 12);
+    const factor = Number(zoom.value), across = high - low + 12;
+    const height = Math.round(Math.max(Math.min(1.2 * width, meter * across), Math.min(0.15 * width, factor * meter * across)));
     if (road.canvas.width !== width || road.canvas.height !== height) {
       road.canvas.width = width; road.canvas.height = height;
     }
-    const scale = near * Math.min(metre, height / across);
+    const scale = factor * Math.min(meter, height / across);
     const middle = [left + view.x * (right - left), low + view.y * (high - low)];
-    road.metre = scale / (window.devicePixelRatio || 1);
-    const enlarged = Math.max(1, 6 * (window.devicePixelRatio || 1) / (scale * data.vehicle_length));
+    road.meter = scale / (window.devicePixelRatio || 1);
+    const enlargement = Math.max(1, 6 * (window.devicePixelRatio || 1) / (scale * data.vehicle_length));
     const pen = road.canvas.getContext("2d");
     pen.setTransform(1, 0, 0, 1, 0, 0);
     pen.clearRect(0, 0, width, height);
@@ -129,20 +129,20 @@
 
     const frame = Math.min(time / data.step, data.frames - 1);
     const first = Math.floor(frame), second = Math.min(first + 1, data.frames - 1), part = frame - first;
-    let sum = 0, there = 0;
+    let sum = 0, count = 0;
     for (let vehicle = 0; vehicle < road.vehicles; vehicle++) {
       const [a, b] = [first * road.vehicles + vehicle, second * road.vehicles + vehicle];
       if (Number.isNaN(road.speeds[a])) continue;
       const later = Number.isNaN(road.speeds[b]) ? road.speeds[a] : road.speeds[b];
       const speed = road.speeds[a] + part * (later - road.speeds[a]);
       sum += speed;
-      there += 1;
-      const [x, y, angle] = spot(road, a, b, part);
+      count += 1;
+      const [x, y, angle] = pose(road, a, b, part);
       pen.save();
       pen.translate(x, y);
       pen.rotate(angle);
-      pen.scale(enlarged, enlarged);
-      pen.fillStyle = colour(speed);
+      pen.scale(enlargement, enlargement);
+      pen.fillStyle = color(speed);
       pen.fillRect(-data.vehicle_length / 2, -1.2, data.vehicle_length, 2.4);
       if (road.cavs.has(vehicle)) {
         pen.lineWidth = 0.8; pen.strokeStyle = "#d7263d";
@@ -150,7 +150,7 @@
       }
       pen.restore();
     }
-    road.mean.textContent = there ? `mean ${(sum / there).toFixed(1)} m/s` : "nobody on the road";
+    road.mean.textContent = count ? `mean ${(sum / count).toFixed(1)} m/s` : "no vehicle on the road";
   }
 
   let now = 0, playing = false, last = 0;
