@@ -55,7 +55,7 @@ def test_new_units_leave_the_answers_as_they_were() -> None:
     generator = torch_generator((3,), "cpu")
     targets = torch.rand((50, len(TARGET_NAMES)), generator=generator, dtype=torch.float64) * 7 + 3
     for scale in (1.0, 0.1):
-        model.set_normalization(inputs.double() * scale, targets * scale, 1e-4)
+        model.set_normalization(inputs.double() * scale, targets * scale)
         assert_close(predict(model.layers(), inputs, members), before, atol=2e-4, rtol=2e-4)
     assert_close(model.target_mean, targets.mean(0).float() * 0.1)
 
@@ -94,7 +94,7 @@ def test_all_members_are_asked_equally_often() -> None:
 
 def test_state_dict_is_all_of_it() -> None:
     model = shaken(1)
-    model.set_normalization(some_inputs(20).double(), torch.rand((20, 6), dtype=torch.float64), 1e-4)
+    model.set_normalization(some_inputs(20).double(), torch.rand((20, 6), dtype=torch.float64))
     other = RowModel(SETTINGS, 1, (9,))
     other.load_state_dict(model.state_dict())
     members = torch.tensor([0, 1, 2])

@@ -110,7 +110,7 @@ def test_of_a_single_episode_the_end_is_held_out(decisions: tuple[int, ...]) -> 
 
 
 def test_without_data_there_is_nothing_to_learn_from() -> None:
-    with pytest.raises(InputError, match="no actual decisions"):
+    with pytest.raises(InputError, match="no environment steps"):
         EnvironmentData(10).transitions(0.2)
 
 

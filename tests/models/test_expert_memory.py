@@ -123,7 +123,7 @@ def test_on_tensors_it_drives_as_on_arrays(number: int, my_drivers: Path) -> Non
 
 def test_an_acceleration_that_is_not_finite_is_told(my_drivers: Path) -> None:
     state = state_of_ones(COMMON_FIELDS, torch.ones, 3)
-    with pytest.raises(InputError, match="virtual environment: acceleration is nan; allowed: finite"):
+    with pytest.raises(InputError, match="model rollout: acceleration is nan; allowed: finite"):
         tensor_driver(FileDriver(my_drivers, "broken"), "cpu").act(state, {})
     with pytest.raises(InputError, match=r"shape \(4,\); allowed: \(3,\)"):
         tensor_driver(FileDriver(my_drivers, "short"), "cpu").act(state, {})

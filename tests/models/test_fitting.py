@@ -152,7 +152,7 @@ def test_bad_steps_are_taken_back(actual: Transitions, known: tuple[RowModel, Mo
 def test_a_loss_that_is_not_finite_is_told(actual: Transitions) -> None:
     broken = actual.next_states.leader_gap.copy()
     broken[:] = np.inf
-    with pytest.raises(UnjamError, match="loss in pass 1 of its fit is not finite"):
+    with pytest.raises(UnjamError, match="loss of its fit is not finite in epoch 1"):
         fitted(actual._replace(next_states=actual.next_states._replace(leader_gap=broken)))
 
 

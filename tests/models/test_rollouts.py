@@ -224,7 +224,7 @@ def test_starts_are_looks_with_enough_ahead() -> None:
 def test_what_is_not_finite_is_told() -> None:
     driver, data = residual_driver(IDM()), actual_data(ToyDynamics(), residual_driver(IDM()), 1, 10)
     starts = prepare_starts(data, data.start_indices(), driver.expert, "cpu")
-    with pytest.raises(UnjamError, match="rewards of a rollout are not finite"):
+    with pytest.raises(UnjamError, match="model rollout: rewards are not finite"):
         roll_out(driver, ToyDynamics(bonus=inf), starts, 3, None)
 
 

@@ -1,4 +1,4 @@
-"""From trajectories to experience, the form in which learners take it, and into SB3's buffers."""
+"""Experience: trajectories in the form in which learners take them, and how SB3's buffers are filled with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -19,20 +19,20 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Experience:
-    """What a learner learns from: one row per choice of the network, trajectories one behind the other."""
+    """Trajectories one after the other, with one row per action of the network."""
 
     observations: Float32
-    """what the actor sees, then what the critic alone sees, shape (rows, inputs + critic inputs)"""
+    """inputs of the actor, then those of the critic alone, shape (rows, inputs + critic inputs)"""
     actions: Float32
-    """residuals that the network chose [m/s2], shape (rows,)"""
+    """residuals [m/s2], shape (rows,)"""
     rewards: Float64
-    """what was earned while each residual was held, shape (rows,)"""
+    """sums while each residual was held, shape (rows,)"""
     starts: NDArray[np.intp]
     """first row of each trajectory, shape (trajectories,)"""
     last_observations: Float32
-    """where each trajectory ended, shape (trajectories, inputs + critic inputs)"""
+    """observation at the end of each trajectory, shape (trajectories, inputs + critic inputs)"""
     terminated: NDArray[np.bool_]
-    """whether a collision ended it, shape (trajectories,); otherwise it was cut and is bootstrapped"""
+    """whether it ended in a collision, shape (trajectories,); otherwise it was truncated and is bootstrapped"""
 
     @property
     def last_rows(self) -> NDArray[np.intp]:
@@ -41,7 +41,7 @@ class Experience:
 
     @property
     def next_observations(self) -> Float32:
-        """What was seen after each row, of the shape of `observations`."""
+        """Observation after each row, of the shape of `observations`."""
         after = np.empty_like(self.observations)
         after[:-1] = self.observations[1:]
         after[self.last_rows] = self.last_observations
@@ -55,35 +55,37 @@ def make_experience(
 ) -> Experience:
     """Return the experience of trajectories.
 
-    `critic_inputs` has, for each, what the critic alone sees; `afterwards` what was earned after its end,
-    discounted to its last choice: it then is no cut. None: the value of where it ended stands for that.
+    Args:
+        trajectories: with observations.
+        critic_inputs: of each, the inputs of the critic alone.
+        returns_after_exit: of each, the rewards after its end, discounted to its last action, so that it counts as
+            terminated; None: it is bootstrapped with the value of its last observation.
     """
-    choices = [trajectory.actions_and_rewards for trajectory in trajectories]
-    ended = [trajectory.terminated for trajectory in trajectories]
-    for number, more in enumerate(returns_after_exit or ()):
-        if more is not None:
-            choices[number][1][-1] += more
-            ended[number] = True
-    seen = [
+    residuals, rewards = zip(*(trajectory.actions_and_rewards for trajectory in trajectories), strict=True)
+    terminated = [trajectory.terminated for trajectory in trajectories]
+    for number, later in enumerate(returns_after_exit or ()):
+        if later is not None:
+            rewards[number][-1] += later
+            terminated[number] = True
+    observations = [
         np.column_stack([trajectory.observations, np.tile(extra, (len(trajectory.observations), 1))])
         for trajectory, extra in zip(trajectories, critic_inputs, strict=True)
     ]
-    counts = [len(earned) for _, earned in choices]
     return Experience(
-        observations=np.concatenate([rows[:-1] for rows in seen]).astype(np.float32),
-        actions=np.concatenate([residual for residual, _ in choices]).astype(np.float32),
-        rewards=np.concatenate([earned for _, earned in choices]),
-        starts=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp),
-        last_observations=np.concatenate([rows[-1:] for rows in seen]).astype(np.float32),
-        terminated=np.array(ended),
+        observations=np.concatenate([rows[:-1] for rows in observations]).astype(np.float32),
+        actions=np.concatenate(residuals).astype(np.float32),
+        rewards=np.concatenate(rewards),
+        starts=np.cumsum([0, *(len(each) for each in rewards[:-1])]).astype(np.intp),
+        last_observations=np.concatenate([rows[-1:] for rows in observations]).astype(np.float32),
+        terminated=np.array(terminated),
     )
 
 
 def join_experience(parts: Sequence[Experience]) -> Experience:
-    """Return the experience of all parts, one behind the other: actual and virtual ones, say."""
+    """Return the experience of all parts, one after the other."""
     joined = {each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Experience)}
-    before = np.cumsum([0, *(len(part.rewards) for part in parts[:-1])])
-    joined["starts"] += np.repeat(before, [len(part.starts) for part in parts])
+    offsets = np.cumsum([0, *(len(part.rewards) for part in parts[:-1])])
+    joined["starts"] += np.repeat(offsets, [len(part.starts) for part in parts])
     return Experience(**joined)
 
 
@@ -91,13 +93,11 @@ def join_experience(parts: Sequence[Experience]) -> Experience:
 def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
     """Fill `buffer` with rows and compute their advantages.
 
-    Values and log-probabilities are computed here, in one batch, so that the ratio before the first update
-    is exactly 1. A trajectory that was cut (by the horizon, by leaving the road, at the end of a virtual
-    rollout) is bootstrapped: gamma V of where it ended is folded into its last reward. One that ended in a
-    collision is not.
+    Values and log-probabilities are computed in one batch, so that the ratio before the first update is exactly 1. A
+    truncated trajectory is bootstrapped: gamma V of its last observation is added to its last reward.
     """
-    actions, seen = rows.actions[:, None], torch.as_tensor(rows.observations)
-    values, log_probs, _ = policy.evaluate_actions(seen, torch.as_tensor(actions))
+    actions, observations = rows.actions[:, None], torch.as_tensor(rows.observations)
+    values, log_probs, _ = policy.evaluate_actions(observations, torch.as_tensor(actions))
     last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
     rewards = rows.rewards.astype(np.float32)
     rewards[rows.last_rows] += buffer.gamma * np.where(rows.terminated, 0.0, last_values).astype(np.float32)
@@ -115,41 +115,39 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
 
 
 def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Float64) -> None:
-    """Add rows to those of earlier iterations, in place of the oldest where the buffer is full.
+    """Add rows to the buffer, in place of the oldest ones if it is full.
 
-    Only a collision ends what is to be earned: a trajectory that was cut goes on with the value of where it
-    ended. SB3 keeps actions as shares of their bounds, here of the `authority` [m/s2].
+    A truncated trajectory is bootstrapped: only a collision sets `dones`. SB3 stores actions as shares of their bounds,
+    here of the `authority` [m/s2].
     """
     done = np.zeros(len(rewards), np.float32)
     done[rows.last_rows] = rows.terminated
-    places = (buffer.pos + np.arange(len(rewards))) % buffer.buffer_size
-    buffer.observations[places, 0] = rows.observations
-    buffer.next_observations[places, 0] = rows.next_observations
-    buffer.actions[places, 0, 0] = rows.actions / np.float32(authority)
-    buffer.rewards[places, 0] = rewards
-    buffer.dones[places, 0] = done
+    indices = (buffer.pos + np.arange(len(rewards))) % buffer.buffer_size
+    buffer.observations[indices, 0] = rows.observations
+    buffer.next_observations[indices, 0] = rows.next_observations
+    buffer.actions[indices, 0, 0] = rows.actions / np.float32(authority)
+    buffer.rewards[indices, 0] = rewards
+    buffer.dones[indices, 0] = done
     end = buffer.pos + len(rewards)
     buffer.full = buffer.full or end >= buffer.buffer_size
     buffer.pos = end % buffer.buffer_size
 
 
 class MixedReplayBuffer(ReplayBuffer):
-    """SB3's replay buffer of actual rows; while it has virtual ones too, a batch is made of both."""
+    """SB3's replay buffer of environment rows; while it has model rows too, batches are mixed."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._model_buffer: ReplayBuffer | None = None
-        self.real_ratio = 1.0
-        """share of actual rows in a batch"""
+    _model_buffer: ReplayBuffer | None = None
+    real_ratio = 1.0
+    """share of environment rows in a batch"""
 
     def new_model_buffer(self, rows: int) -> ReplayBuffer:
-        """Return an empty buffer for so many virtual rows, in place of the one before."""
+        """Return an empty buffer for a number of model rows, which replaces the previous one."""
         spaces = self.observation_space, self.action_space
         self._model_buffer = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
         return self._model_buffer
 
     def drop_model_buffer(self) -> None:
-        """Sample actual rows alone from now on."""
+        """Sample environment rows alone from now on."""
         self._model_buffer = None
 
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
@@ -160,15 +158,14 @@ class MixedReplayBuffer(ReplayBuffer):
         parts = [super().sample(real)] if real else []
         if real < batch_size:
             parts.append(self._model_buffer.sample(batch_size - real))
-        joined = [torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)]
-        return ReplayBufferSamples(*joined)
+        return ReplayBufferSamples(*(torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)))
 
 
 def shift_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
-    """Return the rewards less `offset`, shape (rows,), so that the same policies are the best ones.
+    """Return the rewards minus `offset`, shape (rows,), so that the best policies stay the same.
 
-    What follows a row is then worth less by offset / (1 - gamma), wherever it is; after a collision, where
-    nothing follows, the last reward is less by what is missing.
+    All values then decrease by offset / (1 - gamma). After a collision, where no reward follows, the last reward
+    decreases by the missing part.
     """
     rewards = rows.rewards - offset
     rewards[rows.last_rows] -= np.where(rows.terminated, offset * gamma / (1.0 - gamma), 0.0)
@@ -176,14 +173,13 @@ def shift_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
 
 
 def discounted_returns(rows: Experience, gamma: float) -> Float64:
-    """Return the discounted sum of the rewards that follow each row, shape (rows,).
+    """Return the discounted sum of the rewards from each row on, shape (rows,).
 
-    The end of a cut trajectory counts as if it went on at its mean reward.
+    A truncated trajectory counts as if it continued with its mean reward.
     """
     returns = np.empty(len(rows.rewards))
     for first, last, terminated in zip(rows.starts, rows.last_rows, rows.terminated, strict=True):
-        earned = rows.rewards[first : last + 1]
-        later = 0.0 if terminated else float(earned.mean()) / (1.0 - gamma)
+        later = 0.0 if terminated else float(rows.rewards[first : last + 1].mean()) / (1.0 - gamma)
         for row in range(last, first - 1, -1):
             later = returns[row] = rows.rewards[row] + gamma * later
     return returns

@@ -1,6 +1,6 @@
-"""What Algorithm 1 does between actual episodes: fit the virtual environment, and imagine in it."""
+"""What Algorithm 1 does between environment episodes: fit a model to them, and roll the policy out in it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from math import ceil
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver
 from unjam.following.calibration import calibrate_human_drivers
-from unjam.learners.experience import Experience
-from unjam.learners.learner import tensors_with_prefix
+from unjam.learners.experience import Experience, join_experience
+from unjam.learners.learner import Tensors, tensors_with_prefix
 from unjam.learners.settings import PolicySettings
 from unjam.learners.waves import Waves
 from unjam.models.comparison import return_gap
@@ -26,48 +26,73 @@ from unjam.models.rollouts import RolloutBatch, draw_starts, prepare_starts, ret
 from unjam.models.row_model import RowModel
 from unjam.models.settings import ModelSettings
 from unjam.physics.idm import IDMParameters
-from unjam.tree import pack, unpack
+from unjam.tree import Arrays, pack, unpack
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask
 
 FIT_SEED, STARTS_SEED, NOISE_SEED, EXPLORATION_SEED = 2, 3, 4, 5
-"""what the random numbers of an iteration are for, in their seeds"""
+"""purposes of the random numbers of an iteration, in their seeds"""
 _DATA_PREFIX, _SAMPLES_PREFIX = "data/", "samples/"
 """prefixes of tensors in checkpoints"""
+Seed = tuple[int, ...]
 
 
 class ExperienceFactory(NamedTuple):
-    """How what was imagined becomes what a learner takes."""
+    """Converts model rollouts to the experience of learners."""
 
     privileged_inputs: Callable[[Floats], Floats]
-    """from what episodes drew, shape (rows, m), to what the critic alone sees of it"""
+    """from the scaled values that episodes drew, shape (rows, m), to the inputs of the critic alone"""
     from_episodes: Callable[[Sequence[Episode]], Experience]
-    """of whole episodes, as of actual ones"""
+    """from whole episodes, as those of the environment"""
+
+
+class RolloutPlan(NamedTuple):
+    """The model rollouts of a part of an iteration."""
+
+    driver: ResidualDriver
+    starts: Any
+    """rows (recording, step), or samples of episodes"""
+    control_steps: int
+    noise_seed: Seed
+    exploration_seed: Seed
+
+
+class RolloutResult(NamedTuple):
+    """What model rollouts return."""
+
+    experience: Experience | None
+    """None: no CAV was on the road"""
+    control_steps: int
+    """in all"""
+    returns: Floats
+    """of each rollout"""
+    facts: dict[str, Any]
+    """at least `crash_share`"""
 
 
 def full_policy(task: Task, policy: PolicySettings, network: Network) -> ResidualDriver:
     """Return the full policy on a task: its expert plus the residual of `network`."""
-    hold = policy.action_repeat(task.scenario.control_step)
-    return ResidualDriver(task.expert, network, task.scenario.action_limit, policy.inputs, hold)
+    repeat = policy.action_repeat(task.scenario.control_step)
+    return ResidualDriver(task.expert, network, task.scenario.action_limit, policy.inputs, repeat)
 
 
 EnsembleT = TypeVar("EnsembleT", bound=Ensemble)
 
 
 class ModelRollouts(Generic[EnsembleT]):
-    """The virtual environment of a run, and the actual data that it learns from.
+    """The learned model of a task, the environment data D_a that it is fitted to, and the rollouts in it."""
 
-    What kind of environment it is, its heirs say: what is learned, and how one drives in it.
-    """
+    model: EnsembleT
 
     def __init__(
         self, settings: ModelSettings, task: Task, policy: PolicySettings, run_seed: int, task_index: int = 0
     ) -> None:
-        """Begin with physics alone, and without data; `index` is the task's place in its training.
+        """Start with the base alone and without data.
 
         Raises:
-            MissingPartError: the device that the settings name is not there.
+            MissingPartError: the device of the settings is not available.
+            InputError: the model does not support the scenario or the settings.
         """
         check_device(settings.device, "model.device")
         self.settings = settings
@@ -75,116 +100,131 @@ class ModelRollouts(Generic[EnsembleT]):
         """in checkpoints"""
         self.data = EnvironmentData(settings.buffer_size)
         self.scenario = task.scenario
-        """the road as far as it is known: with calibrated people where the settings ask for them"""
-        self._task = task
-        self._policy = policy
-        self._run_seed = run_seed
+        """the road, with calibrated IDM parameters if the settings ask for them"""
+        self._task, self._policy, self._run_seed = task, policy, run_seed
         self._task_index = (task_index,) if task_index else ()
         self.model = self._new_model()
         self.model_steps = 0
-        """virtual decisions of all iterations so far"""
+        """of all iterations"""
         self.facts: dict[str, Any] = {}
-        """what there is to say of the virtual environment in this iteration"""
+        """about the model in this iteration"""
 
     def _new_model(self) -> EnsembleT:
-        """Return a model that has learned nothing."""
         raise NotImplementedError
 
-    def _fit_model(self, seed: Sequence[int]) -> ModelFit:
-        """Fit the model to D_a as it is now."""
+    def _fit_model(self, seed: Seed) -> ModelFit:
+        """Fit the model to D_a."""
+        raise NotImplementedError
+
+    def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
         raise NotImplementedError
 
     def roll_out(
         self, network: Network, iteration: int, part: int, parts: int, experience_factory: ExperienceFactory
     ) -> Experience | None:
-        """Return what the policy `network` does in the virtual environment; None where it is not trusted.
+        """Return experience of the policy `network` in the model; None if k* is too short, or there is none.
 
-        Rollouts begin at random decisions at which a residual was due, `begin` says of which episodes. In all
-        `parts` of an iteration together they make `model_ratio` times as many decisions as the newest
-        actual episodes have.
+        All `parts` of an iteration together have `model_ratio` times as many control steps as its environment episodes.
         """
-        raise NotImplementedError
+        driver = full_policy(self._task, self._policy, network)
+        control_steps = self._max_control_steps // driver.action_repeat * driver.action_repeat
+        seed, *seeds = (self._seed(iteration, purpose, part) for purpose in (STARTS_SEED, NOISE_SEED, EXPLORATION_SEED))
+        starts = self._draw_starts(parts, seed, control_steps) if control_steps else ()
+        if len(starts) == 0:
+            return None
+        result = self._run(RolloutPlan(driver, starts, control_steps, *seeds), experience_factory)
+        self.model_steps += result.control_steps
+        if part == 0:
+            model, environment = self._compare_returns(result.returns, starts, control_steps)
+            self.facts |= {"return_model": model, "return_environment": environment, **result.facts}
+        return result.experience
 
-    def _seed(self, *key: int) -> tuple[int, ...]:
-        """Return a seed of the run's, the task's own."""
+    @property
+    def _max_control_steps(self) -> int:
+        return self.k_star
+
+    def _seed(self, *key: int) -> Seed:
+        """Return a seed of the run and the task."""
         return (self._run_seed, *key, *self._task_index)
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
-        """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
+        """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
         first = self.data.episode_count
         self.data.add(episodes, self.scenario)
-        driven = (len(each.reward) for episode in episodes for each in episode.trajectories)
-        self._first_new_episode, self._new_steps = first, sum(driven)
+        self._first_new_episode = first
+        self._new_steps = sum(len(each.reward) for episode in episodes for each in episode.trajectories)
         settings = self.settings
         if settings.calibrate_base and first == 0:
-            states = (kept.states for kept in self.data.recordings)
+            states = (recording.states for recording in self.data.recordings)
             self.scenario = replace(self.scenario, humans=calibrate_human_drivers(states, self.scenario))
-        found = self._fit_model(self._seed(iteration, FIT_SEED))
-        eps_m = found.errors[settings.error_estimator]
+        fit = self._fit_model(self._seed(iteration, FIT_SEED))
+        eps_m = fit.errors[settings.error_estimator]
         self.k_star = rollout_length(eps_m, settings)
         self.facts = {
             "k_star": self.k_star,
             "eps_m": eps_m,
-            "eps_m_by_estimator": found.errors,
-            "one_step": {name: error._asdict() for name, error in found.one_step.items()},
-            "learned_targets": list(found.learned_targets),
-            "epochs": found.epochs,
+            "eps_m_by_estimator": fit.errors,
+            "one_step": {name: error._asdict() for name, error in fit.one_step.items()},
+            "learned_targets": list(fit.learned_targets),
+            "epochs": fit.epochs,
         }
 
-    def _draw_starts(self, parts: int, seed: tuple[int, ...], control_steps: int) -> NDArray[np.int64]:
-        """Return where a part of an iteration's rollouts of so many decisions begin, as `draw_starts`."""
+    def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> Any:
+        """Return the starts of a part of an iteration's rollouts of `control_steps`, as `draw_starts`."""
         count = ceil(self.settings.model_ratio * self._new_steps / parts / control_steps)
-        begin = self.settings.rollout_starts
-        since = self._first_new_episode if begin == "newest" else 0
-        return draw_starts(self.data, count, 1, seed, since, episode_starts_only=begin == "first")
+        starts = self.settings.rollout_starts
+        first_episode = self._first_new_episode if starts == "newest" else 0
+        return draw_starts(self.data, count, 1, seed, first_episode, episode_starts_only=starts == "first")
 
-    def _note_returns(
-        self, returns: Floats, start_indices: NDArray[np.int64], control_steps: int, crash_share: float
-    ) -> None:
-        """Note what the policy that drove the actual episodes earned here and there, and its crashes."""
-        newest = [self.data.recordings[place].episode >= self._first_new_episode for place in start_indices[:, 0]]
-        gap = return_gap(returns[newest], start_indices[newest], self.data, control_steps)
-        self.facts |= {
-            "return_model": gap and gap.model_return,
-            "return_environment": gap and gap.environment_return,
-            "crash_share": crash_share,
-        }
+    def _compare_returns(
+        self, returns: Floats, starts: Any, control_steps: int
+    ) -> tuple[float, float] | tuple[None, None]:
+        """Return the mean returns of model and environment from starts in episodes of the newest policy."""
+        is_new = [self.data.recordings[index].episode >= self._first_new_episode for index in starts[:, 0]]
+        gap = return_gap(returns[is_new], starts[is_new], self.data, control_steps)
+        return (gap.model_return, gap.environment_return) if gap else (None, None)
 
     def bound(self, eps_pi: float, gamma: float) -> float:
-        """Return the bound C for this iteration; `gamma` is that from choice to choice."""
+        """Return the bound C for this iteration; `gamma` is the discount from action to action."""
         return self.bound_at(self.k_star, eps_pi, self.facts["eps_m_by_estimator"]["transitions"], gamma)
 
     def bound_at(self, k: int, eps_pi: float, eps_m: float, gamma: float) -> float:
-        """Return the bound C with rollouts of `k` decisions; `gamma` is that from choice to choice."""
+        """Return the bound C for rollouts of `k` control steps; `gamma` is the discount from action to action."""
         return return_bound(eps_pi, eps_m, k, self.step_discount(gamma), self.max_reward)
 
     @property
     def max_reward(self) -> float:
-        """R_max: the largest |reward| of a decision in the actual data."""
-        return max(float(np.abs(kept.reward).max()) for kept in self.data.recordings)
+        """R_max: the largest |reward| of a control step in D_a."""
+        return max(float(np.abs(recording.reward).max()) for recording in self.data.recordings)
 
     def step_discount(self, gamma: float) -> float:
-        """Return the discount from decision to decision; `gamma` is that from choice to choice."""
+        """Return the discount per control step; `gamma` is that from action to action."""
         return gamma ** (1 / self._policy.action_repeat(self.scenario.control_step))
 
-    def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-        """Return all that a run must keep of it to go on, as JSON and tensors."""
-        facts, arrays = pack_data(self.data)
-        tensors = {f"{_DATA_PREFIX}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
-        tensors |= {name: tensor.cpu() for name, tensor in self.model.state_dict().items()}
-        return {"model_steps": self.model_steps, "data": facts, "humans": asdict(self.scenario.humans)}, tensors
+    def state(self) -> tuple[dict[str, Any], Tensors]:
+        """Return all that a run needs to resume, as JSON and tensors."""
+        data, arrays = pack_data(self.data)
+        tensors = _to_tensors(_DATA_PREFIX, arrays) | {name: t.cpu() for name, t in self.model.state_dict().items()}
+        return {"model_steps": self.model_steps, "data": data, "humans": asdict(self.scenario.humans)}, tensors
 
-    def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
-        """Go on from what `state` returned."""
-        arrays = {name: tensor.numpy() for name, tensor in tensors_with_prefix(_DATA_PREFIX, tensors).items()}
-        self.data = unpack_data(facts["data"], arrays)
+    def restore(self, facts: dict[str, Any], tensors: Tensors) -> None:
+        """Resume from what `state` returned."""
+        self.data = unpack_data(facts["data"], _to_arrays(_DATA_PREFIX, tensors))
         self.model_steps = facts["model_steps"]
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["humans"]))
-        self.model.load_state_dict({n: t for n, t in tensors.items() if not n.startswith(_DATA_PREFIX)})
+        self.model.load_state_dict({name: tensor for name, tensor in tensors.items() if "/" not in name})
+
+
+def _to_tensors(prefix: str, arrays: Arrays) -> Tensors:
+    return {f"{prefix}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+
+
+def _to_arrays(prefix: str, tensors: Tensors) -> Arrays:
+    return {name: tensor.numpy() for name, tensor in tensors_with_prefix(prefix, tensors).items()}
 
 
 class EpisodeSummary(Protocol):
-    """What is kept of an actual episode."""
+    """The samples of an environment episode."""
 
     @property
     def episode(self) -> int:
@@ -196,13 +236,12 @@ SamplesT = TypeVar("SamplesT", bound=EpisodeSummary)
 
 
 class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
-    """The virtual environment of a run as whole roads, of which more is kept than what CAVs perceived."""
+    """The learned model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
 
     sample_type: type[SamplesT]
-    """of what is kept of each episode"""
 
     def __init__(self, *args: Any) -> None:
-        """Begin with the base alone, and without data; arguments are those of `ModelRollouts`."""
+        """Start with the base alone and without data; arguments as of `ModelRollouts`."""
         super().__init__(*args)
         self.samples: list[SamplesT] = []
         """of the episodes in D_a, oldest first"""
@@ -211,111 +250,109 @@ class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
         return RoadModel(self.settings, self._seed(FIT_SEED))
 
     def _sample_episode(self, episode: Episode, number: int) -> SamplesT:
-        """Return what is kept of an actual episode, the so many-th."""
         raise NotImplementedError
 
-    def _fit_samples(self, seed: Sequence[int]) -> ModelFit:
-        """Fit the model to what is kept of D_a as it is now."""
+    def _fit_samples(self, seed: Seed) -> ModelFit:
+        raise NotImplementedError
+
+    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+        """Yield the episodes of rollouts batch by batch."""
         raise NotImplementedError
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
-        """Return a road as it was and as it is imagined; `drive` runs an episode where actual ones run."""
+        """Return a holdout episode in environment and model; `run_episode` runs one where environment episodes run."""
         raise NotImplementedError
+
+    def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
+        steps, returns, crashed, parts = 0, list[float](), list[bool](), list[Experience]()
+        for episodes in self._simulate_batches(plan):
+            steps += sum(episode.control_steps for episode in episodes)
+            returns += [float(episode.reward.sum()) for episode in episodes]
+            crashed += [episode.status == "collision" for episode in episodes]
+            if any(episode.trajectories for episode in episodes):
+                parts.append(experience_factory.from_episodes(episodes))
+        experience = join_experience(parts) if parts else None
+        return RolloutResult(experience, steps, np.array(returns), {"crash_share": float(np.mean(crashed))})
 
     @property
     def _holdout_samples(self) -> SamplesT:
-        """The newest episode that no network learned from, if there is one."""
-        share, twins = self.settings.holdout, self._episodes_per_group
-        unseen = [each for each in self.samples if is_holdout_episode(each.episode // twins, share)]
-        return (unseen or self.samples)[-1]
+        """The newest holdout episode, or the newest one if there is none."""
+        holdout, group = self.settings.holdout, self._episodes_per_group
+        held_out = [each for each in self.samples if is_holdout_episode(each.episode // group, holdout)]
+        return (held_out or self.samples)[-1]
 
     @property
     def _episodes_per_group(self) -> int:
-        """How many episodes in a row meet the same people: they are held out together."""
+        """Number of consecutive episodes with the same vehicles, which are held out together."""
         return len(self._policy.exploration_signs)
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
-        """Add actual episodes to D_a, fit the model to it, and find the rollout length of Eq. 15."""
+        """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
         first = self.data.episode_count
-        self.samples += [self._sample_episode(episode, first + place) for place, episode in enumerate(episodes)]
+        self.samples += [self._sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
         super().learn(episodes, iteration)
 
-    def _fit_model(self, seed: Sequence[int]) -> ModelFit:
+    def _fit_model(self, seed: Seed) -> ModelFit:
         oldest = self.data.recordings[0].episode
-        self.samples = [kept for kept in self.samples if kept.episode >= oldest]
+        self.samples = [each for each in self.samples if each.episode >= oldest]
         return self._fit_samples(seed)
 
-    def state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-        """Return all that a run must keep of it to go on, as JSON and tensors."""
+    def state(self) -> tuple[dict[str, Any], Tensors]:
+        """Return all that a run needs to resume, as JSON and tensors."""
         facts, tensors = super().state()
-        kept, arrays = pack(self.samples)
-        tensors |= {f"{_SAMPLES_PREFIX}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
-        return {**facts, "samples": kept}, tensors
+        samples, arrays = pack(self.samples)
+        return {**facts, "samples": samples}, tensors | _to_tensors(_SAMPLES_PREFIX, arrays)
 
-    def restore(self, facts: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
-        """Go on from what `state` returned."""
-        arrays = {name: tensor.numpy() for name, tensor in tensors_with_prefix(_SAMPLES_PREFIX, tensors).items()}
+    def restore(self, facts: dict[str, Any], tensors: Tensors) -> None:
+        """Resume from what `state` returned."""
+        super().restore(facts, tensors)
+        arrays = _to_arrays(_SAMPLES_PREFIX, tensors)
         self.samples = unpack(list[self.sample_type], facts["samples"], arrays)
-        super().restore(facts, {n: t for n, t in tensors.items() if not n.startswith(_SAMPLES_PREFIX)})
 
 
 class RowRollouts(ModelRollouts[RowModel]):
-    """The paper's: a row is a CAV with its leader and its follower."""
+    """The paper's virtual environment: a row is a CAV with its leader and its follower."""
 
     def _new_model(self) -> RowModel:
-        drawn = len(self._task.scenario.drawn_ranges)
-        return RowModel(self.settings, drawn, self._seed(FIT_SEED), self.settings.device)
+        drawn_count = len(self._task.scenario.drawn_ranges)
+        return RowModel(self.settings, drawn_count, self._seed(FIT_SEED), self.settings.device)
 
-    def _fit_model(self, seed: Sequence[int]) -> ModelFit:
-        actual = self.data.transitions(self.settings.holdout)
-        return fit_row_model(self.model, actual, self.settings, self.scenario, self._task.reward, seed)
+    def _fit_model(self, seed: Seed) -> ModelFit:
+        transitions = self.data.transitions(self.settings.holdout)
+        return fit_row_model(self.model, transitions, self.settings, self.scenario, self._task.reward, seed)
 
-    def roll_out(
-        self, network: Network, iteration: int, part: int, parts: int, experience_factory: ExperienceFactory
-    ) -> Experience | None:
-        """Return what the policy `network` does with rows; None where there are none."""
-        rollouts = self.roll_out_rows(network, iteration, part, parts)
-        if rollouts is None:
-            return None
-        return rollout_experience(rollouts, experience_factory.privileged_inputs(rollouts.drawn_values.cpu().numpy()))
+    def simulate(self, plan: RolloutPlan) -> RolloutBatch:
+        """Return the rollouts of rows from `plan.starts`, rows (recording, step)."""
+        device, expert = self.settings.device, self._task.expert
+        noise, exploration = (torch_generator(seed, device) for seed in (plan.noise_seed, plan.exploration_seed))
+        dynamics = ModelDynamics(self.model, self.scenario, self._task.reward, noise, self.settings.add_noise)
+        starts = prepare_starts(self.data, plan.starts, expert, device)
+        return roll_out(plan.driver, dynamics, starts, plan.control_steps, exploration)
 
-    def roll_out_rows(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> RolloutBatch | None:
-        """Return the virtual rollouts of rows; None where there are none."""
-        driver = full_policy(self._task, self._policy, network)
-        driven = self.k_star // driver.action_repeat * driver.action_repeat
-        if driven == 0:
-            return None
-        seeds = [self._seed(iteration, purpose, part) for purpose in (STARTS_SEED, NOISE_SEED, EXPLORATION_SEED)]
-        choices = self._draw_starts(parts, seeds[0], driven)
-        if len(choices) == 0:
-            return None
-        noise, exploration = (torch_generator(seed, self.settings.device) for seed in seeds[1:])
-        world = ModelDynamics(self.model, self.scenario, self._task.reward, noise, self.settings.add_noise)
-        starts = prepare_starts(self.data, choices, self._task.expert, self.settings.device)
-        rollouts = roll_out(driver, world, starts, driven, exploration)
-        self.model_steps += rollouts.control_steps
-        if part == 0:
-            earned = rollouts.rewards.sum(1).double().cpu().numpy()
-            self._note_returns(earned, rollouts.start_indices, driven, float(rollouts.terminated.double().mean()))
-            self.facts["clipped_share"] = rollouts.clipped_share
-        return rollouts
+    def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
+        rollouts = self.simulate(plan)
+        inputs = experience_factory.privileged_inputs(rollouts.drawn_values.cpu().numpy())
+        returns = rollouts.rewards.sum(1).double().cpu().numpy()
+        crash_share = float(rollouts.terminated.double().mean())
+        facts = {"crash_share": crash_share, "clipped_share": rollouts.clipped_share}
+        return RolloutResult(rollout_experience(rollouts, inputs), rollouts.control_steps, returns, facts)
 
 
 def rollout_experience(rollouts: RolloutBatch, critic_inputs: NDArray[np.floating]) -> Experience:
-    """Return virtual rollouts in the form in which learners take them; the cut at k* is no termination.
+    """Return rollouts of rows as experience; the truncation at k* is no termination.
 
-    `critic_inputs`, shape (n, m), is what the critic alone sees in each row.
+    `critic_inputs`, shape (n, m), are the inputs of the critic alone in each row.
     """
-    made = rollouts.lengths.cpu().numpy()
-    seen = rollouts.observations.cpu().numpy()
-    extra = np.broadcast_to(critic_inputs[:, None], (*seen.shape[:2], critic_inputs.shape[1]))
-    seen = np.concatenate([seen, extra], axis=2)
-    counted = np.arange(seen.shape[1] - 1) < made[:, None]
+    lengths = rollouts.lengths.cpu().numpy()
+    observations = rollouts.observations.cpu().numpy()
+    extra = np.broadcast_to(critic_inputs[:, None], (*observations.shape[:2], critic_inputs.shape[1]))
+    observations = np.concatenate([observations, extra], axis=2)
+    is_valid = np.arange(observations.shape[1] - 1) < lengths[:, None]
     return Experience(
-        observations=seen[:, :-1][counted].astype(np.float32),
-        actions=rollouts.actions.cpu().numpy()[counted].astype(np.float32),
-        rewards=rollouts.rewards.cpu().numpy()[counted].astype(np.float64),
-        starts=np.concatenate([[0], made.cumsum()[:-1]]).astype(np.intp),
-        last_observations=seen[np.arange(len(made)), made].astype(np.float32),
+        observations=observations[:, :-1][is_valid].astype(np.float32),
+        actions=rollouts.actions.cpu().numpy()[is_valid].astype(np.float32),
+        rewards=rollouts.rewards.cpu().numpy()[is_valid].astype(np.float64),
+        starts=np.concatenate([[0], lengths.cumsum()[:-1]]).astype(np.intp),
+        last_observations=observations[np.arange(len(lengths)), lengths].astype(np.float32),
         terminated=rollouts.terminated.cpu().numpy(),
     )

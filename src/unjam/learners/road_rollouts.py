@@ -1,25 +1,15 @@
-"""Imagining whole roads: everybody drives on, from recorded moments, and waves come and go."""
+"""Model rollouts on closed roads: all vehicles drive on from recorded states."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.network import Network
 from unjam.drivers.residual import EXPERT_KEY, RESIDUAL_AGE_KEY, RESIDUAL_KEY
-from unjam.learners.experience import Experience
-from unjam.learners.model_rollouts import (
-    EXPLORATION_SEED,
-    NOISE_SEED,
-    STARTS_SEED,
-    ExperienceFactory,
-    WholeRoadRollouts,
-    full_policy,
-)
+from unjam.learners.model_rollouts import RolloutPlan, Seed, WholeRoadRollouts
 from unjam.learners.waves import RoadTrajectories, Waves, road_trajectories
 from unjam.models.comparison import ReplayDriver
 from unjam.models.ensemble import torch_generator
@@ -36,7 +26,7 @@ from unjam.models.road_model import (
 )
 from unjam.scenarios.ring import LoopScenario
 from unjam.tree import map_leaves
-from unjam.worlds.batch.figure_eight.crossing import CrossingMemory as Waits
+from unjam.worlds.batch.figure_eight.crossing import CrossingMemory
 from unjam.worlds.batch.human_idm import HumanSpeedModel
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
@@ -48,51 +38,32 @@ from unjam.worlds.worker_pool import EpisodeTask
 
 
 class RoadRollouts(WholeRoadRollouts[RoadSamples]):
-    """The virtual environment of a run as whole closed roads."""
+    """The learned model of whole closed roads."""
 
     sample_type = RoadSamples
 
     def __init__(self, *args: Any) -> None:
-        """Begin with the base alone, and without data; arguments are those of `ModelRollouts`.
-
-        Raises:
-            InputError: whole roads cannot be imagined on the task's road.
-        """
+        """Start with the base alone and without data; arguments and errors as of `ModelRollouts`."""
         super().__init__(*args)
         check_road_model(self.scenario)
 
     def _sample_episode(self, episode: Episode, number: int) -> RoadSamples:
         return road_samples(episode, number, cast(LoopScenario, self.scenario))
 
-    def _fit_samples(self, seed: Sequence[int]) -> ModelFit:
+    def _fit_samples(self, seed: Seed) -> ModelFit:
         return fit_road_model(self.model, self.samples, self.settings, self.scenario, seed)
 
-    def roll_out(
-        self, network: Network, iteration: int, part: int, parts: int, experience_factory: ExperienceFactory
-    ) -> Experience | None:
-        """Return what the policy `network` does on imagined roads; None where they are not trusted."""
-        driver = full_policy(self._task, self._policy, network)
-        driven = self.k_star // driver.action_repeat * driver.action_repeat
-        if driven == 0:
-            return None
-        starts, *others = (self._seed(iteration, each, part) for each in (STARTS_SEED, NOISE_SEED, EXPLORATION_SEED))
-        cavs = len(self.scenario.possible_cav_ids())  # rows of each road
-        choices = self._draw_starts(parts * cavs, starts, driven)
-        if len(choices) == 0:
-            return None
-        memory: Memory = {EXPERT_KEY: self._expert_memory(choices, cavs)}
-        if driver.action_repeat > 1:
-            nothing = np.zeros(cavs * len(choices))
-            memory |= {RESIDUAL_KEY: nothing, RESIDUAL_AGE_KEY: nothing}
-        members, draws = others
-        people = learned_human_model(self.model, self.scenario, torch_generator(members, "cpu"))
-        episodes = self.simulate(driver, memory, choices, driven, people, draws)
-        self.model_steps += sum(episode.control_steps for episode in episodes)
-        if part == 0:
-            earned = np.array([episode.reward.sum() for episode in episodes])
-            crashed = [episode.status == "collision" for episode in episodes]
-            self._note_returns(earned, choices, driven, float(np.mean(crashed)))
-        return experience_factory.from_episodes(episodes)
+    def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> NDArray[np.int64]:
+        cavs_per_road = len(self.scenario.possible_cav_ids())
+        return super()._draw_starts(parts * cavs_per_road, seed, control_steps)
+
+    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+        memory: Memory = {EXPERT_KEY: self._expert_memory(plan.starts)}
+        if plan.driver.action_repeat > 1:
+            zeros = np.zeros(len(self.scenario.possible_cav_ids()) * len(plan.starts))
+            memory |= {RESIDUAL_KEY: zeros, RESIDUAL_AGE_KEY: zeros}
+        human_model = learned_human_model(self.model, self.scenario, torch_generator(plan.noise_seed, "cpu"))
+        yield self.simulate(plan.driver, memory, plan.starts, plan.control_steps, human_model, plan.exploration_seed)
 
     def simulate(
         self,
@@ -103,73 +74,71 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
         human_model: HumanSpeedModel,
         seed: Sequence[int],
     ) -> list[Episode]:
-        """Return what follows recorded moments in so many decisions.
+        """Return the episodes that follow recorded states.
 
         Args:
             driver: of all CAVs, with its exploration.
-            memory: what it remembers there, all rows of the first CAV, then of the second.
-            choices: the moments, rows (recording, decision).
-            decisions: of each road.
-            people: how they drive.
-            seed: of all noise, and of what sensors misread.
+            memory: of the driver, all rows of the first CAV, then of the second.
+            start_indices: rows (recording, step).
+            control_steps: of each episode.
+            human_model: of the human drivers.
+            seed: of all noise, and of sensor errors.
         """
         road = cast(LoopScenario, self.scenario)
-        by_episode = {kept.episode: kept for kept in self.samples}
-        kept = [by_episode[self.data.recordings[place].episode] for place, _ in start_indices]
-        here = [(each, at // each.interval) for each, (_, at) in zip(kept, start_indices, strict=True)]
+        by_episode = {each.episode: each for each in self.samples}
+        samples = [by_episode[self.data.recordings[index].episode] for index, _ in start_indices]
+        rows = [at // each.interval for each, (_, at) in zip(samples, start_indices, strict=True)]
+        pairs = list(zip(samples, rows, strict=True))
         noise = float(self.model.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
-        noise = noise if self.settings.add_noise else 0.0
-        common = replace(road, horizon=control_steps, noise=noise, population="")
+        common = replace(road, horizon=control_steps, noise=noise if self.settings.add_noise else 0.0, population="")
         world = RingBatch(
-            [with_size(common, each.size) for each in kept],
-            [(*seed, number) for number in range(len(kept))],  # of sensors alone: all else is given
+            [with_size(common, each.size) for each in samples],
+            [(*seed, number) for number in range(len(samples))],  # of sensors alone: everything else is given
             reward=self._task.reward,
             draw=np.random.default_rng(list(seed)).standard_normal,
             human_model=human_model,
             allow_statistical=True,
         )
-        waits = [
-            each.crossing_memory and Waits(*(values[row] for values in each.crossing_memory)) for each, row in here
-        ]
         world.place_vehicles(
-            np.stack([each.speeds[row] for each, row in here], 1),
-            np.stack([each.positions[row] for each, row in here], 1),
-            waits,
+            np.stack([each.speeds[row] for each, row in pairs], 1),
+            np.stack([each.positions[row] for each, row in pairs], 1),
+            [
+                each.crossing_memory and CrossingMemory(*(values[row] for values in each.crossing_memory))
+                for each, row in pairs
+            ],
         )
-        found = finish_drive(start_batch_drive(world, driver, explore=True, memory=memory))
-        earned = make_reward(self._task.reward or road.reward)
-        return [add_reward_terms(episode, earned) for episode in found.episodes]
+        results = finish_drive(start_batch_drive(world, driver, explore=True, memory=memory))
+        reward = make_reward(self._task.reward or road.reward)
+        return [add_reward_terms(episode, reward) for episode in results.episodes]
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
-        """Return an actual road that no network learned from, and those imagined from its start on.
+        """Return a recorded holdout episode, and what model and base make of it from its start on.
 
-        It is one of the record's: nothing is driven anew. CAVs do what they did, and noise is drawn anew.
+        CAVs repeat their recorded accelerations; the noise is drawn anew.
         """
-        moments, recordings = self._holdout_samples, self.data.recordings
-        rows = [place for place, each in enumerate(recordings) if each.episode == moments.episode]
-        did = ReplayDriver(np.stack([recordings[row].applied_acceleration for row in rows], 1))
-        begun = np.array([[rows[0], 0]])
-        kinds = {
+        samples, recordings = self._holdout_samples, self.data.recordings
+        rows = [index for index, each in enumerate(recordings) if each.episode == samples.episode]
+        driver = ReplayDriver(np.stack([recordings[row].applied_acceleration for row in rows], 1))
+        human_models = {
             "model": learned_human_model(self.model, self.scenario, torch_generator((0,), "cpu")),
             "base": base_human_model(self.settings.base, self.scenario),
         }
-        cavs, memory = np.flatnonzero(moments.is_human == 0.0).tolist(), did.initial_memory(len(rows))
-        roads = {"recorded": RoadTrajectories(moments.speeds, moments.positions, np.zeros((0, 0)), cavs)}
-        for label, people in kinds.items():
-            (episode,) = self.simulate(did, memory, begun, len(did.accelerations), people, (1,))
-            roads[label] = road_trajectories(episode, moments.interval)
-        return Waves(moments.interval * self.scenario.control_step, moments.length, (), roads)
+        cav_columns = np.flatnonzero(samples.is_human == 0.0).tolist()
+        roads = {"recorded": RoadTrajectories(samples.speeds, samples.positions, np.zeros((0, 0)), cav_columns)}
+        start, memory = np.array([[rows[0], 0]]), driver.initial_memory(len(rows))
+        for label, human_model in human_models.items():
+            (episode,) = self.simulate(driver, memory, start, len(driver.accelerations), human_model, (1,))
+            roads[label] = road_trajectories(episode, samples.interval)
+        return Waves(samples.interval * self.scenario.control_step, samples.length, (), roads)
 
-    def _expert_memory(self, start_indices: NDArray[np.int64], cav_count: int) -> Memory:
-        """Return what the expert remembered at `choices`: all rows of the first CAV, then of the second."""
-        first: dict[int, int] = {}
-        for place, recording in enumerate(self.data.recordings):
-            first.setdefault(recording.episode, place)
-        firsts = np.array([first[self.data.recordings[place].episode] for place, _ in start_indices])
-        each = [
-            reconstruct_memory(
-                self._task.expert, self.data.recordings, np.column_stack([firsts + cav, start_indices[:, 1]])
-            )
-            for cav in range(cav_count)
+    def _expert_memory(self, start_indices: NDArray[np.int64]) -> Memory:
+        """Return the expert's memory at the starts, rows (recording, step): all rows of the first CAV, then of the next."""
+        first_by_episode: dict[int, int] = {}
+        for index, recording in enumerate(self.data.recordings):
+            first_by_episode.setdefault(recording.episode, index)
+        first = np.array([first_by_episode[self.data.recordings[index].episode] for index, _ in start_indices])
+        starts = [
+            np.column_stack([first + cav, start_indices[:, 1]]) for cav in range(len(self.scenario.possible_cav_ids()))
         ]
-        return map_leaves(lambda *values: np.concatenate(values), each[0], *each[1:])
+        memories = [reconstruct_memory(self._task.expert, self.data.recordings, each) for each in starts]
+        return map_leaves(lambda *values: np.concatenate(values), *memories)

@@ -1,6 +1,6 @@
-"""What decides how an agent learns. Free of torch, so that a wrong value is refused at once.
+"""Settings of policies and learners. Free of torch, so that a wrong value is refused at once.
 
-A learner is a file that makes it, and here its settings, which name it, and their place in `AgentSettings`.
+A new learner needs a file that makes it, its settings here, which name it, and their field in `AgentSettings`.
 """
 
 from dataclasses import field
@@ -18,74 +18,71 @@ UnitInterval = Annotated[float, Field(ge=0, le=1)]
 
 @dataclass(frozen=True, config=STRICT)
 class PolicySettings:
-    """The residual network and how it explores."""
+    """The residual network and its exploration."""
 
     hidden: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (64, 64)
-    """units of the hidden layers, of the policy and of the value network"""
+    """units of the hidden layers of the policy and the value network"""
     inputs: Annotated[tuple[FeatureName, ...], Field(min_length=1)] = ("local", "expert_acceleration", "expert_memory")
-    """what the network sees; the paper's network sees `local` alone, and cannot know what PI will do"""
+    """features of the network; the paper uses `local` alone, which does not show what PI will do"""
     zero_init: bool = True
-    """whether the untrained network adds nothing, so that the full policy begins as exactly the expert, or
-    what its random weights happen to answer, as the paper's"""
+    """start with a residual of zero, so that the full policy starts as the expert; the paper starts at random"""
     history_features: bool = False
-    """whether what the network sees of the expert's memory has means of the own past besides: speed, its
-    spread, and gap, over ten seconds to some minutes"""
+    """add means of own speed, its spread, and gap over ten seconds to some minutes to the expert's memory"""
     authority: Positive = 1.0
     """largest residual, as a share of the action limit"""
     exploration_std: Positive = 0.1
-    """standard deviation of the exploration noise at the start, as a share of the action limit"""
+    """initial standard deviation of the exploration noise, as a share of the action limit"""
     learn_exploration_std: bool = True
-    """whether the standard deviation is learned, or stays what it is at the start (sac always learns it)"""
+    """whether the standard deviation is learned (always by sac)"""
     exploration: Literal["per_step", "per_episode", "antithetic"] = "per_step"
-    """`anew`: noise for each look of a CAV. `episode_noise`: one change of what the last hidden layer is weighed
-    with, of which `exploration_std` is that of each weight, for all CAVs all episode long: what many do for
-    minutes shows in what everybody gains, where single commands vanish in people's noise (trpo and ppo; it
-    is not learned; after Raffin et al. 2022, CoRL). `mirrored`: likewise, and each episode has another of the
-    same people in which the change is opposite (after Salimans et al. 2017, arXiv:1703.03864)"""
+    """`per_step`: independent noise for each action of a CAV. `per_episode`: one perturbation of the weights of the last
+    layer, each with `exploration_std`, for all CAVs of an episode: what many do for minutes changes everyone's travel
+    time, while single commands vanish in the noise of human drivers (trpo and ppo; the standard deviation is not
+    learned; after Raffin et al. 2022, CoRL). `antithetic`: in pairs of episodes with the same vehicles, the second with
+    the opposite perturbation (after Salimans et al. 2017, arXiv:1703.03864)"""
     reward_after_exit: bool = False
-    """whether a CAV also earns what is earned once it has left a road with ends, and the value network sees
-    when it came: where all earn the same, a jam that it has prevented shows when it is gone. Not where
-    rows are imagined, whose moments do not know what follows"""
+    """give CAVs the rewards after they leave an open road, and the value network their entry time: with a shared reward,
+    a prevented jam pays off only later. Not with the row model, which does not know what follows"""
     action_duration: NonNegative = 1.0
-    """how long one residual is held [s], rounded to whole decisions, at least one: over a second noise adds
-    up to a change of speed instead of cancelling itself"""
+    """time for which a residual is held [s], rounded to control steps: over a second, noise adds up to a change of speed
+    instead of cancelling itself"""
     privileged_critic: bool = True
-    """whether the value network also sees what the episode has drawn (the ring's length); without it, it
-    takes a large gap for a longer and faster ring, and the policy learns to fall back"""
+    """give the value network what the episode drew (the ring's length); else it takes a large gap for a longer and
+    faster ring, and the policy learns to fall back"""
     normalize_value: bool = True
-    """scale the value network by the returns of the first iteration (sac: shift by its mean reward): one that
-    starts at zero needs tens of iterations to reach values of 150"""
+    """scale the value network by the returns of the first iteration (sac: shift by its mean reward); starting at zero,
+    it needs tens of iterations to reach values of 150"""
 
     @property
     def episode_noise(self) -> bool:
-        """Whether exploration stays as it is all episode long."""
+        """Whether the exploration noise is drawn once per episode."""
         return self.exploration != "per_step"
 
     @property
     def exploration_signs(self) -> list[float]:
-        """By how much exploration counts in episodes that are alike but for that."""
+        """Factors of the exploration noise in consecutive episodes with the same vehicles."""
         return [1.0, -1.0] if self.exploration == "antithetic" else [1.0]
 
     def action_repeat(self, control_step: float) -> int:
-        """Return for how many decisions a residual is held where one takes `control_step` seconds."""
+        """Return the number of control steps of `control_step` seconds for which a residual is held."""
         return max(1, round(self.action_duration / control_step))
 
 
 @dataclass(frozen=True, config=STRICT)
 class LearnerSettings:
-    """What every learner has."""
+    """Settings of every learner."""
 
     learner_class: ClassVar[str]
-    """who is made of them: `module:class`"""
+    """the learner that is made of them, `module:class`"""
     steps_per_iteration: PositiveInt = 12_000
-    """actual steps in an iteration, rounded up to whole episodes"""
+    """environment steps per iteration, rounded up to whole episodes"""
     gamma: Discount = 0.99
-    """discount from one choice of the network to the next"""
+    """discount from one action of the network to the next"""
 
 
 @dataclass(frozen=True, config=STRICT)
 class TRPOSettings(LearnerSettings):
-    """Trust region policy optimisation; the preset `paper` has the values of Table B5 where these differ."""
+    """Trust region policy optimization; the preset `paper` has the values of Table B5 where these differ."""
 
     learner_class: ClassVar[str] = "unjam.learners.trpo_ppo:TRPO"
     gae_lambda: UnitInterval = 0.97
@@ -100,41 +97,40 @@ class TRPOSettings(LearnerSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class PPOSettings(LearnerSettings):
-    """Proximal policy optimisation; its defaults are the values of Table B3, but for larger iterations."""
+    """Proximal policy optimization; the defaults are the values of Table B3, except for larger iterations."""
 
     learner_class: ClassVar[str] = "unjam.learners.trpo_ppo:PPO"
     gae_lambda: UnitInterval = 0.97
     clip_range: Annotated[float, Field(gt=0, lt=1)] = 0.2
-    """how far the ratio of new to old probability may move an update"""
+    """largest change of the ratio of new to old probability in an update"""
     epochs: PositiveInt = 80
     minibatches: PositiveInt = 1
-    """parts of an iteration's rows, each a gradient step in each epoch; 1: full batches"""
+    """gradient steps per epoch, each on a part of an iteration's rows; 1: full batches"""
     actor_learning_rate: Positive = 3e-4
     critic_learning_rate: Positive = 1e-3
 
 
 @dataclass(frozen=True, config=STRICT)
 class OffPolicySettings(LearnerSettings):
-    """What learners share that learn from earlier iterations too."""
+    """Settings of off-policy learners, which also learn from earlier iterations."""
 
     steps_per_iteration: PositiveInt = 6_000
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """share by which the target networks move towards the learned ones in a gradient step"""
+    """soft update coefficient of the target networks"""
     learning_rate: Positive = 3e-4
     reward_scale: Positive = 0.1
-    """factor of what is earned from one choice to the next: the temperature is weighed against it"""
+    """factor of the rewards, which the temperature is weighed against"""
     batch_size: PositiveInt = 256
     gradient_steps_per_step: Positive = 0.25
-    """gradient steps per actual step, those of the start included"""
+    """gradient steps per environment step, including those before learning starts"""
     learning_starts: NonNegativeInt = 10_000
-    """actual steps before the first gradient step"""
+    """environment steps before the first gradient step"""
     start_policy: Literal["expert", "uniform"] = "expert"
-    """how these are driven: `expert`, with the little noise of `policy.exploration_std`; `uniform` residuals
-    over the whole authority"""
+    """policy of these steps: `expert` with noise of `policy.exploration_std`, or `uniform` residuals"""
     real_ratio: UnitInterval = 0.5
-    """share of actual rows in a batch, where there are virtual ones"""
+    """share of environment rows in a batch, if there are model rows"""
     buffer_size: PositiveInt = 200_000
-    """newest rows, one per choice, that are learned from"""
+    """newest rows in the replay buffer, one per action"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -143,10 +139,10 @@ class SACSettings(OffPolicySettings):
 
     learner_class: ClassVar[str] = "unjam.learners.sac:SAC"
     temperature: Positive = 0.05
-    """weight of the policy's entropy, in units of scaled rewards; with the paper's 0.2 the noise alone costs
-    a quarter of the return on the ring, and what is learned from such driving fails on short rings"""
+    """weight of the policy's entropy, in units of scaled rewards; with the paper's 0.2 the noise alone costs a quarter of
+    the return on the ring, and what is learned from it fails on short rings"""
     learn_temperature: bool = False
-    """whether the temperature is learned, from its start on, so that the entropy becomes `target_entropy`"""
+    """whether the temperature is adapted, starting from `temperature`, so that the entropy becomes `target_entropy`"""
     target_entropy: Annotated[float, Field(lt=0.69)] = -1.0
     """of the residual as a share of its authority: -1 is that of noise with a standard deviation of 0.09"""
 
@@ -158,9 +154,9 @@ class TD3Settings(OffPolicySettings):
     learner_class: ClassVar[str] = "unjam.learners.td3:TD3"
     learning_rate: Positive = 1e-3
     policy_delay: PositiveInt = 2
-    """gradient steps of the critics for one of the policy and of the target networks"""
+    """gradient steps of the critics per update of the policy and the target networks"""
     target_noise: NonNegative = 0.2
-    """standard deviation of the noise that smooths the target policy, as a share of the authority"""
+    """standard deviation of the target policy's smoothing noise, as a share of the authority"""
     target_noise_clip: NonNegative = 0.5
     """largest such noise, as a share of the authority"""
 
@@ -171,10 +167,10 @@ AGENT_NAMES: tuple[AgentName, ...] = get_args(AgentName)
 
 @dataclass(frozen=True, config=STRICT)
 class AgentSettings:
-    """Who learns, and the settings of every learner in the table of its name."""
+    """The chosen learner, and the settings of each one in the table of its name."""
 
     agent: AgentName = "trpo"
-    """who learns; its settings are in the table of its name"""
+    """the learner"""
     trpo: TRPOSettings = field(default_factory=TRPOSettings)
     ppo: PPOSettings = field(default_factory=PPOSettings)
     sac: SACSettings = field(default_factory=SACSettings)
@@ -182,5 +178,5 @@ class AgentSettings:
 
     @property
     def learner(self) -> LearnerSettings:
-        """The settings of the learner that was chosen."""
+        """The settings of the chosen learner."""
         return getattr(self, self.agent)

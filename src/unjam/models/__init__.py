@@ -1,1 +1,1 @@
-"""The virtual environment: IDM plus residual networks, in which the policy learns between actual episodes."""
+"""Models of the environment that are learned while a policy is trained."""

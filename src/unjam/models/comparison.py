@@ -1,4 +1,4 @@
-"""Virtual beside actual: the same accelerations from the same start, and the same policy in the loop."""
+"""Comparison of model and environment: replayed accelerations, one-step errors, and returns of the same policy."""
 
 import itertools
 from dataclasses import dataclass
@@ -23,51 +23,48 @@ from unjam.worlds.record import Floats
 
 
 class OpenLoopErrors(NamedTuple):
-    """Virtual against actual states under the same accelerations; H decisions."""
+    """Model states compared with recorded states under the same accelerations; H control steps."""
 
     error: dict[str, Floats]
-    """root mean square of the error of a member, by number of the state [m/s, m], shape (H,)"""
+    """root mean squared error of a member, by name of `STATE_FIELDS` [m/s, m], shape (H,)"""
     spread: dict[str, Floats]
-    """standard deviation of the members about their mean [m/s, m], shape (H,); zero for one member"""
+    """standard deviation of the members around their mean [m/s, m], shape (H,); zero for one member"""
     change: dict[str, Floats]
-    """root mean square of what happened: how far the actual state is from its start, shape (H,)"""
+    """root mean square of the recorded change since the start [m/s, m], shape (H,)"""
 
 
 def open_loop_errors(
     model: RowModel, data: EnvironmentData, start_indices: NDArray[np.int64], control_steps: int, scenario: Scenario
 ) -> OpenLoopErrors:
-    """Replay recorded accelerations in the virtual environment, and tell how far it goes astray.
-
-    The arguments are those of `replay`.
-    """
-    actual = recorded_states(data, start_indices, control_steps)
+    """Replay recorded accelerations in the model, and compare; arguments as of `replay_accelerations`."""
+    recorded = recorded_states(data, start_indices, control_steps)
     error, spread, change = {}, {}, {}
-    for name, virtual in replay_accelerations(model, data, start_indices, control_steps, scenario).items():
-        error[name] = np.sqrt(np.square(virtual - actual[name][:, 1:]).mean((0, 1)))
-        spread[name] = np.sqrt(virtual.var(0).mean(0))
-        change[name] = np.sqrt(np.square(actual[name][:, 1:] - actual[name][:, :1]).mean(0))
+    for name, predicted in replay_accelerations(model, data, start_indices, control_steps, scenario).items():
+        error[name] = np.sqrt(np.square(predicted - recorded[name][:, 1:]).mean((0, 1)))
+        spread[name] = np.sqrt(predicted.var(0).mean(0))
+        change[name] = np.sqrt(np.square(recorded[name][:, 1:] - recorded[name][:, :1]).mean(0))
     return OpenLoopErrors(error, spread, change)
 
 
 def recorded_states(data: EnvironmentData, start_indices: NDArray[np.int64], control_steps: int) -> dict[str, Floats]:
-    """Return what happened from `choices` on, by number of the state [m/s, m], shape (rows, H + 1)."""
-    windows = [(data.recordings[place].states, slice(at, at + control_steps + 1)) for place, at in start_indices]
+    """Return the recorded states from each start on, by name of `STATE_FIELDS` [m/s, m], shape (rows, H + 1)."""
+    windows = [(data.recordings[index].states, slice(at, at + control_steps + 1)) for index, at in start_indices]
     return {name: np.stack([getattr(states, name)[at] for states, at in windows]) for name in STATE_FIELDS}
 
 
 @dataclass(frozen=True)
 class ReplayDriver(Driver):
-    """Accelerations that were recorded, one decision after the other."""
+    """Applies recorded accelerations, step by step."""
 
     accelerations: Array
     """[m/s2], shape (H, rows)"""
 
     def initial_memory(self, n: int) -> Memory:
-        """Return that nothing was decided yet."""
+        """Return the index of the first step."""
         return {"index": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return those of this decision."""
+        """Return the accelerations of this step."""
         return self.accelerations[int(memory["index"][0])], {"index": memory["index"] + 1.0}
 
 
@@ -75,68 +72,67 @@ class ReplayDriver(Driver):
 def replay_accelerations(
     model: RowModel, data: EnvironmentData, start_indices: NDArray[np.int64], control_steps: int, scenario: Scenario
 ) -> dict[str, Floats]:
-    """Replay recorded accelerations in the virtual environment, without noise, each member by itself.
+    """Replay recorded accelerations in the model, without noise, each member separately.
 
     Args:
         model: fitted, or new: then it is the base alone.
-        data: actual data.
-        choices: where to begin, rows (recording, decision); at least `decisions` recorded ones must follow.
-        decisions: H.
+        data: recordings.
+        start_indices: rows (recording, step), each with at least `control_steps` recorded steps after it.
+        control_steps: H.
         scenario: the road.
 
     Returns:
-        By number of the state [m/s, m], shape (members, rows, H).
+        By name of `STATE_FIELDS` [m/s, m], shape (members, rows, H).
     """
     device = model.input_mean.device
-    each_member = np.tile(start_indices, (model.members, 1))
-    states = data.states_at(each_member).map(lambda values: to_device(values, device))
-    drawn = np.stack([data.recordings[place].drawn_values for place in each_member[:, 0]])
-    applied = np.stack([data.recordings[place].applied_acceleration[at : at + control_steps] for place, at in each_member], 1)
-    starts = RolloutStarts(states, {}, to_device(drawn, device), each_member)
-    generator = torch_generator((0,), device)  # nothing is drawn from it
+    indices = np.tile(start_indices, (model.members, 1))
+    recordings = [data.recordings[index] for index in indices[:, 0]]
+    states = data.states_at(indices).map(lambda values: to_device(values, device))
+    drawn = to_device(np.stack([recording.drawn_values for recording in recordings]), device)
+    windows = zip(recordings, indices[:, 1], strict=True)
+    accelerations = np.stack([each.applied_acceleration[at : at + control_steps] for each, at in windows], 1)
+    generator = torch_generator((0,), device)  # not used
     members = torch.arange(model.members, device=device)
     dynamics = ModelDynamics(model, scenario, "", generator, add_noise=False, members=members)
+    starts = RolloutStarts(states, {}, drawn, indices)
     world = ModelWorld(dynamics, starts, control_steps, scenario.acceleration_limits, None)
-    for _ in DriveLoop(world, ReplayDriver(to_device(applied, device))):
+    for _ in DriveLoop(world, ReplayDriver(to_device(accelerations, device))):
         pass
     shape = model.members, len(start_indices), control_steps
-    found = {name: torch.stack([getattr(state, name) for state in world.states[1:]], 1) for name in STATE_FIELDS}
-    return {name: numbers.view(shape).cpu().numpy() for name, numbers in found.items()}
+    columns = {name: torch.stack([getattr(state, name) for state in world.states[1:]], 1) for name in STATE_FIELDS}
+    return {name: values.view(shape).cpu().numpy() for name, values in columns.items()}
 
 
 def one_step_errors(model: RowModel, transitions: Transitions, scenario: Scenario, reward: str) -> OneStepErrors:
-    """Return the errors of base and model in predicting each of the actual decisions."""
-    wanted, changed = (residual_targets(transitions, base, scenario, reward) for base in (model.base, "none"))
+    """Return the errors of base and model in predicting each of the transitions."""
+    targets, change = (residual_targets(transitions, base, scenario, reward) for base in (model.base, "none"))
     inputs = torch.as_tensor(model_inputs(transitions.states, transitions.acceleration, transitions.drawn_values))
-    answers = model.member_predictions(inputs.to(model.input_mean.device))
-    return OneStepErrors(wanted, answers * model.output_mask.cpu().numpy(), changed)  # elsewhere the base is used
+    predictions = model.member_predictions(inputs.to(model.input_mean.device))
+    return OneStepErrors(targets, predictions * model.output_mask.cpu().numpy(), change)
 
 
 class ReturnGap(NamedTuple):
-    """Mean return of virtual rollouts beside the actual one of the same rows, over as many decisions."""
+    """Mean return of model rollouts, and of the environment from the same starts over the same number of steps."""
 
     model_return: float
     environment_return: float
     standard_error: float
-    """of their difference, rows taken as independent"""
+    """of their difference, for independent rows"""
 
 
 def return_gap(
     model_returns: Floats, start_indices: NDArray[np.int64], data: EnvironmentData, control_steps: int
 ) -> ReturnGap | None:
-    """Compare what so many virtual decisions earned with what was earned from the same actual rows.
+    """Compare `model_returns`, (rows,), with the recorded returns from the same starts, rows (recording, step).
 
-    `earned` has shape (rows,), `starts` where each began, rows (recording, decision).
-
-    The comparison is fair where the same policy drove both, with exploration. Returns are sums of the
-    rewards, not discounted, until the last decision or a crash. Rows that fewer recorded decisions follow are
-    left out; None where nothing is left.
+    The comparison is fair if the same policy drove both, with exploration. Returns are undiscounted sums of rewards up
+    to the last step or a crash. Rows with fewer than `control_steps` recorded steps are skipped; None if none is left.
     """
-    actually = [data.recordings[place].reward[at : at + control_steps] for place, at in start_indices]
-    whole = [len(rewards) == control_steps for rewards in actually]
-    if not any(whole):
+    rewards = [data.recordings[index].reward[at : at + control_steps] for index, at in start_indices]
+    is_complete = [len(each) == control_steps for each in rewards]
+    if not any(is_complete):
         return None
-    virtual = model_returns[whole]
-    actual = np.array([rewards.sum() for rewards in itertools.compress(actually, whole)])
-    error = (virtual - actual).std() / np.sqrt(len(actual))
-    return ReturnGap(float(virtual.mean()), float(actual.mean()), float(error))
+    model = model_returns[is_complete]
+    environment = np.array([each.sum() for each in itertools.compress(rewards, is_complete)])
+    error = (model - environment).std() / np.sqrt(len(environment))
+    return ReturnGap(float(model.mean()), float(environment.mean()), float(error))

@@ -1,4 +1,4 @@
-"""The virtual environment itself: thousands of rows stepped at once as tensors, free of the simulator."""
+"""The dynamics of the row model: thousands of rows stepped at once as tensors, without the simulator."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -32,24 +32,24 @@ from unjam.tree import map_leaves
 from unjam.worlds.reward import Outcome, Reward, make_reward
 
 GAP_SLICE = slice(len(SPEED_FIELDS), len(STATE_FIELDS))
-"""where the gaps are among NUMBERS"""
+"""the gaps in `STATE_FIELDS`"""
 CLIPPED_QUANTITIES = ("speed", "gap", "reward")
-"""what is kept within physical bounds"""
+"""quantities that are clipped to physical bounds"""
 
 
 def check_device(device: Device, name: str = "device") -> None:
-    """Raise `MissingPartError` where there is no such device; `name` says who names it."""
+    """Raise `MissingPartError` if a device is not available; `name` is the setting that asks for it."""
     if device == "cuda" and not torch.cuda.is_available():
-        raise MissingPartError(f"{name}: cuda is not there; use cpu")
+        raise MissingPartError(f"{name}: cuda is not available; allowed: cpu")
 
 
 def to_device(values: NDArray[Any], device: torch.device | str) -> Tensor:
-    """Return numbers in single precision on `device`, as the virtual environment has them."""
+    """Return values in single precision on `device`, as model rollouts use them."""
     return torch.as_tensor(values, dtype=torch.float32, device=device)
 
 
 def tensor_reward(text: str) -> Reward:
-    """Return the reward for a name or for `path.py:name`; a user's function is asked through NumPy."""
+    """Return the reward for a name or for `path.py:name`; a user's function is called with NumPy arrays."""
     reward = make_reward(text)
     if not is_file_reference(text):
         return reward
@@ -62,7 +62,7 @@ def tensor_reward(text: str) -> Reward:
 
 
 def tensor_driver(driver: Driver, device: torch.device | str) -> Driver:
-    """Return a driver that takes tensors on `device`: the same, or the same through NumPy."""
+    """Return a driver that takes tensors on `device`: the same, or an adapter that calls it with NumPy arrays."""
     return driver if driver.accepts_tensors else NumPyDriverAdapter(driver, torch.device(device))
 
 
@@ -73,28 +73,27 @@ def tensor_memory(driver: Driver, memory: Memory, device: torch.device | str) ->
 
 @dataclass(frozen=True)
 class NumPyDriverAdapter(Driver):
-    """A driver that knows nothing of tensors, asked through NumPy; its memory stays NumPy's."""
+    """Calls a driver that does not take tensors with NumPy arrays; its memory stays in NumPy."""
 
     accepts_tensors: ClassVar[bool] = True
 
     driver: Driver
     device: torch.device
-    """where the world is"""
+    """device of the world"""
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the driver's."""
+        """Return the driver's initial memory."""
         return self.driver.initial_memory(n)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Tensor, Memory]:
         """Return the driver's acceleration as a tensor, and its memory.
 
         Raises:
-            InputError: the acceleration is not finite or of a wrong shape.
+            InputError: the acceleration is not finite or has a wrong shape.
         """
-        numbers = state.map(lambda values: values.double().cpu().numpy())
-        answer, memory = self.driver.act(numbers, memory)
-        acceleration = check_acceleration(answer, len(state.speed), "virtual environment")
-        return to_device(acceleration, self.device), memory
+        arrays = state.map(lambda values: values.double().cpu().numpy())
+        acceleration, memory = self.driver.act(arrays, memory)
+        return to_device(check_acceleration(acceleration, len(state.speed), "model rollout"), self.device), memory
 
     def memory_features(self, memory: Memory) -> Tensor | None:
         """Return the driver's features as a tensor."""
@@ -103,30 +102,30 @@ class NumPyDriverAdapter(Driver):
 
 
 class ModelTransition(NamedTuple):
-    """What a virtual decision led to; n rows of torch tensors."""
+    """The result of a model step; n rows of torch tensors."""
 
     state: LocalState
     reward: Tensor
     crashed: Tensor
-    """whether the gap ahead or behind was used up, shape (n,)"""
+    """whether a gap ahead or behind is used up, shape (n,)"""
     clipped: Tensor
-    """which of BOUNDS had to be enforced, shape (3, n)"""
+    """which of `CLIPPED_QUANTITIES` were clipped, shape (3, n)"""
 
 
 class Dynamics(Protocol):
-    """What a decision leads to, row by row."""
+    """The transition function of rows."""
 
     def step(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor) -> ModelTransition:
-        """Return what `applied` [m/s2], shape (n,), leads to; `drawn`, (n, m), is what the episode drew."""
+        """Return the transitions under `acceleration` [m/s2], (n,), in episodes that drew `drawn_values`, (n, m)."""
         ...
 
 
 class ModelDynamics:
-    """IDM plus residual networks; Eq. 4, for state and reward.
+    """Base plus residual networks, Eq. 4, for state and reward.
 
-    In each step a random member of the ensemble answers for each row. Noise is an error that the model made
-    somewhere on the holdout, drawn anew for each row and step: so it has the errors' standard deviations,
-    the correlations between them, and their tails. Noise alone never makes a crash.
+    A random member of the ensemble predicts each row in each step. Noise is a random holdout error of the model, drawn
+    independently for each row and step: it has their standard deviations, correlations and tails. Noise alone never
+    causes a collision.
     """
 
     def __init__(
@@ -138,64 +137,60 @@ class ModelDynamics:
         add_noise: bool = True,
         members: Tensor | None = None,
     ) -> None:
-        """Make the world of `scenario` as `model` has it, on the generator's device.
+        """Make the dynamics of `scenario` according to `model`, on the generator's device.
 
-        With `members`, those answer in every step, each for an equal share of the rows in turn.
+        With `members`, each of those predicts an equal share of the rows, in order, in every step.
         """
         self._model, self._layers, self._fixed_members = model, model.layers(), members
         self._scenario, self._generator, self._add_noise = scenario, generator, add_noise
         self._reward = tensor_reward(reward or scenario.reward)
 
     def step(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor) -> ModelTransition:
-        """Return what `applied` leads to once it is filtered: next state, reward, whether that is a crash."""
+        """Return the transitions under `acceleration`, limited by the safety filter; arguments as of `Dynamics`."""
         scenario = self._scenario
         acceleration = scenario.safety.limit(acceleration, FollowingState(*state[:3]), scenario.control_step)
-        known = base_step(self._model.base, scenario, state, acceleration)
-        expected = torch.stack([getattr(known, name) for name in STATE_FIELDS])
+        base_state = base_step(self._model.base, scenario, state, acceleration)
+        expected = torch.stack([getattr(base_state, name) for name in STATE_FIELDS])
         residual = self._residual(state, acceleration, drawn_values, expected[GAP_SLICE]).T
-        numbers = expected + residual[: len(STATE_FIELDS)]
-        wanted_speeds, wanted_gaps = numbers[: len(SPEED_FIELDS)], numbers[GAP_SLICE]
-        crashed = (wanted_gaps <= 0.0).any(0)
-        largest = max_gap(state)
-        speeds = wanted_speeds.clip(0.0, scenario.top_speed)
-        gaps = wanted_gaps.clip(0.0).minimum(largest)
+        predicted = expected + residual[: len(STATE_FIELDS)]
+        predicted_speeds, predicted_gaps = predicted[: len(SPEED_FIELDS)], predicted[GAP_SLICE]
+        crashed = (predicted_gaps <= 0.0).any(0)
+        largest_gap = max_gap(state)
+        speeds = predicted_speeds.clip(0.0, scenario.top_speed)
+        gaps = predicted_gaps.clip(0.0).minimum(largest_gap)
         residual_reward = residual[-1].clip(*self._model.reward_range)
-        nobody = gaps >= largest
+        is_missing = gaps >= largest_gap
         speed = speeds[0]
-        driven = distance_driven(state.speed, speed, scenario.simulation_step, scenario.steps_per_control_step)
-        position, ahead = state.route_position + driven, state.distance_to_crossing
-        following = LocalState(
+        distance = distance_driven(state.speed, speed, scenario.simulation_step, scenario.steps_per_control_step)
+        position, to_crossing = state.route_position + distance, state.distance_to_crossing
+        next_state = LocalState(
             speed=speed,
-            leader_speed=torch.where(nobody[0], speed, speeds[1]),
+            leader_speed=torch.where(is_missing[0], speed, speeds[1]),
             leader_gap=gaps[0],
-            follower_speed=torch.where(nobody[1], speed, speeds[2]),
+            follower_speed=torch.where(is_missing[1], speed, speeds[2]),
             follower_gap=gaps[1],
             route_position=torch.where(state.loop_length.isnan(), position, position % state.loop_length),
             loop_length=state.loop_length,
-            # Behind a crossing the next is taken to be a lap away: rows do not know where else there is one.
-            distance_to_crossing=None if ahead is None else (ahead - driven) % state.loop_length,
+            # Behind a crossing the next one is assumed a lap away: rows do not know other crossings.
+            distance_to_crossing=None if to_crossing is None else (to_crossing - distance) % state.loop_length,
             penetration_rate=state.penetration_rate,
         )
-        earned = base_reward(self._model.base, self._reward, following, acceleration, crashed)
-        bounded = torch.stack(
-            [(speeds != wanted_speeds).any(0), (gaps != wanted_gaps).any(0), residual_reward != residual[-1]]
+        reward = base_reward(self._model.base, self._reward, next_state, acceleration, crashed)
+        clipped = torch.stack(
+            [(speeds != predicted_speeds).any(0), (gaps != predicted_gaps).any(0), residual_reward != residual[-1]]
         )
-        return ModelTransition(following, earned + residual_reward * ~crashed, crashed, bounded)
+        return ModelTransition(next_state, reward + residual_reward * ~crashed, crashed, clipped)
 
     def _residual(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor, expected_gaps: Tensor) -> Tensor:
-        """Return what the networks add to the base, with noise, shape (n, 6).
-
-        `expected_gaps`, shape (2, n), are those of the base.
-        """
-        rows, members = len(acceleration), self._fixed_members
+        """Return the residual of the base with noise, shape (n, 6); `expected_gaps`, (2, n), are the base's."""
+        rows, members, generator = len(acceleration), self._fixed_members, self._generator
         if members is None:
-            members = random_members(self._model.members, rows, self._generator)
+            members = random_members(self._model.members, rows, generator)
         residual = predict(self._layers, model_inputs(state, acceleration, drawn_values), members)
-        if self._add_noise:
-            generator = self._generator
-            chosen = torch.randint(NOISE_SAMPLES, (rows,), generator=generator, device=generator.device)
-            noisy = residual + self._model.noise.index_select(0, chosen)
-            # A vehicle that changes lanes or merges makes a gap jump: it does so only where it fits.
-            closes = (expected_gaps + noisy.T[GAP_SLICE] <= 0.0).any(0)
-            residual = torch.where(closes[:, None], residual, noisy)
-        return residual
+        if not self._add_noise:
+            return residual
+        samples = torch.randint(NOISE_SAMPLES, (rows,), generator=generator, device=generator.device)
+        noisy = residual + self._model.noise.index_select(0, samples)
+        # Vehicles that change lanes or merge make gaps jump; they do so only where they fit.
+        is_collision = (expected_gaps + noisy.T[GAP_SLICE] <= 0.0).any(0)
+        return torch.where(is_collision[:, None], residual, noisy)

@@ -1,8 +1,8 @@
-"""On-ramps as the virtual environment: who came when is known, and how they drive, beside what is learned.
+"""The road model of on-ramps: the batch's human drivers with known entry times, plus what networks learn.
 
-The base is the batch's: people's own drivers and lane changes. What they misjudge is noise, drawn anew. What
-they did besides, where they keep their lane, one ensemble learns from moments of actual episodes: a vehicle
-of each such moment makes a decision's steps as the base has it, and what is left of its speed is to predict.
+The base is the batch: each vehicle's own driver model and lane changes. Perception errors are noise, drawn anew. One
+ensemble learns the rest, where vehicles keep their lane, from samples of environment episodes: vehicles are stepped
+once as the base does, and the remaining difference in speed is the target.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from unjam.errors import InputError
 from unjam.models.fitting import ModelFit
-from unjam.models.road_model import HumanRows, RoadModel, fit_human_model, residual_function
+from unjam.models.road_model import HumanRows, RoadModel, check_road_model, fit_human_model, residual_function
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Floats
 from unjam.scenarios.on_ramp import RAMP_SPEED_LIMIT, OnRamp
@@ -38,107 +38,100 @@ from unjam.worlds.batch.on_ramp.vehicles import (
 from unjam.worlds.record import Episode
 
 MAX_SAMPLE_INTERVAL = 60
-"""decisions from one moment that is learned from to the next, at most"""
+"""maximum number of control steps between samples"""
 MIN_ERROR_REDUCTION = 0.3
-"""share of the base's mean square error that networks must save: a record does not tell what people remember
-of lane changes, and who imagines them knows it; its mean effect would be added twice. Networks that saved a
-fifth made imagined episodes 10 s too long; others, that saved more than half, 20 s instead of
-180 (docs/virtual.md)"""
+"""share by which networks must reduce the base's mean squared error: a record lacks the lane-change memory of human
+drivers, which rollouts have, and its mean effect would be added twice. Networks that reduced it by a fifth made model
+episodes 10 s too long; others, by more than half, 20 s instead of 180 (docs/virtual.md)"""
 PERCEPTION_ERROR_STD = 0.5
-"""standard deviation of what people misjudge once they have driven for a while; of how they drive it is 1"""
+"""stationary standard deviation of drivers' errors in gap and leader speed; that of their driving error is 1"""
 
 
 @dataclass(frozen=True)
 class MotorwaySamples:
-    """What is kept of an actual episode on an on-ramp."""
+    """Samples of an environment episode on an on-ramp."""
 
     episode: int
     """number of the episode"""
     seed: tuple[int, ...]
-    """of the episode: it says who wanted to enter, and when"""
+    """of the episode: it determines the vehicles and their entry times"""
     episode_return: float
-    """return of the episode"""
     human_rows: HumanRows
-    """what people did who kept their lane; the base is without what they misjudge"""
+    """steps of human drivers that keep their lane; the base is without perception errors"""
     noise_variance: float
-    """mean square of what that adds to a speed in a decision [m2/s2]"""
+    """mean square of what perception errors add to a speed in a control step [m2/s2]"""
 
 
 def check_motorway_model(scenario: OnRamp, settings: ModelSettings) -> None:
-    """Raise `InputError` where an on-ramp cannot be imagined with these settings."""
+    """Raise `InputError` if the road model of on-ramps does not support a scenario or settings."""
+    check_road_model(scenario)
     if settings.rollout_starts != "first":
-        raise InputError(
-            f"model.rollout_starts: {settings.rollout_starts} is not allowed; allowed: first, on the on-ramp"
-        )
-    if settings.base not in ("idm", "none"):
-        words = "idm, as each drives, or none, on the on-ramp"
-        raise InputError(f"model.base: {settings.base} is not allowed; allowed: {words}")
-    if settings.calibrate_base:
-        raise InputError("model.calibrate_base: true is not allowed; allowed: false, on the on-ramp")
+        setting, allowed = f"rollout_starts: {settings.rollout_starts}", "first"
+    elif settings.base not in ("idm", "none"):
+        setting, allowed = f"base: {settings.base}", "idm, each vehicle's own driver model, or none"
+    elif settings.calibrate_base:
+        setting, allowed = "calibrate_base: true", "false"
+    else:
+        return
+    raise InputError(f"model.{setting} is not allowed; allowed: {allowed}, on on-ramps")
 
 
 class _SampledVehicles(NamedTuple):
-    """Vehicles at some moments of an episode, moment by moment from front to back; V in all."""
+    """Vehicles at some steps of an episode, in each from front to back; V in all, arrays of shape (V,)."""
 
     sample: NDArray[np.intp]
-    """which of the moments, shape (V,)"""
+    """index of the step"""
     column: NDArray[np.intp]
-    """of the record's tables"""
+    """of the tables of the record"""
     vehicle: NDArray[np.intp]
-    """number among the record's vehicles"""
+    """number in the record"""
 
 
 def motorway_samples(episode: Episode, number: int, scenario: OnRamp, base: str = "idm") -> MotorwaySamples:
-    """Return what is kept of an actual episode, the so many-th, on a scenario.
+    """Return the samples of an environment episode with this number.
 
     Raises:
-        InputError: so many drove for so long that the record skips moments.
+        InputError: the record skips steps, since many vehicles drove for a long time.
     """
     if episode.snapshot_stride > 1:
-        raise InputError("road: its record skips moments; allowed: a shorter horizon, where it is imagined")
+        raise InputError("road: its record skips moments; allowed: a shorter horizon, with model.kind road")
     road = cast(MotorwayRoad, scenario.draw_from_seed(episode.seed)[0])
-    every = max(1, min(MAX_SAMPLE_INTERVAL, episode.control_steps // 4))
-    at = np.arange(every, episode.control_steps, every)
-    those = _sample_vehicles(episode, at)
-    now, later = (at[those.sample], those.column), (at[those.sample] + 1, those.column)
-    before = _batch_vehicles(episode, road, scenario, now, those)
+    interval = max(1, min(MAX_SAMPLE_INTERVAL, episode.control_steps // 4))
+    steps = np.arange(interval, episode.control_steps, interval)
+    sampled = _sample_vehicles(episode, steps)
+    now, later = (steps[sampled.sample], sampled.column), (steps[sampled.sample] + 1, sampled.column)
+    before = _batch_vehicles(episode, road, scenario, now, sampled)
     generator = np.random.default_rng([*episode.seed, number])
-    errors = generator.standard_normal((3, len(those.sample)))
-    erring = before._replace(
-        gap_error=PERCEPTION_ERROR_STD * errors[0],
-        leader_error=PERCEPTION_ERROR_STD * errors[1],
-        driving_error=errors[2],
-    )
-    known, noisy = (
-        _speeds_after_step(each, road, scenario, len(at), draw)
-        for each, draw in ((before, np.zeros), (erring, generator.standard_normal))
-    )
-    row, after = (
-        neighbors_on_lane(find_neighbors(before, len(road.lane_names)).leaders, before.lane),
-        episode.speeds[later],
-    )
-    keeps = episode.lane_indices[later] == episode.lane_indices[now]
-    counts = (row >= 0) & before.is_eidm & keeps & ~np.isnan(known + noisy + after)
-    gap = before.position[row] - road.vehicle_length - before.position
-    noise = float(np.square(noisy - known)[counts].mean()) if counts.any() else 0.0
-    based = before.speed if base == "none" else known
-    columns = before.speed, before.speed[row], gap, based, after, after, np.full(len(row), float(number))
-    people = HumanRows(*(each[counts] for each in columns))
-    return MotorwaySamples(number, tuple(episode.seed), float(episode.reward.sum()), people, noise)
+    errors = generator.standard_normal((3, len(sampled.sample)))
+    perception = {"gap_error": PERCEPTION_ERROR_STD * errors[0], "leader_error": PERCEPTION_ERROR_STD * errors[1]}
+    noisy = before._replace(**perception, driving_error=errors[2])
+    base_speed = _speeds_after_step(before, road, scenario, len(steps), np.zeros)
+    noisy_speed = _speeds_after_step(noisy, road, scenario, len(steps), generator.standard_normal)
+    leader = neighbors_on_lane(find_neighbors(before, len(road.lane_names)).leaders, before.lane)
+    next_speed = episode.speeds[later]
+    keeps_lane = episode.lane_indices[later] == episode.lane_indices[now]
+    is_used = (leader >= 0) & before.is_eidm & keeps_lane & ~np.isnan(base_speed + noisy_speed + next_speed)
+    gap = before.position[leader] - road.vehicle_length - before.position
+    noise_variance = float(np.square(noisy_speed - base_speed)[is_used].mean()) if is_used.any() else 0.0
+    if base == "none":
+        base_speed = before.speed
+    columns = before.speed, before.speed[leader], gap, base_speed, next_speed, next_speed
+    rows = HumanRows(*(values[is_used] for values in (*columns, np.full(len(leader), float(number)))))
+    return MotorwaySamples(number, tuple(episode.seed), float(episode.reward.sum()), rows, noise_variance)
 
 
 def _sample_vehicles(episode: Episode, steps: NDArray[np.intp]) -> _SampledVehicles:
-    """Return who is on the road at moments, and where: vehicles share columns one after the other."""
-    there = ~np.isnan(episode.speeds)
-    begins = there & ~np.vstack([np.zeros((1, there.shape[1]), bool), there[:-1]])
-    so_many = np.cumsum(begins, 0) - 1
-    columns = np.array(episode.vehicle_columns or range(there.shape[1]))
+    """Return the vehicles on the road at `steps`; vehicles share columns of the record one after the other."""
+    is_present = ~np.isnan(episode.speeds)
+    enters = is_present & ~np.vstack([np.zeros((1, is_present.shape[1]), bool), is_present[:-1]])
+    number_in_column = np.cumsum(enters, 0) - 1
+    columns = np.array(episode.vehicle_columns or range(is_present.shape[1]))
     order = np.argsort(columns, kind="stable")
-    first = np.searchsorted(columns[order], np.arange(there.shape[1]))
-    moment, column = np.nonzero(there[steps])
-    rows = np.lexsort((-episode.positions[steps[moment], column], moment))
-    moment, column = moment[rows], column[rows]
-    return _SampledVehicles(moment, column, order[first[column] + so_many[steps[moment], column]])
+    first = np.searchsorted(columns[order], np.arange(is_present.shape[1]))
+    sample, column = np.nonzero(is_present[steps])
+    rows = np.lexsort((-episode.positions[steps[sample], column], sample))
+    sample, column = sample[rows], column[rows]
+    return _SampledVehicles(sample, column, order[first[column] + number_in_column[steps[sample], column]])
 
 
 def _batch_vehicles(
@@ -148,26 +141,27 @@ def _batch_vehicles(
     sample_index: tuple[NDArray[np.intp], NDArray[np.intp]],
     sampled: _SampledVehicles,
 ) -> MotorwayVehicles:
-    """Return the vehicles of moments as a batch has them, each moment a road; nobody errs or remembers."""
+    """Return sampled vehicles as a batch has them, without errors or memory; each sample is a road."""
     numbers = {entry.name: number for number, entry in enumerate(road.entries)}
     entries = np.array([numbers[name] for name in episode.vehicle_ids])
-    people = np.array([driver_columns(road.vehicle_types[road.entries[number].vehicle_type]) for number in entries.tolist()])
-    *follows, factor, extended = people[sampled.vehicle].T
-    way = (len(road.lane_names) - 1 - episode.lane_indices[sample_index]).astype(np.intp)
-    place, speed = episode.positions[sample_index] + road.merge_position, episode.speeds[sample_index]
-    change = np.nan_to_num(speed - episode.speeds[sample_index[0] - 1, sample_index[1]]) / episode.control_step
-    limit = np.where((way == 0) & (place < road.merge_position), RAMP_SPEED_LIMIT, road.limit_speed)
-    where = sampled.sample, entries[sampled.vehicle], way, place, speed, change
-    found = make_vehicles(*where, *follows, factor, extended, limit * factor)
-    cavs = np.isin(np.array(episode.vehicle_ids), episode.cav_ids)
-    enable_acc(found, cavs[sampled.vehicle], scenario.cruise)
-    return found
+    types = [road.vehicle_types[road.entries[number].vehicle_type] for number in entries.tolist()]
+    *parameters, speed_factor, is_eidm = np.array([driver_columns(each) for each in types])[sampled.vehicle].T
+    lane = (len(road.lane_names) - 1 - episode.lane_indices[sample_index]).astype(np.intp)
+    position, speed = episode.positions[sample_index] + road.merge_position, episode.speeds[sample_index]
+    previous_speed = episode.speeds[sample_index[0] - 1, sample_index[1]]
+    acceleration = np.nan_to_num(speed - previous_speed) / episode.control_step
+    limit = np.where((lane == 0) & (position < road.merge_position), RAMP_SPEED_LIMIT, road.limit_speed)
+    moving = sampled.sample, entries[sampled.vehicle], lane, position, speed, acceleration
+    vehicles = make_vehicles(*moving, *parameters, speed_factor, is_eidm, limit * speed_factor)
+    is_cav = np.isin(np.array(episode.vehicle_ids), episode.cav_ids)
+    enable_acc(vehicles, is_cav[sampled.vehicle], scenario.cruise)
+    return vehicles
 
 
 def _speeds_after_step(
     vehicles: MotorwayVehicles, road: MotorwayRoad, scenario: OnRamp, road_count: int, draw_noise: Callable[..., Floats]
 ) -> Floats:
-    """Return the speeds after a decision of those who kept their lane and are there [m/s]; NaN of others."""
+    """Return the speeds after a control step [m/s]; NaN for vehicles that changed lanes or left."""
     empty = [replace(road, entries=())] * road_count
     traffic = BatchMotorways(empty, scenario.simulation_step, draw_noise, np.asarray)
     traffic.vehicles = vehicles.map(np.copy)
@@ -175,29 +169,29 @@ def _speeds_after_step(
         traffic.step()
     after = traffic.vehicles
     row = find_rows(vehicle_numbers(vehicles), after)
-    keeps = (row >= 0) & (after.lane[row] == vehicles.lane)
-    return np.where(keeps, after.speed[row], np.nan)
+    keeps_lane = (row >= 0) & (after.lane[row] == vehicles.lane)
+    return np.where(keeps_lane, after.speed[row], np.nan)
 
 
 def learned_correction(
     model: RoadModel, generator: torch.Generator, steps: int, has_noise: bool = True
 ) -> LearnedCorrection | None:
-    """Return what people do in a decision of so many steps beside what the batch has them do.
+    """Return what the model adds to the speeds of the batch's human drivers in a control step of `steps` steps.
 
-    With the base `none` that takes back what the batch knows of following, and what people misjudge, of which
-    `noise` of as much strength is left.
+    With the base `none` it replaces the car following of the batch, and perception errors by noise of the same
+    strength.
     """
     residual = residual_function(model, generator)
     if model.base != "none":
         return residual
     sigma = float(model.noise) * sqrt(steps) if has_noise else 0.0
 
-    def residual_speed(speed: Floats, leader_speed: Floats, gap: Floats, base_speed: Floats) -> Floats:
+    def replacement(speed: Floats, leader_speed: Floats, gap: Floats, base_speed: Floats) -> Floats:
         drawn = torch.randn(speed.size, generator=generator, dtype=torch.float64).numpy()
         learned = residual(speed, leader_speed, gap, speed) if residual else 0.0
         return speed - base_speed + learned + sigma * drawn
 
-    return residual_speed
+    return replacement
 
 
 def fit_motorway_model(
@@ -207,15 +201,15 @@ def fit_motorway_model(
     seed: Sequence[int],
     episodes_per_group: int = 1,
 ) -> ModelFit:
-    """Teach `model` what people did beside the base; what they misjudge is no ignorance.
+    """Fit `model` to what the base leaves, see `fit_human_model`; perception errors do not count as model error.
 
-    So many `twins` in a row meet the same people: they are held out together.
+    `episodes_per_group` consecutive episodes have the same vehicles, and are held out together.
 
     Raises:
         UnjamError: a loss is not finite.
     """
-    rows = HumanRows(*(np.concatenate(each) for each in zip(*(one.human_rows for one in samples), strict=True)))
+    rows = HumanRows(*(np.concatenate(parts) for parts in zip(*(each.human_rows for each in samples), strict=True)))
     rows = rows._replace(episode=rows.episode // episodes_per_group)
-    sigma = float(np.sqrt(np.mean([one.noise_variance for one in samples])))
-    least = 0.0 if model.base == "none" else MIN_ERROR_REDUCTION
-    return fit_human_model(model, rows, sigma, settings, seed, is_noise_known=False, min_error_reduction=least)
+    sigma = float(np.sqrt(np.mean([each.noise_variance for each in samples])))
+    min_reduction = 0.0 if model.base == "none" else MIN_ERROR_REDUCTION
+    return fit_human_model(model, rows, sigma, settings, seed, False, min_reduction)

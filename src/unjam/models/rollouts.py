@@ -1,4 +1,4 @@
-"""Virtual rollouts: how long they may be (Eq. 15), and driving them with the full policy."""
+"""Model rollouts of rows: how long they may be (Eq. 15), and how the full policy is driven in them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,64 +23,62 @@ from unjam.worlds.world import DriverLog, ProgressCallback
 
 
 def rollout_length(eps_m: float, settings: ModelSettings) -> int:
-    """Return k* = min(k_max, floor(kappa / eps_m)) [decisions], Eq. 15; 0: the model is not to be used."""
+    """Return k* = min(k_max, floor(kappa / eps_m)) [control steps], Eq. 15; 0: the model must not be used."""
     if not isfinite(eps_m):
         return 0
-    if eps_m * settings.k_max <= settings.kappa:
-        return settings.k_max
-    return floor(settings.kappa / eps_m)
+    return settings.k_max if eps_m * settings.k_max <= settings.kappa else floor(settings.kappa / eps_m)
 
 
 def return_bound(eps_pi: float, eps_m: float, k: int, gamma: float, max_reward: float) -> float:
-    """Return C, by how much the actual return may fall short of the virtual one (paper, below Eq. 13).
+    """Return C, the bound on model return minus environment return (paper, below Eq. 13).
 
     Args:
         eps_pi: total variation between the policy and the one that collected the data.
-        eps_m: total variation between virtual and actual next state.
-        k: rollout length [decisions].
-        gamma: discount for a decision.
-        largest_reward: R_max, the largest |reward| of a decision.
+        eps_m: total variation between the next states of model and environment.
+        k: rollout length [control steps].
+        gamma: discount per control step.
+        max_reward: R_max, the largest |reward| of a control step.
     """
-    far = 1.0 / (1.0 - gamma)
-    policy = gamma ** (k + 1) * eps_pi * far**2 + gamma**k * eps_pi * far
-    return 2.0 * max_reward * (policy + k * eps_m * far)
+    horizon = 1.0 / (1.0 - gamma)
+    policy_term = gamma ** (k + 1) * eps_pi * horizon**2 + gamma**k * eps_pi * horizon
+    return 2.0 * max_reward * (policy_term + k * eps_m * horizon)
 
 
 class RolloutStarts(NamedTuple):
-    """Actual rows from which virtual rollouts begin; n rows."""
+    """Recorded states from which model rollouts start; n rows."""
 
     state: LocalState
     """tensors of shape (n,)"""
     memory: Memory
-    """of the expert, as `tensor_driver` of it takes it"""
+    """of the expert, as its `tensor_driver` takes it"""
     drawn_values: Tensor
-    """what the rows' episodes have drawn, scaled, shape (n, m)"""
+    """scaled values that the episodes drew, shape (n, m)"""
     indices: NDArray[np.int64]
-    """where they are: rows (recording, decision), shape (n, 2)"""
+    """rows (recording, step), shape (n, 2)"""
 
 
 @dataclass(frozen=True)
 class RolloutBatch:
-    """Virtual experience: n rows, each of as many choices of the network; tensors."""
+    """Model rollouts: n rows, each with the same number of actions of the network; tensors."""
 
     observations: Tensor
-    """what the network saw at each choice, and at the end, shape (n, choices + 1, inputs)"""
+    """of the network at each action, and at the end, shape (n, actions + 1, inputs)"""
     actions: Tensor
-    """the residual it chose, with its exploration noise, not clipped [m/s2], shape (n, choices)"""
+    """residuals with exploration noise, not clipped [m/s2], shape (n, actions)"""
     rewards: Tensor
-    """what was earned while each residual was held, zero after a crash, shape (n, choices)"""
+    """sums while each residual was held, zero after a crash, shape (n, actions)"""
     lengths: Tensor
-    """choices that each row made: those after its crash mean nothing, shape (n,)"""
+    """valid actions of each row, up to its crash, shape (n,)"""
     terminated: Tensor
-    """whether it crashed; otherwise it was cut, and goes on where it ended, shape (n,)"""
+    """whether the row crashed; otherwise it was truncated, shape (n,)"""
     drawn_values: Tensor
-    """what its episode had drawn, scaled, shape (n, m)"""
+    """scaled values that the episodes drew, shape (n, m)"""
     start_indices: NDArray[np.int64]
-    """where it began: rows (recording, decision), shape (n, 2)"""
+    """rows (recording, step), shape (n, 2)"""
     control_steps: int
-    """virtual decisions in all"""
+    """total number of valid control steps"""
     clipped_share: dict[str, float]
-    """share of the decisions in which each of BOUNDS had to be enforced"""
+    """share of the control steps in which each of `CLIPPED_QUANTITIES` was clipped"""
 
 
 def draw_starts(
@@ -92,24 +90,24 @@ def draw_starts(
     *,
     episode_starts_only: bool = False,
 ) -> NDArray[np.int64]:
-    """Return random decisions at which a residual was due, rows (recording, decision), shape (rows, 2).
+    """Return random steps at which a residual was due, rows (recording, step), shape (rows, 2).
 
-    At least `ahead` recorded decisions follow each, and its episode is number `since` or a later one; with
-    `at_first` they are the first of a recording. Shape (0, 2) where there are none such.
+    At least `min_control_steps` recorded steps follow each, in episodes from `first_episode` on; with
+    `episode_starts_only` they are first steps of recordings. Shape (0, 2) if there are none.
     """
-    choices = data.start_indices(min_control_steps, first_episode)
+    indices = data.start_indices(min_control_steps, first_episode)
     if episode_starts_only:
-        choices = choices[choices[:, 1] == 0]
-    if len(choices) == 0:
-        return choices
-    return choices[np.random.default_rng(list(seed)).integers(len(choices), size=rows)]
+        indices = indices[indices[:, 1] == 0]
+    if len(indices) == 0:
+        return indices
+    return indices[np.random.default_rng(list(seed)).integers(len(indices), size=rows)]
 
 
 def prepare_starts(
     data: EnvironmentData, start_indices: NDArray[np.int64], expert: Driver, device: torch.device | str
 ) -> RolloutStarts:
-    """Return the start of virtual rollouts at `choices`, with what the expert remembered there."""
-    drawn = np.stack([data.recordings[place].drawn_values for place in start_indices[:, 0]])
+    """Return the starts of rollouts at `start_indices`, with the expert's memory there."""
+    drawn = np.stack([data.recordings[index].drawn_values for index in start_indices[:, 0]])
     memory = reconstruct_memory(expert, data.recordings, start_indices)
     return RolloutStarts(
         state=data.states_at(start_indices).map(lambda values: to_device(values, device)),
@@ -120,9 +118,9 @@ def prepare_starts(
 
 
 class ModelWorld:
-    """The virtual environment as a world to drive in: n rows from actual states, so many decisions of each.
+    """The row model as a world to drive in: n rows from recorded states for a number of control steps.
 
-    Rows that have crashed are driven on, but count no more.
+    Rows that have crashed are driven on, but no longer counted.
     """
 
     is_scalar, entered_count, remaining_rows = False, 0, None
@@ -135,84 +133,80 @@ class ModelWorld:
         limits: Limits,
         generator: torch.Generator | None,
     ) -> None:
-        """Begin at `starts`; `generator` is of the exploration noise."""
+        """Place the rows at `starts`; `generator` draws the exploration noise."""
         self.limits, self.cav_count = limits, len(starts.state.speed)
         self.states = [starts.state]
-        """one after the other, the last being the present one"""
-        self._dynamics, self._starts = dynamics, starts
-        self._control_steps, self._generator = control_steps, generator
-        like = starts.state.speed
-        self._is_running, self._running_log, self._rewards = torch.ones_like(like), [], []
+        """at each step, the last being the present one"""
+        self._dynamics, self._starts, self._control_steps, self._generator = dynamics, starts, control_steps, generator
+        speed = starts.state.speed
+        self._is_running, self._running_log, self._rewards = torch.ones_like(speed), [], []
         self._episode_noise: Tensor | None = None
         # Single precision counts to 2^24 only.
-        self._step_total = torch.zeros((), dtype=torch.float64, device=like.device)
-        self._clipped_totals = torch.zeros(len(CLIPPED_QUANTITIES), dtype=torch.float64, device=like.device)
+        self._step_total = torch.zeros((), dtype=torch.float64, device=speed.device)
+        self._clipped_totals = torch.zeros(len(CLIPPED_QUANTITIES), dtype=torch.float64, device=speed.device)
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Begin; what the driver remembers was recorded with the starts."""
+        """Do nothing: the memory of the driver comes with the starts."""
 
     @property
     def has_ended(self) -> bool:
-        """Whether all decisions are made."""
+        """Whether all control steps are made."""
         return len(self._rewards) >= self._control_steps
 
     def local_state(self) -> LocalState:
-        """Return the states now, tensors of shape (n,)."""
+        """Return the present states, tensors of shape (n,)."""
         return self.states[-1]
 
     def advance(self, command: Command | None) -> None:
-        """Make one virtual decision in each row."""
+        """Make one model step in each row."""
         assert command is not None
-        applied = self.limits.clip(command.acceleration)
-        found = self._dynamics.step(self.states[-1], applied, self._starts.drawn_values)
-        self.states.append(found.state)
+        acceleration = self.limits.clip(command.acceleration)
+        transition = self._dynamics.step(self.states[-1], acceleration, self._starts.drawn_values)
+        self.states.append(transition.state)
         self._running_log.append(self._is_running)
-        self._rewards.append(found.reward * self._is_running)
-        self._clipped_totals += (found.clipped * self._is_running).sum(1)
+        self._rewards.append(transition.reward * self._is_running)
+        self._clipped_totals += (transition.clipped * self._is_running).sum(1)
         self._step_total += self._is_running.sum()
-        self._is_running = self._is_running * ~found.crashed
+        self._is_running = self._is_running * ~transition.crashed
 
     def noise(self, episode_noise_size: int = 0) -> Tensor:
-        """Return standard normal noise, shape (n,), or (n, lasting): each row is a road of its own."""
-        like = self.states[-1].speed
+        """Return standard normal noise, shape (n,), or (n, episode_noise_size): each row is a road of its own."""
+        speed = self.states[-1].speed
         if not episode_noise_size:
-            return torch.randn(len(like), generator=self._generator, device=like.device)
+            return torch.randn(len(speed), generator=self._generator, device=speed.device)
         if self._episode_noise is None:
-            shape = len(like), episode_noise_size
-            drawn = torch.randn(shape, generator=self._generator, device=like.device)
-            self._episode_noise = drawn.to(like.dtype)
+            shape = len(speed), episode_noise_size
+            self._episode_noise = torch.randn(shape, generator=self._generator, device=speed.device).to(speed.dtype)
         return self._episode_noise
 
     def record(self, driver_log: DriverLog) -> RolloutBatch:
-        """Return what happened, choice by choice.
+        """Return the rollouts, action by action.
 
         Raises:
-            UnjamError: something of it is not finite.
+            UnjamError: some value is not finite.
         """
-        hold, nothing = driver_log.action_repeat, self.states[0].speed.new_zeros((self.cav_count, 0))
-        choices = range(0, len(self._rewards), hold)
-        actions = [driver_log.decisions[choice][1] for choice in choices]
-        none = torch.zeros_like(self._is_running)
-        rewards = [sum(self._rewards[choice : choice + hold], none) for choice in choices]
-        made = sum((self._running_log[choice] for choice in choices), none)
-        seen = [*(driver_log.decisions[choice][2] for choice in choices), driver_log.last_observation]
+        repeat, empty = driver_log.action_repeat, self.states[0].speed.new_zeros((self.cav_count, 0))
+        steps = range(0, len(self._rewards), repeat)
+        actions = [driver_log.decisions[step][1] for step in steps]
+        observations = [*(driver_log.decisions[step][2] for step in steps), driver_log.last_observation]
+        zeros = torch.zeros_like(self._is_running)
+        rewards = [sum(self._rewards[step : step + repeat], zeros) for step in steps]
+        clipped_shares = (self._clipped_totals / self._step_total.clip(1.0)).tolist()
         rollouts = RolloutBatch(
-            observations=torch.stack(seen, 1),
-            actions=torch.stack(actions, 1) if actions else nothing,
-            rewards=torch.stack(rewards, 1) if rewards else nothing,
-            lengths=made.long(),
+            observations=torch.stack(observations, 1),
+            actions=torch.stack(actions, 1) if actions else empty,
+            rewards=torch.stack(rewards, 1) if rewards else empty,
+            lengths=sum((self._running_log[step] for step in steps), zeros).long(),
             terminated=self._is_running == 0.0,
             drawn_values=self._starts.drawn_values,
             start_indices=self._starts.indices,
             control_steps=int(self._step_total.item()),
-            clipped_share=dict(
-                zip(CLIPPED_QUANTITIES, (self._clipped_totals / self._step_total.clip(1.0)).tolist(), strict=True)
-            ),
+            clipped_share=dict(zip(CLIPPED_QUANTITIES, clipped_shares, strict=True)),
         )
         for name in ("observations", "actions", "rewards"):
             if not getattr(rollouts, name).isfinite().all():
-                why = "; speeds of who is not seen are NaN there, too" if name == "rewards" else ""
-                raise UnjamError(f"virtual environment: {name} of a rollout are not finite{why}")
+                hint = "; speeds of vehicles outside the row are NaN in a reward" if name == "rewards" else ""
+                raise UnjamError(f"model rollout: {name} are not finite{hint}")
         return rollouts
 
 
@@ -224,28 +218,23 @@ def roll_out(
     control_steps: int,
     generator: torch.Generator | None,
 ) -> RolloutBatch:
-    """Drive with the full policy, expert plus residual, for `decisions` from actual states.
-
-    `decisions` is rounded down to whole choices of the network; the expert decides in each of them, and what
-    it remembers is rolled forward.
+    """Drive the full policy, expert plus residual, in the model; the expert decides in each control step.
 
     Args:
-        driver: expert, network, and for how long a residual is held.
-        dynamics: of the virtual environment.
-        starts: where to begin.
-        decisions: k*.
+        driver: expert, network, and action repeat.
+        dynamics: of the rows.
+        starts: of the rollouts.
+        control_steps: k*, rounded down to whole actions of the network.
         generator: of the exploration noise; None: no exploration.
 
     Raises:
-        UnjamError: the virtual environment gave something that is not finite.
-        InputError: so did a driver of the user's.
+        UnjamError: the model returned a value that is not finite.
+        InputError: a driver of the user did.
     """
-    like = starts.state.speed
-    driver = replace(driver, expert=tensor_driver(driver.expert, like.device))
+    speed, repeat = starts.state.speed, driver.action_repeat
+    driver = replace(driver, expert=tensor_driver(driver.expert, speed.device))
     memory: Memory = {EXPERT_KEY: starts.memory}
-    if driver.action_repeat > 1:
-        memory |= {RESIDUAL_KEY: torch.zeros_like(like), RESIDUAL_AGE_KEY: 0.0}  # all rows begin with a choice
-    world = ModelWorld(
-        dynamics, starts, control_steps // driver.action_repeat * driver.action_repeat, driver.limits, generator
-    )
+    if repeat > 1:
+        memory |= {RESIDUAL_KEY: torch.zeros_like(speed), RESIDUAL_AGE_KEY: 0.0}  # all rows start with an action
+    world = ModelWorld(dynamics, starts, control_steps // repeat * repeat, driver.limits, generator)
     return drive_world(world, driver, generator is not None, memory)

@@ -1,4 +1,4 @@
-"""The model of the virtual environment: a base, and an ensemble of networks for its residual; Eq. 4."""
+"""The row model: a base model of a CAV, its leader and its follower, and an ensemble for its residual; Eq. 4."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -22,11 +22,11 @@ from unjam.worlds.reward import Outcome, Reward, time_gap
 SPEED_FIELDS = ("speed", "leader_speed", "follower_speed")
 GAP_FIELDS = ("leader_gap", "follower_gap")
 STATE_FIELDS = (*SPEED_FIELDS, *GAP_FIELDS)
-"""the five numbers of the state that are predicted"""
+"""the five predicted quantities of the state"""
 TARGET_NAMES = (*STATE_FIELDS, "reward")
-"""what the networks answer: by how much each differs from what the base says [m/s, m, reward]"""
+"""outputs of the networks: the difference of each quantity to the base's prediction [m/s, m, reward]"""
 NOISE_SAMPLES = 4096
-"""errors on the holdout that are kept, to draw the noise of virtual steps from"""
+"""stored errors on the holdout, from which the noise of model steps is drawn"""
 BASE_DRIVERS: dict[str, Callable[[Scenario], Driver] | None] = {
     "idm": lambda scenario: IDM(**asdict(scenario.humans)),
     "population": lambda scenario: TypicalDriver(scenario),
@@ -34,123 +34,118 @@ BASE_DRIVERS: dict[str, Callable[[Scenario], Driver] | None] = {
     "ovm": lambda scenario: OVM(max_speed=scenario.humans.desired_speed),
     "none": None,
 }
-"""Who is taken to drive behind the CAV, a driver without memory; None: nothing is known."""
+"""assumed driver of the follower, without memory; None: no base"""
 
 
 def model_inputs(state: LocalState, acceleration: Array, drawn_values: Array) -> Array:
-    """Return what the networks see, SI units, shape (n, 6 + m).
+    """Return the inputs of the networks, SI units, shape (n, 6 + m).
 
-    The five numbers of the state, the applied acceleration, and what the episode has drawn, scaled.
+    They are `STATE_FIELDS`, the applied acceleration, and the scaled values that the episode drew.
     """
     xp = namespace(acceleration)
-    numbers = [getattr(state, name) for name in STATE_FIELDS]
-    return xp.concatenate([xp.stack([*numbers, acceleration], 1), drawn_values], 1)
+    columns = [getattr(state, name) for name in STATE_FIELDS]
+    return xp.concatenate([xp.stack([*columns, acceleration], 1), drawn_values], 1)
 
 
 def max_gap(state: LocalState) -> Array:
-    """Return the largest gap that there can be [m], shape (n,): on a closed road its length."""
+    """Return the largest possible gap [m], shape (n,): the length of a closed road, else `MAX_OBSERVED_GAP`."""
     xp = namespace(state.speed)
     return xp.where(xp.isnan(state.loop_length), MAX_OBSERVED_GAP, state.loop_length)
 
 
 def missing_neighbors(state: LocalState) -> tuple[Array, Array]:
-    """Return whether nobody is ahead, and whether nobody is behind, each of shape (n,)."""
+    """Return whether there is no leader, and whether there is no follower, shape (n,) each."""
     largest = max_gap(state)
     return state.leader_gap >= largest, state.follower_gap >= largest
 
 
 def base_step(base: str, scenario: Scenario, state: LocalState, acceleration: Array) -> LocalState:
-    """Return the state after one decision as the base model has it; Eq. 2 of the paper.
+    """Return the state after one control step according to the base; Eq. 2 of the paper.
 
-    The CAV moves by its acceleration and the follower by the base's car-following model; the leader, whose
-    own leader is not seen, keeps its speed. All take `scenario.steps_per_control_step` Euler steps, as SUMO
-    moves them. Where nobody is ahead (behind), nobody will be. The base `none` expects no change.
+    The CAV moves by its acceleration and the follower by the base's car-following model. The leader keeps its speed,
+    since its own leader is not observed. All take `scenario.steps_per_control_step` Euler steps, as in SUMO. Missing
+    neighbors stay missing. The base `none` predicts no change.
 
     Args:
-        base: a name in BASES.
-        scenario: whose steps and people these are.
+        base: a name in `BASE_DRIVERS`.
+        scenario: its time steps and IDM parameters are used.
         state: n rows.
-        applied: the acceleration that was commanded, within the action limit [m/s2], shape (n,).
-
-    Returns:
-        The state, its place on the route as before.
+        acceleration: the command, within the action limit [m/s2], shape (n,).
     """
-    make = BASE_DRIVERS[base]
-    if make is None:
+    make_driver = BASE_DRIVERS[base]
+    if make_driver is None:
         return state
-    xp, step, behind = namespace(state.speed), scenario.simulation_step, make(scenario)
+    xp, step, driver = namespace(state.speed), scenario.simulation_step, make_driver(scenario)
     speed, follower_speed = state.speed, state.follower_speed
     leader_gap, follower_gap = state.leader_gap, state.follower_gap
     for _ in range(scenario.steps_per_control_step):
-        seen = state._replace(speed=follower_speed, leader_speed=speed, leader_gap=follower_gap)
-        following, _ = behind.act(seen, {})
+        follower_state = state._replace(speed=follower_speed, leader_speed=speed, leader_gap=follower_gap)
+        follower_acceleration, _ = driver.act(follower_state, {})
         speed = next_speed(speed, acceleration, step)
-        follower_speed = next_speed(follower_speed, following, step)
+        follower_speed = next_speed(follower_speed, follower_acceleration, step)
         leader_gap = next_position(leader_gap, state.leader_speed - speed, step)
         follower_gap = next_position(follower_gap, speed - follower_speed, step)
-    nobody_ahead, nobody_behind = missing_neighbors(state)
+    no_leader, no_follower = missing_neighbors(state)
     return state._replace(
         speed=speed,
-        leader_speed=xp.where(nobody_ahead, speed, state.leader_speed),
-        leader_gap=xp.where(nobody_ahead, state.leader_gap, leader_gap),
-        follower_speed=xp.where(nobody_behind, speed, follower_speed),
-        follower_gap=xp.where(nobody_behind, state.follower_gap, follower_gap),
+        leader_speed=xp.where(no_leader, speed, state.leader_speed),
+        leader_gap=xp.where(no_leader, state.leader_gap, leader_gap),
+        follower_speed=xp.where(no_follower, speed, follower_speed),
+        follower_gap=xp.where(no_follower, state.follower_gap, follower_gap),
     )
 
 
 def base_reward(base: str, reward: Reward, next_state: LocalState, acceleration: Array, crashed: Array) -> Array:
-    """Return the reward of a decision as far as the next state tells it, shape (n,).
+    """Return the part of the reward of a control step that the next state determines, shape (n,).
 
-    The mean speed of all vehicles is approximated by that of the three that are seen. The base `none`
-    knows nothing of it.
+    The mean speed of all vehicles is approximated by that of the CAV and its neighbors. It is 0 for the base `none`.
 
     Args:
-        base: a name in BASES.
+        base: a name in `BASE_DRIVERS`.
         reward: of the road.
-        following: the next state, n rows.
-        applied: the acceleration that was commanded [m/s2], shape (n,).
-        crashed: whether the decision ended in a collision, shape (n,).
+        next_state: n rows.
+        acceleration: the command [m/s2], shape (n,).
+        crashed: whether the step ended in a collision, shape (n,).
     """
     if BASE_DRIVERS[base] is None:
         return acceleration * 0.0
     xp = namespace(acceleration)
-    nobody_ahead, nobody_behind = missing_neighbors(next_state)
-    speeds = (
-        next_state.speed,
-        xp.where(nobody_ahead, nan, next_state.leader_speed),
-        xp.where(nobody_behind, nan, next_state.follower_speed),
-    )
-    headway = time_gap(next_state.leader_gap, next_state.speed)
-    outcome = Outcome(stack_columns(speeds), as_column(acceleration), as_column(headway), crashed, 0.0 * acceleration)
-    return sum(reward(outcome).values())
+    no_leader, no_follower = missing_neighbors(next_state)
+    leader_speed = xp.where(no_leader, nan, next_state.leader_speed)
+    follower_speed = xp.where(no_follower, nan, next_state.follower_speed)
+    speeds = stack_columns((next_state.speed, leader_speed, follower_speed))
+    gap = as_column(time_gap(next_state.leader_gap, next_state.speed))
+    return sum(reward(Outcome(speeds, as_column(acceleration), gap, crashed, 0.0 * acceleration)).values())
 
 
 @dataclass(frozen=True)
 class TypicalDriver(Driver):
-    """The typical driver of a road's calibrated population, with its residual; without one, its IDM alone."""
+    """The typical driver of a road's calibrated population, with its residual; without a population, its IDM."""
 
     scenario: Scenario
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return how such a driver accelerates; nothing is remembered."""
+        """Return its acceleration; the memory is not used."""
         gap = clamp_min(state.leader_gap, _MIN_GAP)
-        seen = (state.speed, state.leader_speed, gap)
-        acceleration = idm_acceleration(*seen, self.scenario.humans)
-        return apply_population(self.scenario.driver_population, acceleration, *seen), memory
+        inputs = (state.speed, state.leader_speed, gap)
+        acceleration = idm_acceleration(*inputs, self.scenario.humans)
+        return apply_population(self.scenario.driver_population, acceleration, *inputs), memory
 
 
 class RowModel(Ensemble):
-    """An ensemble of networks for what a base leaves of a row, with all that a virtual step needs besides."""
+    """An ensemble for the residual of a base of rows, with the noise and the reward bounds of model steps."""
 
     noise: Tensor
+    """errors on the holdout, shape (NOISE_SAMPLES, 6)"""
     reward_range: Tensor
+    """smallest and largest residual of the reward"""
 
     def __init__(
         self, settings: ModelSettings, drawn_count: int, seed: Sequence[int], device: torch.device | str = "cpu"
     ) -> None:
-        """Make the model of a road whose episodes draw `drawn` numbers."""
+        """Make the model of a road whose episodes draw `drawn_count` values."""
         super().__init__(settings, len(STATE_FIELDS) + 1 + drawn_count, len(TARGET_NAMES), seed)
         self.base: BaseName = settings.base
         self.register_buffer("noise", torch.zeros((NOISE_SAMPLES, len(TARGET_NAMES))))
-        self.register_buffer("reward_range", torch.zeros(2))  # of the residual of the reward
+        self.register_buffer("reward_range", torch.zeros(2))
         self.to(device)

@@ -1,4 +1,4 @@
-"""What decides how the virtual environment learns and how far it is trusted. Free of torch."""
+"""Settings of the learned model: how it is fitted, and how long its rollouts are. Free of torch."""
 
 from typing import Annotated, Literal
 
@@ -14,62 +14,58 @@ ErrorEstimator = Literal["unexplained_variance", "transitions", "total_variation
 
 @dataclass(frozen=True, config=STRICT)
 class ModelSettings:
-    """The virtual environment: its model, how it is fitted, and the length of its rollouts."""
+    """The learned model (the paper's virtual environment), its fit, and the length of its rollouts."""
 
     kind: Literal["row", "road"] = "row"
-    """what is imagined: the row of a CAV, its leader and its follower, as in the paper; or, on rings,
-    figures eight and on-ramps, whole roads, each of whose people drives by the base and by what all of them
-    have taught one ensemble"""
+    """`row`: a CAV, its leader and its follower, as in the paper; `road`: whole rings, figures eight or on-ramps,
+    on which each human driver follows the base plus one learned ensemble"""
     base: BaseName = "idm"
-    """what is known before learning: how the follower drives; `population`: as the typical driver of the
-    road's calibrated population, residual included; `none`: nothing, all is learned"""
+    """known model of human drivers, which the networks correct; `population`: the typical driver of the road's
+    calibrated population, with its residual; `none`: everything is learned"""
     calibrate_base: bool = False
-    """whether the base takes IDM parameters that are calibrated, in the first iteration, on those who drove
-    behind the CAVs; otherwise it knows those of the road"""
+    """calibrate the IDM of the base in the first iteration on the followers of CAVs; else the road's parameters"""
     members: PositiveInt = 5
     """networks in the ensemble"""
     hidden: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (64, 64)
     """units of the hidden layers of each network"""
     fallback_to_base: bool = True
-    """whether the networks begin by adding nothing to the base, which stands alone where they are worse on
-    the holdout; the paper's begin as they are drawn, and are always added"""
+    """start the networks at zero, and use the base alone for outputs that they predict worse on the holdout; the
+    paper starts them at random and always adds them"""
     buffer_size: PositiveInt = 100_000
-    """actual decisions that are kept, the newest, rounded up to whole episodes"""
+    """newest environment steps that are stored, rounded up to whole episodes"""
     max_fit_rows: IntAboveOne = 10_000
-    """at most so many of them are drawn for each fit: neighbouring rows, 0.1 s apart, hardly differ"""
+    """rows drawn from them for each fit; rows that are 0.1 s apart hardly differ"""
     holdout: Annotated[float, Field(gt=0, lt=1)] = 0.2
-    """share of the episodes that no network learns from; while there is a single one, its last part"""
+    """share of the episodes that no network is trained on; of a single episode, its last part"""
     epochs: PositiveInt = 6
-    """most passes over the rows in a fit, which goes on from the fit before"""
+    """maximum number of epochs of a fit, which continues from the previous fit"""
     patience: PositiveInt = 3
-    """passes without progress on the holdout after which a fit ends"""
+    """epochs without improvement on the holdout after which a fit stops"""
     learning_rate: Positive = 3e-3
     """learning rate of Adam"""
     batch_size: PositiveInt = 512
-    """rows of each network in a gradient step"""
+    """rows per network in a gradient step"""
     add_noise: bool = True
-    """whether virtual steps are as noisy as the model's errors on the holdout, or the mean of each network"""
+    """add noise as large as the model's errors on the holdout to each model step; else the mean of each network"""
     k_max: NonNegativeInt = 500
-    """longest rollout [decisions]"""
+    """maximum rollout length [control steps]"""
     kappa: Positive = 100.0
-    """rollout length times model error, Eq. 15. The paper has 2; but on a road with noisy people most of the
-    error that is measured is their noise, and virtual returns agree with actual ones over hundreds of
-    decisions"""
+    """rollout length times model error, Eq. 15. The paper uses 2; with noisy human drivers most of the measured error
+    is their noise, and model returns agree with environment returns over hundreds of steps"""
     error_estimator: ErrorEstimator = "unexplained_variance"
-    """estimator of the model error eps_m that sets the rollout length, see unjam.models.fitting"""
+    """estimator of the model error eps_m that sets the rollout length, see `unjam.models.fitting.ModelFit`"""
     model_ratio: NonNegative = 5.0
-    """virtual decisions for each actual one that the agent learns from, at least one whole rollout in each
-    iteration; 0: model-free"""
+    """model steps per environment step, at least one rollout in each iteration; 0: model-free"""
     rollout_starts: Literal["newest", "all", "first"] = "newest"
-    """at which actual decisions rollouts begin: those of the newest policy's episodes; of all episodes that
-    are kept, whose roads are more various; or the first ones of all, so that what is imagined are episodes"""
+    """where rollouts start: at random steps of the newest policy's episodes, of all stored episodes (more diverse
+    roads), or at first steps of episodes, so that rollouts are episodes"""
     update_mode: Literal["union", "sequential"] = "union"
-    """how the agent learns from both: from all of them at once; or first from the actual ones, then `model_updates`
-    times from virtual ones alone, each time with those of the newest policy, as the released code"""
+    """`union`: one update on environment and model rows; `sequential`: one on environment rows, then `model_updates` on
+    model rows alone, each with rollouts of the newest policy, as in the authors' code"""
     model_updates: PositiveInt = 5
-    """updates on virtual rows of `sequential`"""
+    """updates on model rows of `sequential`"""
     device: Device = "cpu"
-    """where the virtual environment runs"""
+    """device of the model and its rollouts"""
 
     @model_validator(mode="after")
     def _check_estimator(self) -> "ModelSettings":
