@@ -3,12 +3,12 @@
 import os
 import signal
 import sys
-from importlib.metadata import entry_points
 from itertools import pairwise
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from unjam import __version__
 from unjam.child_processes import isolate_children
@@ -16,12 +16,30 @@ from unjam.cli import calibrate, catalog, diagnostics, drive, results, sign, tra
 from unjam.cli.options import with_trust_option
 from unjam.cli.runs import runs_app
 from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, invalid_value, missing_package_error
+from unjam.plugins import load_plugins, plugin_names
 from unjam.processes import exit_with_parent, mark_as_command_line
 
 INTERRUPTED_EXIT_CODE = 130
 
+
+class _CommandGroup(TyperGroup):
+    """The commands of unjam, and those of plugins, which are loaded on demand."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), *plugin_names("unjam.commands")]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        command = super().get_command(ctx, cmd_name)
+        if command is None and (plugins := load_plugins("unjam.commands", cmd_name)):
+            single = typer.Typer(rich_markup_mode="markdown")
+            single.command(cmd_name)(plugins[cmd_name])
+            command = typer.main.get_command(single)
+        return command
+
+
 app = typer.Typer(
     name="unjam",
+    cls=_CommandGroup,
     help="Train, compare and ship controllers for automated vehicles that dissolve stop-and-go waves.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -73,8 +91,6 @@ CODE_RUNNING_COMMANDS = {
 """commands that accept folders, which can name Python code"""
 for _name, _command in COMMANDS.items():
     app.command(_name)(with_trust_option(_command) if _name in CODE_RUNNING_COMMANDS else _command)
-for _entry_point in entry_points(group="unjam.commands"):  # of other packages, such as unjam_paper
-    app.command(_entry_point.name)(_entry_point.load())
 app.add_typer(runs_app)
 
 
