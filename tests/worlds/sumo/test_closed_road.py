@@ -103,7 +103,7 @@ def test_a_vehicle_that_vanishes_ends_the_episode_with_an_error(warmup: int, sim
         libsumo.vehicle.remove("human_5")
         return speed * 0.0
 
-    with pytest.raises(EpisodeError, match="21 vehicles on the road where 22 should be"):
+    with pytest.raises(EpisodeError, match="21 vehicles on the road; expected: 22"):
         run_episode(replace(RING, warmup=warmup), Answers(lose_one), (0,), simulation=simulation)
     assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
 
@@ -115,7 +115,7 @@ def test_a_vehicle_that_is_too_many_ends_the_episode_with_an_error(simulation: S
         return speed * 0.0
 
     small = replace(RING, vehicles=5, length=(230, 230))
-    with pytest.raises(EpisodeError, match="6 vehicles on the road where 5 should be"):
+    with pytest.raises(EpisodeError, match="6 vehicles on the road; expected: 5"):
         run_episode(small, Answers(add_one), (0,), simulation=simulation)
 
 

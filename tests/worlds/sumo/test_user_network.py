@@ -284,7 +284,7 @@ def test_people_who_touch_people_are_counted_once_each_and_end_nothing(
 ) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     told = iter([["f.0", "f.1"], ["f.0", "f.1"], ["f.1", "f.2"]])
-    monkeypatch.setattr(simulation, "colliding", lambda: next(told, []))
+    monkeypatch.setattr(simulation, "colliding_vehicles", lambda: next(told, []))
     episode = run_episode(scenario_of(file, penetration_rate=0.2, horizon=300), IDM(), (0,), simulation=simulation)
     row = measure(episode)
     assert not {"f.0", "f.1", "f.2"} & set(episode.cav_ids)

@@ -1,4 +1,4 @@
-"""The actual environment: SUMO. The only room that knows its files and its speed modes."""
+"""The environment in SUMO. Only this package knows SUMO's files and speed modes."""
 
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -18,7 +18,6 @@ TRAFFIC_CLASSES: dict[type[Road], Any] = {
     MotorwayRoad: MotorwayTraffic,
     UserNetworkRoad: UserNetworkTraffic,
 }
-"""the traffic of each kind of road"""
 
 
 def make_traffic(
@@ -29,11 +28,15 @@ def make_traffic(
     record_details: bool = False,
     measured_fields: Collection[str] = (),
 ) -> Traffic:
-    """Put the vehicles of `seed` on the road; nothing moves yet.
+    """Put the vehicles of a seed on the road; nothing moves yet.
 
-    With `accepts_floats`, a single CAV on a closed road perceives and is driven in floats instead of arrays
-    of one row. With `record_details`, fuel is recorded, and on roads with ends where on the plane vehicles are. On a
-    network of the user's own CAVs are told of the road ahead where `asked` has that field of `LocalState`.
+    Args:
+        scenario: road and traffic.
+        seed: of all random numbers.
+        simulation: an open one.
+        is_scalar: use floats instead of arrays with one row for a single CAV on a closed road.
+        record_details: record fuel and, on roads with ends, positions (x, y).
+        measured_fields: optional fields of `LocalState` that the driver uses, for example roadside information.
     """
     road, seeds = scenario.draw_from_seed(seed)
     traffic = TRAFFIC_CLASSES[type(road)](scenario, road, SeedTree(tuple(seed), seeds), simulation, record_details)

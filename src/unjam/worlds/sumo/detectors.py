@@ -5,7 +5,7 @@ from math import nan
 from typing import NamedTuple
 
 from unjam.scenarios.user_network import UserNetwork
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.inputs import sumo_inputs, sumo_random_seed
 from unjam.worlds.sumo.networks import xml_document
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -44,7 +44,7 @@ def load_with_loops(
         for number, loop in enumerate(loops)
     ]
     files = sumo_inputs(scenario, road)._replace(traffic_xml=xml_document("additional", "inductionLoop", places))
-    simulation.load(files, scenario.simulation_step, int(sumo_seed.generate_state(1)[0]) % 2**31)
+    simulation.load(files, scenario.simulation_step, sumo_random_seed(sumo_seed))
 
 
 def loop_name(number: int) -> str:

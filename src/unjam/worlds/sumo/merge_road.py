@@ -1,8 +1,8 @@
-"""Traffic of a main road that a ramp joins: people are commanded, and neighbours computed from positions.
+"""Traffic on a main road with a ramp: human drivers are commanded, and neighbors are computed from positions.
 
-All vehicles stand in one list: those that are past the place where the ways meet, then the main road's, then
-the ramp's, each from front to back. Nobody overtakes, so that a vehicle's leader is the one before it in the
-list, but for the first of the ramp, which follows the last that is past the meeting place.
+All vehicles are in one list: those past the merge point, then those on the main road, then those on the ramp, each from
+front to back. As overtaking is impossible, a vehicle's leader is the previous one in the list. The first vehicle on the
+ramp follows the last one past the merge point instead.
 """
 
 from collections.abc import Collection, Sequence
@@ -21,45 +21,44 @@ from unjam.scenarios.population import apply_population
 from unjam.scenarios.road import MergeRoad, Origin
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.networks import lane_center_lines, network_file
 from unjam.worlds.sumo.open_road import OpenTraffic
 from unjam.worlds.sumo.traffic import NO_SPEED_COMMAND
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 MERGE_BRANCHES = ("highway", "ramp")
 ABSENT_LEADER_GAP = 1e9
-"""gap to a leader that is not there [m]"""
+"""gap to a missing leader [m]"""
 
 
 class MergingStreams:
     """The vehicles on a merging road, in the order described above."""
 
     def __init__(self) -> None:
-        """Begin with an empty road."""
+        """Start with an empty road."""
         self.names: list[str] = []
         self.positions: Floats = np.zeros(0)
-        """of front bumpers, zero where the ways meet, negative before it [m]"""
+        """of front bumpers, zero at the merge point, negative before it [m]"""
         self.speeds: Floats = np.zeros(0)
         """[m/s]"""
         self._merged_count, self._main_road_count = 0, 0
-        """how many are past the meeting place, and on the main road before it"""
+        """number of vehicles past the merge point, and on the main road before it"""
 
     def enter(self, name: str, origin: Origin, speed: float) -> None:
-        """Put a vehicle behind the last of its branch."""
+        """Add a vehicle behind the last one of its branch."""
         if origin.position >= 0:
             self._merged_count += 1
-            place = self._merged_count - 1
+            row = self._merged_count - 1
         elif origin.branch == 0:
             self._main_road_count += 1
-            place = self._merged_count + self._main_road_count - 1
+            row = self._merged_count + self._main_road_count - 1
         else:
-            place = len(self.names)
-        self.names.insert(place, name)
-        self.positions = np.insert(self.positions, place, origin.position)
-        self.speeds = np.insert(self.speeds, place, speed)
+            row = len(self.names)
+        self.names.insert(row, name)
+        self.positions = np.insert(self.positions, row, origin.position)
+        self.speeds = np.insert(self.speeds, row, speed)
 
     def leave(self, names: Collection[str]) -> None:
-        """Take the vehicles at the very front off the road."""
+        """Remove the first vehicles from the road."""
         count = len(names)
         if set(names) != set(self.names[:count]):
             raise EpisodeError(f"{', '.join(sorted(names))} left the road from behind another vehicle")
@@ -68,70 +67,69 @@ class MergingStreams:
         self.positions, self.speeds = self.positions[count:], self.speeds[count:]
 
     def move(self, speeds: Sequence[float], step: float) -> None:
-        """Move all vehicles by one step, `speeds` being those after it [m/s]."""
+        """Move all vehicles by one step; `speeds` are those after it [m/s]."""
         self.speeds = np.array(speeds, np.float64)
         self.positions = next_position(self.positions, self.speeds, step)
-        while (
-            self._main_road_count and self.positions[self._merged_count] >= 0
-        ):  # the first of the main road: in place already
+        while self._main_road_count and self.positions[self._merged_count] >= 0:  # its row stays the same
             self._merged_count, self._main_road_count = self._merged_count + 1, self._main_road_count - 1
         while (first := self._merged_count + self._main_road_count) < len(self.names) and self.positions[first] >= 0:
-            place = int((self.positions[: self._merged_count] >= self.positions[first]).sum())
-            self.names.insert(place, self.names.pop(first))
+            row = int((self.positions[: self._merged_count] >= self.positions[first]).sum())
+            self.names.insert(row, self.names.pop(first))
             order = np.arange(len(self.names))
-            order[place : first + 1] = [first, *range(place, first)]
+            order[row : first + 1] = [first, *range(row, first)]
             self.positions, self.speeds = self.positions[order], self.speeds[order]
             self._merged_count += 1
 
     def leaders(self) -> NDArray[np.intp]:
-        """Return the place of each vehicle's leader; -1 where it has none."""
-        ahead = np.arange(len(self.names)) - 1
+        """Return the row of each vehicle's leader; -1 without a leader."""
+        leaders = np.arange(len(self.names)) - 1
         first_on_ramp = self._merged_count + self._main_road_count
-        if first_on_ramp < len(ahead):
-            ahead[first_on_ramp] = self._merged_count - 1
-        return ahead
+        if first_on_ramp < len(leaders):
+            leaders[first_on_ramp] = self._merged_count - 1
+        return leaders
 
     def gaps(self, leaders: NDArray[np.intp]) -> Floats:
-        """Return each vehicle's gap to its leader [m]; `FAR` where it has none."""
+        """Return each vehicle's gap to its leader [m]; `ABSENT_LEADER_GAP` without a leader."""
         return np.where(leaders < 0, ABSENT_LEADER_GAP, self.positions[leaders] - self.positions - VEHICLE_LENGTH)
 
     def is_on_junction(self, approach_lengths: tuple[float, float]) -> NDArray[np.bool_]:
-        """Return who is on the ways across the junction, `ways` metres long, that end where both meet."""
-        before = np.zeros(len(self.names))
-        before[self._merged_count : self._merged_count + self._main_road_count] = approach_lengths[0]
-        before[self._merged_count + self._main_road_count :] = approach_lengths[1]
-        return (self.positions < 0) & (self.positions >= -before)
+        """Return which vehicles are on the junction, of these lengths before the merge point on both branches [m]."""
+        lengths = np.zeros(len(self.names))
+        lengths[self._merged_count : self._merged_count + self._main_road_count] = approach_lengths[0]
+        lengths[self._merged_count + self._main_road_count :] = approach_lengths[1]
+        return (self.positions < 0) & (self.positions >= -lengths)
 
     def states(self) -> LocalState:
-        """Return what all vehicles perceive; who is farther than `MAX_OBSERVED_GAP` is not there."""
+        """Return the local states of all vehicles; neighbors beyond `MAX_OBSERVED_GAP` count as missing."""
         leaders = self.leaders()
         followers, gaps = self._followers(leaders), self.gaps(leaders)
-        behind = self.positions - self.positions[followers] - VEHICLE_LENGTH
-        gaps_behind = np.where(followers < 0, ABSENT_LEADER_GAP, behind)
+        follower_gaps = np.where(
+            followers < 0, ABSENT_LEADER_GAP, self.positions - self.positions[followers] - VEHICLE_LENGTH
+        )
         return LocalState(
             speed=self.speeds,
             leader_speed=np.where(gaps < MAX_OBSERVED_GAP, self.speeds[leaders], self.speeds),
             leader_gap=gaps.clip(max=MAX_OBSERVED_GAP),
-            follower_speed=np.where(gaps_behind < MAX_OBSERVED_GAP, self.speeds[followers], self.speeds),
-            follower_gap=gaps_behind.clip(max=MAX_OBSERVED_GAP),
+            follower_speed=np.where(follower_gaps < MAX_OBSERVED_GAP, self.speeds[followers], self.speeds),
+            follower_gap=follower_gaps.clip(max=MAX_OBSERVED_GAP),
             route_position=self.positions,
             loop_length=np.full(len(self.names), np.nan),
         )
 
     def _followers(self, leaders: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the place of each vehicle's follower, of two the nearer one; -1 where it has none."""
-        behind = np.full(len(leaders), -1)
-        followed = np.flatnonzero(leaders >= 0)
-        order = followed[np.argsort(self.positions[followed], kind="stable")]
-        behind[leaders[order]] = order  # of several the last one written counts: the nearest
-        return behind
+        """Return the row of each vehicle's follower, the nearer one of two; -1 without a follower."""
+        followers = np.full(len(leaders), -1)
+        with_leader = np.flatnonzero(leaders >= 0)
+        order = with_leader[np.argsort(self.positions[with_leader], kind="stable")]
+        followers[leaders[order]] = order  # of several, the last assignment counts: the nearest
+        return followers
 
 
 class MergingTraffic(OpenTraffic[MergeRoad]):
-    """The actual environment of a merge."""
+    """The SUMO environment of a merge."""
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Run the warm-up, then hand the CAVs over."""
+        """Run the warm-up, then hand the CAVs to the driver, without a history."""
         self._streams = MergingStreams()
         super().start(is_controlled, on_progress)
 
@@ -141,60 +139,52 @@ class MergingTraffic(OpenTraffic[MergeRoad]):
         streams.move(simulation.speeds(streams.names), self.scenario.simulation_step)
         simulation.command_humans(entered_names, self.scenario.right_of_way, self.scenario.enforce_human_limits)
         origins = self.road.origins
-        for name in sorted(entered_names, key=lambda name: -origins[name].position):  # the foremost first
+        for name in sorted(entered_names, key=lambda name: -origins[name].position):  # from front to back
             streams.enter(name, origins[name], simulation.speeds([name])[0])
 
     def _command_humans(self) -> None:
-        """Ask for the speeds of the IDM with noise, except on the junction, where SUMO drives.
+        """Command speeds of the IDM with noise, except on the junction, where SUMO drives.
 
-        CAVs are asked for too: what they are told in the same step replaces it.
+        This includes CAVs, whose own commands in the same step replace these.
         """
         scenario, streams = self.scenario, self._streams
-        leaders = streams.leaders()
+        leaders, speeds = streams.leaders(), streams.speeds
         gaps = streams.gaps(leaders).clip(_MIN_GAP, None)
-        speeds = streams.speeds
-        ahead = np.where(leaders < 0, speeds, speeds[leaders])
+        leader_speeds = np.where(leaders < 0, speeds, speeds[leaders])
         humans = scenario.humans
         if self.road.human_parameters:
             humans = stack_idm_parameters(self._human_parameters(streams.names))
-        acceleration = idm_acceleration(speeds, ahead, gaps, humans)
-        acceleration = apply_population(scenario.driver_population, acceleration, speeds, ahead, gaps)
+        acceleration = idm_acceleration(speeds, leader_speeds, gaps, humans)
+        acceleration = apply_population(scenario.driver_population, acceleration, speeds, leader_speeds, gaps)
         if scenario.noise > 0:
             noise = self._noise_generator.standard_normal(len(speeds))
             acceleration = acceleration + scenario.noise_per_step * noise
-        wanted = next_speed(speeds, acceleration, scenario.simulation_step)
-        wanted[streams.is_on_junction(self.road.junction_lengths)] = NO_SPEED_COMMAND
-        self._simulation.command_speeds(streams.names, wanted.tolist())
+        commanded = next_speed(speeds, acceleration, scenario.simulation_step)
+        commanded[streams.is_on_junction(self.road.junction_lengths)] = NO_SPEED_COMMAND
+        self._simulation.command_speeds(streams.names, commanded.tolist())
 
     def _names_and_speeds(self) -> tuple[Sequence[str], Floats]:
         return self._streams.names, self._streams.speeds
 
-    def _prepare_states(self) -> None:
+    def _local_states(self, names: Sequence[str]) -> LocalState:
         self._all_local_states = self._streams.states()
+        return self._all_local_states.select([self._streams.names.index(name) for name in names])
 
     def _snapshot(self, names: Sequence[str]) -> dict[str, Any]:
         return {"positions": self._streams.positions, "gaps": self._all_local_states.leader_gap}
 
-    def _local_states(self, names: Sequence[str]) -> LocalState:
-        places = [self._streams.names.index(name) for name in names]
-        return self._all_local_states.select(places)
-
-    def record(self, driver_log: DriverLog) -> Episode:
-        """Return what happened since the start; positions are checked against SUMO's odometer."""
-        streams = self._streams
-        entered = np.array([self.road.origins[name].position for name in streams.names])
-        self._check_odometer(streams.names, entered, streams.positions)
-        return super().record(driver_log)
-
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
         if not self.scenario.safety.active:
             return super()._following_states(names)
-        states, place_of = self._streams.states(), self._streams.names.index
-        near = list(zip(*(values.tolist() for values in states[:3]), strict=True))
-        return [FollowingState(*near[place_of(name)]) for name in names]
-
-    def _lane_lines(self) -> Floats:
-        return lane_center_lines(network_file(self.road.network))
+        rows = list(zip(*(values.tolist() for values in self._streams.states()[:3]), strict=True))
+        return [FollowingState(*rows[self._streams.names.index(name)]) for name in names]
 
     def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
         return [MERGE_BRANCHES[self.road.origins[name].branch] for name in vehicles]
+
+    def record(self, driver_log: DriverLog) -> Episode:
+        """Return the record since the start, after checking positions against SUMO's odometer."""
+        streams = self._streams
+        entries = np.array([self.road.origins[name].position for name in streams.names])
+        self._check_odometer(streams.names, entries, streams.positions)
+        return super().record(driver_log)

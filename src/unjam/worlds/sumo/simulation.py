@@ -86,8 +86,6 @@ class Simulation(VehicleControl):
         """changes that for one vehicle"""
         self.set_time_gap: Callable[[str, float], object] = call("vehicle", "setTau")
         """changes the time headway that a vehicle keeps [s]"""
-        self.set_parameter: Callable[[str, str, str], object] = call("vehicle", "setParameter")
-        """changes one of a vehicle's other parameters, by name"""
         self._set_previous_speed = call("vehicle", "setPreviousSpeed")
         self.vehicles_on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
         """whose front bumpers are on a lane"""

@@ -1,4 +1,4 @@
-"""What a road with ends keeps of its CAVs: each stay of one is a trajectory of its own."""
+"""The log of CAVs on a road with ends: each trip of a CAV is a trajectory."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,65 +10,64 @@ from unjam.worlds.record import Trajectory, make_trajectory
 from unjam.worlds.world import DriverLog
 
 TRIPS_PER_PROGRESS = 500
-"""stays that are put in order between two signs of life"""
+"""trips that are processed between two reports of progress"""
 
 
 class TripLog:
-    """Which CAVs were there at each moment, what they perceived, and what they were told after it."""
+    """The CAVs on the road at each moment, their states, and their commands in the control step that follows."""
 
     def __init__(self) -> None:
-        """Begin with no moment."""
+        """Start without a moment."""
         self.cav_ids: list[Sequence[str]] = []
         self.states: list[LocalState] = []
         self.applied_accelerations: list[list[float]] = []
-        """[m/s2]; this and the next of each decision, one less than moments"""
+        """[m/s2]; this and the following lists have one entry per control step"""
         self.filter_brakings: list[list[float]] = []
-        """what the safety filter took from it [m/s2]"""
+        """reduction by the safety filter [m/s2]"""
         self.shield_brakings: list[list[float]] = []
-        """braking that SUMO added to it [m/s2]"""
+        """braking that SUMO added [m/s2]"""
 
     def trajectories(
         self, driver_log: DriverLog, has_crashed: bool, on_progress: Callable[[], object]
     ) -> tuple[Trajectory, ...]:
-        """Return the stays of at least one decision, in order of entry.
+        """Return the trips of at least one control step, in order of entry.
 
-        `driven` is all that the driver decided, `crashed` whether a collision ended the episode; `on_stay` is
-        called now and then.
+        `has_crashed`: a collision ended the episode. `on_progress` is called now and then.
         """
-        stays = list[tuple[str, list[tuple[int, int]]]]()
-        """of whom each is, and moment and row: one that SUMO lifts off the road and puts back has several"""
-        newest = dict[str, list[tuple[int, int]]]()
+        trips = list[tuple[str, list[tuple[int, int]]]]()
+        """vehicle, and its moments and rows; a teleported vehicle that is reinserted starts another trip"""
+        latest = dict[str, list[tuple[int, int]]]()
         for time, names in enumerate(self.cav_ids):
             for row, name in enumerate(names):
-                if name not in newest or newest[name][-1][0] < time - 1:
-                    newest[name] = list[tuple[int, int]]()
-                    stays.append((name, newest[name]))
-                newest[name].append((time, row))
+                if name not in latest or latest[name][-1][0] < time - 1:
+                    latest[name] = list[tuple[int, int]]()
+                    trips.append((name, latest[name]))
+                latest[name].append((time, row))
         states = list(zip(*self.states, strict=True))
-        found = []
-        for number, (name, places) in enumerate(stays):
+        trajectories = list[Trajectory]()
+        for number, (name, entries) in enumerate(trips):
             if number % TRIPS_PER_PROGRESS == 0:
                 on_progress()
-            start, steps = places[0][0], len(places) - 1
+            start, steps = entries[0][0], len(entries) - 1
             if steps == 0:
                 continue
-            found.append(
+            trajectories.append(
                 make_trajectory(
                     vehicle=name,
                     entry_number=number,
                     start_step=start,
-                    rows=np.array([row for _, row in places]),
-                    states=LocalState(*(_trip_values(values, places) for values in states)),
-                    applied_acceleration=_trip_values(self.applied_accelerations, places[:-1]),
-                    filter_braking=_trip_values(self.filter_brakings, places[:-1]),
-                    shield_braking=_trip_values(self.shield_brakings, places[:-1]),
+                    rows=np.array([row for _, row in entries]),
+                    states=LocalState(*(_trip_values(values, entries) for values in states)),
+                    applied_acceleration=_trip_values(self.applied_accelerations, entries[:-1]),
+                    filter_braking=_trip_values(self.filter_brakings, entries[:-1]),
+                    shield_braking=_trip_values(self.shield_brakings, entries[:-1]),
                     terminated=has_crashed and start + steps == len(self.applied_accelerations),
                     driver_log=driver_log,
                 )
             )
-        return tuple(found)
+        return tuple(trajectories)
 
 
 def _trip_values(values: Sequence[Any], entries: Sequence[tuple[int, int]]) -> Any:
-    """Return what a CAV was told of one quantity at its moments and rows; None where the road offers none."""
+    """Return a CAV's values of one quantity at its moments and rows; None if the road does not provide it."""
     return None if values[0] is None else np.array([values[time][row] for time, row in entries])
