@@ -42,7 +42,7 @@ measurements = st.builds(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(rows=st.lists(measurements, min_size=1, max_size=5), kind=st.sampled_from(["edge", "lane"]))
-def test_what_is_written_is_read_again(rows: list[Measurement], kind: str, tmp_path: Path) -> None:
+def test_written_measurements_are_read_back(rows: list[Measurement], kind: str, tmp_path: Path) -> None:
     texts = [["" if isnan(value) else repr(value) for value in list(vars(row).values())[1:]] for row in rows]
     lines = [",".join([row.place, *values]) for row, values in zip(rows, texts, strict=True)]
     found_kind, found = read_detectors(file_of(tmp_path, ",".join((kind, *DETECTOR_COLUMNS)), *lines))
@@ -50,7 +50,7 @@ def test_what_is_written_is_read_again(rows: list[Measurement], kind: str, tmp_p
     assert str(found) == str(rows)  # NaN is not equal to itself
 
 
-def test_other_columns_orders_and_a_byte_order_mark_are_fine(tmp_path: Path) -> None:
+def test_additional_columns_any_order_and_a_byte_order_mark_are_accepted(tmp_path: Path) -> None:
     path = tmp_path / "detectors.csv"
     path.write_text("speed,name,lane,position,begin,end,flow_veh_per_h\n20,a,e_0,5,0,60,900\n", encoding="utf-8-sig")
     assert read_detectors(path) == ("lane", [Measurement("e_0", 5.0, 0.0, 60.0, 900.0, 20.0)])
@@ -73,7 +73,7 @@ def test_other_columns_orders_and_a_byte_order_mark_are_fine(tmp_path: Path) -> 
         ([HEAD, ",1,0,60,5,20"], "edge: ''"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_line(lines: list[str], words: str, tmp_path: Path) -> None:
+def test_error_message_has_the_line_of_the_wrong_value(lines: list[str], words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         read_detectors(file_of(tmp_path, *lines))
     assert words in str(error.value)
@@ -82,25 +82,25 @@ def test_what_is_wrong_is_told_with_its_line(lines: list[str], words: str, tmp_p
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=st.binary(max_size=200))
-def test_whatever_a_file_holds_it_is_read_or_refused(content: bytes, tmp_path: Path) -> None:
+def test_any_file_content_is_read_or_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "detectors.csv"
     path.write_bytes(HEAD.encode() + b"\n" + content)
     with suppress(InputError):
         assert read_detectors(path)[1]
 
 
-def test_a_device_is_no_file_of_measurements() -> None:
+def test_device_is_refused_as_a_file_of_measurements() -> None:
     with pytest.raises(InputError, match="is not a file"):
         read_detectors(Path("/dev/zero"))
 
 
-def test_geh_is_that_of_the_manual() -> None:
+def test_geh_matches_the_design_manual() -> None:
     # Worked by hand: sqrt(2 * 100^2 / 2100) and sqrt(2 * 50^2 / 150).
     found = geh(np.array([1100.0, 100.0, 0.0]), np.array([1000.0, 50.0, 0.0]))
     assert found == pytest.approx([3.0861, 5.7735, 0.0], abs=1e-4)
 
 
-def test_agreement_is_worked_by_hand() -> None:
+def test_agreement_matches_a_manual_calculation() -> None:
     rows = [Measurement("a", 0, 0, 60, 1000, 20), Measurement("a", 0, 60, 120, 50, nan)]
     found = compute_agreement(rows, np.array([1100.0, 100.0]), np.array([17.0, 30.0]))
     assert found.geh == pytest.approx((3.0861 + 5.7735) / 2, abs=1e-4)
@@ -110,12 +110,12 @@ def test_agreement_is_worked_by_hand() -> None:
     assert found.score == pytest.approx(found.geh / 5 + 3 / 20)
 
 
-def test_traffic_that_never_arrives_has_no_speed() -> None:
+def test_intervals_without_vehicles_count_as_speed_zero() -> None:
     found = compute_agreement([Measurement("a", 0, 0, 60, 600, 20)], np.array([0.0]), np.array([nan]))
     assert found.speed_rmse == 20.0
 
 
-def test_passages_make_flows_and_speeds_of_each_interval() -> None:
+def test_passages_are_aggregated_to_flow_and_speed_by_interval() -> None:
     rows = [Measurement("a", 0, 0, 60, 0, 0), Measurement("a", 0, 60, 180, 0, 0), Measurement("b", 0, 0, 60, 0, 0)]
     passed = [
         DetectorPassage(0, "x", 0.0, 10.0),
@@ -128,7 +128,7 @@ def test_passages_make_flows_and_speeds_of_each_interval() -> None:
     assert isnan(speeds[2])
 
 
-def test_who_changes_lanes_over_the_loops_of_an_edge_is_counted_once() -> None:
+def test_lane_change_over_the_loops_of_an_edge_counts_once() -> None:
     rows = [Measurement("a", 0, 0, 600, 0, 0)]
     passed = [
         DetectorPassage(0, "x", 1.0, 10.0),
@@ -140,7 +140,7 @@ def test_who_changes_lanes_over_the_loops_of_an_edge_is_counted_once() -> None:
     assert speeds[0] == 12.0
 
 
-def test_a_passage_without_a_speed_counts_in_the_flow_alone() -> None:
+def test_passage_of_unknown_speed_counts_only_for_flow() -> None:
     rows = [Measurement("a", 0, 0, 60, 0, 0), Measurement("a", 0, 60, 120, 0, 0)]
     passed = [DetectorPassage(0, "x", 1.0, nan), DetectorPassage(1, "x", 1.4, 12.0), DetectorPassage(0, "y", 5.0, nan)]
     flows, speeds = aggregate_passages(rows, [(0, 1)] * 2, [*passed, DetectorPassage(0, "z", 70.0, nan)])
@@ -149,7 +149,7 @@ def test_a_passage_without_a_speed_counts_in_the_flow_alone() -> None:
     assert isnan(speeds[1])
 
 
-def test_where_no_speed_was_measured_its_error_is_not_known() -> None:
+def test_speed_error_is_nan_without_measured_speeds() -> None:
     found = compute_agreement([Measurement("a", 0, 0, 60, 600, nan)], np.array([600.0]), np.array([20.0]))
     assert isnan(found.speed_rmse)
     assert found.score == 0.0

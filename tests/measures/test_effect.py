@@ -1,4 +1,4 @@
-"""Does the rule refuse whatever is not shown to help, and say why?"""
+"""Effects of CAVs and the reasons against a recommendation."""
 
 from dataclasses import replace
 from math import nan
@@ -58,7 +58,7 @@ GOOD = Effect(
 )
 
 
-def test_words_say_what_everybody_gains() -> None:
+def test_summary_has_travel_time_flow_and_fuel() -> None:
     known = replace(GOOD, delay_reduction=between(0.06, 0.14))
     assert known.summary == (
         "travel time -4.0 [-6.0, -2.0] s (10 % [6, 14] less delay), flow +10 [-10, +30] veh/h, "
@@ -74,25 +74,25 @@ def test_words_say_what_everybody_gains() -> None:
     assert closed.summary.startswith("mean speed +0.20 [+0.10, +0.30] m/s, flow")
 
 
-def test_every_driver_is_seen_beside_people_who_are_there() -> None:
+def test_effects_need_a_human_baseline() -> None:
     found = effects_by_driver({"pi": rows_of([98.0, 99.0]), "human": rows_of([100.0, 100.0])})
     assert list(found) == ["pi"]
     assert found["pi"].travel_time.mean == -1.5
     assert not effects_by_driver({"pi": rows_of([98.0])})
 
 
-def test_the_share_of_delay_that_is_saved_has_an_interval_of_its_own() -> None:
-    people = [{**row, "delay": row["travel_time"] - 60.0} for row in rows_of([90.0, 100.0, 120.0])]
-    half = effect_of(rows_of([75.0, 80.0, 90.0]), people).delay_reduction
+def test_delay_reduction_has_its_own_confidence_interval() -> None:
+    baseline = [{**row, "delay": row["travel_time"] - 60.0} for row in rows_of([90.0, 100.0, 120.0])]
+    half = effect_of(rows_of([75.0, 80.0, 90.0]), baseline).delay_reduction
     assert (half.mean, half.low, half.high) == pytest.approx((0.5, 0.5, 0.5))  # on each seed
-    assert effect_of(rows_of([75.0, 80.0, nan]), people).delay_reduction.count == 2
-    nobody_arrived = [{**row, "delay": -40.0} for row in people]
-    assert effect_of(rows_of([75.0] * 3), nobody_arrived).delay_reduction.count == 0
+    assert effect_of(rows_of([75.0, 80.0, nan]), baseline).delay_reduction.count == 2
+    negative_delay = [{**row, "delay": -40.0} for row in baseline]
+    assert effect_of(rows_of([75.0] * 3), negative_delay).delay_reduction.count == 0
 
 
-def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:
-    people = rows_of([100.0, 120.0, 140.0, 999.0])
-    found = effect_of(rows_of([98.0, 117.0, 136.0], outflow_veh_per_h=1990.0), people)
+def test_differences_are_paired_on_common_seeds() -> None:
+    baseline = rows_of([100.0, 120.0, 140.0, 999.0])
+    found = effect_of(rows_of([98.0, 117.0, 136.0], outflow_veh_per_h=1990.0), baseline)
     assert (found.travel_time.mean, found.travel_time.count) == (-3.0, 3)
     assert found.travel_time == estimate([-2.0, -3.0, -4.0])
     assert found.flow == Estimate(-10.0, -10.0, -10.0, 3)
@@ -101,7 +101,7 @@ def test_differences_are_paired_and_only_on_seeds_that_both_have() -> None:
     assert found.relative_half_width == (found.travel_time.high - found.travel_time.low) / 2 / 120.0
 
 
-def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -> None:
+def test_effect_has_collisions_failures_and_feasibility() -> None:
     rows = rows_of([99.0, 98.0, nan], human_braking_beyond_4_5=500.0)
     rows[0] |= {"status": "collision", "collisions": 2.0}
     rows[2] |= {"status": "failed", "collisions": nan}
@@ -113,12 +113,12 @@ def test_an_effect_knows_contacts_failures_and_the_verdict_on_the_cavs_alone() -
     assert effect_of(rows_of([99.0], human_braking_beyond_4_5=500.0), rows_of([100.0])).feasibility == "feasible"
 
 
-def test_more_confidence_is_a_wider_interval() -> None:
-    people, rows = rows_of([100.0] * 12), rows_of([99.0 + 0.3 * number for number in range(12)])
-    assert effect_of(rows, people, 0.99).relative_half_width > effect_of(rows, people).relative_half_width > 0
+def test_higher_confidence_widens_the_interval() -> None:
+    baseline, rows = rows_of([100.0] * 12), rows_of([99.0 + 0.3 * number for number in range(12)])
+    assert effect_of(rows, baseline, 0.99).relative_half_width > effect_of(rows, baseline).relative_half_width > 0
 
 
-def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
+def test_beneficial_effect_has_no_rejection_reasons() -> None:
     assert rejection_reasons(GOOD) == []
     assert describe_harm(GOOD) == ""
     assert rejection_reasons(replace(GOOD, flow=NONE, hard_braking=NONE)) == []
@@ -141,16 +141,16 @@ def test_nothing_speaks_against_what_helps_and_harms_nobody() -> None:
         (
             {"hard_braking": between(-1, 9)},
             "human drivers brake beyond 4.5 m/s² more often than in the human baseline: +4 [-1, +9] times "
-            "in a million moments (only the sign of the mean counts)",
+            "in a million vehicle-steps (the sign of the mean counts)",
         ),
     ],
 )
-def test_each_failing_is_one_reason(changes: dict[str, Any], reason: str) -> None:
+def test_each_violation_gives_one_reason(changes: dict[str, Any], reason: str) -> None:
     assert rejection_reasons(replace(GOOD, **changes)) == [reason]
 
 
 @pytest.mark.parametrize("time", [between(0.1, 0.4), between(-0.4, -0.1), between(-0.3, 0.4)])
-def test_a_difference_below_half_a_percent_is_no_gain_and_no_harm(time: Estimate) -> None:
+def test_difference_below_half_a_percent_is_neither_gain_nor_harm(time: Estimate) -> None:
     found = replace(GOOD, travel_time=time)  # of 100 s
     assert describe_harm(found) == ""
     (reason,) = rejection_reasons(found)
@@ -160,13 +160,13 @@ def test_a_difference_below_half_a_percent_is_no_gain_and_no_harm(time: Estimate
 
 
 @pytest.mark.parametrize("time", [between(0.1, 0.6), between(-0.6, -0.1), Estimate(0.1, nan, nan, 1)])
-def test_a_difference_that_may_be_half_a_percent_is_not_too_small(time: Estimate) -> None:
+def test_difference_that_may_exceed_half_a_percent_is_not_too_small(time: Estimate) -> None:
     found = replace(GOOD, travel_time=time)
     assert not found.is_too_small
     assert bool(describe_harm(found)) == (time.low > 0)
 
 
-def test_speed_does_not_excuse_a_loss_of_flow_and_all_reasons_are_told() -> None:
+def test_loss_of_flow_is_rejected_despite_shorter_travel_time() -> None:
     found = replace(GOOD, travel_time=between(-60, -50), flow=between(-99, -50), feasibility="2 in contact")
     assert [reason.split(":")[0] for reason in rejection_reasons(found)] == [
         "flow is lower than that of the human baseline",
@@ -174,7 +174,7 @@ def test_speed_does_not_excuse_a_loss_of_flow_and_all_reasons_are_told() -> None
     ]
 
 
-def test_one_seed_has_no_interval_and_proves_nothing() -> None:
+def test_one_seed_is_not_enough_for_a_recommendation() -> None:
     found = effect_of(rows_of([50.0]), rows_of([100.0]))
     reasons = rejection_reasons(found)
     assert any("too few" in reason for reason in reasons)
@@ -182,7 +182,7 @@ def test_one_seed_has_no_interval_and_proves_nothing() -> None:
     assert any("flow may be lower" in reason for reason in reasons)
 
 
-def test_both_harms_are_told_where_both_are_shown() -> None:
+def test_both_harms_are_reported() -> None:
     both = replace(GOOD, travel_time=between(2.0, 8.0), flow=between(-150.0, -50.0))
     longer, lower = rejection_reasons(both)
     assert longer == "travel time is longer than that of the human baseline: +5.0 [+2.0, +8.0] s"

@@ -1,4 +1,4 @@
-"""Is the verdict the first reason against a driver, and nobody blamed for what people do anyway?"""
+"""The feasibility verdict, and the comparison of human braking with the baseline."""
 
 from typing import Any
 
@@ -25,9 +25,9 @@ HUMAN = {**GOOD, "cav_max_braking": float("nan"), "human_braking_beyond_4_5": 20
         ({}, FEASIBLE),
         ({"min_time_gap": 0.9}, FEASIBLE),
         ({"cav_min_ttc": float("nan"), "min_time_gap": float("nan")}, FEASIBLE),
-        ({"min_time_gap": 0.2}, "follows at 0.20 s (floor 1 s)"),
-        ({"min_time_gap": 1.2, "required_time_gap": 1.5}, "follows at 1.20 s (floor 1.5 s)"),
-        ({"min_time_gap": 0.8, "required_time_gap": 0.0}, "follows at 0.80 s (floor 1 s)"),
+        ({"min_time_gap": 0.2}, "time gap 0.20 s (limit 1 s)"),
+        ({"min_time_gap": 1.2, "required_time_gap": 1.5}, "time gap 1.20 s (limit 1.5 s)"),
+        ({"min_time_gap": 0.8, "required_time_gap": 0.0}, "time gap 0.80 s (limit 1 s)"),
         ({"cav_min_ttc": 0.9}, "0.90 s to a collision"),
         ({"cav_max_braking": 6.5}, "brakes with 6.5 m/s2"),
         ({"override_share": 0.013}, "SUMO overrides 1.3 % of its commands"),
@@ -36,23 +36,25 @@ HUMAN = {**GOOD, "cav_max_braking": float("nan"), "human_braking_beyond_4_5": 20
         ({"cav_max_braking": float("nan")}, ""),
     ],
 )
-def test_a_verdict_names_the_first_reason(changes: dict[str, Any], verdict: str) -> None:
+def test_verdict_is_the_first_violated_limit(changes: dict[str, Any], verdict: str) -> None:
     assert feasibility({**GOOD, **changes}) == verdict
 
 
-def test_people_who_brake_hard_are_a_reason_only_where_they_do_so_more_than_alone() -> None:
+def test_hard_human_braking_counts_only_above_the_baseline() -> None:
     row = {**GOOD, "human_braking_beyond_4_5": 15.0}
-    words = "people brake beyond 4.5 m/s2 15 times in a million moments"
-    assert feasibility(row) == f"{words} (without CAVs: not driven)"
+    text = "human drivers brake beyond 4.5 m/s2 15 times in a million vehicle-steps"
+    assert feasibility(row) == f"{text} (without CAVs: not driven)"
     assert overall_feasibility([row, row], [HUMAN]) == FEASIBLE
-    assert overall_feasibility([row, {**GOOD, "human_braking_beyond_4_5": 40.0}], [HUMAN]).startswith("people brake")
+    assert overall_feasibility([row, {**GOOD, "human_braking_beyond_4_5": 40.0}], [HUMAN]).startswith(
+        "human drivers brake"
+    )
 
 
-def test_one_bad_episode_of_many_is_told_with_how_many_there_are() -> None:
-    assert overall_feasibility([GOOD, {**GOOD, "min_time_gap": 0.3}, GOOD]) == "follows at 0.30 s (floor 1 s) (1 of 3)"
+def test_overall_verdict_counts_the_violating_episodes() -> None:
+    assert overall_feasibility([GOOD, {**GOOD, "min_time_gap": 0.3}, GOOD]) == "time gap 0.30 s (limit 1 s) (1 of 3)"
 
 
-def test_of_results_that_are_compared_each_has_its_own_people() -> None:
+def test_compared_results_use_their_own_baselines() -> None:
     rows = {"many: human": [HUMAN], "few: human": [{**HUMAN, "human_braking_beyond_4_5": 10.0}]}
     driven = [{**GOOD, "human_braking_beyond_4_5": 15.0}]
     found = feasibility_by_driver({**rows, "many: pi": driven, "few: pi": driven})
@@ -60,5 +62,5 @@ def test_of_results_that_are_compared_each_has_its_own_people() -> None:
     assert found["few: pi"].endswith("(without CAVs: 10)")
 
 
-def test_each_driver_of_a_road_has_a_verdict_and_people_have_none() -> None:
+def test_human_baseline_has_no_verdict() -> None:
     assert feasibility_by_driver({"human": [HUMAN], "pi": [GOOD]}) == {"human": "", "pi": FEASIBLE}

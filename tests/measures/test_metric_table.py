@@ -1,4 +1,4 @@
-"""Does every table say the same of the same rows, and set drivers beside the right one?"""
+"""The table of metrics: baseline, differences, cells."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ def rows_of(*returns: float) -> list[dict[str, Any]]:
         ({"pi": 1.0}, ""),
     ],
 )
-def test_beside_people_else_beside_the_expert_that_earns_most(drivers: dict[str, float], baseline: str) -> None:
+def test_baseline_is_human_or_the_expert_with_the_largest_return(drivers: dict[str, float], baseline: str) -> None:
     assert choose_baseline({label: rows_of(value, value) for label, value in drivers.items()}) == baseline
 
 
@@ -44,7 +44,7 @@ def row_named(table: list[TableRow], label: str) -> TableRow:
     return next(row for row in table if row.label == label)
 
 
-def test_the_table_has_every_metric_of_every_driver_with_its_definition() -> None:
+def test_table_has_every_metric_with_its_definition() -> None:
     verdict, *table = metric_table({"human": rows_of(1.0), "pi": rows_of(10.0, 20.0)}, "")
     assert verdict.label == "feasible"
     assert [row.label for row in table] == [metric.label for metric in METRICS.values()]
@@ -54,7 +54,7 @@ def test_the_table_has_every_metric_of_every_driver_with_its_definition() -> Non
     assert row_named(table, "return").cells == [TableCell("1"), TableCell("15", "(10 to 20)")]
 
 
-def test_differences_are_paired_and_stand_in_columns_of_their_own() -> None:
+def test_differences_are_paired_and_have_their_own_columns() -> None:
     rows = {"idm": rows_of(8.0, 9.0, 10.0), "human": rows_of(1.0, 2.0, 4.0), "pi": rows_of(1.0, 1.0, 7.0)}
     assert table_headings(rows, "human") == ["idm", "human", "pi", "idm \u2212 human", "pi \u2212 human"]
     table = metric_table(rows, "human")
@@ -68,7 +68,7 @@ def test_differences_are_paired_and_stand_in_columns_of_their_own() -> None:
     assert better[4] == TableCell("0.50", f"[{found.low:.2f}, {found.high:.2f}]")
 
 
-def test_a_difference_of_few_pairs_says_of_how_many() -> None:
+def test_cell_of_incomplete_pairs_has_the_count() -> None:
     never = {"time_to_dissolve": np.nan}
     alone = [row | {"time_to_dissolve": 100.0} for row in rows_of(1.0, 1.0, 1.0, 1.0)]
     pi = [row | ({"time_to_dissolve": 60.0 + k} if k < 3 else never) for k, row in enumerate(alone)]
@@ -77,7 +77,7 @@ def test_a_difference_of_few_pairs_says_of_how_many() -> None:
     assert (gain.mean, gain.interval) == ("-39", "[-41, -37] 3 of 4")
 
 
-def test_a_cell_says_how_many_values_it_stands_for() -> None:
+def test_cell_has_the_count_of_values() -> None:
     assert estimate_cell(estimate([1.0, 1.0]), 2, 2) == TableCell("1.00")
     assert estimate_cell(estimate([1.0, 3.0, np.nan]), 1, 3) == TableCell("2.0", "(1.0 to 3.0) 2 of 3")
     assert estimate_cell(estimate([1.0, np.nan]), 0, 2) == TableCell("1", "1 of 2")

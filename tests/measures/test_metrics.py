@@ -43,7 +43,7 @@ def trajectory_of(states: LocalState, applied: ArrayLike = 0.0, **changes: Any) 
 
 
 def followed_in(states: LocalState, cavs: int, step: float) -> FollowingStatistics:
-    """How the first `cavs` of vehicles followed, whose states have the shape (vehicles, moments)."""
+    """Following statistics of the first `cavs` vehicles; states have the shape (vehicles, steps)."""
     speed, leader, gap = (values[:cavs].T for values in states[:3])
     return following_statistics(speed, leader, gap, step)
 
@@ -92,7 +92,7 @@ def wave(waves: list[tuple[float, bool]], vehicles: int = 4, step: float = 0.1) 
     return np.array(rows)
 
 
-def test_traffic_at_one_speed_has_that_speed_and_no_waves() -> None:
+def test_uniform_traffic_has_its_speed_and_no_waves() -> None:
     row = measure(episode_of(steady(4.0)))
     for name in ("mean_speed", "mean_speed_steady", "cav_mean_speed"):
         assert row[name] == pytest.approx(4.0)
@@ -105,13 +105,13 @@ def test_traffic_at_one_speed_has_that_speed_and_no_waves() -> None:
     assert row["steps"] == 100
 
 
-def test_two_groups_differ_by_half_their_distance_from_the_mean() -> None:
+def test_speed_std_of_two_groups() -> None:
     row = measure(episode_of(np.tile([2.0, 6.0, 2.0, 6.0], (51, 1))))
     assert row["mean_speed"] == pytest.approx(4.0)
     assert row["speed_std_fleet"] == pytest.approx(2.0)
 
 
-def test_mean_speed_has_the_start_up_in_it_and_the_steady_one_has_not() -> None:
+def test_mean_speed_includes_the_start_up_and_steady_speed_does_not() -> None:
     speeds = np.vstack([steady(1.0, 500), steady(7.0, 0), steady(4.0, 998)])
     row = measure(episode_of(speeds))
     assert row["steps"] == 1500
@@ -121,13 +121,13 @@ def test_mean_speed_has_the_start_up_in_it_and_the_steady_one_has_not() -> None:
     assert row["speed_limit_ratio_steady"] == pytest.approx(row["mean_speed_steady"] / LIMIT)
 
 
-def test_a_wave_before_the_steady_state_counts_in_the_mean_alone() -> None:
+def test_wave_before_the_steady_state_counts_only_in_the_mean() -> None:
     row = measure(episode_of(np.vstack([wave([(50.0, False)]), steady(4.0, 1000, 4)])))
     assert row["speed_std_fleet"] == pytest.approx(499 / 1500, rel=0.01)
     assert row["speed_std_fleet_steady"] == pytest.approx(0.0)
 
 
-def test_what_holds_before_the_first_decision_does_not_count() -> None:
+def test_initial_state_does_not_count() -> None:
     speeds = steady(4.0)
     speeds[0] = [9.0, 0.0, 3.0, 9.0, 0.0]
     row = measure(episode_of(speeds))
@@ -138,7 +138,7 @@ def test_what_holds_before_the_first_decision_does_not_count() -> None:
     assert row["speed_std_cav"] == pytest.approx(0.0)
 
 
-def test_the_papers_convention_is_about_the_cav_and_the_fleets_about_all() -> None:
+def test_paper_metrics_cover_the_cav_and_fleet_metrics_all_vehicles() -> None:
     slow_cav = measure(episode_of(np.tile([2.0, 6.0, 6.0, 6.0], (51, 1))))
     assert slow_cav["cav_mean_speed"] == pytest.approx(2.0)
     assert slow_cav["mean_speed"] == pytest.approx(5.0)
@@ -151,17 +151,17 @@ def test_the_papers_convention_is_about_the_cav_and_the_fleets_about_all() -> No
     assert pulsing["speed_std_fleet"] == pytest.approx(0.0)
 
 
-def test_with_several_cavs_theirs_is_the_mean_over_them() -> None:
+def test_metrics_of_several_cavs_are_averaged() -> None:
     row = measure(episode_of(np.tile([2.0, 4.0, 6.0, 6.0], (11, 1)), cavs=2))
     assert row["cav_mean_speed"] == pytest.approx(3.0)
 
 
-def test_a_wave_is_dissolved_at_the_first_moment_from_which_on_traffic_stays_calm() -> None:
+def test_wave_is_dissolved_once_traffic_stays_calm() -> None:
     episode = episode_of(wave([(20.0, False), (70.0, True)]))
     assert metric("time_to_dissolve", episode) == pytest.approx(20.0)
 
 
-def test_calm_in_between_does_not_count_as_dissolved() -> None:
+def test_short_calm_period_does_not_count_as_dissolved() -> None:
     episode = episode_of(wave([(20.0, False), (59.0, True), (5.0, False), (61.0, True), (5.0, False)]))
     assert metric("time_to_dissolve", episode) == pytest.approx(84.0)
 
@@ -177,21 +177,21 @@ def test_calm_in_between_does_not_count_as_dissolved() -> None:
         ([(10.0, False)], "shorter than calm has to last"),
     ],
 )
-def test_no_time_to_dissolve_where_there_is_no_answer(waves: list[tuple[float, bool]], why: str) -> None:
+def test_time_to_dissolve_is_nan_without_a_wave_or_a_calm_end(waves: list[tuple[float, bool]], why: str) -> None:
     assert np.isnan(metric("time_to_dissolve", episode_of(wave(waves)))), why
 
 
 @pytest.mark.parametrize("step", [0.1, 0.2, 1.0])
-def test_time_to_dissolve_is_in_seconds_whatever_the_step(step: float) -> None:
+def test_time_to_dissolve_is_in_seconds_for_any_step(step: float) -> None:
     episode = episode_of(wave([(30.0, False), (65.0, True)], step=step), step=step)
     assert metric("time_to_dissolve", episode) == pytest.approx(30.0)
 
 
-def test_standing_is_slower_than_a_tenth_of_a_metre_per_second() -> None:
+def test_standing_is_below_a_tenth_of_a_meter_per_second() -> None:
     assert metric("share_standing", episode_of(np.tile([0.0, 0.09, 0.1, 4.0], (11, 1)))) == pytest.approx(0.5)
 
 
-def test_vehicles_that_are_not_on_the_road_are_left_out() -> None:
+def test_vehicles_off_the_road_are_left_out() -> None:
     speeds = np.tile([4.0, 0.0, 8.0, np.nan], (11, 1))
     episode = episode_of(speeds)
     assert metric("mean_speed", episode) == pytest.approx(4.0)
@@ -219,53 +219,53 @@ def test_time_to_collision_of_a_closing_pair() -> None:
     assert metric("min_ttc", with_states(states)) == pytest.approx(4.5)  # 9 m at 2 m/s; 8 m at 1 m/s take 8 s
 
 
-def test_time_to_collision_watches_the_follower_too() -> None:
+def test_time_to_collision_includes_the_follower() -> None:
     states = seen(follower_gap=[10.0, 6.0, 6.0], follower_speed=[5.0, 8.0, 4.0])
     assert metric("min_ttc", with_states(states)) == pytest.approx(2.0)  # 6 m at 3 m/s
 
 
-def test_time_to_collision_is_infinite_where_nobody_closes_in() -> None:
+def test_time_to_collision_is_infinite_without_closing() -> None:
     assert metric("min_ttc", with_states(seen(leader_gap=[2.0, 2.0], leader_speed=[6.0, 6.0]))) == np.inf
 
 
-def test_time_headway_counts_only_while_the_cav_moves() -> None:
+def test_time_gap_counts_only_while_the_cav_moves() -> None:
     states = seen(speed=[0.5, 1.0, 2.0, 5.0], leader_gap=[0.1, 0.2, 3.0, 10.0])
     assert metric("min_time_gap", with_states(states)) == pytest.approx(1.5)
     assert np.isnan(metric("min_time_gap", with_states(seen(speed=[0.5, 0.9]))))
 
 
-def test_jerk_of_a_speed_with_a_constant_one() -> None:
+def test_constant_jerk_is_measured() -> None:
     times = np.arange(51) * 0.1
     speeds = steady(4.0, 50)
     speeds[:, 0] = 0.5 * 0.6 * times**2
     assert metric("mean_abs_jerk", episode_of(speeds)) == pytest.approx(0.6)
 
 
-def test_jerk_of_speeding_up_and_slowing_down_counts_both_ways() -> None:
+def test_jerk_counts_both_directions() -> None:
     speeds = steady(4.0, 4)
     speeds[:, 0] = [4.0, 4.1, 4.1, 4.1, 4.0]  # accelerations 1, 0, 0, -1: two changes of 1 in 0.1 s among three
     assert metric("mean_abs_jerk", episode_of(speeds)) == pytest.approx(2 * 10.0 / 3)
 
 
-def test_acceleration_is_what_the_cav_was_told() -> None:
+def test_acceleration_is_the_commanded_one() -> None:
     assert metric("mean_abs_accel", episode_of(steady(4.0, 4), applied=[1.0, -0.5, 0.0, 0.5])) == pytest.approx(0.5)
 
 
-def test_throughput_is_the_flow_past_a_point_of_the_loop() -> None:
+def test_outflow_of_a_loop_is_the_flow_past_a_point() -> None:
     speeds = np.tile([2.0, 4.0, 6.0, 8.0], (1001, 1))
     assert metric("outflow_veh_per_h", episode_of(speeds)) == pytest.approx(20.0 / LENGTH * 3600)
 
 
-def test_fuel_of_a_constant_rate() -> None:
+def test_constant_fuel_rate_is_measured() -> None:
     episode = episode_of(steady(4.0, 50), fuel=np.full((50, 5), 371.0))
     assert metric("fuel_ml_per_km", episode) == pytest.approx(0.5 / 4.0 * 1000)  # half a ml/s at 4 m/s
 
 
-def test_fuel_that_was_not_recorded_is_not_a_number() -> None:
+def test_unrecorded_fuel_is_nan() -> None:
     assert np.isnan(metric("fuel_ml_per_km", episode_of(steady(4.0))))
 
 
-def test_return_is_the_sum_of_all_terms_once_however_many_cavs_share_it() -> None:
+def test_return_counts_shared_reward_terms_once() -> None:
     terms = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1.0, 0.0, 0.0])}
     shares = tuple(trajectory_of(seen(speed=[5.0] * 4), reward_terms=terms) for _ in range(2))
     for cavs in ((), shares[:1], shares):
@@ -273,13 +273,13 @@ def test_return_is_the_sum_of_all_terms_once_however_many_cavs_share_it() -> Non
         assert metric("return", episode) == pytest.approx(5.0)
 
 
-def test_return_by_eq16_pays_for_speed_and_charges_for_push_and_closeness() -> None:
+def test_return_eq16_rewards_speed_and_penalizes_acceleration_and_short_time_gaps() -> None:
     states = seen(speed=[5.0] * 3, leader_gap=[10.0, 2.5, 10.0])
     episode = episode_of(steady(5.0, 2), trajectories=(trajectory_of(states, [1.0, -0.5]),))
     assert metric("return_eq16", episode) == pytest.approx(2 * 5.0 - 0.1 * 0.5 - 0.1 * 1.5)
 
 
-def test_shield_counts_what_was_overridden_and_how_hard() -> None:
+def test_shield_metrics_count_overrides_and_their_size() -> None:
     states = seen(speed=[5.0] * 5)
     first, second = np.array([0.0, 1e-9, 0.5, 3.0]), np.array([0.0, 0.0, 0.0, 1.0])
     cavs = tuple(trajectory_of(states, shield_braking=shield) for shield in (first, second))
@@ -288,7 +288,7 @@ def test_shield_counts_what_was_overridden_and_how_hard() -> None:
     assert metric("shield_max_braking", episode) == pytest.approx(3.0)
 
 
-def test_a_collision_is_measured_up_to_its_end() -> None:
+def test_collision_is_measured_up_to_its_end() -> None:
     episode = episode_of(steady(4.0, 20), status="collision", collisions=2)
     row = measure(episode)
     assert row["status"] == "collision"
@@ -303,7 +303,7 @@ def test_a_collision_is_measured_up_to_its_end() -> None:
     assert not calm.any()
 
 
-def test_a_collision_in_the_first_step_is_measured_without_complaint() -> None:
+def test_collision_in_the_first_step_is_measured_without_warnings() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         row = measure(episode_of(steady(4.0, 1), status="collision", collisions=2))
@@ -312,14 +312,14 @@ def test_a_collision_in_the_first_step_is_measured_without_complaint() -> None:
     assert np.isnan(row["mean_abs_jerk"])
 
 
-def test_a_failed_episode_has_its_reason_and_no_metrics() -> None:
+def test_failed_episode_has_a_reason_and_no_metrics() -> None:
     row = measure(failed_episode((3,), "SUMO cannot start: no road", "EpisodeError"))
     assert (row["seed"], row["status"]) == (3, "failed")
     assert (row["reason"], row["error"]) == ("SUMO cannot start: no road", "EpisodeError")
     assert all(np.isnan(row[name]) for name in METRICS)
 
 
-def test_a_row_has_the_episode_what_was_drawn_and_every_metric() -> None:
+def test_row_has_facts_drawn_values_and_every_metric() -> None:
     row = measure(episode_of(steady(4.0), seed=(7, 1)))
     about = {
         "seed",
@@ -360,21 +360,21 @@ SPEEDS = arrays(
 
 
 @given(SPEEDS)
-def test_speed_std_is_zero_exactly_where_all_drive_alike(speeds: Floats) -> None:
+def test_speed_std_is_zero_only_for_equal_speeds(speeds: Floats) -> None:
     found = metric("speed_std_fleet", episode_of(speeds))
     alike = bool((np.ptp(speeds[1:], axis=1) == 0).all())
     assert (found < 1e-9) == alike
 
 
 @given(SPEEDS, st.sampled_from([0.25, 2.0, 10.0]))
-def test_speeds_scale_with_the_unit_they_are_told_in(speeds: Floats, scale: float) -> None:
+def test_speed_metrics_scale_with_their_unit(speeds: Floats, scale: float) -> None:
     for name in ("mean_speed", "speed_std_fleet", "speed_std_cav", "cav_mean_speed", "outflow_veh_per_h"):
-        told, scaled = metric(name, episode_of(speeds)), metric(name, episode_of(speeds * scale))
-        assert scaled == pytest.approx(told * scale, abs=1e-9)
+        value, scaled = metric(name, episode_of(speeds)), metric(name, episode_of(speeds * scale))
+        assert scaled == pytest.approx(value * scale, abs=1e-9)
 
 
 @given(SPEEDS, st.randoms(use_true_random=False))
-def test_the_fleets_metrics_do_not_depend_on_who_is_who(speeds: Floats, chance: Any) -> None:
+def test_fleet_metrics_do_not_depend_on_the_order_of_vehicles(speeds: Floats, chance: Any) -> None:
     order = list(range(speeds.shape[1]))
     chance.shuffle(order)
     for name in ("mean_speed", "speed_std_fleet", "share_standing", "outflow_veh_per_h"):
@@ -392,21 +392,21 @@ def test_metrics_stay_within_their_bounds(speeds: Floats) -> None:
 
 
 @given(st.floats(0.5, 20.0), st.sampled_from([0.05, 0.1, 0.5]))
-def test_flow_of_even_traffic_is_its_density_times_its_speed(speed: float, step: float) -> None:
+def test_flow_of_uniform_traffic_is_density_times_speed(speed: float, step: float) -> None:
     found = metric("outflow_veh_per_h", episode_of(steady(speed), step=step))
     assert found == pytest.approx(5 / LENGTH * speed * 3600)
 
 
 @pytest.mark.parametrize("name", ["mean_speed", "fuel_ml_per_km", "outflow_veh_per_h", "mean_abs_accel"])
 @pytest.mark.parametrize("times", [2, 5])
-def test_a_longer_episode_of_the_same_measures_the_same(name: str, times: int) -> None:
+def test_metrics_do_not_depend_on_the_episode_length(name: str, times: int) -> None:
     def measured(steps: int) -> float:
         return metric(name, episode_of(steady(4.0, steps), applied=0.3, fuel=np.full((steps, 5), 200.0)))
 
     assert measured(40 * times) == pytest.approx(measured(40))
 
 
-def test_metrics_have_labels_of_their_own() -> None:
+def test_metrics_have_unique_labels() -> None:
     labels = [found.label for found in METRICS.values()]
     functions: list[Callable[[Episode], float]] = [found.function for found in METRICS.values()]
     assert len(set(labels)) == len(labels)
@@ -436,7 +436,7 @@ def open_episode(speeds: ArrayLike, **changes: Any) -> Episode:
     return Episode(**{**values, **changes})
 
 
-def test_vehicles_count_while_they_are_on_the_road() -> None:
+def test_vehicles_count_only_on_the_road() -> None:
     episode = open_episode([[4.0, NAN], [4.0, 1.0], [NAN, 3.0], [NAN, 0.0]])
     assert metric("mean_speed", episode) == pytest.approx((4.0 + 1.0 + 3.0 + 0.0) / 4)
     assert metric("mean_speed_steady", episode) == pytest.approx((3.0 + 0.0) / 2)  # of three steps the last two
@@ -447,14 +447,14 @@ def test_vehicles_count_while_they_are_on_the_road() -> None:
     assert np.isnan(metric("cav_mean_speed", episode))
 
 
-def test_throughput_of_a_road_with_ends_is_who_left_it_and_backlog_who_waits_at_the_end() -> None:
+def test_outflow_and_backlog_of_an_open_road() -> None:
     episode = open_episode(np.full((121, 3), 5.0), arrivals=7, backlog=np.arange(121.0))
     assert metric("outflow_veh_per_h", episode) == pytest.approx(7 * 30.0)
     assert metric("insertion_backlog_veh", episode) == 120.0
     assert metric("insertion_backlog_veh", episode_of(steady(4.0))) == 0.0
 
 
-def test_a_collision_makes_nobody_quicker_who_is_still_under_way() -> None:
+def test_collision_does_not_shorten_travel_time() -> None:
     episode = open_episode(np.full((11, 2), 5.0), backlog=np.full(11, 3.0), planned_duration=40.0)
     assert metric("travel_time", episode) == pytest.approx(10.0)
     assert metric("travel_time", replace(episode, status="collision")) == pytest.approx(40.0)
@@ -465,7 +465,7 @@ def test_a_collision_makes_nobody_quicker_who_is_still_under_way() -> None:
 @pytest.mark.parametrize(
     ("steps", "counted"), [(1, 1), (2, 1), (3, 2), (10, 5), (999, 500), (1000, 500), (1001, 1000), (3000, 1000)]
 )
-def test_steady_are_the_last_thousand_steps_and_of_a_shorter_episode_its_second_half(steps: int, counted: int) -> None:
+def test_steady_state_is_the_last_thousand_steps_or_the_second_half(steps: int, counted: int) -> None:
     speeds = np.zeros((steps + 1, 3))
     speeds[-counted:] = 4.0
     assert metric("mean_speed_steady", episode_of(speeds)) == pytest.approx(4.0)
@@ -474,7 +474,7 @@ def test_steady_are_the_last_thousand_steps_and_of_a_shorter_episode_its_second_
     assert metric("mean_speed_steady", episode_of(speeds)) == pytest.approx(expected)
 
 
-def test_an_episode_in_which_nobody_came_is_measured_without_complaint() -> None:
+def test_episode_without_vehicles_is_measured_without_warnings() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for vehicles in (0, 2):
@@ -485,7 +485,7 @@ def test_an_episode_in_which_nobody_came_is_measured_without_complaint() -> None
 
 
 @pytest.mark.parametrize(("peak", "flow"), [((60.0, 90.0), 3600.0), ((0.0, 90.0), 1200.0), ((150.0, 200.0), 1440.0)])
-def test_flow_of_a_peak_is_of_the_peak_alone(peak: tuple[float, float], flow: float) -> None:
-    # Somebody leaves every second from the sixtieth on; where the peak never comes all of it counts.
+def test_flow_of_a_demand_peak_counts_only_the_peak(peak: tuple[float, float], flow: float) -> None:
+    # A vehicle leaves every second from the sixtieth on; without the peak within the episode all of it counts.
     speeds = np.where(np.arange(101)[:, None] <= np.arange(60, 160), 10.0, np.nan)
     assert metric("outflow_veh_per_h", open_episode(speeds, demand_peak=peak)) == pytest.approx(flow)

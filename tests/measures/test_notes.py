@@ -22,7 +22,7 @@ def test_complete_episodes_without_warnings_have_no_notes() -> None:
     assert episode_notes({"human": rows_of(3), "pi": [*rows_of(2), failed]}) == []
 
 
-def test_a_note_says_how_many_episodes_of_which_driver_ended_early_and_why() -> None:
+def test_note_has_driver_count_and_reasons_of_early_ends() -> None:
     stopped = rows_of(1, status="teleports", reason="more than 0 teleports (max-num-teleports)")
     rows = [*rows_of(2), *rows_of(2, status="collision"), *stopped]
     assert count_early_ends(rows) == {"collision": 2, "more than 0 teleports (max-num-teleports)": 1}
@@ -34,7 +34,7 @@ def test_a_note_says_how_many_episodes_of_which_driver_ended_early_and_why() -> 
     ]
 
 
-def test_each_kind_of_warning_is_shown_once_with_its_count_and_missing_demand_first() -> None:
+def test_warnings_are_grouped_and_missing_demand_comes_first() -> None:
     stops = [warning("stop %", f"stop {number}", 3) for number in range(3)]
     lost = warning("Route file should be sorted by departure time, ignoring '%'!", "ignoring 'c'!")
     rows = {"human": rows_of(2, warnings=[stops[0], lost]), "pi": rows_of(1, warnings=[stops[1]])}
@@ -45,16 +45,16 @@ def test_each_kind_of_warning_is_shown_once_with_its_count_and_missing_demand_fi
     assert episode_notes({"human": rows_of(1, warnings=[warning("x", "x")])}) == ["SUMO warns: x"]
 
 
-def test_many_kinds_of_warnings_are_few_notes() -> None:
+def test_number_of_warning_notes_is_limited() -> None:
     kinds = [warning(f"kind {number}", f"kind {number}", 100 - number) for number in range(40)]
     *shown, rest = episode_notes({"human": rows_of(1, warnings=kinds)})
     assert len(shown) == MAX_WARNING_KINDS
     assert shown[0].startswith("SUMO warns: kind 0 ")
-    assert rest == "SUMO warns of 30 other kinds of things, less often"
+    assert rest == "SUMO gives 30 less frequent kinds of warnings"
 
 
 @pytest.mark.parametrize(("backlog", "noted"), [(2.0, False), (10.0, True)])
-def test_vehicles_that_never_entered_are_noted(backlog: float, noted: bool) -> None:
+def test_insertion_backlog_is_noted(backlog: float, noted: bool) -> None:
     notes = episode_notes({"human": rows_of(2, insertion_backlog_veh=backlog)})
     assert (
         notes
@@ -71,7 +71,7 @@ def test_teleports_are_noted() -> None:
     ("early", "complete", "planned", "refused"),
     [(1, 19, 0, False), (2, 18, 0, True), (1, 1, 20, False), (2, 0, 20, True), (1, 1, 0, True), (0, 2, 0, False)],
 )
-def test_a_baseline_that_often_ends_early_is_refused(early: int, complete: int, planned: int, refused: bool) -> None:
+def test_baseline_with_many_early_ends_is_refused(early: int, complete: int, planned: int, refused: bool) -> None:
     rows = [*rows_of(complete), *rows_of(early, status="teleports", reason="more than 0 teleports")]
     if not refused:
         check_baseline(rows, planned)

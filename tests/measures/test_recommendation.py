@@ -1,4 +1,4 @@
-"""Do the words say what the numbers say, whichever way they went?"""
+"""Texts of assessments: they match the numbers in every case."""
 
 from dataclasses import replace
 from math import inf, nan
@@ -27,7 +27,7 @@ ACC_HELPS = AccResult(0.2, GOOD)
 ACC_CHANGES_NOTHING = AccResult(0.2, replace(GOOD, travel_time=between(-1.0, 1.0)))
 
 
-def test_what_passes_is_recommended_with_its_numbers() -> None:
+def test_recommendation_has_its_numbers() -> None:
     assert HELPS.summary == (
         "acc at a penetration rate of 5 %: recommended. Travel time -4.0 [-6.0, -2.0] s (-4.0 %), flow "
         "+10 [-10, +30] veh/h, fuel +0.0 [+0.0, +0.0] ml/km compared with the human baseline; travel time "
@@ -35,7 +35,7 @@ def test_what_passes_is_recommended_with_its_numbers() -> None:
     )
 
 
-def test_a_refusal_says_why() -> None:
+def test_rejection_has_its_reason() -> None:
     assert QUICK_AND_WRONG.summary == (
         "mine.py:bold at a penetration rate of 10 %: not recommended: flow is lower than that of the human "
         "baseline: -70 [-90, -50] veh/h."
@@ -50,13 +50,13 @@ def test_a_refusal_says_why() -> None:
         (Estimate(nan, nan, nan, 0), "not shown to be shorter than with ACC vehicles alone"),
     ],
 )
-def test_a_gain_that_acc_vehicles_have_too_is_no_reason_for_a_controller(beyond: Estimate, shown: str) -> None:
+def test_controller_must_be_better_than_acc_vehicles(beyond: Estimate, shown: str) -> None:
     found = replace(HELPS, difference_to_acc=beyond)
     assert [shown in reason for reason in found.reasons] == [True]
     assert recommended_result([found]) is None
 
 
-def test_what_a_controller_gains_beyond_acc_vehicles_must_matter() -> None:
+def test_difference_to_acc_vehicles_must_not_be_too_small() -> None:
     found = replace(HELPS, difference_to_acc=between(-0.4, -0.2))
     assert found.reasons == [
         "travel time differs from that with ACC vehicles alone at this penetration rate by less than 0.5 %, "
@@ -66,7 +66,7 @@ def test_what_a_controller_gains_beyond_acc_vehicles_must_matter() -> None:
 
 
 @pytest.mark.parametrize("time", [between(0.1, 0.3), between(-0.3, -0.1)])
-def test_acc_vehicles_that_change_too_little_neither_shorten_nor_lengthen(time: Estimate) -> None:
+def test_too_small_effect_of_acc_vehicles_is_reported(time: Estimate) -> None:
     little = AccResult(0.2, replace(GOOD, travel_time=time))
     small = "by less than 0.5 %, which is too small to matter"
     assert assessment_headline([], [little]).endswith(f" ACC vehicles alone change travel time {small}.")
@@ -74,17 +74,17 @@ def test_acc_vehicles_that_change_too_little_neither_shorten_nor_lengthen(time: 
     assert assessment_headline([], [little, ACC_HELPS]).endswith("-4.0 [-6.0, -2.0] s (-4.0 %) at 20 %.")
 
 
-def test_the_answer_is_the_largest_gain_among_those_that_pass() -> None:
+def test_headline_recommends_the_largest_gain() -> None:
     judged = [HELPS, QUICK_AND_WRONG, HELPS_MORE]
     assert recommended_result(judged) == plotted_result(judged) == HELPS_MORE
     assert assessment_headline(judged, [ACC_CHANGES_NOTHING]) == (
-        "Recommended on this road: pi at a penetration rate of 20 %. Travel time -10.0 [-12.0, -8.0] s a "
+        "Recommended on this road: pi at a penetration rate of 20 %. Travel time -10.0 [-12.0, -8.0] s per "
         "vehicle (-10.0 %) compared with the human baseline, -2.0 [-3.0, -1.0] s compared with ACC vehicles "
         "alone. ACC vehicles alone are not shown to shorten travel time."
     )
 
 
-def test_where_nothing_passes_nothing_is_recommended_and_the_quickest_is_shown() -> None:
+def test_without_recommendation_the_shortest_travel_time_is_plotted() -> None:
     judged = [QUICK_AND_WRONG, ControllerResult(0.2, "pi", replace(GOOD, failed_episodes=1), BEYOND)]
     assert recommended_result(judged) is None
     assert assessment_headline(judged, [ACC_HELPS]) == (
@@ -94,22 +94,23 @@ def test_where_nothing_passes_nothing_is_recommended_and_the_quickest_is_shown()
     assert plotted_result(judged) == QUICK_AND_WRONG
 
 
-def test_without_a_tested_controller_nothing_is_recommended_or_shown() -> None:
+def test_without_tested_controllers_nothing_is_recommended_or_plotted() -> None:
     assert plotted_result([]) is None
     worse = AccResult(0.1, replace(GOOD, travel_time=between(1.0, 2.0)))
     assert assessment_headline([], [worse, ACC_CHANGES_NOTHING]) == (
-        "No controller is recommended on this road: none was tested, or all were set aside before the test. "
+        "No controller is recommended on this road: none was tested, or all were rejected before the test. "
         "ACC vehicles alone lengthen travel time."
     )
 
 
-def test_without_a_verdict_the_words_say_how_wide_the_interval_is_and_what_is_missing() -> None:
+def test_missing_verdict_has_interval_width_and_missing_seeds() -> None:
     open_one = replace(HELPS, difference_to_acc=between(-5.0, 3.0), missing_seeds=300.0)
     assert open_one.summary.endswith(
-        "; no verdict yet: the interval is ±4.0 s, and a verdict needs about 300 more test seeds (900 episodes)."
+        "; no verdict yet: the confidence interval is ±4.0 s, and a verdict needs about 300 more test seeds "
+        "(900 episodes)."
     )
     assert assessment_headline([open_one], []).startswith("No controller is recommended on this road so far: ")
-    assert "too few for an interval" in replace(open_one, missing_seeds=inf).summary
+    assert "too few for a confidence interval" in replace(open_one, missing_seeds=inf).summary
     assert replace(ACC_CHANGES_NOTHING, missing_seeds=7.0).summary.endswith("about 7 more test seeds (14 episodes).")
 
 
@@ -122,20 +123,20 @@ def test_without_a_verdict_the_words_say_how_wide_the_interval_is_and_what_is_mi
         (0.0, 0.0, 3, 0.1, MIN_VERDICT_SEEDS),
     ],
 )
-def test_seeds_for_a_verdict_follow_from_the_width(
+def test_required_seeds_follow_from_the_interval_width(
     low: float, high: float, count: int, narrow: float, needed: float
 ) -> None:
     assert required_seeds(between(low, high, count), narrow) == needed
     assert required_seeds(Estimate(-1.0, nan, nan, 2), narrow) == inf
 
 
-def test_only_with_properties_set_for_cavs_the_gain_is_split() -> None:
+def test_property_effect_is_reported_only_if_properties_are_set() -> None:
     split = replace(ACC_HELPS, property_effect=between(-4.0, -2.0))
     assert split.summary.endswith("change -3.0 [-4.0, -2.0] s of travel time.")
     assert "properties" not in ACC_HELPS.summary
 
 
-def test_a_road_that_is_nearly_free_is_said_to_have_nothing_to_gain() -> None:
+def test_nearly_free_road_has_nothing_to_gain() -> None:
     free = [{"status": "completed", "travel_time": 103.2, "delay": 3.2} for _ in range(3)]
     nothing = "Nothing to gain here: the human baseline is within 4 % of free flow. No controller"
     found = assessment_headline([QUICK_AND_WRONG], [ACC_HELPS], free)
@@ -156,6 +157,6 @@ def test_a_road_that_is_nearly_free_is_said_to_have_nothing_to_gain() -> None:
         ({"teleports": 3}, "3 more vehicles teleported or removed than without CAVs"),
     ],
 )
-def test_nothing_is_recommended_where_sumo_takes_vehicles_off_the_road(changes: dict[str, float], words: str) -> None:
+def test_teleports_prevent_a_recommendation(changes: dict[str, float], words: str) -> None:
     assert words in replace(HELPS, effect=replace(GOOD, **changes)).reasons[0]  # pyright: ignore[reportArgumentType]
     assert not replace(HELPS, effect=replace(GOOD, baseline_teleport_share=0.01, teleports=-3)).reasons

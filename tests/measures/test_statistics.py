@@ -39,13 +39,13 @@ def coverage(found: Sequence[Estimate], true: float) -> float:
 
 @pytest.mark.parametrize("trim", [0.0, 0.25])
 @pytest.mark.parametrize("count", COUNTS)
-def test_intervals_of_normal_values_cover_what_they_say(count: int, trim: float) -> None:
+def test_intervals_of_normal_values_have_the_stated_coverage(count: int, trim: float) -> None:
     drawn = np.random.default_rng(count).normal(3.0, 2.0, (2 * REPEATS, count))
     assert 0.93 <= coverage([estimate(values, trim=trim) for values in drawn], 3.0) <= 0.97
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_intervals_of_ratios_cover_what_they_say(count: int) -> None:
+def test_intervals_of_ratios_have_the_stated_coverage(count: int) -> None:
     generator = np.random.default_rng(count)
     scales = 48.0 + 14.0 * generator.standard_normal((2 * REPEATS, count))
     values = 0.6 * scales + 9.0 * generator.standard_normal(scales.shape)
@@ -80,7 +80,7 @@ def coverage_by_kind(returns: dict[str, np.ndarray], count: int) -> dict[str, fl
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_intervals_of_real_returns_cover_what_they_say(count: int) -> None:
+def test_intervals_of_real_returns_have_the_stated_coverage(count: int) -> None:
     returns = returns_on_ring()
     found = coverage_by_kind(returns, count)
     assert 0.93 <= np.mean(list(found.values())) <= 0.97
@@ -90,13 +90,13 @@ def test_intervals_of_real_returns_cover_what_they_say(count: int) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("count", COUNTS)
-def test_intervals_of_what_residuals_earn_alone_cover_a_little_less(count: int) -> None:
+def test_intervals_of_residual_returns_cover_slightly_less(count: int) -> None:
     """On each length they earn all but the same, and now and then less: few values of such are too sure."""
     assert 0.85 <= coverage_by_kind(returns_on_ring(), count)["trainings"] <= 0.97
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_of_few_episodes_over_all_lengths_intervals_cover_a_little_less(count: int) -> None:
+def test_intervals_of_few_episodes_over_all_lengths_cover_slightly_less(count: int) -> None:
     """Lengths drawn evenly make returns flat, for which Student's t of three values covers 92 %."""
     found = coverage_of_resampled([values.ravel() for values in returns_on_ring().values()], count)
     assert (0.93 if count >= 10 else 0.90) <= found <= 0.97
@@ -104,14 +104,14 @@ def test_of_few_episodes_over_all_lengths_intervals_cover_a_little_less(count: i
 
 @pytest.mark.parametrize("count", [5, 10, 20])
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.9])
-def test_intervals_of_shares_cover_and_stay_possible(share: float, count: int) -> None:
+def test_intervals_of_shares_cover_and_stay_within_bounds(share: float, count: int) -> None:
     drawn = np.where(np.random.default_rng(count).random((REPEATS, 1, count)) < share, 1.0, -1.0)
     found = [probability_of_improvement(values) for values in drawn]
     assert all(0.0 <= each.low <= each.mean <= each.high <= 1.0 for each in found)
     assert coverage(found, share) >= 0.90
 
 
-def test_an_interval_is_cut_at_what_is_possible() -> None:
+def test_interval_is_clipped_at_the_bounds() -> None:
     values = [0.0, 0.0, 0.0, 0.9]
     assert estimate(values).low < 0.0
     cut = estimate(values, bounds=(0.0, 1.0))
@@ -121,7 +121,7 @@ def test_an_interval_is_cut_at_what_is_possible() -> None:
     assert metric_estimate(rows, "return").low < -0.9
 
 
-def test_a_trimmed_mean_leaves_the_ends_out() -> None:
+def test_trimmed_mean_leaves_the_ends_out() -> None:
     found = estimate([1.0, 2.0, 3.0, 4.0, 100.0], trim=0.25)
     assert (found.mean, found.largest) == (3.0, 100.0)
     # Winsorised 2 2 3 4 4: squares 4, over h (h - 1) = 6, times t of two degrees of freedom.
@@ -129,33 +129,33 @@ def test_a_trimmed_mean_leaves_the_ends_out() -> None:
     assert np.isnan(estimate([0.0, 0.0, 0.0, 0.0, 6.0], trim=0.25).low)
 
 
-def test_interval_is_as_wide_as_theory_says() -> None:
+def test_interval_width_matches_theory() -> None:
     values = np.random.default_rng(1).normal(0.0, 1.0, 400)
     found = estimate(list(values))
     assert found.mean == pytest.approx(values.mean())
     assert found.high - found.low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
 
 
-def test_more_values_give_a_narrower_interval() -> None:
+def test_more_values_narrow_the_interval() -> None:
     values = np.random.default_rng(2).normal(0.0, 1.0, 320)
     few, many = estimate(list(values[:20])), estimate(list(values))
     assert many.high - many.low < (few.high - few.low) / 2
 
 
-def test_a_mean_that_would_be_rounded_away_gets_more_digits() -> None:
+def test_mean_that_would_round_to_zero_gets_more_digits() -> None:
     assert display_digits(estimate([0.0] * 23 + [1.0, 1.0]), 0) == 2
     assert display_digits(estimate([0.0, 0.0]), 0) == 0
     assert display_digits(estimate([1.0, 0.0]), 1) == 1
     assert display_digits(estimate([]), 0) == 0
 
 
-def test_values_that_are_no_numbers_are_left_out_and_not_counted() -> None:
+def test_nonfinite_values_are_left_out() -> None:
     assert estimate([1.0, float("nan"), 2.0, float("inf"), 4.0]) == estimate([1.0, 2.0, 4.0])
     assert estimate([1.0, float("nan"), 2.0, 4.0]).count == 3
 
 
 @pytest.mark.parametrize(("values", "words"), [([3.0], "+3"), ([3.0, 5.0], "+4 (+3 to +5)")])
-def test_one_value_or_two_have_no_interval_but_a_range(values: list[float], words: str) -> None:
+def test_few_values_have_a_range_and_no_interval(values: list[float], words: str) -> None:
     found = estimate([*values, float("nan")])
     assert (found.mean, found.count) == (np.mean(values), len(values))
     assert np.isnan([found.low, found.high]).all()
@@ -169,7 +169,7 @@ def test_equal_values_have_an_interval_of_no_width() -> None:
 
 
 @pytest.mark.parametrize("values", [[], [float("nan")] * 3])
-def test_nothing_to_average_is_not_a_number(values: list[float]) -> None:
+def test_estimate_of_nothing_is_nan(values: list[float]) -> None:
     found = estimate(values)
     assert found.count == 0
     assert np.isnan([found.mean, found.low, found.high]).all()
@@ -181,7 +181,7 @@ def test_the_same_values_give_the_same_interval(values: list[float]) -> None:
 
 
 @given(NUMBERS)
-def test_interval_is_around_its_mean_and_knows_the_range(values: list[float]) -> None:
+def test_interval_contains_its_mean_and_has_the_range(values: list[float]) -> None:
     found = estimate(values)
     slack = 1e-9 * (1 + max(map(abs, values)))
     assert (found.smallest, found.largest) == (min(values), max(values))
@@ -190,7 +190,7 @@ def test_interval_is_around_its_mean_and_knows_the_range(values: list[float]) ->
         assert found.low <= found.mean <= found.high
 
 
-def test_does_not_touch_the_generator_that_others_use() -> None:
+def test_global_random_state_is_not_changed() -> None:
     np.random.seed(5)
     untouched = np.random.random()
     np.random.seed(5)
@@ -209,7 +209,7 @@ def test_differences_are_paired_by_seed_and_not_by_order() -> None:
     assert found == estimate([1.0, 2.0, 3.0])  # by order, the differences would be -19, 12 and 13
 
 
-def test_pairing_takes_the_traffic_out_of_the_difference() -> None:
+def test_pairing_removes_the_variance_of_traffic() -> None:
     traffic = np.random.default_rng(3).normal(0.0, 100.0, 20)
     ours = [{"seed": [9, seed], "return": value + 1.0} for seed, value in enumerate(traffic)]
     others = [{"seed": [9, seed], "return": value} for seed, value in enumerate(traffic)]
@@ -218,12 +218,12 @@ def test_pairing_takes_the_traffic_out_of_the_difference() -> None:
     assert found.high - found.low < 1e-6
 
 
-def test_seeds_that_only_one_side_has_are_left_out() -> None:
+def test_seeds_of_one_side_only_are_left_out() -> None:
     found = paired_difference(rows_of(s1=3.0, s2=5.0, s9=100.0), rows_of(s1=1.0, s2=1.0, s5=7.0), "return")
     assert (found.mean, found.count) == (3.0, 2)
 
 
-def test_a_failed_episode_takes_its_pair_out() -> None:
+def test_failed_episode_removes_its_pair() -> None:
     found = paired_difference(rows_of(s1=3.0, s2=float("nan")), rows_of(s1=1.0, s2=1.0), "return")
     assert (found.mean, found.count) == (2.0, 1)
 
@@ -238,7 +238,7 @@ def test_summary_has_an_estimate_of_every_metric() -> None:
 
 @pytest.mark.parametrize(("between", "shared"), [(1.0, 0.5), (0.3, 2.0), (1.0, 0.0)])
 @pytest.mark.parametrize("trainings", [3, 5, 10, 20])
-def test_crossed_intervals_cover_what_they_say(trainings: int, between: float, shared: float) -> None:
+def test_crossed_intervals_have_the_stated_coverage(trainings: int, between: float, shared: float) -> None:
     generator, seeds, repeats = np.random.default_rng(trainings), 20, 2000
     tables = (
         between * generator.standard_normal((repeats, trainings, 1))
@@ -250,12 +250,12 @@ def test_crossed_intervals_cover_what_they_say(trainings: int, between: float, s
     assert 0.93 <= covered <= 0.97
 
 
-def test_a_crossed_interval_of_equal_numbers_is_a_point() -> None:
+def test_crossed_interval_of_equal_values_is_a_point() -> None:
     found = estimate_crossed(np.full((3, 4), 2.5))
     assert (found.mean, found.low, found.high, found.count) == (2.5, 2.5, 2.5, 3)
 
 
-def test_trainings_of_two_modes_or_too_few_have_a_range_and_no_interval() -> None:
+def test_bimodal_or_few_trainings_have_a_range_and_no_interval() -> None:
     seeds = np.random.default_rng(0).normal(0.0, 1.0, 20)
     modes = np.array([0.0, 1.0, 2.0, 80.0, 81.0])[:, None] + seeds
     found = estimate_crossed(modes)
@@ -267,7 +267,7 @@ def test_trainings_of_two_modes_or_too_few_have_a_range_and_no_interval() -> Non
 
 
 @pytest.mark.parametrize("count", [4, 5, 8, 10, 20])
-def test_two_modes_are_seen_and_seldom_made_up(count: int) -> None:
+def test_bimodality_is_detected_with_few_false_positives(count: int) -> None:
     generator = np.random.default_rng(count)
     normal = generator.normal(0.0, 1.0, (REPEATS, count))
     assert np.mean([is_bimodal(values) for values in normal]) < 0.03
@@ -278,35 +278,33 @@ def test_two_modes_are_seen_and_seldom_made_up(count: int) -> None:
 @pytest.mark.parametrize(
     ("low", "high", "trainings", "words"),
     [
-        (1.0, 3.0, 10, "The residual pays."),
-        (1.0, 3.0, 9, "It earns more: that is 9 trainings, and a residual pays where 10 show it."),
-        (-3.0, -1.0, 1, "It earns less: that is one training, and a residual pays where 10 show it."),
-        (-3.0, -1.0, 12, "The residual makes it worse."),
-        (-1.0, 3.0, 50, "No gain is shown: the interval holds zero."),
-        (0.0, 0.0, 50, "No gain is shown: the interval holds zero."),
-        (np.nan, np.nan, 50, "There is no interval: nothing is shown."),
+        (1.0, 3.0, 10, "The residual increases the return."),
+        (1.0, 3.0, 9, "The return increases in 9 trainings; a verdict on the residual needs 10 trainings."),
+        (-3.0, -1.0, 1, "The return decreases in one training; a verdict on the residual needs 10 trainings."),
+        (-3.0, -1.0, 12, "The residual decreases the return."),
+        (-1.0, 3.0, 50, "No gain is shown: the confidence interval contains zero."),
+        (0.0, 0.0, 50, "No gain is shown: the confidence interval contains zero."),
+        (np.nan, np.nan, 50, "No conclusion: there is no confidence interval."),
     ],
 )
-def test_words_follow_from_an_interval_without_zero_and_ten_trainings(
-    low: float, high: float, trainings: int, words: str
-) -> None:
+def test_gain_verdict_follows_from_interval_and_trainings(low: float, high: float, trainings: int, words: str) -> None:
     assert gain_verdict(Estimate((low + high) / 2, low, high, 20), trainings) == words
 
 
-def test_two_modes_need_two_values_each() -> None:
+def test_bimodality_needs_two_values_per_group() -> None:
     assert not is_bimodal([0.0, 0.0, 0.0, 0.0, 6.0])
     assert not is_bimodal([0.0, 0.0, 6.0])
     assert not is_bimodal([1.0] * 5)
     assert is_bimodal([0.0, 0.0, 0.0, 6.0, 6.0])
 
 
-def test_differences_of_trainings_are_on_the_seeds_that_all_have_driven() -> None:
+def test_differences_of_trainings_use_common_seeds() -> None:
     runs = [rows_of(s1=3.0, s2=5.0, s3=1.0), rows_of(s2=6.0, s1=4.0, s3=float("nan"))]
     found = paired_differences(runs, rows_of(s1=1.0, s2=2.0, s3=0.0, s4=9.0), "return")
     assert found.tolist() == [[2.0, 3.0], [3.0, 4.0]]
 
 
-def test_probability_of_improvement_counts_ties_half_and_stays_possible() -> None:
+def test_probability_of_improvement_counts_ties_half_and_stays_within_bounds() -> None:
     assert probability_of_improvement(np.array([[1.0, 0.0, -1.0, 2.0]])).mean == 0.625
     never = probability_of_improvement(-np.ones((1, 10)))
     assert (never.mean, never.low) == (0.0, 0.0)
@@ -316,7 +314,7 @@ def test_probability_of_improvement_counts_ties_half_and_stays_possible() -> Non
     assert 0.0 < better.low < better.mean < better.high <= 1.0
 
 
-def test_trainings_that_all_agree_do_not_make_certain_and_two_say_nothing() -> None:
+def test_unanimous_trainings_have_an_interval_and_two_have_none() -> None:
     found = probability_of_improvement(np.ones((3, 20)))
     assert (found.mean, found.high) == (1.0, 1.0)
     assert found.low < 0.2
@@ -325,7 +323,7 @@ def test_trainings_that_all_agree_do_not_make_certain_and_two_say_nothing() -> N
 
 @pytest.mark.parametrize("trainings", [3, 5, 10, 20])
 @pytest.mark.parametrize("shift", [0.0, 1.0])
-def test_probabilities_of_improvement_cover(shift: float, trainings: int) -> None:
+def test_probability_of_improvement_has_the_stated_coverage(shift: float, trainings: int) -> None:
     generator = np.random.default_rng(trainings)
     tables = (
         shift
@@ -337,7 +335,7 @@ def test_probabilities_of_improvement_cover(shift: float, trainings: int) -> Non
     assert coverage([probability_of_improvement(table) for table in tables], true) >= 0.92
 
 
-def test_trimming_leaves_as_many_as_an_interval_needs() -> None:
+def test_trimming_keeps_enough_values_for_an_interval() -> None:
     found = estimate([100.0, 107.0, 113.0, 120.0], trim=0.25)
     assert found == estimate([100.0, 107.0, 113.0, 120.0])
     assert estimate([100.0, 107.0, 113.0, 120.0, 200.0], trim=0.25).mean == pytest.approx(340.0 / 3)

@@ -53,10 +53,14 @@ def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_no
     assert found["rounds"] == 1
     assert min(found[name] for name in RATES) > 0
     assert found["relative_to_sumo"] == pytest.approx(found["episode_steps_per_s"] / found["sumo_steps_per_s"])
-    assert found["relative_to_sumo_every_step"] == pytest.approx(found["every_step_steps_per_s"] / found["sumo_steps_per_s"])
+    assert found["relative_to_sumo_every_step"] == pytest.approx(
+        found["every_step_steps_per_s"] / found["sumo_steps_per_s"]
+    )
     assert found["relative_to_traci"] > 2.0
     for rollouts in found["model"].values():
-        assert rollouts["relative_to_environment"] == pytest.approx(rollouts["steps_per_s"] / found["episode_steps_per_s"])
+        assert rollouts["relative_to_environment"] == pytest.approx(
+            rollouts["steps_per_s"] / found["episode_steps_per_s"]
+        )
     assert found["model"]["long"]["relative_to_environment"] > 2.0
     batch = found["batch"]
     assert batch["rings"] == 100

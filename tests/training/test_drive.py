@@ -179,9 +179,7 @@ def follow(state: LocalState) -> Any:
 
 
 def test_functions_and_objects_of_the_program_drive_beside_the_others() -> None:
-    result = drive(
-        "ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, scenario_options=ROAD, workers=1
-    )
+    result = drive("ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, scenario_options=ROAD, workers=1)
     assert list(result.rows) == ["follow", "Follows", "Follows (2)", "Stays", "idm"]
     raise_failures(result)
     rows = {label: [row["return"] for row in rows] for label, rows in result.rows.items()}
@@ -259,7 +257,14 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
 def test_wrong_arguments_are_told_before_anything_starts(
     tmp_path: Path, started: Callable[[], bool], wrong: dict[str, Any]
 ) -> None:
-    arguments = {"driver": "pi", "episodes": 1, "scenario_options": ROAD, "workers": 1, "out": tmp_path / "out", **wrong}
+    arguments = {
+        "driver": "pi",
+        "episodes": 1,
+        "scenario_options": ROAD,
+        "workers": 1,
+        "out": tmp_path / "out",
+        **wrong,
+    }
     with pytest.raises(InputError) as caught:
         drive(**arguments)
     assert "\n" not in str(caught.value)

@@ -355,7 +355,13 @@ def test_validates_now_and_then_and_at_the_end(tmp_path: Path, learn: Learn) -> 
 def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
     tmp_path: Path, spread: bool, learn: Learn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = small_config(stratified=spread, trpo__steps_per_iteration=11 * 20, steps=20, scenario_options__horizon=20, evaluation__validation_interval=0)
+    config = small_config(
+        stratified=spread,
+        trpo__steps_per_iteration=11 * 20,
+        steps=20,
+        scenario_options__horizon=20,
+        evaluation__validation_interval=0,
+    )
     episodes = collected(monkeypatch)
     learn(tmp_path / "run", config)
     lengths = [episode.drawn_values["length"] for episode in episodes]

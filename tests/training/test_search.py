@@ -64,7 +64,9 @@ def test_nothing_to_vary_is_refused() -> None:
 )
 def test_what_cannot_work_is_told_before_anything_is_trained(changes: dict[str, Any], text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        check_search_space(small_config(**{"evaluation__validation_interval": 1, **changes}), parse_search_space([text]))
+        check_search_space(
+            small_config(**{"evaluation__validation_interval": 1, **changes}), parse_search_space([text])
+        )
 
 
 def test_a_trial_differs_from_the_base_in_its_values_alone() -> None:

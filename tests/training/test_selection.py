@@ -17,11 +17,11 @@ from unjam.training.selection import (
     MIN_TEST_SEEDS,
     SELECTION_BUDGET_FRACTION,
     UNCHANGED_ACC_DRIVER,
+    AssessmentFindings,
     EpisodeBudget,
     EpisodeSeed,
     Option,
     OptionRows,
-    AssessmentFindings,
     compare_on_test_seeds,
     min_episodes,
     select_controllers,
@@ -65,7 +65,9 @@ def shifted(mean: float, spread: float = 0.3, **changes: Any) -> Change:
     return lambda generator: {"travel_time": generator.normal(mean, spread), **changes}
 
 
-def run_judge(drive: MadeUp, finalists: Sequence[Option], precision: float = 0.01, split: bool = False) -> AssessmentFindings:
+def run_judge(
+    drive: MadeUp, finalists: Sequence[Option], precision: float = 0.01, split: bool = False
+) -> AssessmentFindings:
     shares = tuple(dict.fromkeys(option.penetration_rate for option in finalists)) or (0.1,)
     return compare_on_test_seeds(finalists, shares, split, drive, drive.budget, precision, quiet)
 

@@ -171,9 +171,13 @@ def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("agent", "exploration"), [("trpo", "per_step"), ("trpo", "antithetic"), ("ppo", "antithetic")])
+@pytest.mark.parametrize(
+    ("agent", "exploration"), [("trpo", "per_step"), ("trpo", "antithetic"), ("ppo", "antithetic")]
+)
 def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, tmp_path: Path) -> None:
-    mixture = {"tasks": [{"scenario_options": {"length": [120, 125]}}, {"scenario_options": {"vehicles": 7}, "name": "fewer"}]}
+    mixture = {
+        "tasks": [{"scenario_options": {"length": [120, 125]}}, {"scenario_options": {"vehicles": 7}, "name": "fewer"}]
+    }
     runs = {}
     for world in ("sumo", "batch"):
         with WorkerPool(1) as workers:
@@ -191,8 +195,17 @@ def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, t
 
 def test_roads_that_cannot_be_batched_are_driven_in_sumo_beside_those_that_can(tmp_path: Path) -> None:
     ring = {"length": [120, 130], "vehicles": 8}
-    tasks = [{"scenario_options": ring}, {"scenario": "figure-eight", "scenario_options": EIGHT}, {"scenario_options": ring, "name": "other"}]
-    small = {"tasks": tasks, "scenario_options": {"horizon": 100}, "trpo.steps_per_iteration": 300, "policy.hidden": [8]}
+    tasks = [
+        {"scenario_options": ring},
+        {"scenario": "figure-eight", "scenario_options": EIGHT},
+        {"scenario_options": ring, "name": "other"},
+    ]
+    small = {
+        "tasks": tasks,
+        "scenario_options": {"horizon": 100},
+        "trpo.steps_per_iteration": 300,
+        "policy.hidden": [8],
+    }
     folders = {world: tmp_path / world for world in ("sumo", "batch")}
     driven = {}
     for world, folder in folders.items():
@@ -229,14 +242,21 @@ def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(
     assert [row["episodes"] for row in one] == [6, 7, 7]
 
 
-@pytest.mark.parametrize("changes", [{"tasks": []}, {"evaluation__validation_interval": 0}], ids=["one road", "no validation"])
+@pytest.mark.parametrize(
+    "changes", [{"tasks": []}, {"evaluation__validation_interval": 0}], ids=["one road", "no validation"]
+)
 def test_sampling_by_regret_wants_several_roads_that_are_validated(changes: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="task_sampling: regret is not allowed; allowed: weights"):
         mixture(task_sampling="regret", **changes)
 
 
 def test_a_network_acts_within_the_narrowest_limits_of_its_roads(tmp_path: Path) -> None:
-    config = mixture(tasks=[{"scenario_options": {"action_limit": 2.0}}, {"scenario_options": {"action_limit": 0.5}, "name": "gentle"}])
+    config = mixture(
+        tasks=[
+            {"scenario_options": {"action_limit": 2.0}},
+            {"scenario_options": {"action_limit": 0.5}, "name": "gentle"},
+        ]
+    )
     with WorkerPool(1) as workers:
         trainer = Trainer(tmp_path, config, workers)
         strong, gentle = trainer.make_drivers(trainer.training.learner.network())

@@ -1,4 +1,4 @@
-"""What detectors measured, and how near simulated traffic comes to it: GEH and root mean square errors."""
+"""Detector measurements and the agreement of simulated traffic with them: GEH and root mean square errors."""
 
 import csv
 from collections import defaultdict
@@ -14,19 +14,19 @@ from unjam.physics.arrays import Floats
 from unjam.worlds.sumo.detectors import DetectorPassage
 
 DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
-"""of a file of measurements, beside `edge` or `lane`"""
+"""columns of a file of measurements, in addition to `edge` or `lane`"""
 GEH_LIMIT = 5.0
-"""a flow counts as met below this"""
+"""a flow agrees below this"""
 SAME_PASSAGE_SECONDS = 10.0
-"""time within which who comes over loops of the same edge again only changes lanes [s]"""
+"""a vehicle that passes loops of one edge again within this time has only changed lanes [s]"""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a detector measured in an interval."""
+    """Measurement of a detector in an interval."""
 
     place: str
-    """an edge, all of whose lanes are counted, or a lane"""
+    """an edge, all lanes of which are counted, or a lane"""
     position: float
     """along it [m]"""
     begin: float
@@ -36,72 +36,71 @@ class Measurement:
     flow: float
     """[veh/h]"""
     speed: float
-    """mean of the vehicles that passed [m/s]; NaN where it is not known"""
+    """mean of the vehicles that passed [m/s]; NaN if unknown"""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How near simulated traffic is to what was measured."""
+    """Agreement of simulated traffic with measurements."""
 
     geh: float
     """mean over all intervals of all detectors"""
     geh_below_5: float
-    """share of these"""
+    """share of the intervals"""
     flow_rmse: float
     """[veh/h]"""
     speed_rmse: float
-    """[m/s]; NaN where no speed was measured"""
+    """[m/s]; NaN if no speed was measured"""
     score: float
-    """mean GEH over 5, plus the error of speed over the mean measured speed: what calibration makes small"""
+    """objective of calibration, smaller is better: mean GEH over 5, plus speed error over mean measured speed"""
 
 
 def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
-    """Return whether a CSV file names places by `edge` or by `lane`, and what it holds; all in SI units.
+    """Return whether a CSV file names places by `edge` or by `lane`, and its measurements; all in SI units.
 
-    Its columns are that one and `COLUMNS`; an empty speed is not known. Other columns are ignored.
+    It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown. Other columns are ignored.
 
     Raises:
-        InputError: it is missing, lacks a column, has no rows, or a value is wrong; the line says which.
+        InputError: the file, a column or all rows are missing, or a value is wrong; the message has the line.
     """
-    if not path.is_file():  # a device would never end
+    if not path.is_file():  # reading a device would never end
         raise InputError(f"detectors: {str(path)!r} is not a file; allowed: a CSV file")
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
-            given = reader.fieldnames or ()
-            kinds = [kind for kind in ("edge", "lane") if kind in given]
-            missing = [name for name in DETECTOR_COLUMNS if name not in given]
-            if len(kinds) != 1 or missing:
+            columns = reader.fieldnames or ()
+            kinds = [kind for kind in ("edge", "lane") if kind in columns]
+            if len(kinds) != 1 or not set(DETECTOR_COLUMNS) <= set(columns):
                 allowed = f"edge or lane, {', '.join(DETECTOR_COLUMNS)}"
-                raise invalid_value(f"{path.name}: columns", ", ".join(given), allowed)
+                raise invalid_value(f"{path.name}: columns", ", ".join(columns), allowed)
             rows = [_parse_measurement(path.name, reader.line_num, kinds[0], row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        why = error.strerror if isinstance(error, OSError) else str(error)
-        raise InputError(f"detectors: {str(path)!r} cannot be read: {why}") from None
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise InputError(f"detectors: {str(path)!r} cannot be read: {reason}") from None
     if not rows:
         raise InputError(f"{path.name}: has no rows; allowed: one measurement at least")
     return kinds[0], rows
 
 
 def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | None]) -> Measurement:
-    where = f"{file}: line {line}"
+    context = f"{file}: line {line}"
     place = (row[kind] or "").strip()
     if not place:
-        raise invalid_value(f"{where}: {kind}", place, f"the id of one {kind}")
+        raise invalid_value(f"{context}: {kind}", place, f"the id of one {kind}")
     values = []
     for name in DETECTOR_COLUMNS:
         text = (row[name] or "").strip()
         try:
             value = nan if name == "speed" and not text else float(text)
         except ValueError:
-            raise invalid_value(f"{where}: {name}", text, "a number >= 0") from None
-        if text and not (isfinite(value) and value >= 0):
-            raise invalid_value(f"{where}: {name}", text, "a number >= 0")
+            value = nan
+        if (text or name != "speed") and not (isfinite(value) and value >= 0):
+            raise invalid_value(f"{context}: {name}", text, "a number >= 0")
         values.append(value)
-    found = Measurement(place, *values)
-    if found.end <= found.begin:
-        raise invalid_value(f"{where}: end", found.end, f"after begin, {found.begin:g} s")
-    return found
+    measurement = Measurement(place, *values)
+    if measurement.end <= measurement.begin:
+        raise invalid_value(f"{context}: end", measurement.end, f"after begin, {measurement.begin:g} s")
+    return measurement
 
 
 def aggregate_passages(
@@ -110,50 +109,50 @@ def aggregate_passages(
     """Return the flow [veh/h] and the mean speed [m/s] that each detector would have measured.
 
     Args:
-        measured: place and time of each interval.
+        measurements: place and time of each interval.
         loops: numbers of its loops: one, or one in each lane of an edge, where a vehicle is counted once.
-        passed: who passed them.
+        passages: of vehicles over the loops.
 
     Returns:
-        Two arrays in the order of `measured`; the speed is NaN where nobody passed who tells one.
+        Two arrays in the order of `measurements`; the speed is NaN without a passage of known speed.
     """
     by_loop: defaultdict[int, list[DetectorPassage]] = defaultdict(list)
     for passage in passages:
         by_loop[passage.loop].append(passage)
-    known: dict[tuple[int, ...], Floats] = {}
+    unique: dict[tuple[int, ...], Floats] = {}
     flows, speeds = np.full((2, len(measurements)), np.nan)
-    for number, (row, places) in enumerate(zip(measurements, map(tuple, loops), strict=True)):
-        if places not in known:
-            known[places] = _unique_passages([passage for place in places for passage in by_loop[place]])
-        times, found = known[places]
+    for index, (row, numbers) in enumerate(zip(measurements, map(tuple, loops), strict=True)):
+        if numbers not in unique:
+            unique[numbers] = _unique_passages([passage for number in numbers for passage in by_loop[number]])
+        times, passage_speeds = unique[numbers]
         first, last = np.searchsorted(times, (row.begin, row.end))
-        flows[number] = (last - first) * 3600 / (row.end - row.begin)
-        told = found[first:last][np.isfinite(found[first:last])]
-        if told.size:
-            speeds[number] = told.mean()
+        flows[index] = (last - first) * 3600 / (row.end - row.begin)
+        known = passage_speeds[first:last][np.isfinite(passage_speeds[first:last])]
+        if known.size:
+            speeds[index] = known.mean()
     return flows, speeds
 
 
 def _unique_passages(passages: Sequence[DetectorPassage]) -> Floats:
-    """Return times and speeds of passages in the order of time, each vehicle's once, shape (2, n).
+    """Return times and speeds of passages in the order of time, shape (2, n), lane changes counted once.
 
-    Of passages that are one the first counts, with the speed of the first that tells one.
+    A passage over several loops has the time of the first and the first known speed.
     """
-    before: dict[str, tuple[float, int]] = {}
-    kept: list[tuple[float, float]] = []
+    last_passages: dict[str, tuple[float, int]] = {}
+    rows: list[tuple[float, float]] = []
     for passage in sorted(passages, key=lambda one: one.time):
-        last, row = before.get(passage.vehicle, (-np.inf, len(kept)))
-        if passage.time - last > SAME_PASSAGE_SECONDS:
-            row = len(kept)
-            kept.append((passage.time, passage.speed))
-        elif isnan(kept[row][1]):
-            kept[row] = kept[row][0], passage.speed
-        before[passage.vehicle] = passage.time, row
-    return np.array(kept, np.float64).reshape(-1, 2).T
+        last_time, row = last_passages.get(passage.vehicle, (-np.inf, len(rows)))
+        if passage.time - last_time > SAME_PASSAGE_SECONDS:
+            row = len(rows)
+            rows.append((passage.time, passage.speed))
+        elif isnan(rows[row][1]):
+            rows[row] = rows[row][0], passage.speed
+        last_passages[passage.vehicle] = passage.time, row
+    return np.array(rows, np.float64).reshape(-1, 2).T
 
 
 def geh(simulated: Floats, measured: Floats) -> Floats:
-    """Return the GEH statistic of flows [veh/h], elementwise: sqrt(2 (M - C)² / (M + C)), 0 where both are 0.
+    """Return the GEH statistic of flows [veh/h], elementwise: sqrt(2 (M - C)² / (M + C)), 0 if both are 0.
 
     Source: Design Manual for Roads and Bridges, volume 12, section 2, part 1 (UK, 1996).
     """
@@ -162,17 +161,17 @@ def geh(simulated: Floats, measured: Floats) -> Floats:
 
 
 def compute_agreement(measurements: Sequence[Measurement], flows: Floats, speeds: Floats) -> Agreement:
-    """Return how near simulated flows [veh/h] and speeds [m/s] are to what was measured, in the same order.
+    """Return the agreement of simulated flows [veh/h] and speeds [m/s] with the measurements, in their order.
 
-    Where nobody passed the simulated speed is NaN and counts as 0: traffic that stands still is not forgiven.
+    The simulated speed of an interval without vehicles is NaN and counts as 0, so that a standstill costs.
     """
-    counted = np.array([row.flow for row in measurements])
-    wanted = np.array([row.speed for row in measurements])
-    errors = geh(flows, counted)
-    known = np.isfinite(wanted)
-    missed = np.nan_to_num(speeds[known]) - wanted[known]
-    speed_rmse = float(np.sqrt(np.mean(missed**2))) if known.any() else nan
-    typical = float(np.mean(wanted[known])) if known.any() else 0.0
-    score = float(np.mean(errors)) / GEH_LIMIT + (speed_rmse / typical if typical else 0.0)
-    flow_rmse = float(np.sqrt(np.mean((flows - counted) ** 2)))
+    measured_flows = np.array([row.flow for row in measurements])
+    measured_speeds = np.array([row.speed for row in measurements])
+    errors = geh(flows, measured_flows)
+    known = np.isfinite(measured_speeds)
+    speed_errors = np.nan_to_num(speeds[known]) - measured_speeds[known]
+    speed_rmse = float(np.sqrt(np.mean(speed_errors**2))) if known.any() else nan
+    mean_speed = float(np.mean(measured_speeds[known])) if known.any() else 0.0
+    score = float(np.mean(errors)) / GEH_LIMIT + (speed_rmse / mean_speed if mean_speed else 0.0)
+    flow_rmse = float(np.sqrt(np.mean((flows - measured_flows) ** 2)))
     return Agreement(float(np.mean(errors)), float(np.mean(errors < GEH_LIMIT)), flow_rmse, speed_rmse, score)

@@ -1,24 +1,19 @@
-"""Could a car have driven so? What an episode's audit says, and the verdict: the first reason against it."""
+"""Feasibility: whether a car could have driven as a CAV did. The verdict is the first limit that was violated."""
 
-from collections.abc import Callable, Sequence
-from math import isfinite, isnan, nan
-from typing import Any, Literal
-
-import numpy as np
-
-from unjam.worlds.audit import BRAKING_THRESHOLDS
-from unjam.worlds.record import Episode
+from collections.abc import Sequence
+from math import isnan
+from typing import Any
 
 MIN_TIME_GAP_FRACTION = 0.9
-"""share of the demanded time headway that must be left at any moment"""
+"""smallest time gap at any moment, as a fraction of the required one"""
 DEFAULT_REQUIRED_TIME_GAP = 1.0
-"""time headway that is demanded where a road names none [s]"""
+"""required time gap on roads that do not set one [s]"""
 MIN_TIME_GAP_WITH_LANES = 0.8
-"""time headway behind who was followed for long that must be left at any moment, where others cut in [s]"""
+"""smallest time gap at any moment on roads with lanes, recovery after cut-ins excluded [s]"""
 MAX_SHORT_TIME_GAP_SHARE = 1e-3
-"""of that time, how much may be below the floor"""
+"""share of that time in which the time gap may be shorter than the required one"""
 MAX_CUT_IN_BRAKING = 9.0
-"""braking just after somebody has cut in [m/s2]: what dry asphalt allows"""
+"""braking just after a cut-in [m/s2]: what dry asphalt allows"""
 MIN_FEASIBLE_TTC = 1.0
 """[s]"""
 MAX_FEASIBLE_BRAKING = 6.0
@@ -26,125 +21,27 @@ MAX_FEASIBLE_BRAKING = 6.0
 FEASIBILITY_TOLERANCE = 1e-6
 
 FEASIBLE = "feasible"
-
-
-def min_time_gap(episode: Episode) -> float:
-    """Smallest time headway of the CAV, gap over speed, while it drives faster than 1 m/s [s]; NaN if never.
-
-    In any simulation step, as all that follows; on the merge after every decision.
-    """
-    return _nan_if_infinite(episode.audit.following.min_time_gap)
-
-
-def _nan_if_infinite(value: float) -> float:
-    return value if isfinite(value) else nan
-
-
-def share_short_time_gap(episode: Episode) -> float:
-    """Share of the CAV's time faster than 1 m/s with a time headway below one second."""
-    return episode.audit.following.share_short_time_gap
-
-
-def min_ttc(episode: Episode) -> float:
-    """Smallest time to collision [s], gap over closing speed, of the CAV and of the vehicle behind it.
-
-    Infinite where nobody ever closed in. Hayward 1972.
-    """
-    smallest = np.inf
-    for trajectory in episode.trajectories:
-        own, leader, gap, follower, gap_behind, *_ = trajectory.states
-        for distance, closing in ((gap, own - leader), (gap_behind, follower - own)):
-            near = closing > 0
-            smallest = min(smallest, float((distance[near] / closing[near]).min(initial=np.inf)))
-    return smallest
-
-
-def cav_min_ttc(episode: Episode) -> float:
-    """Smallest time to collision of the CAV with the vehicle ahead [s]; NaN where it never closed in."""
-    return _nan_if_infinite(episode.audit.following.min_time_to_collision)
-
-
-def max_drac(episode: Episode) -> float:
-    """Largest deceleration rate to avoid a crash of the CAV, closing speed squared over twice the gap [m/s2].
-
-    Almqvist, Hyden and Risser 1991.
-    """
-    return episode.audit.following.max_required_braking
-
-
-def max_jerk(episode: Episode) -> float:
-    """Largest change of the CAV's acceleration over time [m/s3]."""
-    return episode.audit.following.max_jerk
-
-
-def cav_max_braking(episode: Episode) -> float:
-    """Hardest braking of a CAV [m/s2]; NaN where nobody is automated."""
-    return episode.audit.cav_braking.max_braking if episode.audit.cav_braking.samples else nan
-
-
-def cut_in_max_braking(episode: Episode) -> float:
-    """Hardest braking of a CAV in the 3 s after somebody else came before it [m/s2], on roads with lanes.
-
-    It is not part of the other brakings of CAVs; NaN where nobody may cut in.
-    """
-    return episode.audit.cut_in_braking.max_braking if episode.audit.cut_in_braking.samples else nan
-
-
-def human_max_braking(episode: Episode) -> float:
-    """Hardest braking of people [m/s2]."""
-    return episode.audit.human_braking.max_braking
-
-
-def braking_beyond_metric(group: Literal["humans", "cavs"], limit: float) -> Callable[[Episode], float]:
-    """Return the metric of how often people or CAVs brake beyond one of BEYOND [m/s2]."""
-
-    def beyond(episode: Episode) -> float:
-        brakings = episode.audit.human_braking if group == "humans" else episode.audit.cav_braking
-        moments = brakings.samples
-        return 1e6 * brakings.exceedances[BRAKING_THRESHOLDS.index(limit)] / moments if moments else nan
-
-    beyond.__doc__ = (
-        f"{group.capitalize()}: vehicle-steps with braking beyond {limit:g} m/s2 [per million]. ".replace("Cavs", "CAVs")
-        + "ISO 15622 allows 3.5 above 20 m/s; dry asphalt allows hardly 9."
-    )
-    return beyond
-
-
-def filter_override_share(episode: Episode) -> float:
-    """Share of the CAV's decisions in which the safety filter braked harder than its driver."""
-    shares = [(trajectory.filter_braking > 0).mean() for trajectory in episode.trajectories]
-    return float(np.mean(shares)) if shares else nan
-
-
-def override_share(episode: Episode) -> float:
-    """Share of commands that SUMO's safety check changed, but for the right of way."""
-    return episode.audit.following.override_share
-
-
-def yield_share(episode: Episode) -> float:
-    """Share of commands that SUMO changed near a crossing, where vehicles yield."""
-    return episode.audit.following.yield_share
+HARD_BRAKING_METRIC = "human_braking_beyond_4_5"
+"""metric of human drivers that is compared with the human baseline"""
 
 
 def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> str:
-    """Return the verdict on an episode: `feasibility`, or the first reason why not.
+    """Return the verdict on an episode: `FEASIBLE`, or the first reason against it.
 
-    Empty where nobody automated drove, or the episode failed. `people_alone` is how often in a million
-    moments people brake beyond 4.5 m/s2 where there are no CAVs; None: nobody looked.
+    It is empty for an episode that failed or had no CAV. `baseline_braking` is how often human drivers brake
+    beyond 4.5 m/s2 without CAVs [per million vehicle-steps]; None: unknown.
     """
     if row["status"] == "failed" or isnan(row["cav_max_braking"]):
         return ""
-    alone = "not driven" if baseline_braking is None else f"{baseline_braking:.0f}"
-    floor, lanes = row.get("required_time_gap") or DEFAULT_REQUIRED_TIME_GAP, row.get("has_lanes", False)
-    smallest = MIN_TIME_GAP_WITH_LANES if lanes else MIN_TIME_GAP_FRACTION * floor
+    required, has_lanes = row.get("required_time_gap") or DEFAULT_REQUIRED_TIME_GAP, row.get("has_lanes", False)
+    time_gap, human_braking = row["min_time_gap"], row[HARD_BRAKING_METRIC]
+    min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
+    baseline = "not driven" if baseline_braking is None else f"{baseline_braking:.0f}"
     checks = [
         (row["status"] == "collision", f"{row['collisions']:.0f} vehicles in contact"),
         ((contacts := row.get("contacts", 0)) > 0, f"{contacts} CAVs in contact"),
-        (
-            row["min_time_gap"] < smallest - FEASIBILITY_TOLERANCE,
-            f"follows at {row['min_time_gap']:.2f} s (floor {floor:g} s)",
-        ),
-        *(_lane_checks(row, floor) if lanes else ()),
+        (time_gap < min_time_gap - FEASIBILITY_TOLERANCE, f"time gap {time_gap:.2f} s (limit {required:g} s)"),
+        *(_lane_checks(row, required) if has_lanes else ()),
         (row["cav_min_ttc"] < MIN_FEASIBLE_TTC - FEASIBILITY_TOLERANCE, f"{row['cav_min_ttc']:.2f} s to a collision"),
         (
             row["cav_max_braking"] > MAX_FEASIBLE_BRAKING + FEASIBILITY_TOLERANCE,
@@ -152,54 +49,48 @@ def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> s
         ),
         (row["override_share"] > 0, f"SUMO overrides {100 * row['override_share']:.2g} % of its commands"),
         (
-            row["human_braking_beyond_4_5"] > (baseline_braking or 0.0),
-            f"people brake beyond 4.5 m/s2 {row['human_braking_beyond_4_5']:.0f} times in a million moments "
-            f"(without CAVs: {alone})",
+            human_braking > (baseline_braking or 0.0),
+            f"human drivers brake beyond 4.5 m/s2 {human_braking:.0f} times in a million vehicle-steps "
+            f"(without CAVs: {baseline})",
         ),
     ]
     return next((reason for fails, reason in checks if fails), FEASIBLE)
 
 
 def _lane_checks(row: dict[str, Any], required_time_gap: float) -> tuple[tuple[bool, str], ...]:
-    """Return what is asked besides where others may cut in."""
+    """Return the additional checks on roads where other vehicles may cut in."""
     short, braking = row["share_short_time_gap"], row["cut_in_max_braking"]
-    return (
-        (short > MAX_SHORT_TIME_GAP_SHARE, f"follows below {required_time_gap:g} s in {100 * short:.2g} % of the time"),
-        (
-            braking > MAX_CUT_IN_BRAKING + FEASIBILITY_TOLERANCE,
-            f"brakes with {braking:.1f} m/s2 where somebody cuts in",
-        ),
-    )
+    short_text = f"time gap below {required_time_gap:g} s in {100 * short:.2g} % of the time"
+    hard = braking > MAX_CUT_IN_BRAKING + FEASIBILITY_TOLERANCE
+    return (short > MAX_SHORT_TIME_GAP_SHARE, short_text), (hard, f"brakes with {braking:.1f} m/s2 after a cut-in")
 
 
 def feasibility_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
-    """Return the verdict on each driver of a road; people alone, where they are among them, are `human`."""
+    """Return the verdict on each driver of a road; that of the human baseline is empty."""
     return {
         label: overall_feasibility(rows, baseline_rows(label, rows_by_driver)) for label, rows in rows_by_driver.items()
     }
 
 
 def baseline_rows(label: str, rows_by_driver: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the rows of people alone on a driver's road: of results that are compared, those of its own."""
+    """Return the rows of the human baseline of a driver; of compared results, those of the same result."""
     result, _, _ = label.rpartition(": ")
     return rows_by_driver.get(f"{result}: human", rows_by_driver.get("human", []))
 
 
 def overall_feasibility(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]] = ()) -> str:
-    """Return one verdict on all episodes of a driver: the first reason against any of them, and how many.
+    """Return one verdict on all episodes of a driver: the first reason against any of them, and how many violate.
 
-    `people` are the episodes of the same road in which nobody is automated: what people do there is no
-    driver's fault.
+    `baseline` has the rows of human-only traffic on the same road: a driver is not blamed for braking that
+    human drivers do without CAVs.
     """
-    alone = [row["human_braking_beyond_4_5"] for row in baseline if row["status"] == "completed"]
-    share = sum(alone) / len(alone) if alone else None
-    verdicts = [feasibility({**row, "human_braking_beyond_4_5": 0.0}) for row in rows]
-    wrong = [verdict for verdict in verdicts if verdict not in ("", FEASIBLE)]
-    if wrong:
-        return f"{wrong[0]} ({len(wrong)} of {len(verdicts)})"
+    alone = [row[HARD_BRAKING_METRIC] for row in baseline if row["status"] == "completed"]
+    verdicts = [feasibility({**row, HARD_BRAKING_METRIC: 0.0}) for row in rows]
+    if violations := [verdict for verdict in verdicts if verdict not in ("", FEASIBLE)]:
+        return f"{violations[0]} ({len(violations)} of {len(verdicts)})"
     pairs = zip(rows, verdicts, strict=True)
-    judged = [row for row, verdict in pairs if verdict and row["status"] == "completed"]
-    if not judged:
+    completed = [row for row, verdict in pairs if verdict and row["status"] == "completed"]
+    if not completed:
         return ""
-    mean = sum(row["human_braking_beyond_4_5"] for row in judged) / len(judged)
-    return feasibility({**judged[0], "human_braking_beyond_4_5": mean}, share)
+    mean = sum(row[HARD_BRAKING_METRIC] for row in completed) / len(completed)
+    return feasibility({**completed[0], HARD_BRAKING_METRIC: mean}, sum(alone) / len(alone) if alone else None)

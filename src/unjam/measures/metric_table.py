@@ -1,4 +1,4 @@
-"""The table of all metrics, for terminals and pages alike: drivers, and what each is beyond a baseline."""
+"""The table of all metrics, for terminals and pages alike: drivers, and their differences to a baseline."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,9 +20,9 @@ from unjam.measures.statistics import (
 )
 
 RowsByDriver = dict[str, list[dict[str, Any]]]
-"""by driver: a row of metrics per episode, failed ones too"""
+"""by driver: a row of metrics per episode, failed episodes included"""
 HUMAN_LABEL = "human"
-"""label of people alone"""
+"""label of the human baseline"""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class TableCell:
 
     mean: str
     interval: str = ""
-    """or the range, where there is none; and of how many episodes, where not of all"""
+    """CI, or the range if there is none; with the number of episodes if it is not of all"""
 
     def __str__(self) -> str:
         """Return both, on one line."""
@@ -49,7 +49,7 @@ class TableRow:
 
 
 def choose_baseline(rows_by_driver: RowsByDriver) -> str:
-    """Return beside whom the others stand: people alone, else the expert that earns most; empty: nobody."""
+    """Return the driver to compare with: the human baseline, else the expert with the largest return; or empty."""
     if len(rows_by_driver) < 2 or HUMAN_LABEL in rows_by_driver:
         return HUMAN_LABEL if len(rows_by_driver) > 1 else ""
     returns = {
@@ -66,35 +66,33 @@ def table_headings(rows_by_driver: RowsByDriver, baseline: str) -> list[str]:
 
 
 def metric_table(rows_by_driver: RowsByDriver, baseline: str) -> list[TableRow]:
-    """Return the verdict, how often each earns more than the baseline, and all metrics.
+    """Return the verdicts, the probabilities of improvement over the baseline, and all metrics.
 
-    A cell per driver, then the differences to the baseline, same seeds paired; none without one.
+    A row has a cell per driver, then the paired differences to the baseline; none without a baseline.
     """
     compared = _compared_rows(rows_by_driver, baseline)
     pairs = {label: len(pair_rows(rows, rows_by_driver[baseline])) for label, rows in compared.items()}
-    said = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]
-    about = "The first reason against it; docs: What a car can drive."
-    table = [TableRow("feasible", "", about, [*said, *(TableCell("") for _ in compared)])]
+    verdicts = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]
+    description = "The first violated limit; see docs/safety.md."
+    table = [TableRow("feasible", "", description, [*verdicts, *(TableCell("") for _ in compared)])]
     if compared:
-        about = f"Share of seeds on which it earns more than {baseline}, a tie counting half; Wilson's interval."
-        found = [
+        description = f"Share of seeds with a larger return than {baseline}; a tie counts half. Wilson's interval."
+        improvements = [
             probability_of_improvement(paired_differences([rows], rows_by_driver[baseline], "return"))
             for rows in compared.values()
         ]
-        cells = [*(TableCell("") for _ in rows_by_driver), *(estimate_cell(each, 2) for each in found)]
-        table.append(TableRow("probability of improvement", "in return", about, cells))
+        cells = [*(TableCell("") for _ in rows_by_driver), *(estimate_cell(each, 2) for each in improvements)]
+        table.append(TableRow("probability of improvement", "in return", description, cells))
     for name, metric in METRICS.items():
-        if not any(metric_estimate(rows, name).count for rows in rows_by_driver.values()):
+        estimates = [(metric_estimate(rows, name), len(rows)) for rows in rows_by_driver.values()]
+        if not any(each.count for each, _ in estimates):
             continue  # it is not defined on this road
-        cells = [
-            estimate_cell(metric_estimate(rows, name), metric.digits, len(rows)) for rows in rows_by_driver.values()
-        ]
+        cells = [estimate_cell(each, metric.digits, episodes) for each, episodes in estimates]
         cells += [
             estimate_cell(paired_difference(rows, rows_by_driver[baseline], name), metric.digits, pairs[label], "+")
             for label, rows in compared.items()
         ]
-        about = " ".join((metric.function.__doc__ or "").split())
-        table.append(TableRow(metric.label, metric.unit, about, cells))
+        table.append(TableRow(metric.label, metric.unit, " ".join((metric.function.__doc__ or "").split()), cells))
     return table
 
 
@@ -103,14 +101,14 @@ def _compared_rows(rows_by_driver: RowsByDriver, baseline: str) -> RowsByDriver:
 
 
 def estimate_cell(estimate: Estimate, digits: int, expected_count: int | None = None, sign: str = "") -> TableCell:
-    """Return a cell: mean and interval, unless that is a point; of how many, where `wanted` are more."""
+    """Return a cell: mean and CI, unless that is a point; with the count if it is below `expected_count`."""
     if estimate.count == 0:
         return TableCell("–")
-    shown = f"{sign if estimate.mean else ''}.{display_digits(estimate, digits)}f"
-    interval = "" if estimate.smallest == estimate.largest else format_ci(estimate, shown)
+    format_spec = f"{sign if estimate.mean else ''}.{display_digits(estimate, digits)}f"
+    interval = "" if estimate.smallest == estimate.largest else format_ci(estimate, format_spec)
     if expected_count is not None and estimate.count < expected_count:
         interval = f"{interval} {estimate.count} of {expected_count}".strip()
-    return TableCell(f"{estimate.mean:{shown}}", interval)
+    return TableCell(f"{estimate.mean:{format_spec}}", interval)
 
 
 def with_no_break_spaces(text: str) -> str:

@@ -1,36 +1,21 @@
-"""What is measured of an episode. Each metric is defined here, once, with its unit and source."""
+"""Metrics of an episode: each is defined here once, with its unit and source."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from math import inf, prod
+from math import inf, isfinite, nan, prod
 from typing import Any, Literal
 
 import numpy as np
 
-from unjam.measures.feasibility import (
-    braking_beyond_metric,
-    cav_max_braking,
-    cav_min_ttc,
-    cut_in_max_braking,
-    feasibility,
-    filter_override_share,
-    human_max_braking,
-    max_drac,
-    max_jerk,
-    min_time_gap,
-    min_ttc,
-    override_share,
-    share_short_time_gap,
-    yield_share,
-)
-from unjam.worlds.audit import BRAKING_THRESHOLDS, OVERRIDE_TOLERANCE
+from unjam.measures.feasibility import feasibility
+from unjam.worlds.audit import BRAKING_THRESHOLDS, OVERRIDE_TOLERANCE, BrakingStatistics
 from unjam.worlds.episode_reward import MAX_REWARD_CELLS, episode_reward_terms
-from unjam.worlds.record import Episode, Floats
+from unjam.worlds.record import Episode, Floats, Trajectory
 from unjam.worlds.reward import eq16_reward
 from unjam.worlds.trips import VEHICLE_GROUPS
 
 STEADY_STATE_STEPS = 1000
-"""decisions at the end of an episode that count as steady state; of one that is no longer, its second half"""
+"""control steps at the end of an episode that count as steady state; of a shorter episode, its second half"""
 STANDING_SPEED = 0.1
 """[m/s]; SUMO's own threshold for a halting vehicle"""
 MAX_CALM_SPEED_STD = 0.3
@@ -42,52 +27,55 @@ GASOLINE_DENSITY = 742.0
 SHARE_BOUNDS, UNBOUNDED = (0.0, 1.0), (-inf, inf)
 """bounds of metrics; others are not negative"""
 PEAK_END_SECONDS = 600.0
-"""end of a peak of demand in which flow is counted [s]: then it is capacity, not demand"""
+"""end of the demand peak in which flow is counted [s]: there it is capacity, not demand"""
+
+EpisodeFunction = Callable[[Episode], float]
 
 
 def _steady_state(values: Floats) -> Floats:
     return values[-STEADY_STATE_STEPS:] if len(values) > STEADY_STATE_STEPS else values[len(values) // 2 :]
 
 
-def _mean_over_cavs(values: Sequence[Any]) -> float:
-    """Return the mean over CAVs; NaN where there were none."""
-    return float(np.mean(values)) if len(values) else float("nan")
+def _mean_over_cavs(episode: Episode, function: Callable[[Trajectory], Any]) -> float:
+    """Return the mean over the CAVs; NaN without any."""
+    values = [function(trajectory) for trajectory in episode.trajectories]
+    return float(np.mean(values)) if values else nan
 
 
 def _chunks(speeds: Floats) -> Iterator[Floats]:
-    """Return moments part by part: of hours of traffic there is no copy."""
+    """Return the rows in chunks, so that hours of traffic are not copied as a whole."""
     rows = max(1, MAX_REWARD_CELLS // max(1, prod(speeds.shape[1:])))
     return (speeds[start : start + rows] for start in range(0, len(speeds), rows))
 
 
 def _mean_of_present(speeds: Floats, transform: Callable[[Floats], Any] = np.asarray) -> float:
-    """Return the mean of what `of` makes of all that are on the road; NaN where nobody ever was."""
+    """Return the mean of `transform` over all vehicle-steps on the road; NaN without any."""
     total, count = 0.0, 0
-    for part in _chunks(speeds):
-        there = part[~np.isnan(part)]
-        total, count = total + float(transform(there).sum()), count + there.size
-    return total / count if count else float("nan")
+    for chunk in _chunks(speeds):
+        present = chunk[~np.isnan(chunk)]
+        total, count = total + float(transform(present).sum()), count + present.size
+    return total / count if count else nan
 
 
 def _per_step(function: Callable[..., Floats], speeds: Floats) -> Floats:
-    """Return `np.nanmean` or the like of each moment; NaN where nobody is."""
-    found = []
-    for part in _chunks(speeds):
-        there = ~np.isnan(part).all(axis=1)
-        found.append(np.full(len(part), np.nan))
-        found[-1][there] = function(part[there], axis=1)
-    return np.concatenate([np.zeros(0), *found])
+    """Return `np.nanmean` or the like of each step; NaN for steps without vehicles."""
+    results = []
+    for chunk in _chunks(speeds):
+        occupied = ~np.isnan(chunk).all(axis=1)
+        results.append(np.full(len(chunk), np.nan))
+        results[-1][occupied] = function(chunk[occupied], axis=1)
+    return np.concatenate([np.zeros(0), *results])
 
 
 def mean_speed(episode: Episode) -> float:
-    """Mean over all vehicles and all steps of the episode, start-up included [m/s]. The honest convention."""
+    """Mean over all vehicles and all steps of the episode, start-up included [m/s]."""
     return _mean_of_present(episode.speeds[1:])
 
 
 def mean_speed_step_average(episode: Episode) -> float:
-    """Mean over the moments of the mean over the vehicles then on the road [m/s]: Flow's convention.
+    """Mean over the steps of the mean over the vehicles then on the road [m/s]: Flow's convention.
 
-    Where vehicles come and go it counts a moment with few vehicles as much as one in a jam.
+    On an open road a step with few vehicles counts as much as one in a jam.
     """
     return _mean_of_present(_per_step(np.nanmean, episode.speeds[1:]))
 
@@ -103,9 +91,9 @@ def mean_speed_second_half(episode: Episode) -> float:
 
 
 def speed_std_fleet(episode: Episode) -> float:
-    """Standard deviation of speed across vehicles at one moment, averaged over the episode [m/s].
+    """Standard deviation of speed across vehicles in a step, averaged over the episode [m/s].
 
-    The size of the waves: zero when all drive alike. Stern et al. 2018, section 4.
+    It is the size of the waves: zero when all vehicles have the same speed. Stern et al. 2018, section 4.
     """
     return _mean_of_present(_per_step(np.nanstd, episode.speeds[1:]))
 
@@ -117,12 +105,12 @@ def speed_std_fleet_steady(episode: Episode) -> float:
 
 def speed_std_cav(episode: Episode) -> float:
     """Standard deviation over time of the CAV's own speed [m/s]: the paper's `speed std` (Table 1)."""
-    return _mean_over_cavs([np.std(trajectory.states.speed[1:]) for trajectory in episode.trajectories])
+    return _mean_over_cavs(episode, lambda trajectory: np.std(trajectory.states.speed[1:]))
 
 
 def cav_mean_speed(episode: Episode) -> float:
     """Mean over time of the CAV's own speed [m/s]: the paper's `average speed` (Table 1)."""
-    return _mean_over_cavs([np.mean(trajectory.states.speed[1:]) for trajectory in episode.trajectories])
+    return _mean_over_cavs(episode, lambda trajectory: np.mean(trajectory.states.speed[1:]))
 
 
 def speed_limit_ratio(episode: Episode) -> float:
@@ -136,161 +124,252 @@ def speed_limit_ratio_steady(episode: Episode) -> float:
 
 
 def episode_return(episode: Episode) -> float:
-    """Sum of the reward that the episode was run with, not discounted; all CAVs share it."""
+    """Sum of the reward of the episode, not discounted; all CAVs share it."""
     return float(episode.reward.sum())
 
 
 def return_eq16(episode: Episode) -> float:
-    """Sum of the paper's reward, Eq. 16 with its sign mended, not discounted."""
+    """Sum of the paper's reward, Eq. 16 with its sign corrected, not discounted."""
     crashed = episode.status == "collision"
     terms = episode_reward_terms(eq16_reward, episode.speeds, episode.trajectories, crashed, episode.backlog)
     return float(sum(term.sum() for term in terms.values()))
 
 
 def mean_abs_accel(episode: Episode) -> float:
-    """Mean absolute acceleration that the CAV was told [m/s2]; of a human driver, what it did."""
-    return _mean_over_cavs([np.abs(trajectory.applied_acceleration).mean() for trajectory in episode.trajectories])
+    """Mean absolute commanded acceleration of the CAV [m/s2]; of a human driver, the actual one."""
+    return _mean_over_cavs(episode, lambda trajectory: np.abs(trajectory.applied_acceleration).mean())
 
 
 def mean_abs_jerk(episode: Episode) -> float:
     """Mean absolute change of the CAV's actual acceleration per second [m/s3]."""
     speeds = (trajectory.states.speed for trajectory in episode.trajectories)
     jerks = [np.abs(np.diff(speed, 2)).mean() for speed in speeds if len(speed) > 2]
-    return float(np.mean(jerks) / episode.control_step**2) if jerks else float("nan")
+    return float(np.mean(jerks) / episode.control_step**2) if jerks else nan
+
+
+def min_ttc(episode: Episode) -> float:
+    """Minimum time to collision [s], gap over closing speed, of the CAV and of its follower.
+
+    Infinite if no vehicle ever closed in. Hayward 1972.
+    """
+    smallest = inf
+    for trajectory in episode.trajectories:
+        own, leader, gap, follower, gap_behind, *_ = trajectory.states
+        for distance, closing in ((gap, own - leader), (gap_behind, follower - own)):
+            near = closing > 0
+            smallest = min(smallest, float((distance[near] / closing[near]).min(initial=inf)))
+    return smallest
 
 
 def share_standing(episode: Episode) -> float:
     """Share of vehicle-seconds spent below 0.1 m/s."""
-    return _mean_of_present(episode.speeds[1:], lambda there: there < STANDING_SPEED)
+    return _mean_of_present(episode.speeds[1:], lambda speeds: speeds < STANDING_SPEED)
 
 
 def time_to_dissolve(episode: Episode) -> float:
-    """Time until the wave that an episode starts with is dissolved [s]; NaN if there is none or it stays.
+    """Time until the wave at the start of the episode is dissolved [s]; NaN without a wave, or if it stays.
 
-    From the first decision to the first moment from which on the std of speed across vehicles stays below
-    0.3 m/s for 60 s on end.
+    It ends with the first moment from which on the std of speed across vehicles stays below 0.3 m/s for 60 s.
     """
     spread = _per_step(np.nanstd, episode.speeds)
     calm = np.isnan(spread) | (spread < MAX_CALM_SPEED_STD)
-    needed = round(MIN_CALM_SECONDS / episode.control_step)
-    if calm[0] or len(calm) < needed:
-        return float("nan")
-    found = np.flatnonzero(np.convolve(calm, np.ones(needed), "valid") > needed - 0.5)
-    return float(found[0] * episode.control_step) if len(found) else float("nan")
+    steps = round(MIN_CALM_SECONDS / episode.control_step)
+    if calm[0] or len(calm) < steps:
+        return nan
+    dissolved = np.flatnonzero(np.convolve(calm, np.ones(steps), "valid") > steps - 0.5)
+    return float(dissolved[0] * episode.control_step) if len(dissolved) else nan
 
 
 def collisions(episode: Episode) -> float:
-    """Vehicles that collided, on a user's network by its own settings; with a CAV it ends the episode."""
+    """Vehicles that collided, on a user's network by its own settings; a collision of a CAV ends the episode."""
     return float(episode.collisions)
 
 
+def filter_override_share(episode: Episode) -> float:
+    """Share of the CAV's control steps in which the safety filter braked harder than its driver."""
+    return _mean_over_cavs(episode, lambda trajectory: (trajectory.filter_braking > 0).mean())
+
+
 def shield_override_share(episode: Episode) -> float:
-    """Share of the CAV's commands that SUMO's safety check did not let pass."""
-    return _mean_over_cavs(
-        [(trajectory.shield_braking > OVERRIDE_TOLERANCE).mean() for trajectory in episode.trajectories]
-    )
+    """Share of the CAV's commands that SUMO's safety check changed."""
+    return _mean_over_cavs(episode, lambda trajectory: (trajectory.shield_braking > OVERRIDE_TOLERANCE).mean())
 
 
 def shield_max_braking(episode: Episode) -> float:
-    """Hardest braking that the safety check added to a command [m/s2]."""
+    """Maximum braking that the safety check added to a command [m/s2]."""
     return float(max((trajectory.shield_braking.max() for trajectory in episode.trajectories), default=np.nan))
 
 
 def fuel_ml_per_km(episode: Episode) -> float:
-    """Fuel of all vehicles per kilometre [ml/km], by the scenario's emission class; NaN if nobody drove.
+    """Fuel of all vehicles per kilometer [ml/km], by the scenario's emission class; NaN without any distance.
 
     SUMO's emission model, where it was recorded: https://sumo.dlr.de/docs/Models/Emissions.html
     """
-    driven = sum(float(np.nansum(part)) for part in _chunks(episode.speeds[1:])) * episode.control_step
-    if episode.fuel.size == 0 or driven == 0:
-        return float("nan")
-    return float(np.nansum(episode.fuel)) * episode.control_step / GASOLINE_DENSITY / (driven / 1000.0)
+    distance = sum(float(np.nansum(chunk)) for chunk in _chunks(episode.speeds[1:])) * episode.control_step
+    if episode.fuel.size == 0 or distance == 0:
+        return nan
+    return float(np.nansum(episode.fuel)) * episode.control_step / GASOLINE_DENSITY / (distance / 1000.0)
 
 
 def outflow_veh_per_h(episode: Episode) -> float:
-    """Flow [veh/h]: on a closed road distance driven by all vehicles over length and time (Edie 1963); of a
-    road with ends, who left it over the time that it was to be driven; of a peak, in its last ten minutes.
+    """Flow [veh/h]. On a closed road: distance of all vehicles over length and time (Edie 1963). On an open
+    road: vehicles that left it over the planned duration; with a demand peak, in its last ten minutes.
     """
+    step, steps = episode.control_step, episode.control_steps
     if episode.demand_peak[1] > 0:
-        end = min(round(episode.demand_peak[1] / episode.control_step), episode.control_steps)
-        first = round(episode.demand_peak[0] / episode.control_step)
-        begin = max(first if first < end else 0, end - round(PEAK_END_SECONDS / episode.control_step))
-        there = ~np.isnan(episode.speeds[begin : end + 1])
-        left = (there[:-1] & ~there[1:]).sum()
-        return float(left * 3600.0 / max(end - begin, 1) / episode.control_step)
-    hours, planned = (
-        episode.control_steps * episode.control_step / 3600.0,
-        np.nan_to_num(episode.planned_duration) / 3600.0,
-    )
+        end, peak_start = min(round(episode.demand_peak[1] / step), steps), round(episode.demand_peak[0] / step)
+        begin = max(peak_start if peak_start < end else 0, end - round(PEAK_END_SECONDS / step))
+        present = ~np.isnan(episode.speeds[begin : end + 1])
+        left = (present[:-1] & ~present[1:]).sum()
+        return float(left * 3600.0 / max(end - begin, 1) / step)
+    hours, planned = steps * step / 3600.0, np.nan_to_num(episode.planned_duration) / 3600.0
     if np.isnan(episode.loop_length):
         return episode.arrivals / (hours if episode.status == "collision" else max(hours, planned))
-    driven = np.nansum(episode.positions[-1] - episode.positions[0])
-    return float(driven / episode.loop_length / hours)
+    distance = np.nansum(episode.positions[-1] - episode.positions[0])
+    return float(distance / episode.loop_length / hours)
 
 
 def mean_travel_time(episode: Episode) -> float:
-    """Mean time per vehicle that wanted to drive, waiting to enter included [s]; NaN on a closed road.
+    """Mean time of the vehicles of the demand, departure delay included [s]; NaN on a closed road.
 
-    The integral over time of who is on the road or waits to be, over how many wanted to enter: nobody gains
-    by keeping vehicles out. Who is under way at the end counts with the time so far, at a collision with all.
-    On a network of the user's own it is the mean over SUMO's trips: `duration` and `departDelay`.
+    It is the integral over time of the vehicles on the road and in the insertion backlog, over the vehicles
+    of the demand, so that keeping vehicles out is no gain. Vehicles under way at the end count with their time
+    so far, after a collision with all the planned time. On a user's network: mean `duration` plus
+    `departDelay` of SUMO's trips.
     """
-    if episode.trips.vehicle_ids and episode.status != "collision":
+    collided = episode.status == "collision"
+    if episode.trips.vehicle_ids and not collided:
         return float(episode.trips.travel_time.mean())
     if not len(episode.backlog):
-        return float("nan")
+        return nan
     under_way = (~np.isnan(episode.speeds)).sum(axis=1) + episode.backlog
-    demanded = len(episode.vehicle_ids) + episode.backlog[-1] - episode.teleported
-    lost = (
-        max(0.0, episode.planned_duration - episode.control_steps * episode.control_step)
-        if episode.status == "collision"
-        else 0.0
-    )
-    return float((under_way[1:].sum() * episode.control_step + under_way[-1] * lost) / (demanded or np.nan))
+    demand = len(episode.vehicle_ids) + episode.backlog[-1] - episode.teleported
+    remaining = episode.planned_duration - episode.control_steps * episode.control_step
+    lost = max(0.0, remaining) if collided else 0.0
+    return float((under_way[1:].sum() * episode.control_step + under_way[-1] * lost) / (demand or np.nan))
 
 
 def delay(episode: Episode) -> float:
-    """Mean delay of a trip [s]: SUMO's `timeLoss` and `departDelay` on a network of the user's own, elsewhere
-    travel time beyond that on a free road; NaN where neither is known.
+    """Mean delay of a trip [s]: SUMO's `timeLoss` plus `departDelay` on a user's network, elsewhere travel time
+    minus that on a free road; NaN if neither is known.
     """
     trips = episode.trips
     return float(trips.delay.mean()) if trips.vehicle_ids else mean_travel_time(episode) - episode.free_flow_time
 
 
-def travel_time_metric(group: str) -> Callable[[Episode], float]:
-    """Return the metric that is the travel time of one group of vehicles, waiting included [s]."""
+def min_time_gap(episode: Episode) -> float:
+    """Minimum time gap of the CAV, net gap over own speed, while it drives faster than 1 m/s [s]; NaN if never.
+
+    This and the following values of the audit cover all simulation steps; on the merge, all control steps.
+    """
+    return _nan_if_infinite(episode.audit.following.min_time_gap)
+
+
+def _nan_if_infinite(value: float) -> float:
+    return value if isfinite(value) else nan
+
+
+def cav_min_ttc(episode: Episode) -> float:
+    """Minimum time to collision of the CAV with its leader [s]; NaN if it never closed in."""
+    return _nan_if_infinite(episode.audit.following.min_time_to_collision)
+
+
+def share_short_time_gap(episode: Episode) -> float:
+    """Share of the CAV's time faster than 1 m/s with a time gap below one second."""
+    return episode.audit.following.share_short_time_gap
+
+
+def max_drac(episode: Episode) -> float:
+    """Maximum deceleration rate to avoid a crash of the CAV, closing speed squared over twice the gap [m/s2].
+
+    Almqvist, Hyden and Risser 1991.
+    """
+    return episode.audit.following.max_required_braking
+
+
+def max_jerk(episode: Episode) -> float:
+    """Maximum change of the CAV's acceleration over time [m/s3]."""
+    return episode.audit.following.max_jerk
+
+
+def cav_max_braking(episode: Episode) -> float:
+    """Maximum braking of a CAV [m/s2]; NaN without CAVs."""
+    return _max_braking(episode.audit.cav_braking)
+
+
+def cut_in_max_braking(episode: Episode) -> float:
+    """Maximum braking of a CAV in the 3 s after another vehicle cut in [m/s2], on roads with lanes.
+
+    It is not part of the other braking of CAVs; NaN if there were no cut-ins.
+    """
+    return _max_braking(episode.audit.cut_in_braking)
+
+
+def _max_braking(statistics: BrakingStatistics) -> float:
+    return statistics.max_braking if statistics.samples else nan
+
+
+def human_max_braking(episode: Episode) -> float:
+    """Maximum braking of human drivers [m/s2]."""
+    return episode.audit.human_braking.max_braking
+
+
+def override_share(episode: Episode) -> float:
+    """Share of commands that SUMO's safety check changed, right of way excluded."""
+    return episode.audit.following.override_share
+
+
+def yield_share(episode: Episode) -> float:
+    """Share of commands that SUMO changed near a crossing, where vehicles yield."""
+    return episode.audit.following.yield_share
+
+
+def insertion_backlog_veh(episode: Episode) -> float:
+    """Vehicles in the insertion backlog at the end; zero on a closed road."""
+    return float(episode.backlog[-1]) if len(episode.backlog) else 0.0
+
+
+def travel_time_metric(group: str) -> EpisodeFunction:
+    """Return the metric that is the travel time of one group of vehicles, departure delay included [s]."""
 
     def mean(episode: Episode) -> float:
         return episode.trips.mean_travel_time(group)
 
-    mean.__doc__ = f"Mean travel time of {group} alone on a network of the user's own, waiting included [s]."
+    mean.__doc__ = f"Mean travel time of {group} on a user's network, departure delay included [s]."
     return mean
-
-
-def insertion_backlog_veh(episode: Episode) -> float:
-    """Vehicles that wait to enter at the end; on a closed road nobody does."""
-    return float(episode.backlog[-1]) if len(episode.backlog) else 0.0
 
 
 @dataclass(frozen=True)
 class Metric:
     """A metric as tables show it."""
 
-    function: Callable[[Episode], float]
+    function: EpisodeFunction
     label: str
     unit: str
     digits: int = 2
     bounds: tuple[float, float] = (0.0, inf)
-    """what it can be"""
+    """smallest and largest possible value"""
 
 
-def _braking_metrics(group: Literal["humans", "cavs"], key_prefix: str, label_prefix: str) -> dict[str, Metric]:
-    """Return the metrics of how often somebody brakes hard."""
-    return {
-        f"{key_prefix}_braking_beyond_{limit:g}".replace(".", "_"): Metric(
-            braking_beyond_metric(group, limit), f"{label_prefix} braking beyond {limit:g} m/s2", "per million", 0
+def _braking_metrics(group: Literal["CAV", "human"]) -> dict[str, Metric]:
+    """Return the metrics of how often CAVs or human drivers brake beyond each of `BRAKING_THRESHOLDS`."""
+
+    def exceedance(index: int, limit: float) -> EpisodeFunction:
+        def per_million(episode: Episode) -> float:
+            braking = episode.audit.cav_braking if group == "CAV" else episode.audit.human_braking
+            return 1e6 * braking.exceedances[index] / braking.samples if braking.samples else nan
+
+        per_million.__doc__ = (
+            f"Vehicle-steps ({group}, simulation steps) with braking beyond {limit:g} m/s2 [per million]. "
+            "ISO 15622 allows 3.5 above 20 m/s; dry asphalt hardly allows 9."
         )
-        for limit in BRAKING_THRESHOLDS
+        return per_million
+
+    return {
+        f"{group.lower()}_braking_beyond_{limit:g}".replace(".", "_"): Metric(
+            exceedance(index, limit), f"{group} braking beyond {limit:g} m/s2", "per million", 0
+        )
+        for index, limit in enumerate(BRAKING_THRESHOLDS)
     }
 
 
@@ -314,15 +393,19 @@ METRICS: dict[str, Metric] = {
     "min_ttc": Metric(min_ttc, "minimum time to collision", "s"),
     "min_time_gap": Metric(min_time_gap, "minimum time gap", "s"),
     "cav_min_ttc": Metric(cav_min_ttc, "CAV's minimum time to collision", "s"),
-    "share_short_time_gap": Metric(share_short_time_gap, "CAV's share of time with a time gap below 1 s", "", 4, SHARE_BOUNDS),
+    "share_short_time_gap": Metric(
+        share_short_time_gap, "CAV's share of time with a time gap below 1 s", "", 4, SHARE_BOUNDS
+    ),
     "max_drac": Metric(max_drac, "CAV's maximum DRAC", "m/s2"),
     "max_jerk": Metric(max_jerk, "CAV's maximum jerk", "m/s3", 1),
     "cav_max_braking": Metric(cav_max_braking, "CAV's maximum braking", "m/s2"),
     "cut_in_max_braking": Metric(cut_in_max_braking, "CAV's maximum braking after a cut-in", "m/s2"),
-    **_braking_metrics("cavs", "cav", "CAV"),
+    **_braking_metrics("CAV"),
     "human_max_braking": Metric(human_max_braking, "human drivers' maximum braking", "m/s2"),
-    **_braking_metrics("humans", "human", "human"),
-    "filter_override_share": Metric(filter_override_share, "control steps in which the safety filter braked", "", 4, SHARE_BOUNDS),
+    **_braking_metrics("human"),
+    "filter_override_share": Metric(
+        filter_override_share, "control steps in which the safety filter braked", "", 4, SHARE_BOUNDS
+    ),
     "override_share": Metric(override_share, "commands overridden by SUMO in car following", "", 4, SHARE_BOUNDS),
     "yield_share": Metric(yield_share, "commands overridden by SUMO at a crossing", "", 4, SHARE_BOUNDS),
     "collisions": Metric(collisions, "vehicles in collisions", "", 0),
@@ -341,9 +424,9 @@ METRICS: dict[str, Metric] = {
 
 
 def measure(episode: Episode) -> dict[str, Any]:
-    """Return the row of an episode: seed, status, steps, what was drawn, every metric by name, the verdict.
+    """Return the row of an episode: seed, status, steps, drawn values, every metric by name, the verdict.
 
-    The metrics of a failed episode are NaN, and its row has the reason.
+    The metrics of a failed episode are NaN; its row has the reason.
     """
     row = {
         "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),

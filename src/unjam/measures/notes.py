@@ -1,4 +1,4 @@
-"""What a reader of metrics should know first: missing demand, early ends, teleports, SUMO's warnings."""
+"""Notes to read before the metrics: missing demand, early ends, teleports, SUMO's warnings."""
 
 import re
 from collections import Counter
@@ -10,36 +10,31 @@ from unjam.measures.metric_table import RowsByDriver
 from unjam.measures.statistics import has_ended_early
 
 MAX_EARLY_END_SHARE = 0.05
-"""share of the baseline's episodes that may end early: beyond it there is nothing to compare with"""
+"""share of the baseline's episodes that may end early; beyond it comparisons would mislead"""
 MAX_WARNING_KINDS = 10
 """kinds of SUMO's warnings that are shown, the most frequent first"""
 MAX_BACKLOG_SHARE = 0.05
-"""share of the vehicles that had not entered by the end beyond which a note says so"""
+"""share of the vehicles in the insertion backlog at the end beyond which a note says so"""
 LOST_DEMAND_PATTERN = re.compile(
     "sorted by departure time|no (valid )?route|discard|removing vehicle|not reachable|inserted", re.IGNORECASE
 )
-"""what SUMO warns of where part of the demand is missing: these warnings come first"""
+"""SUMO's warnings of missing demand: these come first"""
 
 
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return all notes on the episodes of several drivers, the gravest first."""
+    """Return all notes on the episodes of several drivers, the most serious first."""
     lost, others = warning_notes(rows_by_driver)
-    return [
-        *lost,
-        *early_end_notes(rows_by_driver),
-        *_backlog_notes(rows_by_driver),
-        *teleport_notes(rows_by_driver),
-        *others,
-    ]
+    notes = (note(rows_by_driver) for note in (early_end_notes, _backlog_notes, teleport_notes))
+    return [*lost, *(each for group in notes for each in group), *others]
 
 
 def count_early_ends(rows: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """Return how many episodes ended early, by reason."""
+    """Return the number of episodes that ended early, by reason."""
     return dict(Counter(row.get("reason") or row["status"] for row in rows if has_ended_early(row)))
 
 
 def early_end_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return by driver how many episodes ended early, and why."""
+    """Return a note for each driver with episodes that ended early, with the reasons."""
     return [
         f"{label}: {_early_end_text(rows)}; means are over complete episodes only"
         for label, rows in rows_by_driver.items()
@@ -48,46 +43,47 @@ def early_end_notes(rows_by_driver: RowsByDriver) -> list[str]:
 
 
 def _early_end_text(rows: Sequence[dict[str, Any]]) -> str:
-    found = count_early_ends(rows)
-    why = ", ".join(f"{reason} ({count})" if len(found) > 1 else reason for reason, count in found.items())
-    return f"{sum(found.values())} of {len(rows)} episodes ended early: {why}"
+    counts = count_early_ends(rows)
+    reasons = ", ".join(f"{reason} ({count})" if len(counts) > 1 else reason for reason, count in counts.items())
+    return f"{sum(counts.values())} of {len(rows)} episodes ended early: {reasons}"
 
 
 def check_baseline(rows: Sequence[dict[str, Any]], planned_episodes: int = 0) -> None:
-    """Raise `InputError` where so many episodes of the baseline ended early that comparisons would mislead.
+    """Raise `InputError` if so many episodes of the human baseline ended early that comparisons would mislead.
 
     Args:
         rows: those of human-only traffic so far.
-        planned: how many there will be at least.
+        planned_episodes: their planned number, at least.
     """
     if sum(count_early_ends(rows).values()) > MAX_EARLY_END_SHARE * max(len(rows), planned_episodes):
         raise InputError(
-            f"human: {_early_end_text(rows)}; allowed: {100 * MAX_EARLY_END_SHARE:g} %, for CAVs are compared with the baseline"
+            f"human: {_early_end_text(rows)}; allowed: {100 * MAX_EARLY_END_SHARE:g} %, because CAVs are compared with "
+            "the baseline"
         )
 
 
 def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return by driver how often SUMO took a vehicle off the road: no road does that."""
+    """Return a note for each driver with teleports, which do not exist in real traffic."""
     counts = {label: sum(row["teleports"] for row in rows) for label, rows in rows_by_driver.items()}
     why = "that had stood for its time-to-teleport or collided"
     return [f"{label}: SUMO teleported or removed {count} vehicles {why}" for label, count in counts.items() if count]
 
 
 def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return by driver how many vehicles had not entered at the end, where they are more than a few."""
+    """Return a note for each driver with more than a few vehicles in the insertion backlog at the end."""
     notes = []
     for label, rows in rows_by_driver.items():
         complete = [row for row in rows if row["status"] == "completed"]
-        left = sum(row["insertion_backlog_veh"] for row in complete)
-        wanted = left + sum(row["vehicles"] for row in complete)
-        if left > MAX_BACKLOG_SHARE * wanted:
-            many = f"{left:.0f} of {wanted:.0f} vehicles"
-            notes.append(f"{label}: {many} had not entered by the end: they wait in the insertion backlog")
+        backlog = sum(row["insertion_backlog_veh"] for row in complete)
+        demand = backlog + sum(row["vehicles"] for row in complete)
+        if backlog > MAX_BACKLOG_SHARE * demand:
+            count = f"{backlog:.0f} of {demand:.0f} vehicles"
+            notes.append(f"{label}: {count} had not entered by the end: they wait in the insertion backlog")
     return notes
 
 
 def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
-    """Return a note for each kind of SUMO's warnings, with one example: of missing demand, and others."""
+    """Return a note with one example for each kind of SUMO's warnings: on missing demand, and others."""
     rows = [row for rows in rows_by_driver.values() for row in rows if row["status"] != "failed"]
     counts, episodes, examples = Counter[str](), Counter[str](), dict[str, str]()
     for each in (each for row in rows for each in row["warnings"]):
@@ -96,14 +92,13 @@ def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
         episodes[each["kind"]] += 1
     lost, others = list[str](), list[str]()
     for kind, count in counts.most_common():
-        often = f" ({count} warnings of this kind in {episodes[kind]} of {len(rows)} episodes)"
-        note = examples[kind] + (often if len(rows) > 1 or count > 1 else "")
+        frequency = f" ({count} warnings of this kind in {episodes[kind]} of {len(rows)} episodes)"
+        note = examples[kind] + (frequency if len(rows) > 1 or count > 1 else "")
         if LOST_DEMAND_PATTERN.search(kind):
             lost.append(f"demand is missing, SUMO warns: {note}")
         else:
             others.append(f"SUMO warns: {note}")
     if len(others) > MAX_WARNING_KINDS:
-        others[MAX_WARNING_KINDS:] = [
-            f"SUMO warns of {len(others) - MAX_WARNING_KINDS} other kinds of things, less often"
-        ]
+        rest = len(others) - MAX_WARNING_KINDS
+        others[MAX_WARNING_KINDS:] = [f"SUMO gives {rest} less frequent kinds of warnings"]
     return lost, others

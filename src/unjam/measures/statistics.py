@@ -1,7 +1,7 @@
-"""Means over seeds and over trainings, and how far to trust them: intervals that cover what they say.
+"""Means over seeds and over trainings, with confidence intervals (CI) that have the stated coverage.
 
-An interval is Student's t: it covers 95 % from three values on; a percentile bootstrap of five covers 84 %.
-Where none would cover there is none, and words show the range of the values instead.
+A CI is Student's t: it covers 95 % from three values on; a percentile bootstrap of five values covers 84 %.
+Where no CI would cover, there is none, and texts show the range of the values instead.
 """
 
 from collections.abc import Sequence
@@ -16,85 +16,89 @@ from unjam.measures.metrics import METRICS, UNBOUNDED
 
 CONFIDENCE = 0.95
 MIN_INTERVAL_VALUES = 3
-"""values without which there is no interval: that of two is thirteen times as wide as they are apart"""
+"""fewest values with a CI: that of two values is thirteen times as wide as their distance"""
 
 METRICS_DEFINED_AT_EARLY_END = {
     *("collisions", "min_ttc", "min_time_gap", "cav_min_ttc", "max_drac", "max_jerk", "shield_max_braking"),
     *("cav_max_braking", "cut_in_max_braking", "human_max_braking"),
 }
-"""metrics that also count where an episode ended early: how near a collision was, and how many there were"""
+"""metrics that also count for episodes that ended early: severity and number of conflicts"""
 RETURN_METRICS = {"return", "return_eq16"}
-"""metrics whose value at a collision the reward defines"""
+"""metrics that the reward defines also for a collision"""
 MIN_VERDICT_TRAININGS = 10
-"""without which nothing is said of a way to learn, only of these trainings"""
+"""fewest trainings for a verdict on a method; with fewer, it covers only these trainings"""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean with its interval, NaN where there is none; all of it NaN where there is nothing to average."""
+    """A mean with its CI, NaN without one; all values are NaN if there is nothing to average."""
 
     mean: float
     low: float
     high: float
     count: int
-    """values that it is the mean of"""
+    """number of values"""
     smallest: float = field(default=nan, compare=False)
     largest: float = field(default=nan, compare=False)
-    """of the values: what is said where there is no interval"""
+    """of the values: the range to show if there is no CI"""
+
+    @property
+    def half_width(self) -> float:
+        """Half the width of the CI; NaN without one."""
+        return (self.high - self.low) / 2.0
 
 
 def estimate(
     values: Sequence[float], confidence: float = CONFIDENCE, trim: float = 0.0, bounds: tuple[float, float] = UNBOUNDED
 ) -> Estimate:
-    """Return the mean of `values` and its interval, Student's t; NaN values are left out.
+    """Return the mean of independent `values` and its CI, Student's t; values that are not finite are left out.
 
-    Of fewer than `LEAST` values there is no interval, and that of equal values has no width.
+    Fewer than `MIN_INTERVAL_VALUES` values have no CI; equal values have one of no width.
 
     Args:
         values: independent of each other.
-        confidence: how often the interval shall hold the true mean.
-        trim: share that is left out at either end, 0.25 for the interquartile mean; the interval is then that
-            of the trimmed mean by winsorised variance: Tukey and McLaughlin 1963, Sankhya A 25.
-        bounds: what the mean can be; the interval is cut there, which takes no true mean away.
+        confidence: coverage of the CI.
+        trim: share left out at either end, 0.25 for the interquartile mean; the CI is then that of the trimmed
+            mean by winsorized variance: Tukey and McLaughlin 1963, Sankhya A 25.
+        bounds: smallest and largest possible mean; the CI is clipped there.
     """
     finite = np.array([value for value in values if np.isfinite(value)], float)
     if not len(finite):
         return Estimate(nan, nan, nan, 0)
-    most = max(0, (len(finite) - MIN_INTERVAL_VALUES) // 2)  # at least so many are kept
-    cut, ordered = min(int(trim * len(finite)), most), np.sort(finite)
-    kept = ordered[cut : len(finite) - cut] if cut else finite
-    found = Estimate(float(kept.mean()), nan, nan, len(finite), float(ordered[0]), float(ordered[-1]))
-    if len(finite) < MIN_INTERVAL_VALUES or (kept.min() == kept.max() and found.smallest < found.largest):
-        return found
-    # Of equal values the variance may be a rounding error.
-    winsorised = np.clip(finite, kept.min(), kept.max())
-    variance = float(winsorised.var()) * len(finite) if found.smallest < found.largest else 0.0
-    error = sqrt(variance / (len(kept) * (len(kept) - 1)))
-    half = _student_t(len(kept) - 1, confidence) * error
-    return replace(found, low=max(found.mean - half, bounds[0]), high=min(found.mean + half, bounds[1]))
+    max_cut = max(0, (len(finite) - MIN_INTERVAL_VALUES) // 2)  # MIN_INTERVAL_VALUES remain at least
+    cut, ordered = min(int(trim * len(finite)), max_cut), np.sort(finite)
+    trimmed = ordered[cut : len(finite) - cut] if cut else finite
+    point = Estimate(float(trimmed.mean()), nan, nan, len(finite), float(ordered[0]), float(ordered[-1]))
+    if len(finite) < MIN_INTERVAL_VALUES or (trimmed.min() == trimmed.max() and point.smallest < point.largest):
+        return point
+    # The computed variance of equal values may be a rounding error.
+    winsorized = np.clip(finite, trimmed.min(), trimmed.max())
+    variance = float(winsorized.var()) * len(finite) if point.smallest < point.largest else 0.0
+    half = _student_t(len(trimmed) - 1, confidence) * sqrt(variance / (len(trimmed) * (len(trimmed) - 1)))
+    return replace(point, low=max(point.mean - half, bounds[0]), high=min(point.mean + half, bounds[1]))
 
 
 def _student_t(degrees: float, confidence: float = CONFIDENCE) -> float:
-    """Return the t of Student's distribution within which, to both sides, `confidence` of it lies."""
-    from scipy.special import stdtrit  # a third of what a command takes to start, and many have no interval
+    """Return the two-sided quantile of Student's distribution."""
+    from scipy.special import stdtrit  # imported late: it takes a third of the start of a command
 
     return float(stdtrit(degrees, 0.5 + confidence / 2))
 
 
 def display_digits(value: Estimate, digits: int) -> int:
-    """Return with how many digits to show an estimate: two more where a mean would be rounded to zero."""
+    """Return the number of digits to show an estimate: two more if the mean would be rounded to zero."""
     return digits + 2 if value.mean and not round(value.mean, digits) else digits
 
 
 def has_ended_early(row: dict[str, Any]) -> bool:
-    """Return whether an episode ran, but ended early, from its row of `measure`."""
+    """Return whether an episode ran but ended early, from its row of `measure`."""
     return row.get("status", "completed") not in ("completed", "failed")
 
 
 def metric_value(row: dict[str, Any], name: str) -> float:
-    """Return a metric of a row of `measure` for statistics: NaN where an early end makes it meaningless.
+    """Return a metric of a row of `measure` for statistics: NaN if an early end makes it meaningless.
 
-    Early ends are not averaged with complete episodes: a metric of the first minutes is not one of an hour.
+    A metric of the first minutes must not be averaged with those of complete episodes.
     """
     counts = not has_ended_early(row) or name in METRICS_DEFINED_AT_EARLY_END
     return row[name] if counts or (name in RETURN_METRICS and row["status"] == "collision") else nan
@@ -113,25 +117,23 @@ def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Estimate]:
 def pair_rows(
     rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Return each row with the other of its seed, where there is one."""
-    other = {str(row["seed"]): row for row in others}
-    return [(row, other[str(row["seed"])]) for row in rows if str(row["seed"]) in other]
+    """Return the pairs of rows with equal seeds."""
+    by_seed = {str(row["seed"]): row for row in others}
+    return [(row, by_seed[str(row["seed"])]) for row in rows if str(row["seed"]) in by_seed]
 
 
 def paired_difference(
     rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], name: str, confidence: float = CONFIDENCE
 ) -> Estimate:
-    """Return the estimate of the difference, same seeds paired, of a metric between two sets of rows."""
+    """Return the estimate of the paired difference of a metric between two sets of rows."""
     differences = [metric_value(row, name) - metric_value(other, name) for row, other in pair_rows(rows, others)]
     return estimate(differences, confidence=confidence)
 
 
 def linearized_ratio(numerators: Any, denominators: Any) -> Any:
-    """Return numbers whose mean is mean(values) / mean(scales), and whose interval is that of this ratio.
+    """Return values whose mean is the ratio of the means, and whose CI is that of this ratio (delta method).
 
-    Each pair, of one seed, lies as far from the ratio as it moves it: the delta method, for a scale that is
-    measured on the same seeds errs with what is measured by it. Both have the shape (seeds,).
-
+    Numerators and denominators are measured on the same seeds, so their errors are correlated; shape (seeds,).
     Source: Cochran 1977, Sampling Techniques, section 6.3.
     """
     ratio = np.mean(numerators) / np.mean(denominators)
@@ -139,7 +141,7 @@ def linearized_ratio(numerators: Any, denominators: Any) -> Any:
 
 
 def format_difference(difference: Estimate, digits: int = 0) -> str:
-    """Return a difference with its sign and its interval; where it has none, the range of several values."""
+    """Return a difference with its sign and its CI; without one, with the range of the values."""
     if not difference.count:
         return "–"
     interval = format_ci(difference, f"+.{digits}f")
@@ -147,13 +149,13 @@ def format_difference(difference: Estimate, digits: int = 0) -> str:
 
 
 def format_share(share: Estimate) -> str:
-    """Return a share in per cent, with its interval, where it has one."""
+    """Return a share in percent, with its CI if it has one."""
     interval = "" if isnan(share.low) else f" [{100 * share.low:.0f}, {100 * share.high:.0f}]"
     return f"{100 * share.mean:.0f} %{interval}"
 
 
 def format_ci(value: Estimate, format_spec: str) -> str:
-    """Return the interval in words, where there is none the range; empty of a single value."""
+    """Return the CI as text, without one the range; empty for a single value."""
     if not isnan(value.low):
         return f"[{value.low:{format_spec}}, {value.high:{format_spec}}]"
     if value.count < 2 or isnan(value.smallest):
@@ -162,43 +164,41 @@ def format_ci(value: Estimate, format_spec: str) -> str:
 
 
 def gain_verdict(gain: Estimate, trainings: int = 1) -> str:
-    """Return what may be said of a return beyond the expert's: that a residual pays needs ten trainings."""
+    """Return the verdict on the return difference to the expert; one on the method needs ten trainings."""
     if isnan(gain.low):
-        return "There is no interval: nothing is shown."
+        return "No conclusion: there is no confidence interval."
     if gain.low <= 0 <= gain.high:
-        return "No gain is shown: the interval holds zero."
+        return "No gain is shown: the confidence interval contains zero."
+    change = "increases" if gain.low > 0 else "decreases"
     if trainings < MIN_VERDICT_TRAININGS:
-        who = "one training" if trainings == 1 else f"{trainings} trainings"
-        more = "more" if gain.low > 0 else "less"
-        return f"It earns {more}: that is {who}, and a residual pays where {MIN_VERDICT_TRAININGS} show it."
-    return "The residual pays." if gain.low > 0 else "The residual makes it worse."
+        count = "one training" if trainings == 1 else f"{trainings} trainings"
+        return f"The return {change} in {count}; a verdict on the residual needs {MIN_VERDICT_TRAININGS} trainings."
+    return f"The residual {change} the return."
 
 
 def estimate_over_trainings(
     values: Sequence[float], trim: float = 0.0, bounds: tuple[float, float] = UNBOUNDED
 ) -> Estimate:
-    """Return the estimate of a number of each training: of two modes there is no interval, but the range."""
-    found = estimate(values, trim=trim, bounds=bounds)
-    return replace(found, low=nan, high=nan) if is_bimodal(values) else found
+    """Return the estimate of one value per training; a bimodal sample has no CI, only the range."""
+    result = estimate(values, trim=trim, bounds=bounds)
+    return replace(result, low=nan, high=nan) if is_bimodal(values) else result
 
 
 def paired_differences(runs: Sequence[Sequence[dict[str, Any]]], others: Sequence[dict[str, Any]], name: str) -> Any:
-    """Return the differences of a metric, shape (trainings, seeds), on the seeds that all have driven."""
+    """Return the differences of a metric, shape (trainings, seeds), on the seeds that all have."""
     tables = [{str(row["seed"]): metric_value(row, name) for row in rows} for rows in (others, *runs)]
     seeds = [seed for seed in tables[0] if all(np.isfinite(table.get(seed, nan)) for table in tables)]
-    other, *found = ([table[seed] for seed in seeds] for table in tables)
-    return np.array(found, np.float64).reshape(len(runs), len(seeds)) - np.array(other)
+    other, *values = ([table[seed] for seed in seeds] for table in tables)
+    return np.array(values, np.float64).reshape(len(runs), len(seeds)) - np.array(other)
 
 
 def probability_of_improvement(differences: Any) -> Estimate:
-    """Return how often a driver is better than another on the same seed, a tie counting half.
+    """Return the share of seeds on which a driver is better than another; a tie counts half.
 
-    The interval is Wilson's, which stays possible and covers near 0 and 1, too; of several trainings with the
-    number of independent episodes that would have their variance. Differences have the shape (trainings,
-    seeds); above zero is better.
-
-    Source: Wilson 1927, Journal of the American Statistical Association 22; Korn and Graubard 1998, Survey
-    Methodology 24.
+    Differences have the shape (trainings, seeds); above zero is better. The CI is Wilson's, which stays within
+    [0, 1] and also covers near its ends; with several trainings, for the number of independent episodes that
+    would have the same variance. Sources: Wilson 1927, Journal of the American Statistical Association 22;
+    Korn and Graubard 1998, Survey Methodology 24.
     """
     better = (differences > 0) + 0.5 * (differences == 0)
     trainings, seeds = better.shape
@@ -210,17 +210,17 @@ def probability_of_improvement(differences: Any) -> Estimate:
         variance, degrees = _crossed_variance(better)
         episodes = share * (1 - share) / variance if variance else min(better.shape)
         z = _student_t(degrees)
-    middle = share + z**2 / (2 * episodes)
+    center = share + z**2 / (2 * episodes)
     half = z * sqrt(share * (1 - share) / episodes + (z / episodes) ** 2 / 4)
-    low, high = ((middle + side * half) / (1 + z**2 / episodes) for side in (-1, 1))
+    low, high = ((center + side * half) / (1 + z**2 / episodes) for side in (-1, 1))
     return Estimate(share, min(max(low, 0.0), share), max(min(high, 1.0), share), count)
 
 
 def is_bimodal(values: Sequence[float]) -> bool:
-    """Return whether values fall into two groups of two at least, with a gap between that is no accident.
+    """Return whether values form two groups of at least two values with a significant gap between them.
 
-    The mean is then that of no training. The gap is wider than the range times 1/3 + 2/n, which fewer than
-    three in a hundred normal samples have; that of three values cannot be told.
+    The mean then describes no training. The gap is wider than the range times 1/3 + 2/n, which fewer than 3 %
+    of normal samples have; three values are never bimodal.
     """
     ordered = np.sort(values)
     gaps = np.diff(ordered)[1:-1]
@@ -228,32 +228,27 @@ def is_bimodal(values: Sequence[float]) -> bool:
 
 
 def estimate_crossed(values: Any) -> Estimate:
-    """Return the mean over trainings that were judged on shared seeds, with its 95 % interval.
+    """Return the mean over trainings that were evaluated on shared seeds, with its 95 % CI.
 
-    Both trainings and seeds are drawn at random, and every training meets every seed: two-way random effects
-    without repetition. The interval is that of Student's t with Satterthwaite's degrees of freedom. Of fewer
-    than `LEAST` trainings or seeds, and of trainings of two modes, there is none, but the range of means.
-    Values have the shape (trainings, seeds).
-
-    Source: Satterthwaite 1946, Biometrics Bulletin 2; Searle, Casella, McCulloch 1992, Variance Components.
+    Values have the shape (trainings, seeds): two-way random effects without repetition. The CI is Student's t
+    with Satterthwaite's degrees of freedom. Fewer than `MIN_INTERVAL_VALUES` trainings or seeds, and bimodal
+    trainings, have only the range of their means. Sources: Satterthwaite 1946, Biometrics Bulletin 2; Searle,
+    Casella, McCulloch 1992, Variance Components.
     """
     table = np.asarray(values, np.float64)
     if not table.size:
         return Estimate(nan, nan, nan, 0)
     mean, means = float(table.mean()), table.mean(1)
-    found = Estimate(mean, nan, nan, len(table), float(means.min()), float(means.max()))
+    point = Estimate(mean, nan, nan, len(table), float(means.min()), float(means.max()))
     if min(table.shape) < MIN_INTERVAL_VALUES or is_bimodal(means):
-        return found
+        return point
     variance, degrees = _crossed_variance(table)
     half = _student_t(degrees) * sqrt(variance)
-    return replace(found, low=mean - half, high=mean + half)
+    return replace(point, low=mean - half, high=mean + half)
 
 
 def estimate_on_shared_seeds(values: Any) -> Estimate:
-    """Return `estimate_crossed` of several trainings, `estimate` of a single driver.
-
-    Values have the shape (drivers, seeds).
-    """
+    """Return `estimate_crossed` of several trainings, `estimate` of a single driver; shape (drivers, seeds)."""
     return estimate_crossed(values) if len(values) > 1 else estimate(values[0].tolist())
 
 
@@ -264,7 +259,7 @@ def _crossed_variance(table: Any) -> tuple[float, float]:
     rest = table - table.mean() - rows[:, None] - columns
     freedom = np.array([trainings - 1.0, seeds - 1.0, (trainings - 1.0) * (seeds - 1.0)])
     squares = np.array([seeds * (rows**2).sum(), trainings * (columns**2).sum(), (rest**2).sum()]) / freedom
-    # Never below what one of both alone would give: estimated by chance, the difference may be negative.
+    # At least the variance of either effect alone: the estimated difference may be negative by chance.
     spread = float(max(squares[0] + squares[1] - squares[2], squares[0], squares[1]))
     if spread == 0:
         return 0.0, min(freedom)

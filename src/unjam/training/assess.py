@@ -274,7 +274,9 @@ def _assessment_document(
         "controller_results": [
             {**asdict(each), "reasons": each.reasons, "summary": each.summary} for each in findings.controller_results
         ],
-        "acc_results": [{**asdict(each), "driver": ACC_DRIVER, "summary": each.summary} for each in findings.acc_results],
+        "acc_results": [
+            {**asdict(each), "driver": ACC_DRIVER, "summary": each.summary} for each in findings.acc_results
+        ],
         "candidates": tried,
         "baseline": {name: asdict(metric_estimate(findings.rows[HUMAN_BASELINE], name)) for name in BASELINE_METRICS},
         "road": {**scenario_recipe(request.network), "file": request.file},

@@ -1,0 +1,242 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from unjam.measures.metrics import METRICS
+from unjam.measures.statistics import Estimate, estimate
+from unjam.reports.results import Results
+from unjam.reports.summary import (
+    common_baseline,
+    format_difference,
+    key_figures,
+    main_finding,
+    report_columns,
+    report_notes,
+    report_title,
+)
+
+USUAL: dict[str, Any] = {"status": "completed", "reason": "", **dict.fromkeys(METRICS, 1.0), "min_time_gap": 2.0}
+USUAL |= {"shield_override_share": 0.0, "collisions": 0.0}
+
+
+def rows_of(returns: list[float], **changes: Any) -> list[dict[str, Any]]:
+    """A row per return, with seeds from zero."""
+    return [{**USUAL, "seed": seed, "return": value, **changes} for seed, value in enumerate(returns)]
+
+
+def failed_rows(count: int) -> list[dict[str, Any]]:
+    undefined = dict.fromkeys(METRICS, float("nan"))
+    return [{**USUAL, **undefined, "seed": seed, "status": "failed", "reason": "no road"} for seed in range(count)]
+
+
+def trained_on_pi(trained: list[float], pi: list[float], reward: str = "released", **changes: Any) -> Results:
+    rows = {"human": rows_of([0.0] * len(pi)), "pi": rows_of(pi), "trained": rows_of(trained, **changes)}
+    metadata = {"scenario": "ring", "reward": reward, "trained": "trained", "expert": "pi"}
+    return Results(Path("runs/ring-001"), metadata, rows, {})
+
+
+def driven(folder: str = "runs/drive-001", scenario: str = "ring", **rows: list[dict[str, Any]]) -> Results:
+    return Results(Path(folder), {"scenario": scenario, "reward": "released"}, rows, {})
+
+
+EXPERT = [100.0, 140.0, 180.0, 120.0]
+
+
+def test_finding_compares_with_the_human_baseline_and_then_with_the_expert() -> None:
+    undefined: dict[str, Any] = {"travel_time": float("nan")}  # vehicles do not leave a ring
+    result = trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT, mean_speed=1.5, fuel_ml_per_km=0.8, **undefined)
+    finding = main_finding(result)
+    assert finding.startswith("Compared with the human baseline on ring, 4 paired test seeds: ")
+    assert "mean speed +0.50" in finding
+    assert "fuel -0.2" in finding
+    assert f"Return difference to its expert, pi: {format_difference(estimate([12.0, 8.0, 10.0, 10.0]))}." in finding
+    assert finding.endswith("The return increases in one training; a verdict on the residual needs 10 trainings.")
+
+
+def test_finding_compares_with_the_expert_of_highest_return() -> None:
+    result = trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT)
+    result.rows["acc"] = rows_of([500.0] * 4)
+    assert "Return difference to acc, the expert with the highest return: -355" in main_finding(result)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [({}, "; feasible."), ({"status": "collision", "collisions": 2.0}, "; infeasible: 2 vehicles in contact")],
+)
+def test_finding_has_the_feasibility(changes: dict[str, Any], text: str) -> None:
+    safe: dict[str, Any] = {"cav_min_ttc": 9.0, "override_share": 0.0, "human_braking_beyond_4_5": 0.0, **changes}
+    assert text in main_finding(trained_on_pi([1.0, 2.0], [1.0, 2.0], **safe))
+
+
+def test_finding_reports_a_negative_gain() -> None:
+    finding = main_finding(trained_on_pi([90.0, 120.0, 170.0, 100.0], EXPERT))
+    assert "-15 [" in finding
+    assert "The return decreases in one training" in finding
+
+
+@pytest.mark.parametrize("trained", [[125.0, 125.0, 205.0, 110.0], [90.0, 150.0, 155.0, 125.0], EXPERT])
+def test_finding_claims_no_gain_that_may_be_zero(trained: list[float]) -> None:
+    assert main_finding(trained_on_pi(trained, EXPERT)).endswith("No gain is shown: the confidence interval contains zero.")
+
+
+def test_finding_on_one_seed_has_no_interval() -> None:
+    result = trained_on_pi([150.0], [100.0])
+    finding = main_finding(result)
+    assert finding.endswith("+50. There is no interval: nothing is shown.")
+    assert "pays" not in finding
+    assert "holds zero" not in finding
+    assert not any("nan" in text for text in (finding, *(card["detail"] for card in key_figures(result))))
+
+
+def test_finding_without_an_expert_has_the_return() -> None:
+    metadata = {"scenario": "ring", "reward": "released", "trained": "trained", "expert": "none"}
+    finding = main_finding(Results(Path("x"), metadata, {"trained": rows_of([10.0, 20.0])}, {}))
+    assert finding == "On 2 test seeds the mean return of the trained controller is 15."
+
+
+def test_finding_counts_seeds_on_which_both_ran() -> None:
+    human = rows_of([1.0] * 3, travel_time=100.0)
+    result = driven(human=human, pi=[*rows_of([2.0, 2.0], travel_time=90.0), {**failed_rows(1)[0], "seed": 2}])
+    assert main_finding(result).startswith("Compared with the human baseline on ring, 2 episodes on paired seeds: ")
+
+
+def test_finding_of_a_single_driver_has_speed_and_share_of_the_limit() -> None:
+    finding = main_finding(driven(pi=rows_of([1.0, 2.0], mean_speed=4.0, speed_limit_ratio_steady=0.83)))
+    assert "pi on ring, 2 episodes" in finding
+    assert "all vehicles is 4.00 m/s" in finding
+    assert "83 % of the limit" in finding
+
+
+def test_results_of_failed_episodes_show_no_nan() -> None:
+    result = driven(pi=failed_rows(2))
+    texts = [main_finding(result), *report_notes(result), *(card["value"] for card in key_figures(result))]
+    assert not any("nan" in text for text in texts)
+
+
+def test_results_without_caveats_have_no_notes() -> None:
+    assert report_notes(trained_on_pi([1.0, 2.0], [1.0, 2.0])) == []
+
+
+def test_early_ends_of_each_driver_are_noted_once() -> None:
+    rows = [*rows_of([1.0] * 3), *rows_of([1.0], status="collision"), *failed_rows(1)]
+    note = "pi: 1 of 5 episodes ended early: collision; means are over complete episodes only"
+    assert report_notes(driven(pi=rows)) == [f"{note}."]
+    noted = driven(pi=rows)
+    noted.metadata["notes"] = [note]
+    assert report_notes(noted) == [f"{note}."]
+    result = trained_on_pi([1.0], [1.0])
+    result.rows["pi"][0]["status"] = "collision"
+    assert [note[:26] for note in report_notes(result)] == ["pi: 1 of 1 episodes ended "]
+
+
+def test_close_following_is_noted_with_a_reward_without_distance() -> None:
+    [note] = report_notes(trained_on_pi([1.0], [1.0], min_time_gap=0.42))
+    assert "min time gap is 0.42 s" in note
+    assert "(released) has no term for distance" in note
+
+
+def test_close_following_is_not_attributed_to_a_reward_with_distance() -> None:
+    [note] = report_notes(trained_on_pi([1.0], [1.0], reward="eq16", min_time_gap=0.42))
+    assert note == "trained follows closely: its min time gap is 0.42 s."
+
+
+@pytest.mark.parametrize("time_gap", [1.0, float("inf"), float("nan")])
+def test_larger_time_gaps_are_not_noted(time_gap: float) -> None:
+    assert report_notes(trained_on_pi([1.0], [1.0], min_time_gap=time_gap)) == []
+
+
+def test_overrides_of_the_safety_check_are_noted() -> None:
+    [note] = report_notes(trained_on_pi([1.0], [1.0], shield_override_share=0.034, shield_max_braking=5.25))
+    assert "overrides 3.4 % of commands" in note
+    assert "adds up to 5.2 m/s² of braking" in note
+    assert report_notes(trained_on_pi([1.0], [1.0], shield_override_share=0.009)) == []
+
+
+def test_traffic_above_the_limit_is_explained() -> None:
+    [note] = report_notes(trained_on_pi([1.0], [1.0], speed_limit_ratio_steady=1.034))
+    assert "With trained all vehicles drive at 103 % of the limit" in note
+    assert report_notes(trained_on_pi([1.0], [1.0], speed_limit_ratio_steady=1.005)) == []
+
+
+def test_a_comparison_has_notes_about_each_driver() -> None:
+    found = driven(human=rows_of([1.0]), pi=rows_of([1.0], min_time_gap=0.3, status="collision"))
+    assert [note.split()[0] for note in report_notes(found)] == ["pi:", "pi"]
+
+
+def test_notes_are_about_the_trained_controller_only() -> None:
+    result = trained_on_pi([1.0], [1.0])
+    result.rows["pi"][0]["min_time_gap"] = 0.3
+    assert report_notes(result) == []
+
+
+def test_key_figures_have_the_human_baseline_and_the_difference_to_the_expert() -> None:
+    result = trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT, speed_limit_ratio_steady=0.914)
+    cards = key_figures(result)
+    assert cards[0]["label"] == "Mean speed / limit, steady"
+    assert cards[0]["value"] == "91 %"
+    assert cards[0]["detail"] == "human baseline: 100 %"
+    assert cards[-1]["label"] == "Return difference to expert"
+    assert cards[-1]["value"] == "+10"
+
+
+def test_key_figures_without_a_human_baseline_have_no_comparison() -> None:
+    cards = key_figures(driven(pi=rows_of([1.0, 2.0])))
+    assert len(cards) == 3
+    assert all(card["detail"] == "pi" for card in cards)
+
+
+def test_title_names_what_was_compared() -> None:
+    assert report_title([driven(human=rows_of([1.0]), pi=rows_of([1.0]))]) == "ring: human, pi"
+    assert report_title([trained_on_pi([1.0], [1.0])]) == "ring: a trained residual on pi"
+    both = [driven(pi=rows_of([1.0])), driven(scenario="ring-warm", pi=rows_of([1.0]))]
+    assert report_title(both) == "ring, ring-warm: comparison of 2 results"
+
+
+def test_title_without_an_expert_names_no_residual() -> None:
+    metadata = {"scenario": "ring", "reward": "released", "trained": "trained", "expert": "none"}
+    assert "none" not in report_title([Results(Path("x"), metadata, {"trained": rows_of([1.0])}, {})])
+
+
+def test_columns_of_one_folder_are_its_drivers() -> None:
+    assert [column.name for column in report_columns([trained_on_pi([1.0], [1.0])])] == ["human", "pi", "trained"]
+
+
+def test_columns_of_several_folders_have_their_names() -> None:
+    names = [column.name for column in report_columns([driven("a", pi=rows_of([1.0])), driven("b", pi=rows_of([2.0]))])]
+    assert names == ["a: pi", "b: pi"]
+
+
+def test_common_drivers_of_runs_have_one_column() -> None:
+    first, second = trained_on_pi([1.0], [5.0]), trained_on_pi([2.0], [5.0])
+    second = Results(Path("runs/ring-002"), second.metadata, second.rows, {})
+    names = [column.name for column in report_columns([first, second])]
+    assert names == ["human", "pi", "ring-001: trained", "ring-002: trained"]
+
+
+def test_folders_of_the_same_name_have_different_columns() -> None:
+    columns = report_columns([driven("old/ring", pi=rows_of([1.0])), driven("new/ring", pi=rows_of([2.0]))])
+    assert [column.rows[0]["return"] for column in columns] == [1.0, 2.0]
+    assert len({column.name for column in columns}) == 2
+
+
+def test_the_same_driver_on_another_road_has_its_own_column() -> None:
+    ring, warm = trained_on_pi([1.0], [5.0]), trained_on_pi([2.0], [9.0])
+    warm = Results(Path("runs/warm-001"), {**warm.metadata, "scenario": "ring-warm"}, warm.rows, {})
+    returns = [column.rows[0]["return"] for column in report_columns([ring, warm]) if "pi" in column.name]
+    assert returns == [5.0, 9.0]
+
+
+def test_the_baseline_of_several_folders_ran_the_same_episodes() -> None:
+    first, second = trained_on_pi([1.0], [5.0]), trained_on_pi([2.0], [5.0])
+    second = replace(second, folder=Path("runs/ring-002"))
+    assert common_baseline([first]) == common_baseline([first, second]) == "human"
+    elsewhere = replace(second, rows={**second.rows, "human": rows_of([9.0])})
+    assert common_baseline([first, elsewhere]) == ""
+    assert common_baseline([driven("a", human=rows_of([1.0]), pi=rows_of([1.0]))] * 2) == ""
+    assert common_baseline([driven(pi=rows_of([1.0]))]) == ""
+
+
+def test_a_difference_shows_its_sign() -> None:
+    assert format_difference(Estimate(3.4, -0.6, 7.0, 5)) == "+3 [-1, +7]"
