@@ -173,7 +173,7 @@ def test_recipe_makes_the_same_scenario_again() -> None:
     [
         ({"standing_vehicles": 81}, "standing_vehicles: 81 is not allowed; allowed: <= 80"),
         ({"standing_vehicles": -1}, "standing_vehicles"),
-        ({"cavs": 167}, "cavs: 167 is not allowed; allowed: <= 166, who enter in the first half"),
+        ({"cavs": 167}, "cavs: 167 is not allowed; allowed: <= 166, the vehicles of the first half"),
         ({"cavs": 0}, "cavs"),
         ({"penetration_rate": 1.1}, "penetration_rate: 1.1"),
         ({"penetration_rate": -0.1}, "penetration_rate: -0.1"),

@@ -255,7 +255,7 @@ def test_a_type_that_sumo_has_by_itself_may_be_a_cav(tmp_path: Path) -> None:
 )
 def test_trains_ships_and_aircraft_never_become_cavs(attributes: str, tmp_path: Path) -> None:
     routes = f'<routes><vType id="train" {attributes}/><vType id="car"/>{{}}<trip id="t" type="train"/></routes>'
-    with pytest.raises(InputError, match="cav_types: 'train' is not allowed, for it is no type of road"):
+    with pytest.raises(InputError, match="cav_types: 'train' is not allowed: its vehicles are not road vehicles"):
         own(tmp_path, routes=routes.format(""), cav_types=("train",))
     with pytest.raises(InputError, match="penetration_rate: no vehicle has one of the classes"):
         own(tmp_path, routes=routes.format(""), penetration_rate=1.0)
@@ -282,13 +282,13 @@ def test_without_a_rate_a_tenth_of_the_vehicles_become_cavs_and_a_line_says_so(
     path = str(configuration(tmp_path))
     rates = [load_user_network(path, changes).penetration_rate for changes in ({}, {"cav_types": ["car"]})]
     assert rates == [0.1, 0.0]
-    assert "penetration rate: 10 %, as none is set; --penetration-rate sets another" in caplog.messages
+    assert "penetration rate: 10 % by default; --penetration-rate changes it" in caplog.messages
 
 
 def test_what_differs_from_sumo_alone_is_noted(tmp_path: Path) -> None:
     inside = '<seed value="7"/><max-depart-delay value="9"/><fcd-output value="x"/><tripinfo value="y"/>'
     assert own(tmp_path, inside).notes[:-1] == [
-        "road.sumocfg: left out, for they only write or listen: option fcd-output, option tripinfo",
-        "road.sumocfg: unjam has a value of its own for: seed, max-depart-delay",
+        "road.sumocfg: left out because they only write or listen: option fcd-output, option tripinfo",
+        "road.sumocfg: replaced by values of unjam: seed, max-depart-delay",
     ]
     assert make_scenario("ring").notes == []

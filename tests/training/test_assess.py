@@ -129,7 +129,7 @@ def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Asse
     assert (written["recommended"] is None) == bool(found.reasons)
     assert written["baseline"]["travel_time"]["count"] == written["seeds"]["test"] >= 5
     assert written["manifest"]["packages"]["libsumo"]
-    assert written["notes"] == ["straight.sumocfg: unjam has a value of its own for: seed"]
+    assert written["notes"] == ["straight.sumocfg: replaced by values of unjam: seed"]
     page = render_assessment(answer.page.parent)
     lifted = "acc, 50 %: SUMO lifted 3 vehicles"
     (answer.page.parent / "assessment.json").write_text(json.dumps({**written, "notes": [lifted]}))

@@ -1,4 +1,4 @@
-"""Where the vehicles drive: roads, traffic, how an episode starts and ends."""
+"""Scenarios: roads, traffic, how an episode starts and ends."""
 
 from dataclasses import asdict
 from typing import Any
@@ -27,15 +27,15 @@ SCENARIOS: dict[str, Scenario] = {
 }
 
 EXAMPLE_PENETRATION_RATE = 0.1
-"""share of CAVs where a network of the user's own stands as an example"""
+"""penetration rate of a user network as an example"""
 SCENARIO_KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp, UserNetwork)}
-"""All kinds of road, by their title."""
+"""all kinds of road, by title"""
 
 
 def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     """Return the scenario `name`, or that of a .sumocfg file, with `changes` to its parameters.
 
-    A dot in a name leads into a group of parameters: `{"safety.time_headway": 1.5}`.
+    A dot in a name leads into a group of parameters: `{"safety.time_gap": 1.5}`.
 
     Raises:
         InputError: unknown scenario or parameter, or a value out of range.
@@ -54,23 +54,23 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
 
 
 def example_scenario(name: str) -> Scenario:
-    """Return a scenario as it is listed and sampled: with some CAVs on a network of the user's own."""
+    """Return a scenario as it is listed and sampled: a user network has some CAVs."""
     return make_scenario(name, {"penetration_rate": EXAMPLE_PENETRATION_RATE} if name.endswith(".sumocfg") else None)
 
 
 def _population_changes(file: str) -> dict[str, Any]:
-    """Return what else changes with a population: who is typical, and who computes how people drive."""
+    """Return the settings that follow from a population: typical parameters, and what computes the motion."""
     population = read_population(file)
     commanded = {"human_control": "commanded"} if population.residual else {}
     return {"humans": asdict(population.typical), **commanded}
 
 
 def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
-    """Return a scenario as JSON; `scenario_from_recipe` makes it again."""
+    """Return a scenario as JSON; the inverse of `scenario_from_recipe`."""
     return {"kind": scenario.title, **asdict(scenario)}
 
 
 def scenario_from_recipe(recipe: dict[str, Any]) -> Scenario:
-    """Return the scenario that `scenario_recipe` wrote down."""
+    """Return the scenario of a recipe."""
     values = {key: value for key, value in recipe.items() if key != "kind"}
     return build_dataclass(SCENARIO_KINDS[recipe["kind"]], values, "scenario")

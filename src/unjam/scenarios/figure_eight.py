@@ -1,7 +1,7 @@
-"""The figure eight: a closed road that crosses itself, where one direction yields to the other."""
+"""The figure eight: a closed road that crosses itself, where one direction must yield to the other."""
 
 from math import pi
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,32 +16,32 @@ from unjam.scenarios.road import Connection, Edge, Node, Polyline, RoadNetwork, 
 from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl
 
 CROSSING_RADIUS = 3.1
-"""of the node where the ways of a figure eight cross [m], as Flow's"""
+"""of the node at the crossing [m], as in Flow"""
 CROSSING_LINK = 9.4
-"""length of a way across, as netconvert makes it from that radius [m]"""
+"""length of a lane across the junction [m], as netconvert makes it from that radius"""
 INNER_LINK, OUTER_LINK = 0.222837, 0.1
-"""lengths of the links at both ends of the upper and of the lower arc, as netconvert makes them [m]: the lane
-lies to the right of the line"""
+"""lengths of the links at both ends of the upper and of the lower arc [m], as netconvert makes them for lanes to the
+right of the line"""
 UPPER_ARC, LOWER_ARC = (1.0, pi, -pi / 2), (-1.0, pi / 2, 2 * pi)
-"""of a figure eight: both coordinates of the centre [radii], first and last angle [rad]"""
+"""of a figure eight: both coordinates of the center [radii], first and last angle [rad]"""
 ARC_POINTS = 61
 """points of each arc; the lengths of the links depend on it"""
 MAJOR_PRIORITY, MINOR_PRIORITY = 78, 46
-"""priorities of the way that goes first (bottom to top) and of the one that yields, as Flow's"""
+"""priorities of the direction with the right of way (bottom to top) and of the other one, as in Flow"""
 
 
 def figure_eight_length(radius: float) -> float:
-    """Return the length of a lap of the figure eight [m], ways across the junctions included."""
+    """Return the length of a lap of the figure eight [m], links across the junctions included."""
     return _edge_length(radius) + 2 * (CROSSING_LINK + INNER_LINK + OUTER_LINK)
 
 
 def figure_eight_radius(length: Array) -> Array:
-    """Return the radius of figures eight whose laps are so long [m]; the reverse of `loop_length`."""
+    """Return the radius of figure eights with laps of a given length [m]; the inverse of `figure_eight_length`."""
     return (length - 2 * (CROSSING_LINK + INNER_LINK + OUTER_LINK)) / (4 + 3 * pi)
 
 
 def lane_lengths(radius: Array) -> tuple[Array, ...]:
-    """Return the lengths of all lanes in driving order [m]: an edge, the link behind it, and so on."""
+    """Return the lengths of all lanes in driving order [m]: an edge, the link after it, and so on."""
     arc = 1.5 * pi * radius
     upper = radius, CROSSING_LINK, radius, INNER_LINK, arc, INNER_LINK
     return *upper, radius, CROSSING_LINK, radius, OUTER_LINK, arc, OUTER_LINK
@@ -49,11 +49,11 @@ def lane_lengths(radius: Array) -> tuple[Array, ...]:
 
 @dataclass(frozen=True, config=STRICT)
 class FigureEight(LoopScenario):
-    """Two loops of equal radius that cross at a junction without signals; the radius is new in each episode.
+    """Two loops of equal radius that cross at a junction without signals; each episode draws the radius.
 
-    The paper's has 14 vehicles, one of them a CAV, and radii of 32 to 35 m; Flow's benchmark 30 m. All pass
-    the crossing twice a lap, and those from the right yield to those from below: a queue that is longer than
-    half a lap meets its own tail there, and everybody stops and starts.
+    The paper's figure eight has 14 vehicles, one of them a CAV, and radii of 32 to 35 m; Flow's benchmark 30 m. All
+    vehicles pass the crossing twice a lap, and those from the right yield to those from below. A queue that is longer
+    than half a lap meets its own tail there, and all vehicles stop and start.
     """
 
     title: ClassVar[str] = "figure-eight"
@@ -66,36 +66,36 @@ class FigureEight(LoopScenario):
     )
 
     radius: Annotated[tuple[Annotated[int, Field(ge=15)], Annotated[int, Field(ge=15)]], NumberOrRange] = (32, 35)
-    """smallest and largest radius, drawn uniformly among the integers between them; or one [m]"""
+    """range of the radius, drawn uniformly among its integers; or a single radius [m]"""
     vehicles: Annotated[int, Field(ge=2)] = 14
     cavs: PositiveInt = 1
-    """vehicles that are CAVs, evenly spread; the first leads the queue"""
+    """number of CAVs, evenly spread; the first leads the queue"""
     free_length: NonNegative = 50.0
-    """road left free ahead of the first vehicle at the start [m]; Flow's `bunching`"""
+    """free road ahead of the first vehicle at the start [m]; Flow's `bunching`"""
     horizon: PositiveInt = 1500
-    """decisions in an episode"""
+    """control steps in an episode"""
     human_control: HumanControl = "commanded"
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.5
 
     @model_validator(mode="after")
-    def _check_length(self) -> "FigureEight":
-        room = _edge_length(self.radius[0]) - self.free_length
-        if room < self._min_length:
+    def _check_length(self) -> Self:
+        available = _edge_length(self.radius[0]) - self.free_length
+        if available < self._min_length:
             raise ValueError(
                 f"radius: {self.radius[0]} m is not allowed for {self.vehicles} vehicles: they need "
-                f"{self._min_length:g} m of road, there are {room:.0f} m"
+                f"{self._min_length:g} m of road, there are {available:.0f} m"
             )
         return self
 
     def layout(self, size: float) -> LoopLayout:
-        """Return the figure eight of a radius [m]."""
-        places = _edge_spans(size)
-        # As in Flow, the ways across the junctions are left out of what is shared among the vehicles.
+        """Return the figure eight of a given radius [m]."""
+        spans = _edge_spans(size)
+        # As in Flow, vehicles are spread over the edges alone, without the links across the junctions.
         spacing = (_edge_length(size) - self.free_length) / self.vehicles
         positions = np.arange(self.vehicles, dtype=np.float64) * spacing
-        edge = np.searchsorted([place.start for place in places], positions, side="right") - 1
-        before_links = np.minimum(positions, np.array([place.end for place in places])[edge])
-        bottom, top, upper, right, left, lower = places
+        edge = np.searchsorted([span.start for span in spans], positions, side="right") - 1
+        positions_on_edges = np.minimum(positions, np.array([span.end for span in spans])[edge])
+        bottom, top, upper, right, left, lower = spans
         upper_arc, lower_arc = _arc_points(size, *UPPER_ARC), _arc_points(size, *LOWER_ARC)
         lines = [
             [(bottom.start, 0.0, -size), (top.end, 0.0, size)],
@@ -105,19 +105,19 @@ class FigureEight(LoopScenario):
             [(figure_eight_length(size), 0.0, -size)],
         ]
         return LoopLayout(
-            places,
+            spans,
             figure_eight_length(size),
-            before_links,
+            positions_on_edges,
             _network(size, as_polyline(upper_arc), as_polyline(lower_arc), self.top_speed),
             np.vstack(lines),
             crossings=((bottom.end, top.start), (right.end, left.start)),
         )
 
     def limit_speed(self, size: float) -> float:
-        """Return the speed at which a queue at equilibrium just clears the crossing before its head is back.
+        """Return the speed at which a queue at equilibrium just clears the crossing before its head is back [m/s].
 
-        The queue of all vehicles at the IDM's equilibrium gaps and the crossing fill half a lap. Vehicles
-        that yield want some seconds in hand, so that the real limit is lower.
+        The queue of all vehicles at the IDM's equilibrium gaps and the crossing fill half a lap. Vehicles that must
+        yield need a margin of some seconds, so the real limit is lower.
         """
         queue = _edge_length(size) / 2 - CROSSING_LINK
         return equilibrium_speed(queue / self.vehicles - VEHICLE_LENGTH, self.humans)
@@ -129,13 +129,13 @@ def _edge_length(radius: float) -> float:
 
 def _edge_spans(radius: float) -> list[EdgeSpan]:
     """Return the edges in driving order; between them lie the links of the junctions."""
-    names = "bottom", "top", "upper_ring", "right", "left", "lower_ring"
     lengths = lane_lengths(radius)
-    edges, start = [], 0.0
-    for name, length, link in zip(names, lengths[::2], lengths[1::2], strict=True):
-        edges.append(EdgeSpan(name, start, length))
+    spans, start = [], 0.0
+    for number, name in enumerate(("bottom", "top", "upper_ring", "right", "left", "lower_ring")):
+        length, link = lengths[2 * number : 2 * number + 2]
+        spans.append(EdgeSpan(name, start, length))
         start += length + link
-    return edges
+    return spans
 
 
 def _arc_points(radius: float, center: float, first: float, last: float) -> NDArray[np.float64]:
@@ -144,9 +144,9 @@ def _arc_points(radius: float, center: float, first: float, last: float) -> NDAr
 
 
 def _network(radius: float, upper: Polyline, lower: Polyline, speed: float) -> RoadNetwork:
-    places = {"right": (radius, 0.0), "top": (0.0, radius), "left": (-radius, 0.0), "bottom": (0.0, -radius)}
+    ends = {"right": (radius, 0.0), "top": (0.0, radius), "left": (-radius, 0.0), "bottom": (0.0, -radius)}
     center = Node("center", 0.0, 0.0, has_priority=True, radius=CROSSING_RADIUS)
-    nodes = (center, *(Node(f"at_{name}", x, y, has_priority=True) for name, (x, y) in places.items()))
+    nodes = (center, *(Node(f"at_{name}", x, y, has_priority=True) for name, (x, y) in ends.items()))
     arc = 1.5 * pi * radius
     edges = (
         Edge("bottom", "at_bottom", "center", radius, MAJOR_PRIORITY),

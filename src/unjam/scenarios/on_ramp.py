@@ -1,8 +1,8 @@
-"""The on-ramp: a motorway of one or two lanes that a ramp joins, among people who differ and overtake."""
+"""The on-ramp: a motorway of one or two lanes that a ramp joins, with different human drivers that overtake."""
 
 from collections.abc import Iterator
 from dataclasses import field, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -15,19 +15,21 @@ from unjam.scenarios.road import Connection, Edge, EdgeLane, Entry, MotorwayRoad
 from unjam.scenarios.scenario import Actuation, Scenario
 
 UPSTREAM_LENGTH, MERGING_LENGTH, DOWNSTREAM_LENGTH, RAMP_LENGTH = 2000.0, 300.0, 700.0, 400.0
-"""lengths of the motorway before the ramp's lane runs beside it, with it, behind it, and of the ramp [m]"""
+"""lengths of the motorway upstream of the merging section, of that section, downstream of it, and of the ramp [m]"""
+MOTORWAY_LENGTH = UPSTREAM_LENGTH + MERGING_LENGTH + DOWNSTREAM_LENGTH
+"""[m]"""
 MOTORWAY_SPEED_LIMIT, RAMP_SPEED_LIMIT = 27.78, 22.22
-"""what they allow [m/s]"""
+"""[m/s]"""
 RAMP_ENTRY_SPEED = 15.0
 """[m/s]"""
 MIN_RAMP_HEADWAY = 2.0
 """smallest time between two vehicles that want to enter the ramp [s]"""
 FREE_FLOW_TIMES = {1: 113.0, 2: 106.6}
-"""mean travel time of people alone without a peak, by lanes, of six seeds [s]"""
+"""mean travel time in human-only traffic without a peak, by lanes, of six seeds [s]"""
 HUMAN_TYPE_COUNT = 200
-"""how many different people there are"""
+"""number of different human drivers"""
 RAMP_OFFSET = 60.0
-"""of the nodes where motorway and ramp begin [m]"""
+"""distance between the nodes where motorway and ramp begin [m]"""
 
 Arrival = tuple[float, str, int, float | Literal["last"]]
 Interval = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
@@ -35,11 +37,11 @@ Interval = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
 
 @dataclass(frozen=True, config=STRICT)
 class OnRamp(Scenario):
-    """A motorway of 3 km that a ramp joins after 2 km, with a peak of demand just beyond what it carries.
+    """A motorway of 3 km that a ramp joins after 2 km, with a peak of demand slightly above capacity.
 
-    People are SUMO's extended intelligent drivers, each different, who change lanes. In the peak a jam comes
-    where the ramp joins, in nine of ten episodes, and sends waves back. A CAV replaces a person and wants to
-    drive as fast; its own ACC follows, and its driver can hold it back upstream of where the ramp joins.
+    Human drivers follow SUMO's extended IDM, each with other parameters, and change lanes. In the peak a jam forms at
+    the ramp, in nine of ten episodes, and sends waves upstream. A CAV replaces a human-driven vehicle and desires the
+    same speed; its own ACC follows, and its driver can reduce the set speed upstream of the ramp.
     """
 
     title: ClassVar[str] = "on-ramp"
@@ -53,84 +55,84 @@ class OnRamp(Scenario):
     lanes: Literal[1, 2] = 2
     """of the motorway"""
     inflow: Positive = 3200.0
-    """vehicles that want to enter the motorway in the peak [veh/h]"""
+    """demand of the motorway in the peak [veh/h]"""
     ramp_flow: NonNegative = 500.0
-    """vehicles that want to enter the ramp in the peak [veh/h]"""
+    """demand of the ramp in the peak [veh/h]"""
     off_peak_inflow: NonNegative = 1800.0
-    """before and after the peak [veh/h]"""
+    """of the motorway, before and after the peak [veh/h]"""
     off_peak_ramp_flow: NonNegative = 250.0
-    """before and after the peak [veh/h]"""
+    """of the ramp, before and after the peak [veh/h]"""
     peak: Interval = (300.0, 1500.0)
-    """from when to when it lasts [s]"""
+    """its begin and end [s]"""
     min_entry_headway: NonNegative = 1.1
     """smallest time between two vehicles that want to enter a lane of the motorway [s]"""
     penetration_rate: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """share of all vehicles that are CAVs; a larger share contains the smaller one"""
+    """share of CAVs among all vehicles; the CAVs of a smaller share are part of those of a larger one"""
     cavs: PositiveInt | None = None
-    """exactly so many CAVs instead of a share, among those that want to enter in the first half"""
+    """exact number of CAVs instead of a share, among the vehicles of the first half"""
     car_following: Literal["EIDM", "IDM"] = "EIDM"
-    """SUMO's model of how people follow"""
+    """SUMO's car-following model of human drivers"""
     time_headways: Interval = (1.0, 1.8)
-    """between which people's lie [s]"""
+    """range among human drivers [s]"""
     accelerations: Interval = (1.0, 1.5)
-    """between which people's lie [m/s2]"""
+    """range among human drivers [m/s2]"""
     decelerations: Interval = (1.5, 2.0)
-    """between which people's comfortable ones lie [m/s2]"""
+    """range of comfortable decelerations among human drivers [m/s2]"""
     minimum_gaps: Interval = (2.0, 2.5)
-    """between which people's lie in a standing queue [m]"""
+    """range among human drivers, in a standing queue [m]"""
     speed_factor_std: NonNegative = 0.1
-    """standard deviation of people's wanted speed over what the road allows, which is 1, at most 0.2 off"""
+    """standard deviation of desired speed / speed limit, with mean 1; at most 0.2 from the mean"""
     vehicle_length: Positive = 4.8
     """[m]"""
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
-    """how late and how smooth CAVs are told of the speeds ahead"""
+    """latency and smoothing of the speeds ahead that CAVs receive"""
     simulation_step: Positive = 0.5
     steps_per_control_step: PositiveInt = 2
     horizon: PositiveInt = 2400
-    """decisions in an episode"""
+    """control steps in an episode"""
     action_limit: Positive = 2.5
     actuation: Actuation = "cruise"
     safety: SafetyFilter = field(default_factory=lambda: SafetyFilter(active=False))
-    """none: the CAV's own ACC keeps its distance"""
+    """inactive: the CAV's own ACC keeps its distance"""
     noise: Annotated[float, Field(ge=0, le=0)] = 0.0
-    """none beside that of the people's own model"""
+    """none: the car-following model has its own"""
     emission_class: str = "HBEFA4/PC_petrol_Euro-6d"
 
     @model_validator(mode="after")
-    def _check_settings(self) -> "OnRamp":
+    def _check_settings(self) -> Self:
         for name in ("time_headways", "accelerations", "decelerations", "minimum_gaps", "peak"):
             low, high = getattr(self, name)
             if not 0 <= low <= high or (high == 0 and name != "peak"):
                 raise ValueError(f"{name}: ({low:g}, {high:g}) is not allowed; allowed: 0 < low <= high")
-        for name, flow in (("inflow", self.inflow), ("off_peak_inflow", self.off_peak_inflow)):
-            most = 3600.0 * self.lanes / max(self.min_entry_headway, 1e-9)
-            if flow >= most:
-                raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {most:.0f}, by min_entry_headway")
-        for name, flow in (("ramp_flow", self.ramp_flow), ("off_peak_ramp_flow", self.off_peak_ramp_flow)):
-            if flow >= 3600.0 / MIN_RAMP_HEADWAY:
-                raise ValueError(f"{name}: {flow:g} is not allowed; allowed: < {3600.0 / MIN_RAMP_HEADWAY:.0f}")
+        capacity = 3600.0 * self.lanes / max(self.min_entry_headway, 1e-9)
+        for name, most, reason in (
+            *((name, capacity, ", by min_entry_headway") for name in ("inflow", "off_peak_inflow")),
+            *((name, 3600.0 / MIN_RAMP_HEADWAY, "") for name in ("ramp_flow", "off_peak_ramp_flow")),
+        ):
+            if getattr(self, name) >= most:
+                raise ValueError(f"{name}: {getattr(self, name):g} is not allowed; allowed: < {most:.0f}{reason}")
         self.check_native_humans("on the on-ramp")
         return self
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
-        """Return the road with who wants to enter it; random are the people, when they come, who is a CAV."""
-        kinds = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
+        """Return the road with its demand; random are the human drivers, their entry times and the choice of CAVs."""
+        types = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
         entries, draws = list[Entry](), dict[str, float]()
         for number, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
-            name, kind = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
+            name, vehicle_type = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
             draws[name] = generator.random()
-            entries.append(Entry(name, route, 0.0, speed, time, lane, kind))
+            entries.append(Entry(name, route, 0.0, speed, time, lane, vehicle_type))
         return MotorwayRoad(
             network=_network(self.lanes),
             routes=_ROUTES,
             entries=tuple(entries),
             limit_speed=MOTORWAY_SPEED_LIMIT,
-            vehicle_types=kinds,
+            vehicle_types=types,
             cav_ids=self._select_cavs(draws),
             edge_lanes=_edge_lanes(self.lanes),
             lane_names=("ramp", "motorway") if self.lanes == 1 else ("ramp", "right lane", "left lane"),
             merge_position=UPSTREAM_LENGTH,
-            length=UPSTREAM_LENGTH + MERGING_LENGTH + DOWNSTREAM_LENGTH,
+            length=MOTORWAY_LENGTH,
             vehicle_length=self.vehicle_length,
             peak=self.peak,
             free_flow_time=FREE_FLOW_TIMES[self.lanes],
@@ -138,7 +140,7 @@ class OnRamp(Scenario):
         )
 
     def _select_cavs(self, draws: dict[str, float]) -> frozenset[str]:
-        """Return who is a CAV: those with the lowest draws."""
+        """Return the CAVs: the vehicles with the lowest draws."""
         if self.cavs is None:
             return frozenset(name for name, draw in draws.items() if draw < self.penetration_rate)
         early = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
@@ -148,7 +150,7 @@ class OnRamp(Scenario):
         def draw_uniform(interval: tuple[float, float]) -> float:
             return round(float(generator.uniform(*interval)), 4)
 
-        drawn = VehicleType(
+        human = VehicleType(
             model=self.car_following,
             time_headway=draw_uniform(self.time_headways),
             acceleration=draw_uniform(self.accelerations),
@@ -157,10 +159,10 @@ class OnRamp(Scenario):
             speed_factor=round(float(np.clip(generator.normal(1.0, self.speed_factor_std), 0.8, 1.2)), 4),
         )
         if self.driver_population is None:
-            return drawn
+            return human
         (one,) = self.driver_population.draw(1, generator)
-        # They follow as they were calibrated; how fast people want to be no recording of a jam tells.
-        return drawn._replace(
+        # Only following is calibrated: recordings of jams say nothing about desired speeds.
+        return human._replace(
             model="IDM",
             time_headway=one.time_headway,
             acceleration=one.max_acceleration,
@@ -169,7 +171,7 @@ class OnRamp(Scenario):
         )
 
     def _arrivals(self, generator: np.random.Generator) -> Iterator[Arrival]:
-        """Yield when vehicles want to enter, on which route, in which lane, and how fast."""
+        """Yield time, route, lane and speed of vehicles that want to enter."""
         for lane in range(self.lanes):
             flows = self.off_peak_inflow / self.lanes, self.inflow / self.lanes
             for time in self._entry_times(generator, *flows, self.min_entry_headway):
@@ -193,37 +195,31 @@ class OnRamp(Scenario):
 
     @property
     def top_speed(self) -> float:
-        """What the road allows [m/s]."""
+        """The speed limit of the motorway [m/s]."""
         return MOTORWAY_SPEED_LIMIT
 
     @property
     def human_description(self) -> str:
-        """How people drive."""
-        who = f"as {self.population_description}" if self.driver_population else self.car_following
-        return f"{HUMAN_TYPE_COUNT} different people, {who}, with SUMO's lane changes"
+        """How human drivers drive, as one phrase."""
+        model = f"as {self.population_description}" if self.driver_population else self.car_following
+        return f"{HUMAN_TYPE_COUNT} different human drivers, {model}, with SUMO's lane changes"
 
     def possible_cav_ids(self) -> tuple[str, ...]:
-        """Return the ids that CAVs may have: any vehicle's."""
+        """Return the ids of all vehicles: each can be a CAV."""
         flow = max(self.inflow, self.off_peak_inflow) + max(self.ramp_flow, self.off_peak_ramp_flow)
         most = int(self.max_duration / 3600.0 * 2.0 * flow)
         return tuple(f"vehicle_{number}" for number in range(most))
 
     def facts(self) -> list[tuple[str, str]]:
-        """Return the road's own facts for `unjam scenarios`."""
+        """Return a description of the road for `unjam scenarios`."""
         lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
-        begin, end = self.peak
+        peak = f"{self.inflow:g} + {self.ramp_flow:g} veh/h from {self.peak[0]:g} to {self.peak[1]:g} s"
+        off_peak = f"else {self.off_peak_inflow:g} + {self.off_peak_ramp_flow:g}"
         return [
-            (
-                "road",
-                f"motorway of {(UPSTREAM_LENGTH + MERGING_LENGTH + DOWNSTREAM_LENGTH) / 1000:g} km, {lanes}, with a ramp",
-            ),
-            (
-                "vehicles",
-                f"{self.inflow:g} + {self.ramp_flow:g} veh/h from {begin:g} to {end:g} s, "
-                f"else {self.off_peak_inflow:g} + {self.off_peak_ramp_flow:g} ({100 * self.penetration_rate:g} % CAV)",
-            ),
+            ("road", f"motorway of {MOTORWAY_LENGTH / 1000:g} km, {lanes}, with a ramp"),
+            ("vehicles", f"{peak}, {off_peak} ({100 * self.penetration_rate:g} % CAV)"),
             ("limit", f"{MOTORWAY_SPEED_LIMIT:.2f} m/s"),
-            ("limit is", "what the motorway allows"),
+            ("limit is", "the speed limit of the motorway"),
         ]
 
 
@@ -250,18 +246,18 @@ def _network(lanes: int) -> RoadNetwork:
 
 
 def _edge_lanes(lanes: int) -> tuple[EdgeLane, ...]:
-    """Return all lanes; way 0 is the ramp and the lane beside the motorway in which it ends."""
-    found = [
+    """Return all lanes; lane 0 is the ramp with its extension along the motorway, where it ends."""
+    result = [
         EdgeLane("ramp_0", 0, UPSTREAM_LENGTH - RAMP_LENGTH, RAMP_SPEED_LIMIT),
         EdgeLane("merging_0", 0, UPSTREAM_LENGTH, MOTORWAY_SPEED_LIMIT, is_merging=True),
     ]
     for lane in range(lanes):
-        found += [
+        result += [
             EdgeLane(f"motorway_{lane}", lane + 1, 0.0, MOTORWAY_SPEED_LIMIT),
             EdgeLane(f"merging_{lane + 1}", lane + 1, UPSTREAM_LENGTH, MOTORWAY_SPEED_LIMIT, is_merging=True),
             EdgeLane(f"after_{lane}", lane + 1, UPSTREAM_LENGTH + MERGING_LENGTH, MOTORWAY_SPEED_LIMIT),
         ]
-    return tuple(found)
+    return tuple(result)
 
 
 _ROUTES = (Route("motorway", ("motorway", "merging", "after")), Route("ramp", ("ramp", "merging", "after")))
@@ -274,4 +270,4 @@ ON_RAMP_SCENARIOS = {
     ),
     "on-ramp-steady": replace(ON_RAMP, peak=(300.0, 2400.0)),
 }
-"""the roads of this kind that have a name"""
+"""the named roads of this kind"""

@@ -1,7 +1,7 @@
-"""A population of drivers, as `unjam fit-drivers` calibrates it: who the people on a road may be.
+"""A population of human drivers, as `unjam fit-drivers` calibrates it.
 
-A population is `NAME.json`, where it has a residual network with `NAME.safetensors` beside it. Nothing in it
-is ever executed.
+A population is a file `NAME.json`; its residual network, if it has one, is `NAME.safetensors` in the same folder.
+Nothing in it is ever executed.
 """
 
 import hashlib
@@ -26,70 +26,70 @@ from unjam.physics.arrays import Array, clip, namespace
 from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMParameters
 
 PACKAGED_POPULATIONS = Path(str(files("unjam") / "scenarios/populations"))
-"""populations that are part of the package, results/field/measure.sh: five parameters of each driver's own"""
+"""folder of the packaged populations, in which each driver has five individual parameters"""
 POPULATION_FORMAT = 1
 RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
-"""what the residual sees [m/s, m/s, m]"""
+"""inputs of the residual [m/s, m/s, m]"""
 MAX_POPULATION_BYTES = 64 * 2**20
-"""bytes of a file"""
+"""of a file"""
 POPULATION_KEYS = ("format", "unjam", "typical", "parameter_statistics", "limits", "drivers", "residual")
 """keys of the file; others are `metadata`"""
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Drivers as they were calibrated, one set of parameters each."""
+    """Calibrated human drivers, one set of parameters each."""
 
     typical: IDMParameters
-    """the one IDM that suits all of them best together"""
+    """the one IDM that fits all of them best"""
     drivers: tuple[IDMParameters, ...] = field(repr=False)
     limits: tuple[float, float]
-    """within which their acceleration was kept [m/s2]"""
+    """limits of their acceleration [m/s2]"""
     residual: Network | None = None
-    """what all of them do beside their IDM: a network of RESIDUAL_INPUTS that answers [m/s2]"""
+    """a correction of the IDM that all of them share: a network from RESIDUAL_INPUTS to an acceleration [m/s2]"""
     details: tuple[dict[str, Any], ...] = field(default=(), repr=False)
-    """of each driver, whatever else is known"""
+    """of each driver, all other entries of the file"""
     metadata: dict[str, Any] = field(default_factory=dict, repr=False)
-    """where it comes from"""
+    """origin of the population"""
 
     @property
     def max_desired_speed(self) -> float:
         """The largest desired speed [m/s]."""
-        return max(one.desired_speed for one in (self.typical, *self.drivers))
+        return max(driver.desired_speed for driver in (self.typical, *self.drivers))
 
     @property
     def min_time_headway(self) -> float:
         """The smallest time headway [s]."""
-        return min(one.time_headway for one in (self.typical, *self.drivers))
+        return min(driver.time_headway for driver in (self.typical, *self.drivers))
 
     def draw(self, count: int, generator: np.random.Generator) -> list[IDMParameters]:
-        """Return `count` drivers, drawn with replacement; each keeps its own parameters together."""
+        """Return `count` drivers, drawn with replacement; the parameters of a driver stay together."""
         return [self.drivers[index] for index in generator.integers(len(self.drivers), size=count)]
 
     def parameter_statistics(self) -> dict[str, dict[str, float]]:
         """Return mean, standard deviation and quartiles of each parameter."""
-        found = {}
-        for name in IDM_PARAMETER_NAMES:
-            values = np.array([getattr(one, name) for one in self.drivers])
-            found[name] = {
+        columns = {name: np.array([getattr(driver, name) for driver in self.drivers]) for name in IDM_PARAMETER_NAMES}
+        return {
+            name: {
                 "mean": float(values.mean()),
                 "std": float(values.std()),
                 "quartiles": np.quantile(values, [0.25, 0.5, 0.75]).tolist(),
             }
-        return found
+            for name, values in columns.items()
+        }
 
 
 def residual_inputs(speed: Array, leader_speed: Array, gap: Array) -> Array:
-    """Return what a residual sees, shape (..., 3), SI units: RESIDUAL_INPUTS."""
+    """Return the inputs of a residual, RESIDUAL_INPUTS, in SI units, shape (..., 3)."""
     return namespace(gap).stack([speed, leader_speed - speed, gap], -1)
 
 
 def apply_population(
     population: Population | None, acceleration: Array, speed: Array, leader_speed: Array, gap: Array
 ) -> Array:
-    """Return IDM accelerations with what a population adds to them: its residual and its limits [m/s2].
+    """Return IDM accelerations with the residual and the limits of a population applied [m/s2].
 
-    Shapes: all arrays (n,). Without a population the accelerations are as they were.
+    Shapes: all arrays (n,). Without a population the accelerations are unchanged.
     """
     if population is None:
         return acceleration
@@ -99,19 +99,15 @@ def apply_population(
 
 
 def write_population(path: Path, population: Population) -> None:
-    """Write a population to `path`, its residual beside it."""
+    """Write a population to `path`, and its residual into the same folder."""
     residual = None
     if population.residual is not None:
         weights = save(network_weights(population.residual))
-        beside = path.with_suffix(".safetensors")
-        residual = {
-            "file": beside.name,
-            "sha256": hashlib.sha256(weights).hexdigest(),
-            "authority": population.residual.authority,
-        }
-        atomic_write(beside, weights)
+        weights_file = path.with_suffix(".safetensors")
+        sha256 = hashlib.sha256(weights).hexdigest()
+        residual = {"file": weights_file.name, "sha256": sha256, "authority": population.residual.authority}
+        atomic_write(weights_file, weights)
     details = population.details or ({},) * len(population.drivers)
-    drivers = [{**detail, **asdict(one)} for detail, one in zip(details, population.drivers, strict=True)]
     content = {
         "format": POPULATION_FORMAT,
         "unjam": __version__,
@@ -120,16 +116,16 @@ def write_population(path: Path, population: Population) -> None:
         "limits": list(population.limits),
         "residual": residual,
         **population.metadata,
-        "drivers": drivers,
+        "drivers": [{**detail, **asdict(one)} for detail, one in zip(details, population.drivers, strict=True)],
     }
     atomic_write(path, to_json(content, indent=1))
 
 
 def population_file(name: Path | str) -> Path:
-    """Return the file of a population: `unjam:ngsim` and the like are part of the package, others are paths.
+    """Return the file of a population: names such as `unjam:ngsim` are part of the package, others are paths.
 
     Raises:
-        InputError: none of that name is part of the package.
+        InputError: the package has no population of that name.
     """
     if not str(name).startswith(PACKAGED_PREFIX):
         return Path(name)
@@ -140,10 +136,10 @@ def population_file(name: Path | str) -> Path:
 
 
 def read_population(name: Path | str) -> Population:
-    """Return the population of a file, or a shipped one.
+    """Return the population of a file, or a packaged one.
 
     Raises:
-        InputError: there is none, or it is damaged, or not a population.
+        InputError: the file is missing, damaged or not a population.
     """
     path = population_file(name)
     if not os.path.exists(path):
@@ -156,18 +152,17 @@ def read_population(name: Path | str) -> Population:
 
 @lru_cache(maxsize=8)
 def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
-    """Read a file once, as long as it stays as it is: every episode asks for it."""
+    """Read a file again only if it has changed: every episode needs it."""
     if size > MAX_POPULATION_BYTES:
         raise InputError(f"population {path.name}: {size} bytes are not allowed; allowed: <= {MAX_POPULATION_BYTES}")
     try:
         content = json.loads(path.read_bytes())
         if content["format"] != POPULATION_FORMAT:
             raise InputError(f"population {path.name}: format {content['format']!r} is unknown")
+        entries = content["drivers"]
         drivers = tuple(
-            build_dataclass(
-                IDMParameters, {name: one[name] for name in IDM_PARAMETER_NAMES}, f"population.drivers.{number}"
-            )
-            for number, one in enumerate(content["drivers"])
+            build_dataclass(IDMParameters, {name: one[name] for name in IDM_PARAMETER_NAMES}, f"population.drivers.{n}")
+            for n, one in enumerate(entries)
         )
         if not drivers:
             raise InputError(f"population {path.name}: it has no drivers")
@@ -179,26 +174,23 @@ def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
             drivers=drivers,
             limits=(low, high),
             residual=_read_residual(path, content["residual"]),
-            details=tuple(
-                {key: value for key, value in one.items() if key not in IDM_PARAMETER_NAMES}
-                for one in content["drivers"]
-            ),
+            details=tuple({key: one[key] for key in one if key not in IDM_PARAMETER_NAMES} for one in entries),
             metadata={key: value for key, value in content.items() if key not in POPULATION_KEYS},
         )
     except INVALID_DATA_ERRORS as error:
-        words = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
-        raise InputError(f"population {path.name}: not a population: {words}") from None
+        reason = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise InputError(f"population {path.name}: not a population: {reason}") from None
 
 
 def _read_residual(path: Path, entry: dict[str, Any] | None) -> Network | None:
     if entry is None:
         return None
-    beside = path.parent / Path(str(entry["file"])).name  # never a file of another folder
-    if beside.stat().st_size > MAX_POPULATION_BYTES:
+    weights_file = path.parent / Path(str(entry["file"])).name  # never a file of another folder
+    if weights_file.stat().st_size > MAX_POPULATION_BYTES:
         raise InputError(f"population {path.name}: its residual is too large")
-    weights = beside.read_bytes()
+    weights = weights_file.read_bytes()
     if hashlib.sha256(weights).hexdigest() != entry["sha256"]:
-        raise InputError(f"population {path.name}: damaged: {beside.name} does not have the hash it names")
+        raise InputError(f"population {path.name}: damaged: {weights_file.name} does not have the hash it names")
     network = network_from_weights(load(weights), float(entry["authority"]), 0.0)
     if network.input_size != len(RESIDUAL_INPUTS):
         raise InputError(f"population {path.name}: {network.input_size} inputs are not allowed; allowed: 3")

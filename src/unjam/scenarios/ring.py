@@ -1,4 +1,4 @@
-"""Closed roads with one lane, and the simplest of them: the ring, too full to be driven without waves."""
+"""Closed roads with one lane, and the simplest of them: the ring, too dense for stable traffic."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,11 +15,11 @@ from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Rou
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 RING_EDGES = 4
-"""of a ring"""
+"""number of edges of a ring"""
 
 
 class EdgeSpan(NamedTuple):
-    """Where along a closed road an edge lies."""
+    """The position of an edge along a closed road."""
 
     name: str
     start: float
@@ -29,15 +29,15 @@ class EdgeSpan(NamedTuple):
 
     @property
     def end(self) -> float:
-        """Where it ends [m]."""
+        """Its end along the road [m]."""
         return self.start + self.length
 
 
 class LoopLayout(NamedTuple):
-    """One closed road, and where vehicles stand on it."""
+    """One closed road, and the initial positions of its vehicles."""
 
     edges: Sequence[EdgeSpan]
-    """its edges, in driving order"""
+    """in driving order"""
     length: float
     """[m]"""
     positions: NDArray[np.float64]
@@ -46,30 +46,30 @@ class LoopLayout(NamedTuple):
     outline: NDArray[np.float64]
     """rows (coordinate along the lap, x, y) [m]"""
     crossings: tuple[tuple[float, float], ...] = ()
-    """where it crosses itself [m]"""
+    """sections where the road crosses itself [m]"""
 
 
 @dataclass(frozen=True, config=STRICT)
 class LoopScenario(Scenario):
-    """What closed roads share: each episode draws their size anew."""
+    """A closed road; each episode draws its size."""
 
     size_parameter: ClassVar[str]
     """the parameter that is drawn, uniformly among the integers of its range [m]"""
     description: ClassVar[str]
-    """in words, with braces for the sizes"""
+    """of the road, with braces for the sizes"""
     limit_description: ClassVar[str]
-    """what its limit is, in words"""
+    """definition of its limit speed"""
     provided_fields: ClassVar[tuple[str, ...]] = ("penetration_rate",)
     is_first_leading: ClassVar[bool] = False
-    """whether vehicle 0 leads the queue, and does not end it"""
+    """whether vehicle 0 leads the queue; otherwise it is the last one"""
 
     vehicles: Annotated[int, Field(ge=2)] = 22
-    """on the road, CAVs among them"""
+    """on the road, CAVs included"""
     cavs: PositiveInt = 1
-    """vehicles that are CAVs, evenly spread"""
+    """number of CAVs, evenly spread"""
 
     @model_validator(mode="after")
-    def _check_counts(self) -> "LoopScenario":
+    def _check_counts(self) -> Self:
         low, high = self._size_range
         if high < low:
             raise ValueError(f"{self.size_parameter}: {high} m is not allowed as the largest; allowed: >= {low} m")
@@ -77,57 +77,57 @@ class LoopScenario(Scenario):
             raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= vehicles, {self.vehicles}")
         if self.human_control == "native" and self.driver_population and self.driver_population.residual is not None:
             raise ValueError(
-                "human_control: native is not allowed for a population with a residual network, which SUMO's "
-                "own IDM knows nothing of; allowed: commanded"
+                "human_control: native is not allowed for a population with a residual network, which SUMO's own IDM "
+                "does not know; allowed: commanded"
             )
         return self
 
     def layout(self, size: float) -> LoopLayout:
-        """Return the road of a size [m]."""
+        """Return the road of a given size [m]."""
         raise NotImplementedError
 
     def limit_speed(self, size: float) -> float:
-        """Return the speed that the traffic cannot exceed in the long run on a road of a size [m/s]."""
+        """Return the speed that the traffic cannot exceed in the long run, on a road of a given size [m] [m/s]."""
         raise NotImplementedError
 
     def draw(self, generator: np.random.Generator) -> ClosedRoad:
         """Return a road of random size with its vehicles."""
         size = float(generator.integers(*self._size_range, endpoint=True))
-        lap, ids = self.layout(size), self._vehicle_ids()
-        routes, entries = _entries(lap, ids, self.max_duration * self.top_speed)
+        layout, ids = self.layout(size), self._vehicle_ids()
+        routes, entries = _entries(layout, ids, self.max_duration * self.top_speed)
         return ClosedRoad(
-            network=lap.network,
+            network=layout.network,
             routes=routes,
             entries=entries,
             vehicle_ids=ids,
             cav_ids=self.possible_cav_ids(),
-            start_positions=lap.positions,
-            loop_length=lap.length,
-            crossings=lap.crossings,
+            start_positions=layout.positions,
+            loop_length=layout.length,
+            crossings=layout.crossings,
             limit_speed=self.limit_speed(size),
-            center_line=lap.outline,
+            center_line=layout.outline,
             drawn_values={self.size_parameter: size},
             human_parameters=self.draw_humans(ids, generator),
         )
 
     @property
     def drawn_ranges(self) -> dict[str, tuple[float, float]]:
-        """The size."""
+        """The range of the size."""
         return {self.size_parameter: self._size_range}
 
     def stratum(self, index: int, count: int) -> Self:
-        """Return this road with one of `count` equal parts of its sizes, both ends included."""
+        """Return this road with one of `count` equal parts of its range of sizes, both ends included."""
         low, high = self._size_range
         borders = np.linspace(low, high + 1, count + 1).astype(int)
         first, last = int(borders[index]), int(borders[index + 1]) - 1
         return replace(self, **{self.size_parameter: (first, max(first, last))})
 
     def possible_cav_ids(self) -> tuple[str, ...]:
-        """Return the ids of the CAVs, in the order in which they stand along the road."""
+        """Return the ids of the CAVs, in their order along the road."""
         return tuple(name for name in self._vehicle_ids() if name.startswith("cav"))
 
     def facts(self) -> list[tuple[str, str]]:
-        """Return the road's own facts for `unjam scenarios`."""
+        """Return a description of the road for `unjam scenarios`."""
         ends = dict.fromkeys(self._size_range)
         return [
             ("road", self.description.format("-".join(map(str, ends)))),
@@ -142,35 +142,35 @@ class LoopScenario(Scenario):
 
     @property
     def _min_length(self) -> float:
-        """Road that the vehicles need at least [m]."""
+        """Shortest road on which the vehicles fit [m]."""
         return self.vehicles * (VEHICLE_LENGTH + self.humans.minimum_gap)
 
     def _vehicle_ids(self) -> tuple[str, ...]:
-        """Return all ids in the order along the road; CAVs are evenly spread, vehicle 0 is one of them."""
-        chosen = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
-        ids = [f"{'cav' if index in chosen else 'human'}_{index}" for index in range(self.vehicles)]
+        """Return all ids in their order along the road; vehicle 0 is a CAV, and CAVs are evenly spread."""
+        cavs = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
+        ids = [f"{'cav' if index in cavs else 'human'}_{index}" for index in range(self.vehicles)]
         return tuple(reversed(ids) if self.is_first_leading else ids)
 
 
 @dataclass(frozen=True, config=STRICT)
 class Ring(LoopScenario):
-    """Vehicles on a circle, evenly spaced and standing at the start; the length is new in each episode.
+    """Vehicles on a circle, evenly spaced and standing at the start; each episode draws the length.
 
-    The paper's ring has 22 vehicles, one of them a CAV, on 220 to 270 m. At that density the IDM's own
-    steady flow is unstable, and the humans' noise grows into a wave.
+    The paper's ring has 22 vehicles, one of them a CAV, on 220 to 270 m. At that density the steady flow of the IDM
+    is unstable, and the noise of the human drivers grows into a wave.
     """
 
     title: ClassVar[str] = "ring"
     reward: ClassVar[str] = "released"
     size_parameter: ClassVar[str] = "length"
     description: ClassVar[str] = "ring of {} m"
-    limit_description: ClassVar[str] = "the IDM's equilibrium speed, at which all vehicles could drive alike for ever"
+    limit_description: ClassVar[str] = "the IDM's equilibrium speed, which all vehicles could keep forever"
 
     length: Annotated[tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]], NumberOrRange] = (220, 270)
-    """shortest and longest ring, drawn uniformly among the integers between them; or one length [m]"""
+    """range of the length, drawn uniformly among its integers; or a single length [m]"""
 
     @model_validator(mode="after")
-    def _check_length(self) -> "Ring":
+    def _check_length(self) -> Self:
         shortest = self.length[0]
         if shortest < self._min_length:
             raise ValueError(
@@ -179,11 +179,11 @@ class Ring(LoopScenario):
         return self
 
     def layout(self, size: float) -> LoopLayout:
-        """Return the circle of a length [m], of equal edges."""
-        each = size / RING_EDGES
+        """Return the circle of a given length [m], of equal edges."""
+        edge_length = size / RING_EDGES
         coordinates = np.linspace(0, size, 161)
         return LoopLayout(
-            edges=[EdgeSpan(f"edge_{index}", index * each, each) for index in range(RING_EDGES)],
+            edges=[EdgeSpan(f"edge_{index}", index * edge_length, edge_length) for index in range(RING_EDGES)],
             length=size,
             positions=np.arange(self.vehicles, dtype=np.float64) * (size / self.vehicles),
             network=_circle_network(size, self.top_speed),
@@ -191,21 +191,20 @@ class Ring(LoopScenario):
         )
 
     def limit_speed(self, size: float) -> float:
-        """Return the IDM's equilibrium speed on a ring of this length [m/s]."""
+        """Return the IDM's equilibrium speed on a ring of a given length [m/s]."""
         return equilibrium_speed(size / self.vehicles - VEHICLE_LENGTH, self.humans)
 
 
 def _entries(
     layout: LoopLayout, ids: Sequence[str], min_distance: float
 ) -> tuple[tuple[Route, ...], tuple[Entry, ...]]:
-    """Return routes from each edge on, at least `way` [m] long, and the vehicles that stand there."""
-    places = layout.edges
-    laps = int(min_distance / sum(place.length for place in places)) + 2
-    names = [place.name for place in places]
+    """Return routes of at least `min_distance` [m] from each edge, and the vehicles that stand there."""
+    names = [edge.name for edge in layout.edges]
+    laps = int(min_distance / sum(edge.length for edge in layout.edges)) + 2
     routes = [Route(f"from_{name}", (*names[first:], *names[:first]), laps) for first, name in enumerate(names)]
     entries = []
     for name, position in zip(ids, layout.positions.tolist(), strict=True):
-        edge = max((place for place in places if place.start <= position), key=lambda place: place.start)
+        edge = max((edge for edge in layout.edges if edge.start <= position), key=lambda edge: edge.start)
         entries.append(Entry(name, f"from_{edge.name}", min(position - edge.start, edge.length)))
     return tuple(routes), tuple(entries)
 
@@ -220,6 +219,6 @@ def _circle_network(length: float, speed: float) -> RoadNetwork:
     edges = []
     for index in range(RING_EDGES):
         line = _circle_points(2 * np.pi * (index + np.linspace(0, 1, 41)) / RING_EDGES, length)
-        begin, end = nodes[index].name, nodes[(index + 1) % RING_EDGES].name
-        edges.append(Edge(f"edge_{index}", begin, end, length / RING_EDGES, shape=as_polyline(line)))
+        ends = nodes[index].name, nodes[(index + 1) % RING_EDGES].name
+        edges.append(Edge(f"edge_{index}", *ends, length / RING_EDGES, shape=as_polyline(line)))
     return RoadNetwork(nodes, tuple(edges), speed, has_internal_links=False)

@@ -21,7 +21,7 @@ def as_polyline(points: NDArray[np.float64]) -> Polyline:
 
 
 class Node(NamedTuple):
-    """Where edges begin, end and meet."""
+    """A point where edges begin, end or meet."""
 
     name: str
     x: float
@@ -29,13 +29,13 @@ class Node(NamedTuple):
     y: float
     """[m]"""
     has_priority: bool = False
-    """whether priorities of the edges decide who goes first"""
+    """whether the priorities of the edges decide the right of way"""
     radius: float | None = None
-    """of its junction [m]; None: the simulator's"""
+    """of its junction [m]; None: the simulator's default"""
 
 
 class Edge(NamedTuple):
-    """A stretch of road between two nodes."""
+    """A piece of road between two nodes."""
 
     name: str
     from_node: str
@@ -43,16 +43,16 @@ class Edge(NamedTuple):
     length: float
     """[m]"""
     priority: int | None = None
-    """larger goes first where edges meet"""
+    """the larger one has the right of way"""
     shape: Polyline = ()
     """empty: straight"""
     lanes: int = 1
     speed_limit: float | None = None
-    """what it allows [m/s]; None: what the network does"""
+    """[m/s]; None: that of the network"""
 
 
 class Connection(NamedTuple):
-    """An edge that another one follows, or a lane that follows a lane; lanes count from 0 at the right."""
+    """Two edges, or two lanes, that follow each other; lanes count from 0 at the right."""
 
     from_edge: str
     to_edge: str
@@ -68,15 +68,15 @@ class RoadNetwork:
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
     speed_limit: float
-    """what every edge allows that says nothing else [m/s]"""
+    """of all edges without their own [m/s]"""
     has_internal_links: bool = True
-    """whether ways across junctions have a length of their own"""
+    """whether the lanes across junctions have a length of their own"""
     connections: tuple[Connection, ...] = ()
     """empty: all that are possible"""
 
 
 class Route(NamedTuple):
-    """Edges one after the other."""
+    """Edges that a vehicle drives one after the other."""
 
     name: str
     edges: tuple[str, ...]
@@ -92,12 +92,12 @@ class Entry(NamedTuple):
     position: float
     """of its front bumper on the first edge [m]"""
     speed: float | Literal["last"] = 0.0
-    """[m/s]; `last`: as fast as who entered before"""
+    """[m/s]; `last`: that of the vehicle that entered before"""
     time: float = 0.0
     """[s]"""
     lane: int = 0
     vehicle_type: str = ""
-    """of the road's `vehicle_types`; empty: as the scenario's people"""
+    """one of the road's `vehicle_types`; empty: a human driver as the scenario says"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,16 +105,16 @@ class Road:
     """One episode's road and traffic."""
 
     limit_speed: float
-    """speed that the traffic cannot exceed in the long run [m/s]: the scenario's own limit; NaN: unknown"""
+    """speed that the traffic cannot exceed in the long run [m/s], as the scenario defines it; NaN: unknown"""
     drawn_values: dict[str, float] = field(default_factory=dict)
-    """what the episode's seed has drawn, by name"""
+    """values drawn from the episode's seed, by name"""
     human_parameters: dict[str, IDMParameters] = field(default_factory=dict)
-    """how each vehicle's human driver drives, by vehicle; empty: all as the scenario says"""
+    """parameters of each vehicle's human driver, by vehicle; empty: all as the scenario says"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BuiltRoad(Road):
-    """A road that is built for the episode, and who enters it."""
+    """A road that is built for the episode, with the vehicles that enter it."""
 
     network: RoadNetwork
     routes: tuple[Route, ...]
@@ -124,28 +124,28 @@ class BuiltRoad(Road):
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedRoad(BuiltRoad):
-    """A loop with one lane: nobody enters, nobody leaves, nobody overtakes."""
+    """A loop with one lane: vehicles neither enter nor leave nor overtake."""
 
     vehicle_ids: tuple[str, ...]
-    """all vehicles, in the order in which they stand along the road"""
+    """all vehicles, in their order along the road"""
     cav_ids: tuple[str, ...]
-    """those of them that a driver drives, in the same order"""
+    """the CAVs among them, in the same order"""
     start_positions: NDArray[np.float64]
     """front bumper of each vehicle along the route at the start [m]"""
     loop_length: float
     """length of the closed road [m]"""
     crossings: tuple[tuple[float, float], ...]
-    """where along the road it crosses another way: there SUMO drives commanded people itself [m]"""
+    """sections where the road crosses itself, and SUMO itself drives commanded human drivers [m]"""
     center_line: NDArray[np.float64]
-    """the road's centre line: rows (coordinate along the route, x, y) [m]"""
+    """the road's center line: rows (coordinate along the route, x, y) [m]"""
 
     def provided_penetration_rate(self, required_fields: Collection[str]) -> float | None:
-        """Return the share of CAVs, as a service tells it, where it is among what a driver asks for."""
+        """Return the penetration rate if it is among the fields that a driver requires, else None."""
         return len(self.cav_ids) / len(self.vehicle_ids) if "penetration_rate" in required_fields else None
 
 
 class VehicleType(NamedTuple):
-    """How somebody drives on a motorway, as SUMO's car-following models take it."""
+    """A human driver on a motorway, with the parameters of SUMO's car-following models."""
 
     model: str
     """SUMO's name of the car-following model"""
@@ -156,40 +156,40 @@ class VehicleType(NamedTuple):
     deceleration: float
     """comfortable [m/s2]"""
     minimum_gap: float
-    """to who stands ahead [m]"""
+    """to a standing leader [m]"""
     speed_factor: float
-    """wanted speed over what the road allows"""
+    """desired speed divided by the speed limit"""
 
 
 class EdgeLane(NamedTuple):
-    """A lane of an edge, and which way it is part of: a way is lanes one after the other."""
+    """A lane of an edge; the lanes of consecutive edges with the same `lane_index` form one lane of the road."""
 
     name: str
     """the simulator's"""
     lane_index: int
     start: float
-    """where along the main road it begins [m]"""
+    """its begin along the main road [m]"""
     speed_limit: float
-    """what it allows [m/s]"""
+    """[m/s]"""
     is_merging: bool = False
-    """whether it leads nowhere and is there to change lanes: nobody is commanded on its edge"""
+    """whether it is part of the merging section, where no vehicle is commanded"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenRoad(Road):
-    """A road with ends: vehicles come and go."""
+    """A road with ends, which vehicles enter and leave."""
 
     cav_ids: frozenset[str] = frozenset()
-    """those that a driver drives, where that is known before they enter"""
+    """the CAVs, if they are known before they enter"""
 
 
 class Origin(NamedTuple):
-    """Where a vehicle of a merging road comes from."""
+    """The point where a vehicle enters a merge."""
 
     branch: int
     """0: the main road; 1: the ramp"""
     position: float
-    """of its front bumper as it enters, negative before the place where both ways meet [m]"""
+    """of its front bumper as it enters, negative upstream of the merge point [m]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,55 +197,55 @@ class MergeRoad(BuiltRoad, OpenRoad):
     """A main road that a ramp joins, with one lane each."""
 
     origins: dict[str, Origin]
-    """of all vehicles that may enter"""
+    """of all vehicles that can enter"""
     junction_lengths: tuple[float, float]
-    """lengths of the ways across the junction, of main road and ramp [m]; they end where the ways meet, and
-    there SUMO drives commanded people itself"""
+    """lengths of the lanes across the junction up to the merge point, of main road and ramp [m]; on them SUMO itself
+    drives commanded human drivers"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotorwayRoad(BuiltRoad, OpenRoad):
-    """A main road with lanes that ramps join; people differ and overtake."""
+    """A main road with lanes that ramps join; human drivers differ, and overtake."""
 
     vehicle_types: dict[str, VehicleType]
-    """the people that there are, by name"""
+    """the types of human drivers, by name"""
     edge_lanes: tuple[EdgeLane, ...]
     """of all edges"""
     lane_names: tuple[str, ...]
-    """names of the ways that lanes join to, from right to left"""
+    """names of the lanes of the road, from right to left"""
     merge_position: float
-    """where along the main road the ramp's lane begins to run beside it [m]"""
+    """begin of the merging section along the main road [m]"""
     length: float
     """of the main road [m]"""
     vehicle_length: float
     """of every vehicle [m]"""
     peak: tuple[float, float]
-    """from when to when the most vehicles want to enter [s]"""
+    """begin and end of the peak of demand [s]"""
     free_flow_time: float
-    """mean travel time of people where they are few [s]"""
+    """mean travel time of human drivers in free flow [s]"""
     roadside: RoadsideSettings
-    """what CAVs are told of the road ahead"""
+    """the roadside information that CAVs receive"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class UserNetworkRoad(OpenRoad):
-    """A network of the user's own, with all its traffic."""
+    """A network of the user, with all its traffic."""
 
     files: SumoFiles
-    """what its files say"""
+    """the content of its files"""
     penetration_rate: float
-    """share of the vehicles that become CAVs"""
+    """share of the eligible vehicles that become CAVs"""
     cav_types: tuple[str, ...]
-    """vehicle types all of whose vehicles become CAVs"""
+    """vehicle types of which all vehicles become CAVs"""
     eligible_types: frozenset[str]
-    """vehicle types whose vehicles the share may pick"""
+    """vehicle types to which the penetration rate applies"""
     cav_seed: int
-    """which vehicles the share picks"""
+    """seed of the choice of CAVs"""
     cavs: int | None = None
-    """at most so many of them, the first that enter"""
+    """maximum number of CAVs: the first that enter"""
     drivers: tuple[IDMParameters, ...] = ()
-    """calibrated people, one of whom drives each car; nobody where all drive as their types say"""
+    """calibrated human drivers, one for each car; empty: all drive as their types say"""
     calibrated_types: frozenset[str] = frozenset()
     """vehicle types that they drive"""
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
-    """what CAVs are told of the road ahead"""
+    """the roadside information that CAVs receive"""

@@ -1,4 +1,4 @@
-"""What a scenario is: where the vehicles drive, how an episode starts and when it ends."""
+"""What all scenarios share: the settings of a road's traffic, how an episode starts and when it ends."""
 
 from collections.abc import Sequence
 from dataclasses import field
@@ -21,58 +21,60 @@ from unjam.scenarios.population import Population, read_population
 from unjam.scenarios.road import Road
 
 UNLIMITED_ACCELERATION = 20.0
-"""accelerations of an obedient CAV's type [m/s2]: far beyond what it asks for, so that only safety clips"""
+"""acceleration limit of a CAV's vehicle type in SUMO [m/s2]: far above any command, so that only safety clips"""
 VEHICLE_LENGTH = 5.0
 """[m], of every vehicle"""
 SUMO_ACCELERATION = 2.6
-"""of commanded people and of cars, SUMO's own [m/s2]"""
+"""acceleration limit of commanded human drivers and of cars [m/s2], SUMO's default"""
 MIN_CAV_GAP = 0.5
 """gap that SUMO keeps for a CAV [m]"""
 MIN_SET_SPEED = 0.1
-"""set speed below which SUMO has none [m/s]"""
+"""lowest set speed that SUMO accepts [m/s]"""
 IDM_SUBSTEP = 0.25
-"""about how long the steps are that SUMO's IDM makes within one of the simulation [s]"""
+"""approximate length of the steps into which SUMO's IDM divides a simulation step [s]"""
+MAX_HORIZON = 10_000_000
+"""control steps of the longest episode: twelve days of 0.1 s; more would fill the memory"""
 
 Actuation = Literal["shielded", "raw", "flow", "cruise"]
 """How SUMO carries out a CAV's command.
 
 `shielded`: exactly, until it is unsafe; then SUMO brakes, and the override is counted.
 `raw`: exactly, always; a collision ends the episode.
-`flow`: as in Flow, the CAV is also bound by SUMO's human model and can never accelerate beyond it.
-`cruise`: the CAV's own ACC follows and keeps its distance; commands can only hold it back. With lanes, where
-SUMO makes room for who changes them, it is the one that works.
+`flow`: as in Flow, SUMO's human model also limits the CAV, which can never accelerate more than that model.
+`cruise`: the CAV's own ACC follows and keeps its distance; commands can only reduce its set speed. It suits roads
+with several lanes, where SUMO makes room for vehicles that change lanes.
 """
 
 HumanControl = Literal["native", "commanded"]
-"""Who computes how people drive.
+"""What computes the motion of human drivers.
 
-`native`: SUMO's own IDM with the scenario's parameters, to whose speeds noise is added.
-`commanded`: the same IDM and noise as a speed command in every step, as Flow does it, over a quicker model
-of SUMO's that keeps vehicles safe and obeys the right of way. SUMO's IDM with the paper's parameters alone is
-far more timid where roads cross.
+`native`: SUMO's own IDM with the scenario's parameters; noise is added to its speeds.
+`commanded`: the same IDM and noise as a speed command in every step, as in Flow, on top of a quicker model of SUMO
+that keeps vehicles safe and obeys the right of way. SUMO's IDM with the paper's parameters alone is far more timid
+where roads cross.
 """
 
 
 @dataclass(frozen=True, config=STRICT)
 class CruiseControl:
-    """A CAV's own ACC, an IDM as SUMO has it, and how it changes lanes.
+    """A CAV's own ACC, an IDM as SUMO computes it, and its motivation to change lanes.
 
-    What makes an ACC worse than people is weak acceleration, not a long headway. With 1 s it follows below
-    0.8 s for moments.
+    Weak acceleration, not a long time gap, makes an ACC worse than human drivers. With 1 s its time gap falls below
+    0.8 s at times.
     """
 
     time_gap: Positive = 1.1
     """[s]"""
     acceleration: Positive | None = 2.5
-    """[m/s2]; None, on your own network: that of the vehicle which the CAV replaces"""
+    """[m/s2]; None, on a user network: that of the vehicle that the CAV replaces"""
     deceleration: Positive | None = 2.0
     """comfortable [m/s2]; None likewise"""
     minimum_gap: Positive = 2.0
-    """to who stands ahead [m]"""
+    """to a standing leader [m]"""
     keep_right: NonNegative | None = None
-    """how eagerly it keeps right; None: as the vehicle does by itself, 1 for most; 0: it does not"""
+    """eagerness to keep right; None: that of the vehicle, mostly 1; 0: none"""
     speed_gain: NonNegative | None = None
-    """how eagerly it changes lanes to be faster, likewise"""
+    """eagerness to change lanes for a higher speed, likewise"""
 
     def set_speed(
         self,
@@ -82,119 +84,112 @@ class CruiseControl:
         step: float,
         vehicle_limits: tuple[Array, Array] | None = None,
     ) -> Array:
-        """Return the set speed with which it accelerates as wanted where nobody is near [m/s].
+        """Return the set speed with which the ACC accelerates as commanded on a free road [m/s].
 
-        Infinite where it may drive as it likes: as hard as it can, or as anybody may ask.
+        It is infinite where the command is the largest possible: the ACC then drives without a set-speed cap.
 
         Args:
             speed: own [m/s], shape (n,).
-            wanted: how fast it is to be after a step [m/s], shape (n,).
-            highest: acceleration that anybody may ask for [m/s2].
+            target_speed: speed to reach after a step [m/s], shape (n,).
+            max_acceleration: largest acceleration that can be commanded [m/s2].
             step: of the simulation [s].
-            vehicle: acceleration and comfortable deceleration of each vehicle [m/s2], shape (n,), which the
-                ACC has where it has none of its own.
+            vehicle_limits: acceleration and comfortable deceleration of each vehicle [m/s2], shape (n,), for an ACC
+                without its own.
         """
-        xp, asked = namespace(speed), (target_speed - speed) / step
-        own_most, own_braking = vehicle_limits or (0.0, 0.0)
-        most: Array = self.acceleration or own_most
-        braking: Array = self.deceleration or own_braking
-        held = asked < clamp_max(most, max_acceleration) - 1e-6
-        acc = IDMArrays(0.0, self.time_gap, most, braking, IDMParameters().exponent, self.minimum_gap)
-        faster = desired_speed_from_acceleration(xp.where(held, asked, 0.0 * asked), speed, acc)
-        rising = clamp_min(xp.maximum(target_speed, faster), MIN_SET_SPEED)
-        # SUMO's IDM overshoots low set speeds within a step, brakes for it, and may stand for ever.
-        parts = max(1, int(step / IDM_SUBSTEP + 0.5))
-        reached, steady = speed, 2.0 * most * step / parts
-        told = acc._replace(desired_speed=rising)
-        for _ in range(parts):
-            reached = next_speed(reached, idm_acceleration(reached, reached, inf, told), step / parts)
-        rising = xp.where(reached <= speed, clamp_min(rising, steady), rising)
-        found = clamp_min(xp.where(asked <= 0.0, target_speed, rising), MIN_SET_SPEED)
-        return xp.where(held, found, 0.0 * found + inf)
+        xp, command = namespace(speed), (target_speed - speed) / step
+        vehicle_acceleration, vehicle_deceleration = vehicle_limits or (0.0, 0.0)
+        acceleration: Array = self.acceleration or vehicle_acceleration
+        deceleration: Array = self.deceleration or vehicle_deceleration
+        is_capped = command < clamp_max(acceleration, max_acceleration) - 1e-6
+        acc = IDMArrays(0.0, self.time_gap, acceleration, deceleration, IDMParameters().exponent, self.minimum_gap)
+        desired = desired_speed_from_acceleration(xp.where(is_capped, command, 0.0 * command), speed, acc)
+        rising = clamp_min(xp.maximum(target_speed, desired), MIN_SET_SPEED)
+        # SUMO's IDM overshoots low set speeds within a step, brakes, and may then stand forever.
+        substeps = max(1, int(step / IDM_SUBSTEP + 0.5))
+        speed_after, steady = speed, 2.0 * acceleration * step / substeps
+        acc = acc._replace(desired_speed=rising)
+        for _ in range(substeps):
+            acceleration_now = idm_acceleration(speed_after, speed_after, inf, acc)
+            speed_after = next_speed(speed_after, acceleration_now, step / substeps)
+        rising = xp.where(speed_after <= speed, clamp_min(rising, steady), rising)
+        capped = clamp_min(xp.where(command <= 0.0, target_speed, rising), MIN_SET_SPEED)
+        return xp.where(is_capped, capped, 0.0 * capped + inf)
 
 
 def whole_milliseconds(step: float) -> float:
-    """Return a step [s]; raise `ValueError` where it is none of SUMO's, which counts milliseconds."""
+    """Return a step [s]; raise `ValueError` unless it is a whole number of milliseconds, SUMO's unit of time."""
     if abs(1000.0 * step - round(1000.0 * step)) > 1e-9:
         raise ValueError("a whole number of milliseconds, as SUMO counts")
     return step
 
 
-MAX_HORIZON = 10_000_000
-"""decisions of the longest episode: twelve days in tenths of a second; more would fill the memory"""
-
-
 @dataclass(frozen=True, config=STRICT)
 class Scenario:
-    """What all scenarios share; each kind of road adds its own."""
+    """The settings that all scenarios share; each kind of road adds its own."""
 
     title: ClassVar[str]
     reward: ClassVar[str]
-    """reward used where none is named"""
+    """the default reward"""
     is_closed: ClassVar[bool] = True
     """whether the road is a loop"""
     has_coordinate: ClassVar[bool] = True
     """whether vehicles have a position along the road"""
     provided_fields: ClassVar[tuple[str, ...]] = ()
-    """fields of a `LocalState` that CAVs are told here and not everywhere"""
+    """optional fields of a `LocalState` that this road provides"""
     has_vehicle_types: ClassVar[bool] = False
-    """whether vehicles have types of the user's, whose properties a CAV keeps"""
+    """whether the user defines vehicle types, whose properties a CAV keeps"""
     sumo_human_gap: ClassVar[float] = 0.0
-    """gap that SUMO keeps for commanded people [m]"""
+    """gap that SUMO keeps for commanded human drivers [m]"""
 
     simulation_step: Annotated[Positive, AfterValidator(whole_milliseconds)] = 0.1
     """time step of SUMO [s]"""
     steps_per_control_step: PositiveInt = 1
-    """simulation steps for which one command holds"""
+    """simulation steps for which one command is applied"""
     horizon: Annotated[PositiveInt, Field(le=MAX_HORIZON)] = 3000
-    """decisions in an episode"""
+    """control steps in an episode"""
     warmup: NonNegativeInt = 0
-    """all-human simulation steps before the CAVs take over"""
+    """simulation steps with human drivers alone, before the CAVs take over"""
     remember_warmup: bool = True
-    """whether a driver may remember the warm-up, which it saw but did not drive"""
+    """whether a driver's memory includes the warm-up, which it observed but did not drive"""
     action_limit: Positive = 1.0
-    """largest acceleration that a CAV may ask for, in either direction [m/s2]"""
+    """largest acceleration that a CAV can command, in either direction [m/s2]"""
     actuation: Actuation = "shielded"
-    """how SUMO carries out a CAV's command: `shielded` exactly until it is unsafe, then SUMO brakes; `raw`
-    exactly; `flow` bound by the human IDM; `cruise` bound by the CAV's own ACC"""
+    """how SUMO carries out a CAV's command: `shielded` exactly until it is unsafe, then SUMO brakes; `raw` exactly;
+    `flow` limited by the human IDM; `cruise` limited by the CAV's own ACC"""
     cruise: CruiseControl = field(default_factory=CruiseControl)
-    """the CAV's own ACC, where it is what follows"""
+    """the CAV's own ACC, for `cruise`"""
     safety: SafetyFilter = field(default_factory=SafetyFilter)
     """the filter between driver and road, of every CAV, in every simulation step"""
     actuator: Actuator = field(default_factory=Actuator)
-    """how late a CAV does what it is told"""
+    """delay with which a CAV follows its commands"""
     sensors: Sensors = field(default_factory=Sensors)
-    """how wrong what a CAV senses of its neighbours is"""
+    """errors with which a CAV measures its neighbors"""
     enforce_human_limits: bool = True
-    """whether commanded people keep to what brakes and engine can do, in an emergency too"""
+    """whether commanded human drivers respect the limits of brakes and engine, in an emergency too"""
     humans: IDMParameters = field(default_factory=IDMParameters)
-    """how people drive"""
+    """parameters of human drivers"""
     population: str = ""
-    """calibrated drivers, each of whom drives in its own way: a file of `unjam fit-drivers`, `unjam:ngsim` or
+    """calibrated human drivers with individual parameters: a file of `unjam fit-drivers`, `unjam:ngsim` or
     `unjam:astazero`; empty: all drive as `humans` says"""
     human_control: HumanControl = "native"
-    """who computes how people drive: `native` SUMO's own IDM; `commanded` the same IDM as a speed command in
-    every step, as in Flow"""
+    """what computes the motion of human drivers: `native` SUMO's own IDM; `commanded` the same IDM as a speed command
+    in every step, as in Flow"""
     right_of_way: bool = True
-    """whether vehicles obey the right of way where roads meet; if not, SUMO only keeps them from colliding"""
+    """whether vehicles obey the right of way where roads meet; if not, SUMO only prevents collisions"""
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """how readily vehicles that must yield take a gap in crossing traffic (SUMO's `impatience`)"""
+    """how readily vehicles that must yield accept a gap in crossing traffic (SUMO's `impatience`)"""
     noise: NonNegative = 0.2
-    """standard deviation of the humans' acceleration noise [m/s2]"""
+    """standard deviation of the acceleration noise of human drivers [m/s2]"""
     noise_scaling: Literal["sqrt-step", "none"] = "sqrt-step"
-    """`sqrt-step`: noise times sqrt(time step), as Flow; `none`: as the paper says"""
+    """`sqrt-step`: noise times sqrt(time step), as in Flow; `none`: as in the paper"""
     emission_class: str = "HBEFA4/PC_petrol_Euro-6ab"
     """SUMO's emission class of every vehicle, for fuel"""
 
     @model_validator(mode="after")
-    def _acc_has_limits(self) -> Self:
+    def _check_filter_and_acc(self) -> Self:
         for name in ("acceleration", "deceleration"):
             if not self.has_vehicle_types and getattr(self.cruise, name) is None:
                 raise ValueError(f"cruise.{name}: None is not allowed on {self.title}; allowed: > 0")
-        return self
-
-    @model_validator(mode="after")
-    def _filter_covers_sensor_errors(self) -> Self:
         for name in ("gap_error", "speed_error"):
             known, largest = getattr(self.safety, name), getattr(self.sensors, name)
             if self.safety.active and known < largest:
@@ -203,48 +198,47 @@ class Scenario:
 
     @property
     def notes(self) -> list[str]:
-        """What a user must know of this road beside the results."""
+        """What a user must know about this road in addition to the results."""
         return []
 
     @property
     def control_step(self) -> float:
-        """Time between two decisions [s]."""
+        """Time between two commands [s]."""
         return self.simulation_step * self.steps_per_control_step
 
     @property
     def noise_per_step(self) -> float:
         """Standard deviation of the acceleration noise in one simulation step [m/s2]."""
-        scale = self.simulation_step**0.5 if self.noise_scaling == "sqrt-step" else 1.0
-        return self.noise * scale
+        return self.noise * (self.simulation_step**0.5 if self.noise_scaling == "sqrt-step" else 1.0)
 
     @property
     def cav_max_braking(self) -> float:
-        """How hard a CAV can brake at all [m/s2]: with a car's brakes where a filter keeps it safe."""
+        """Strongest braking of a CAV [m/s2]: that of a car's brakes if the safety filter is active."""
         return self.safety.braking if self.safety.active else UNLIMITED_ACCELERATION
 
     @property
     def max_duration(self) -> float:
-        """How long an episode lasts at most, warm-up included [s]."""
+        """Longest duration of an episode, warm-up included [s]."""
         return self.simulation_step * (self.warmup + self.horizon * self.steps_per_control_step)
 
     @property
     def acceleration_limits(self) -> Limits:
-        """Accelerations that a CAV may ask for."""
+        """Accelerations that a CAV can command."""
         return Limits.symmetric(self.action_limit)
 
     @cached_property
     def driver_population(self) -> Population | None:
-        """The people of `population`, read once."""
+        """The human drivers of `population`, read once."""
         return read_population(self.population) if self.population else None
 
     @property
     def top_speed(self) -> float:
-        """What the road allows: as fast as the fastest driver wants to be [m/s]."""
+        """Speed limit of the road: the largest desired speed of its human drivers [m/s]."""
         population = self.driver_population
         return population.max_desired_speed if population else self.humans.desired_speed
 
     def check_native_humans(self, context: str) -> None:
-        """Raise `ValueError` unless SUMO itself can drive these people, as it must `where` this is."""
+        """Raise `ValueError` unless SUMO itself can drive the human drivers, as it must on this road, `context`."""
         if self.driver_population and self.driver_population.residual is not None:
             raise ValueError(
                 f"population: one with a residual network is not allowed {context}: SUMO's own IDM drives them there"
@@ -253,19 +247,19 @@ class Scenario:
             raise ValueError(f"human_control: 'commanded' is not allowed {context}; allowed: 'native'")
 
     def draw_humans(self, names: Sequence[str], generator: np.random.Generator) -> dict[str, IDMParameters]:
-        """Return who drives which vehicle; nobody where all drive as `humans` says."""
+        """Return the parameters of each vehicle's human driver; empty if all drive as `humans` says."""
         population = self.driver_population
         return dict(zip(names, population.draw(len(names), generator), strict=True)) if population else {}
 
     @property
     def population_description(self) -> str:
-        """Who the people of `population` are."""
+        """The number and origin of the calibrated drivers, as one phrase."""
         drivers = self.driver_population.drivers if self.driver_population else ()
         return f"{len(drivers)} calibrated drivers of {self.population}"
 
     @property
     def human_description(self) -> str:
-        """How people drive."""
+        """How human drivers drive, as one phrase."""
         if self.driver_population:
             return self.population_description
         return f"IDM with acceleration noise of std {self.noise_per_step:.3f} m/s2 a step"
@@ -275,7 +269,7 @@ class Scenario:
         raise NotImplementedError
 
     def scale_drawn_values(self, drawn_values: dict[str, float]) -> tuple[float, ...]:
-        """Return what an episode has drawn, each number scaled to [-1, 1] over its range: for a critic."""
+        """Return the drawn values of an episode, each scaled to [-1, 1] over its range: inputs of a critic."""
         return tuple(
             (drawn_values[name] - (low + high) / 2) / max((high - low) / 2, 1e-9)
             for name, (low, high) in self.drawn_ranges.items()
@@ -283,26 +277,26 @@ class Scenario:
 
     @property
     def drawn_ranges(self) -> dict[str, tuple[float, float]]:
-        """What each episode draws anew that a critic could see, and from which range."""
+        """Ranges of the values that each episode draws and that a critic can use."""
         return {}
 
     def stratum(self, index: int, count: int) -> Self:
-        """Return this scenario with what it draws narrowed to one of `count` equal parts of the range.
+        """Return this scenario with its drawn values narrowed to one of `count` equal parts of their range.
 
-        Episodes of all parts cover the range evenly: with few episodes, whether a ring is long or short
-        otherwise hides what the driver does.
+        Episodes of all parts cover the range evenly: with few episodes, whether a ring is long or short would
+        otherwise hide the effect of the driver.
         """
         return self
 
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
-        """Return the road of an episode's seed; and the seeds of noise, exploration, simulator, sensors."""
+        """Return the road of an episode's seed, and the seeds of noise, exploration, simulator and sensors."""
         road, *others = np.random.SeedSequence(list(seed)).spawn(5)
         return self.draw(np.random.default_rng(road)), others
 
     def possible_cav_ids(self) -> tuple[str, ...]:
-        """Return the ids of all CAVs that an episode may have."""
+        """Return the ids of all CAVs that an episode can have."""
         raise NotImplementedError
 
     def facts(self) -> list[tuple[str, str]]:
-        """Return what a reader wants to know of this road, as (name, value) pairs."""
+        """Return a description of this road as (name, value) pairs."""
         raise NotImplementedError

@@ -130,7 +130,7 @@ def test_what_is_left_out_is_told_once_in_one_line(hostile: Path, caplog: pytest
     for _ in range(2):
         make_scenario(str(hostile), {"penetration_rate": 0.5})
     (line,) = [record.getMessage() for record in caplog.records]
-    words = r"straight\.sumocfg: left out, for they only write or listen: option tripinfo-output, .* and \d+ more"
+    words = r"straight\.sumocfg: left out because they only write or listen: option tripinfo-output, .* and \d+ more"
     assert re.fullmatch(words, line)
     dropped = read_sumo_files(hostile).dropped_items
     assert {"option remote-port", "file of e1Detector", "edgeData", "parameter device.ssm.file"} <= {*dropped}
@@ -140,9 +140,9 @@ def test_it_is_noted_in_results_and_report(hostile: Path, tmp_path: Path) -> Non
     road, out = {"horizon": 20, "penetration_rate": 0.5}, tmp_path / "out"
     found = unjam.drive(str(hostile), ["human"], 1, scenario_options=road, workers=1, out=out)
     (note,) = [each for each in found.notes if "left out" in each]
-    assert note.startswith("straight.sumocfg: left out, for they only write or listen: option tripinfo-output")
+    assert note.startswith("straight.sumocfg: left out because they only write or listen: option tripinfo-output")
     assert note in json.loads((out / "evaluation.json").read_text())["notes"]
-    assert "left out, for they only write or listen" in (out / "report.html").read_text()
+    assert "left out because they only write or listen" in (out / "report.html").read_text()
 
 
 def test_harmless_files_are_read_themselves_and_nothing_is_told(

@@ -127,7 +127,7 @@ def test_a_population_with_a_residual_is_refused_where_sumo_drives(tmp_path: Pat
     residual = Network(((np.zeros((3, 1)), np.zeros(1)),), 0.5)
     one, people = IDMParameters(), tmp_path / "drivers.json"
     write_population(people, Population(one, (one,), (-9.0, 3.0), residual))
-    with pytest.raises(InputError, match="residual network is not allowed on your own network"):
+    with pytest.raises(InputError, match="residual network is not allowed on a user network"):
         scenario_of(game(tmp_path, "ramp"), population=str(people))
     with pytest.raises(InputError, match="human_control: native is not allowed for a population with a residual"):
         make_scenario("ring", {"population": str(people), "human_control": "native"})
