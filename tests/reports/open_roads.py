@@ -1,4 +1,4 @@
-"""Episodes on roads with ends, as pictures show them."""
+"""Episodes on open roads for figures."""
 
 from dataclasses import replace
 from functools import cache
@@ -15,26 +15,26 @@ from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 
 
-def shown_from(episode: Episode, driver: str) -> PlotEpisode:
-    """What a folder of results has of an episode."""
+def plot_episode_of(episode: Episode, driver: str) -> PlotEpisode:
+    """Return an episode as a folder of results contains it."""
     arrays = {name: getattr(episode, name).astype(np.float32) for name in PLOT_ARRAYS}
     return replace(to_plot_episode(driver, episode), **arrays)
 
 
 @cache
 def merge_episode(seconds: int = 100, driver: str = "pi") -> Episode:
-    found = {"pi": PISaturation(), "human": Human()}[driver]
-    return run_episode(Merge(penetration_rate=0.2, horizon=seconds), found, (1,), record_details=True)
+    drivers = {"pi": PISaturation(), "human": Human()}
+    return run_episode(Merge(penetration_rate=0.2, horizon=seconds), drivers[driver], (1,), record_details=True)
 
 
 @cache
 def ramp_episode(driver: str = "jam-ahead") -> Episode:
-    """Half of the people on the motorway of two lanes are CAVs."""
+    """A motorway of two lanes with 50 % CAVs."""
     changes = {"peak": (0.0, 90.0), "penetration_rate": 0.5, "horizon": 90}
     return run_episode(make_scenario("on-ramp", changes), make_driver(driver, 1.0), (1,), record_details=True)
 
 
-def own_episode(folder: Path, seconds: int = 60) -> Episode:
-    """Some traffic on SUMO's game `ramp`."""
+def user_episode(folder: Path, seconds: int = 60) -> Episode:
+    """Traffic on the network `ramp` of a SUMO game."""
     scenario = make_scenario(str(game(folder, "ramp")), {"penetration_rate": 0.3, "horizon": seconds * 5})
     return run_episode(scenario, PISaturation(), (1,), record_details=True)

@@ -17,8 +17,9 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 
-from tests.reports.open_roads import merge_episode, own_episode, shown_from
+from tests.reports.open_roads import merge_episode, plot_episode_of, user_episode
 from unjam.reports.figures import (
+    CAV_PLOT_COLOR,
     LINE_COLORS,
     MAX_PLOT_TIMES,
     color_table,
@@ -34,23 +35,22 @@ from unjam.reports.figures import (
 from unjam.reports.results import PlotEpisode
 
 LENGTH = 120.0
-CAV_COLOUR = "#d7263d"
 
 
-def shown_of(
+def make_episode(
     driver: str = "pi", speed: float = 4.0, steps: int = 300, vehicles: int = 5, **changes: Any
 ) -> PlotEpisode:
-    """Vehicles that drive around the ring at about `speed`: faster the later, and the further ahead."""
+    """Vehicles on a ring at about `speed`, increasing with time and with the number of the vehicle."""
     speeds = speed + np.linspace(0, 1, steps + 1)[:, None] + 0.1 * np.arange(vehicles)
     positions = np.arange(vehicles) * LENGTH / vehicles + np.cumsum(speeds, axis=0) * 0.1
     angles = np.linspace(0, 2 * np.pi, 41)
     radius = LENGTH / (2 * np.pi)
     values: dict[str, Any] = {
-        "step": 0.1,
+        "control_step": 0.1,
         "loop_length": LENGTH,
         "crossings": [],
         "limit_speed": 6.5,
-        "drawn": {"length": LENGTH},
+        "drawn_values": {"length": LENGTH},
         "vehicle_ids": [f"human_{n}" for n in range(vehicles - 1)] + ["cav_0"],
         "cav_ids": ["cav_0"],
         "speeds": speeds.astype(np.float32),
@@ -58,85 +58,85 @@ def shown_of(
         "gaps": np.full_like(speeds, 7.5, np.float32) + np.arange(vehicles, dtype=np.float32),
         "outline": np.column_stack([angles * radius, radius * np.cos(angles), radius * np.sin(angles)]),
         "branches": [],
-        "waiting": np.zeros(0, np.float32),
-        "lines": np.zeros((0, 2), np.float32),
-        "places": np.zeros((0, 0, 3), np.float32),
+        "backlog": np.zeros(0, np.float32),
+        "lane_lines": np.zeros((0, 2), np.float32),
+        "poses": np.zeros((0, 0, 3), np.float32),
     }
     return PlotEpisode(driver=driver, **{**values, **changes})
 
 
 def panels_of(figure: Figure) -> list[Axes]:
-    """The panels that can be seen, without the colour bar."""
+    """Return the visible panels, without the color bar."""
     return [axes for axes in figure.axes if axes.get_visible() and axes.get_label() != "<colorbar>"]
 
 
 def lines_of(axes: Axes) -> list[LineCollection]:
-    return [found for found in axes.collections if isinstance(found, LineCollection)]
+    return [each for each in axes.collections if isinstance(each, LineCollection)]
 
 
 def fields_of(axes: Axes) -> list[QuadMesh]:
-    return [found for found in axes.collections if isinstance(found, QuadMesh)]
+    return [each for each in axes.collections if isinstance(each, QuadMesh)]
 
 
 def drawn_lines(axes: Axes) -> list[Line2D]:
-    """The lines of a panel, without those that only the legend needs."""
+    """Return the lines of a panel, without those for the legend only."""
     return [line for line in axes.lines if len(np.asarray(line.get_xdata()))]
 
 
 def drivers(count: int) -> list[PlotEpisode]:
-    return [shown_of(f"driver {number}", 2.0 + number) for number in range(count)]
+    return [make_episode(f"driver {number}", 2.0 + number) for number in range(count)]
 
 
 @pytest.mark.parametrize("count", [1, 4, 6, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5))])
-def test_space_time_has_a_panel_for_each_driver(count: int) -> None:
+def test_trajectory_figure_has_a_panel_for_each_driver(count: int) -> None:
     panels = panels_of(trajectory_figure(drivers(count)))
     assert [axes.get_title(loc="left") for axes in panels] == [f"driver {number}" for number in range(count)]
 
 
-def test_space_time_of_three_puts_one_panel_beside_the_other() -> None:
+def test_trajectory_figure_of_three_drivers_has_one_row() -> None:
     figure = trajectory_figure(drivers(3))
     figure.draw_without_rendering()
-    places = [axes.get_position() for axes in panels_of(figure)]
-    assert len({round(place.y0, 3) for place in places}) == 1
-    assert places[0].x0 < places[1].x0 < places[2].x0
+    boxes = [axes.get_position() for axes in panels_of(figure)]
+    assert len({round(box.y0, 3) for box in boxes}) == 1
+    assert boxes[0].x0 < boxes[1].x0 < boxes[2].x0
 
 
-def test_space_time_colours_all_panels_on_one_scale() -> None:
-    shown = drivers(3)
-    [*fields] = [field for axes in panels_of(trajectory_figure(shown)) for field in fields_of(axes)]
+def test_all_panels_have_one_scale_of_speed() -> None:
+    episodes = drivers(3)
+    [*fields] = [field for axes in panels_of(trajectory_figure(episodes)) for field in fields_of(axes)]
     assert len(fields) == 3
-    fastest = np.ceil(max(episode.speeds.max() for episode in shown))
-    assert {(field.norm.vmin, field.norm.vmax) for field in fields} == {(0.0, fastest)}
+    max_speed = np.ceil(max(episode.speeds.max() for episode in episodes))
+    assert {(field.norm.vmin, field.norm.vmax) for field in fields} == {(0.0, max_speed)}
 
 
-def test_speed_scale_begins_at_zero_and_is_never_empty() -> None:
+def test_speed_scale_starts_at_zero_and_is_never_empty() -> None:
     assert (speed_scale(drivers(2)).vmin, speed_scale(drivers(2)).vmax) == (0.0, 5.0)
-    standing = shown_of(speeds=np.zeros((10, 5), np.float32))
+    standing = make_episode(speeds=np.zeros((10, 5), np.float32))
     assert speed_scale([standing]).vmax == 1.0
-    absent = shown_of(speeds=np.array([[2.5, np.nan]], np.float32))
+    absent = make_episode(speeds=np.array([[2.5, np.nan]], np.float32))
     assert speed_scale([absent]).vmax == 3.0
 
 
-def test_where_a_vehicle_is_the_road_has_its_speed_and_between_two_what_lies_between() -> None:
+def test_speed_field_interpolates_between_vehicles() -> None:
     positions, speeds = np.array([[10.0, 30.0]]), np.array([[2.0, 4.0]])
     found = speed_field(positions, speeds, np.array([10.0, 15.0, 20.0, 30.0]), 0.0)
     assert found[:, 0].tolist() == [2.0, 2.5, 3.0, 4.0]
 
 
-def test_the_speed_of_a_ring_goes_on_across_its_seam() -> None:
+def test_speed_field_of_a_ring_is_continuous_at_its_seam() -> None:
     positions, speeds = np.array([[95.0, 5.0]]), np.array([[2.0, 4.0]])
     found = speed_field(positions, speeds, np.array([0.0, 97.5, 100.0]), 100.0)
     assert found[:, 0].tolist() == [3.0, 2.5, 3.0]
 
 
-def test_paper_is_left_where_nobody_is_near_or_on_the_road() -> None:
+def test_speed_field_is_nan_far_from_vehicles() -> None:
     positions, speeds = np.array([[0.0, 400.0], [np.nan, np.nan]]), np.array([[5.0, 5.0], [np.nan, np.nan]])
     found = speed_field(positions, speeds, np.array([0.0, 16.0, 200.0, 400.0]), 0.0)
     assert np.isnan(found).tolist() == [[False, True], [False, True], [True, True], [False, True]]
 
 
-def test_no_stripes_of_paper_lie_between_the_vehicles_of_a_full_ring() -> None:
-    [panel] = panels_of(trajectory_figure([shown_of(vehicles=8)]))
+def test_speed_field_of_a_full_ring_has_no_gaps() -> None:
+    [panel] = panels_of(trajectory_figure([make_episode(vehicles=8)]))
     [field] = fields_of(panel)
     speeds = field.get_array()
     assert speeds is not None
@@ -144,64 +144,70 @@ def test_no_stripes_of_paper_lie_between_the_vehicles_of_a_full_ring() -> None:
 
 
 @pytest.mark.parametrize("steps", [300, 5000])
-def test_space_time_draws_no_line_across_the_seam_of_the_ring(steps: int) -> None:
-    [panel] = panels_of(trajectory_figure([shown_of(steps=steps, speed=6.0)]))
+def test_trajectories_have_no_line_across_the_seam_of_the_ring(steps: int) -> None:
+    [panel] = panels_of(trajectory_figure([make_episode(steps=steps, speed=6.0)]))
     for lines in lines_of(panel):
         segments = np.array(lines.get_segments())
         assert np.abs(np.diff(segments[:, :, 1], axis=1)).max() < LENGTH / 2
         assert segments[:, :, 1].min() >= 0
         assert segments[:, :, 1].max() <= LENGTH
-    [still] = panels_of(trajectory_figure([shown_of(steps=steps, speed=0.0)]))
-    assert len(segments_of(panel)) < len(segments_of(still)), "the ring was gone around"
+    [still] = panels_of(trajectory_figure([make_episode(steps=steps, speed=0.0)]))
+    assert len(segments_of(panel)) < len(segments_of(still)), "vehicles crossed the seam"
 
 
-def test_space_time_marks_the_cav_and_nobody_else() -> None:
-    shown = shown_of(vehicles=6)
-    [panel] = panels_of(trajectory_figure([shown]))
+def test_only_the_cav_is_marked() -> None:
+    episode = make_episode(vehicles=6)
+    [panel] = panels_of(trajectory_figure([episode]))
     marks = marks_of(panel)
-    assert marks[0, 0, 1] == pytest.approx(shown.positions[0, 5] % LENGTH, abs=1e-3)
-    assert len(marks) == unbroken(shown)[5]
-    assert len(segments_of(panel)) == unbroken(shown).sum()
+    assert marks[0, 0, 1] == pytest.approx(episode.positions[0, 5] % LENGTH, abs=1e-3)
+    assert len(marks) == steps_within_seam(episode)[5]
+    assert len(segments_of(panel)) == steps_within_seam(episode).sum()
 
 
-def test_space_time_marks_every_cav() -> None:
-    shown = shown_of(cav_ids=["human_0", "cav_0"])
-    [panel] = panels_of(trajectory_figure([shown]))
-    assert len(shown.cav_columns) == 2
-    assert len(marks_of(panel)) == unbroken(shown)[list(shown.cav_columns)].sum()
+def test_every_cav_is_marked() -> None:
+    episode = make_episode(cav_ids=["human_0", "cav_0"])
+    [panel] = panels_of(trajectory_figure([episode]))
+    assert len(episode.cav_columns) == 2
+    assert len(marks_of(panel)) == steps_within_seam(episode)[list(episode.cav_columns)].sum()
 
 
-def test_a_long_episode_is_thinned_out_and_a_short_one_is_not() -> None:
+def test_only_long_episodes_are_thinned_out() -> None:
     def points(steps: int) -> int:
-        [panel] = panels_of(trajectory_figure([shown_of(steps=steps, speed=0.0, vehicles=2)]))
+        [panel] = panels_of(trajectory_figure([make_episode(steps=steps, speed=0.0, vehicles=2)]))
         return len(lines_of(panel)[0].get_segments())
 
     assert points(50) == 50
     assert MAX_PLOT_TIMES * 0.9 < points(6000) < MAX_PLOT_TIMES * 2
 
 
-def test_space_time_spans_the_episode_and_the_ring() -> None:
-    [panel] = panels_of(trajectory_figure([shown_of(steps=300)]))
+def test_trajectory_figure_covers_the_episode_and_the_ring() -> None:
+    [panel] = panels_of(trajectory_figure([make_episode(steps=300)]))
     assert panel.get_xlim() == pytest.approx((0, 30))
     assert panel.get_ylim() == pytest.approx((0, LENGTH))
 
 
-def test_space_time_of_episodes_of_different_length_shows_all_of_each() -> None:
-    for shown in ([shown_of(), shown_of("crashed", steps=50)], [shown_of("crashed", steps=50), shown_of()]):
-        panels = panels_of(trajectory_figure(shown))
+def test_trajectory_figure_covers_episodes_of_different_length() -> None:
+    for episodes in (
+        [make_episode(), make_episode("crashed", steps=50)],
+        [make_episode("crashed", steps=50), make_episode()],
+    ):
+        panels = panels_of(trajectory_figure(episodes))
         assert all(panel.get_xlim() == pytest.approx((0, 30)) for panel in panels)
 
 
-def test_space_time_of_rings_of_different_length_shows_all_of_each() -> None:
-    for shown in ([shown_of(), shown_of(loop_length=90.0)], [shown_of(loop_length=90.0), shown_of()]):
-        panels = panels_of(trajectory_figure(shown))
+def test_trajectory_figure_covers_rings_of_different_length() -> None:
+    for episodes in (
+        [make_episode(), make_episode(loop_length=90.0)],
+        [make_episode(loop_length=90.0), make_episode()],
+    ):
+        panels = panels_of(trajectory_figure(episodes))
         assert all(panel.get_ylim() == pytest.approx((0, LENGTH)) for panel in panels)
 
 
-def test_over_time_has_a_line_of_each_driver_in_each_panel() -> None:
-    shown = drivers(3)
-    panels = [drawn_lines(axes) for axes in panels_of(time_series_figure(shown))]
-    for number, episode in enumerate(shown):
+def test_time_series_have_a_line_of_each_driver_in_each_panel() -> None:
+    episodes = drivers(3)
+    panels = [drawn_lines(axes) for axes in panels_of(time_series_figure(episodes))]
+    for number, episode in enumerate(episodes):
         cav = episode.cav_columns[0]
         expected = (episode.speeds[:, cav], episode.gaps[:, cav], episode.speeds.std(axis=1))
         for lines, values in zip(panels, expected, strict=True):
@@ -209,7 +215,7 @@ def test_over_time_has_a_line_of_each_driver_in_each_panel() -> None:
             assert lines[number].get_color() == LINE_COLORS[number]
 
 
-def test_over_time_names_the_drivers_and_the_limit() -> None:
+def test_time_series_have_drivers_and_limit_in_the_legend() -> None:
     figure = time_series_figure(drivers(2))
     [legend] = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["driver 0", "driver 1", "limit"]
@@ -220,13 +226,13 @@ def test_over_time_names_the_drivers_and_the_limit() -> None:
 def row(number: int, validation: float | None = None, **changes: Any) -> dict[str, Any]:
     usual = {"iteration": number, "environment_steps": 12_000 * number, "return_mean": 90.0 + number}
     usual |= {"return_expert": 100.0, "return_validation": validation}
-    return {**usual, "seconds": {"actual": 2.0, "update": 0.5}, **changes}
+    return {**usual, "seconds": {"collect": 2.0, "update": 0.5}, **changes}
 
 
 RUN = [row(1), row(2, 104.0), row(3), row(4, 108.0)]
 
 
-def test_learning_starts_at_step_zero_with_the_expert() -> None:
+def test_learning_curve_starts_at_step_zero_with_the_expert() -> None:
     [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}))
     training, validation, expert = axes.lines
     assert np.asarray(validation.get_xydata()).tolist() == [[0.0, 100.0], [24.0, 104.0], [48.0, 108.0]]
@@ -235,14 +241,14 @@ def test_learning_starts_at_step_zero_with_the_expert() -> None:
     assert set(np.asarray(expert.get_ydata())) == {100.0}
 
 
-def test_a_run_without_validation_still_shows_training() -> None:
+def test_learning_curve_without_validation_shows_training() -> None:
     rows = [row(number, return_expert=None) for number in (1, 2)]
     [axes] = panels_of(learning_curve_figure({"ring-001": rows}, {}))
     assert len(np.asarray(axes.lines[0].get_xydata())) == 2
     assert len(np.asarray(axes.lines[1].get_xydata())) == 0
 
 
-def test_several_runs_are_told_apart() -> None:
+def test_several_runs_have_different_labels_and_colors() -> None:
     figure = learning_curve_figure({"a": RUN, "b": RUN}, {"pi": 100.0})
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert [label.split(":")[0] for label in labels] == ["a", "a", "b", "b", "pi"]
@@ -250,26 +256,26 @@ def test_several_runs_are_told_apart() -> None:
     assert lines[1].get_color() != lines[3].get_color()
 
 
-def test_no_run_is_left_out_however_many_there_are() -> None:
+def test_learning_curve_has_all_runs() -> None:
     [axes] = panels_of(learning_curve_figure({f"run-{number}": RUN for number in range(9)}, {}))
     assert len(axes.lines) == 2 * 9
 
 
-def test_no_reference_is_left_out_however_many_there_are() -> None:
+def test_learning_curve_has_all_references() -> None:
     references = {f"driver {number}": float(number) for number in range(7)}
     [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, references))
     assert [line.get_label() for line in axes.lines[2:]] == list(references)
 
 
-def test_wall_time_is_divided_among_its_parts() -> None:
+def test_training_time_has_a_bar_for_each_part() -> None:
     [axes] = panels_of(training_time_figure(RUN))
     bars = [(bar.get_x(), bar.get_width()) for bar in axes.patches]  # pyright: ignore[reportAttributeAccessIssue]
     assert bars == [(0.0, 8.0), (8.0, 2.0)]
     labels = [text.get_text() for text in axes.figure.legends[0].get_texts()]
-    assert labels == ["actual 8 s", "update 2 s"]
+    assert labels == ["collect 8 s", "update 2 s"]
 
 
-def test_colours_of_the_table_get_brighter_with_speed() -> None:
+def test_colors_get_brighter_with_speed() -> None:
     table = color_table()
     assert len(table) == 32
     light = [0.299 * int(code[1:3], 16) + 0.587 * int(code[3:5], 16) + 0.114 * int(code[5:], 16) for code in table]
@@ -291,75 +297,75 @@ FIGURES: Sequence[Callable[[], Figure]] = (
 
 @pytest.mark.long
 @pytest.mark.parametrize("draw", FIGURES)
-def test_the_same_figure_gives_the_same_bytes(draw: Callable[[], Figure]) -> None:
+def test_the_same_figure_has_the_same_bytes(draw: Callable[[], Figure]) -> None:
     assert data_uri(draw()) == data_uri(draw())
     assert data_uri(draw()) != data_uri(trajectory_figure(drivers(1)))
 
 
 @pytest.mark.parametrize("draw", FIGURES)
-def test_letters_are_legible_at_the_least_width_that_the_page_gives_a_picture(draw: Callable[[], Figure]) -> None:
+def test_texts_are_legible_at_the_smallest_width_on_the_page(draw: Callable[[], Figure]) -> None:
     figure, page = draw(), files("unjam.reports") / "page" / "report.css"
     figure.draw_without_rendering()
-    [least] = re.findall(r"\.picture img {.*min-width: (\d+)px", page.read_text())
-    pixels = int(least) / (72 * figure.get_figwidth())
+    [min_width] = re.findall(r"\.picture img {.*min-width: (\d+)px", page.read_text())
+    pixels = int(min_width) / (72 * figure.get_figwidth())
     sizes = [float(text.get_fontsize()) for text in figure.findobj(Text) if text.get_text()]
     assert min(sizes) * pixels >= 8
 
 
-def in_the_cavs_colour(image: Image.Image) -> int:
+def count_cav_pixels(image: Image.Image) -> int:
     pixels = np.asarray(image.convert("RGB")).astype(int)
-    wanted = [int(CAV_COLOUR[start : start + 2], 16) for start in (1, 3, 5)]
-    return (np.abs(pixels - wanted).max(axis=-1) < 30).sum()
+    rgb = [int(CAV_PLOT_COLOR[start : start + 2], 16) for start in (1, 3, 5)]
+    return (np.abs(pixels - rgb).max(axis=-1) < 30).sum()
 
 
-def test_a_png_has_the_cav_in_its_colour() -> None:
-    image = Image.open(io.BytesIO(png_bytes(trajectory_figure([shown_of()]))))
+def test_a_png_keeps_the_color_of_cavs() -> None:
+    image = Image.open(io.BytesIO(png_bytes(trajectory_figure([make_episode()]))))
     assert image.format == "PNG"
     assert image.width > 1000
-    assert in_the_cavs_colour(image) > 100
+    assert count_cav_pixels(image) > 100
 
 
-def test_a_drawing_is_an_svg() -> None:
+def test_a_data_uri_is_an_svg() -> None:
     head, data = content(data_uri(training_time_figure(RUN)))
     assert head == "data:image/svg+xml;base64"
     assert ElementTree.fromstring(data).tag == "{http://www.w3.org/2000/svg}svg"
 
 
-def test_vehicles_are_pixels_in_their_svg_with_the_cav_in_its_colour() -> None:
-    shown = shown_of()
-    _, data = content(data_uri(trajectory_figure([shown])))
+def test_vehicles_are_rasterized_in_the_svg() -> None:
+    episode = make_episode()
+    _, data = content(data_uri(trajectory_figure([episode])))
     images = [
         Image.open(io.BytesIO(base64.b64decode(found)))
         for found in re.findall(rb'data:image/png;base64,([^"]+)"', data)
     ]
     largest = max(images, key=lambda image: image.width)
     assert largest.width > 800
-    assert in_the_cavs_colour(largest) > 100
-    assert all(len(image.getcolors() or ()) <= 256 for image in images), "or the page is too large"
-    assert data.count(b"<path") < 500, "a line of a vehicle is no path"
+    assert count_cav_pixels(largest) > 100
+    assert all(len(image.getcolors() or ()) <= 256 for image in images), "to limit the size of the page"
+    assert data.count(b"<path") < 500, "vehicles are not drawn as paths"
 
 
-def unbroken(shown: PlotEpisode) -> np.ndarray:
-    """How many of its steps each vehicle makes within the road, not across the seam, shape (N,)."""
-    return (np.abs(np.diff(shown.positions % LENGTH, axis=0)) < LENGTH / 2).sum(axis=0)
+def steps_within_seam(episode: PlotEpisode) -> np.ndarray:
+    """Return the number of steps of each vehicle that do not cross the seam, shape (N,)."""
+    return (np.abs(np.diff(episode.positions % LENGTH, axis=0)) < LENGTH / 2).sum(axis=0)
 
 
 def marks_of(axes: Axes) -> np.ndarray:
-    """Return the ends of all lines in the CAVs' colour, shape (n, 2, 2)."""
-    marked = [lines for lines in lines_of(axes) if to_hex(np.asarray(lines.get_color())[0]) == CAV_COLOUR]
+    """Return the ends of all lines in the color of CAVs, shape (n, 2, 2)."""
+    marked = [lines for lines in lines_of(axes) if to_hex(np.asarray(lines.get_color())[0]) == CAV_PLOT_COLOR]
     assert len(marked) == 1
     return np.concatenate([np.array(lines.get_segments()).reshape(-1, 2, 2) for lines in marked])
 
 
 def segments_of(axes: Axes) -> np.ndarray:
-    """Everything that a panel shows of vehicles: (time, position) of both ends, shape (n, 2, 2)."""
+    """Return (time, position) of both ends of all lines of a panel, shape (n, 2, 2)."""
     return np.concatenate([np.array(lines.get_segments()).reshape(-1, 2, 2) for lines in lines_of(axes)])
 
 
 @pytest.mark.parametrize("count", [1, 4, pytest.param(2, marks=pytest.mark.slow)])
-def test_space_time_of_the_merge_has_panels_of_highway_and_ramp(count: int) -> None:
-    shown = [shown_from(merge_episode(), f"driver {number}") for number in range(count)]
-    figure = trajectory_figure(shown)
+def test_trajectory_figure_of_the_merge_has_panels_of_highway_and_ramp(count: int) -> None:
+    episodes = [plot_episode_of(merge_episode(), f"driver {number}") for number in range(count)]
+    figure = trajectory_figure(episodes)
     figure.draw_without_rendering()
     panels = panels_of(figure)
     assert len(panels) == 2 * count
@@ -377,40 +383,40 @@ def test_space_time_of_the_merge_has_panels_of_highway_and_ramp(count: int) -> N
         assert main.get_xlim() == ramp.get_xlim() == pytest.approx((0, 100))
 
 
-def test_each_vehicle_of_the_merge_is_on_one_panel_at_a_time() -> None:
-    shown = shown_from(merge_episode(), "pi")
-    panels = panels_of(trajectory_figure([shown]))
-    drawn = sum(len(segments_of(axes)) for axes in panels)
-    there = ~np.isnan(shown.positions)
-    together = there[1:] & there[:-1]
-    ramp = np.array(shown.branches) == "ramp"
-    crossing = together & ramp & (shown.positions[1:] >= 0) & (shown.positions[:-1] < 0)
+def test_vehicles_of_the_merge_are_in_one_panel_at_a_time() -> None:
+    episode = plot_episode_of(merge_episode(), "pi")
+    panels = panels_of(trajectory_figure([episode]))
+    drawn_steps = sum(len(segments_of(axes)) for axes in panels)
+    is_present = ~np.isnan(episode.positions)
+    both_present = is_present[1:] & is_present[:-1]
+    ramp = np.array(episode.branches) == "ramp"
+    crossing = both_present & ramp & (episode.positions[1:] >= 0) & (episode.positions[:-1] < 0)
     assert crossing.any()
-    assert drawn == together.sum() - crossing.sum()
+    assert drawn_steps == both_present.sum() - crossing.sum()
 
 
 def test_cavs_of_the_merge_are_marked(tmp_path: Path) -> None:
-    shown = shown_from(merge_episode(), "pi")
-    main, ramp = panels_of(trajectory_figure([shown]))
-    there = ~np.isnan(shown.positions[:, list(shown.cav_columns)])
-    assert len(marks_of(main)) == (there[1:] & there[:-1]).sum() > 0
+    episode = plot_episode_of(merge_episode(), "pi")
+    main, ramp = panels_of(trajectory_figure([episode]))
+    is_present = ~np.isnan(episode.positions[:, list(episode.cav_columns)])
+    assert len(marks_of(main)) == (is_present[1:] & is_present[:-1]).sum() > 0
     assert len(marks_of(ramp)) == 0
 
 
-def test_space_time_of_your_own_network_shows_the_route(tmp_path: Path) -> None:
-    shown = shown_from(own_episode(tmp_path), "pi")
-    (panel,) = panels_of(trajectory_figure([shown]))
+def test_trajectory_figure_of_a_user_network_shows_the_route(tmp_path: Path) -> None:
+    episode = plot_episode_of(user_episode(tmp_path), "pi")
+    (panel,) = panels_of(trajectory_figure([episode]))
     assert panel.get_ylabel() == "position along the road [m]"
-    assert segments_of(panel)[..., 1].min() == pytest.approx(np.nanmin(shown.positions), abs=5)
+    assert segments_of(panel)[..., 1].min() == pytest.approx(np.nanmin(episode.positions), abs=5)
     low, high = panel.get_ylim()
-    assert (low, high) == pytest.approx((np.nanmin(shown.positions), np.nanmax(shown.positions)))
+    assert (low, high) == pytest.approx((np.nanmin(episode.positions), np.nanmax(episode.positions)))
 
 
-def test_over_time_of_a_road_with_ends_shows_mean_speed_waves_and_who_waits() -> None:
-    shown = [shown_from(merge_episode(driver=driver), driver) for driver in ("human", "pi")]
-    panels = panels_of(time_series_figure(shown))
-    assert [axes.get_ylabel().split()[0] for axes in panels] == ["mean", "speed", "vehicles"]
-    for number, episode in enumerate(shown):
+def test_time_series_of_an_open_road_have_mean_speed_waves_and_backlog() -> None:
+    episodes = [plot_episode_of(merge_episode(driver=driver), driver) for driver in ("human", "pi")]
+    panels = panels_of(time_series_figure(episodes))
+    assert [axes.get_ylabel().split()[0] for axes in panels] == ["mean", "speed", "insertion"]
+    for number, episode in enumerate(episodes):
         expected = (np.nanmean(episode.speeds, 1), np.nanstd(episode.speeds, 1), episode.backlog)
         for axes, values in zip(panels, expected, strict=True):
             found = np.asarray(drawn_lines(axes)[number].get_ydata())

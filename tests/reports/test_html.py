@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from tests.measures.test_metrics import LENGTH, episode_of
 from tests.reports.test_model import facts_of, progress_of
-from tests.reports.test_replay import unpacked
+from tests.reports.test_replay import decode
 from unjam import __version__
 from unjam.errors import DiskError, InputError
 from unjam.files import to_json
@@ -26,13 +26,13 @@ SPEEDS = {"human": 3.0, "pi": 4.0, "trained": 4.5, "follower-stopper": 3.5}
 
 
 def driven(speed: float, seed: int, steps: int = 60) -> Episode:
-    """Vehicles that drive alike but for a wave that grows with the seed."""
+    """Vehicles with equal speeds except for a wave that grows with the seed."""
     times, vehicles = np.arange(steps + 1)[:, None], np.arange(6)
     speeds = speed + (0.5 + 0.1 * seed) * np.sin(times / 20 + vehicles)
     return episode_of(speeds, seed=(seed,), fuel=np.full((steps, 6), 300.0))
 
 
-def results_in(folder: Path, *drivers: str, failing: int = 0, **about: Any) -> Path:
+def results_in(folder: Path, *drivers: str, failing: int = 0, **metadata: Any) -> Path:
     """A folder of results like `unjam drive` writes."""
     episodes = {name: [driven(SPEEDS.get(name, 4.0), seed) for seed in range(3)] for name in drivers}
     rows = {name: [measure(episode) for episode in found] for name, found in episodes.items()}
@@ -41,7 +41,7 @@ def results_in(folder: Path, *drivers: str, failing: int = 0, **about: Any) -> P
     evaluation = Evaluation(rows, {name: found[0] for name, found in episodes.items()})
     manifest = {"unjam": __version__, "python": "3.11.2", "packages": {}, "started": "2026-01-02T03:04:05+00:00"}
     manifest["command"] = ["unjam", "drive", "ring", "--driver", *drivers]
-    save_evaluation(folder, evaluation, {"scenario": "ring", "reward": "released", "manifest": manifest, **about})
+    save_evaluation(folder, evaluation, {"scenario": "ring", "reward": "released", "manifest": manifest, **metadata})
     return folder
 
 
@@ -55,7 +55,7 @@ def run_in(folder: Path, scenario: str = "ring") -> Path:
             "return_mean": 90.0 + number,
             "return_expert": 100.0,
             "return_validation": 101.0 + number if number % 2 else None,
-            "seconds": {"actual": 2.0, "update": 0.5},
+            "seconds": {"collect": 2.0, "update": 0.5},
         }
         for number in range(1, 5)
     ]
@@ -65,23 +65,23 @@ def run_in(folder: Path, scenario: str = "ring") -> Path:
 
 
 class Page(HTMLParser):
-    """What a browser would make of a page: tags, texts, and what it would load."""
+    """Tags and texts of a page, as a browser parses them."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.tags: list[tuple[str, dict[str, str]]] = []
         self.texts: dict[str, list[str]] = {}
-        self._open_simulations = ""
+        self._open_tag = ""
         self.feed(text)
         self.close()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, {name: value or "" for name, value in attrs}))
-        self._open_simulations = tag
+        self._open_tag = tag
 
     def handle_data(self, data: str) -> None:
         if data.strip():
-            self.texts.setdefault(self._open_simulations, []).append(data.strip())
+            self.texts.setdefault(self._open_tag, []).append(data.strip())
 
     def of(self, tag: str) -> list[dict[str, str]]:
         return [attributes for name, attributes in self.tags if name == tag]
@@ -91,7 +91,7 @@ class Page(HTMLParser):
         """The columns of the last table, that of all metrics."""
         heads = self.texts["th"]
         first = len(heads) - heads[::-1].index("metric")
-        return heads[first : heads.index("could a car drive so?")]
+        return heads[first : heads.index("feasible")]
 
     @property
     def replay(self) -> dict[str, Any]:
@@ -107,8 +107,8 @@ def page_of(*folders: Path) -> tuple[str, Page]:
 
 
 @pytest.fixture(autouse=True)
-def pictures(request: pytest.FixtureRequest) -> None:
-    """Draw pictures for those tests alone that are about the page that has them."""
+def without_figures(request: pytest.FixtureRequest) -> None:
+    """Draw figures only for tests of the page that contains them."""
     if "written" not in request.fixturenames:
         request.getfixturevalue("without_pictures")
 
@@ -123,7 +123,7 @@ def written(run: Path) -> tuple[str, Page]:
     return page_of(run)
 
 
-def test_a_page_loads_nothing_from_anywhere_else(written: tuple[str, Page]) -> None:
+def test_page_loads_nothing_from_elsewhere(written: tuple[str, Page]) -> None:
     text, page = written
     loading = {"src", "srcset", "data", "poster", "action", "formaction", "background"}
     for tag, attributes in page.tags:
@@ -137,11 +137,11 @@ def test_a_page_loads_nothing_from_anywhere_else(written: tuple[str, Page]) -> N
     for script in page.texts["script"]:
         assert not re.search(r"fetch\(|XMLHttpRequest|WebSocket|importScripts|\bimport\b", script)
     assert not re.search(r"https?://", re.sub(r'title="[^"]*"|<dd>.*?</dd>', "", text)), (
-        "only definitions name their sources"
+        "only definitions cite their sources"
     )
 
 
-def test_pictures_inside_the_page_load_nothing_either(written: tuple[str, Page]) -> None:
+def test_figures_of_the_page_load_nothing(written: tuple[str, Page]) -> None:
     _, page = written
     drawings = [base64.b64decode(image["src"].partition(",")[2]) for image in page.of("img")]
     assert drawings
@@ -149,7 +149,7 @@ def test_pictures_inside_the_page_load_nothing_either(written: tuple[str, Page])
         assert not re.search(rb'(href|src)="(?!#|data:)', drawing)
 
 
-def test_a_run_has_all_its_pictures_once_for_all_screens(written: tuple[str, Page]) -> None:
+def test_report_of_a_run_has_each_figure_once(written: tuple[str, Page]) -> None:
     _, page = written
     assert len({image["src"] for image in page.of("img")}) == len(page.of("img")) == 4
     assert all(len(image["alt"]) > 20 for image in page.of("img"))
@@ -157,13 +157,13 @@ def test_a_run_has_all_its_pictures_once_for_all_screens(written: tuple[str, Pag
     assert not page.of("source")
 
 
-def test_drives_have_no_learning_curve(tmp_path: Path) -> None:
+def test_report_of_a_drive_has_no_learning_curve(tmp_path: Path) -> None:
     _, page = page_of(results_in(tmp_path / "drive", "human", "pi"))
     assert len(page.of("img")) == 2
-    assert "Learning" not in page.texts["h2"]
+    assert "Training" not in page.texts["h2"]
 
 
-def test_lines_of_the_learning_curve_are_the_drivers_that_do_not_learn(
+def test_learning_curve_has_lines_of_drivers_that_do_not_learn(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn = []
@@ -172,16 +172,16 @@ def test_lines_of_the_learning_curve_are_the_drivers_that_do_not_learn(
         drawn.append((list(runs), references))
         return learning_curve_figure(runs, references)
 
-    monkeypatch.setattr("unjam.reports.html.learning_curve", spy)
+    monkeypatch.setattr("unjam.reports.figures.learning_curve_figure", spy)
     write_report_page([run], tmp_path / "page.html")
     found = read_results(run)
-    held_out = np.mean([row["return"] for row in found.rows["human"]])
-    # The expert's line is where the curve starts: on the seeds of the validation.
-    expected = {"pi, validation": found.progress[0]["return_expert"], "human, held-out": held_out}
+    test_return = np.mean([row["return"] for row in found.rows["human"]])
+    # The line of the expert is its return on the validation seeds, where the curve starts.
+    expected = {"pi, validation": found.progress[0]["return_expert"], "human, test seeds": test_return}
     assert drawn[0] == (["ring-001"], pytest.approx(expected))
 
 
-def test_the_page_says_who_made_it_and_how_to_repeat_it(written: tuple[str, Page]) -> None:
+def test_page_has_its_version_and_the_command_to_reproduce_it(written: tuple[str, Page]) -> None:
     text, page = written
     assert f"unjam {__version__}" in text
     assert any("unjam drive ring --driver human pi trained" in code for code in page.texts["code"])
@@ -189,7 +189,7 @@ def test_the_page_says_who_made_it_and_how_to_repeat_it(written: tuple[str, Page
     assert "2026-01-02" in text
 
 
-def test_the_table_holds_the_means_of_the_rows(written: tuple[str, Page], run: Path) -> None:
+def test_table_has_the_means_of_the_rows(written: tuple[str, Page], run: Path) -> None:
     _, page = written
     assert page.drivers[:3] == ["human", "pi", "trained"]
     rows = read_results(run).rows
@@ -200,7 +200,7 @@ def test_the_table_holds_the_means_of_the_rows(written: tuple[str, Page], run: P
             assert f"{mean:.{metric.digits}f}" in page.texts["b"]
 
 
-def test_names_of_drivers_are_text_whatever_they_hold(tmp_path: Path) -> None:
+def test_names_of_drivers_are_escaped(tmp_path: Path) -> None:
     names = ["<b>x", "a&b", '"quoted"', "</script><script>document.title='x'</script>", "<!--<script>", "ünïcode"]
     text, page = page_of(results_in(tmp_path / "drive", *names))
     assert len(page.of("script")) == 3
@@ -211,14 +211,14 @@ def test_names_of_drivers_are_text_whatever_they_hold(tmp_path: Path) -> None:
     assert [driver["name"] for driver in page.replay["drivers"]] == names
     data = text.partition('type="application/json">')[2].partition("</script>")[0]
     assert json.loads(data) == page.replay
-    assert "<!--" not in data, "a browser would look for the end of the script elsewhere"
+    assert "<!--" not in data, "a browser would find another end of the script"
 
 
-def test_texts_of_a_folder_are_text_whatever_they_hold(tmp_path: Path) -> None:
+def test_texts_of_a_folder_are_escaped(tmp_path: Path) -> None:
     folder = results_in(tmp_path / "a <i>b", "pi", failing=1, scenario="<u>ring")
     (folder / "config.toml").write_text('expert = "<s>"\n')
     text, page = page_of(folder, results_in(tmp_path / "c", "pi"))
-    assert not page.of("i")[1:]  # the page's own one shows the scale
+    assert not page.of("i")[1:]  # the first is the scale of the page itself
     for tag in ("u", "s", "cannot"):
         assert not page.of(tag)
     assert "SUMO &lt;cannot&gt; start" in text
@@ -226,78 +226,78 @@ def test_texts_of_a_folder_are_text_whatever_they_hold(tmp_path: Path) -> None:
 
 def test_failed_episodes_are_listed_with_their_reason(tmp_path: Path) -> None:
     text, _ = page_of(results_in(tmp_path / "drive", "human", "pi", failing=2))
-    assert "Episodes that failed" in text
+    assert "Failed episodes" in text
     assert "pi seed [9, 0]" in text
     assert "pi seed [9, 1]" in text
-    assert "3 of 5" in text, "a cell says how many episodes it stands for"
+    assert "3 of 5" in text, "a cell has its number of episodes"
 
 
 def numbers(data: list[dict[str, Any]], vehicles: int) -> np.ndarray:
-    return unpacked({"vehicles": vehicles, "positions": data}, "positions")
+    return decode({"vehicles": vehicles, "positions": data}, "positions")
 
 
-def test_the_replay_holds_the_positions_and_speeds_that_were_driven(written: tuple[str, Page], run: Path) -> None:
-    replay, shown = written[1].replay, read_results(run).plot_episodes
-    assert [driver["name"] for driver in replay["drivers"]] == list(shown)
-    every = round(REPLAY_STEP / 0.1)
+def test_replay_has_positions_and_speeds(written: tuple[str, Page], run: Path) -> None:
+    replay, plot_episodes = written[1].replay, read_results(run).plot_episodes
+    assert [driver["name"] for driver in replay["drivers"]] == list(plot_episodes)
+    stride = round(REPLAY_STEP / 0.1)
     assert replay["step"] == pytest.approx(REPLAY_STEP)
     for driver in replay["drivers"]:
-        episode = shown[driver["name"]]
-        np.testing.assert_allclose(numbers(driver["positions"], 6), episode.positions[::every], atol=0.01)
-        np.testing.assert_allclose(numbers(driver["speeds"], 6), episode.speeds[::every], atol=0.001)
-        assert replay["frames"] == len(episode.positions[::every])
+        episode = plot_episodes[driver["name"]]
+        np.testing.assert_allclose(numbers(driver["positions"], 6), episode.positions[::stride], atol=0.01)
+        np.testing.assert_allclose(numbers(driver["speeds"], 6), episode.speeds[::stride], atol=0.001)
+        assert replay["frames"] == len(episode.positions[::stride])
         assert driver["cavs"] == episode.cav_columns == [0]
         assert driver["loop_length"] == LENGTH
         np.testing.assert_allclose(driver["lines"], [episode.outline], atol=0.006)
-    fastest = max(episode.speeds.max() for episode in shown.values())
-    assert fastest <= replay["fastest"] < fastest + 1
+    max_speed = max(episode.speeds.max() for episode in plot_episodes.values())
+    assert max_speed <= replay["max_speed"] < max_speed + 1
 
 
 def save_driven(folder: Path, **episodes: Episode) -> Path:
-    """A folder of results of one episode each."""
+    """Write a folder of results with one episode each."""
     evaluation = Evaluation({name: [measure(found)] for name, found in episodes.items()}, episodes)
     save_evaluation(folder, evaluation, {"scenario": "ring", "reward": "released", "manifest": {}})
     return folder
 
 
-def test_the_replay_is_not_cut_short_by_a_driver_that_crashed(tmp_path: Path) -> None:
-    crashed, whole = driven(3.0, 0, steps=20), driven(3.0, 0, steps=60)
-    for number, episodes in enumerate(({"a": crashed, "b": whole}, {"a": whole, "b": crashed})):
+def test_replay_is_not_truncated_by_a_collision(tmp_path: Path) -> None:
+    crashed, complete = driven(3.0, 0, steps=20), driven(3.0, 0, steps=60)
+    for number, episodes in enumerate(({"a": crashed, "b": complete}, {"a": complete, "b": crashed})):
         _, page = page_of(save_driven(tmp_path / str(number), **episodes))
         assert (page.replay["frames"] - 1) * page.replay["step"] == pytest.approx(6.0)
 
 
-def test_the_replay_shows_roads_of_different_steps_at_the_same_times(tmp_path: Path) -> None:
+def test_replay_shows_roads_with_different_steps_at_the_same_times(tmp_path: Path) -> None:
     coarse, fine = (episode_of(np.full((round(4.0 / step) + 1, 3), 2.0), step=step, seed=(0,)) for step in (0.1, 0.05))
     replay = page_of(save_driven(tmp_path / "a", one=coarse, other=fine))[1].replay
     one, other = (numbers(driver["positions"], 3) for driver in replay["drivers"])
     np.testing.assert_allclose(one, other, atol=0.01)
 
 
-def test_several_folders_are_compared_side_by_side(tmp_path: Path) -> None:
+def test_several_folders_are_compared(tmp_path: Path) -> None:
     folders = run_in(tmp_path / "ring-001"), run_in(tmp_path / "ring-002")
     text, page = page_of(*folders)
-    assert page.texts["h1"] == ["ring: 2 results compared"]
+    assert page.texts["h1"] == ["ring: comparison of 2 results"]
     assert page.drivers[:4] == ["human", "pi", "ring-001: trained", "ring-002: trained"]
     assert [driver["name"] for driver in page.replay["drivers"]] == page.drivers[:4]
-    [lead] = [text for text in page.texts["p"] if "held-out seeds" in text]
-    assert "ring-001: Beside people alone on ring, 3 held-out seeds" in lead
-    assert "ring-002: Beside people alone on ring, 3 held-out seeds" in lead
-    assert page.texts["h3"] == ["ring-001", "ring-002"], "how to repeat each"
-    assert text.count('alt="Return against') == 1, "both learn in one picture"
+    [finding] = [text for text in page.texts["p"] if "paired test seeds" in text]
+    assert "ring-001: Compared with the human baseline on ring, 3 paired test seeds" in finding
+    assert "ring-002: Compared with the human baseline on ring, 3 paired test seeds" in finding
+    assert page.texts["h3"] == ["ring-001", "ring-002"], "reproduction of each"
+    assert text.count('alt="Return against') == 1, "one figure for both"
 
 
-def test_a_comparison_of_drives_has_a_column_of_each(tmp_path: Path) -> None:
+def test_a_comparison_of_drives_has_a_column_for_each(tmp_path: Path) -> None:
     _, page = page_of(results_in(tmp_path / "a", "pi"), results_in(tmp_path / "b", "pi"))
     assert page.texts["th"][1:3] == ["a: pi", "b: pi"]
 
 
-def test_episodes_of_a_comparison_are_counted_from_fewest_to_most(tmp_path: Path) -> None:
+def test_a_comparison_has_the_range_of_episode_counts(tmp_path: Path) -> None:
     text, _ = page_of(results_in(tmp_path / "drive", "human", "pi", failing=2))
     assert "Mean over 3 to 5 episodes" in text
 
 
-def test_results_in_which_every_episode_failed_still_have_a_page(tmp_path: Path) -> None:
+def test_results_with_only_failed_episodes_have_a_page(tmp_path: Path) -> None:
     folder = tmp_path / "drive"
     rows = {"pi": [measure(failed_episode((0,), "no road", "EpisodeError"))]}
     save_evaluation(folder, Evaluation(rows, {}), {"scenario": "ring", "reward": "released", "manifest": {}})
@@ -308,18 +308,18 @@ def test_results_in_which_every_episode_failed_still_have_a_page(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_a_run_with_a_virtual_environment_shows_it(tmp_path: Path, written: tuple[str, Page]) -> None:
-    folder = run_in(tmp_path / "virtual")
+def test_report_of_a_run_with_a_learned_model_has_its_section(tmp_path: Path, written: tuple[str, Page]) -> None:
+    folder = run_in(tmp_path / "model")
     (folder / "progress.jsonl").write_text("".join(to_json(row) + "\n" for row in progress_of()))
     (folder / "model.json").write_text(to_json(facts_of()))
     _, page = page_of(folder)
-    assert "The virtual environment" in page.texts["h2"]
-    assert "The virtual environment" not in written[1].texts["h2"]
+    assert "Learned model" in page.texts["h2"]
+    assert "Learned model" not in written[1].texts["h2"]
     assert len(page.of("img")) == len(written[1].of("img")) + 3
     assert any("IDM alone, 10 s" in text for text in page.texts["th"])
-    words = " ".join(page.texts["p"])
-    assert "earns 5.50 in the virtual environment" in words
-    assert "so it says nothing" in words
+    text = " ".join(page.texts["p"])
+    assert "is 5.50 in the model" in text
+    assert "so it is not informative" in text
 
 
 def test_the_same_results_give_the_same_page(tmp_path: Path, written: tuple[str, Page], run: Path) -> None:
@@ -327,14 +327,14 @@ def test_the_same_results_give_the_same_page(tmp_path: Path, written: tuple[str,
     assert (tmp_path / "again.html").read_text(encoding="utf-8") == written[0]
 
 
-def test_a_folder_without_results_leaves_no_page(tmp_path: Path) -> None:
+def test_a_folder_without_results_is_refused_without_a_page(tmp_path: Path) -> None:
     good = results_in(tmp_path / "drive", "pi")
     with pytest.raises(InputError):
         write_report_page([good, tmp_path], tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
-def test_a_page_that_cannot_be_written_gets_one_clear_line(tmp_path: Path) -> None:
+def test_a_page_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     good = results_in(tmp_path / "drive", "pi")
     with pytest.raises(DiskError, match="cannot write"):
         write_report_page([good], tmp_path / "nowhere" / "page.html")

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, Route, sync_playwright
 
 import unjam
-from tests.reports.test_assessment import HARMS, HELPS, folder_of
+from tests.reports.test_assessment import HARMS, HELPS, assessment_folder
 from unjam.measures.metrics import METRICS, Metric
 from unjam.reports.assessment import write_assessment
 
@@ -22,10 +22,10 @@ ROAD = {"length": (120, 120), "vehicles": 8, "horizon": 150}
 LAPTOP = (1280, 800)
 PHONE = (390, 844)
 SECONDS = 15.0
-"""length of the shown episodes"""
+"""duration of the episodes"""
 
 
-def slowly(size: tuple[int, int]) -> Any:
+def mark_slow(size: tuple[int, int]) -> Any:
     return pytest.param(size, marks=pytest.mark.slow)
 
 
@@ -40,7 +40,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def merged(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of `unjam drive merge`: vehicles come and go."""
+    """The report of `unjam drive merge`: vehicles enter and leave."""
     road = {"horizon": 40, "penetration_rate": 0.3}
     folder = tmp_path_factory.mktemp("merge") / "results"
     report = unjam.drive("merge", ["human", "pi"], episodes=1, scenario_options=road, workers=1, out=folder).report
@@ -52,7 +52,7 @@ def merged(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam train`."""
     changes = {
-        "road": ROAD,
+        "scenario_options": ROAD,
         "steps": 600,
         "workers": 1,
         "policy.hidden": (8,),
@@ -68,7 +68,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def assessed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of `unjam assess`."""
-    folder = folder_of(tmp_path_factory.mktemp("assess"), [HELPS, HARMS])
+    folder = assessment_folder(tmp_path_factory.mktemp("assess"), [HELPS, HARMS])
     return write_assessment(folder, folder / "assessment.html")
 
 
@@ -85,15 +85,15 @@ def browser() -> Iterator[Browser]:
 
 @dataclass
 class Visit:
-    """A page in the browser, and what went wrong on it."""
+    """A page in the browser, and its errors."""
 
     page: Page
     requests: list[str] = field(default_factory=list)
-    """everything that it asked for but itself and what it holds"""
+    """everything that the page requested from elsewhere"""
     errors: list[str] = field(default_factory=list)
 
     def time(self) -> float:
-        """The moment that the replay says it shows [s]."""
+        """Return the time of the replay [s]."""
         return float(self.page.locator(".clock").inner_text().removesuffix(" s"))
 
     def canvases(self) -> list[str]:
@@ -111,7 +111,7 @@ def open_page(browser: Browser) -> Iterator["Opener"]:
 
 
 class Opener:
-    """Opens reports from their files, without a network; what they miss or complain about fails the test."""
+    """Opens report files offline; requests and errors of a page fail the test."""
 
     def __init__(self, browser: Browser) -> None:
         self._browser = browser
@@ -126,17 +126,17 @@ class Opener:
             visit.requests.append(route.request.url)
             route.abort()
 
-        def watch(request: Request) -> None:
+        def record_request(request: Request) -> None:
             if not request.url.startswith("data:") and request.url != report.as_uri():
                 visit.requests.append(request.url)
 
-        def listen(message: ConsoleMessage) -> None:
+        def record_message(message: ConsoleMessage) -> None:
             if message.type in ("error", "warning"):
                 visit.errors.append(message.text)
 
         context.route("**/*", lambda route: route.continue_() if route.request.url[:4] != "http" else refuse(route))
-        visit.page.on("request", watch)
-        visit.page.on("console", listen)
+        visit.page.on("request", record_request)
+        visit.page.on("console", record_message)
         visit.page.on("pageerror", lambda error: visit.errors.append(str(error)))
         visit.page.goto(report.as_uri())
         visit.page.wait_for_selector("#replay.ready, body:not(:has(#replay))", state="attached")
@@ -145,7 +145,7 @@ class Opener:
 
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
 @pytest.mark.parametrize(
-    ("report", "pictures"),
+    ("report", "figures"),
     [
         pytest.param("driven", 2, marks=pytest.mark.slow),
         pytest.param("merged", 2, marks=pytest.mark.slow),
@@ -153,20 +153,20 @@ class Opener:
         ("assessed", 2),
     ],
 )
-def test_every_picture_is_there(
-    open_page: Opener, request: pytest.FixtureRequest, report: str, pictures: int, size: tuple[int, int]
+def test_page_has_every_figure(
+    open_page: Opener, request: pytest.FixtureRequest, report: str, figures: int, size: tuple[int, int]
 ) -> None:
     page = open_page(request.getfixturevalue(report), size).page
     widths = page.eval_on_selector_all("img", "all => all.map(image => image.complete && image.naturalWidth)")
-    assert len(widths) == pictures
+    assert len(widths) == figures
     assert all(width > 200 for width in widths)
 
 
 @pytest.mark.parametrize(
-    "size", [PHONE, *map(slowly, (LAPTOP, (320, 640), (820, 1180)))], ids=lambda size: str(size[0])
+    "size", [PHONE, *map(mark_slow, (LAPTOP, (320, 640), (820, 1180)))], ids=lambda size: str(size[0])
 )
 @pytest.mark.parametrize("report", ["driven", "merged", "trained", "assessed"])
-def test_nothing_is_wider_than_the_screen(
+def test_page_is_not_wider_than_the_screen(
     open_page: Opener, request: pytest.FixtureRequest, report: str, size: tuple[int, int]
 ) -> None:
     page = open_page(request.getfixturevalue(report), size).page
@@ -182,26 +182,26 @@ def test_nothing_is_wider_than_the_screen(
     assert too_wide == []
 
 
-def test_a_picture_fills_a_laptop_and_stays_legible_on_a_phone_that_moves_it(open_page: Opener, driven: Path) -> None:
+def test_figures_fill_a_laptop_and_scroll_on_a_phone(open_page: Opener, driven: Path) -> None:
     sizes = """all => all.map(each => [each.clientWidth, each.scrollWidth, each.firstChild.clientWidth,
                  getComputedStyle(each, "::before").content.includes("swipe")])"""
     page = open_page(driven, LAPTOP).page
-    for visible, whole, picture, hinted in page.eval_on_selector_all(".picture", sizes):
-        assert visible == whole == picture > 1000
-        assert not hinted
+    for visible, total, image, has_hint in page.eval_on_selector_all(".picture", sizes):
+        assert visible == total == image > 1000
+        assert not has_hint
     page = open_page(driven, PHONE).page
-    for visible, whole, picture, hinted in page.eval_on_selector_all(".picture", sizes):
-        assert visible < 390 < 700 < whole == picture
-        assert hinted
-    page.eval_on_selector(".picture", "moved => moved.scrollLeft = 1000")
+    for visible, total, image, has_hint in page.eval_on_selector_all(".picture", sizes):
+        assert visible < 390 < 700 < total == image
+        assert has_hint
+    page.eval_on_selector(".picture", "element => element.scrollLeft = 1000")
     box = page.locator(".picture img").first.bounding_box()
     assert box is not None
     assert box["x"] + box["width"] <= 390
     shape = "all => all.map(image => image.naturalHeight / image.naturalWidth - image.height / image.width)"
-    assert all(abs(off) < 0.01 for off in page.eval_on_selector_all("img", shape)), "as it was drawn"
+    assert all(abs(off) < 0.01 for off in page.eval_on_selector_all("img", shape)), "in the original proportions"
 
 
-def test_the_replay_shows_the_vehicles_of_every_driver(open_page: Opener, driven: Path) -> None:
+def test_replay_shows_the_vehicles_of_every_driver(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     captions = visit.page.locator("figcaption").all_inner_texts()
     assert [caption.split("\n")[0] for caption in captions] == ["human", "pi"]
@@ -223,10 +223,10 @@ def test_the_replay_shows_the_vehicles_of_every_driver(open_page: Opener, driven
     for width, drawn, red in found:
         assert width >= 200
         assert drawn > width * 10, "a road and vehicles"
-        assert red > 20, "the CAV has a red ring"
+        assert red > 20, "the CAV has a red outline"
 
 
-def test_play_lets_time_pass_and_pause_stops_it(open_page: Opener, driven: Path) -> None:
+def test_play_starts_and_pause_stops_the_replay(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     page, button = visit.page, visit.page.locator(".play")
     before = visit.canvases()
@@ -237,14 +237,14 @@ def test_play_lets_time_pass_and_pause_stops_it(open_page: Opener, driven: Path)
     page.wait_for_function("parseFloat(document.querySelector('.clock').textContent) >= 1")
     button.click()
     assert button.inner_text() == "Play"
-    stopped, picture = visit.time(), visit.canvases()
-    assert 1 <= stopped < SECONDS
-    assert all(old != new for old, new in zip(before, picture, strict=True))
+    time, pictures = visit.time(), visit.canvases()
+    assert 1 <= time < SECONDS
+    assert all(old != new for old, new in zip(before, pictures, strict=True))
     page.wait_for_timeout(150)
-    assert (visit.time(), visit.canvases()) == (stopped, picture)
+    assert (visit.time(), visit.canvases()) == (time, pictures)
 
 
-def test_the_replay_stops_at_its_end_and_starts_again_from_the_beginning(open_page: Opener, driven: Path) -> None:
+def test_replay_stops_at_its_end_and_restarts_from_the_beginning(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     page, button = visit.page, visit.page.locator(".play")
     page.locator(".pace").select_option("30")
@@ -258,7 +258,7 @@ def test_the_replay_stops_at_its_end_and_starts_again_from_the_beginning(open_pa
     assert visit.time() < SECONDS / 2
 
 
-def test_a_road_with_ends_is_played_from_its_first_vehicles_to_its_last(open_page: Opener, merged: Path) -> None:
+def test_replay_of_an_open_road_plays_the_whole_episode(open_page: Opener, merged: Path) -> None:
     visit = open_page(merged)
     means = visit.page.locator("figcaption small")
     pictures, texts = [], []
@@ -268,7 +268,7 @@ def test_a_road_with_ends_is_played_from_its_first_vehicles_to_its_last(open_pag
         texts.append([float(text.split()[1]) for text in means.all_inner_texts()])
     for panel in range(2):
         assert len({picture[panel] for picture in pictures}) == 4
-    assert all(0.5 < speed < 30 for text in texts for speed in text)  # one of six enters at 10 m/s
+    assert all(0.5 < speed < 30 for text in texts for speed in text)  # every sixth vehicle enters at 10 m/s
     visit.page.locator(".time").fill("0")
     visit.page.locator(".pace").select_option("30")
     visit.page.locator(".play").click()
@@ -276,28 +276,28 @@ def test_a_road_with_ends_is_played_from_its_first_vehicles_to_its_last(open_pag
     assert visit.time() == 40.0
     assert visit.canvases() == pictures[-1]
     sizes = visit.page.eval_on_selector_all("canvas", "all => all.map(each => each.width / each.height)")
-    assert all(size > 3 for size in sizes), "a long road is a wide picture"
+    assert all(size > 3 for size in sizes), "a long road has a wide picture"
 
 
-def test_pace_is_how_many_times_as_fast_as_life_it_plays(open_page: Opener, driven: Path) -> None:
+def test_pace_is_the_speed_relative_to_real_time(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     visit.page.locator(".pace").select_option("5")
-    took = visit.page.evaluate(
+    ratio = visit.page.evaluate(
         """() => new Promise(done => {
              const slider = document.querySelector(".time"), started = performance.now();
              document.querySelector(".play").click();
-             const look = () => {
-               const shown = Number(slider.value);
-               if (shown < 5) requestAnimationFrame(look);
-               else done((performance.now() - started) / 1000 / shown);
+             const check = () => {
+               const time = Number(slider.value);
+               if (time < 5) requestAnimationFrame(check);
+               else done((performance.now() - started) / 1000 / time);
              };
-             look();
+             check();
            })"""
     )
-    assert took == pytest.approx(1 / 5, rel=0.2)
+    assert ratio == pytest.approx(1 / 5, rel=0.2)
 
 
-def test_the_slider_shows_any_moment(open_page: Opener, driven: Path) -> None:
+def test_slider_selects_the_time(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     pictures = []
     for moment in ("4", "9.5", "15", "4"):
@@ -308,7 +308,7 @@ def test_the_slider_shows_any_moment(open_page: Opener, driven: Path) -> None:
     assert len({picture[0] for picture in pictures}) == 3
 
 
-def test_the_mean_speed_under_the_replay_is_that_of_the_moment(open_page: Opener, driven: Path) -> None:
+def test_replay_shows_the_current_mean_speed(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     means = visit.page.locator("figcaption small")
     assert means.all_inner_texts() == ["mean 0.0 m/s"] * 2
@@ -317,7 +317,7 @@ def test_the_mean_speed_under_the_replay_is_that_of_the_moment(open_page: Opener
 
 
 @pytest.mark.parametrize("key", ["Enter", " "])
-def test_the_keyboard_plays_and_pauses(open_page: Opener, driven: Path, key: str) -> None:
+def test_keyboard_plays_and_pauses(open_page: Opener, driven: Path, key: str) -> None:
     visit = open_page(driven)
     visit.page.locator(".pace").select_option("1")
     visit.page.locator(".play").focus()
@@ -327,7 +327,7 @@ def test_the_keyboard_plays_and_pauses(open_page: Opener, driven: Path, key: str
     assert visit.page.locator(".play").get_attribute("aria-label") == "Play"
 
 
-def test_the_keyboard_moves_through_time(open_page: Opener, driven: Path) -> None:
+def test_keyboard_moves_the_slider(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     slider = visit.page.locator(".time")
     slider.focus()
@@ -337,11 +337,11 @@ def test_the_keyboard_moves_through_time(open_page: Opener, driven: Path) -> Non
         moments.append(float(slider.input_value()))
     end, home, once, twice, back = moments
     assert (end, home) == (SECONDS, 0.0)
-    assert 0.1 <= once < twice <= SECONDS / 5, "a key moves by a step that the eye can follow"
+    assert 0.1 <= once < twice <= SECONDS / 5, "a key moves by a small step"
     assert back == pytest.approx(once)
 
 
-def test_all_controls_can_be_reached_by_tab_and_have_names(open_page: Opener, driven: Path) -> None:
+def test_all_controls_are_reachable_by_tab_and_have_names(open_page: Opener, driven: Path) -> None:
     page = open_page(driven).page
     page.locator(".play").focus()
     reached = []
@@ -354,57 +354,55 @@ def test_all_controls_can_be_reached_by_tab_and_have_names(open_page: Opener, dr
 
 
 def metrics_in(report: Path) -> list[Metric]:
-    """The metrics that the road of a report has."""
+    """Return the metrics that are defined on the road of a report."""
     rows = json.loads((report.parent / "evaluation.json").read_text())["rows"]
     return [metric for name, metric in METRICS.items() if any(row[name] is not None for row in rows)]
 
 
-def test_the_table_has_all_metrics_of_all_drivers(open_page: Opener, trained: Path) -> None:
+def test_table_has_all_metrics_of_all_drivers(open_page: Opener, trained: Path) -> None:
     table = open_page(trained).page.locator("section:has(h2:text-is('All metrics')) table")
     assert table.locator("thead th").all_inner_texts() == [
         *("metric", "human", "pi", "trained", "pi − human", "trained − human")
     ]
     rows, metrics = table.locator("tbody tr"), metrics_in(trained)
-    assert rows.count() == len(metrics) + 2  # above them the verdict, and who earns more how often
-    assert rows.first.locator("th").inner_text() == "could a car drive so?"
+    assert rows.count() == len(metrics) + 2  # and feasibility and probability of improvement
+    assert rows.first.locator("th").inner_text() == "feasible"
     for row, metric in zip(rows.all()[2:], metrics, strict=True):
         assert row.locator("th").inner_text().replace("\n", " ") == f"{metric.label} {metric.unit}".strip()
         assert row.locator("td").count() == 5
         assert all(row.locator("td b").all_inner_texts())
 
 
-def test_a_metric_shows_its_definition_when_pointed_at(open_page: Opener, driven: Path) -> None:
+def test_metrics_have_their_definition_as_a_tooltip(open_page: Opener, driven: Path) -> None:
     page = open_page(driven).page
     heads = page.locator("section:has(h2:text-is('All metrics')) tbody th")
     for head, metric in zip(heads.all()[2:], metrics_in(driven), strict=True):
         assert head.get_attribute("title") == " ".join((metric.function.__doc__ or "").split())
 
 
-def test_metric_names_stay_in_sight_when_a_phone_scrolls_the_table(open_page: Opener, trained: Path) -> None:
+def test_metric_names_stay_visible_when_a_phone_scrolls_the_table(open_page: Opener, trained: Path) -> None:
     page = open_page(trained, PHONE).page
-    page.eval_on_selector(".scroll", "scrolled => scrolled.scrollLeft = 1000")
-    assert page.eval_on_selector(".scroll", "scrolled => scrolled.scrollLeft") > 0
+    page.eval_on_selector(".scroll", "element => element.scrollLeft = 1000")
+    assert page.eval_on_selector(".scroll", "element => element.scrollLeft") > 0
     box = page.locator("tbody th").first.bounding_box()
     assert box is not None
     assert 0 <= box["x"] < 40
 
 
-def test_a_run_leads_with_what_everybody_gains_and_keeps_its_configuration_at_hand(
-    open_page: Opener, trained: Path
-) -> None:
+def test_report_of_a_run_has_finding_and_configuration(open_page: Opener, trained: Path) -> None:
     page = open_page(trained).page
     assert page.title() == page.locator("h1").inner_text() == "ring: a trained residual on pi"
-    lead = page.locator(".lead").inner_text()
-    assert lead.startswith("Beside people alone on ring, 2 held-out seeds")
-    assert "Return beyond its expert" in lead
-    assert page.locator(".card").last.inner_text().startswith("Return beyond the expert")
+    finding = page.locator(".lead").inner_text()
+    assert finding.startswith("Compared with the human baseline on ring, 2 paired test seeds")
+    assert "Return difference to its expert" in finding
+    assert page.locator(".card").last.inner_text().startswith("Return difference to expert")
     code = page.locator("details code")
     assert not code.is_visible()
     page.locator("summary", has_text="Configuration").click()
     assert "steps = 600" in code.inner_text()
 
 
-def test_the_replay_stays_sharp_when_the_window_changes(open_page: Opener, driven: Path) -> None:
+def test_replay_adapts_to_the_size_of_the_window(open_page: Opener, driven: Path) -> None:
     page = open_page(driven).page
     for width in (1280, 500):
         page.set_viewport_size({"width": width, "height": 800})
@@ -416,17 +414,17 @@ def test_the_replay_stays_sharp_when_the_window_changes(open_page: Opener, drive
 
 
 @pytest.mark.parametrize("report", ["driven", "assessed"])
-def test_every_picture_and_table_can_be_taken_away(
+def test_every_figure_and_table_can_be_downloaded(
     open_page: Opener, request: pytest.FixtureRequest, report: str, tmp_path: Path
 ) -> None:
     page = open_page(request.getfixturevalue(report)).page
     assert page.locator(".picture + a.download").count() == page.locator(".picture").count() > 0
     assert page.locator(".scroll + a.download").count() == page.locator(".scroll").count() > 0
     for link in page.locator("a.download").all():
-        with page.expect_download() as waiting:
+        with page.expect_download() as download:
             link.click()
-        path = tmp_path / waiting.value.suggested_filename
-        waiting.value.save_as(path)
+        path = tmp_path / download.value.suggested_filename
+        download.value.save_as(path)
         text = path.read_text()
         if path.suffix == ".svg":
             assert ElementTree.fromstring(text).tag.endswith("svg")
@@ -436,12 +434,12 @@ def test_every_picture_and_table_can_be_taken_away(
             assert {len(row) for row in rows} == {len(header)}
 
 
-def test_zoom_goes_to_the_slowest_vehicle_and_dragging_moves_on(open_page: Opener, merged: Path) -> None:
+def test_zoom_centers_the_slowest_vehicle_and_dragging_moves_the_view(open_page: Opener, merged: Path) -> None:
     visit = open_page(merged)
     visit.page.locator(".time").fill("20")
-    whole = visit.canvases()
+    overview = visit.canvases()
     visit.page.locator(".zoom").select_option("16")
-    near = visit.canvases()
+    zoomed = visit.canvases()
     visit.page.locator("canvas").first.scroll_into_view_if_needed()
     box = visit.page.locator("canvas").first.bounding_box()
     assert box is not None
@@ -452,11 +450,11 @@ def test_zoom_goes_to_the_slowest_vehicle_and_dragging_moves_on(open_page: Opene
     moved = visit.canvases()
     visit.page.locator(".zoom").select_option("1")
     for panel in range(2):
-        assert len({whole[panel], near[panel], moved[panel]}) == 3, "both roads move together"
-    assert visit.canvases() == whole
+        assert len({overview[panel], zoomed[panel], moved[panel]}) == 3, "both roads move together"
+    assert visit.canvases() == overview
 
 
-def test_a_wide_table_says_that_there_is_more_of_it(open_page: Opener, trained: Path) -> None:
+def test_a_wide_table_has_a_hint_to_swipe(open_page: Opener, trained: Path) -> None:
     scroll = "document.querySelector('.scroll')"
     for size in (PHONE, LAPTOP):
         page = open_page(trained, size).page
@@ -465,19 +463,19 @@ def test_a_wide_table_says_that_there_is_more_of_it(open_page: Opener, trained: 
         assert wide is (size == PHONE)
 
 
-def test_at_night_paper_is_dark_and_letters_are_light(open_page: Opener, driven: Path) -> None:
+def test_dark_mode_has_light_text_on_dark_background(open_page: Opener, driven: Path) -> None:
     page = open_page(driven).page
     style = "getComputedStyle(document.querySelector('section'))"
-    colours = f"['background', 'color'].map(name => {style}[name].match(/\\d+/g)[0])"
-    day = [int(part) for part in page.evaluate(colours)]
+    colors = f"['background', 'color'].map(name => {style}[name].match(/\\d+/g)[0])"
+    day = [int(part) for part in page.evaluate(colors)]
     page.emulate_media(color_scheme="dark")
-    night = [int(part) for part in page.evaluate(colours)]
+    night = [int(part) for part in page.evaluate(colors)]
     assert day[0] > 200 > 80 > day[1]
     assert night[0] < 80 < 200 < night[1]
 
 
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
-def test_the_page_can_be_photographed_whole(
+def test_page_can_be_captured_as_a_screenshot(
     open_page: Opener, driven: Path, tmp_path: Path, size: tuple[int, int]
 ) -> None:
     path = tmp_path / "page.png"

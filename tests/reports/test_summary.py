@@ -78,15 +78,17 @@ def test_finding_reports_a_negative_gain() -> None:
 
 @pytest.mark.parametrize("trained", [[125.0, 125.0, 205.0, 110.0], [90.0, 150.0, 155.0, 125.0], EXPERT])
 def test_finding_claims_no_gain_that_may_be_zero(trained: list[float]) -> None:
-    assert main_finding(trained_on_pi(trained, EXPERT)).endswith("No gain is shown: the confidence interval contains zero.")
+    assert main_finding(trained_on_pi(trained, EXPERT)).endswith(
+        "No gain is shown: the confidence interval contains zero."
+    )
 
 
 def test_finding_on_one_seed_has_no_interval() -> None:
     result = trained_on_pi([150.0], [100.0])
     finding = main_finding(result)
-    assert finding.endswith("+50. There is no interval: nothing is shown.")
-    assert "pays" not in finding
-    assert "holds zero" not in finding
+    assert finding.endswith("+50. No conclusion: there is no confidence interval.")
+    assert "verdict" not in finding
+    assert "contains zero" not in finding
     assert not any("nan" in text for text in (finding, *(card["detail"] for card in key_figures(result))))
 
 
@@ -156,7 +158,7 @@ def test_overrides_of_the_safety_check_are_noted() -> None:
 
 def test_traffic_above_the_limit_is_explained() -> None:
     [note] = report_notes(trained_on_pi([1.0], [1.0], speed_limit_ratio_steady=1.034))
-    assert "With trained all vehicles drive at 103 % of the limit" in note
+    assert "With trained the mean speed is 103 % of the limit" in note
     assert report_notes(trained_on_pi([1.0], [1.0], speed_limit_ratio_steady=1.005)) == []
 
 

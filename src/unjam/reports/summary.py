@@ -169,14 +169,14 @@ def _driver_notes(result: Results, label: str) -> list[str]:
     ratio = metric_estimate(rows, "speed_limit_ratio_steady").mean
     if ratio > MAX_LIMIT_RATIO:
         notes.append(
-            f"With {label} the mean speed is {100 * ratio:.0f} % of the limit, which is the equilibrium speed of human "
+            f"With {label} the mean speed is {100 * ratio:.0f}\u00a0% of the limit, which is the equilibrium speed of human "
             "drivers: the CAV keeps a smaller gap than they would."
         )
     share = metric_estimate(rows, "shield_override_share").mean
     if share > 0.01:
         hardest = max(row["shield_max_braking"] for row in rows)
         notes.append(
-            f"{label} relies on SUMO's safety check: it overrides {100 * share:.1f} % of commands, and adds up to "
+            f"{label} relies on SUMO's safety check: it overrides {100 * share:.1f}\u00a0% of commands, and adds up to "
             f"{hardest:.1f} m/s² of braking."
         )
     return notes

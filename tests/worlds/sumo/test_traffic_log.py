@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.reports.open_roads import own_episode, ramp_episode
+from tests.reports.open_roads import ramp_episode, user_episode
 from unjam.measures.metrics import measure
 from unjam.reports.html import replay_data
 from unjam.reports.lanes import lane_map_figure
@@ -47,7 +47,7 @@ def thinned(whole: Episode, small: None) -> Episode:
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 12)), max_size=25), st.integers(1, 60))
-def test_whoever_comes_and_goes_every_speed_is_kept_in_a_column_of_its_own_kind(stays: Stays, most: int) -> None:
+def test_every_speed_is_in_a_column_of_its_group(stays: Stays, most: int) -> None:
     moments = max((first + more for first, more in stays), default=0) + 1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(traffic_log, "MAX_UNSHARED_CELLS", 0)
@@ -73,7 +73,7 @@ def test_whoever_comes_and_goes_every_speed_is_kept_in_a_column_of_its_own_kind(
         assert {groups[other] for other in np.flatnonzero(columns == column)} == {group}
 
 
-def test_a_picture_is_kept_of_every_moment_until_they_are_many() -> None:
+def test_every_moment_has_a_snapshot_until_there_are_many() -> None:
     log = TrafficLog()
     for time in range(100):
         log.add(["one", "other"], [1.0, 2.0])
@@ -83,7 +83,7 @@ def test_a_picture_is_kept_of_every_moment_until_they_are_many() -> None:
     assert log.columns(["", ""]).tolist() == [0, 1]
 
 
-def test_all_that_is_measured_is_the_same_where_columns_are_shared(whole: Episode, thinned: Episode) -> None:
+def test_metrics_are_the_same_with_shared_columns(whole: Episode, thinned: Episode) -> None:
     assert thinned.snapshot_stride > 1
     assert 0 < thinned.speeds.shape[1] < whole.speeds.shape[1] == len(whole.vehicle_ids)
     assert (thinned.vehicle_ids, thinned.cav_ids) == (whole.vehicle_ids, whole.cav_ids)
@@ -100,7 +100,7 @@ def test_all_that_is_measured_is_the_same_where_columns_are_shared(whole: Episod
         assert found[name] == (pytest.approx(value, nan_ok=True, rel=1e-9) if close else value), name
 
 
-def test_pictures_of_what_is_thinned_show_the_moments_that_are_kept(whole: Episode, thinned: Episode) -> None:
+def test_figures_of_thinned_snapshots_show_the_remaining_moments(whole: Episode, thinned: Episode) -> None:
     every = thinned.snapshot_stride
     one, other = to_plot_episode("", whole), to_plot_episode("", thinned)
     assert other.control_step == pytest.approx(one.control_step * every)
@@ -118,7 +118,7 @@ def test_pictures_of_what_is_thinned_show_the_moments_that_are_kept(whole: Episo
     assert lane_map_figure([replace(other, driver="it")]).axes
 
 
-def test_a_reward_that_sees_an_episode_part_by_part_pays_the_same(whole: Episode, small: None) -> None:
+def test_a_reward_computed_in_parts_is_the_same(whole: Episode, small: None) -> None:
     assert whole.speeds.size > episode_reward.MAX_REWARD_CELLS
     seen = (whole.speeds, whole.trajectories, False, whole.backlog)
     parts = {name: episode_reward_terms(make_reward(f"{name}:time_gap=1,comfort=1"), *seen) for name in REWARDS}
@@ -131,7 +131,7 @@ def test_a_reward_that_sees_an_episode_part_by_part_pays_the_same(whole: Episode
             np.testing.assert_allclose(parts[name][term], values, rtol=1e-12, atol=1e-12)
 
 
-def test_a_collision_ends_the_last_part_alone(whole: Episode, small: None) -> None:
+def test_a_collision_belongs_to_the_last_part(whole: Episode, small: None) -> None:
     def crashes(outcome: object) -> dict[str, np.ndarray]:
         return {"crashed": 1.0 * outcome.has_crashed}  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -140,8 +140,8 @@ def test_a_collision_ends_the_last_part_alone(whole: Episode, small: None) -> No
 
 
 @pytest.mark.long
-def test_a_network_of_ones_own_is_thinned_as_well(tmp_path: Path, small: None) -> None:
-    episode = own_episode(tmp_path)
+def test_a_users_network_is_thinned_as_well(tmp_path: Path, small: None) -> None:
+    episode = user_episode(tmp_path)
     shown = to_plot_episode("", episode)
     assert episode.snapshot_stride > 1
     there = ~np.isnan(shown.speeds)
