@@ -48,7 +48,7 @@ def test_the_word_in_a_comment_or_a_text_is_harmless(tmp_path: Path) -> None:
 def test_what_unpacks_to_too_much_is_refused_and_takes_no_memory_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sumo_files, "LARGEST_MEMORY", 150 * 2**20)
+    monkeypatch.setattr(sumo_files, "MAX_READER_MEMORY", 150 * 2**20)
     path = configuration(tmp_path)
     bomb = b'<routes name="' + b"a" * 200_000_000 + b'"/>'
     (tmp_path / "road.rou.xml.gz").write_bytes(gzip.compress(bomb, 1))
@@ -146,7 +146,7 @@ def test_included_files_count_wherever_they_are_included(tmp_path: Path) -> None
 def test_a_large_file_takes_no_memory_and_is_read_by_sumo_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sumo_files, "LARGEST_MEMORY", 100 * 2**20)
+    monkeypatch.setattr(sumo_files, "MAX_READER_MEMORY", 100 * 2**20)
     vehicle = '<vehicle id="v" type="car" depart="7.5" departLane="best"><route edges="a b"/></vehicle>\n'
     found = read_sumo_files(configuration(tmp_path, routes=f"<routes>{vehicle * 300_000}</routes>"))
     assert (found.used_types, found.copy_sources, found.first_departure) == ({"car"}, {}, 7.5)

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.car_following import _MIN_GAP
+from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.drivers.safety import SafetyFilter
 from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt
 from unjam.physics.arrays import clamp_min
@@ -160,7 +160,7 @@ class Merge(Scenario):
 
 @lru_cache
 def _free_flow_speed(flow: float, length: float, humans: IDMParameters, step: float) -> float:
-    """Return the mean speed over `length` of human drivers who enter one after the other and never meet a jam [m/s]."""
+    """Return the mean speed over `length` of human drivers that enter one after the other and never meet a jam [m/s]."""
     delay = round(3600.0 / flow / step)
     leader: list[tuple[float, float]] = []
     own: list[tuple[float, float]] = []
@@ -170,7 +170,7 @@ def _free_flow_speed(flow: float, length: float, humans: IDMParameters, step: fl
             position, speed = own[-1]
             index = len(own) - 1 + delay
             leader_position, leader_speed = leader[index] if index < len(leader) else (inf, speed)
-            gap = clamp_min(leader_position - position - VEHICLE_LENGTH, _MIN_GAP)
+            gap = clamp_min(leader_position - position - VEHICLE_LENGTH, MIN_IDM_GAP)
             speed = next_speed(speed, idm_acceleration(speed, leader_speed, gap, humans), step)
             own.append((next_position(position, speed, step), speed))
         leader = own

@@ -137,7 +137,7 @@ class Scenario:
     provided_fields: ClassVar[tuple[str, ...]] = ()
     """optional fields of a `LocalState` that this road provides"""
     has_vehicle_types: ClassVar[bool] = False
-    """whether the user defines vehicle types, whose properties a CAV keeps"""
+    """whether the user defines vehicle types; a CAV keeps the properties of its type"""
     sumo_human_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded human drivers [m]"""
 

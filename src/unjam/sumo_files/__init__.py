@@ -1,8 +1,7 @@
-"""What the user's own SUMO files say, read before SUMO starts: SUMO crashes on some that are broken.
+"""Read and check the user's SUMO files before SUMO starts: SUMO crashes on some broken ones.
 
-Such files may come from anywhere. So that none can harm who asks, `reader_program.py` reads them in a process of its
-own that `unjam.sandbox` limits, and answers one JSON document. What SUMO would write, and where it would
-listen, is never passed on to it: see `write_harmless_copy`.
+The files are untrusted. `reader_program.py` reads them in a separate process that `unjam.sandbox` limits, and returns
+one JSON document. SUMO never receives options and elements that make it write or listen: see `write_harmless_copy`.
 """
 
 import json
@@ -17,72 +16,66 @@ from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.sumo_files.reader import FILE_ATTRIBUTES, FILE_PARAMETER_PARTS, file_stamp
 
 READER_PROGRAM = Path(__file__).with_name("reader_program.py")
-MAX_READER_MEMORY = 4 * 2**30
-"""bytes that reading may take"""
-MAX_READER_TIME = 120
-"""seconds that reading may take"""
+MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120
+"""limits of the reader process [bytes, s]"""
 
 LaneShape = tuple[str, float, list[tuple[float, float]]]
-"""edge, length [m] and centre line [(x, y), m]"""
-PASSED_OPTIONS = {
-    *("begin", "end", "junction-taz", "weight-attribute", "step-method.ballistic", "extrapolate-departpos"),
-    *("lateral-resolution", "route-steps", "no-internal-links", "ignore-junction-blocker"),
-    *("ignore-route-errors", "ignore-accidents", "intermodal-collision.action", "collision.stoptime"),
-    *("collision.action", "collision.mingap-factor", "collision.check-junctions"),
-    *("intermodal-collision.stoptime", "collision.check-junctions.mingap", "keep-after-arrival"),
-    *("max-num-vehicles", "max-num-persons", "max-num-teleports", "scale", "scale-suffix"),
-    *("sloppy-insert", "eager-insert", "emergency-insert", "insertion-checks"),
-    *("random-depart-offset", "waiting-time-memory", "startup-wait-threshold", "slope-centered"),
-    *("time-to-impatience", "pedestrian.model", "pedestrian.timegap-crossing", "mesosim"),
-    *("use-stop-ended", "use-stop-started", "routing-algorithm", "replay-rerouting", "time-to-teleport"),
-    *("thread-rngs", "phemlight-year", "phemlight-temperature"),
-}
-"""options that only say how to simulate"""
-PASSED_OPTION_PREFIXES = (
-    *("time-to-teleport.", "lanechange.", "tls.", "railsignal.", "railsignal-moving-block", "default."),
-    *("overhead-wire.", "emergencydecel.", "parking.", "pedestrian.striping.", "ride.", "mapmatch."),
-    *("weights.", "persontrip.", "railway.", "device.rerouting.", "person-device.rerouting."),
-    *("device.driverstate.", "device.bluelight.", "device.glosa.", "device.toc.", "device.taxi."),
-    *("device.emissions.", "device.battery.", "device.friction.", "device.stationfinder."),
-    *("device.elechybrid.", "pedestrian.jupedsim.", "meso-"),
-)
-"""what the names of others of them begin with"""
-IGNORED_OPTIONS = {
-    *("step-length", "no-step-log", "no-warnings", "aggregate-warnings", "verbose", "start"),
-    *("duration-log.disable", "duration-log.statistics"),
-    *("xml-validation", "xml-validation.net", "xml-validation.routes", "gui-settings-file", "quit-on-end"),
-    *("delay", "precision", "step-log.period", "print-options", "human-readable-time", "registry-viewport"),
-    *("aggregate-warnings", "language", "log.timestamps", "log.processid", "help", "version", "threads"),
-    *("device.rerouting.threads", "emissions.volumetric-fuel", "load-state.offset"),
-    *("load-state.remove-vehicles", "configuration-file", "configuration", "c", "game", "game.mode"),
-    *("breakpoints", "edgedata-files", "data-files", "alternative-net-file", "selection-file", "demo"),
-    *("disable-textures", "window-size", "window-pos", "tracker-interval", "gui-testing"),
-    *("gui-testing-debug", "suppress-warnings", "no-duration-log", *"vtgdHWXVQGSDTBmN?"),
-}
-"""options that unjam decides itself, or that change nothing: of no interest where they are left out"""
+"""edge, length [m] and center line [(x, y), m]"""
+_PASSED = """
+begin end junction-taz weight-attribute step-method.ballistic extrapolate-departpos lateral-resolution route-steps
+no-internal-links ignore-junction-blocker ignore-route-errors ignore-accidents intermodal-collision.action
+collision.stoptime collision.action collision.mingap-factor collision.check-junctions intermodal-collision.stoptime
+collision.check-junctions.mingap keep-after-arrival max-num-vehicles max-num-persons max-num-teleports scale
+scale-suffix sloppy-insert eager-insert emergency-insert insertion-checks random-depart-offset waiting-time-memory
+startup-wait-threshold slope-centered time-to-impatience pedestrian.model pedestrian.timegap-crossing mesosim
+use-stop-ended use-stop-started routing-algorithm replay-rerouting time-to-teleport thread-rngs phemlight-year
+phemlight-temperature
+"""
+_PASSED_PREFIXES = """
+time-to-teleport. lanechange. tls. railsignal. railsignal-moving-block default. overhead-wire. emergencydecel.
+parking. pedestrian.striping. ride. mapmatch. weights. persontrip. railway. device.rerouting. person-device.rerouting.
+device.driverstate. device.bluelight. device.glosa. device.toc. device.taxi. device.emissions. device.battery.
+device.friction. device.stationfinder. device.elechybrid. pedestrian.jupedsim. meso-
+"""
+_IGNORED = """
+step-length no-step-log no-warnings aggregate-warnings verbose start duration-log.disable duration-log.statistics
+xml-validation xml-validation.net xml-validation.routes gui-settings-file quit-on-end delay precision step-log.period
+print-options human-readable-time registry-viewport aggregate-warnings language log.timestamps log.processid help
+version threads device.rerouting.threads emissions.volumetric-fuel load-state.offset load-state.remove-vehicles
+configuration-file configuration c game game.mode breakpoints edgedata-files data-files alternative-net-file
+selection-file demo disable-textures window-size window-pos tracker-interval gui-testing gui-testing-debug
+suppress-warnings no-duration-log
+"""
+PASSED_OPTIONS = set(_PASSED.split())
+"""options that only define how to simulate"""
+PASSED_OPTION_PREFIXES = tuple(_PASSED_PREFIXES.split())
+"""beginnings of the names of other such options"""
+IGNORED_OPTIONS = {*_IGNORED.split(), *"vtgdHWXVQGSDTBmN?"}
+"""options that unjam decides itself, or that change nothing: not reported if they are left out"""
 REPLACED_OPTIONS = ("seed", "random", "max-depart-delay")
-"""options that change the traffic, and for which unjam has a value of its own"""
+"""options that change the traffic, and that unjam replaces by its own values"""
 OUTPUT_OPTIONS = re.compile(
     r"output|^(write-|save-|netstate|ndump|dump-|summary$|tripinfo$|personinfo$|vehroutes|personroutes$)"
     r"|^(log|log-file|message-log|error-log|precision\.geo|person-fcd|remote-port|num-clients|l|C)$"
     r"|^(person-)?device\.(fcd|ssm|tripinfo|vehroute|btsender|btreceiver|example)\."
     r"|^device\.toc\.file$|^device\.fcd-replay\.(?!files)|^pedestrian\.jupedsim\.(wkt|py)"
 )
-"""options about what SUMO writes, and where it listens: without them the traffic is the same"""
+"""options about SUMO's output and connections: without them the traffic is the same"""
 REFUSED_OPTIONS = {
     "load-state": "no file, as episodes begin on an empty road; begin earlier, with --set warmup=600",
-    "astar.all-distances": "no file, as unjam cannot check what is in it",
-    "astar.landmark-distances": "no file, as unjam cannot check what is in it",
-    "device.fcd-replay.files": "no file, as unjam cannot check what is in it",
+    **dict.fromkeys(
+        ("astar.all-distances", "astar.landmark-distances", "device.fcd-replay.files"),
+        "no file, as unjam cannot check what is in it",
+    ),
     "phemlight-path": "./PHEMlight/, SUMO's default",
 }
-"""options that change what is simulated, and that SUMO cannot be told; with what is allowed instead"""
+"""options that change the simulation but cannot be passed to SUMO; with the allowed values"""
 HARMFUL_OPTION_PARTS = ("file", "output", "threads", ".wkt", ".py")
-"""what is in the names of options that belong to these groups and are harmful all the same"""
+"""parts of the names of harmful options among those with PASSED_OPTION_PREFIXES"""
 
 
 class SumoFiles(NamedTuple):
-    """A .sumocfg file and what the files that it names hold."""
+    """A .sumocfg file and the content of the files that it names."""
 
     path: Path
     network: Path
@@ -97,19 +90,19 @@ class SumoFiles(NamedTuple):
     end: float | None
     """[s]; None: when the last vehicle has arrived"""
     first_departure: float | None
-    """when the first vehicle departs at the earliest [s]; None where that cannot be told"""
+    """earliest departure of a vehicle [s]; None: unknown"""
     calibrated_until: float
-    """until when calibrators may bring vehicles at the latest [s]; zero: there are none"""
+    """latest time at which calibrators may add vehicles [s]; zero: there are none"""
     step: float
     """[s]"""
     options: dict[str, str]
-    """what else SUMO may be told of it, by name: harmless ways of simulating"""
+    """harmless options about how to simulate, by name, which SUMO receives"""
     dropped_items: tuple[str, ...]
-    """options and elements that are left out: they only write or listen"""
+    """options and elements that are left out because they only write or listen"""
     replaced_options: tuple[str, ...]
-    """options that change the traffic, and for which unjam has a value of its own"""
+    """options that change the traffic, and that unjam replaces by its own values"""
     copy_sources: dict[Path, tuple[Path, ...]]
-    """files that SUMO gets a harmless copy of, and what the copy is made from; it reads others themselves"""
+    """files of which SUMO reads a harmless copy, with the sources of the copy; SUMO reads the others directly"""
     types: dict[str, dict[str, str]]
     """attributes of all vehicle types, by id"""
     type_parameters: dict[str, dict[str, str]]
@@ -119,17 +112,16 @@ class SumoFiles(NamedTuple):
 
 
 _read_files: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
-"""what was read already, with the stamps of all files that were read for it"""
+"""by configuration: the stamps of all its files, and their content"""
 _answers: dict[str, dict[str, Any]] = {}
-"""of each configuration that was read: what the program answered, as it is passed on to other processes"""
+"""by configuration: the answer of the reader process, for other processes"""
 
 
 def read_sumo_files(path: Path) -> SumoFiles:
-    """Return what a .sumocfg file and the files that it names say; read again where one has changed.
+    """Return the content of a .sumocfg file and of the files that it names; read again if one has changed.
 
     Raises:
-        InputError: one is missing, broken or too large, the network has no version, or there are no
-            vehicles.
+        InputError: a file is missing, broken or too large, the network has no version, or there are no vehicles.
     """
     if path in _read_files:
         stamps, files = _read_files[path]
@@ -139,35 +131,38 @@ def read_sumo_files(path: Path) -> SumoFiles:
 
 
 def answer_of(path: str) -> dict[str, Any] | None:
-    """Return what another process needs in order not to read a configuration again; None: it was not read."""
+    """Return the reader's answer for another process, which then need not read a configuration; None: not read."""
     return _answers.get(path)
 
 
 def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
-    """Note and return what a .sumocfg file says, of which the program has answered this in some process.
+    """Store and return the content of a .sumocfg file from the reader's answer, made in any process.
 
     Raises:
         InputError: SUMO has no such option, or it changes the traffic and cannot be passed on.
     """
-    path, found = Path(file), dict(answer)
-    stamps = {Path(each): (time, size) for each, (time, size) in found.pop("stamps").items()}
-    found["network"], found["sources"] = Path(found["network"]), tuple(stamps)
+    path, fields = Path(file), dict(answer)
+    stamps = {Path(source): (time, size) for source, (time, size) in fields.pop("stamps").items()}
+    fields["network"], fields["sources"] = Path(fields["network"]), tuple(stamps)
     for name in ("additional_files", "route_files", "weight_files"):
-        found[name] = tuple(map(Path, found[name]))
-    found["copy_sources"] = {Path(each): tuple(map(Path, made)) for each, made in found["copy_sources"].items()}
-    found["used_types"] = frozenset(found["used_types"])
-    options: dict[str, str] = found["options"]
+        fields[name] = tuple(map(Path, fields[name]))
+    fields["copy_sources"] = {
+        Path(copied): tuple(map(Path, sources)) for copied, sources in fields["copy_sources"].items()
+    }
+    fields["used_types"] = frozenset(fields["used_types"])
+    options: dict[str, str] = fields["options"]
     kinds = {name: classify_option(path.name, name, value) for name, value in options.items()}
-    found["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
-    found["dropped_items"] = (*(f"option {name}" for name in options if kinds[name] == "dropped"), *found["dropped_items"])
-    found["replaced_options"] = tuple(name for name in options if kinds[name] == "replaced")
-    files = SumoFiles(path, **found)
+    fields["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
+    dropped = [f"option {name}" for name in options if kinds[name] == "dropped"]
+    fields["dropped_items"] = (*dropped, *fields["dropped_items"])
+    fields["replaced_options"] = tuple(name for name in options if kinds[name] == "replaced")
+    files = SumoFiles(path, **fields)
     _read_files[path], _answers[file] = (stamps, files), answer
     return files
 
 
 def classify_option(file: str, name: str, value: str) -> Literal["passed", "ignored", "replaced", "dropped"]:
-    """Return what becomes of an option of a configuration.
+    """Return how unjam treats an option of a configuration.
 
     Raises:
         InputError: SUMO has no such option, or it changes the traffic and cannot be passed on.
@@ -192,56 +187,53 @@ def read_lanes(path: Path) -> list[LaneShape]:
     """Return all lanes of a network file.
 
     Raises:
-        InputError: it is broken, or too large.
+        InputError: the file is broken or too large.
     """
     lanes = _run_reader("lanes", path)
     return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in lanes]
 
 
 def write_harmless_copy(path: Path, copy: Path, types: Path | None = None) -> None:
-    """Write one of SUMO's files again without what makes SUMO write a file, listen, or read another file.
+    """Write a copy of a SUMO file without elements that make SUMO write a file, listen, or read another file.
 
     Vehicle types get the attributes that a JSON file `types` has for them, by id.
 
     Raises:
-        InputError: it is broken, or too large.
+        InputError: the file is broken or too large.
     """
     _run_reader("copy", path, copy, *([types] if types else []))
 
 
 def is_harmless_attribute(name: str) -> bool:
-    """Return whether SUMO may read an attribute of a vehicle type: it names no file."""
+    """Return whether an attribute of a vehicle type is harmless: it names no file."""
     return name not in FILE_ATTRIBUTES and not name.endswith("File")
 
 
 def is_harmless_parameter(key: str) -> bool:
-    """Return whether SUMO may read a `<param>` of a vehicle type: it makes SUMO write no file."""
+    """Return whether a `<param>` of a vehicle type is harmless: it makes SUMO write no file."""
     return not any(word in key.lower() for word in FILE_PARAMETER_PARTS)
 
 
 def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, *extra_paths: Path) -> Any:
-    """Return what the program answers; raise `InputError` where it says what is wrong, or is lost."""
+    """Return the answer of the reader process; raise `InputError` if it reports an error, or is lost."""
     limits = [str(MAX_READER_MEMORY), str(MAX_READER_TIME), str(extra_paths[0].parent) if extra_paths else ""]
     program = python_command("-I", "-S", sandbox.__file__, *limits, str(READER_PROGRAM), command)
+    arguments = [*program, str(path), *map(str, extra_paths)]
     try:
-        done = subprocess.run(
-            [*program, str(path), *map(str, extra_paths)],
-            capture_output=True,
-            timeout=MAX_READER_TIME,
-            env=child_environment(),
-            check=False,
+        process = subprocess.run(
+            arguments, capture_output=True, timeout=MAX_READER_TIME, env=child_environment(), check=False
         )
-        answer = json.loads(done.stdout)
+        answer = json.loads(process.stdout)
     except (subprocess.TimeoutExpired, ValueError):
-        limits = f"{MAX_READER_MEMORY / 2**30:g} GiB, {MAX_READER_TIME:g} s"
-        raise InputError(f"{path.name}: its files cannot be read within {limits}") from None
+        limit = f"{MAX_READER_MEMORY / 2**30:g} GiB, {MAX_READER_TIME:g} s"
+        raise InputError(f"{path.name}: its files cannot be read within {limit}") from None
     if "error" in answer:
         raise InputError(answer["error"])
     return answer["result"]
 
 
 def is_passed_option(name: str) -> bool:
-    """Return whether SUMO may be told an option: it only says how to simulate."""
+    """Return whether SUMO receives an option: it only defines how to simulate."""
     return name in PASSED_OPTIONS or (
         name.startswith(PASSED_OPTION_PREFIXES) and not any(word in name for word in HARMFUL_OPTION_PARTS)
     )

@@ -1,6 +1,6 @@
-"""Reads SUMO's XML files in one pass: what vehicles and harmful elements they have, and a harmless copy.
+"""Read SUMO's XML files in one pass: find vehicles and harmful elements, and write a harmless copy.
 
-It uses Python's own library alone: `reader_program.py` runs it in a process of its own.
+It needs only Python's standard library: `reader_program.py` runs it in a separate process.
 """
 
 import os
@@ -11,60 +11,58 @@ from typing import IO, Any
 from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
 
-XML_CHUNK_BYTES = 1 << 18
-"""bytes read at once"""
-MAX_UNPACKED_BYTES = 1 << 22
-"""bytes that are unpacked at once"""
+XML_CHUNK_BYTES, MAX_UNPACKED_BYTES = 1 << 18, 1 << 22
+"""bytes read at once, and bytes unpacked at once"""
 MAX_INCLUDED_FILES = 1000
 """files that one file may include: without a limit a few of them could include each other endlessly"""
 OUTPUT_ELEMENTS = {"edgeData", "laneData", "vTypeProbe", "timedEvent", "instantInductionLoop"}
-"""elements that do nothing but write files"""
+"""elements that only write files"""
 DETECTOR_SUFFIXES = ("Detector", "inductionLoop", "routeProbe", "detector")
-"""how elements end that signals and calibrators ask too: they stay, and write to nowhere"""
+"""ends of the names of elements that traffic lights and calibrators use too: they stay, but write no file"""
 EXTERNAL_ELEMENTS = ("calibrator", "variableSpeedSign")
-"""elements whose attribute `file` names the file that defines their content"""
+"""elements with an attribute `file` that names the file of their content"""
 NULL_FILE = "NUL"
-"""the file that SUMO never makes"""
+"""the file that SUMO never creates"""
 FILE_ATTRIBUTES = ("file", "output", "dest", "href")
-"""attributes that name files, beside those that end in `File`"""
+"""attributes that name files, in addition to those that end in `File`"""
 FILE_PARAMETER_PARTS = ("file", "output", "log", "ssm", "tripinfo")
-"""what is in the names of parameters of vehicles and signals that name files, write one by themselves, or
-keep trips out of the records that delays are read from"""
+"""parts of the names of parameters of vehicles and traffic lights that name files, write one themselves, or keep trips
+out of the records from which delays are read"""
 TYPE_ELEMENTS = "vType", "vTypeDistribution"
-CHECKED_ELEMENTS = {*OUTPUT_ELEMENTS, "include", "param", "vType", "vTypeDistribution"}
-"""elements that are looked at whatever attributes they have"""
+CHECKED_ELEMENTS = {*OUTPUT_ELEMENTS, *TYPE_ELEMENTS, "include", "param"}
+"""elements that are checked whatever attributes they have"""
 PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")
-"""in which SUMO's parser cannot see another element than the one here"""
+"""encodings in which SUMO's parser finds the same elements as this one"""
 XML_ERRORS = (expat.ExpatError, OSError, EOFError, zlib.error, LookupError, ValueError)
-"""what reading can raise where a file is broken"""
+"""errors of reading a broken file"""
 
 FileStamp = tuple[int, int]
 XmlAttributes = dict[str, str]
 XmlHandlers = dict[str, Callable[[XmlAttributes], None]]
-"""what to call with the attributes of an element, by its name; of an end by `/name`"""
+"""functions to call with the attributes of an element, by its name; at its end by `/name`"""
 
 
 class BrokenFileError(Exception):
-    """What is wrong with a file, in one line."""
+    """A file is broken; the message is one line."""
 
 
 def check_file_exists(file: Path) -> None:
-    """Raise `BrokenFileError` unless there is such a file."""
-    if not os.path.isfile(file):  # also of names that no file can have
+    """Raise `BrokenFileError` unless the file exists."""
+    if not os.path.isfile(file):  # also for names that no file can have
         raise BrokenFileError(f"{str(file)!r}: there is no such file")
 
 
 def file_stamp(file: Path) -> FileStamp:
-    """Return time of change and size of a file: another content has another stamp."""
-    found = file.stat()
-    return found.st_mtime_ns, found.st_size
+    """Return time of change and size of a file, which change with its content."""
+    status = file.stat()
+    return status.st_mtime_ns, status.st_size
 
 
 class XmlReader:
-    """Follows an XML file of SUMO's and what it includes, and writes what is harmless of it to `out`.
+    """Reads an XML file of SUMO and the files that it includes, and writes its harmless parts to `out`.
 
-    Names are those in the file, with their prefixes, as SUMO takes them. Vehicle types get the attributes
-    that `types` has for their ids. A large file is read in one pass that keeps nothing of it.
+    Names are those in the file, with their prefixes, as SUMO reads them. Vehicle types get the attributes that
+    `type_changes` has for their ids. A large file is read in one pass that stores nothing of it.
     """
 
     def __init__(
@@ -73,25 +71,25 @@ class XmlReader:
         self._handlers, self._type_changes = handlers, type_changes or {}
         self._write = out.write if out else None
         self._dropped_depth = 0
-        """open elements within one that was dropped, itself included"""
+        """depth of open elements within a dropped one, itself included"""
         self._open_type = ""
-        """the outermost type or distribution of types that is open; empty where none is"""
+        """the outermost open type or distribution of types; empty: none"""
         self._renamed_tags: dict[str, str] = {}
-        """other names by which elements are written"""
+        """names under which elements are written, if they differ"""
         self._harmless_names: set[str] = set()
-        """names of attributes that are known to name no file"""
+        """attributes that name no file, as far as known"""
         self._parsers: list[Any] = []
         self._open_files: list[Path] = []
-        """the file that is being read, behind those that include it"""
+        """the file that is being read, after those that include it"""
         self.root = self.version = ""
         self.sources: dict[Path, FileStamp] = {}
-        """the files that were read, with their stamps before they were"""
+        """the files that were read, with their stamps before reading"""
         self._include_count = 0
         self.dropped_items: set[str] = set()
         self.needs_copy = False
 
     def read(self, path: Path) -> None:
-        """Follow a file to its end; raise `BrokenFileError` where it has a document type, or is no XML."""
+        """Read a file to its end; raise `BrokenFileError` if it has a document type, or is not XML."""
         check_file_exists(path)
         if path.resolve() in [file.resolve() for file in self._open_files]:
             raise BrokenFileError(f"{path.name}: includes itself")
@@ -106,13 +104,13 @@ class XmlReader:
         parser.StartElementHandler = self._on_start
         if self._write is not None:
             parser.EndElementHandler, parser.CharacterDataHandler = self._on_end, self._on_text
-        self.needs_copy |= any(sign in str(path) for sign in ",; \t$%")
+        self.needs_copy |= any(character in str(path) for character in ",; \t$%")
         parse_xml(path, parser, self._chunks(path))
         self._open_files.pop()
         self._parsers.pop()
 
     def _chunks(self, path: Path) -> Iterator[bytes]:
-        """Yield the bytes of a file; SUMO knows compressed ones by how they begin."""
+        """Yield the bytes of a file, unpacked; SUMO recognizes compressed ones by their first bytes."""
         with path.open("rb") as file:
             head = file.peek(4)[:4]
             packed = head[:2] == b"\x1f\x8b" or head[:2] in (b"\x78\x01", b"\x78\x9c", b"\x78\xda")
@@ -120,7 +118,7 @@ class XmlReader:
             unpacker = None
             while chunk := file.read(XML_CHUNK_BYTES):
                 while packed and chunk:
-                    if unpacker is None or unpacker.eof:  # one of several parts that follow each other
+                    if unpacker is None or unpacker.eof:  # the next of several compressed parts
                         unpacker = zlib.decompressobj(zlib.MAX_WBITS | 32)
                     yield unpacker.decompress(chunk, MAX_UNPACKED_BYTES)
                     chunk = unpacker.unused_data or unpacker.unconsumed_tail
@@ -128,7 +126,7 @@ class XmlReader:
         if unpacker is not None:
             yield unpacker.flush()
             if not unpacker.eof:
-                raise EOFError("it ends before the end of what was compressed")
+                raise EOFError("it ends before the end of the compressed data")
 
     def _on_declaration(self, version: str, encoding: str | None, standalone: int) -> None:
         self.needs_copy |= version != "1.0" or (encoding and encoding.lower()) not in PLAIN_ENCODINGS
@@ -139,38 +137,36 @@ class XmlReader:
             return
         if not self.root:
             self.root, self.version = tag, attributes.get("version", "")
-        if (note := self._handlers.get(tag)) is not None:
-            note(attributes)
+        if (handler := self._handlers.get(tag)) is not None:
+            handler(attributes)
         if tag in CHECKED_ELEMENTS or not self._harmless_names.issuperset(attributes):
             self._process_element(tag, attributes)
         elif self._write is not None:
             self._write_start(tag, attributes)
 
     def _process_element(self, tag: str, attributes: XmlAttributes) -> None:
-        """Take what is harmless of an element that may name a file; read what it includes."""
+        """Write the harmless parts of an element that may name a file; read the file that it includes."""
         if tag == "include":
             self._include(attributes.get("href", ""))
-            self._drop_content()
-            return
-        kept = self._filter_attributes(tag, attributes)
-        if kept is None:
+        harmless = None if tag == "include" else self._filter_attributes(tag, attributes)
+        if harmless is None:
             self._drop_content()
             return
         if tag in TYPE_ELEMENTS:
             self._open_type = self._open_type or tag
             self._parsers[-1].EndElementHandler = self._on_end
         if tag == "vType":
-            kept |= self._type_changes.get(kept.get("id", ""), {})
-        self._write_start(tag, kept)
+            harmless |= self._type_changes.get(harmless.get("id", ""), {})
+        self._write_start(tag, harmless)
         if tag in EXTERNAL_ELEMENTS and attributes.get("file"):
-            self._renamed_tags = dict.fromkeys(EXTERNAL_ELEMENTS, "content")  # within itself it would crash SUMO
+            self._renamed_tags = dict.fromkeys(EXTERNAL_ELEMENTS, "content")  # nested in itself it would crash SUMO
             self._include(attributes["file"])
             self._renamed_tags = {}
             self._write_end(tag)
             self._drop_content()  # as SUMO does
 
     def _drop_content(self) -> None:
-        """Take nothing of the element that has just begun, nor its end."""
+        """Leave out the content of the element that has just begun, and its end."""
         self._dropped_depth = 1
         self._parsers[-1].EndElementHandler = self._on_end
 
@@ -181,9 +177,9 @@ class XmlReader:
             self._write_end(tag)
             if tag == self._open_type:
                 self._open_type = ""
-            if (note := self._handlers.get(f"/{tag}")) is not None:
-                note({})
-        # Where nothing is written a call for each element would only take time.
+            if (handler := self._handlers.get(f"/{tag}")) is not None:
+                handler({})
+        # Without output, a call at the end of each element would only take time.
         if self._write is None and not self._dropped_depth and not self._open_type:
             self._parsers[-1].EndElementHandler = None
 
@@ -201,30 +197,30 @@ class XmlReader:
             self._write(f"</{self._renamed_tags.get(tag, tag)}>")
 
     def _include(self, name: str) -> None:
-        """Read another file in this place, as SUMO does: its name is relative to the one that names it."""
+        """Read another file at this position, as SUMO does: its name is relative to the including file."""
         self.needs_copy = True
         self._include_count += 1
         self.read(self._open_files[-1].parent / name)
 
     def _filter_attributes(self, tag: str, attributes: XmlAttributes) -> XmlAttributes | None:
-        """Return which attributes of an element are harmless; None where the element is not."""
+        """Return the harmless attributes of an element; None if the element itself is harmful."""
         key = attributes.get("key", "").lower().replace("profile", "")
         if tag in OUTPUT_ELEMENTS or (tag == "param" and any(word in key for word in FILE_PARAMETER_PARTS)):
             self._record_dropped(tag if tag != "param" else f"parameter {attributes['key']}")
             return None
-        kept = dict(attributes)
+        harmless = dict(attributes)
         for name in attributes:
             if name not in FILE_ATTRIBUTES and not name.endswith("File"):
                 self._harmless_names.add(name)
             elif name == "file" and tag.endswith(DETECTOR_SUFFIXES):
-                if kept[name] != NULL_FILE:
-                    kept[name] = NULL_FILE
+                if harmless[name] != NULL_FILE:
+                    harmless[name] = NULL_FILE
                     self._record_dropped(f"{name} of {tag}")
             else:
-                del kept[name]
+                del harmless[name]
                 if name != "file" or tag not in EXTERNAL_ELEMENTS:
                     self._record_dropped(f"{name} of {tag}")
-        return kept
+        return harmless
 
     def _record_dropped(self, name: str) -> None:
         self.dropped_items.add(name)
@@ -232,10 +228,9 @@ class XmlReader:
 
 
 def parse_xml(path: Path, parser: Any, chunks: Iterable[bytes]) -> None:
-    """Parse a file; raise `BrokenFileError` where it is no XML, or has a document type.
+    """Parse a file; raise `BrokenFileError` if it is not XML, or has a document type.
 
-    That can name other files, or grow without end. SUMO's own files have none, and SUMO itself would follow
-    what it names.
+    A document type can name other files, or grow without end. SUMO's own files have none, but SUMO would follow it.
     """
 
     def refuse_doctype(*definition: object) -> None:

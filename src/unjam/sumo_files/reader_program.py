@@ -1,6 +1,6 @@
-"""The program that reads users' own SUMO files: in a process of its own, limited by `unjam.sandbox`.
+"""The program that reads users' SUMO files, in a separate process that `unjam.sandbox` limits.
 
-It answers one JSON document, uses Python's own library alone, and starts in a twentieth of a second.
+It prints one JSON document, needs only Python's standard library, and starts in 50 ms.
 """
 
 import json
@@ -17,7 +17,7 @@ from urllib.parse import unquote
 from xml.parsers import expat
 
 _PROGRAM_FOLDER = Path(__file__).parent
-if __name__ == "__main__":  # packages that run none of their own code: it imports more than is needed
+if __name__ == "__main__":  # packages without their own code, which would import more than is needed
     for name, folder in (("unjam", _PROGRAM_FOLDER.parent), ("unjam.sumo_files", _PROGRAM_FOLDER)):
         sys.modules[name] = ModuleType(name)
         sys.modules[name].__path__ = [str(folder)]
@@ -35,61 +35,51 @@ from unjam.sumo_files.reader import (  # noqa: E402
 DEFAULT_VEHICLE_TYPE = "DEFAULT_VEHTYPE"
 """SUMO's type of vehicles that name none"""
 MODE_TYPES = {"car": DEFAULT_VEHICLE_TYPE, "bicycle": "DEFAULT_BIKETYPE"}
-"""types of the vehicles that SUMO creates for a person's trip that names modes alone"""
+"""types of the vehicles that SUMO creates for a person's trip that only names modes"""
 OTHER_DEFAULT_TYPES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
-"""vehicle classes of SUMO's other types that no file need define"""
+"""vehicle classes of SUMO's other predefined types"""
 DEMAND_ELEMENTS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}
-"""elements that bring vehicles, with the attribute that says when the first one departs"""
+"""elements that create vehicles, with the attribute of their first departure"""
 TIME_UNITS = (1.0, 60.0, 3600.0, 86400.0)
-"""seconds, minutes, hours and days [s]: SUMO's times may be 1:30:00"""
+"""seconds, minutes, hours and days [s]: SUMO's times can be 1:30:00"""
 FILE_OPTIONS = ("net-file", "additional-files", "route-files", "weight-files")
-"""options that name files which SUMO reads, and which are passed on once they have been checked"""
+"""options that name the files that SUMO reads once they are checked"""
 SYNONYMS = {
     synonym: name
     for name, synonyms in {
-        "net-file": "n net",
-        "route-files": "r routes",
-        "additional-files": "a additional",
-        "weight-files": "w weights",
-        "weight-attribute": "x measure",
-        "begin": "b",
-        "end": "e",
-        "route-steps": "s",
-        "seed": "srand",
-        "random": "abs-rand",
-        "default.carfollowmodel": "carfollow.model",
-        "railsignal-moving-block": "railsignal.moving-block",
-        "device.rerouting.with-taz": "with-taz",
-        "device.rerouting.threads": "routing-threads",
-        "device.taxi.vclasses": "taxi.vclasses",
-        "device.fcd-replay.files": "device.fcd-replay.file",
-        "meso-ignore-lanes-by-vclass": "meso.ignore-lanes.by-vclass",
+        **{"net-file": "n net", "route-files": "r routes", "additional-files": "a additional"},
+        **{"weight-files": "w weights", "weight-attribute": "x measure", "begin": "b", "end": "e"},
+        **{"route-steps": "s", "seed": "srand", "random": "abs-rand", "default.carfollowmodel": "carfollow.model"},
+        **{"railsignal-moving-block": "railsignal.moving-block", "device.rerouting.with-taz": "with-taz"},
+        **{"device.rerouting.threads": "routing-threads", "device.taxi.vclasses": "taxi.vclasses"},
+        **{"device.fcd-replay.files": "device.fcd-replay.file"},
+        **{"meso-ignore-lanes-by-vclass": "meso.ignore-lanes.by-vclass"},
     }.items()
     for synonym in synonyms.split()
 }
-"""other names of options, as SUMO has them"""
+"""SUMO's other names of options"""
 CAR_FOLLOWING_MODELS = (
     *("Krauss", "KraussOrig1", "KraussPS", "KraussX", "IDM", "IDMM", "EIDM", "SmartSK"),
     *("Daniel1", "PWagner2009", "BKerner", "Wiedemann", "W99", "ACC", "CACC", "CC", "Rail"),
 )
 """car-following models that older files name in an element of their own"""
 TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")
-"""what SUMO takes for yes"""
+"""SUMO's words for true"""
 _LaneShape = tuple[str, float, list[tuple[float, float]]]
-"""edge, length [m] and centre line [(x, y), m]"""
+"""edge, length [m] and center line [(x, y), m]"""
 
 
 def _read_configuration(path: Path) -> dict[str, Any]:
-    """Return what a .sumocfg file and the files that it names say, as JSON; the fields of `SumoFiles`.
+    """Return the content of a .sumocfg file and of the files that it names as JSON, the fields of `SumoFiles`.
 
     Raises:
-        BrokenFileError: one is missing or broken, the network has no version, or there are no vehicles.
+        BrokenFileError: a file is missing or broken, the network has no version, or there are no vehicles.
     """
     check_file_exists(path)
     stamps = {path: file_stamp(path)}
     options = _read_options(path)
     if options.get("mesosim", "").lower() in TRUE_VALUES:
-        raise BrokenFileError(f"{path.name}: mesosim: true is not allowed; allowed: false, for it obeys no commands")
+        raise BrokenFileError(f"{path.name}: mesosim: true is not allowed; allowed: false, as it obeys no commands")
     networks, additional, routes, weights = (
         [path.parent / unquote(name.strip()) for name in options.pop(files, "").split(",") if name.strip()]
         for files in FILE_OPTIONS
@@ -106,7 +96,8 @@ def _read_configuration(path: Path) -> dict[str, Any]:
         stamps = {**reader.sources, **stamps}
     _check_network(network, readers[network])
     if not demand.used_names:
-        raise BrokenFileError(f"{path.name}: its route and additional files have no vehicle, trip, flow or personal car")
+        elements = "vehicle, trip, flow or personal car"
+        raise BrokenFileError(f"{path.name}: its route and additional files have no {elements}")
     begin = _read_seconds(path, options, "begin", 0.0) or 0.0
     end = _read_seconds(path, options, "end", None)
     if end is not None and end <= begin:
@@ -132,7 +123,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
 
 
 def _read_options(path: Path) -> dict[str, str]:
-    """Return the options of a configuration that have a value, by SUMO's own names for them.
+    """Return the options of a configuration that have a value, by SUMO's main names.
 
     Raises:
         BrokenFileError: an option is set twice, or has a text instead of a value.
@@ -158,16 +149,16 @@ def _read_options(path: Path) -> dict[str, str]:
 
 
 def canonical_option(name: str) -> str:
-    """Return the name by which SUMO lists an option that has several."""
+    """Return SUMO's main name of an option that has several."""
     for old, new in (("device.routing.", "device.rerouting."), (".knownveh", ".explicit")):
         name = name.replace(old, new)
     return SYNONYMS.get(name, name)
 
 
 def _substitute_variables(text: str) -> str:
-    """Return an option's value with what SUMO puts for `~` and `${VARIABLE}`; unset ones are empty."""
+    """Return an option's value with `~` and `${VARIABLE}` replaced as SUMO does; unset variables are empty."""
     home = re.sub("(^|,)~", r"\1${HOME}", text)
-    return re.sub(r"\$\{(.+?)\}", lambda found: os.environ.get(found[1], ""), home)
+    return re.sub(r"\$\{(.+?)\}", lambda match: os.environ.get(match[1], ""), home)
 
 
 def _read_lanes(path: Path) -> list[_LaneShape]:
@@ -196,7 +187,7 @@ def _read_seconds(path: Path, options: dict[str, str], name: str, default: float
 
 
 def _parse_time(text: str) -> float:
-    """Return a time [s] of 90, 1:30:00 or 1:00:00:00; NaN where it is none."""
+    """Return a time [s] from 90, 1:30:00 or 1:00:00:00; NaN: not a time."""
     parts = text.split(":")
     try:
         value = sum(float(part) * unit for part, unit in zip(reversed(parts), TIME_UNITS, strict=False))
@@ -206,44 +197,49 @@ def _parse_time(text: str) -> float:
 
 
 def _check_network(path: Path, reader: "XmlReader") -> None:
-    """Raise `BrokenFileError` unless it is a network with a version: SUMO itself would crash without."""
+    """Raise `BrokenFileError` unless it is a network with a version, without which SUMO would crash."""
     if reader.root != "net":
         raise BrokenFileError(f"{path.name}: is not a SUMO network: it begins with <{reader.root}>")
     if not reader.version:
-        raise BrokenFileError(f"{path.name}: the network has no version; make it anew: netconvert -s {path.name} -o")
+        raise BrokenFileError(f"{path.name}: the network has no version; convert it: netconvert -s {path.name} -o")
 
 
 class _Demand:
-    """The vehicle types that files define, and the vehicles that they bring."""
+    """The vehicle types that files define, and the vehicles that they create."""
 
     def __init__(self) -> None:
         self.types: dict[str, XmlAttributes] = {}
+        self.type_parameters: dict[str, XmlAttributes] = {}
+        """values of the parameters of each type, by key"""
         self.used_names: set[str] = set()
         """types and distributions that vehicles have"""
         self.first_departure: float | None = inf
-        """when the first vehicle departs [s]; None where that cannot be told"""
+        """departure of the first vehicle [s]; None: unknown"""
         self.calibrates = False
-        """whether there is a calibrator: SUMO does not count among those it expects whom it will bring"""
+        """whether there is a calibrator: SUMO's number of expected vehicles excludes those that it will add"""
         self.last_end = 0.0
-        """the latest end of a flow that names one [s], in calibrators and elsewhere"""
+        """latest end that a flow names, in calibrators and elsewhere [s]"""
         self._distributions: dict[str, set[str]] = {}
-        """types of each distribution; it may be used in another file than the one that defines it"""
-        self.type_parameters: dict[str, XmlAttributes] = {}
-        """values of the parameters of each type, by key"""
+        """types of each distribution; other files than the defining one can use it"""
         self._current_type = ""
-        """the type that is being read; empty where none is"""
+        """the type that is being read; empty: none"""
         self._current_distribution: set[str] = set()
         """types of the distribution that is being read"""
 
     def handlers(self) -> XmlHandlers:
-        """Return what to call with the attributes of an element, by its name."""
-        vehicles = {tag: partial(self._on_vehicle, depart) for tag, depart in DEMAND_ELEMENTS.items()}
-        types = {"vType": self._on_type, "vTypeDistribution": self._on_distribution}
-        persons = dict.fromkeys(("person", "personFlow"), self._on_person)
-        persons |= {"personTrip": self._note_person_trip, "calibrator": self._note_calibrator}
-        laws = {f"carFollowing-{name}": self._on_model for name in CAR_FOLLOWING_MODELS}
-        ends = {"/vType": self._on_type_end, "/vTypeDistribution": self._on_distribution_end}
-        return {**vehicles, **types, **persons, **laws, "param": self._on_parameter, **ends}
+        """Return the functions to call with the attributes of an element, by its name."""
+        return {
+            **{tag: partial(self._on_vehicle, depart) for tag, depart in DEMAND_ELEMENTS.items()},
+            **dict.fromkeys(("person", "personFlow"), self._on_person),
+            "personTrip": self._on_person_trip,
+            "calibrator": self._on_calibrator,
+            "vType": self._on_type,
+            "/vType": self._on_type_end,
+            "vTypeDistribution": self._on_distribution,
+            "/vTypeDistribution": self._on_distribution_end,
+            **{f"carFollowing-{name}": self._on_model for name in CAR_FOLLOWING_MODELS},
+            "param": self._on_parameter,
+        }
 
     def _on_vehicle(self, depart_attribute: str, attributes: XmlAttributes) -> None:
         if "speed" in attributes and "vehsPerHour" not in attributes:
@@ -255,14 +251,14 @@ class _Demand:
             self._add_departure(attributes.get(depart_attribute, ""))
 
     def _on_person(self, attributes: XmlAttributes) -> None:
-        self.first_departure = None  # persons may take a car of their own
+        self.first_departure = None  # persons may use their own car
 
-    def _note_person_trip(self, attributes: XmlAttributes) -> None:
+    def _on_person_trip(self, attributes: XmlAttributes) -> None:
         modes = attributes.get("modes", "").replace(",", " ").split()
-        own = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
-        self.used_names |= set(attributes.get("vTypes", "").split()) or own
+        default_types = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
+        self.used_names |= set(attributes.get("vTypes", "").split()) or default_types
 
-    def _note_calibrator(self, attributes: XmlAttributes) -> None:
+    def _on_calibrator(self, attributes: XmlAttributes) -> None:
         self.calibrates = True
 
     def _on_type(self, attributes: XmlAttributes) -> None:
@@ -272,7 +268,7 @@ class _Demand:
             self._current_type, self.types[name], self.type_parameters[name] = name, dict(attributes), {}
 
     def _on_model(self, attributes: XmlAttributes) -> None:
-        if self._current_type:  # older files have the attributes of the car-following law in an element of its own
+        if self._current_type:  # an older file, with the car-following attributes in an element of their own
             self.types[self._current_type] |= attributes
 
     def _on_parameter(self, attributes: XmlAttributes) -> None:
@@ -294,17 +290,16 @@ class _Demand:
             time = float(text or 0)
         except ValueError:
             time = _parse_time(text)
-        self.first_departure = (
-            None if self.first_departure is None or not isfinite(time) else min(self.first_departure, time)
-        )
+        known = self.first_departure
+        self.first_departure = None if known is None or not isfinite(time) else min(known, time)
 
     def used_types(self) -> set[str]:
-        """Return the types that vehicles have; those of SUMO's own among them are defined from now on."""
-        used, left = set[str](), set(self.used_names)
-        while left:
-            name = left.pop()
+        """Return the types that vehicles have, and define SUMO's predefined types among them."""
+        used, remaining = set[str](), set(self.used_names)
+        while remaining:
+            name = remaining.pop()
             used.add(name)
-            left |= self._distributions.get(name, set()) - used
+            remaining |= self._distributions.get(name, set()) - used
         used -= self._distributions.keys()
         self.types.setdefault(DEFAULT_VEHICLE_TYPE, {})
         for name in used & OTHER_DEFAULT_TYPES.keys():
@@ -313,7 +308,7 @@ class _Demand:
 
 
 def _write_copy(path: Path, copy: Path, types: Path | None = None) -> None:
-    """Write an XML file again without what is not harmless, vehicle types changed as a JSON file says."""
+    """Write a harmless copy of an XML file, with vehicle types changed as a JSON file says."""
     changes = json.loads(types.read_bytes()) if types else {}
     with open(copy, "w", encoding="utf-8") as out:
         XmlReader({}, out, changes).read(path)
@@ -327,14 +322,14 @@ READER_COMMANDS: dict[str, Callable[..., Any]] = {
 
 
 def _main(command: str, *paths: str) -> None:
-    """Print what a file says, or what is wrong with it."""
+    """Print the result of a command, or the error, as JSON."""
     try:
-        found = {"result": READER_COMMANDS[command](*map(Path, paths))}
+        answer = {"result": READER_COMMANDS[command](*map(Path, paths))}
     except BrokenFileError as error:
-        found = {"error": str(error)}
+        answer = {"error": str(error)}
     except (MemoryError, RecursionError):
-        found = {"error": f"{Path(paths[0]).name}: its files are too large to be read"}
-    sys.stdout.write(json.dumps(found))
+        answer = {"error": f"{Path(paths[0]).name}: its files are too large to be read"}
+    sys.stdout.write(json.dumps(answer))
 
 
 if __name__ == "__main__":

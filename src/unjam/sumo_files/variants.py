@@ -1,4 +1,4 @@
-"""A network of the user's own with other vehicle types and more or less traffic, as new files beside it."""
+"""Variants of a user network with other vehicle types and more or less traffic, as new files."""
 
 import os
 from collections.abc import Mapping
@@ -15,19 +15,19 @@ TypeChanges = Mapping[str, Mapping[str, str]]
 
 
 def write_variant(files: SumoFiles, types: TypeChanges, scale: float, path: Path) -> Path:
-    """Write a network's files again under the folder of `path`, the configuration last; return `path`.
+    """Write a variant of a network's files into the folder of `path`, the configuration last; return `path`.
 
-    The network itself stays where it is. Options and elements that write, listen or read other files are left
-    out, as they are when unjam drives on it.
+    The network file itself stays where it is. Options and elements that write, listen or read other files are left
+    out, as in unjam's own episodes.
 
     Args:
         files: the network; none of its files is changed.
-        types: attributes that vehicle types get beside their others, by id.
-        scale: factor on the number of vehicles, beside that of the configuration.
+        types: attributes to set in vehicle types, by id.
+        scale: factor on the number of vehicles, in addition to that of the configuration.
         path: of the new configuration.
 
     Raises:
-        InputError: a file is broken, or too large, or the configuration's own scale is no number.
+        InputError: a file is broken or too large, or the configuration's scale is not a number.
         DiskError: the disk is full or cannot be written.
     """
     folder, before = path.parent, files.options.get("scale", "1")
@@ -37,10 +37,10 @@ def write_variant(files: SumoFiles, types: TypeChanges, scale: float, path: Path
         raise invalid_value(f"{files.path.name}: scale", before, "a number") from None
     names: dict[str, list[str]] = {"additional-files": [], "route-files": [], "weight-files": []}
     undefined = {name: types[name] for name in types if "id" not in files.types[name]}
-    if undefined:  # SUMO's default type may be defined before any vehicle has it
-        inside = "".join(f"<vType {_xml_attributes({'id': name, **found})}/>" for name, found in undefined.items())
+    if undefined:  # SUMO's default type can be defined before any vehicle has it
+        elements = (f"<vType {_xml_attributes({'id': name, **changes})}/>" for name, changes in undefined.items())
         names["additional-files"].append("types.add.xml")
-        atomic_write(folder / "types.add.xml", f"<additional>{inside}</additional>\n")
+        atomic_write(folder / "types.add.xml", f"<additional>{''.join(elements)}</additional>\n")
     with PrivateFolder() as private:
         copy, changes = Path(private) / "copy.xml", Path(private) / "types.json"
         atomic_write(changes, to_json(types))
@@ -55,7 +55,7 @@ def write_variant(files: SumoFiles, types: TypeChanges, scale: float, path: Path
                 atomic_write(folder / names[option][-1], copy.read_bytes())
     values = {
         "net-file": os.path.relpath(files.network.resolve(), folder.resolve()),
-        **{option: ",".join(found) for option, found in names.items() if found},
+        **{option: ",".join(files_of_option) for option, files_of_option in names.items() if files_of_option},
         **files.options,
         "step-length": f"{files.step:g}",
         "scale": f"{scaled:.6g}",
