@@ -9,7 +9,7 @@ from unjam.worlds import audit
 from unjam.worlds.audit import Audit, BrakingLog, FollowingPair, braking_statistics, following_statistics, is_recovering
 
 
-def test_brakings_are_counted_beyond_each_limit_and_rounding_is_none() -> None:
+def test_braking_is_counted_beyond_each_threshold_with_a_tolerance() -> None:
     found = braking_statistics([[1.0, -3.5, -3.6], [-4.5 - 1e-9, -4.6, -12.0]])
     assert (found.max_braking, found.exceedances, found.samples) == (12.0, (4, 2, 1), 6)
     assert braking_statistics([0.5, 1.0]).max_braking == 0.0
@@ -20,7 +20,7 @@ def column(*values: float) -> np.ndarray:
     return np.array(values, float)[:, None]
 
 
-def test_headway_counts_while_a_car_moves_and_ttc_while_it_closes_in() -> None:
+def test_time_gaps_count_above_1_m_s_and_time_to_collision_while_closing() -> None:
     found = following_statistics(column(0.5, 4.0, 8.0), column(0.5, 4.0, 4.0), column(0.1, 2.0, 12.0), 0.1)
     assert found.min_time_gap == pytest.approx(0.5)
     assert found.min_time_to_collision == pytest.approx(3.0)
@@ -66,18 +66,18 @@ def test_jerk_is_the_change_of_acceleration_over_time() -> None:
     assert following_statistics(speeds, speeds, speeds * 3.0, 0.1).max_jerk == pytest.approx(10.0)
 
 
-def test_contact_is_no_time_to_collision_at_all() -> None:
+def test_contact_is_a_time_to_collision_of_zero() -> None:
     assert following_statistics(column(5.0, 5.0), column(5.0, 6.0), column(1.0, -0.1), 0.1).min_time_to_collision == 0.0
 
 
-def test_a_car_that_is_not_there_is_not_judged() -> None:
+def test_absent_vehicles_do_not_count() -> None:
     there = following_statistics(column(5.0, np.nan), column(4.0, np.nan), column(10.0, np.nan), 0.1)
     assert (there.min_time_gap, there.min_time_to_collision, there.max_jerk) == (2.0, 10.0, 0.0)
     nobody = np.zeros((4, 0))
     assert following_statistics(nobody, nobody, nobody, 0.1) == Audit().following
 
 
-def test_an_override_near_a_crossing_is_put_down_to_the_right_of_way() -> None:
+def test_an_override_near_a_crossing_counts_as_yielding() -> None:
     overridden, near = np.array([1, 1, 0, 0], bool), np.array([0, 1, 1, 0], bool)
     still = np.ones((4, 1))
     found = following_statistics(still, still, still, 0.1, overridden, near)
@@ -85,7 +85,7 @@ def test_an_override_near_a_crossing_is_put_down_to_the_right_of_way() -> None:
 
 
 @given(st.lists(st.lists(st.tuples(st.floats(-9, 3), st.integers(0, 2)), max_size=6), max_size=30))
-def test_brakings_counted_step_by_step_are_those_of_all_steps_together(steps: list[list[tuple[float, int]]]) -> None:
+def test_braking_counted_step_by_step_equals_that_of_all_steps_together(steps: list[list[tuple[float, int]]]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(audit, "BRAKING_BLOCK_STEPS", 4)
         log = BrakingLog(0.5)

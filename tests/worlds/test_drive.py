@@ -18,19 +18,19 @@ PI = PISaturation()
 RESIDUAL = ResidualDriver(PI, random_network(), 1.0, action_repeat=4)
 
 
-def test_it_drives_until_the_world_has_ended() -> None:
+def test_a_drive_lasts_until_the_world_has_ended() -> None:
     applied, driven = drive_world(MockWorld(decisions=25), PI)
     assert applied.shape == (25, 3)
     assert driven.decisions == []
 
 
-def test_a_single_cav_in_plain_numbers_drives_as_one_row_does() -> None:
+def test_a_single_cav_with_floats_drives_as_one_row() -> None:
     rows, _ = drive_world(MockWorld(rows=1), RESIDUAL)
     plain, _ = drive_world(MockWorld(rows=1, single=True), RESIDUAL)
     np.testing.assert_allclose(plain, rows, atol=1e-12)
 
 
-def test_it_keeps_what_was_decided_and_what_would_be_seen_at_the_end() -> None:
+def test_decisions_and_the_last_observation_are_recorded() -> None:
     world = MockWorld()
     applied, driven = drive_world(world, RESIDUAL)
     experts, residuals, seen = (np.array(part) for part in zip(*driven.decisions, strict=True))
@@ -42,14 +42,14 @@ def test_it_keeps_what_was_decided_and_what_would_be_seen_at_the_end() -> None:
     assert driven.action_repeat == 4
 
 
-def test_it_explores_only_when_asked_to() -> None:
+def test_there_is_no_exploration_by_default() -> None:
     calm, _ = drive_world(MockWorld(), RESIDUAL)
     again, _ = drive_world(MockWorld(), RESIDUAL)
     np.testing.assert_array_equal(calm, again)
     assert not np.array_equal(calm, drive_world(MockWorld(), RESIDUAL, explore=True)[0])
 
 
-def test_noise_that_lasts_is_the_same_in_all_decisions_and_counts_the_other_way_too() -> None:
+def test_per_episode_noise_is_the_same_in_all_control_steps_and_can_have_the_opposite_sign() -> None:
     lasting = replace(RESIDUAL, network=replace(random_network(), episode_noise=True), action_limit=100.0)
     told = [drive_world(MockWorld(decisions=4), lasting, explore)[0] for explore in (0.0, 1.0, -1.0)]
     (calm, one, other), again = told, drive_world(MockWorld(decisions=4), lasting, 1.0)[0]
@@ -59,7 +59,7 @@ def test_noise_that_lasts_is_the_same_in_all_decisions_and_counts_the_other_way_
 
 
 @pytest.mark.parametrize("driver", [PI, RESIDUAL, MixedDriver((PI, IDM())), ImpairedDriver(PI, delay=0.3)])
-def test_memory_goes_with_the_vehicle_where_some_leave_and_others_enter(driver: MixedDriver) -> None:
+def test_memory_follows_its_vehicle_when_others_leave_and_enter(driver: MixedDriver) -> None:
     world = MockWorld(turnover=5)
     driving = DriveLoop(world, driver)
     for _ in driving:
@@ -68,23 +68,23 @@ def test_memory_goes_with_the_vehicle_where_some_leave_and_others_enter(driver: 
     assert len(driving.initial_memories) == world.entered_count
 
 
-def test_a_newcomer_remembers_nothing() -> None:
+def test_a_new_cav_has_an_initial_memory() -> None:
     driving = DriveLoop(MockWorld(turnover=5), PI)
     seen = [driving.memory["count"].tolist() for _ in driving]
     assert seen[3:6] == [[4, 4, 4], [5, 5, 0], [6, 6, 1]]
 
 
-def test_where_the_simulator_drives_nobody_is_asked() -> None:
+def test_a_native_driver_makes_no_decisions() -> None:
     assert list(DriveLoop(MockWorld(decisions=3), Human())) == [None] * 3
 
 
-def test_progress_is_told_now_and_then() -> None:
+def test_progress_is_reported_every_ten_control_steps() -> None:
     told: list[int] = []
     drive_world(MockWorld(decisions=25), PI, on_progress=told.append)
     assert told == [10, 20]
 
 
-def test_it_goes_on_from_a_memory() -> None:
+def test_a_drive_can_continue_with_a_given_memory() -> None:
     states = LocalState(*(np.full((6, 2), value) for value in (4.0, 5.0, 10.0, 3.0, 8.0, 20.0, 250.0)))
     whole = drive_world(RecordedWorld(states, Limits(-1.0, 1.0)), PI)
     first = DriveLoop(RecordedWorld(states.select(slice(2)), Limits(-1.0, 1.0)), PI)
@@ -93,7 +93,7 @@ def test_it_goes_on_from_a_memory() -> None:
     np.testing.assert_array_equal(drive_world(rest, PI, memory=first.memory), whole[2:])
 
 
-def test_a_recording_names_the_row_that_is_driven_wrongly() -> None:
+def test_a_recording_names_the_row_with_an_invalid_command() -> None:
     states = LocalState(*(np.full((6, 2), value) for value in (4.0, 5.0, 10.0, 3.0, 8.0, 20.0, 250.0)))
     world = RecordedWorld(states, Limits(-1.0, 1.0))
     world.advance(Command(np.zeros(2)))

@@ -68,7 +68,7 @@ def uses_up_random_numbers(simulation: Simulation) -> None:
 @pytest.mark.parametrize(
     "before", [drives_badly, another_road, stops_in_the_middle, cannot_start, uses_up_random_numbers]
 )
-def test_an_episode_is_the_same_to_the_last_bit_whatever_ran_before(
+def test_an_episode_is_bit_identical_whatever_ran_before(
     scenario: Ring, driver: Driver, before: Callable[[Simulation], None]
 ) -> None:
     first = fingerprint(run_episode(scenario, driver, (1, 2), explore=True))
@@ -109,7 +109,7 @@ def test_the_same_seed_is_the_same_traffic_for_every_driver(simulation: Simulati
 
 
 @pytest.mark.parametrize(("warmup", "held", "hold", "cavs"), [(0, 1, 1, 1), (30, 5, 1, 2), (0, 1, 7, 3)])
-def test_all_that_is_recorded_has_a_row_for_each_decision_and_one_for_the_end(
+def test_records_have_a_row_for_each_control_step_and_one_for_the_end(
     warmup: int, held: int, hold: int, cavs: int, simulation: Simulation
 ) -> None:
     ring = replace(RING, horizon=60, warmup=warmup, steps_per_control_step=held, cavs=cavs)
@@ -137,7 +137,7 @@ def test_all_that_is_recorded_has_a_row_for_each_decision_and_one_for_the_end(
 
 
 @pytest.mark.parametrize("cavs", [1, 2, 3, 4, 22])
-def test_each_trajectory_is_that_of_its_vehicle(cavs: int, simulation: Simulation) -> None:
+def test_each_trajectory_belongs_to_its_vehicle(cavs: int, simulation: Simulation) -> None:
     class Different(Driver):
         def act(self, state: LocalState, memory: dict) -> tuple:
             return np.linspace(0.1, 0.4, len(state.speed)), memory
@@ -163,7 +163,7 @@ def test_each_trajectory_is_that_of_its_vehicle(cavs: int, simulation: Simulatio
         assert not trajectory.residual.any()
 
 
-def test_what_the_seed_drew_is_written_down(simulation: Simulation) -> None:
+def test_the_values_drawn_from_the_seed_are_recorded(simulation: Simulation) -> None:
     episode = run_episode(RING, IDM(), (5,), simulation=simulation)
     assert episode.drawn_values == {"length": episode.loop_length}
     assert 220 <= episode.loop_length <= 270
@@ -175,7 +175,9 @@ def test_what_the_seed_drew_is_written_down(simulation: Simulation) -> None:
 @pytest.mark.parametrize("cavs", [1, 2])
 @pytest.mark.parametrize("hold", [1, 7])
 @pytest.mark.parametrize("expert", [PISaturation(time_constant=0), IDM()])
-def test_a_residual_drivers_record_adds_up(cavs: int, hold: int, expert: Driver, simulation: Simulation) -> None:
+def test_expert_and_residual_add_up_to_the_applied_acceleration(
+    cavs: int, hold: int, expert: Driver, simulation: Simulation
+) -> None:
     ring = replace(RING, cavs=cavs, horizon=500, warmup=50)
     driver = ResidualDriver(expert, random_network(), 0.5, action_repeat=hold)
     calm, explored = (
@@ -200,7 +202,9 @@ def test_a_residual_drivers_record_adds_up(cavs: int, hold: int, expert: Driver,
 @pytest.mark.long
 @pytest.mark.parametrize("cavs", [1, 2])
 @pytest.mark.parametrize("hold", [1, 5])
-def test_exploration_adds_noise_of_the_networks_spread(cavs: int, hold: int, simulation: Simulation) -> None:
+def test_exploration_adds_noise_with_the_networks_standard_deviation(
+    cavs: int, hold: int, simulation: Simulation
+) -> None:
     driver = replace(RESIDUAL, action_repeat=hold)
     ring = replace(RING, cavs=cavs, horizon=1000 * hold)
     episode = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
@@ -216,7 +220,7 @@ def test_exploration_adds_noise_of_the_networks_spread(cavs: int, hold: int, sim
         assert abs(np.corrcoef(*noises)[0, 1]) < 0.1
 
 
-def test_exploration_follows_the_seed_and_leaves_the_traffics_noise_alone(simulation: Simulation) -> None:
+def test_exploration_depends_on_the_seed_and_does_not_change_the_traffic_noise(simulation: Simulation) -> None:
     ring = replace(RING, length=(230, 230), horizon=100)
     mute = replace(RESIDUAL, network=replace(RESIDUAL.network, exploration_std=0.0))
     still = run_episode(ring, mute, (0,), simulation=simulation)
@@ -230,7 +234,7 @@ def test_exploration_follows_the_seed_and_leaves_the_traffics_noise_alone(simula
     assert np.abs(noises[0] - noises[1]).min() > 0.0
 
 
-def test_of_a_driver_without_a_network_the_expert_is_all(simulation: Simulation) -> None:
+def test_a_driver_without_a_network_has_no_residual(simulation: Simulation) -> None:
     driver = PISaturation(time_constant=0)
     episode = run_episode(RING, driver, (0,), explore=True, simulation=simulation)
     trajectory = episode.trajectories[0]
@@ -241,7 +245,7 @@ def test_of_a_driver_without_a_network_the_expert_is_all(simulation: Simulation)
     assert fingerprint(still) == fingerprint(episode)
 
 
-def test_fuel_is_recorded_only_when_asked_for_and_changes_nothing_else(simulation: Simulation) -> None:
+def test_recording_fuel_is_optional_and_changes_nothing_else(simulation: Simulation) -> None:
     without = run_episode(RING, IDM(), (0,), simulation=simulation)
     episode = run_episode(RING, IDM(), (0,), record_details=True, simulation=simulation)
     assert without.fuel.shape == (0, 0)
@@ -262,7 +266,7 @@ def test_fuel_depends_on_the_emission_class(simulation: Simulation) -> None:
     assert other > 1.1 * car
 
 
-def test_the_reward_is_the_scenarios_own_where_none_is_named(simulation: Simulation) -> None:
+def test_the_default_reward_is_the_scenarios_own(simulation: Simulation) -> None:
     episode = run_episode(RING, PISaturation(), (0,), simulation=simulation)
     trajectory = episode.trajectories[0]
     assert set(trajectory.reward_terms) == {"speed", "acceleration"}
@@ -270,7 +274,7 @@ def test_the_reward_is_the_scenarios_own_where_none_is_named(simulation: Simulat
     np.testing.assert_allclose(trajectory.reward_terms["acceleration"], -4.0 * np.abs(trajectory.applied_acceleration))
 
 
-def test_a_named_reward_and_ones_own_are_used(my_drivers: Path, simulation: Simulation) -> None:
+def test_named_rewards_and_users_rewards_are_used(my_drivers: Path, simulation: Simulation) -> None:
     ring = replace(UNFILTERED, cavs=2)
     found = run_episode(ring, Constant(0.2), (0,), "eq16", simulation=simulation).trajectories
     assert set(found[0].reward_terms) == {"speed", "time_gap", "acceleration"}
@@ -281,7 +285,7 @@ def test_a_named_reward_and_ones_own_are_used(my_drivers: Path, simulation: Simu
         np.testing.assert_allclose(trajectory.reward_terms["push"], -0.4)
 
 
-def test_the_headways_of_a_reward_are_those_after_each_step(simulation: Simulation) -> None:
+def test_time_gaps_of_a_reward_are_those_after_each_step(simulation: Simulation) -> None:
     episode = run_episode(UNFILTERED, Constant(1.0), (0,), "eq16", simulation=simulation)
     trajectory = episode.trajectories[0]
     gap, speed = trajectory.states.leader_gap[1:], trajectory.states.speed[1:]
@@ -327,7 +331,7 @@ def test_a_reward_of_a_wrong_shape_is_refused(name: str, tmp_path: Path, simulat
         run_episode(RING, IDM(), (0,), f"{file}:{name}", simulation=simulation)
 
 
-def test_a_reward_may_answer_in_lists_of_whole_numbers(tmp_path: Path, simulation: Simulation) -> None:
+def test_a_reward_may_return_lists_of_integers(tmp_path: Path, simulation: Simulation) -> None:
     file = tmp_path / "rewards.py"
     file.write_text(BAD_REWARDS)
     episode = run_episode(RING, IDM(), (0,), f"{file}:listed", simulation=simulation)
@@ -339,7 +343,7 @@ def test_an_unknown_reward_is_refused_before_anything_runs() -> None:
         run_episode(RING, IDM(), (0,), "fame")
 
 
-def test_progress_is_told_during_warm_up_and_episode(simulation: Simulation) -> None:
+def test_progress_is_reported_during_warm_up_and_episode(simulation: Simulation) -> None:
     told: list[int] = []
     ring = replace(RING, warmup=1200, horizon=2600)
     run_episode(ring, IDM(), (0,), simulation=simulation, on_progress=told.append)
@@ -349,7 +353,7 @@ def test_progress_is_told_during_warm_up_and_episode(simulation: Simulation) -> 
     assert len(set(told)) >= 4
 
 
-def test_a_trajectory_begins_with_what_its_expert_remembered_of_the_warmup(simulation: Simulation) -> None:
+def test_a_trajectory_has_the_experts_memory_of_the_warm_up(simulation: Simulation) -> None:
     warm = Ring(length=(230, 230), vehicles=8, horizon=20, warmup=30)
     driver = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=5)
     trajectory = run_episode(warm, driver, (3,), simulation=simulation).trajectories[0]
@@ -374,7 +378,7 @@ def insists(state: LocalState) -> np.ndarray:
 
 
 @pytest.mark.parametrize("road", ["ring", "figure-eight", "merge", "on-ramp", "own"])
-def test_a_driver_cannot_change_how_it_is_measured(road: str, simulation: Simulation, tmp_path: Path) -> None:
+def test_a_driver_cannot_change_its_measurements(road: str, simulation: Simulation, tmp_path: Path) -> None:
     if road == "own":
         flow = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
         road = str(straight(tmp_path, flow, length=300.0))
@@ -390,7 +394,7 @@ def test_a_driver_cannot_change_how_it_is_measured(road: str, simulation: Simula
     assert fingerprint(driven[0]) == fingerprint(driven[1])
 
 
-def test_a_seed_may_be_any_whole_number_from_zero_on(simulation: Simulation) -> None:
+def test_a_seed_may_be_any_non_negative_integer(simulation: Simulation) -> None:
     first, *others = (
         run_episode(SHORT_RING, PISaturation(), seed, simulation=simulation) for seed in (3, np.int64(3), [3])
     )

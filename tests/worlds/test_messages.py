@@ -69,18 +69,18 @@ def test_empty_arrays_keep_their_shape() -> None:
     assert_same(read_message(BytesIO(frame({}, arrays)))[1], arrays)
 
 
-def test_views_arrive_as_what_they_show() -> None:
+def test_views_arrive_as_their_elements() -> None:
     whole = np.arange(12.0).reshape(3, 4)
     arrays: Arrays = {"columns": whole.T, "every_other": whole[:, ::2], "backwards": whole[::-1]}
     assert_same(read_message(BytesIO(frame({}, arrays)))[1], arrays)
 
 
 @pytest.mark.parametrize("arrays", [None, {}])
-def test_a_message_without_arrays_has_none_at_the_other_end(arrays: Arrays | None) -> None:
+def test_a_message_without_arrays_arrives_without_arrays(arrays: Arrays | None) -> None:
     assert read_message(BytesIO(frame({"progress": 500}, arrays))) == ({"progress": 500}, {})
 
 
-def test_messages_are_read_one_after_the_other_however_the_pipe_cuts_them() -> None:
+def test_messages_are_read_one_after_the_other_from_partial_reads() -> None:
     sent = [({"index": index}, {"row": np.full(3, float(index))}) for index in range(3)]
     pipe = Trickle(b"".join(frame(*message) for message in sent))
     for facts, arrays in sent:
@@ -91,14 +91,14 @@ def test_messages_are_read_one_after_the_other_however_the_pipe_cuts_them() -> N
         read_message(pipe)
 
 
-def test_a_frame_that_ends_early_is_the_end_wherever_it_is_cut() -> None:
+def test_an_incomplete_frame_is_the_end_of_file() -> None:
     whole = frame({"seed": [1, 2]}, {"speeds": np.ones((2, 3))})
     for length in range(len(whole)):
         with pytest.raises(EOFError, match="closed the pipe"):
             read_message(BytesIO(whole[:length]))
 
 
-def test_a_message_is_at_the_other_end_as_soon_as_it_is_written() -> None:
+def test_a_message_arrives_as_soon_as_it_is_written() -> None:
     flushed = []
 
     class Pipe(BytesIO):
@@ -109,7 +109,7 @@ def test_a_message_is_at_the_other_end_as_soon_as_it_is_written() -> None:
     assert flushed == [len(frame({"progress": 1}))]
 
 
-def test_pickled_objects_do_not_travel() -> None:
+def test_objects_that_need_pickling_are_refused() -> None:
     with pytest.raises(Exception, match="object"):
         frame({}, {"driver": np.array([object()])})
 
@@ -122,7 +122,7 @@ def test_a_frame_is_two_lengths_then_json_then_arrays() -> None:
     assert whole[16 + text + about :] == np.ones(1).tobytes()
 
 
-def test_arrays_of_anything_but_numbers_are_not_read() -> None:
+def test_arrays_of_other_kinds_than_numbers_are_refused() -> None:
     about = json.dumps([["b", "|O", [1]]]).encode()
     with pytest.raises(ValueError, match="not allowed"):
         read_message(BytesIO(struct.pack(">QQ", 2, len(about)) + b"{}" + about + bytes(8)))

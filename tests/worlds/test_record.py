@@ -67,7 +67,7 @@ def test_an_episode_arrives_as_it_was_sent(scenario: Ring, driver: Driver, simul
     assert fingerprint(travelled(episode)) == fingerprint(episode)
 
 
-def test_numbers_that_json_does_not_know_arrive() -> None:
+def test_nan_and_infinity_arrive() -> None:
     episode = Episode(
         seed=(0,),
         status="completed",
@@ -86,12 +86,12 @@ def test_a_failed_episode_arrives_with_its_reason() -> None:
     assert (arrived.seed, arrived.error) == ((3, 4), "InputError")
 
 
-def test_only_a_failed_episode_is_not_ok() -> None:
+def test_only_a_failed_episode_has_not_run() -> None:
     found = {status: Episode(seed=(0,), status=status).has_run for status in ("completed", "collision", "failed")}
     assert found == {"completed": True, "collision": True, "failed": False}
 
 
-def test_what_a_held_residual_earned_is_the_sum_over_its_decisions(simulation: Simulation) -> None:
+def test_the_reward_of_a_held_residual_is_the_sum_over_its_control_steps(simulation: Simulation) -> None:
     driver = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=7)
     trajectory: Trajectory = run_episode(RING, driver, (0,), simulation=simulation).trajectories[0]
     reward = trajectory.reward_terms["speed"] + trajectory.reward_terms["acceleration"]

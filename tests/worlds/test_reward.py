@@ -63,19 +63,17 @@ def total(terms: dict[str, Any]) -> Any:
         ([5.0, 15.0, np.nan], [0.5, 0.0], 1.0),
     ],
 )
-def test_released_gives_what_the_authors_code_gives(
-    speeds: list[float], accelerations: list[float], expected: float
-) -> None:
+def test_released_equals_the_authors_code(speeds: list[float], accelerations: list[float], expected: float) -> None:
     assert total(released_reward(one(speeds, accelerations)))[0] == pytest.approx(expected, abs=1e-12)
 
 
-def test_released_gives_nothing_for_a_crash() -> None:
+def test_released_is_zero_at_a_crash() -> None:
     terms = released_reward(one([3.0, 4.0], [0.7], crashed=True))
     assert {name: values.tolist() for name, values in terms.items()} == {"speed": [0.0], "acceleration": [0.0]}
 
 
 @given(outcomes())
-def test_released_is_four_times_mean_speed_over_twenty_less_four_times_mean_effort(outcome: Outcome) -> None:
+def test_released_is_four_times_mean_speed_over_twenty_minus_four_times_mean_acceleration(outcome: Outcome) -> None:
     found = total(released_reward(outcome))
     for row, crashed in enumerate(outcome.has_crashed):
         effort = [abs(push) for push in there(outcome.accelerations[row])]
@@ -84,7 +82,7 @@ def test_released_is_four_times_mean_speed_over_twenty_less_four_times_mean_effo
 
 
 @given(outcomes())
-def test_released_merge_is_one_less_the_distance_from_twenty_and_lacking_headways(outcome: Outcome) -> None:
+def test_released_merge_is_one_minus_speed_errors_and_short_time_gaps(outcome: Outcome) -> None:
     for numbers in (outcome, Outcome(*(torch.from_numpy(values) for values in outcome))):
         terms = REWARDS["released-merge"](numbers)
         assert set(terms) == {"speed", "time_gap", "lower_bound"}
@@ -127,7 +125,7 @@ def test_equation_16_term_by_term(outcome: Outcome, name: str) -> None:
         assert {key: values[row] for key, values in terms.items()} == pytest.approx(expected, abs=1e-9)
 
 
-def test_equation_16_pays_for_speed_and_as_printed_for_standing() -> None:
+def test_equation_16_rewards_speed_and_as_printed_standing() -> None:
     slow, fast = one([1.0, 2.0], [0.0]), one([10.0, 20.0], [0.0])
     assert total(REWARDS["eq16"](fast)) > total(REWARDS["eq16"](slow))
     assert total(REWARDS["eq16-as-printed"](fast)) < total(REWARDS["eq16-as-printed"](slow))
@@ -149,7 +147,7 @@ def test_vehicles_that_are_not_on_the_road_are_left_out(outcome: Outcome, name: 
 
 
 @given(outcomes(), st.sampled_from(sorted(REWARDS)))
-def test_tensors_earn_what_arrays_earn(outcome: Outcome, name: str) -> None:
+def test_tensors_have_the_rewards_of_arrays(outcome: Outcome, name: str) -> None:
     expected = REWARDS[name](outcome)
     found = REWARDS[name](Outcome(*(torch.from_numpy(values) for values in outcome)))
     assert found.keys() == expected.keys()
@@ -159,7 +157,7 @@ def test_tensors_earn_what_arrays_earn(outcome: Outcome, name: str) -> None:
 
 
 @given(outcomes())
-def test_travel_time_counts_who_is_there_and_who_waits(outcome: Outcome) -> None:
+def test_travel_time_counts_vehicles_on_the_road_and_in_the_backlog(outcome: Outcome) -> None:
     found = REWARDS["travel-time"](outcome)["travel_time"]
     for row, waiting in enumerate(outcome.backlog.tolist()):
         count = len(there(outcome.speeds[row])) + waiting
@@ -167,7 +165,7 @@ def test_travel_time_counts_who_is_there_and_who_waits(outcome: Outcome) -> None
         assert found[row] == pytest.approx(-(count + closed) / 100.0)
 
 
-def test_the_sooner_a_road_is_closed_by_a_crash_the_less_is_earned() -> None:
+def test_an_earlier_crash_decreases_the_return() -> None:
     coming = np.minimum(np.arange(2400), 150)  # one a decision enters, up to a jam of 150
     without = -coming.sum() / 100.0
     crashed = [
@@ -196,7 +194,7 @@ def test_power_prefers_free_flow_to_a_jam_of_the_same_flow_and_to_an_empty_road(
     assert empty == pytest.approx(0.1)
 
 
-def test_a_headway_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> None:
+def test_a_time_gap_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> None:
     gaps, speeds = np.array([10.0, 10.0, 3.0, 0.0]), np.array([5.0, 0.0, 1e-12, 2.0])
     np.testing.assert_allclose(time_gap(gaps, speeds), [2.0, 1e4, 3e3, 0.0])
     found = time_gap(torch.from_numpy(gaps), torch.from_numpy(speeds))
@@ -208,7 +206,7 @@ def test_rewards_are_found_by_name() -> None:
     assert make_reward("released") is released_reward
 
 
-def test_ones_own_reward_comes_from_a_file(my_drivers: Path) -> None:
+def test_a_users_reward_is_loaded_from_a_file(my_drivers: Path) -> None:
     outcome = Outcome(
         np.array([[1.0, 3.0, np.nan], [2.0, 2.0, 5.0]]),
         np.array([[1.0, -1.0], [0.5, 0.0]]),
@@ -235,7 +233,7 @@ def test_a_reward_that_is_one_array_is_one_term(tmp_path: Path) -> None:
         ("nobody", "mine.py: has no 'nobody'; it has: .*calm"),
     ],
 )
-def test_what_is_no_reward_in_a_file_is_refused(name: str, words: str, my_drivers: Path) -> None:
+def test_objects_that_are_not_rewards_are_refused(name: str, words: str, my_drivers: Path) -> None:
     with pytest.raises(InputError, match=words):
         make_reward(f"{my_drivers}:{name}")
 
@@ -245,7 +243,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         make_reward(f"{tmp_path}/none.py:calm")
 
 
-def test_what_ones_own_reward_raises_is_told_with_its_line(tmp_path: Path) -> None:
+def test_an_error_in_a_users_reward_is_reported_with_its_line(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     file.write_text("def lost(outcome):\n    raise KeyError('map')\n")
     with pytest.raises(InputError, match=r"mine\.py:lost: KeyError: 'map' \(line 2\)"):
@@ -253,7 +251,7 @@ def test_what_ones_own_reward_raises_is_told_with_its_line(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", ["fame", "", "Released", "released "])
-def test_an_unknown_reward_lists_the_known(name: str) -> None:
+def test_an_unknown_reward_lists_the_known_ones(name: str) -> None:
     known = "released, released-merge, eq16, eq16-as-printed, power, travel-time, path.py:name"
     with pytest.raises(InputError, match=f"reward: {name!r} is not allowed; allowed: {known}"):
         make_reward(name)

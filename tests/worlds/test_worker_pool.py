@@ -135,7 +135,7 @@ def tasks_of_all_kinds(my_drivers: Path) -> list[EpisodeTask]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("count", [1, 2, pytest.param(4, marks=pytest.mark.slow)])
-def test_any_number_of_workers_gives_the_bytes_of_this_process(count: int, my_drivers: Path) -> None:
+def test_any_number_of_workers_gives_the_same_bytes_as_this_process(count: int, my_drivers: Path) -> None:
     tasks = tasks_of_all_kinds(my_drivers)
     expected = [
         run_episode(task.scenario, task.driver, task.seed, task.reward, task.explore, task.record_details)
@@ -148,7 +148,7 @@ def test_any_number_of_workers_gives_the_bytes_of_this_process(count: int, my_dr
     assert [episode.status for episode in first] == ["completed"] * 3 + ["collision"] + ["completed"] * 2
 
 
-def test_episodes_come_in_the_order_of_their_tasks_and_not_of_their_ends() -> None:
+def test_episodes_are_in_the_order_of_their_tasks() -> None:
     horizons = [6000, 10, 3000, 20, 30, 1000, 40]
     tasks = [EpisodeTask(Ring(horizon=horizon), IDM(), (seed,)) for seed, horizon in enumerate(horizons)]
     with WorkerPool(2) as workers:
@@ -158,20 +158,20 @@ def test_episodes_come_in_the_order_of_their_tasks_and_not_of_their_ends() -> No
     ]
 
 
-def test_nothing_to_do_is_done_at_once() -> None:
+def test_an_empty_list_of_tasks_starts_no_process() -> None:
     with WorkerPool(2) as workers:
         assert workers.run([]) == []
         assert processes(workers) == []
 
 
-def test_one_task_after_the_other_starts_one_process() -> None:
+def test_consecutive_tasks_start_one_process() -> None:
     with WorkerPool(2) as workers:
         for seed in range(2):
             workers.run([EpisodeTask(SHORT, IDM(), (seed,))])
         assert len(processes(workers)) == 1
 
 
-def test_a_worker_goes_on_with_the_next_task(workers: WorkerPool) -> None:
+def test_a_worker_continues_with_the_next_task(workers: WorkerPool) -> None:
     workers.run([EpisodeTask(SHORT, IDM(), (0,))])
     first = processes(workers)
     workers.run([EpisodeTask(SHORT, IDM(), (seed,)) for seed in range(5)])
@@ -179,7 +179,7 @@ def test_a_worker_goes_on_with_the_next_task(workers: WorkerPool) -> None:
     assert len(first) == 1
 
 
-def test_progress_is_told_for_each_task() -> None:
+def test_progress_is_reported_for_each_task() -> None:
     told: list[tuple[int, int]] = []
     with WorkerPool(2) as workers:
         workers.run(
@@ -264,13 +264,13 @@ def test_a_driver_that_always_kills_its_process_fails_alone_after_three_attempts
     with WorkerPool(2) as workers:
         first, second, failed, *rest = workers.run([*good[:2], bad, *good[2:]])
     assert (failed.status, failed.seed, failed.error) == ("failed", (7, 8), "EpisodeError")
-    assert failed.reason == "3 workers were lost on it: killed by signal 9"
+    assert failed.reason == "3 workers were lost in this episode: killed by signal 9"
     expected = [fingerprint(run_episode(SHORT, IDM(), (seed,))) for seed in range(4)]
     assert [fingerprint(episode) for episode in (first, second, *rest)] == expected
 
 
 @pytest.mark.slow
-def test_as_many_workers_are_lost_as_attempts_are_allowed(drivers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_attempts_can_be_set(drivers: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[subprocess.Popen[bytes]] = []
     popen: Any = subprocess.Popen
 
@@ -282,7 +282,7 @@ def test_as_many_workers_are_lost_as_attempts_are_allowed(drivers: Path, monkeyp
     bad = EpisodeTask(SHORT, FileDriver(drivers, "kills_its_process"), (0,))
     with WorkerPool(1, max_attempts=2) as workers:
         (failed,) = workers.run([bad])
-        assert failed.reason.startswith("2 workers were lost on it")
+        assert failed.reason.startswith("2 workers were lost in this episode")
         assert len(started) == 2
         (found,) = workers.run([EpisodeTask(SHORT, IDM(), (0,))])
         assert found.status == "completed"
@@ -293,7 +293,7 @@ def test_as_many_workers_are_lost_as_attempts_are_allowed(drivers: Path, monkeyp
     ("name", "error", "words"),
     [("leaves", "InputError", "SystemExit: 5"), ("leaves_at_once", "EpisodeError", "ended with code 5")],
 )
-def test_a_driver_that_leaves_is_told_with_its_exit_code(name: str, error: str, words: str, drivers: Path) -> None:
+def test_a_driver_that_exits_is_reported_with_its_exit_code(name: str, error: str, words: str, drivers: Path) -> None:
     with WorkerPool(1, max_attempts=1) as workers:
         (failed,) = workers.run([EpisodeTask(SHORT, FileDriver(drivers, name), (0,))])
     assert (failed.status, failed.error) == ("failed", error)
@@ -306,11 +306,11 @@ def test_a_driver_that_hangs_is_ended(drivers: Path) -> None:
         (failed,) = workers.run([EpisodeTask(SHORT, hangs, (0,))])
         assert processes(workers) == []
     assert (failed.status, failed.error) == ("failed", "EpisodeError")
-    assert "no sign of life for 2 s" in failed.reason
+    assert "no message for 2 s" in failed.reason
 
 
 @pytest.mark.slow
-def test_a_driver_that_thinks_long_does_not_count_as_hung(drivers: Path) -> None:
+def test_a_slow_driver_does_not_count_as_hung(drivers: Path) -> None:
     slow = EpisodeTask(replace(SHORT, horizon=110), FileDriver(drivers, "thinks_long"), (0,))
     with WorkerPool(1, timeout=2.0, max_attempts=1) as workers:
         workers.run([EpisodeTask(SHORT, IDM(), (0,))])  # so that no time goes into starting it
@@ -326,7 +326,7 @@ def test_a_driver_that_thinks_long_does_not_count_as_hung(drivers: Path) -> None
         ("short", "InputError", "driver: step 0: "),
     ],
 )
-def test_a_driver_that_fails_is_told_in_its_own_words_and_the_worker_goes_on(
+def test_a_drivers_error_message_is_reported_and_the_worker_continues(
     name: str, error: str, words: str, my_drivers: Path, workers: WorkerPool
 ) -> None:
     good = EpisodeTask(SHORT, IDM(), (0,))
@@ -340,7 +340,7 @@ def test_a_driver_that_fails_is_told_in_its_own_words_and_the_worker_goes_on(
     assert processes(workers) == process
 
 
-def test_an_end_of_file_in_the_users_code_is_not_the_end_of_the_worker(drivers: Path, workers: WorkerPool) -> None:
+def test_an_end_of_file_in_user_code_does_not_end_the_worker(drivers: Path, workers: WorkerPool) -> None:
     workers.run([EpisodeTask(SHORT, IDM(), (0,))])
     process = processes(workers)
     (failed,) = workers.run([EpisodeTask(SHORT, FileDriver(drivers, "ReadsAnEmptyFile"), (0,))])
@@ -349,7 +349,7 @@ def test_an_end_of_file_in_the_users_code_is_not_the_end_of_the_worker(drivers: 
     assert processes(workers) == process
 
 
-def test_a_road_that_sumo_refuses_fails_in_sumos_words_and_the_worker_goes_on(workers: WorkerPool) -> None:
+def test_sumos_error_message_is_reported_and_the_worker_continues(workers: WorkerPool) -> None:
     good = EpisodeTask(SHORT, IDM(), (0,))
     bad = EpisodeTask(replace(SHORT, emission_class="coal"), IDM(), (5,))
     _, failed, found = workers.run([good, bad, good])
@@ -385,7 +385,7 @@ def test_what_a_driver_prints_does_not_disturb_the_answers(drivers: Path, worker
     assert fingerprint(talking) == fingerprint(silent)
 
 
-def test_a_worker_whose_answer_cannot_be_read_counts_as_lost(drivers: Path) -> None:
+def test_a_worker_with_an_unreadable_answer_counts_as_lost(drivers: Path) -> None:
     bad = EpisodeTask(SHORT, FileDriver(drivers, "writes_everywhere"), (0,))
     with WorkerPool(1, timeout=3.0, max_attempts=1) as workers, ThreadPoolExecutor(1) as thread:
         run = thread.submit(workers.run, [bad])
@@ -397,7 +397,7 @@ def test_a_worker_whose_answer_cannot_be_read_counts_as_lost(drivers: Path) -> N
     assert (failed.status, failed.error) == ("failed", "EpisodeError")
 
 
-def test_a_driver_that_cannot_travel_is_refused_with_the_way_out() -> None:
+def test_a_driver_that_is_not_serializable_is_refused_with_a_hint() -> None:
     class Mine(Driver):
         def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
             return state.speed * 0.0, memory
@@ -406,7 +406,7 @@ def test_a_driver_that_cannot_travel_is_refused_with_the_way_out() -> None:
         workers.run([EpisodeTask(SHORT, Mine(), (0,))])
 
 
-def test_closing_leaves_no_process_and_may_be_done_twice() -> None:
+def test_closing_twice_leaves_no_process() -> None:
     workers = WorkerPool(2)
     workers.run([EpisodeTask(Ring(horizon=2000), IDM(), (seed,)) for seed in range(4)])
     running = processes(workers)
@@ -515,7 +515,7 @@ def test_an_error_in_the_progress_report_ends_the_run_and_leaves_no_process() ->
     assert not any(is_running(process) for process in running)
 
 
-def test_workers_end_when_the_process_that_wants_them_is_gone() -> None:
+def test_workers_end_with_their_parent_process() -> None:
     code = (
         "import os, signal\n"
         "from unjam.drivers import IDM\n"
@@ -548,7 +548,7 @@ def test_a_residual_driver_runs_without_torch(drivers: Path, workers: WorkerPool
     assert set(episode.trajectories[0].expert_acceleration) == {-0.5}
 
 
-def test_on_a_network_of_the_users_own_a_worker_may_not_fill_the_machine(drivers: Path, tmp_path: Path) -> None:
+def test_a_worker_has_limited_memory_on_a_users_network(drivers: Path, tmp_path: Path) -> None:
     path = straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
     road = make_scenario(str(path), {"cav_types": ["car"], "horizon": 5})
     with WorkerPool(1) as workers:

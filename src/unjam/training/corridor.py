@@ -14,7 +14,7 @@ from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.training.assess import ZERO_PENETRATION_RATE
 from unjam.training.search_space import NumericRange, SearchSpace, parse_search_space
 from unjam.worlds.sumo.detectors import InductionLoop
-from unjam.worlds.sumo.networks import edge_lengths, lane_counts
+from unjam.worlds.sumo.networks import network_geometry
 
 FLOW_FACTOR = "flow"
 """factor on the number of vehicles, of all types"""
@@ -115,7 +115,7 @@ def load_corridor(file: str, detectors: Path, begin: float | None = None, end: f
 
 def _detector_loops(network: Path, kind: str, row: Measurement) -> list[InductionLoop]:
     """Return the loops of a detector; raise `InputError` where the network has no such place."""
-    counts, lengths = lane_counts(network), edge_lengths(network)
+    _, lengths, counts = network_geometry(network)
     edge = row.place if kind == "edge" else row.place.rpartition("_")[0]
     all_lanes = [f"{edge}_{number}" for number in range(counts.get(edge, 0))]
     lanes = all_lanes if kind == "edge" else [lane for lane in all_lanes if lane == row.place]

@@ -83,7 +83,7 @@ def human_rings(request: pytest.FixtureRequest, workers: WorkerPool) -> tuple[in
 
 
 @pytest.mark.long
-def test_human_rings_are_those_of_the_papers_equations(human_rings: tuple[int, list[Episode]]) -> None:
+def test_human_rings_follow_the_papers_equations(human_rings: tuple[int, list[Episode]]) -> None:
     length, episodes = human_rings
     found, spread = measured(episodes)
     expected, _ = plain_rings(length)

@@ -123,7 +123,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("road", [RING, make_scenario("merge", {"cavs": 1, "standing_vehicles": 0, "horizon": 60})])
 @pytest.mark.parametrize("change", CHANGES)
-def test_what_other_code_does_to_an_episodes_simulation_is_an_error_in_one_line(
+def test_changes_of_a_simulation_by_other_code_are_an_error_in_one_line(
     change: str, road: Any, command: list[str]
 ) -> None:
     calls = []
@@ -146,9 +146,7 @@ def test_what_other_code_does_to_an_episodes_simulation_is_an_error_in_one_line(
 
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.filterwarnings("ignore:another simulation is open")
-def test_an_environment_that_lost_its_simulation_says_so_and_starts_anew_with_a_reset(
-    change: str, command: list[str]
-) -> None:
+def test_an_environment_reports_a_lost_simulation_and_restarts_with_a_reset(change: str, command: list[str]) -> None:
     with closing(RoadEnv(warmup=0)) as environment:
         expected = environment.reset(seed=0)[0]
         CHANGES[change](command)

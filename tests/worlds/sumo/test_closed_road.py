@@ -85,7 +85,7 @@ def idm(episode: Episode) -> Floats:
 @pytest.mark.parametrize(
     ("vehicles", "cavs", "length"), [(2, 2, 40), (5, 1, 55), (11, 1, 120), (22, 1, 220), (44, 1, 520)]
 )
-def test_as_many_vehicles_run_as_were_asked_for(vehicles: int, cavs: int, length: int, simulation: Simulation) -> None:
+def test_the_number_of_vehicles_is_as_configured(vehicles: int, cavs: int, length: int, simulation: Simulation) -> None:
     ring = replace(RING, vehicles=vehicles, cavs=cavs, length=(length, length))
     episode = run_episode(ring, PISaturation(), (0,), simulation=simulation)
     assert episode.speeds.shape == (301, vehicles)
@@ -108,7 +108,7 @@ def test_a_vehicle_that_vanishes_ends_the_episode_with_an_error(warmup: int, sim
     assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
 
 
-def test_a_vehicle_that_is_too_many_ends_the_episode_with_an_error(simulation: Simulation) -> None:
+def test_an_additional_vehicle_ends_the_episode_with_an_error(simulation: Simulation) -> None:
     def add_one(speed: Any) -> Any:
         route = libsumo.vehicle.getRouteID("cav_0")
         libsumo.vehicle.add("stranger", route, typeID="human", departPos="23")
@@ -119,7 +119,7 @@ def test_a_vehicle_that_is_too_many_ends_the_episode_with_an_error(simulation: S
         run_episode(small, Answers(add_one), (0,), simulation=simulation)
 
 
-def test_humans_and_undriven_cavs_move_as_the_paper_says(simulation: Simulation) -> None:
+def test_human_drivers_and_native_cavs_move_as_in_the_paper(simulation: Simulation) -> None:
     episode = run_episode(replace(RING, horizon=1500), Human(), (0,), simulation=simulation)
     np.testing.assert_allclose(moves(episode), idm(episode), rtol=0, atol=1e-9)
     assert np.ptp(episode.speeds[-1]) > 0.5
@@ -128,7 +128,7 @@ def test_humans_and_undriven_cavs_move_as_the_paper_says(simulation: Simulation)
     np.testing.assert_allclose(episode.trajectories[0].applied_acceleration, done, atol=1e-12)
 
 
-def test_humans_with_other_parameters_move_by_those(simulation: Simulation) -> None:
+def test_human_drivers_use_their_parameters(simulation: Simulation) -> None:
     slow = replace(RING, humans=replace(RING.humans, time_headway=2.0, max_acceleration=0.5), noise=0.0)
     episode = run_episode(slow, Human(), (0,), simulation=simulation)
     speed, gap = episode.speeds[:-1], episode.gaps[:-1]
@@ -145,7 +145,7 @@ def test_humans_with_other_parameters_move_by_those(simulation: Simulation) -> N
         ({"noise": 0.0}, 0.0),
     ],
 )
-def test_humans_noise_has_the_spread_that_was_asked_for(
+def test_human_noise_has_the_configured_standard_deviation(
     changes: dict[str, Any], std: float, simulation: Simulation
 ) -> None:
     ring = replace(RING, length=(270, 270), horizon=2000, **changes)
@@ -195,7 +195,7 @@ def test_a_reckless_raw_driver_collides_and_the_episode_ends_there(simulation: S
 
 
 @pytest.mark.parametrize("held", [3, 5, 20, 100])
-def test_a_collision_ends_the_decision_in_which_it_happens(held: int, simulation: Simulation) -> None:
+def test_a_collision_ends_its_control_step(held: int, simulation: Simulation) -> None:
     ring = replace(RING, actuation="raw", horizon=3000, noise=0.0)
     exact = run_episode(ring, Constant(1.0), (0,), simulation=simulation)
     coarse = replace(ring, steps_per_control_step=held, horizon=3000 // held)
@@ -222,7 +222,7 @@ def test_the_same_driver_shielded_never_collides_and_every_override_is_counted(
         np.testing.assert_array_equal(trajectory.applied_acceleration, 1.0)
 
 
-def test_shielded_executes_every_command_exactly_but_for_the_braking_that_it_counts(simulation: Simulation) -> None:
+def test_shielded_executes_every_command_exactly_except_for_the_counted_braking(simulation: Simulation) -> None:
     commands = np.random.default_rng(1).uniform(-0.6, 1.0, 3000)
     ring = replace(RING, horizon=3000)
     episode = run_episode(ring, Playback(commands), (0,), simulation=simulation)
@@ -236,7 +236,7 @@ def test_shielded_executes_every_command_exactly_but_for_the_braking_that_it_cou
     assert shield.min() >= 0.0
 
 
-def test_the_shield_lets_a_careful_driver_alone(simulation: Simulation) -> None:
+def test_the_shield_does_not_change_a_careful_driver(simulation: Simulation) -> None:
     ring = replace(RING, horizon=3000, length=(270, 270))
     trajectory = run_episode(ring, PISaturation(), (0,), simulation=simulation).trajectories[0]
     assert trajectory.shield_braking.max() < 1e-9
@@ -318,7 +318,7 @@ def test_an_answer_that_is_not_one_number_for_each_cav_is_refused_with_its_step(
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.float32, bool])
-def test_numbers_of_any_kind_are_accelerations(kind: type, simulation: Simulation) -> None:
+def test_accelerations_may_have_any_numeric_type(kind: type, simulation: Simulation) -> None:
     expected, found = (
         run_episode(RING, Answers(answer), (0,), simulation=simulation).speeds
         for answer in (lambda speed: np.ones(len(speed)), lambda speed: np.ones(len(speed), kind))
@@ -326,7 +326,7 @@ def test_numbers_of_any_kind_are_accelerations(kind: type, simulation: Simulatio
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_driver_hears_of_the_warmups_last_minute_oldest_first(simulation: Simulation) -> None:
+def test_a_driver_recalls_the_last_minute_of_the_warm_up_oldest_first(simulation: Simulation) -> None:
     human = run_episode(replace(RING, horizon=900, cavs=2), Human(), (3,), simulation=simulation)
     driver = Watcher()
     ring = replace(RING, warmup=750, cavs=2, horizon=20)
@@ -342,14 +342,14 @@ def test_a_driver_hears_of_the_warmups_last_minute_oldest_first(simulation: Simu
     assert episode.warmup == 750
 
 
-def test_a_short_warmup_is_heard_whole(simulation: Simulation) -> None:
+def test_a_short_warm_up_is_recalled_completely(simulation: Simulation) -> None:
     driver = Watcher()
     run_episode(replace(RING, warmup=7, horizon=5), driver, (3,), simulation=simulation)
     human = run_episode(RING, Human(), (3,), simulation=simulation).trajectories[0]
     np.testing.assert_array_equal(driver.history[0].speed, human.states.speed[None, :7])
 
 
-def test_the_warmup_is_heard_at_the_times_of_decisions(simulation: Simulation) -> None:
+def test_the_warm_up_is_recalled_once_per_control_step(simulation: Simulation) -> None:
     driver = Watcher()
     ring = replace(RING, warmup=752, horizon=4, steps_per_control_step=5)
     run_episode(ring, driver, (3,), simulation=simulation)
@@ -361,16 +361,14 @@ def test_the_warmup_is_heard_at_the_times_of_decisions(simulation: Simulation) -
 
 
 @pytest.mark.parametrize("changes", [{"warmup": 0}, {"warmup": 100, "remember_warmup": False}])
-def test_a_driver_hears_of_no_warmup_where_there_is_none_or_it_shall_not(
-    changes: dict[str, Any], simulation: Simulation
-) -> None:
+def test_no_warm_up_is_recalled_without_one_or_if_switched_off(changes: dict[str, Any], simulation: Simulation) -> None:
     driver = Watcher()
     run_episode(replace(RING, horizon=5, **changes), driver, (3,), simulation=simulation)
     assert driver.history == []
     assert len(driver.perceived) == 5
 
 
-def test_what_is_recalled_changes_how_pi_drives_on(simulation: Simulation) -> None:
+def test_recalling_the_warm_up_changes_the_pi_driver(simulation: Simulation) -> None:
     ring = replace(RING, warmup=400)
     recalled, fresh = (
         run_episode(scenario, PISaturation(), (3,), simulation=simulation).trajectories[0].applied_acceleration
@@ -379,7 +377,7 @@ def test_what_is_recalled_changes_how_pi_drives_on(simulation: Simulation) -> No
     assert not np.array_equal(recalled, fresh)
 
 
-def test_what_is_perceived_is_what_is_recorded(simulation: Simulation) -> None:
+def test_observed_states_are_recorded(simulation: Simulation) -> None:
     driver = Watcher()
     episode = run_episode(replace(RING, cavs=3, horizon=80), driver, (3,), simulation=simulation)
     for row, trajectory in enumerate(episode.trajectories):
@@ -389,7 +387,7 @@ def test_what_is_perceived_is_what_is_recorded(simulation: Simulation) -> None:
 
 
 @pytest.mark.parametrize("actuation", ["shielded", "raw", "flow"])
-def test_five_steps_a_decision_are_each_command_held_for_five_steps(actuation: Any, simulation: Simulation) -> None:
+def test_a_command_is_held_for_the_steps_of_a_control_step(actuation: Any, simulation: Simulation) -> None:
     commands = np.random.default_rng(2).uniform(-0.8, 0.8, (60, 2))
     fine = replace(RING, cavs=2, horizon=300, warmup=50, actuation=actuation)
     coarse = replace(fine, horizon=60, steps_per_control_step=5)
@@ -403,7 +401,7 @@ def test_five_steps_a_decision_are_each_command_held_for_five_steps(actuation: A
         np.testing.assert_array_equal(trajectory.applied_acceleration, commands[:, row])
 
 
-def test_a_finer_simulation_step_drives_about_alike(simulation: Simulation) -> None:
+def test_a_finer_simulation_step_gives_similar_results(simulation: Simulation) -> None:
     ring = replace(RING, noise=0.0)
     coarse = run_episode(ring, IDM(), (0,), simulation=simulation)
     fine = run_episode(

@@ -25,7 +25,7 @@ def road(folder: Path, vehicles: str = STEADY) -> UserNetwork:
     return load_user_network(str(straight(folder, vehicles)), {"penetration_rate": 1e-12})
 
 
-def test_loops_tell_when_and_how_fast_everybody_passed(tmp_path: Path) -> None:
+def test_passages_have_time_and_speed_of_each_vehicle(tmp_path: Path) -> None:
     with DetectorPool(1) as counting:
         (passed,) = counting.run(road(tmp_path), [(1,)], [InductionLoop("road_0", 105.0)])
     assert [one.vehicle for one in passed] == [f"f.{number}" for number in range(9)]
@@ -35,7 +35,7 @@ def test_loops_tell_when_and_how_fast_everybody_passed(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_count_does_not_depend_on_how_many_count(tmp_path: Path) -> None:
+def test_passages_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
     random = STEADY.replace('period="6"', 'probability="0.3"')
     seeds = [(1,), (2,), (1,)]
     found = []
@@ -46,14 +46,14 @@ def test_the_count_does_not_depend_on_how_many_count(tmp_path: Path) -> None:
     assert found[0][0] == found[0][2] != found[0][1]
 
 
-def test_after_one_that_failed_others_go_on(tmp_path: Path) -> None:
+def test_other_simulations_continue_after_a_failed_one(tmp_path: Path) -> None:
     with DetectorPool(1) as counting:
         with pytest.raises(EpisodeError, match="SUMO cannot start"):
             counting.run(road(tmp_path), [(1,), (2,)], [InductionLoop("nowhere_0", 5.0)])
         assert counting.run(road(tmp_path), [(1,)], [InductionLoop("road_0", 5.0)]) != [[]]
 
 
-def test_who_leaves_a_loop_sideways_tells_no_speed_as_with_sumos_own_detectors(tmp_path: Path) -> None:
+def test_a_lane_change_on_a_loop_has_no_speed_as_with_sumos_own_detectors(tmp_path: Path) -> None:
     loops = [InductionLoop(f"{edge}_{lane}", at) for edge, at in (("gneE2", 50.0), ("gneE7", 60.0)) for lane in (0, 1)]
     ramp = load_user_network(str(game(tmp_path, "ramp")), {"penetration_rate": 1e-12})
     with Simulation() as simulation:
@@ -66,7 +66,7 @@ def test_who_leaves_a_loop_sideways_tells_no_speed_as_with_sumos_own_detectors(t
     assert sum(int(np.isnan(each).sum()) for each in speeds) == 3
 
 
-def test_a_simulation_that_was_lost_runs_again_and_one_that_is_lost_again_is_told(
+def test_a_lost_simulation_is_repeated_and_repeated_losses_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, left = DetectorPool._run_one, [0]

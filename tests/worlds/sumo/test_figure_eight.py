@@ -66,7 +66,7 @@ def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
 
 
 @pytest.mark.parametrize("cavs", [2, 7, 14])
-def test_each_of_several_cavs_is_driven_and_recorded_by_itself(cavs: int, simulation: Simulation) -> None:
+def test_several_cavs_are_driven_and_recorded_separately(cavs: int, simulation: Simulation) -> None:
     road = replace(AS_FLOW, cavs=cavs, horizon=300)
     episode = run_episode(road, ByRow(), (1,), simulation=simulation)
     assert (episode.status, len(episode.trajectories)) == ("completed", cavs)
@@ -106,7 +106,9 @@ def test_vehicles_from_the_right_yield(simulation: Simulation) -> None:
         assert bool((standing & at_the_line)[50:].any()) is expected
 
 
-def test_on_the_crossing_people_are_left_to_sumo(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sumo_drives_human_driven_vehicles_on_the_crossing(
+    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
     traffic = make_traffic(FigureEight(radius=(32, 32)), (0,), simulation)
     assert isinstance(traffic, ClosedTraffic)
     asked: list[tuple[str, float]] = []
@@ -137,7 +139,7 @@ def slowly(*values: object) -> Any:
         (Pacer(use_tuned=True), 35, 7.2),
     ],
 )
-def test_pacers_hold_a_queue_that_never_meets_itself(driver: Pacer, radius: int, speed: float) -> None:
+def test_pacers_keep_a_queue_that_avoids_itself_at_the_crossing(driver: Pacer, radius: int, speed: float) -> None:
     road = FigureEight(radius=(radius, radius), horizon=3000)
     with WorkerPool(2) as workers:
         episodes = workers.run([EpisodeTask(road, driver, (seed,)) for seed in range(3)])

@@ -116,7 +116,7 @@ def test_nothing_is_written_and_nothing_listens(
     assert contents(tmp_path) == before
 
 
-def test_in_a_worker_it_is_the_same(hostile: Path, tmp_path: Path) -> None:
+def test_nothing_is_written_in_a_worker(hostile: Path, tmp_path: Path) -> None:
     before = contents(tmp_path)
     scenario = make_scenario(str(hostile), {"penetration_rate": 0.5, "horizon": 100})
     with WorkerPool(1) as workers:
@@ -125,7 +125,7 @@ def test_in_a_worker_it_is_the_same(hostile: Path, tmp_path: Path) -> None:
     assert contents(tmp_path) == before
 
 
-def test_what_is_left_out_is_told_once_in_one_line(hostile: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_dropped_items_are_reported_once_in_one_line(hostile: Path, caplog: pytest.LogCaptureFixture) -> None:
     _log_once.cache_clear()
     for _ in range(2):
         make_scenario(str(hostile), {"penetration_rate": 0.5})
@@ -136,7 +136,7 @@ def test_what_is_left_out_is_told_once_in_one_line(hostile: Path, caplog: pytest
     assert {"option remote-port", "file of e1Detector", "edgeData", "parameter device.ssm.file"} <= {*dropped}
 
 
-def test_it_is_noted_in_results_and_report(hostile: Path, tmp_path: Path) -> None:
+def test_dropped_items_are_in_results_and_report(hostile: Path, tmp_path: Path) -> None:
     road, out = {"horizon": 20, "penetration_rate": 0.5}, tmp_path / "out"
     found = unjam.drive(str(hostile), ["human"], 1, scenario_options=road, workers=1, out=out)
     (note,) = [each for each in found.notes if "left out" in each]
@@ -145,15 +145,13 @@ def test_it_is_noted_in_results_and_report(hostile: Path, tmp_path: Path) -> Non
     assert "left out because they only write or listen" in (out / "report.html").read_text()
 
 
-def test_harmless_files_are_read_themselves_and_nothing_is_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_harmless_files_are_read_without_a_copy_or_message(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     found = read_sumo_files(straight(tmp_path, COLUMN))
     make_scenario(str(found.path), {"penetration_rate": 0.5})
     assert (found.dropped_items, found.replaced_options, found.copy_sources, caplog.records) == ((), (), {}, [])
 
 
-def test_left_out_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulation) -> None:
+def test_dropped_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulation) -> None:
     plain, noted = (tmp_path / name for name in ("plain", "noted"))
     episodes = []
     for folder in (plain, noted):
@@ -171,7 +169,7 @@ def test_left_out_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulati
     assert not (tmp_path / "canary").exists()
 
 
-def test_options_and_files_that_only_simulate_count(tmp_path: Path, simulation: Simulation) -> None:
+def test_options_and_files_that_only_simulate_are_used(tmp_path: Path, simulation: Simulation) -> None:
     path = straight(tmp_path, COLUMN)
     scenario = make_scenario(str(path), {"cav_types": ["van"], "horizon": 200})
     fast = run_episode(scenario, IDM(), (0,), simulation=simulation)
@@ -184,7 +182,7 @@ def test_options_and_files_that_only_simulate_count(tmp_path: Path, simulation: 
     assert np.nanmean(slow.speeds) < 12 < np.nanmean(fast.speeds)
 
 
-def test_folders_with_blanks_and_commas_drive_alike(tmp_path: Path, simulation: Simulation) -> None:
+def test_folders_with_blanks_and_commas_give_the_same_traffic(tmp_path: Path, simulation: Simulation) -> None:
     episodes = []
     for name in ("plain", "with a blank, a comma; and $HOME"):
         (tmp_path / name).mkdir()
@@ -207,7 +205,7 @@ def test_compressed_and_strangely_encoded_files_are_copied(tmp_path: Path, simul
 
 
 @pytest.mark.parametrize("name", ["default namespace", "signal that writes", "swarm that writes"])
-def test_what_hides_is_found(name: str, tmp_path: Path) -> None:
+def test_hidden_outputs_are_found(name: str, tmp_path: Path) -> None:
     path = straight(tmp_path, COLUMN)
     (tmp_path / "hidden.add.xml").write_text(
         {
@@ -222,7 +220,7 @@ def test_what_hides_is_found(name: str, tmp_path: Path) -> None:
     assert found.dropped_items in (("edgeData",), ("parameter file",), ("parameter SWARMLOG",))
 
 
-def test_an_option_whose_value_looks_like_another_is_no_other(tmp_path: Path, simulation: Simulation) -> None:
+def test_an_option_value_that_looks_like_an_option_is_a_value(tmp_path: Path, simulation: Simulation) -> None:
     path = straight(tmp_path, COLUMN)
     sly = "<scale-suffix value='--log=canary'/><end "
     path.write_text(path.read_text().replace("<end ", sly))
@@ -246,7 +244,7 @@ def test_no_option_that_is_passed_names_a_file_or_is_an_output(tmp_path: Path) -
     assert known >= PASSED_OPTIONS
 
 
-def test_games_of_sumos_own_drive_though_they_want_outputs(tmp_path: Path, simulation: Simulation) -> None:
+def test_sumos_games_run_without_their_outputs(tmp_path: Path, simulation: Simulation) -> None:
     path = game(tmp_path, "cross")
     before = contents(tmp_path)
     scenario = make_scenario(str(path), {"penetration_rate": 0.3, "horizon": 50})

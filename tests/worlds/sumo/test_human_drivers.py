@@ -30,7 +30,7 @@ def test_limits_and_residual_change_an_idm() -> None:
 
 
 @pytest.mark.parametrize("human_control", ["native", "commanded"])
-def test_each_person_on_the_ring_drives_by_its_own_parameters(tmp_path: Path, human_control: str) -> None:
+def test_each_human_driver_on_the_ring_has_its_own_parameters(tmp_path: Path, human_control: str) -> None:
     file = population(tmp_path)
     scenario = make_scenario(
         "ring", {"population": file, "human_control": human_control, "noise": 0.0, "horizon": 300, "length": (300, 300)}
@@ -49,7 +49,7 @@ def test_each_person_on_the_ring_drives_by_its_own_parameters(tmp_path: Path, hu
 
 
 @pytest.mark.parametrize("name", ["ring", "figure-eight", "merge"])
-def test_every_road_can_have_them_with_a_residual(tmp_path: Path, name: str) -> None:
+def test_populations_with_a_residual_work_on_every_built_in_road(tmp_path: Path, name: str) -> None:
     file = population(tmp_path, QUARTER)
     episode = run_episode(make_scenario(name, {"population": file, "horizon": 60}), Human(), (0,))
     assert episode.status == "completed"

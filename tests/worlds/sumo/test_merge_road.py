@@ -95,7 +95,7 @@ def leader_of(places: dict[str, float], name: str, traffic: MergingTraffic) -> s
     return min(ahead, key=lambda other: places[other], default=None)
 
 
-def test_people_are_asked_for_the_speeds_of_the_idm_and_on_the_junction_left_to_sumo(
+def test_human_drivers_follow_the_idm_and_sumo_drives_on_the_junction(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traffic = merging(Merge(noise=0.0, penetration_rate=0.0), simulation)
@@ -110,7 +110,7 @@ def test_people_are_asked_for_the_speeds_of_the_idm_and_on_the_junction_left_to_
     assert (done > -1e-9).mean() > 0.8
 
 
-def test_their_noise_is_normal_and_as_large_as_was_asked_for(
+def test_human_noise_is_normal_with_the_configured_size(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traffic = merging(Merge(penetration_rate=0.0, standing_vehicles=0), simulation)
@@ -123,7 +123,7 @@ def test_their_noise_is_normal_and_as_large_as_was_asked_for(
     assert np.mean(np.abs(noise) < noise.std()) == pytest.approx(0.683, abs=0.02)
 
 
-def test_people_obey_the_right_of_way_only_where_they_shall(simulation: Simulation) -> None:
+def test_human_drivers_obey_the_right_of_way_if_configured(simulation: Simulation) -> None:
     for right_of_way, mode in ((False, 1), (True, 25)):
         traffic = merging(Merge(right_of_way=right_of_way, penetration_rate=0.3), simulation)
         for _ in range(20):
@@ -136,7 +136,7 @@ def test_people_obey_the_right_of_way_only_where_they_shall(simulation: Simulati
         assert {libsumo.vehicle.getTypeID(name) for name in traffic.cav_ids} == {"cav"}
 
 
-def test_waiting_and_arrived_are_those_of_the_timetable_and_of_sumo(simulation: Simulation) -> None:
+def test_backlog_and_arrivals_agree_with_the_demand_and_with_sumo(simulation: Simulation) -> None:
     traffic = merging(Merge(), simulation)
     written = ElementTree.fromstring(sumo_inputs(traffic.scenario, traffic.road).traffic_xml)
     departs = [float(vehicle.get("depart", "nan")) for vehicle in written.iter("vehicle")]
@@ -156,7 +156,7 @@ def test_waiting_and_arrived_are_those_of_the_timetable_and_of_sumo(simulation: 
     assert found.arrivals == gone[-1] > 10
 
 
-def test_throughput_and_backlog_are_those_counts(simulation: Simulation) -> None:
+def test_outflow_and_backlog_metrics_are_these_counts(simulation: Simulation) -> None:
     episode = run_episode(Merge(horizon=120), PISaturation(), (1,), simulation=simulation)
     row = measure(episode)
     last = episode.speeds[-1]
@@ -179,7 +179,7 @@ def test_positions_that_differ_from_sumos_odometer_are_an_error(
         traffic.record(DriverLog())
 
 
-def test_what_pictures_show_of_it(simulation: Simulation) -> None:
+def test_snapshots_of_a_merge(simulation: Simulation) -> None:
     episode = run_episode(Merge(horizon=60), PISaturation(), (1,), record_details=True, simulation=simulation)
     assert len(episode.branches) == len(episode.vehicle_ids)
     for name, branch in zip(episode.vehicle_ids, episode.branches, strict=True):
@@ -217,14 +217,14 @@ def human() -> list[Episode]:
 
 
 @pytest.mark.long
-def test_from_a_standing_start_people_stay_in_a_jam_and_pi_makes_it_worse(human: list[Episode]) -> None:
+def test_from_standstill_human_traffic_stays_jammed_and_pi_makes_it_worse(human: list[Episode]) -> None:
     pi = episodes_of(PISaturation(), range(2))
     assert 8.5 < fleet_mean(human) < 13.5
     assert fleet_mean(pi) < fleet_mean(human)
     assert all(episode.backlog[-1] > 5 for episode in [*human, *pi])
 
 
-def test_from_an_empty_start_people_flow_freely(human: list[Episode]) -> None:
+def test_from_an_empty_road_human_traffic_flows_freely(human: list[Episode]) -> None:
     free = episodes_of(Human(), range(2), standing_vehicles=0)
     assert fleet_mean(free) == pytest.approx(19.9, rel=0.06)
     assert fleet_mean(free) < min(episode.limit_speed for episode in free)
@@ -233,7 +233,7 @@ def test_from_an_empty_start_people_flow_freely(human: list[Episode]) -> None:
 
 
 @pytest.mark.long
-def test_nobody_collides_whoever_drives() -> None:
+def test_no_driver_collides() -> None:
     for driver in (Constant(1.0), Constant(-0.1)):
         episodes_of(driver, range(2), horizon=200, penetration_rate=0.3)
 

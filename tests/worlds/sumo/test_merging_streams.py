@@ -81,7 +81,7 @@ def same(streams: MergingStreams, vehicles: list[Vehicle]) -> None:
 
 
 @given(st.data())
-def test_order_and_neighbours_are_those_of_a_plain_search(data: st.DataObject) -> None:
+def test_order_and_neighbors_agree_with_a_plain_search(data: st.DataObject) -> None:
     streams, vehicles, step = MergingStreams(), [], 1.0
     speeds = st.floats(0.0, 30.0).map(lambda speed: round(speed, 3))
     for number in range(data.draw(st.integers(1, 14), "moments")):
@@ -109,14 +109,14 @@ def standing(*positions: tuple[int, float]) -> MergingStreams:
     return streams
 
 
-def test_of_two_that_cross_in_one_step_the_one_further_ahead_leads() -> None:
+def test_of_two_vehicles_that_merge_in_one_step_the_one_further_ahead_leads() -> None:
     streams = standing((0, -6.0), (1, -0.5))
     streams.move([30.5, 32.0], 0.2)  # to 0.1 and 5.9
     assert streams.names == ["b", "a"]
     assert streams.gaps(streams.leaders()).tolist() == pytest.approx([ABSENT_LEADER_GAP, 0.8])
 
 
-def test_the_first_of_both_ways_follow_the_last_beyond_the_meeting_place() -> None:
+def test_the_first_vehicles_of_both_branches_follow_the_last_one_past_the_merge_point() -> None:
     streams = standing((0, 40.0), (0, 5.0), (0, -10.0), (0, -30.0), (1, -20.0))
     assert streams.names == list("abcde")
     assert streams.leaders().tolist() == [-1, 0, 1, 2, 1]
@@ -126,21 +126,21 @@ def test_the_first_of_both_ways_follow_the_last_beyond_the_meeting_place() -> No
     np.testing.assert_allclose(states.follower_gap, [30.0, 10.0, 15.0, 100.0, 100.0])
 
 
-def test_who_enters_beyond_the_meeting_place_is_there() -> None:
+def test_a_vehicle_may_enter_past_the_merge_point() -> None:
     streams = standing((0, -10.0), (1, -10.0))
     streams.enter("x", Origin(0, 50.0), 3.0)
     assert streams.names == ["x", "a", "b"]
     assert streams.leaders().tolist() == [-1, 0, 0]
 
 
-def test_an_empty_road_has_nobody_on_it() -> None:
+def test_an_empty_road_has_no_vehicles() -> None:
     streams = MergingStreams()
     streams.move([], 0.2)
     assert {values.shape for values in streams.states() if values is not None} == {(0,)}
     assert streams.is_on_junction(WAYS).shape == (0,)
 
 
-def test_who_leaves_from_behind_another_is_an_error() -> None:
+def test_leaving_from_behind_another_vehicle_is_an_error() -> None:
     streams = standing((0, 90.0), (0, 50.0), (0, 10.0))
     streams.leave(["b", "a"])
     assert streams.names == ["c"]
@@ -153,7 +153,7 @@ PLACES = {"inflow_highway": -624.625483, "highway": -524.525483, "after": 0.0}
 PLACES |= {"inflow_ramp": -223.370389, "ramp": -123.270389}
 
 
-def test_positions_are_where_sumo_has_the_vehicles(simulation: Simulation) -> None:
+def test_positions_are_those_of_sumo(simulation: Simulation) -> None:
     traffic = merging(simulation)
     compared = 0
     for _ in range(60):

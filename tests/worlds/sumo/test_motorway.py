@@ -53,7 +53,7 @@ def test_leaders_and_gaps_are_sumos(simulation: Simulation) -> None:
     assert compared > 500
 
 
-def test_who_is_beside_a_cav_is_whom_sumo_sees_there(simulation: Simulation) -> None:
+def test_adjacent_vehicles_are_those_of_sumo(simulation: Simulation) -> None:
     traffic, compared = motorway(simulation), 0
     for _ in range(150):
         traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
@@ -81,7 +81,7 @@ def test_who_is_beside_a_cav_is_whom_sumo_sees_there(simulation: Simulation) -> 
     assert compared > 500
 
 
-def test_a_ramps_vehicles_are_beside_the_right_lane_before_it_joins(simulation: Simulation) -> None:
+def test_ramp_vehicles_are_adjacent_to_the_right_lane_before_the_merge(simulation: Simulation) -> None:
     traffic, seen_there = motorway(simulation, replace(BUSY, penetration_rate=1.0)), 0
     for _ in range(200):
         traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
@@ -103,7 +103,7 @@ def test_a_ramps_vehicles_are_beside_the_right_lane_before_it_joins(simulation: 
     assert seen_there > 20
 
 
-def test_a_cav_is_held_back_upstream_and_left_alone_where_the_lane_closes(simulation: Simulation) -> None:
+def test_a_cav_has_a_set_speed_cap_upstream_and_none_where_the_lane_closes(simulation: Simulation) -> None:
     traffic, held, free = motorway(simulation), [], []
     for _ in range(200):
         before = dict(zip(traffic.cav_ids, traffic.local_state().speed.tolist(), strict=True))
@@ -118,7 +118,7 @@ def test_a_cav_is_held_back_upstream_and_left_alone_where_the_lane_closes(simula
     assert max(free) > 0.5
 
 
-def test_it_is_told_how_many_of_all_that_have_entered_are_cavs(simulation: Simulation) -> None:
+def test_the_observed_penetration_rate_is_that_of_entered_vehicles(simulation: Simulation) -> None:
     traffic = motorway(simulation, replace(BUSY, penetration_rate=0.3))
     for _ in range(100):
         traffic.advance(Command(np.full(traffic.cav_count, 1.0)))
@@ -127,7 +127,7 @@ def test_it_is_told_how_many_of_all_that_have_entered_are_cavs(simulation: Simul
     assert share == pytest.approx([sum(name in traffic.road.cav_ids for name in came) / len(came)], abs=0.02)
 
 
-def test_an_acc_keeps_the_time_headway_that_it_is_asked_for_until_it_is_asked_no_more(simulation: Simulation) -> None:
+def test_an_acc_keeps_the_commanded_time_gap_while_it_is_commanded(simulation: Simulation) -> None:
     def shortest(asked: float) -> float:
         """Return a short time headway of CAVs on a full road [s], and look that SUMO knows what was asked."""
         traffic, own, found = motorway(simulation), BUSY.cruise.time_gap, list[float]()
@@ -151,7 +151,7 @@ def test_an_acc_keeps_the_time_headway_that_it_is_asked_for_until_it_is_asked_no
     assert shortest(2.0) > shortest(0.5) + 0.3
 
 
-def test_who_is_not_held_back_drives_as_its_own_acc_does(simulation: Simulation) -> None:
+def test_a_cav_without_a_cap_drives_as_its_own_acc(simulation: Simulation) -> None:
     episode = run_episode(BUSY, Cruise(), (3,), simulation=simulation)
     assert episode.status == "completed"
     assert measure(episode)["shield_override_share"] == 0.0
@@ -160,7 +160,7 @@ def test_who_is_not_held_back_drives_as_its_own_acc_does(simulation: Simulation)
 
 
 @pytest.mark.parametrize("asked", [0.2, 0.5, 1.0])
-def test_who_stands_and_is_asked_to_go_does_so_however_gently_in_sumo_and_in_a_batch(
+def test_a_standing_cav_starts_at_any_positive_command_in_sumo_and_in_a_batch(
     asked: float, simulation: Simulation
 ) -> None:
     """SUMO's IDM stands for ever at set speeds below half a metre a second."""
@@ -174,7 +174,7 @@ def test_who_stands_and_is_asked_to_go_does_so_however_gently_in_sumo_and_in_a_b
         assert 0.8 * asked * 10.0 < world.local_state().speed[0] < 1.3 + asked * 10.0
 
 
-def test_cavs_want_to_drive_as_fast_as_those_whom_they_replace(simulation: Simulation) -> None:
+def test_cavs_have_the_desired_speeds_of_the_vehicles_that_they_replace(simulation: Simulation) -> None:
     traffic = motorway(simulation)
     for _ in range(60):
         traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
@@ -199,7 +199,7 @@ def on_the_left(simulation: Simulation, **lanes: float) -> float:
     return left / upstream
 
 
-def test_cavs_keep_right_and_overtake_as_eagerly_as_their_road_says(simulation: Simulation) -> None:
+def test_cavs_keep_right_and_overtake_as_configured(simulation: Simulation) -> None:
     as_people = on_the_left(simulation)
     assert on_the_left(simulation, keep_right=1.0, speed_gain=1.0) == as_people
     assert on_the_left(simulation, keep_right=10.0) < as_people - 0.05
@@ -229,7 +229,7 @@ def test_the_message_is_the_mean_speed_of_the_lane_ahead(simulation: Simulation)
     assert checked > 5
 
 
-def test_people_alone_are_the_same_whoever_would_be_automated(simulation: Simulation) -> None:
+def test_human_only_traffic_does_not_depend_on_the_penetration_rate(simulation: Simulation) -> None:
     one, other = (
         run_episode(OnRamp(peak=(0.0, 60.0), horizon=60, penetration_rate=share), Human(), (1,), simulation=simulation)
         for share in (0.05, 0.5)
@@ -237,7 +237,7 @@ def test_people_alone_are_the_same_whoever_would_be_automated(simulation: Simula
     np.testing.assert_array_equal(one.speeds, other.speeds)
 
 
-def test_the_audit_tells_cut_ins_from_following(capped: Episode) -> None:
+def test_the_audit_separates_cut_ins_from_car_following(capped: Episode) -> None:
     audit = capped.audit
     assert audit.has_lanes
     assert audit.required_time_gap == 1.0
@@ -252,7 +252,7 @@ def test_the_audit_tells_cut_ins_from_following(capped: Episode) -> None:
     assert row["cav_max_braking"] < 4.0
 
 
-def test_where_each_came_from_and_the_peak_are_recorded(capped: Episode) -> None:
+def test_branches_and_demand_peak_are_recorded(capped: Episode) -> None:
     assert set(capped.branches) == {"motorway", "ramp"}
     assert capped.demand_peak == (0.0, 240.0)
     assert -2000.0 <= np.nanmin(capped.positions) < np.nanmax(capped.positions) <= 1000.0
@@ -262,7 +262,7 @@ def test_where_each_came_from_and_the_peak_are_recorded(capped: Episode) -> None
 
 
 @pytest.mark.long
-def test_a_cav_that_is_held_back_still_brakes_as_hard_as_its_own_acc_must(simulation: Simulation) -> None:
+def test_a_cav_with_a_cap_still_brakes_as_hard_as_its_own_acc(simulation: Simulation) -> None:
     """SUMO keeps who is told a speed to comfortable braking: told on, this one ran into a jam's tail."""
     road = OnRamp(penetration_rate=0.3, horizon=800)
     episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), simulation=simulation)

@@ -41,7 +41,7 @@ def search(place: int, positions: list[float], loop: float) -> tuple[int, float,
 
 
 @given(vehicles_on_a_loop())
-def test_neighbours_and_gaps_are_those_that_a_search_finds(traffic: tuple[list[float], list[float], float]) -> None:
+def test_neighbors_and_gaps_agree_with_a_search(traffic: tuple[list[float], list[float], float]) -> None:
     speeds, positions, loop = traffic
     everyone = loop_neighbors(np.arange(len(speeds)), len(speeds))
     states = loop_state(np.array(speeds), np.array(positions), everyone, loop)
@@ -58,7 +58,7 @@ def test_neighbours_and_gaps_are_those_that_a_search_finds(traffic: tuple[list[f
 
 
 @given(vehicles_on_a_loop())
-def test_one_vehicle_in_plain_numbers_perceives_what_it_does_in_arrays(
+def test_the_state_of_one_vehicle_is_the_same_in_floats_and_arrays(
     traffic: tuple[list[float], list[float], float],
 ) -> None:
     speeds, positions, loop = traffic
@@ -70,7 +70,7 @@ def test_one_vehicle_in_plain_numbers_perceives_what_it_does_in_arrays(
         assert alone == among.select(0)
 
 
-def test_many_moments_are_what_each_moment_is() -> None:
+def test_several_moments_equal_single_moments() -> None:
     generator = np.random.default_rng(0)
     positions = np.array([[0.0], [20.0], [50.0]]) + generator.uniform(0, 5, (3, 7)).cumsum(1)
     speeds = generator.uniform(0, 10, (3, 7))

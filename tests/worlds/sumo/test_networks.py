@@ -75,7 +75,7 @@ def test_other_traffic_on_the_same_road_needs_no_other_network(cache: Path, monk
     assert network_file(other.network) == made
 
 
-def test_whatever_changes_the_network_makes_another_file(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_change_of_a_network_makes_another_file(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     road = road_of(230)
     other = road_of(240)
     plain = tuple(node._replace(has_priority=False) for node in road.nodes)
@@ -94,7 +94,7 @@ def test_whatever_changes_the_network_makes_another_file(cache: Path, monkeypatc
     assert files_in(cache) == set(made)
 
 
-def test_the_cache_is_where_the_user_wants_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_user_can_choose_the_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / "mine"))
     assert network_file(road_of(230)).is_relative_to(tmp_path / "mine")
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / "other"))
@@ -102,18 +102,14 @@ def test_the_cache_is_where_the_user_wants_it(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("value", [None, ""])
-def test_the_cache_is_the_systems_where_the_user_says_nothing(
-    value: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_default_cache_folder_is_the_systems(value: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("UNJAM_CACHE", raising=False)
     if value is not None:
         monkeypatch.setenv("UNJAM_CACHE", value)
     assert cache_folder() == Path(platformdirs.user_cache_dir("unjam"))
 
 
-def test_threads_that_make_the_same_network_at_once_get_one_whole_file(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_threads_that_make_the_same_network_get_one_complete_file(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = network_file(road_of(250))
     edges = edges_of(expected)
     expected.unlink()
@@ -137,7 +133,7 @@ def test_threads_that_make_the_same_network_at_once_get_one_whole_file(
     assert files_in(cache) == {expected}
 
 
-def test_processes_that_make_the_same_network_at_once_get_one_whole_file(cache: Path) -> None:
+def test_processes_that_make_the_same_network_get_one_complete_file(cache: Path) -> None:
     code = (
         "import sys, numpy as np\n"
         "from unjam.scenarios import Ring\n"
@@ -182,7 +178,7 @@ def test_a_missing_netconvert_is_named_with_the_way_to_get_it(cache: Path) -> No
 
 
 @pytest.mark.usefixtures("no_sumo")
-def test_a_netconvert_on_the_path_does_where_the_package_has_none(tmp_path: Path) -> None:
+def test_a_netconvert_on_the_path_is_used_without_the_packages(tmp_path: Path) -> None:
     program = tmp_path / "netconvert"
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
@@ -197,7 +193,7 @@ def test_a_cache_that_cannot_be_a_folder_is_a_disk_error(tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize("problem", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM])
-def test_a_disk_that_takes_nothing_is_a_disk_error_and_leaves_nothing_behind(
+def test_a_full_disk_is_a_disk_error_and_leaves_nothing_behind(
     problem: int, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*arguments: Any, **options: Any) -> NoReturn:
@@ -226,7 +222,7 @@ def unsealed(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [cut, edit, empty, unsealed])
-def test_a_network_that_is_no_longer_as_it_was_made_is_made_anew(damage: Callable[[Path], None], cache: Path) -> None:
+def test_a_changed_network_is_made_again(damage: Callable[[Path], None], cache: Path) -> None:
     made = network_file(road_of(230))
     whole = edges_of(made)
     damage(made)
@@ -235,7 +231,7 @@ def test_a_network_that_is_no_longer_as_it_was_made_is_made_anew(damage: Callabl
     assert files_in(cache) == {made}
 
 
-def test_another_process_notices_too(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_process_detects_a_changed_network(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = network_file(road_of(230))
     whole, stamp = made.read_bytes(), made.stat()
     made.write_bytes(whole.replace(b"57.5", b"58.5"))

@@ -47,7 +47,7 @@ def counted() -> Episode:
     return run_episode(MERGE, Counting(), (2,))
 
 
-def test_a_driver_remembers_each_cav_by_itself_from_its_entry_on(counted: Episode) -> None:
+def test_each_cav_has_its_own_memory_from_its_entry(counted: Episode) -> None:
     assert len(counted.trajectories) > 12
     for trajectory in counted.trajectories:
         np.testing.assert_allclose(
@@ -55,7 +55,7 @@ def test_a_driver_remembers_each_cav_by_itself_from_its_entry_on(counted: Episod
         )
 
 
-def test_cavs_came_and_left_in_between(counted: Episode) -> None:
+def test_cavs_enter_and_leave_during_the_episode(counted: Episode) -> None:
     stays = [(each.start_step, each.start_step + len(each.applied_acceleration)) for each in counted.trajectories]
     assert len({start for start, _ in stays}) > 10
     assert sum(end < 120 for _, end in stays) > 3
@@ -63,7 +63,7 @@ def test_cavs_came_and_left_in_between(counted: Episode) -> None:
     assert [start for start, _ in stays] == sorted(start for start, _ in stays)
 
 
-def test_each_stay_of_a_cav_is_one_trajectory_that_holds_what_was_recorded_of_it(counted: Episode) -> None:
+def test_each_trip_of_a_cav_is_one_trajectory_with_its_records(counted: Episode) -> None:
     assert len({each.vehicle for each in counted.trajectories}) == len(counted.trajectories)
     assert counted.cav_ids == tuple(each.vehicle for each in counted.trajectories)
     for trajectory in counted.trajectories:
@@ -82,7 +82,7 @@ def test_each_stay_of_a_cav_is_one_trajectory_that_holds_what_was_recorded_of_it
             np.testing.assert_array_equal(values, counted.reward_terms[name][start:end])
 
 
-def test_leader_and_follower_of_a_stay_were_there_as_recorded(counted: Episode) -> None:
+def test_leader_and_follower_of_a_trip_are_as_recorded(counted: Episode) -> None:
     seen = 0
     for trajectory in counted.trajectories:
         column = counted.vehicle_ids.index(trajectory.vehicle)
@@ -136,14 +136,14 @@ def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(simulation
     assert [fingerprint(travelled(episode)) for episode in here] == [fingerprint(each) for each in here]
 
 
-def test_the_same_vehicles_are_cavs_whoever_drives(simulation: Simulation) -> None:
+def test_the_same_vehicles_are_cavs_for_every_driver(simulation: Simulation) -> None:
     short = replace(MERGE, horizon=40)
     driven = [run_episode(short, driver, (4,), simulation=simulation) for driver in (Human(), Constant(0.5))]
     early = [[name for name in episode.cav_ids if int(name.removeprefix("cav_")) < 15] for episode in driven]
     assert early[0] == early[1] != []
 
 
-def test_undriven_cavs_have_trajectories_of_what_they_did(simulation: Simulation) -> None:
+def test_cavs_with_a_native_driver_have_trajectories(simulation: Simulation) -> None:
     episode = run_episode(MERGE, Human(), (2,), simulation=simulation)
     assert len(episode.trajectories) > 5
     for trajectory in episode.trajectories:
@@ -152,7 +152,7 @@ def test_undriven_cavs_have_trajectories_of_what_they_did(simulation: Simulation
 
 
 @pytest.mark.parametrize("hold", [1, 4])
-def test_a_residual_driver_counts_its_looks_from_each_entry(hold: int, simulation: Simulation) -> None:
+def test_a_residual_driver_counts_its_actions_from_each_entry(hold: int, simulation: Simulation) -> None:
     driver = ResidualDriver(Counting(), random_network(), 1.0, action_repeat=hold)
     episode = run_episode(MERGE, driver, (2,), explore=True, simulation=simulation)
     noises = []
@@ -176,7 +176,7 @@ def test_a_residual_driver_counts_its_looks_from_each_entry(hold: int, simulatio
     assert len(np.unique(noise)) == len(noise)
 
 
-def test_what_stays_say_is_enough_to_drive_them_again(simulation: Simulation) -> None:
+def test_a_trip_can_be_replayed_from_its_trajectory(simulation: Simulation) -> None:
     driver = ResidualDriver(PISaturation(), random_network(), 1.0)
     episode = run_episode(MERGE, driver, (2,), simulation=simulation)
     for trajectory in episode.trajectories:
@@ -187,7 +187,7 @@ def test_what_stays_say_is_enough_to_drive_them_again(simulation: Simulation) ->
             assert np.clip(expert[0], -1, 1) == pytest.approx(trajectory.expert_acceleration[step], abs=1e-12)
 
 
-def test_exploration_leaves_the_traffics_noise_alone(simulation: Simulation) -> None:
+def test_exploration_does_not_change_the_traffic_noise(simulation: Simulation) -> None:
     mute = ResidualDriver(Constant(), replace(random_network(), exploration_std=0.0), 1.0)
     still, explored = (
         run_episode(MERGE, mute, (2,), explore=explore, simulation=simulation) for explore in (False, True)
@@ -195,7 +195,7 @@ def test_exploration_leaves_the_traffics_noise_alone(simulation: Simulation) -> 
     np.testing.assert_array_equal(explored.speeds, still.speeds)
 
 
-def test_a_driver_that_remembers_nothing_drives_whoever_comes(simulation: Simulation) -> None:
+def test_a_driver_without_memory_drives_all_cavs(simulation: Simulation) -> None:
     function = FunctionDriver(lambda state: 0.1 * (state.leader_speed - state.speed))
     episode = run_episode(MERGE, function, (2,), simulation=simulation)
     for trajectory in episode.trajectories:
@@ -205,7 +205,7 @@ def test_a_driver_that_remembers_nothing_drives_whoever_comes(simulation: Simula
 
 
 @pytest.mark.parametrize("driver", [IDM(), ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=2)])
-def test_time_goes_on_while_no_cav_is_on_the_road(driver: Driver, simulation: Simulation) -> None:
+def test_time_continues_while_no_cav_is_on_the_road(driver: Driver, simulation: Simulation) -> None:
     lonely = Merge(cavs=1, standing_vehicles=0, horizon=150)
     episode = run_episode(lonely, driver, (3,), explore=True, simulation=simulation)
     (trajectory,) = episode.trajectories
@@ -215,7 +215,7 @@ def test_time_goes_on_while_no_cav_is_on_the_road(driver: Driver, simulation: Si
     assert {values.shape for values in episode.reward_terms.values()} == {(150,)}
 
 
-def test_where_no_cav_ever_comes_one_line_says_so(simulation: Simulation) -> None:
+def test_an_episode_without_cavs_is_an_error_in_one_line(simulation: Simulation) -> None:
     empty = Merge(penetration_rate=0.0, horizon=10)
     with pytest.raises(InputError, match="no CAV was on the road in 10 control steps"):
         run_episode(empty, Constant(), (0,), simulation=simulation)
@@ -232,7 +232,7 @@ def test_a_warmup_hands_over_the_cavs_that_are_on_the_road(simulation: Simulatio
     assert (~np.isnan(episode.speeds[0])).sum() > 15
 
 
-def test_a_collision_terminates_the_stays_that_it_ends_and_no_earlier_ones(simulation: Simulation) -> None:
+def test_a_collision_terminates_the_trips_that_it_ends_and_no_earlier_ones(simulation: Simulation) -> None:
     reckless = Merge(penetration_rate=0.5, actuation="raw", standing_vehicles=0)
     episode = run_episode(reckless, Constant(1.0), (1,), simulation=simulation)
     assert (episode.status, episode.collisions >= 2) == ("collision", True)
@@ -242,7 +242,7 @@ def test_a_collision_terminates_the_stays_that_it_ends_and_no_earlier_ones(simul
     assert episode.reward[-1] == 0.0
 
 
-def test_rows_of_those_who_stay_follow_who_leaves_and_enters(simulation: Simulation) -> None:
+def test_remaining_rows_follow_leaving_and_entering_cavs(simulation: Simulation) -> None:
     traffic = make_traffic(MERGE, (2,), simulation)
     traffic.start(is_controlled=True)
     moved = 0
@@ -270,7 +270,7 @@ def test_a_wrong_answer_is_refused_with_its_step(answer: Any, words: str, simula
         run_episode(everyone, FunctionDriver(answer), (0,), simulation=simulation)
 
 
-def test_fuel_and_places_are_recorded_only_when_asked_for_and_change_nothing_else(simulation: Simulation) -> None:
+def test_recording_fuel_and_poses_is_optional_and_changes_nothing_else(simulation: Simulation) -> None:
     short = replace(MERGE, horizon=40)
     plain, full = (
         run_episode(short, Counting(), (2,), record_details=asked, simulation=simulation) for asked in (False, True)

@@ -16,14 +16,14 @@ from unjam.worlds.audit import OVERRIDE_TOLERANCE
 from unjam.worlds.episode import run_episode
 
 
-def test_a_car_that_may_not_creep_is_not_one_that_had_to_be_braked() -> None:
+def test_preventing_creeping_is_not_an_override() -> None:
     road = FAMILY["ring-66-grown-4-cavs"].make_scenario().stratum(1, 10)
     row = measure(run_episode(replace(road, horizon=620), PISaturation(), make_test_seeds(2)[1]))
     assert 0.0 < row["shield_max_braking"] < OVERRIDE_TOLERANCE, "SUMO holds it, a micrometre from its place"
     assert (row["override_share"], row["shield_override_share"]) == (0.0, 0.0)
 
 
-def test_a_car_that_cannot_drive_as_fast_as_it_is_told_to_is_not_braked() -> None:
+def test_a_command_beyond_the_top_speed_is_not_an_override() -> None:
     road = Ring(vehicles=2, length=(1500, 1500), horizon=600)
     episode = run_episode(road, driver_from_name("constant:acceleration=0.9", 0.1), (1,))
     row = measure(episode)
@@ -31,7 +31,7 @@ def test_a_car_that_cannot_drive_as_fast_as_it_is_told_to_is_not_braked() -> Non
     assert (row["shield_max_braking"], row["override_share"], row["shield_override_share"]) == (0.0, 0.0, 0.0)
 
 
-def test_a_car_at_the_speed_limit_of_a_road_with_ends_is_not_braked() -> None:
+def test_a_command_beyond_the_speed_limit_is_not_an_override() -> None:
     changes = {"actuation": "shielded", "horizon": 60, "inflow": 600, "penetration_rate": 0.2, "peak": (0, 60)}
     episode = run_episode(make_scenario("on-ramp", changes), driver_from_name("constant:acceleration=1", 1.0), (1,))
     free = at_the_limit = 0
@@ -44,7 +44,7 @@ def test_a_car_at_the_speed_limit_of_a_road_with_ends_is_not_braked() -> None:
     assert free > at_the_limit > 5
 
 
-def test_what_a_filter_takes_from_an_acc_of_the_cars_own_is_not_taken_twice() -> None:
+def test_reductions_by_the_filter_before_an_own_acc_count_once() -> None:
     road = make_scenario("on-ramp", {"horizon": 100, "penetration_rate": 0.3, "safety.active": True, "peak": (0, 100)})
     episode = run_episode(road, driver_from_name("cruise", 1.0), (1,))
     assert max(each.filter_braking.max() for each in episode.trajectories) > 0.1

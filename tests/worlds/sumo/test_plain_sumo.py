@@ -120,9 +120,7 @@ def test_the_human_baseline_of_a_motorway_has_the_trips_of_plain_sumo(tmp_path: 
     check_same_trips(episode.trips, trips_of_plain_sumo(path, sumo_seed, 60.0))
 
 
-def test_flows_without_an_end_of_their_own_bring_as_many_vehicles_as_in_plain_sumo(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_flows_without_an_end_have_as_many_vehicles_as_in_plain_sumo(tmp_path: Path, simulation: Simulation) -> None:
     flow = '<flow id="f" type="car" route="along" begin="0" number="40" departSpeed="max"/>'
     path = straight(tmp_path, flow, end=120.0, step=0.5)
     command = [sumo_program("sumo"), "-c", str(path), *trip_options(tmp_path / "plain.xml")]
@@ -146,7 +144,7 @@ def test_trips_of_any_type_have_its_class(tmp_path: Path, simulation: Simulation
     assert episode.trips.vehicle_classes == ("passenger", "passenger", "bus", "truck")
 
 
-def test_a_type_cannot_keep_its_vehicles_out_of_the_trips(tmp_path: Path, simulation: Simulation) -> None:
+def test_a_vehicle_type_cannot_exclude_its_vehicles_from_the_trips(tmp_path: Path, simulation: Simulation) -> None:
     kind = '<vType id="hidden"><param key="has.tripinfo.device" value="false"/></vType>'
     vehicles = kind + '<vehicle id="v" type="hidden" route="along" depart="0"/>'
     episode, _ = human_baseline(straight(tmp_path, vehicles, step=0.5), simulation)

@@ -22,7 +22,7 @@ RAW = Ring(actuation="raw", horizon=1500, warmup=600)
 @pytest.mark.parametrize(
     ("vehicles", "length", "cavs"), [(5, 50, 1), (22, 220, 1), (22, 270, 3), (44, 440, 2), (44, 500, 3)]
 )
-def test_a_reckless_driver_touches_nobody_on_rings_of_all_kinds(
+def test_a_reckless_driver_has_no_contact_on_any_ring(
     vehicles: int, length: int, cavs: int, actuator: Actuator, simulation: Simulation
 ) -> None:
     ring = replace(RAW, vehicles=vehicles, length=(length, length), cavs=cavs, actuator=actuator)
@@ -35,7 +35,7 @@ def test_a_reckless_driver_touches_nobody_on_rings_of_all_kinds(
 
 
 @pytest.mark.parametrize("late", [Actuator(), Actuator(lag=0.3, delay=0.2)], ids=["at once", "late"])
-def test_sensors_that_err_and_miss_readings_touch_nobody(late: Actuator, simulation: Simulation) -> None:
+def test_there_is_no_contact_with_noisy_sensors_and_missing_readings(late: Actuator, simulation: Simulation) -> None:
     sensors, knows = Sensors(0.5, 0.5, dropout=0.3), SafetyFilter(gap_error=0.5, speed_error=0.5)
     ring = replace(RAW, cavs=2, sensors=sensors, safety=knows, actuator=late)
     episode = run_episode(ring, Constant(1.0), (3,), simulation=simulation)
@@ -46,7 +46,7 @@ def test_sensors_that_err_and_miss_readings_touch_nobody(late: Actuator, simulat
     np.testing.assert_array_equal(episode.speeds, again.speeds)
 
 
-def test_what_is_commanded_is_what_the_filter_lets_pass(simulation: Simulation) -> None:
+def test_the_command_is_the_output_of_the_filter(simulation: Simulation) -> None:
     episode = run_episode(RAW, Constant(1.0), (0,), simulation=simulation)
     (cav,) = episode.trajectories
     np.testing.assert_allclose(cav.applied_acceleration, 1.0 - cav.filter_braking, atol=1e-12)
@@ -54,7 +54,7 @@ def test_what_is_commanded_is_what_the_filter_lets_pass(simulation: Simulation) 
     np.testing.assert_allclose(cav.states.speed[1:], expected, atol=1e-9)
 
 
-def test_within_a_held_decision_every_simulation_step_is_filtered(simulation: Simulation) -> None:
+def test_every_simulation_step_of_a_control_step_is_filtered(simulation: Simulation) -> None:
     held = replace(RAW, steps_per_control_step=10, horizon=150)
     episode = run_episode(held, Constant(1.0), (0,), simulation=simulation)
     assert episode.audit.following.min_time_gap > 1.0
@@ -67,7 +67,7 @@ def test_sumo_overrides_no_command_in_following(road: Scenario, driver: Driver, 
     assert run_episode(road, driver, (1,), simulation=simulation).audit.following.override_share == 0.0
 
 
-def test_on_the_figure_eight_sumo_makes_cars_yield_and_that_is_told_apart(simulation: Simulation) -> None:
+def test_yielding_on_the_figure_eight_is_counted_separately(simulation: Simulation) -> None:
     found = run_episode(FigureEight(), PISaturation(catch_up_speed=8.0), (1,), simulation=simulation)
     followed = found.audit.following
     assert followed.override_share == 0.0
@@ -75,7 +75,7 @@ def test_on_the_figure_eight_sumo_makes_cars_yield_and_that_is_told_apart(simula
 
 
 @pytest.mark.long
-def test_people_on_a_published_merge_brake_as_no_car_can_and_elsewhere_they_do_not(simulation: Simulation) -> None:
+def test_human_braking_on_the_published_merge_is_infeasible_and_elsewhere_feasible(simulation: Simulation) -> None:
     published = run_episode(Merge(), IDM(), (0,), simulation=simulation)
     assert measure(published)["feasibility"] not in ("", FEASIBLE)
     assert published.audit.human_braking.max_braking > 9.0
@@ -84,7 +84,7 @@ def test_people_on_a_published_merge_brake_as_no_car_can_and_elsewhere_they_do_n
     assert honest.audit.human_braking.max_braking < published.audit.human_braking.max_braking
 
 
-def test_a_wider_floor_is_kept_and_no_floor_is_none(simulation: Simulation) -> None:
+def test_the_required_time_gap_is_kept_and_may_be_zero(simulation: Simulation) -> None:
     for floor in (0.0, 1.5):
         ring = replace(RAW, warmup=0, safety=SafetyFilter(time_gap=floor))
         headway = run_episode(ring, Constant(1.0), (0,), simulation=simulation).audit.following.min_time_gap

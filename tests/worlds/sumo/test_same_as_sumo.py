@@ -243,7 +243,7 @@ def test_options_that_change_the_traffic_change_it_as_in_sumo(
     assert speeds != speeds_of_sumo(plain, seed)
 
 
-def test_a_changed_file_that_another_includes_is_copied_anew(
+def test_a_changed_included_file_is_copied_again(
     network: str, tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files, inside = FORMS["included files"]
@@ -255,7 +255,7 @@ def test_a_changed_file_that_another_includes_is_copied_anew(
     assert before != after
 
 
-def test_an_episode_without_any_vehicle_is_no_result(network: str, tmp_path: Path, simulation: Simulation) -> None:
+def test_an_episode_without_vehicles_is_an_error(network: str, tmp_path: Path, simulation: Simulation) -> None:
     files: Files = {"r.xml": f"<routes>{TYPE}{ROUTE}{FLOW.replace('90', '9')}</routes>"}
     path = write(tmp_path, network, files, '<route-files value="r.xml"/><begin value="20"/>')
     with pytest.raises(InputError, match="no vehicle entered before 60 s; the first departs at 0 s; use --begin 0"):

@@ -42,7 +42,7 @@ def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, simulation: S
     np.testing.assert_array_equal(here.poses, apart.poses)
 
 
-def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, simulation: Simulation) -> None:
+def test_a_sandboxed_simulation_returns_the_same_results(road: Scenario, simulation: Simulation) -> None:
     asked = [(name, of) for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
     told = {"load", "step", "close", "command_speeds", "replace_speeds", "command_humans"}
     told |= {"take_control", "change_type", "end_with_trips", "is_in_contact", "teleport_count", "finish"}
@@ -62,7 +62,7 @@ def test_all_that_is_asked_of_a_simulation_is_answered_alike(road: Scenario, sim
         np.testing.assert_equal(answers[1][name], answer, name)
 
 
-def test_a_function_of_the_program_drives_where_it_is(road: Scenario, tmp_path: Path) -> None:
+def test_a_drivers_function_runs_in_its_own_process(road: Scenario, tmp_path: Path) -> None:
     seen = []
 
     def mine(state: LocalState) -> np.ndarray:
@@ -78,7 +78,7 @@ def test_a_function_of_the_program_drives_where_it_is(road: Scenario, tmp_path: 
 @pytest.mark.long
 @kept
 @pytest.mark.parametrize("option", WRITING)
-def test_what_sumo_might_be_brought_to_do_the_kernel_refuses(option: str, road: Scenario, tmp_path: Path) -> None:
+def test_the_kernel_refuses_that_sumo_writes(option: str, road: Scenario, tmp_path: Path) -> None:
     canary, files = tmp_path / "canary", sumo_inputs(road, road.draw_from_seed((0,))[0])
     canary.write_text("as it was")
     told = (*files.options, option.format(canary))
@@ -90,9 +90,7 @@ def test_what_sumo_might_be_brought_to_do_the_kernel_refuses(option: str, road: 
 
 @kept
 @pytest.mark.parametrize("option", WRITING)
-def test_sumo_as_a_child_of_its_own_and_its_window_write_nothing_either(
-    option: str, road: Scenario, tmp_path: Path
-) -> None:
+def test_sumo_over_traci_writes_nothing_either(option: str, road: Scenario, tmp_path: Path) -> None:
     canary, files = tmp_path / "canary", sumo_inputs(road, road.draw_from_seed((0,))[0])
     canary.write_text("as it was")
     told = (*files.options, option.format(canary))
@@ -114,7 +112,7 @@ def test_a_lost_process_is_an_error_in_one_line_and_leaves_nothing(road: Scenari
     assert not folder.exists()
 
 
-def test_it_outlives_the_thread_that_started_it(road: Scenario) -> None:
+def test_the_process_outlives_the_thread_that_started_it(road: Scenario) -> None:
     with ThreadPoolExecutor(1) as pool:
         apart = pool.submit(SandboxedSimulation).result()
     with apart:
@@ -122,6 +120,6 @@ def test_it_outlives_the_thread_that_started_it(road: Scenario) -> None:
         assert apart.type_of("1") == "car"
 
 
-def test_only_networks_of_others_run_apart(road: Scenario) -> None:
+def test_only_users_networks_are_sandboxed(road: Scenario) -> None:
     with open_simulation(Ring()) as here, open_simulation(Ring(), road) as apart:
         assert [type(here), type(apart)] == [Simulation, SandboxedSimulation]

@@ -58,7 +58,7 @@ def test_vehicles_are_counted_in_the_sections_of_their_lanes_and_not_in_junction
     assert sections.speed_limits.tolist() == [*[20.0] * 6, *[25.0] * 8, 10.0]
 
 
-def test_the_sections_ahead_follow_the_lanes_that_lead_along_the_route(sections: LaneSections) -> None:
+def test_the_sections_ahead_follow_the_lanes_of_the_route(sections: LaneSections) -> None:
     names = numbered(sections)
     ahead = sections.sections_ahead("a_1", 20.0, ("a", "b"))
     assert [names[each] for each in ahead] == ["a_1"] * 2 + ["b_1"] * 4 + [""] * (SECTIONS_AHEAD - 6)
@@ -77,21 +77,19 @@ def monitored(length: float, *, stop_line: bool) -> list[bool]:
     return LaneSections(simulation).is_monitored.tolist()
 
 
-def test_before_a_stop_line_no_congestion_is_reported_as_far_as_its_queue_may_reach() -> None:
+def test_no_congestion_is_reported_within_queue_length_of_a_stop_line() -> None:
     assert monitored(600.0, stop_line=False) == [True] * 12
     assert monitored(600.0, stop_line=True) == [True] * 2 + [False] * 10
     assert monitored(1200.0, stop_line=True) == [True] * 8 + [False] * 10
 
 
-def test_of_a_section_too_short_for_a_mean_no_congestion_is_reported() -> None:
+def test_no_congestion_is_reported_of_a_short_section() -> None:
     assert monitored(649.0, stop_line=False) == [True] * 12 + [False]
     assert monitored(651.0, stop_line=False) == [True] * 13
 
 
 @pytest.mark.parametrize("kind", ["traffic_light", "priority", "right_before_left"])
-def test_queues_at_signals_and_at_right_of_way_are_no_congestion(
-    kind: str, tmp_path: Path, simulation: Simulation
-) -> None:
+def test_queues_at_junctions_are_not_congestion(kind: str, tmp_path: Path, simulation: Simulation) -> None:
     scenario = make_scenario(str(grid(tmp_path, kind)), {"penetration_rate": 0.3})
     make_traffic(scenario, (1,), simulation)
     assert not LaneSections(simulation).is_monitored.any()
@@ -103,7 +101,7 @@ def test_a_motorway_is_monitored_where_ramps_join_and_leave(tmp_path: Path, simu
     assert LaneSections(simulation).is_monitored.mean() > 0.95, "all but pieces of a few meters"
 
 
-def test_who_must_change_lanes_is_told_of_the_lane_beside(sections: LaneSections) -> None:
+def test_sections_ahead_switch_to_the_adjacent_lane_of_the_route(sections: LaneSections) -> None:
     names = numbered(sections)
     assert [names[each] for each in sections.sections_ahead("a_1", 240.0, ("a", "ramp"))][:2] == ["a_1", "ramp_0"]
 
@@ -121,7 +119,7 @@ def told(scenario: Any, simulation: Simulation) -> tuple[UserNetworkTraffic, Any
     return traffic, traffic.local_state()
 
 
-def test_a_cav_is_told_how_fast_its_lane_is_ahead(jammed: Any, simulation: Simulation) -> None:
+def test_a_cav_observes_the_speed_of_its_lane_ahead(jammed: Any, simulation: Simulation) -> None:
     _, state = told(jammed, simulation)
     own, van, other = simulation.speeds(["0", "1", "2"])
     expected = [own, 20.0, 20.0, 20.0, (van + other) / 2, *[20.0] * 6]
@@ -130,19 +128,19 @@ def test_a_cav_is_told_how_fast_its_lane_is_ahead(jammed: Any, simulation: Simul
     assert state.leader_gap[0] == 100.0, "nobody is near: only the message tells of the jam"
 
 
-def test_who_is_held_back_knows_what_is_allowed_all_the_same(jammed: Any, simulation: Simulation) -> None:
+def test_a_set_speed_cap_does_not_change_the_observed_allowed_speed(jammed: Any, simulation: Simulation) -> None:
     traffic, _ = told(jammed, simulation)
     simulation.set_max_speed("0", 6.0)
     assert traffic._local_states(["0"]).allowed_speed.tolist() == [20.0]
 
 
-def test_who_does_not_ask_is_told_nothing(jammed: Any, simulation: Simulation) -> None:
+def test_roadside_information_is_only_provided_if_required(jammed: Any, simulation: Simulation) -> None:
     traffic = make_traffic(jammed, (1,), simulation)
     traffic.start(is_controlled=True)
     assert traffic.local_state().lane_speeds is None
 
 
-def test_a_function_of_ones_own_is_told_too(jammed: Any, simulation: Simulation) -> None:
+def test_a_users_function_gets_roadside_information(jammed: Any, simulation: Simulation) -> None:
     def steady(state: LocalState) -> Any:
         return 0.2 * (state.lane_speeds[:, 4] - state.speed)
 
@@ -161,7 +159,7 @@ QUEUE = (
 
 
 @pytest.mark.long
-def test_a_cav_slows_down_for_congestion_that_it_cannot_see(tmp_path: Path, simulation: Simulation) -> None:
+def test_a_cav_slows_down_for_congestion_beyond_its_sensors(tmp_path: Path, simulation: Simulation) -> None:
     changes = {"cav_types": ("van",), "horizon": 5000, "actuation": "cruise", "safety.active": False}
     scenario = make_scenario(str(straight(tmp_path, QUEUE, 2500.0, 500.0)), changes)
     careful, free = (
@@ -174,7 +172,7 @@ def test_a_cav_slows_down_for_congestion_that_it_cannot_see(tmp_path: Path, simu
     assert of_acc > 14.0
 
 
-def test_an_episode_that_begins_in_a_jam_holds_no_cav_back(jammed: Any, simulation: Simulation) -> None:
+def test_an_episode_that_starts_in_a_jam_has_no_cap(jammed: Any, simulation: Simulation) -> None:
     first, second = (
         run_episode(jammed, driver, (1,), simulation=simulation).trajectories[0].states
         for driver in (JamAhead(first_section=4, last_section=4, speed_margin=0.0, margin_by_penetration=0.0), Cruise())
@@ -182,7 +180,7 @@ def test_an_episode_that_begins_in_a_jam_holds_no_cav_back(jammed: Any, simulati
     assert first.speed.tolist() == second.speed.tolist()
 
 
-def test_a_message_of_ones_own_road_is_late_as_asked(jammed: Any, simulation: Simulation) -> None:
+def test_roadside_messages_have_the_configured_latency(jammed: Any, simulation: Simulation) -> None:
     traffic, first = told(replace(jammed, roadside=RoadsideSettings(latency=2.0)), simulation)
     for _ in range(10):
         traffic.advance(Command(np.zeros(1)))

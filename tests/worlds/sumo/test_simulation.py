@@ -33,13 +33,13 @@ def test_a_second_simulation_in_one_process_is_refused(simulation: Simulation) -
     assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
 
 
-def test_a_refused_simulation_does_not_make_room_for_a_third(simulation: Simulation) -> None:
+def test_a_refused_simulation_does_not_release_libsumo(simulation: Simulation) -> None:
     for _ in range(2):
         with pytest.raises(UnjamError):
             Simulation()
 
 
-def test_simulations_over_traci_run_beside_it_without_disturbing_it(simulation: Simulation) -> None:
+def test_simulations_over_traci_do_not_disturb_it(simulation: Simulation) -> None:
     expected = run_episode(RING, IDM(), (0,), simulation=simulation)
     with Simulation("traci") as first, Simulation("traci") as second:
         traffics = [make_traffic(RING, (0,), each) for each in (simulation, first, second)]
@@ -53,7 +53,7 @@ def test_simulations_over_traci_run_beside_it_without_disturbing_it(simulation: 
     np.testing.assert_array_equal(again.speeds, expected.speeds)
 
 
-def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: SumoInputs) -> None:
+def test_closing_twice_releases_libsumo(road: SumoInputs) -> None:
     first = Simulation()
     first.load(road, 0.1, 0)
     first.close()
@@ -66,7 +66,7 @@ def test_closing_twice_is_fine_and_makes_room_for_a_new_one(road: SumoInputs) ->
             Simulation()
 
 
-def test_one_that_never_ran_can_be_closed() -> None:
+def test_an_unused_simulation_can_be_closed() -> None:
     Simulation().close()
     Simulation().close()
 
@@ -90,7 +90,7 @@ def test_an_error_inside_the_block_closes_it(road: SumoInputs) -> None:
     Simulation().close()
 
 
-def test_loading_puts_every_vehicle_in_its_place_at_rest(road: SumoInputs, simulation: Simulation) -> None:
+def test_loading_inserts_every_vehicle_at_rest(road: SumoInputs, simulation: Simulation) -> None:
     simulation.load(road, 0.1, 0)
     assert simulation.vehicle_count() == 22
     ids = RING.draw(np.random.default_rng(0)).vehicle_ids
@@ -111,7 +111,7 @@ BROKEN_TRAFFIC = {
 @pytest.mark.long
 @pytest.mark.parametrize("loaded_before", [False, True])
 @pytest.mark.parametrize(("traffic", "words"), BROKEN_TRAFFIC.items())
-def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
+def test_sumos_message_about_broken_traffic_is_reported_in_one_line(
     loaded_before: bool, traffic: str, words: str, road: SumoInputs, simulation: Simulation
 ) -> None:
     if loaded_before:
@@ -122,7 +122,7 @@ def test_sumos_own_words_about_broken_traffic_reach_the_user_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_sumos_own_words_come_from_the_child_process_too(road: SumoInputs) -> None:
+def test_sumos_message_is_reported_over_traci_too(road: SumoInputs) -> None:
     for traffic, words in list(BROKEN_TRAFFIC.items())[:2]:
         with Simulation("traci") as simulation, pytest.raises(EpisodeError) as caught:
             simulation.load(road._replace(traffic_xml=traffic), 0.1, 0)
@@ -137,7 +137,7 @@ BROKEN_ROADS = {
 
 
 @pytest.mark.parametrize(("change", "words"), BROKEN_ROADS.items())
-def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
+def test_netconverts_message_about_a_broken_road_is_reported_in_one_line(
     change: tuple[str, Any], words: str, road: SumoInputs
 ) -> None:
     with pytest.raises(EpisodeError) as caught:
@@ -146,7 +146,7 @@ def test_netconverts_own_words_about_a_broken_road_reach_the_user_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_an_error_names_its_own_reason_and_not_an_earlier_one(road: SumoInputs, simulation: Simulation) -> None:
+def test_an_error_has_its_own_reason_and_not_an_earlier_one(road: SumoInputs, simulation: Simulation) -> None:
     for traffic, words in BROKEN_TRAFFIC.items():
         with pytest.raises(EpisodeError) as caught:
             simulation.load(road._replace(traffic_xml=traffic), 0.1, 0)
@@ -167,7 +167,7 @@ def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: 
         assert fingerprint(run_episode(RING, IDM(), (0,), simulation=simulation)) == fingerprint(expected)
 
 
-def test_an_unknown_emission_class_is_told_in_sumos_words(simulation: Simulation) -> None:
+def test_an_unknown_emission_class_is_reported_with_sumos_message(simulation: Simulation) -> None:
     with pytest.raises(EpisodeError, match="emissionClass with name 'coal' doesn't exist"):
         run_episode(replace(RING, emission_class="coal"), IDM(), (0,), simulation=simulation)
 
@@ -201,7 +201,7 @@ def broken(folder: Path, network: str, vehicles: str) -> Path:
         ("whole", '<vehicle id="v" depart="0"><route edges="moon"/></vehicle>', "moon"),
     ],
 )
-def test_what_sumo_refuses_of_the_users_own_network_is_told_in_one_line_and_the_next_episode_runs(
+def test_sumos_refusal_of_a_users_network_is_reported_in_one_line_and_the_next_episode_runs(
     network: str, vehicles: str, words: str, tmp_path: Path, simulation: Simulation
 ) -> None:
     scenario = make_scenario(str(broken(tmp_path, network, vehicles)), {"penetration_rate": 1.0})
@@ -212,7 +212,7 @@ def test_what_sumo_refuses_of_the_users_own_network_is_told_in_one_line_and_the_
     assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
 
 
-def test_over_traci_sumo_is_reached_from_this_machine_alone_once_we_are_there(road: SumoInputs) -> None:
+def test_sumo_over_traci_does_not_accept_connections_from_other_machines(road: SumoInputs) -> None:
     """SUMO has no option to listen on loopback alone: it must stop to listen once its one client is there."""
     with Simulation("traci") as simulation:
         simulation.load(road, 0.1, 1)
@@ -222,9 +222,7 @@ def test_over_traci_sumo_is_reached_from_this_machine_alone_once_we_are_there(ro
     assert all(each.status != psutil.CONN_LISTEN for each in connections)
 
 
-def test_a_temporary_folder_whose_name_sumo_would_take_apart_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_temporary_folder_with_a_comma_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "a,b"))
     with pytest.raises(InputError, match=r"TMPDIR: .*a,b' is not allowed; allowed: a folder without ,"):
         Simulation()

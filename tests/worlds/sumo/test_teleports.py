@@ -69,7 +69,7 @@ def driven(simulation: Simulation, file: Path, share: float) -> tuple[Episode, i
 
 
 @pytest.mark.parametrize("share", [1e-9, 1.0])
-def test_they_count_on_the_road_and_off_it_until_they_arrive(
+def test_teleported_vehicles_count_in_the_backlog_until_they_arrive(
     share: float, blocked: Path, simulation: Simulation
 ) -> None:
     episode, count = driven(simulation, blocked, share)
@@ -81,7 +81,7 @@ def test_they_count_on_the_road_and_off_it_until_they_arrive(
     assert measure(episode)["teleports"] == episode.teleports
 
 
-def test_a_cav_that_is_put_back_is_driven_again(blocked: Path, simulation: Simulation) -> None:
+def test_a_reinserted_cav_is_driven_again(blocked: Path, simulation: Simulation) -> None:
     episode, _ = driven(simulation, blocked, 1.0)
     stays = Counter(each.vehicle for each in episode.trajectories)
     again = [name for name, count in stays.items() if count > 1]
@@ -96,7 +96,7 @@ def test_a_cav_that_is_put_back_is_driven_again(blocked: Path, simulation: Simul
     assert sum(told) > 100, "with 0.3 m/s2 for half a second, where nobody is in its way"
 
 
-def test_who_drives_is_told_of_them(blocked: Path, tmp_path: Path) -> None:
+def test_teleports_are_reported(blocked: Path, tmp_path: Path) -> None:
     (note,) = unjam.drive(
         str(blocked),
         ["human"],

@@ -47,12 +47,12 @@ def test_personal_cars_are_demand_and_become_cavs(how: str, kind: str, tmp_path:
     assert len(episode.cav_ids) >= 3
 
 
-def test_persons_who_bring_no_vehicle_are_no_demand(tmp_path: Path) -> None:
+def test_persons_without_a_vehicle_are_not_demand(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="have no vehicle, trip, flow or personal car"):
         read_sumo_files(two_edges(tmp_path, PERSONS.format(how='modes="public"')))
 
 
-def test_vehicles_of_a_calibrator_alone_are_waited_for_as_in_sumo(tmp_path: Path, simulation: Simulation) -> None:
+def test_an_episode_waits_for_vehicles_of_calibrators_as_sumo_does(tmp_path: Path, simulation: Simulation) -> None:
     file = straight(tmp_path, "", end=300.0, step=0.5, options='<additional-files value="more.add.xml"/>')
     (tmp_path / "more.add.xml").write_text(f'<additional><vType id="slow" speedDev="0"/>{CALIBRATOR}</additional>')
     scenario = make_scenario(str(file), {"penetration_rate": 1.0})
@@ -65,7 +65,7 @@ def test_vehicles_of_a_calibrator_alone_are_waited_for_as_in_sumo(tmp_path: Path
     assert len(run_episode(scenario, IDM(), (1,), simulation=simulation).cav_ids) > 5
 
 
-def test_a_calibrator_of_speeds_brings_nobody(tmp_path: Path) -> None:
+def test_a_calibrator_of_speeds_adds_no_vehicles(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="have no vehicle"):
         read_sumo_files(Path(network(tmp_path, "", SPEEDS)))
 
@@ -77,7 +77,7 @@ BROKEN = (
 )
 
 
-def test_only_the_very_first_task_is_an_answer_for_all(tmp_path: Path) -> None:
+def test_only_an_error_of_the_first_task_ends_a_run(tmp_path: Path) -> None:
     for name, demand in (("good", BROKEN.partition("<trip")[0]), ("bad", BROKEN)):
         (tmp_path / name).mkdir()
         straight(tmp_path / name, demand, end=1000.0, step=1.0)
@@ -92,7 +92,7 @@ def test_only_the_very_first_task_is_an_answer_for_all(tmp_path: Path) -> None:
         workers.run([bad, good])
 
 
-def test_workers_are_told_what_was_read_of_the_files(tmp_path: Path) -> None:
+def test_workers_get_the_content_of_the_files(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="50" period="9"/>')
     task = EpisodeTask(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,))
     answer = json.loads(json.dumps(sumo_files.answer_of(str(file))))

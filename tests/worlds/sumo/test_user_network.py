@@ -62,7 +62,7 @@ def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(file: Path
     assert fingerprint(there) == fingerprint(again) == fingerprint(here) == fingerprint(travelled(here))
 
 
-def test_the_same_vehicles_are_cavs_whoever_drives(file: Path, simulation: Simulation) -> None:
+def test_the_same_vehicles_are_cavs_for_every_driver(file: Path, simulation: Simulation) -> None:
     scenario = scenario_of(file)
     slow, fast, human = (
         run_episode(scenario, driver, (0,), simulation=simulation) for driver in (Constant(-0.2), IDM(), Human())
@@ -81,7 +81,7 @@ def stayed(episode: Any, name: str) -> int:
 
 
 @pytest.mark.long
-def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path) -> None:
+def test_penetration_rate_and_cav_types_select_the_cavs(tmp_path: Path) -> None:
     file = game(tmp_path, "ramp")
     episode = run_episode(scenario_of(file, penetration_rate=0.3, horizon=600), Human(), (0,))
     share = len(episode.cav_ids) / len(episode.vehicle_ids)
@@ -94,13 +94,13 @@ def test_a_share_is_about_that_share_and_types_are_all_of_theirs(tmp_path: Path)
                 kinds.setdefault(name, libsumo.vehicle.getTypeID(name))
             traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
         assert {name for name, kind in kinds.items() if "truck" in kind} >= set(traffic.cav_ids)
-        driven = {name for moment in traffic._trip_log.cav_ids for name in moment}
-        there = set(traffic._traffic_log.names) | driven
+        driven = {name for moment in traffic._log.trips.cav_ids for name in moment}
+        there = set(traffic._log.traffic.names) | driven
         assert driven == {name for name in there if "truck" in kinds.get(name, "")} != set()
 
 
 @pytest.mark.long
-def test_calibrated_people_drive_the_cars_and_the_same_vehicles_stay_cavs(tmp_path: Path) -> None:
+def test_calibrated_drivers_drive_the_cars_and_the_same_vehicles_are_cavs(tmp_path: Path) -> None:
     file, people = game(tmp_path, "ramp"), tmp_path / "drivers.json"
     near, far = IDMParameters(time_headway=0.8), IDMParameters(time_headway=3.0, minimum_gap=6.0)
     write_population(people, Population(near, (near, far), (-9.0, 3.0)))
@@ -123,7 +123,7 @@ def test_calibrated_people_drive_the_cars_and_the_same_vehicles_stay_cavs(tmp_pa
     assert not seen.get("truck", set()) & seen["passenger"]
 
 
-def test_a_population_with_a_residual_is_refused_where_sumo_drives(tmp_path: Path) -> None:
+def test_a_population_with_a_residual_is_refused_on_a_users_network(tmp_path: Path) -> None:
     residual = Network(((np.zeros((3, 1)), np.zeros(1)),), 0.5)
     one, people = IDMParameters(), tmp_path / "drivers.json"
     write_population(people, Population(one, (one,), (-9.0, 3.0), residual))
@@ -133,7 +133,7 @@ def test_a_population_with_a_residual_is_refused_where_sumo_drives(tmp_path: Pat
         make_scenario("ring", {"population": str(people), "human_control": "native"})
 
 
-def test_everyone_may_be_a_cav_and_nobody(file: Path, simulation: Simulation) -> None:
+def test_all_vehicles_or_none_may_be_cavs(file: Path, simulation: Simulation) -> None:
     everyone = run_episode(scenario_of(file, penetration_rate=1.0, horizon=60), IDM(), (0,), simulation=simulation)
     there = [name for name in everyone.vehicle_ids if stayed(everyone, name) > 1]
     assert set(everyone.cav_ids) == set(there)
@@ -141,7 +141,7 @@ def test_everyone_may_be_a_cav_and_nobody(file: Path, simulation: Simulation) ->
         run_episode(scenario_of(file, penetration_rate=1e-9, horizon=5), IDM(), (0,), simulation=simulation)
 
 
-def test_cavs_are_never_faster_than_allowed_but_while_they_brake(file: Path, simulation: Simulation) -> None:
+def test_cavs_exceed_the_allowed_speed_only_while_braking(file: Path, simulation: Simulation) -> None:
     traffic = own(simulation, file)
     compared, brakes = 0, traffic.scenario.safety.braking
     for _ in range(200):
@@ -187,7 +187,7 @@ COLUMN = "".join(
 )
 
 
-def test_neighbours_on_one_lane_are_those_of_the_positions(tmp_path: Path, simulation: Simulation) -> None:
+def test_neighbors_on_one_lane_agree_with_the_positions(tmp_path: Path, simulation: Simulation) -> None:
     traffic = own(simulation, straight(tmp_path, COLUMN), penetration_rate=1.0, horizon=400)
     generator = np.random.default_rng(0)
     lengths = {name: 7.0 if int(name) % 3 == 1 else 5.0 for name in "01234"}
@@ -234,7 +234,7 @@ def test_a_command_holds_for_its_step_whatever_the_configuration_says(tmp_path: 
     np.testing.assert_allclose(np.diff(trajectory.states.speed), 0.07, atol=1e-9)
 
 
-def test_a_heavy_vehicle_stays_so_as_a_cav(tmp_path: Path) -> None:
+def test_a_heavy_vehicle_keeps_its_properties_as_a_cav(tmp_path: Path) -> None:
     one = '<vehicle id="v" type="van" route="along" depart="0"/>'
     file = straight(tmp_path, one)
     demand = tmp_path / "demand.rou.xml"
@@ -253,7 +253,7 @@ def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, simul
     assert not any(trajectory.terminated for trajectory in episode.trajectories)
 
 
-def test_flow_is_not_decided_by_who_arrives_last(tmp_path: Path, simulation: Simulation) -> None:
+def test_the_flow_does_not_depend_on_the_last_arrival(tmp_path: Path, simulation: Simulation) -> None:
     vehicles = '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>'
     scenario = make_scenario(str(straight(tmp_path, vehicles, 800.0, 120.0)), {"penetration_rate": 1.0})
     one, other = (run_episode(scenario, driver, (0,), simulation=simulation) for driver in (Human(), Constant(0.3)))
@@ -261,7 +261,7 @@ def test_flow_is_not_decided_by_who_arrives_last(tmp_path: Path, simulation: Sim
     assert measure(other)["outflow_veh_per_h"] == measure(one)["outflow_veh_per_h"] == 10 * 3600.0 / 120.0
 
 
-def test_who_waits_long_to_enter_is_not_forgotten(tmp_path: Path, simulation: Simulation) -> None:
+def test_vehicles_with_a_long_insertion_delay_are_not_dropped(tmp_path: Path, simulation: Simulation) -> None:
     vehicles = '<flow id="f" type="van" route="along" begin="0" end="30" period="0.2" departSpeed="0"/>'
     file = straight(tmp_path, vehicles)
     file.write_text(file.read_text().replace("<end ", '<max-depart-delay value="5"/><end '))
@@ -269,7 +269,7 @@ def test_who_waits_long_to_enter_is_not_forgotten(tmp_path: Path, simulation: Si
     assert len(episode.vehicle_ids) + episode.backlog[-1] == 150
 
 
-def test_flows_without_an_end_go_on_until_the_end_that_is_asked_for(tmp_path: Path, simulation: Simulation) -> None:
+def test_flows_without_an_end_last_until_the_given_end(tmp_path: Path, simulation: Simulation) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" period="5"/>', end=30.0)
     asked = [{}, {"end": 100.0}, {"end": 100.0, "begin": 0.0}, {"horizon": 1000}]
     roads = [make_scenario(str(file), {"penetration_rate": 0.5, **each}) for each in asked]
@@ -279,7 +279,7 @@ def test_flows_without_an_end_go_on_until_the_end_that_is_asked_for(tmp_path: Pa
     assert counts[1] >= 20
 
 
-def test_people_who_touch_people_are_counted_once_each_and_end_nothing(
+def test_collisions_of_human_driven_vehicles_count_once_each_and_do_not_end_the_episode(
     tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
@@ -292,7 +292,7 @@ def test_people_who_touch_people_are_counted_once_each_and_end_nothing(
     assert "contact" not in feasibility(row)
 
 
-def test_an_episode_is_measured_without_complaint(file: Path, simulation: Simulation) -> None:
+def test_all_metrics_of_an_episode_are_computed(file: Path, simulation: Simulation) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for horizon in (2, 200):
@@ -310,7 +310,7 @@ def test_an_episode_is_measured_without_complaint(file: Path, simulation: Simula
     assert row["fuel_ml_per_km"] > 20
 
 
-def test_lanes_count_from_the_left_and_are_those_that_sumo_says(tmp_path: Path, simulation: Simulation) -> None:
+def test_lanes_are_those_of_sumo_counted_from_the_left(tmp_path: Path, simulation: Simulation) -> None:
     traffic = own(simulation, game(tmp_path, "ramp"))
     for _ in range(60):
         traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
@@ -330,7 +330,7 @@ def test_lanes_count_from_the_left_and_are_those_that_sumo_says(tmp_path: Path, 
     assert len(seen) > 1
 
 
-def test_positions_are_along_the_route_that_most_drive(file: Path, simulation: Simulation) -> None:
+def test_positions_are_along_the_most_frequent_route(file: Path, simulation: Simulation) -> None:
     episode = run_episode(scenario_of(file), Human(), (0,), record_details=True, simulation=simulation)
     assert np.isnan(run_episode(scenario_of(file), Human(), (0,), simulation=simulation).positions).all()
     there = ~np.isnan(episode.positions)
@@ -345,7 +345,7 @@ def test_positions_are_along_the_route_that_most_drive(file: Path, simulation: S
     assert np.mean(close < 1e-3) > 0.6
 
 
-def test_a_warmup_runs_before_the_first_decision(file: Path, simulation: Simulation) -> None:
+def test_a_warm_up_runs_before_the_first_control_step(file: Path, simulation: Simulation) -> None:
     cold = run_episode(scenario_of(file, horizon=100), Human(), (1,), simulation=simulation)
     warm = run_episode(scenario_of(file, horizon=40, warmup=60), Human(), (1,), simulation=simulation)
     for name in warm.vehicle_ids:
@@ -354,7 +354,7 @@ def test_a_warmup_runs_before_the_first_decision(file: Path, simulation: Simulat
             np.testing.assert_array_equal(warm.speeds[:, column], cold.speeds[60:, other])
 
 
-def test_a_vehicle_that_sumo_refuses_later_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_vehicle_that_sumo_refuses_later_is_reported_in_one_line(tmp_path: Path) -> None:
     late = COLUMN + '<vehicle id="v" type="ghost" route="along" depart="300"/>'
     scenario = scenario_of(straight(tmp_path, late, end=1000.0), penetration_rate=1.0, horizon=5000)
     with WorkerPool(1) as workers, pytest.raises(SumoInputError, match="ghost") as refused:
@@ -362,7 +362,7 @@ def test_a_vehicle_that_sumo_refuses_later_is_told_in_one_line(tmp_path: Path) -
     assert "\n" not in str(refused.value)
 
 
-def test_what_sumo_refuses_on_the_way_is_told_in_one_line(tmp_path: Path) -> None:
+def test_an_error_of_sumo_during_the_episode_is_reported_in_one_line(tmp_path: Path) -> None:
     flow = '<flow id="f" type="car" from="road" to="road" begin="0" end="690" period="9"/>'
     late = flow + '<trip id="w" type="car" from="road" to="road" depart="690"/>'  # so far SUMO reads ahead
     late += '<trip id="v" type="car" from="road" to="road" depart="700" departPos="nowhere"/>'
@@ -377,7 +377,7 @@ def test_what_sumo_refuses_on_the_way_is_told_in_one_line(tmp_path: Path) -> Non
         run_episode(task.scenario, task.driver, task.seed)
 
 
-def test_what_sumo_says_before_it_has_a_log_is_told(tmp_path: Path) -> None:
+def test_sumos_messages_before_it_has_a_log_are_reported(tmp_path: Path) -> None:
     file = straight(tmp_path, COLUMN)
     demand = tmp_path / "demand.rou.xml"
     demand.write_text(demand.read_text().replace('id="van"', 'id="van" emissionClass="PHEMlight5/none"'))
@@ -386,7 +386,7 @@ def test_what_sumo_says_before_it_has_a_log_is_told(tmp_path: Path) -> None:
         workers.run([EpisodeTask(scenario_of(file, penetration_rate=1.0, horizon=5), IDM(), (0,))])
 
 
-def test_of_a_network_that_is_made_again_pictures_show_the_new_one(tmp_path: Path, simulation: Simulation) -> None:
+def test_figures_show_a_network_that_was_made_again(tmp_path: Path, simulation: Simulation) -> None:
     for length in (500.0, 800.0):
         scenario = scenario_of(straight(tmp_path, COLUMN, length), penetration_rate=1.0, horizon=5)
         episode = run_episode(scenario, IDM(), (0,), simulation=simulation, record_details=True)
@@ -416,9 +416,7 @@ def test_a_network_that_breaks_later_fails_its_episode_and_nothing_else(tmp_path
     assert mended.status == "completed"
 
 
-def test_who_drives_fast_stops_behind_who_stands_beyond_what_drivers_see(
-    tmp_path: Path, simulation: Simulation
-) -> None:
+def test_a_fast_cav_stops_behind_a_standing_vehicle_beyond_sensor_range(tmp_path: Path, simulation: Simulation) -> None:
     stands = '<vehicle id="stands" type="van" route="along" depart="0" departPos="900"><stop lane="road_0" '
     stands += 'endPos="905" duration="100"/></vehicle>'
     fast = '<vehicle id="fast" type="car" route="along" depart="1" departSpeed="max"/>'

@@ -66,7 +66,7 @@ def test_human_only_traffic_is_that_of_plain_sumo_whatever_the_penetration_rate(
 
 
 @pytest.mark.long
-def test_junctions_are_checked_where_the_configuration_asks_for_it(tmp_path: Path, simulation: Simulation) -> None:
+def test_junctions_are_checked_if_configured(tmp_path: Path, simulation: Simulation) -> None:
     episode = human(crossing(tmp_path, WARN + '<collision.check-junctions value="true"/>'), simulation)
     assert episode.status == "completed"
     assert episode.collisions > 0
@@ -80,7 +80,7 @@ def test_vehicles_that_are_removed_after_a_collision_have_not_arrived(tmp_path: 
 
 
 @pytest.mark.parametrize("settings", ["", WARN, NONE])
-def test_a_cav_in_a_collision_ends_the_episode_also_where_sumo_counts_none(
+def test_a_collision_of_a_cav_ends_the_episode_even_if_sumo_counts_none(
     settings: str, tmp_path: Path, simulation: Simulation
 ) -> None:
     vehicles = (
@@ -99,7 +99,7 @@ def test_a_cav_in_a_collision_ends_the_episode_also_where_sumo_counts_none(
 
 
 @pytest.mark.parametrize("most", [0, 1, 100])
-def test_as_many_teleports_as_the_configuration_allows_are_the_last(
+def test_an_episode_ends_beyond_the_configured_number_of_teleports(
     most: int, tmp_path: Path, simulation: Simulation
 ) -> None:
     file = standing(tmp_path, f'<max-num-teleports value="{most}"/>')

@@ -72,7 +72,7 @@ PASSENGERS = (
     ],
     ids=["drawn", "distribution", "vehicle", "truck", "limits", "action step", "lateral", "bus", "nested", "mix"],
 )
-def test_acc_vehicles_with_the_law_of_their_vehicles_change_nothing(
+def test_acc_vehicles_with_the_model_of_their_vehicles_change_nothing(
     demand: str, more: str, options: str, tmp_path: Path, simulation: Simulation
 ) -> None:
     file = network(tmp_path, demand.replace("{law}", LAW), more, options)
@@ -133,7 +133,7 @@ def test_commands_cannot_exceed_the_limits_of_the_vehicle(
 
 
 @pytest.mark.parametrize(("vehicle", "most"), [(TRUCK, 0.5), (CAR, 2.6)])
-def test_a_set_speed_makes_a_vehicle_accelerate_as_asked_within_its_limits(
+def test_a_set_speed_makes_a_vehicle_accelerate_as_commanded_within_its_limits(
     vehicle: str, most: float, tmp_path: Path, simulation: Simulation
 ) -> None:
     file = network(tmp_path, vehicle + ONE)
@@ -145,7 +145,7 @@ def test_a_set_speed_makes_a_vehicle_accelerate_as_asked_within_its_limits(
 
 
 @pytest.mark.parametrize(("set_to", "found"), [({}, 0.5), ({"cruise.acceleration": 1.5}, 1.5)])
-def test_the_acc_has_another_acceleration_only_where_it_is_given_one(
+def test_the_acc_has_another_acceleration_only_if_configured(
     set_to: dict[str, float], found: float, tmp_path: Path, simulation: Simulation
 ) -> None:
     file = network(tmp_path, TRUCK + ONE)

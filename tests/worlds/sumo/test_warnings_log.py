@@ -19,7 +19,7 @@ def stop(number: int) -> str:
     return STOP.replace("'%'", f"'car.{number}'").replace("stage=%", "stage=move").replace("=%", f"={number}.50")
 
 
-def test_messages_of_a_kind_differ_in_names_values_and_numbers_alone(tmp_path: Path) -> None:
+def test_messages_of_a_kind_differ_only_in_names_values_and_numbers(tmp_path: Path) -> None:
     assert warning_kind(stop(1)) == warning_kind(stop(20)) == STOP
     log = tmp_path / "error.log"
     log.write_text(f"Warning: {stop(1)}\nWarning: {stop(2)}\nError: No route\n  from 'a'\n")
@@ -40,7 +40,7 @@ def test_the_totals_that_sumo_writes_at_the_end_are_counts_of_examples(tmp_path:
     assert {each.example: each.count for each in read_warnings(log)} == {stop(1): 900_000, other: 1}
 
 
-def test_what_is_read_of_a_log_is_bounded(tmp_path: Path) -> None:
+def test_the_size_of_a_log_that_is_read_is_limited(tmp_path: Path) -> None:
     log = tmp_path / "error.log"
     log.write_text(f"Warning: {'long ' * 200}\n" + "".join(f"Warning: {stop(n)}\n" for n in range(40_000)))
     assert log.stat().st_size > 2 * MAX_LOG_BYTES
@@ -49,12 +49,12 @@ def test_what_is_read_of_a_log_is_bounded(tmp_path: Path) -> None:
     assert 5_000 < many.count < 20_000
 
 
-def test_a_log_that_is_missing_holds_no_warnings(tmp_path: Path) -> None:
+def test_a_missing_log_has_no_warnings(tmp_path: Path) -> None:
     assert read_warnings(tmp_path / "none.log") == ()
 
 
 @pytest.mark.parametrize("backend", ["libsumo", pytest.param("traci", marks=pytest.mark.long)])
-def test_an_episode_has_the_warnings_of_its_own_and_of_no_other(backend: str, tmp_path: Path) -> None:
+def test_an_episode_has_only_its_own_warnings(backend: str, tmp_path: Path) -> None:
     for name in ("unsorted", "sorted"):
         (tmp_path / name).mkdir()
     unsorted = straight(tmp_path / "unsorted", UNSORTED)
@@ -72,7 +72,7 @@ def test_an_episode_has_the_warnings_of_its_own_and_of_no_other(backend: str, tm
     assert len({len(episode.vehicle_ids) for episode in found}) == 1
 
 
-def test_teleports_are_counted_and_not_warned_of_again(tmp_path: Path, simulation: Simulation) -> None:
+def test_teleports_are_counted_and_not_listed_as_warnings(tmp_path: Path, simulation: Simulation) -> None:
     file = straight(tmp_path, STANDING, end=90.0, step=0.5, options=TELEPORTS)
     episode = run_episode(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,), simulation=simulation)
     assert episode.teleports > 0
@@ -88,7 +88,7 @@ def test_teleports_are_counted_and_not_warned_of_again(tmp_path: Path, simulatio
         ("on-ramp", {"horizon": 60, "penetration_rate": 0.3}),
     ],
 )
-def test_sumo_warns_of_nothing_on_the_built_in_roads(
+def test_there_are_no_warnings_on_the_built_in_roads(
     road: str, changes: dict[str, object], simulation: Simulation
 ) -> None:
     scenario = make_scenario(road, changes)

@@ -1,8 +1,7 @@
-"""How SUMO is reached: the only module that imports libsumo or traci.
+"""The access to SUMO: the only module that imports libsumo or traci.
 
-Both libraries keep state of the whole process, in which the user may run a simulation of their own: it is
-never closed, stepped, or replaced, and the user's TraCI connection stays the active one. The records of what
-SUMO answers are here, too.
+Both libraries keep state of the whole process, in which the user may run another simulation. unjam never closes, steps
+or replaces it, and the user's TraCI connection stays the active one.
 """
 
 import importlib
@@ -25,13 +24,13 @@ from unjam.sandbox import restrict_writing
 Backend = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
 BACKEND_MODULES = {"libsumo": "libsumo", "traci": "traci.main", "gui": "traci.main"}
-"""where each is; `import traci` would give what LIBSUMO_AS_TRACI or LIBTRACI_AS_TRACI make of it"""
+"""module of each backend; `import traci` would depend on LIBSUMO_AS_TRACI and LIBTRACI_AS_TRACI"""
 MAX_START_SECONDS = 600.0
-"""how long SUMO may take until it accepts a connection [s]: it reads the network first"""
+"""time limit for SUMO to accept a connection [s]: it reads the network first"""
 CONNECT_RETRY_SECONDS = 0.02
 """time between two attempts to connect [s]"""
 _libsumo_lock = threading.Lock()
-"""held by the one simulation that runs on libsumo in this process; never waited for"""
+"""held by the one simulation that runs on libsumo in this process; nothing waits for it"""
 
 
 class InUseError(UnjamError):
@@ -39,26 +38,21 @@ class InUseError(UnjamError):
 
 
 class Libsumo:
-    """SUMO in this process, for one simulation; what other code does to that simulation is detected."""
+    """SUMO in this process, for one simulation; changes of that simulation by other code are detected."""
 
     def __init__(self) -> None:
-        """Claim libsumo.
-
-        Raises:
-            InUseError: another simulation, unjam's or the user's, is open in this process.
-        """
+        """Claim libsumo; raise `InUseError` if another simulation, unjam's or the user's, is open in this process."""
         self.functions: Any = import_backend("libsumo")
         call = partial(sumo_function, self.functions)
         self._is_loaded = call("simulation", "isLoaded")
         self._get_time, self._step = call("simulation", "getTime"), call("simulation", "step")
         self._get_time_step, self._get_option = call("simulation", "getDeltaT"), call("simulation", "getOption")
         self._log_path: str | None = None
-        """the error log of the running simulation, which tells it from any other; None: it does not run"""
-        self._step_count = 0
-        """simulated since the simulation was started"""
-        self._begin_time = 0.0
+        """the error log of the running simulation, by which it is identified; None: it does not run"""
+        self._step_count, self._begin_time = 0, 0.0
+        """steps since the start, and SUMO's time at the start [s]"""
         self.has_refused = False
-        """whether a step has failed since the simulation was started"""
+        """whether a step has failed since the start"""
         self._is_claimed = _libsumo_lock.acquire(blocking=False)
         if not self._is_claimed or self._is_loaded():
             self.close()
@@ -74,15 +68,11 @@ class Libsumo:
         """Whether other code of this process has started, stepped or closed libsumo's simulation."""
         if not self._is_own():
             return True
-        return (
-            self.is_running and round((self._get_time() - self._begin_time) / self._get_time_step()) != self._step_count
-        )
+        steps = round((self._get_time() - self._begin_time) / self._get_time_step()) if self.is_running else 0
+        return self.is_running and steps != self._step_count
 
     def check(self) -> None:
-        """Raise `LostWorkerError` where other code of this process has changed the simulation.
-
-        It costs less than a microsecond.
-        """
+        """Raise `LostWorkerError` if other code has changed the simulation. It takes less than a microsecond."""
         if self.is_lost:
             raise LostWorkerError(
                 "SUMO was lost: other code in this process has started, stepped or closed a simulation "
@@ -90,7 +80,7 @@ class Libsumo:
             )
 
     def start(self, command: Sequence[str], log_path: Path) -> None:
-        """Start SUMO, which writes its errors to `log`."""
+        """Start SUMO, which writes its errors to a log."""
         self._log_path = str(log_path)
         self.functions.start([*command])
         self._reset_step_count()
@@ -113,26 +103,26 @@ class Libsumo:
         self._step_count += 1
 
     def end(self) -> None:
-        """End the simulation; one that is gone is no error, and one of other code goes on."""
+        """End the simulation unless it has ended already; that of other code goes on."""
         if self._log_path is not None and self._is_own():
             close_sumo(self.functions)
         self._log_path = None
 
     def close(self) -> None:
-        """Give libsumo back; may be called twice."""
+        """Release libsumo; may be called twice."""
         if self._is_claimed:
             self._is_claimed = False
             _libsumo_lock.release()
 
     def _is_own(self) -> bool:
-        """Return whether libsumo holds this simulation, or none where it is not running."""
+        """Return whether libsumo holds this simulation, or none if it does not run."""
         if self._log_path is None or not self._is_loaded():
             return self._log_path is None and not self._is_loaded()
         return self._get_option("error-log") == self._log_path
 
 
 class Traci:
-    """SUMO as a child process, over a connection that nobody else in this process is given."""
+    """SUMO as a child process, over a connection that other code in this process does not get."""
 
     is_lost = has_refused = False
 
@@ -140,7 +130,7 @@ class Traci:
         """Import traci; nothing is started yet."""
         self._traci = import_backend("traci")
         self.functions: Any = None
-        """the connection; None while there is none"""
+        """the connection; None without one"""
 
     @property
     def is_running(self) -> bool:
@@ -148,21 +138,21 @@ class Traci:
         return self.functions is not None
 
     def check(self) -> None:
-        """Do nothing: no other code reaches the simulation."""
+        """Do nothing: no other code can change the simulation."""
 
     def start(self, command: Sequence[str], log_path: Path) -> None:
-        """Start SUMO, which may write only into the folder of `log`, and connect to it."""
+        """Start SUMO, which may only write into the folder of its log, and connect to it."""
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
 
         def start_process() -> subprocess.Popen[bytes]:
-            restrict_writing(log_path.parent, Path("/dev"))  # screens and sockets it needs
+            restrict_writing(log_path.parent, Path("/dev"))  # it needs screens and sockets
             return subprocess.Popen([*command, "--remote-port", str(port)], stdout=subprocess.DEVNULL)
 
-        # A thread that ends with it: what is forbidden to SUMO is forbidden to nothing else here.
-        with ThreadPoolExecutor(1) as confined:
-            process = confined.submit(start_process).result()
+        # In a thread of its own, which ends here: the restriction applies to a thread and its child processes.
+        with ThreadPoolExecutor(1) as restricted_thread:
+            process = restricted_thread.submit(start_process).result()
         deadline = time.monotonic() + MAX_START_SECONDS
         while self.functions is None:
             try:  # one attempt at a time: traci prints each of several
@@ -185,7 +175,7 @@ class Traci:
         self._step()
 
     def end(self) -> None:
-        """End SUMO; one that is gone is no error."""
+        """End SUMO unless it has ended already."""
         if self.functions is not None:
             close_sumo(self.functions)
         self.functions = None
@@ -195,7 +185,7 @@ class Traci:
 
 
 class NeighborStates(NamedTuple):
-    """Who is ahead of a vehicle and behind it [m/s, m from bumper to bumper]; no name: nobody is ahead."""
+    """Leader and follower of a vehicle: speeds [m/s] and net gaps [m]; empty name: no leader."""
 
     leader: str
     leader_speed: float
@@ -205,7 +195,7 @@ class NeighborStates(NamedTuple):
 
 
 def close_sumo(sumo: Any) -> None:
-    """End a simulation; one that is gone already is no error."""
+    """End a simulation; one that has ended already is no error."""
     with suppress(Exception):
         sumo.close()
 
@@ -213,15 +203,15 @@ def close_sumo(sumo: Any) -> None:
 def sumo_function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
     """Return a function of libsumo or traci; of libsumo the compiled one, without its Python wrapper.
 
-    The wrapper only passes its arguments on, and is a third of the cost of a call.
+    The wrapper only passes its arguments on, and takes a third of the time of a call.
     """
     compiled = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
-    wrapped = sumo.simulationStep if name == "step" else getattr(getattr(sumo, domain), name)
-    return getattr(compiled, f"{domain}_{name}", wrapped)
+    wrapper = sumo.simulationStep if name == "step" else getattr(getattr(sumo, domain), name)
+    return getattr(compiled, f"{domain}_{name}", wrapper)
 
 
 def import_backend(backend: Backend) -> ModuleType:
-    """Return the library of a backend; raise `MissingPartError` where it is not installed."""
+    """Return the library of a backend; raise `MissingPartError` if it is not installed."""
     try:
         return importlib.import_module(BACKEND_MODULES[backend])
     except ImportError as error:

@@ -8,10 +8,11 @@ from array import array
 from collections.abc import Sequence
 from itertools import compress
 from operator import add
+from typing import Any
 
 import numpy as np
 
-from unjam.drivers.car_following import _MIN_GAP
+from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import FollowingState
@@ -51,7 +52,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._set_human_vehicles(road.vehicle_ids)
         if self._commands_humans:
             simulation.command_humans(road.vehicle_ids, scenario.right_of_way, scenario.enforce_human_limits)
-        self._exploration_noise: np.ndarray | list[float] | None = None
+        self._exploration_noise: Any = None
         self.speeds = simulation.speeds(road.vehicle_ids)
         self._check_all_present()
         self._reset_log()
@@ -180,7 +181,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
                     break
             else:
                 speed, leader = speeds[index], index + 1 if index + 1 < len(speeds) else 0
-                gap = clamp_min(gap_on_loop(position, positions[leader], loop, VEHICLE_LENGTH), _MIN_GAP)
+                gap = clamp_min(gap_on_loop(position, positions[leader], loop, VEHICLE_LENGTH), MIN_IDM_GAP)
                 acceleration = idm_acceleration(speed, speeds[leader], gap, self._idm_parameters[index])
                 if population is None:
                     commanded[index] = clamp_min(speed + acceleration * step + noise[index], 0.0)

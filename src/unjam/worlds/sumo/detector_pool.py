@@ -1,4 +1,4 @@
-"""Several confined simulations at once, of people alone on a network of the user's own, with detectors."""
+"""Parallel sandboxed simulations of human-only traffic on a user's network, with induction loops."""
 
 import queue
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ from unjam.worlds.sumo.detectors import DetectorPassage, InductionLoop, load_wit
 from unjam.worlds.sumo.sandboxed import SandboxedSimulation
 
 MAX_DETECTOR_ATTEMPTS = 3
-"""processes that may be lost on the same simulation"""
+"""processes that may be lost in the same simulation"""
 
 
 class DetectorPool:
-    """A fixed number of confined SUMO processes, started when first needed, that count who passes loops.
+    """A fixed number of sandboxed SUMO processes, started when first needed.
 
-    What they count depends on scenario, seed and loops alone, not on how many there are.
+    The passages depend only on scenario, seed and loops, not on the number of processes.
     """
 
     def __init__(self, count: int = 1) -> None:
-        """Prepare `count` processes; nothing is started yet."""
+        """Prepare `count` processes; none is started yet."""
         self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-detectors")
         self._idle_simulations: queue.SimpleQueue[SandboxedSimulation | None] = queue.SimpleQueue()
         self._open_simulations: set[SandboxedSimulation] = set()
@@ -33,11 +33,11 @@ class DetectorPool:
     def run(
         self, scenario: UserNetwork, seeds: Sequence[tuple[int, ...]], loops: Sequence[InductionLoop]
     ) -> list[list[DetectorPassage]]:
-        """Return who passed the loops in the traffic of each seed, in the order of the seeds.
+        """Return the passages of each seed, in the order of the seeds.
 
         Raises:
             EpisodeError: SUMO cannot run the scenario.
-            LostError: its process was lost, again and again.
+            LostWorkerError: its process was lost repeatedly.
         """
         futures = [self._thread_pool.submit(self._run_with_retries, scenario, seed, loops) for seed in seeds]
         try:
@@ -50,7 +50,6 @@ class DetectorPool:
     def _run_with_retries(
         self, scenario: UserNetwork, seed: tuple[int, ...], loops: Sequence[InductionLoop]
     ) -> list[DetectorPassage]:
-        """Return who passed, in another process where one was lost."""
         for _ in range(MAX_DETECTOR_ATTEMPTS - 1):
             with suppress(LostWorkerError):
                 return self._run_one(scenario, seed, loops)
@@ -68,7 +67,7 @@ class DetectorPool:
             steps = scenario.horizon * scenario.steps_per_control_step
             return unpack(list[DetectorPassage], simulation.passages(loops, steps), {})
         except EpisodeError:
-            if simulation is not None:  # it may be lost: another one goes on
+            if simulation is not None:  # the process may be lost: the next run starts another one
                 simulation.close()
                 self._open_simulations.discard(simulation)
             simulation = None
@@ -79,7 +78,7 @@ class DetectorPool:
     def close(self) -> None:
         """End all processes; may be called twice."""
         self._thread_pool.shutdown(wait=False, cancel_futures=True)
-        for simulation in list(self._open_simulations):  # who waits for one is told that it was lost
+        for simulation in list(self._open_simulations):  # a thread that waits for one gets a LostWorkerError
             simulation.close()
         self._thread_pool.shutdown()
         for simulation in list(self._open_simulations):

@@ -1,4 +1,4 @@
-"""Detectors on a road: who passed which induction loop, when, and how fast."""
+"""Induction loops on a road: which vehicles pass, when, and at which speed."""
 
 from collections.abc import Sequence
 from math import nan
@@ -25,59 +25,56 @@ class DetectorPassage(NamedTuple):
     """number of the loop"""
     vehicle: str
     time: float
-    """when its front bumper came [s]"""
+    """at which its front bumper reached the loop [s]"""
     speed: float
-    """its mean while it was above the loop [m/s]; NaN where it left sideways, before its end had passed"""
+    """mean speed above the loop [m/s]; NaN if it changed lanes before its rear had passed"""
 
 
 def load_with_loops(
     simulation: Simulation, scenario: UserNetwork, seed: Sequence[int], loops: Sequence[InductionLoop]
 ) -> None:
-    """Load the traffic that people alone have on this road and seed in an episode, with loops in the road.
-
-    Raises:
-        EpisodeError: SUMO refuses the files.
-    """
+    """Load human-only traffic of a road and seed, with induction loops; raise `EpisodeError` if SUMO refuses it."""
     road, (_, _, sumo_seed, _) = scenario.draw_from_seed(seed)
-    places = [
+    elements = [
         {"id": loop_name(number), "lane": loop.lane, "pos": loop.position, "period": 3600, "file": "NUL"}
         for number, loop in enumerate(loops)
     ]
-    files = sumo_inputs(scenario, road)._replace(traffic_xml=xml_document("additional", "inductionLoop", places))
-    simulation.load(files, scenario.simulation_step, sumo_random_seed(sumo_seed))
+    inputs = sumo_inputs(scenario, road)._replace(traffic_xml=xml_document("additional", "inductionLoop", elements))
+    simulation.load(inputs, scenario.simulation_step, sumo_random_seed(sumo_seed))
 
 
 def loop_name(number: int) -> str:
-    """Return what a loop is called in SUMO."""
+    """Return the name of a loop in SUMO."""
     return f"unjam_loop_{number}"
 
 
 def passages(simulation: Simulation, loops: Sequence[InductionLoop], steps: int) -> list[DetectorPassage]:
-    """Simulate so many steps, or until nobody is expected any more, and return who passed the loops.
+    """Simulate a number of steps, or until no vehicle is expected, and return the passages.
 
-    Who leaves a loop by changing lanes has passed it too, but tells no speed, as with SUMO's own detectors
+    A vehicle that leaves a loop by changing lanes counts without a speed, as with SUMO's own detectors
     (https://sumo.dlr.de/docs/Simulation/Output/Induction_Loops_Detectors_(E1).html).
     """
     found: dict[tuple[int, str, float], DetectorPassage] = {}
     for _ in range(steps):
         simulation.step()
         for number, loop in enumerate(loops):
-            for vehicle, length, came, left, _ in simulation.vehicles_on_loop(loop_name(number)):
-                if left > came and (number, vehicle, came) not in found:  # it is -1 while it is still there
-                    whole = _has_passed(simulation, vehicle, length, loop)
-                    speed = length / (left - came) if whole else nan
-                    found[number, vehicle, came] = DetectorPassage(number, vehicle, came, speed)
+            for vehicle, length, entry_time, exit_time, _ in simulation.vehicles_on_loop(loop_name(number)):
+                key = number, vehicle, entry_time
+                if exit_time > entry_time and key not in found:  # -1 while the vehicle is on the loop
+                    has_passed = _has_passed(simulation, vehicle, length, loop)
+                    speed = length / (exit_time - entry_time) if has_passed else nan
+                    found[key] = DetectorPassage(*key, speed)
         if not simulation.expects_vehicles():
             break
     return list(found.values())
 
 
 def _has_passed(simulation: Simulation, vehicle: str, length: float, loop: InductionLoop) -> bool:
-    """Return whether a vehicle that has just left a loop did so with its end, not sideways."""
+    """Return whether a vehicle that has just left a loop passed it completely, without a lane change."""
     if vehicle in simulation.arrived_vehicles():
         return True
     if vehicle in simulation.teleporting_vehicles():
         return False
-    ((lane, along),) = simulation.lane_positions([vehicle])
-    same_edge = lane.rpartition("_")[0] == loop.lane.rpartition("_")[0]
-    return not same_edge or along - length >= loop.position
+    ((lane, position),) = simulation.lane_positions([vehicle])
+    is_same_edge = lane.rpartition("_")[0] == loop.lane.rpartition("_")[0]
+    return not is_same_edge or position - length >= loop.position

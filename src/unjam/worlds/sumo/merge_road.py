@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.car_following import _MIN_GAP
+from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.safety import FollowingState
 from unjam.errors import EpisodeError
@@ -149,7 +149,7 @@ class MergingTraffic(OpenTraffic[MergeRoad]):
         """
         scenario, streams = self.scenario, self._streams
         leaders, speeds = streams.leaders(), streams.speeds
-        gaps = streams.gaps(leaders).clip(_MIN_GAP, None)
+        gaps = streams.gaps(leaders).clip(MIN_IDM_GAP, None)
         leader_speeds = np.where(leaders < 0, speeds, speeds[leaders])
         humans = scenario.humans
         if self.road.human_parameters:

@@ -1,4 +1,4 @@
-"""Networks as SUMO reads them, made once for each content and kept; and where SUMO's programs are."""
+"""Network files for SUMO, made once for each content and cached; and SUMO's programs."""
 
 import errno
 import hashlib
@@ -27,28 +27,30 @@ from unjam.sumo_files import file_stamp, read_lanes
 from unjam.worlds.record import Floats
 
 STALE_FILE_SECONDS = 3600.0
-"""seconds after which nobody makes a network any more"""
+"""age of a temporary file after which no process uses it any more"""
 MESSAGE_TOTAL_MARKER = "total messages of type:"
 """in the lines at the end of a log that count its messages"""
 XMLAttributes = dict[str, Any]
-"""of an XML element"""
-_intact_networks: dict[Path, tuple[int, int]] = {}
-"""networks in the cache that this process has found whole, with their stamps"""
+"""attributes of an XML element"""
 UNCONTROLLED_LINK_STATES = "MZ-"
-"""states of connections that no vehicle waits at: with the right of way, a zipper merge, a dead end"""
+"""states of connections without waiting vehicles: right of way, zipper merge, dead end"""
+_intact_networks: dict[Path, tuple[int, int]] = {}
+"""cached networks that this process has verified, with their stamps"""
 
 
 class NetworkLane(NamedTuple):
-    """A lane of a network that is no junction's: its edge, its length [m], what it allows [m/s]."""
+    """A lane of a network outside of junctions."""
 
     name: str
     edge: str
     length: float
+    """[m]"""
     speed_limit: float
+    """[m/s]"""
     successors: tuple[str, ...]
     """lanes of the next edges"""
     has_stop_line: bool = False
-    """whether vehicles may have to wait at its end: at a signal, a stop sign, or to give way"""
+    """whether vehicles may have to wait at its end: at a signal, a stop sign, or to yield"""
 
 
 @cache
@@ -56,7 +58,7 @@ def sumo_program(name: str) -> str:
     """Return the path of one of SUMO's programs: the installed package's, else the one on the PATH.
 
     Raises:
-        MissingPartError: neither has it.
+        MissingPartError: there is neither.
     """
     with suppress(ImportError, AttributeError):
         import sumo
@@ -64,15 +66,14 @@ def sumo_program(name: str) -> str:
         bundled = Path(sumo.SUMO_HOME) / "bin" / name
         if bundled.exists():
             return str(bundled)
-    found = shutil.which(name)
-    if found is None:
-        raise MissingPartError(f"SUMO's {name} is not there; install it: pip install eclipse-sumo==1.28.0")
-    return found
+    if path := shutil.which(name):
+        return path
+    raise MissingPartError(f"SUMO's {name} is not there; install it: pip install eclipse-sumo==1.28.0")
 
 
 @cache
 def sumo_version() -> str:
-    """Return the installed version of libsumo; `MissingPartError` where there is none."""
+    """Return the installed version of libsumo; raise `MissingPartError` if there is none."""
     try:
         return version("libsumo")
     except PackageNotFoundError:
@@ -80,12 +81,12 @@ def sumo_version() -> str:
 
 
 def sumo_message(lines: Iterable[str]) -> str:
-    """Return what one of SUMO's programs says of an error, as one line."""
-    return "; ".join(said for line in lines if (said := line.strip()) and said != "Quitting (on error).")
+    """Return the error message of one of SUMO's programs as one line."""
+    return "; ".join(text for line in lines if (text := line.strip()) and text != "Quitting (on error).")
 
 
 def last_error_message(log_path: Path) -> str:
-    """Return SUMO's own words about its last error: they are in its log, behind warnings."""
+    """Return SUMO's last error message from its log, without the warnings before it."""
     try:
         lines = [line for line in log_path.read_text(errors="replace").splitlines() if MESSAGE_TOTAL_MARKER not in line]
     except OSError:
@@ -94,7 +95,7 @@ def last_error_message(log_path: Path) -> str:
 
 
 def network_file(network: RoadNetwork) -> Path:
-    """Return SUMO's network file, made with netconvert if this content was never made before, or is damaged.
+    """Return SUMO's network file, made with netconvert unless the cache has an intact one with this content.
 
     Raises:
         MissingPartError: netconvert is missing.
@@ -106,8 +107,8 @@ def network_file(network: RoadNetwork) -> Path:
         ("--edge-files", "road.edg.xml"): xml_document("edges", "edge", edges),
     }
     if network.connections:
-        pairs = map(_connection_attributes, network.connections)
-        files["--connection-files", "road.con.xml"] = xml_document("connections", "connection", pairs)
+        attributes = map(_connection_attributes, network.connections)
+        files["--connection-files", "road.con.xml"] = xml_document("connections", "connection", attributes)
     options = ["--no-turnarounds", "true", *([] if network.has_internal_links else ["--no-internal-links", "true"])]
     content = "\n".join([sumo_version(), *options, *files.values()])
     name = hashlib.sha256(content.encode()).hexdigest()[:24]
@@ -115,16 +116,16 @@ def network_file(network: RoadNetwork) -> Path:
     if is_intact(target):
         return target
     make_folder(target.parent)
-    for left in filter(is_leftover, target.parent.glob(".*")):  # of processes that were killed
+    for leftover in filter(is_leftover, target.parent.glob(".*")):  # of processes that were killed
         with suppress(FileNotFoundError, DiskError):  # another process has just removed it
-            if time.time() - left.lstat().st_mtime > STALE_FILE_SECONDS:
-                remove(left)
+            if time.time() - leftover.lstat().st_mtime > STALE_FILE_SECONDS:
+                remove(leftover)
     try:
         with PrivateFolder() as folder:
             made = run_netconvert(files, options, Path(folder)).read_bytes()
     except OSError as error:
         raise (disk_error(error, "a temporary file") if error.errno in DISK_ERRNOS else error) from None
-    atomic_write(target, made + checksum_line(made))  # whole or not at all, also with several workers at it
+    atomic_write(target, made + checksum_line(made))  # so that several workers can do this at the same time
     return target
 
 
@@ -136,39 +137,31 @@ def network_path(road: Road) -> Path:
     return network_file(road.network)
 
 
-class _NetworkGeometry(NamedTuple):
-    """What pictures and services want to know of a network file."""
+class NetworkGeometry(NamedTuple):
+    """Geometry of a network file, for figures and services."""
 
     lane_lines: Floats
+    """center lines of all lanes: rows (x, y) [m], a row of NaN between two lines"""
     edge_lengths: dict[str, float]
+    """[m]"""
     lane_counts: dict[str, int]
+    """number of lanes of each edge"""
+
+
+def network_geometry(path: Path) -> NetworkGeometry:
+    """Return the geometry of a network file, which is read again after a change."""
+    return _read_geometry(path, file_stamp(path))
 
 
 @lru_cache(8)
-def _network_geometry(path: Path, stamp: tuple[int, int]) -> _NetworkGeometry:
-    """Return the shape of a network file; read again where another one has taken its place."""
+def _read_geometry(path: Path, stamp: tuple[int, int]) -> NetworkGeometry:
     lanes = read_lanes(path)
     rows: list[tuple[float, float]] = []
     for _, _, points in lanes:
         rows += [*points, (float("nan"), float("nan"))]
-    lines = np.array(rows, np.float64).reshape(-1, 2)
     lengths = {edge: length for edge, length, _ in lanes}
-    return _NetworkGeometry(lines, lengths, dict(Counter(edge for edge, _, _ in lanes)))
-
-
-def lane_center_lines(path: Path) -> Floats:
-    """Return the centre lines of all lanes: rows (x, y) [m], a row of NaN between two lines."""
-    return _network_geometry(path, file_stamp(path)).lane_lines
-
-
-def edge_lengths(path: Path) -> dict[str, float]:
-    """Return the length of each edge [m]."""
-    return _network_geometry(path, file_stamp(path)).edge_lengths
-
-
-def lane_counts(path: Path) -> dict[str, int]:
-    """Return how many lanes each edge has."""
-    return _network_geometry(path, file_stamp(path)).lane_counts
+    counts = Counter(edge for edge, _, _ in lanes)
+    return NetworkGeometry(np.array(rows, np.float64).reshape(-1, 2), lengths, dict(counts))
 
 
 def _node_attributes(node: Node) -> XMLAttributes:
@@ -200,50 +193,45 @@ def xml_element(tag: str, /, **attributes: Any) -> str:
 
 
 def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
-    """Return the network that netconvert makes in a folder of files by (option, name), and further options.
+    """Return the network that netconvert makes in a folder, from the content of files by (option, name).
 
     Raises:
-        EpisodeError: netconvert refuses them; with its own words.
+        EpisodeError: netconvert refuses them; with its own message.
     """
-    made = folder / "road.net.xml"
+    network = folder / "road.net.xml"
     for (_, name), content in files.items():
         (folder / name).write_text(content)
-    command = [
-        sumo_program("netconvert"),
-        *(f"{option}={folder / name}" for option, name in files),
-        f"--output-file={made}",
-        "--offset.disable-normalization=true",
-        "--precision=6",
-        *options,
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode == 0 and made.exists():
-        if made.read_bytes().rstrip().endswith(b"</net>"):
-            return made
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # of which netconvert itself says nothing
-    words = sumo_message((done.stderr or done.stdout).splitlines())
-    raise EpisodeError(f"netconvert cannot make the road: {words}")
+    inputs = [f"{option}={folder / name}" for option, name in files]
+    fixed = [f"--output-file={network}", "--offset.disable-normalization=true", "--precision=6"]
+    command = [sumo_program("netconvert"), *inputs, *fixed, *options]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode == 0 and network.exists():
+        if network.read_bytes().rstrip().endswith(b"</net>"):
+            return network
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # netconvert itself does not report a full disk
+    message = sumo_message((result.stderr or result.stdout).splitlines())
+    raise EpisodeError(f"netconvert cannot make the road: {message}")
 
 
 def cache_folder() -> Path:
-    """Return where networks are kept: `$UNJAM_CACHE`, or the user's cache folder.
+    """Return the folder for networks: `$UNJAM_CACHE`, or the user's cache folder.
 
     Raises:
-        InputError: SUMO would take its name for a list, or for a variable.
+        InputError: SUMO would read its name as a list, or as a variable.
     """
-    chosen = os.environ.get("UNJAM_CACHE") or platformdirs.user_cache_dir("unjam")
-    if any(sign in chosen for sign in ",;$%"):
-        raise invalid_value("UNJAM_CACHE", chosen, "a folder without , ; $ % in its name")
-    return Path(chosen)
+    folder = os.environ.get("UNJAM_CACHE") or platformdirs.user_cache_dir("unjam")
+    if any(character in folder for character in ",;$%"):
+        raise invalid_value("UNJAM_CACHE", folder, "a folder without , ; $ % in its name")
+    return Path(folder)
 
 
 def checksum_line(content: bytes) -> bytes:
-    """Return the last line of a network in the cache: the hash of what is before it."""
+    """Return the last line of a cached network: the hash of the lines before it."""
     return f"<!-- sha256 {hashlib.sha256(content).hexdigest()} -->\n".encode()
 
 
 def is_intact(network: Path) -> bool:
-    """Return whether a network in the cache is there, and nobody has changed or cut it since it was made."""
+    """Return whether a cached network exists, and was neither changed nor cut since it was made."""
     try:
         stamp = file_stamp(network)
         if _intact_networks.get(network) != stamp:

@@ -14,7 +14,7 @@ from unjam.physics.kinematics import next_speed
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.active_vehicles import ActiveVehicles
 from unjam.worlds.sumo.inputs import lane_change_parameters
-from unjam.worlds.sumo.networks import lane_center_lines, network_path
+from unjam.worlds.sumo.networks import network_geometry, network_path
 from unjam.worlds.sumo.open_log import OpenRoadLog
 from unjam.worlds.sumo.traffic import OpenRoadT, RoadScene, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
@@ -215,7 +215,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
             "teleports": vehicles.teleports,
             "collisions": len(vehicles.collided),
             "planned_duration": self.scenario.horizon * self.scenario.control_step,
-            "lane_lines": lane_center_lines(network_path(self.road)) if details else np.zeros((0, 2)),
+            "lane_lines": network_geometry(network_path(self.road)).lane_lines if details else np.zeros((0, 2)),
         }
         return Episode(**{**self._common_fields(), **fields, **self._snapshot_fields(columns)})
 
@@ -227,5 +227,5 @@ class OpenTraffic(Traffic[OpenRoadT]):
         """Return the current state of the road for pictures."""
         names = self._log.traffic.names
         is_cav = np.array([name in self.cav_ids for name in names], bool)
-        lines = lane_center_lines(network_path(self.road))
+        lines = network_geometry(network_path(self.road)).lane_lines
         return RoadScene(lines, self._simulation.poses(names), np.array(self.speeds), is_cav)

@@ -1,7 +1,7 @@
-"""SUMO in a process of its own that may neither write nor listen: for networks that may come from anywhere.
+"""SUMO in a sandboxed process, which may neither write nor listen: for networks from any source.
 
-Programs that drive on such a network ask it over a pipe for what `Simulation` can do: SUMO is confined, while
-the driver and whoever looks on stay where they are. Started as `python -m unjam.worlds.sumo.sandboxed`.
+Programs that drive on such a network call the functions of `Simulation` over a pipe: SUMO is sandboxed, while the
+driver stays in their own process. Started as `python -m unjam.worlds.sumo.sandboxed`.
 """
 
 import os
@@ -31,14 +31,14 @@ from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.simulation import Simulation
 
 MAX_NETWORK_MEMORY = 16 * 2**30
-"""bytes that a process may take once it drives on a network of the user's own"""
+"""memory limit of a process that drives on a user's network [bytes]"""
 
 
 def open_simulation(*scenarios: Scenario) -> Simulation:
-    """Open a simulation for episodes on these roads: a confined one where one is a network of the user's own.
+    """Open a simulation for episodes of these scenarios: a sandboxed one if there is a user's network.
 
-    Of others it runs in this process. Where libsumo holds one there already, unjam's or the user's, it runs
-    in a process of its own, with a warning: another thread may ask at the same time.
+    Otherwise it runs in this process. If libsumo already holds one there, unjam's or the user's, it runs in its own
+    process, with a warning: another thread may use libsumo at the same time.
     """
     if not any(isinstance(scenario, UserNetwork) for scenario in scenarios):
         try:
@@ -50,28 +50,28 @@ def open_simulation(*scenarios: Scenario) -> Simulation:
                 "other, or use gymnasium.make_vec(..., vectorization_mode='async')",
                 stacklevel=2,
             )
-    return SandboxedSimulation()  # pyright: ignore[reportReturnType]  (it answers to the same names)
+    return SandboxedSimulation()  # pyright: ignore[reportReturnType]  (it has the same methods)
 
 
 @cache
 def enter_sandbox() -> None:
-    """Let a file that would fill the memory end this process alone, which writes only into its own folder."""
+    """Limit the memory of this process, and let it write only into its own folder."""
     limit_resources(MAX_NETWORK_MEMORY)
     confine_process(Path(tempfile.gettempdir()))
 
 
 @cache
 def _process_starter(process: int) -> ThreadPoolExecutor:
-    """Return the thread that starts others' processes here: to the system it is who they must not outlive."""
+    """Return the thread that starts all child processes: they end with the thread that has started them."""
     return ThreadPoolExecutor(1)
 
 
 _process_starter_lock = Lock()
-"""a second thread that starts processes would end with its executor, and they with it"""
+"""prevents a second such thread, whose processes would end with its executor"""
 
 
 class SandboxedSimulation:
-    """A `Simulation` in a confined process; what it is asked for, that process does and answers."""
+    """A `Simulation` in a sandboxed process, which carries out all calls."""
 
     def __init__(self) -> None:
         """Start the process."""
@@ -85,19 +85,19 @@ class SandboxedSimulation:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=child_environment(TMPDIR=self._folder.name),
-            start_new_session=True,  # an interrupt in the terminal is this process's to handle
+            start_new_session=True,  # this process handles an interrupt in the terminal
         )
         self._process = start.result()
         self.episode_lock = Lock()
-        """held by the episode that runs"""
+        """held by the running episode"""
 
     @property
     def is_lost(self) -> bool:
-        """Whether the process has ended: only a new one can go on."""
+        """Whether the process has ended, so that a new one must be started."""
         return self._process.poll() is not None
 
     def check(self) -> None:
-        """Do nothing: no other code reaches the simulation."""
+        """Do nothing: no other code can change the simulation."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):
@@ -106,22 +106,25 @@ class SandboxedSimulation:
 
     def load(self, inputs: SumoInputs, step: float, seed: int) -> None:
         """Start an episode, as `Simulation.load` does."""
-        named = {option: list(map(str, paths)) for option, paths in inputs.existing_files.items()}
-        to_copy = {str(path): list(map(str, made_from)) for path, made_from in inputs.copied_files.items()}
-        self._call("load", {**inputs._asdict(), "existing_files": named, "copied_files": to_copy}, step, seed)
+        existing = {option: list(map(str, paths)) for option, paths in inputs.existing_files.items()}
+        copied = {str(path): list(map(str, sources)) for path, sources in inputs.copied_files.items()}
+        self._call("load", {**inputs._asdict(), "existing_files": existing, "copied_files": copied}, step, seed)
 
     def _call(self, name: str, *arguments: Any) -> Any:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        plain = [each if isinstance(each, (str, dict)) else _as_json(each) for each in arguments]
+        # Names and numbers come in many kinds of sequences.
+        lists = [
+            list(each) if hasattr(each, "__iter__") and not isinstance(each, str | dict) else each for each in arguments
+        ]
         try:
-            write_message(self._process.stdin, {"call": name, "arguments": plain})
-            facts, arrays = read_message(self._process.stdout)
+            write_message(self._process.stdin, {"call": name, "arguments": lists})
+            content, arrays = read_message(self._process.stdout)
         except (BrokenPipeError, EOFError):
             raise LostWorkerError(f"SUMO was lost: its process ended with code {self._process.wait()}") from None
-        if "error" in facts:
-            raise error_from_name(*facts["error"])
-        return unpack(_return_type(name), facts["answer"], arrays)
+        if "error" in content:
+            raise error_from_name(*content["error"])
+        return unpack(_return_type(name), content["answer"], arrays)
 
     def close(self) -> None:
         """End the process; may be called twice."""
@@ -136,48 +139,43 @@ class SandboxedSimulation:
         self.close()
 
 
-def _as_json(value: Any) -> Any:
-    """Return an argument as JSON: names and numbers come in many kinds of sequences."""
-    return list(value) if hasattr(value, "__iter__") else value
-
-
 @cache
 def _return_type(name: str) -> Any:
-    """Return the type of what `Simulation` answers when it is asked for `name`."""
+    """Return the type of the result of a method of `Simulation`."""
     method = getattr(Simulation, name, None)
     return get_type_hints(method).get("return", Any) if method else Any
 
 
 def serve_simulation() -> None:
-    """Do what is asked on standard input until it is closed."""
+    """Carry out the calls from standard input until it is closed."""
     exit_with_parent(signal.SIGKILL)
-    answers = os.fdopen(os.dup(1), "wb")
+    output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # SUMO may print: not into the answers
     enter_sandbox()
     with Simulation(owns_stdout=True) as simulation:
         while True:
             try:
-                facts, _ = read_message(sys.stdin.buffer)
+                request, _ = read_message(sys.stdin.buffer)
             except EOFError:
                 return
             try:
-                answer, arrays = pack(_execute(simulation, facts["call"], facts["arguments"]))
-                write_message(answers, {"answer": answer}, arrays)
+                answer, arrays = pack(_execute(simulation, request["call"], request["arguments"]))
+                write_message(output, {"answer": answer}, arrays)
             except Exception as error:
-                known = as_unjam_error(error)
-                write_message(answers, {"error": [type(known).__name__, str(known)]})
+                unjam_error = as_unjam_error(error)
+                write_message(output, {"error": [type(unjam_error).__name__, str(unjam_error)]})
 
 
 def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
-    if name == passages.__name__:  # a message for each step would cost as much as the steps
+    if name == passages.__name__:  # a message for each step would take as long as the steps
         loops, steps = arguments
         return passages(simulation, [InductionLoop(*each) for each in loops], steps)
     if name == "load":
-        files = arguments[0]
-        named = {option: tuple(map(Path, paths)) for option, paths in files["existing_files"].items()}
-        to_copy = {Path(path): tuple(map(Path, made)) for path, made in files["copied_files"].items()}
-        parts = {"options": tuple(files["options"]), "existing_files": named, "copied_files": to_copy}
-        arguments[0] = SumoInputs(**{**files, **parts})
+        fields, *others = arguments
+        existing = {option: tuple(map(Path, paths)) for option, paths in fields["existing_files"].items()}
+        copied = {Path(path): tuple(map(Path, sources)) for path, sources in fields["copied_files"].items()}
+        fields |= {"options": tuple(fields["options"]), "existing_files": existing, "copied_files": copied}
+        arguments = [SumoInputs(**fields), *others]
     return getattr(simulation, name)(*arguments)
 
 

@@ -1,4 +1,4 @@
-"""Reads SUMO's trip records (`tripinfo-output`), which cost no measurable time while a simulation runs."""
+"""SUMO's trip records (`tripinfo-output`), which take no measurable time during a simulation."""
 
 from pathlib import Path
 from xml.parsers import expat
@@ -8,7 +8,7 @@ import numpy as np
 from unjam.worlds.trips import Trips
 
 NOT_ARRIVED = -1.0
-"""what SUMO writes for the time of an arrival that has not happened"""
+"""SUMO's arrival time of a vehicle that has not arrived"""
 TRIP_TIME_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival"
 """attributes of a trip that are read [s]"""
 TRIP_CHUNK_BYTES = 1 << 20
@@ -16,7 +16,7 @@ TRIP_CHUNK_BYTES = 1 << 20
 
 
 def trip_options(path: Path) -> list[str]:
-    """Return the options by which SUMO writes all trips to a file, those that have not ended included."""
+    """Return the options by which SUMO writes all trips to a file, including those that have not ended."""
     unfinished = ("--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted")
     return ["--tripinfo-output", str(path), *(word for option in unfinished for word in (option, "true"))]
 
@@ -24,8 +24,8 @@ def trip_options(path: Path) -> list[str]:
 def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
     """Return the trips in a file that SUMO has closed, in SUMO's order.
 
-    `classes` has the vehicle class of each vehicle type. Left out are trips that ended before the time
-    `after` [s], during a warm-up, and those of vehicles that were not to depart yet.
+    `vehicle_classes` has the vehicle class of each vehicle type. Trips that ended during the warm-up, which ends at
+    `warmup_end` [s], and trips of vehicles that were to depart later are left out.
     """
     ids, kinds, times = list[str](), list[str](), list[list[float]]()
 
@@ -47,6 +47,6 @@ def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -
 
 
 def _vehicle_class(kind: str, vehicle_classes: dict[str, str]) -> str:
-    """Return the class of a type; SUMO calls a copy that belongs to one vehicle `type@vehicle`."""
+    """Return the class of a type, or of the type of which `kind` is SUMO's copy for one vehicle: `type@vehicle`."""
     names = kind, kind.rpartition("@")[0], kind.partition("@")[0]
     return next((vehicle_classes[name] for name in names if name in vehicle_classes), "")

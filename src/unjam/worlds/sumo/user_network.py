@@ -20,7 +20,7 @@ from unjam.worlds.sumo.backends import NeighborStates
 from unjam.worlds.sumo.control import VehicleLimits
 from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, CAV_TYPE_TEMPLATE, vehicle_class_by_type
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
-from unjam.worlds.sumo.networks import edge_lengths, lane_counts
+from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.sections import RoadsideService
 from unjam.worlds.world import DriverLog, ProgressCallback
 
@@ -228,8 +228,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         fields = {"gaps": gaps, "poses": poses, "positions": np.full(edge.shape, np.nan), "limit_speed": limit}
         if not self._route_counts:
             return fields
-        network = self.road.files.network
-        lengths, counts = edge_lengths(network), lane_counts(network)
+        _, lengths, counts = network_geometry(self.road.files.network)
         planned: Counter[str] = Counter()  # planned routes, so that the figures of all drivers show the same route
         for edges, count in self._route_counts.items():
             planned.update(dict.fromkeys(edges, count))

@@ -8,14 +8,14 @@ from unjam.worlds.record import SumoWarning
 from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
 
 MAX_LOG_BYTES = 2**20
-"""bytes of a log that are read; SUMO itself writes one example and one total for most kinds"""
+"""bytes of a log that are read; SUMO writes one example and one total for most kinds"""
 MAX_EXAMPLE_LENGTH = 300
 """characters of an example"""
 MAX_EXAMPLES_OPTION = "1"
-"""for SUMO's option aggregate-warnings: further messages of a kind are only counted"""
+"""value of SUMO's option aggregate-warnings: further messages of a kind are only counted"""
 _TOTAL_PATTERN = re.compile(rf"(\d+) {MESSAGE_TOTAL_MARKER} (.*)")
 _VARIABLE_PATTERN = re.compile(r"'[^']*'|(?<==)[^\s,;]*[^\s,;.!]|[-+]?\b\d+(?:\.\d+)?\b")
-"""what differs between two messages of a kind: quoted names, values after =, and numbers"""
+"""variable parts of the messages of a kind: quoted names, values after =, and numbers"""
 SEPARATELY_COUNTED = re.compile(
     r"Teleporting vehicle|ends teleporting|teleports beyond|collision with|performs emergency braking"
 )
@@ -30,7 +30,7 @@ def read_warnings(log_path: Path) -> tuple[SumoWarning, ...]:
     try:
         with log_path.open(errors="replace") as file:
             text = file.read(MAX_LOG_BYTES)
-            text = text.rpartition("\n")[0] if file.read(1) else text  # without a message that is cut
+            text = text.rpartition("\n")[0] if file.read(1) else text  # without an incomplete message
     except OSError:
         return ()
     messages = re.findall(r"^(?:Warning|Error): (.*(?:\n(?!Warning:|Error:).*)*)", text, re.MULTILINE)
@@ -43,7 +43,7 @@ def read_warnings(log_path: Path) -> tuple[SumoWarning, ...]:
             kind = warning_kind(message)
             examples.setdefault(kind, message)
             counts[kind] += 1
-    for count, form in totals:  # it includes the example
+    for count, form in totals:  # includes the example
         pattern = re.compile(".*".join(map(re.escape, form.split("%"))))
         for kind in [kind for kind, message in examples.items() if pattern.fullmatch(message)][:1]:
             counts[kind] += count - 1
@@ -52,4 +52,4 @@ def read_warnings(log_path: Path) -> tuple[SumoWarning, ...]:
 
 def warning_kind(message: str) -> str:
     """Return a message with the placeholder % instead of quoted names, values and numbers."""
-    return _VARIABLE_PATTERN.sub(lambda found: "'%'" if found[0].startswith("'") else "%", message)
+    return _VARIABLE_PATTERN.sub(lambda match: "'%'" if match[0].startswith("'") else "%", message)
