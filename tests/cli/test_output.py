@@ -1,4 +1,4 @@
-"""Can a table of metrics be read, however narrow the terminal?"""
+"""Are tables, progress and proposed commands printed as documented?"""
 
 import shlex
 import sys
@@ -35,64 +35,64 @@ def printed(monkeypatch: pytest.MonkeyPatch, width: int, labels: tuple[str, ...]
 
 
 @pytest.mark.parametrize("width", [80, 120, 160, 400])
-def test_no_interval_is_broken_and_no_line_is_too_long(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+def test_intervals_are_not_broken_and_lines_fit_the_terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     lines = printed(monkeypatch, width)
     assert max(map(len, lines)) <= width
     assert not any("…" in line for line in lines)
     assert all(line.count("[") == line.count("]") for line in lines)
-    assert sum(line.count("pi") for line in lines if line.startswith("metric")) >= 2  # it, and beyond people
+    assert (
+        sum(line.count("pi") for line in lines if line.startswith("metric")) >= 2
+    )  # and the difference to the human baseline
     assert "+1000" in "\n".join(lines)
 
 
-def test_where_there_is_room_all_drivers_stand_in_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wide_terminals_have_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
     def tables(width: int) -> int:
         return sum(line.startswith("metric") for line in printed(monkeypatch, width))
 
     assert (tables(400), tables(120) > 1) == (1, True)
 
 
-def test_a_driver_by_itself_is_compared_with_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_single_driver_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     assert printed(monkeypatch, 120, ("pi",))[0].split() == ["metric", "unit", "pi"]
 
 
 @pytest.fixture
-def aside(monkeypatch: pytest.MonkeyPatch) -> StringIO:
-    """What is said beside a verb's output."""
+def messages(monkeypatch: pytest.MonkeyPatch) -> StringIO:
+    """Capture messages on standard error."""
     text = StringIO()
-    monkeypatch.setattr(output, "aside", Console(file=text, width=400))
+    monkeypatch.setattr(output, "err_console", Console(file=text, width=400))
     return text
 
 
-def test_of_several_roads_the_one_is_named_on_which_a_training_gains_least(
-    aside: StringIO, monkeypatch: pytest.MonkeyPatch
+def test_progress_names_the_road_with_the_smallest_difference(
+    messages: StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "aside", output.err_console)
+    monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "err_console", output.err_console)
     row = {"iteration": 1, "environment_steps": 10, "return_mean": 5.0, "return_expert": 4.0}
     roads = {"ring": {"return_validation": 9.0, "return_expert": 3.0}, "eight": {"return_validation": 1.0}}
     roads["eight"]["return_expert"] = 4.4
-    with _TrainingProgress(RunConfig(steps=30), Path("run")) as shown:
-        shown.show_iteration({**row, "return_validation": 6.0, "tasks": roads})
-        shown.show_iteration({**row, "iteration": 11, "return_validation": None, "tasks": {}})
-    said = "return 5, validation 6 (expert 4; least beyond it on eight: -3)"
-    assert [line.partition("steps, ")[2] for line in aside.getvalue().splitlines()] == [said, said]
+    with _TrainingProgress(RunConfig(steps=30), Path("run")) as progress:
+        progress.show_iteration({**row, "return_validation": 6.0, "tasks": roads})
+        progress.show_iteration({**row, "iteration": 11, "return_validation": None, "tasks": {}})
+    text = "return 5, validation 6 (expert 4; smallest difference on eight: -3)"
+    assert [line.partition("steps, ")[2] for line in messages.getvalue().splitlines()] == [text, text]
 
 
-def test_after_a_training_of_several_roads_it_is_the_whole_run_that_goes_on(aside: StringIO) -> None:
+def test_a_training_on_several_roads_is_resumed_as_a_whole(messages: StringIO) -> None:
     output.suggest_after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"), is_finished=False)
-    assert "unjam train --resume runs/all --steps 200" in aside.getvalue()
+    assert "unjam train --resume runs/all --steps 200" in messages.getvalue()
 
 
-def test_a_training_that_is_over_is_shipped_where_it_gained_and_not_trained_on_where_it_did_not(
-    aside: StringIO,
-) -> None:
+def test_a_finished_training_is_exported_if_it_gained(messages: StringIO) -> None:
     output.suggest_after_training(Path("runs/one"), estimate([0.0, 0.0]), 100, Path("runs/one"), is_finished=True)
-    assert aside.getvalue() == ""
+    assert messages.getvalue() == ""
     output.suggest_after_training(Path("runs/one"), estimate([5.0, 6.0, 7.0]), 100, Path("runs/one"), is_finished=True)
-    assert aside.getvalue() == "ship it: unjam export runs/one --to one.unjam\n"
+    assert messages.getvalue() == "export it: unjam export runs/one --out one.unjam\n"
 
 
 @pytest.mark.parametrize(
-    ("drivers", "changes", "words"),
+    ("drivers", "changes", "command"),
     [
         (
             ["human", "unjam:best"],
@@ -102,30 +102,31 @@ def test_a_training_that_is_over_is_shipped_where_it_gained_and_not_trained_on_w
         (
             ["human", "pi"],
             {"cavs": 2, "actuation": "raw"},
-            "unjam train ring --expert pi --preset demo --reward eq16 --set road.cavs=2 --set road.actuation=raw",
+            "unjam train ring --expert pi --preset demo --reward eq16 --set scenario_options.cavs=2 --set scenario_options.actuation=raw",
         ),
         (["unjam:best", "human"], {}, "unjam watch ring -d unjam:best --video ring.gif"),
     ],
 )
-def test_what_is_proposed_after_a_drive_is_for_the_same_road(
-    drivers: list[str], changes: dict[str, Any], words: str, aside: StringIO
+def test_the_command_after_a_drive_is_for_the_same_road(
+    drivers: list[str], changes: dict[str, Any], command: str, messages: StringIO
 ) -> None:
     output.suggest_after_drive("ring", drivers, changes, "eq16")
-    proposed = aside.getvalue().strip().partition(": ")[2]
-    assert proposed == words
-    asked = shlex.split(proposed)
-    told = [word for option, word in pairwise(asked) if option == "--set"]
-    given = {key.removeprefix("road."): value for key, value in parse_assignments(told, "--set").items()}
-    assert given == changes
+    proposed = messages.getvalue().strip().partition(": ")[2]
+    assert proposed == command
+    settings = [word for option, word in pairwise(shlex.split(proposed)) if option == "--set"]
+    parsed = parse_assignments(settings, "--set").items()
+    assert {key.removeprefix("scenario_options."): value for key, value in parsed} == changes
 
 
-def test_the_judgement_after_a_training_shows_how_far_it_is(aside: StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "aside", output.err_console)
+def test_the_evaluation_after_a_training_shows_its_progress(
+    messages: StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "err_console", output.err_console)
     monkeypatch.setattr(output, "PROGRESS_LINE_SECONDS", -1.0)
     monkeypatch.setattr(evaluate, "evaluation_steps", lambda config, folder: 3000)
-    with _TrainingProgress(RunConfig(), Path("run")) as shown:
+    with _TrainingProgress(RunConfig(), Path("run")) as progress:
         for episode, steps in ((("pi", 0), 500), (("pi", 1), 500), (("pi", 0), 1500)):
-            shown.show_evaluation(episode, steps)
-    words = "evaluating on held-out seeds"
-    counted = [f"{words}: {steps} of 3,000 steps" for steps in ("500", "1,000", "2,000")]
-    assert aside.getvalue().splitlines() == [words, *counted]
+            progress.show_evaluation(episode, steps)
+    label = "evaluating on test seeds"
+    lines = [f"{label}: {steps} of 3,000 steps" for steps in ("500", "1,000", "2,000")]
+    assert messages.getvalue().splitlines() == [label, *lines]

@@ -12,7 +12,7 @@ import numpy as np
 from tests.controller.test_verify import content_of
 from tests.faults.outcome import Outcome
 from tests.system.conftest import PLAIN, UNJAM
-from tests.system.test_wrong_inputs import one_line, with_weights_of
+from tests.system.test_invalid_inputs import one_line, with_weights_of
 from unjam.controller.signature import make_keys
 
 Words = tuple[str | bytes, ...]

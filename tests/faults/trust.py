@@ -17,12 +17,12 @@ import pytest
 from tests.conftest import strangers_driver
 from tests.controller.test_file import residual
 from tests.faults.outcome import Outcome, one_line
-from tests.system.test_code_of_others import VERBS
+from tests.system.test_untrusted_code import COMMANDS
 from tests.test_processes import holder
 from tests.test_sandbox import TRIES
 from tests.test_user_code import LATE, plant_bytecode
-from tests.training.test_fingerprint import of_expert, of_network, of_reward, with_checkpoint
 from tests.training.test_crash_points import Moment, content_of, crash, run
+from tests.training.test_fingerprint import of_expert, of_network, of_reward, with_checkpoint
 from tests.training.test_run import small_config
 from tests.worlds.sumo.test_hostile_networks import OPTIONS
 from tests.worlds.sumo.test_networks import edges_of
@@ -254,7 +254,7 @@ def _as_typed(words: Sequence[str]) -> Callable[[], object]:
 TRIED: dict[str, Callable[[], object]] = {
     "verify": lambda: verify_controller_file("run"),
     "verify of the file": lambda: verify_controller_file("run/controller.unjam"),
-    **{verb: _as_typed(words) for verb, words in VERBS.items() if verb not in ("verify", "model")},
+    **{verb: _as_typed(words) for verb, words in COMMANDS.items() if verb not in ("verify", "model")},
 }
 """what a folder is given to, in this process; `verify_command` and `model` go on in a limited child"""
 

@@ -1,4 +1,4 @@
-"""Calling the command line as a user does."""
+"""Run the command line like a user."""
 
 import json
 import os
@@ -18,11 +18,11 @@ PLAIN = {"NO_COLOR": "1"}
 
 
 @pytest.fixture(scope="session")
-def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    """Runs `unjam` in a folder, in a process of its own that need not import torch again."""
-    place = tmp_path_factory.mktemp("warm")
+def preloaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    """Run `unjam` in a folder, in forks of a process that has imported torch."""
+    output_folder = tmp_path_factory.mktemp("preloaded")
     with subprocess.Popen(
-        [sys.executable, "-m", "tests.system.warm"],
+        [sys.executable, "-m", "tests.system.preloaded"],
         cwd=ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -33,7 +33,7 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
         assert process.stdout is not None
 
         def run(*arguments: str, folder: Path, pictures: bool) -> subprocess.CompletedProcess[str]:
-            out, errors = place / "out", place / "errors"
+            out, errors = output_folder / "out", output_folder / "errors"
             request = {"arguments": arguments, "folder": str(folder), "out": str(out), "errors": str(errors)}
             print(json.dumps({**request, "pictures": pictures}), file=process.stdin, flush=True)
             assert process.stdout is not None
@@ -45,10 +45,10 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 
 
 @pytest.fixture
-def unjam(tmp_path: Path, warm: Run) -> Run:
-    """Runs `unjam` with arguments in an empty folder; as a new process where its surroundings differ.
+def unjam(tmp_path: Path, preloaded: Run) -> Run:
+    """Run `unjam` with arguments in an empty folder; in a new process if its environment differs.
 
-    Without `snapshots` those of a report are left empty, where nobody looks at them; a new process draws them.
+    With `pictures=False` the figures of a report are empty, which saves time; a new process always draws them.
     """
 
     def run(
@@ -56,7 +56,7 @@ def unjam(tmp_path: Path, warm: Run) -> Run:
     ) -> subprocess.CompletedProcess[str]:
         words = [str(argument) for argument in arguments]
         if environment is None and not options:
-            return warm(*words, folder=tmp_path, pictures=pictures)
+            return preloaded(*words, folder=tmp_path, pictures=pictures)
         return subprocess.run(
             [UNJAM, *words],
             cwd=tmp_path,

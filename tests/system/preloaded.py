@@ -1,7 +1,7 @@
-"""Runs the command line in forks of a process that has imported everything already.
+"""Run the command line in forks of a process that has imported all packages.
 
-An interpreter that imports torch needs four seconds before it reads its arguments. Reads one request a line
-from standard input, answers with the exit code.
+An interpreter that imports torch needs four seconds before it reads its arguments. This program reads one request
+per line from standard input, and prints the exit code.
 """
 
 import json
@@ -18,13 +18,13 @@ import unjam.training.model_facts
 import unjam.training.train
 from tests.pictures import empty_pictures
 
-LONGEST = 300
+MAX_SECONDS = 300
 """[s]"""
 
 
 def run(arguments: list[str], folder: str, out: str, errors: str, pictures: bool) -> None:
-    """Become `unjam` with these arguments, its reports with pictures or empty ones; never returns."""
-    signal.alarm(LONGEST)
+    """Become `unjam` with these arguments, with or without figures in reports; never returns."""
+    signal.alarm(MAX_SECONDS)
     os.chdir(folder)
     for path, stream in ((out, 1), (errors, 2)):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
@@ -45,7 +45,7 @@ def run(arguments: list[str], folder: str, out: str, errors: str, pictures: bool
 
 
 def main() -> None:
-    """Answer requests until there are no more."""
+    """Run requests until the end of standard input."""
     for line in sys.stdin:
         child = os.fork()
         if child == 0:

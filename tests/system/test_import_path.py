@@ -1,4 +1,4 @@
-"""A folder that holds modules of every name: none of them runs, whatever unjam is asked for there."""
+"""Modules in the working folder are never imported."""
 
 import os
 import subprocess
@@ -24,13 +24,13 @@ def gentle(state):
     import later
     return GAIN * later.ONE * np.subtract(state.leader_speed, state.speed)
 """
-SMALL = {"road__horizon": 50, "trpo__batch_steps": 100, "steps": 100}
+SMALL = {"scenario_options__horizon": 50, "trpo__steps_per_iteration": 100, "steps": 100}
 CARS = "".join(f'<vehicle id="{n}" type="car" route="along" depart="{2 * n}"/>' for n in range(6))
 
 
 @pytest.fixture(scope="module")
 def planted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A downloaded folder with a module of every name that can be imported, and files that name others."""
+    """Make a folder with a module for every importable name, and files that name others."""
     folder = tmp_path_factory.mktemp("planted")
     canary = folder / "canary"
     code = f"open({str(canary)!r}, 'a').write(__name__ + '\\n')\n"
@@ -74,38 +74,36 @@ def check_nothing_ran(folder: Path) -> None:
     "words",
     [
         ("doctor",),
-        ("drive", "straight.sumocfg", "--cav-share", "0.5", "-n", "1", "-d", "acc", "--no-report"),
+        ("drive", "straight.sumocfg", "--penetration-rate", "0.5", "-n", "1", "-d", "acc", "--no-report"),
         ("train", "--config", "small.toml", "--expert", "mine.py:gentle", "--out", "own"),
     ],
     ids=lambda words: words[0],
 )
-def test_the_command_and_its_children_import_nothing_from_the_working_folder(
-    words: tuple[str, ...], planted: Path
-) -> None:
+def test_command_and_children_import_nothing_from_the_working_folder(words: tuple[str, ...], planted: Path) -> None:
     done = subprocess.run([UNJAM, *words], cwd=planted, capture_output=True, text=True, check=False)
     assert done.returncode in ((0, 3) if words == ("doctor",) else (0,)), done.stderr
     check_nothing_ran(planted)
 
 
-VERBS = """
+COMMANDS = """
 scenarios ring
 scenarios straight.sumocfg --picture road.png
 drivers
 drive ring --set horizon=20 --set warmup=0 -n 2 --workers 2 -d mine.py:gentle --out driven
-assess straight.sumocfg -d acc --shares 0.5 -n 34 --out assessed
+assess straight.sumocfg -d acc --penetration-rates 0.5 -n 34 --out assessed
 train --config small.toml --out run
 train --resume run --steps 200
 evaluate run -n 1
 model run
 report run driven --out page.html
-runs --under .
-export run --to it.unjam --onnx
+runs --folder .
+export run --out it.unjam --onnx
 verify it.unjam
 certify it.unjam
 keys maker
 sign it.unjam --key maker.key
-watch ring --set horizon=20 --set warmup=0 -d pi --video film.gif
-watch ring --set horizon=20 --set warmup=0 -d pi --video film.mp4
+watch ring --set horizon=20 --set warmup=0 -d pi --video video.gif
+watch ring --set horizon=20 --set warmup=0 -d pi --video video.mp4
 search ring --config small.toml --vary trpo.target_kl=0.1,0.2 --trials 1 --out search
 tune ring --set horizon=20 --set warmup=0 --expert pi --steps 8000 --out tuned
 fit-drivers data.csv --set calibration.generations=2
@@ -114,9 +112,9 @@ reproduce theory --dry-run
 
 
 @pytest.mark.long
-def test_no_verb_imports_anything_from_the_working_folder(planted: Path, warm: Run) -> None:
-    for words in map(str.split, VERBS.strip().splitlines()):
-        done = warm(*words, folder=planted, pictures=True)
+def test_commands_import_nothing_from_the_working_folder(planted: Path, preloaded: Run) -> None:
+    for words in map(str.split, COMMANDS.strip().splitlines()):
+        done = preloaded(*words, folder=planted, pictures=True)
         assert "Traceback" not in done.stderr, (words, done.stderr)
         assert done.returncode in ((0, 1) if words[0] == "certify" else (0,)), (words, done.stderr)
         check_nothing_ran(planted)
@@ -124,17 +122,17 @@ def test_no_verb_imports_anything_from_the_working_folder(planted: Path, warm: R
 
 SCRIPT = """
 import sys
-here = sys.path.pop(0)  # first, the program itself would run them: last, it does not, and children get it
+here = sys.path.pop(0)  # as the last entry, children inherit it, but this program imports nothing from it
 import numpy
 import unjam, unjam.kernels
 from tests.training.test_run import small_config
 sys.path.append({here})
-unjam.kernels._why_not = "numpy was imported before unjam"  # a training runs in a child then
+unjam.kernels._unpinned_reason = "numpy was imported before unjam"  # so a training runs in a child
 if __name__ == "__main__":
     unjam.drive("ring", "mine.py:gentle", episodes=2, out="api-{name}", workers=2)
-    road = unjam.make_scenario("straight.sumocfg", {{"cav_share": 0.5, "horizon": 20}})
+    road = unjam.make_scenario("straight.sumocfg", {{"penetration_rate": 0.5, "horizon": 20}})
     unjam.run_episode(road, lambda state: 0.0 * state.speed, (0,))
-    unjam.train(small_config(road__horizon=50, trpo__batch_steps=100, steps=100), "trained-{name}")
+    unjam.train(small_config(scenario_options__horizon=50, trpo__steps_per_iteration=100, steps=100), "trained-{name}")
     unjam.write_report(["api-{name}"], "api-{name}.html")
 """
 
@@ -152,7 +150,7 @@ def test_children_of_a_program_import_nothing_from_its_folder(name: str, here: s
     check_nothing_ran(planted)
 
 
-def test_python_m_unjam_leaves_the_working_folder_at_once(tmp_path: Path) -> None:
+def test_python_m_unjam_imports_nothing_from_the_working_folder(tmp_path: Path) -> None:
     canary = tmp_path / "canary"
     for name in ("gymnasium", "numpy", "typer", "platform", "typing"):
         (tmp_path / f"{name}.py").write_text(f"open({str(canary)!r}, 'w').close()\n")

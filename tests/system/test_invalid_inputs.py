@@ -1,4 +1,4 @@
-"""Wrong input: one clear line, the right exit code, and nothing half-written."""
+"""Invalid input: one clear line, the right exit code, and no partial files."""
 
 import os
 import resource
@@ -17,43 +17,43 @@ from unjam.controller.file import WEIGHTS_PART
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=60"]
 
-WRONG: dict[str, tuple[str, list[str]]] = {
-    "unknown verb": ("fly", ["fly"]),
+INVALID: dict[str, tuple[str, list[str]]] = {
+    "unknown command": ("fly", ["fly"]),
     "unknown option": ("--fast", ["drive ring --driver pi --fast"]),
     "no driver": ("--driver", ["watch ring"]),
-    "a length of no digits": ("metres, like 230 or 220-270", ["drive ring --driver pi --length ²"]),
-    "a length of a thousand digits": ("metres", [f"drive ring --driver pi --length {'9' * 5000}"]),
-    "a table that is a number": ("virtual", ["train on-ramp --set virtual=5"]),
-    "a folder for what is not written": ("--no-report", ["drive ring --driver pi --no-report --out new"]),
+    "a length without digits": ("meters, like 230 or 220-270", ["drive ring --driver pi --length ²"]),
+    "a length of a thousand digits": ("meters", [f"drive ring --driver pi --length {'9' * 5000}"]),
+    "a table that is a number": ("model", ["train on-ramp --set model=5"]),
+    "a folder without a report": ("--no-report", ["drive ring --driver pi --no-report --out new"]),
     "nothing to vary": ("at least one key", ["search ring"]),
-    "what is no range": ("low < high", ["search ring --vary trpo.gamma=1..0"]),
-    "unknown executor": ("local, ray", ["search ring --vary trpo.gamma=0.9..0.95 --executor cloud"]),
+    "an invalid range": ("low < high", ["search ring --vary trpo.gamma=1..0"]),
+    "unknown executor": ("'local', 'ray'", ["search ring --vary trpo.gamma=0.9..0.95 --executor cloud"]),
     "unknown scenario": ("ring, ring-warm, ring-jammed", ["drive nowhere --driver pi"]),
-    "folder where none can be": ("allowed: a new folder", ["drive ring --driver pi --out /proc/unjam"]),
+    "folder that cannot be made": ("allowed: a new folder", ["drive ring --driver pi --out /proc/unjam"]),
     "folder of a name too long": ("File name too long", [f"drive ring --driver pi --out {'a' * 300}"]),
     "unknown driver": ("human, idm, pi", ["drive ring --driver ghost"]),
     "unknown parameter of a driver": ("driver pi.ghost: unknown name", ["drive ring --driver pi:ghost=1"]),
-    "word for a number": ("time_constant: 'fast'", ["drive ring --driver pi:time_constant=fast"]),
+    "text for a number": ("time_constant: 'fast'", ["drive ring --driver pi:time_constant=fast"]),
     "negative parameter": ("time_constant: -1", ["drive ring --driver pi:time_constant=-1"]),
     "no episodes": ("episodes", ["drive ring --driver pi --episodes 0"]),
-    "word for a count": ("many", ["drive ring --driver pi --episodes many"]),
-    "length that is no number": ("length: '2x0'", ["drive ring --driver pi --length 2x0"]),
+    "text for a count": ("many", ["drive ring --driver pi --episodes many"]),
+    "length that is not a number": ("length: '2x0'", ["drive ring --driver pi --length 2x0"]),
     "ring too short for its vehicles": (">= 154 m", ["drive ring --driver pi --length 30"]),
-    "range the wrong way round": ("length: 220 m", ["drive ring --driver pi --length 270-220"]),
+    "reversed range": ("length: 220 m", ["drive ring --driver pi --length 270-220"]),
     "one vehicle": ("vehicles: 1", ["drive ring --driver pi --vehicles 1"]),
     "more CAVs than vehicles": ("cavs: 23", ["drive ring --driver pi --cavs 23"]),
     "unknown key of a scenario": ("ghost: unknown name", ["drive ring --driver pi --set ghost=1"]),
-    "word for a noise": ("noise: 'loud'", ["drive ring --driver pi --set noise=loud"]),
+    "text for a noise": ("noise: 'loud'", ["drive ring --driver pi --set noise=loud"]),
     "not a number": ("noise: nan", ["drive ring --driver pi --set noise=nan"]),
     "no horizon": ("horizon: 0", ["drive ring --driver pi --set horizon=0"]),
-    "unknown way of actuation": ("actuation: 'wild'", ["drive ring --driver pi --set actuation=wild"]),
+    "unknown actuation": ("actuation: 'wild'", ["drive ring --driver pi --set actuation=wild"]),
     "setting without a value": ("key=value", ["drive ring --driver pi --set horizon"]),
-    "people that are missing": ("does not exist", ["drive ring --driver pi --humans none.json"]),
-    "people that are none": ("not a population", ["drive ring --driver pi --humans mine.py"]),
-    "trajectories that are missing": ("does not exist", ["fit-drivers none.csv"]),
-    "trajectories chosen by a word": (
-        "--only: 'bad' is not allowed; allowed: key=value",
-        ["fit-drivers none.csv --only bad"],
+    "missing population": ("does not exist", ["drive ring --driver pi --humans none.json"]),
+    "file that is not a population": ("not a population", ["drive ring --driver pi --humans mine.py"]),
+    "missing trajectories": ("does not exist", ["fit-drivers none.csv"]),
+    "trajectories selected by a word": (
+        "--select: 'bad' is not allowed; allowed: key=value",
+        ["fit-drivers none.csv --select bad"],
     ),
     "unknown reward": ("released, released-merge, eq16", ["drive ring --driver pi --reward gold"]),
     "reward that is not in the file": ("has no 'ghost'", ["drive ring --driver pi --reward mine.py:ghost"]),
@@ -69,21 +69,24 @@ WRONG: dict[str, tuple[str, list[str]]] = {
         "SystemExit when loading it",
         ["drive ring --driver pi --reward ends.py:gentle"],
     ),
-    "an episode without end": ("horizon: 1000000000", ["drive ring --driver pi --set horizon=1000000000"]),
-    "two drivers in one window": ("driver: 'pi, acc'", ["watch ring -d pi -d acc --video film.gif"]),
-    "report over another file": ("allowed: a file that ends in .html", ["report full --out mine.py"]),
-    "certificate over another file": ("allowed: a file that ends in .html", ["certify torn.unjam --out mine.py"]),
-    "emissions of an own network": (
+    "an endless episode": ("horizon: 1000000000", ["drive ring --driver pi --set horizon=1000000000"]),
+    "two drivers in one window": ("driver: 'pi, acc'", ["watch ring -d pi -d acc --video video.gif"]),
+    "report that overwrites another file": ("allowed: a file that ends in .html", ["report full --out mine.py"]),
+    "certificate that overwrites another file": (
+        "allowed: a file that ends in .html",
+        ["certify torn.unjam --out mine.py"],
+    ),
+    "emissions of a user network": (
         "emission_class: it is not allowed",
-        ["drive good.sumocfg --driver pi --cav-share 0.5 --set emission_class=zero"],
+        ["drive good.sumocfg --driver pi --penetration-rate 0.5 --set emission_class=zero"],
     ),
     "tuning a controller": ("expert: 'unjam:ring-best' is not", ["tune ring --expert unjam:ring-best"]),
     "driver that cannot be made": ("no battery", ["drive ring --driver mine.py:Raises"]),
-    "driver that answers NaN": ("step 0: acceleration", ["drive ring --driver mine.py:broken"]),
-    "driver that answers too many": ("one for each CAV", ["drive ring --driver mine.py:short"]),
+    "driver that returns NaN": ("step 0: acceleration", ["drive ring --driver mine.py:broken"]),
+    "driver that returns too many accelerations": ("one for each CAV", ["drive ring --driver mine.py:short"]),
     "driver that raises": ("mine.py:raises: ValueError: lost the map (line", ["drive ring --driver mine.py:raises"]),
     "controller that is missing": ("does not exist", ["drive ring --driver none.unjam"]),
-    "controller that is none": ("not a controller", ["drive ring --driver torn.unjam"]),
+    "file that is not a controller": ("not a controller", ["drive ring --driver torn.unjam"]),
     "folder that is not empty": ("full' is not empty", ["drive ring --driver pi --out full"]),
     "missing configuration": ("none.toml: No such file", ["train ring --config none.toml"]),
     "configuration that is not TOML": ("not TOML", ["train ring --config torn.toml"]),
@@ -96,90 +99,96 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "tuning a family that is changed": ("scenario: with rings", ["tune rings --length 230"]),
     "tuning with too few steps": ("steps: 10", ["tune rings --steps 10"]),
     "training into a folder that is not empty": ("--resume full", ["train ring --out full"]),
-    "resuming what is no run": ("not a run folder", ["train --resume full"]),
-    "what an option says too": (
-        "--set length: it is not allowed beside the option for it",
+    "resuming a folder that is not a run": ("not a run folder", ["train --resume full"]),
+    "setting of an option": (
+        "--set length: it is not allowed together with the option for it",
         ["drive ring --length 230 --set length=240"],
     ),
-    "what an option of a training says too": (
-        "--set scenario_options.length: it is not allowed beside the option for it",
+    "setting of an option of a training": (
+        "--set scenario_options.length: it is not allowed together with the option for it",
         ["train ring --length 230 --set scenario_options.length=240"],
     ),
-    "resuming with a preset": ("not allowed beside it", ["train --resume full --preset demo"]),
-    "evaluating what is no run": ("not a run folder", ["evaluate full"]),
-    "virtual environment of what is no run": ("not a run folder", ["model full"]),
-    "virtual environment of a run without one": ("has no virtual environment", ["model model-free"]),
-    "report of no folder": ("report: 'nowhere' is not a folder", ["report nowhere"]),
-    "report of nothing": ("has no evaluation.json", ["report full"]),
+    "resuming with a preset": ("not allowed together with it", ["train --resume full --preset demo"]),
+    "evaluating a folder that is not a run": ("not a run folder", ["evaluate full"]),
+    "model of a folder that is not a run": ("not a run folder", ["model full"]),
+    "model of a run without one": ("has no learned model", ["model model-free"]),
+    "report of a missing folder": ("report: 'nowhere' is not a folder", ["report nowhere"]),
+    "report of an empty folder": ("has no evaluation.json", ["report full"]),
     "report of damaged results": ("damaged", ["report damaged"]),
-    "share above one": ("cav_share: 2", ["drive merge --driver pi --set cav_share=2"]),
-    "nobody a CAV": (
+    "penetration rate above one": ("penetration_rate: 2", ["drive merge --driver pi --set penetration_rate=2"]),
+    "no CAV": (
         "no CAV was on the road in 5 control steps",
-        ["drive merge --driver pi --set cav_share=0 --set horizon=5"],
+        ["drive merge --driver pi --set penetration_rate=0 --set horizon=5"],
     ),
-    "share of CAVs on a road without one": ("cav_share: unknown name", ["drive ring --driver pi --cav-share 0.1"]),
+    "share of CAVs on a road without one": (
+        "cav_share: unknown name",
+        ["drive ring --driver pi --penetration-rate 0.1"],
+    ),
     "configuration that is missing": ("there is no such file", ["drive none.sumocfg --driver pi"]),
-    "own network without CAVs": ("cav_share: 0.0", ["drive good.sumocfg --driver pi --cav-share 0"]),
-    "type that nobody has": (
+    "user network without CAVs": ("penetration_rate: 0.0", ["drive good.sumocfg --driver pi --penetration-rate 0"]),
+    "unused vehicle type": (
         "no vehicle has the type 'tank'; allowed: car",
         ["drive good.sumocfg --driver pi --cav-types tank"],
     ),
     "network without a version": (
         "old.net.xml: the network has no version",
-        ["drive old.sumocfg --driver pi --cav-share 0.5"],
+        ["drive old.sumocfg --driver pi --penetration-rate 0.5"],
     ),
-    "network that is torn": ("torn.net.xml: cannot be read", ["drive torn.sumocfg --driver pi --cav-share 0.5"]),
-    "training where nobody is a CAV": (
-        "cav_share: 0.0",
+    "network that is torn": ("torn.net.xml: cannot be read", ["drive torn.sumocfg --driver pi --penetration-rate 0.5"]),
+    "training without CAVs": (
+        "penetration_rate: 0.0",
         ["train good.sumocfg --steps 10 --set scenario_options.penetration_rate=0"],
     ),
-    "assessing a road of the package": ("your own .sumocfg file", ["assess ring"]),
-    "assessing what is missing": ("there is no such file", ["assess none.sumocfg"]),
-    "shares that are words": ("shares: 'few'", ["assess good.sumocfg --shares few"]),
-    "too large a share to assess": ("shares: 2.0", ["assess good.sumocfg --shares 0.1,2"]),
+    "assessing a built-in road": ("your own .sumocfg file", ["assess ring"]),
+    "assessing a missing file": ("there is no such file", ["assess none.sumocfg"]),
+    "penetration rates that are text": ("penetration_rates: 'few'", ["assess good.sumocfg --penetration-rates few"]),
+    "assessing a penetration rate above one": (
+        "penetration_rates: 2.0",
+        ["assess good.sumocfg --penetration-rates 0.1,2"],
+    ),
     "too few episodes to assess": ("episodes: 10 is not allowed; allowed: >= ", ["assess good.sumocfg -n 10"]),
     "assessing in no time": ("minutes: 0.0", ["assess good.sumocfg --minutes 0"]),
-    "assessing people as CAVs": ("driver: 'human'", ["assess good.sumocfg -d human"]),
+    "assessing human drivers as CAVs": ("driver: 'human'", ["assess good.sumocfg -d human"]),
     "assessing into a folder that is not empty": ("full' is not empty", ["assess good.sumocfg --out full"]),
-    "calibrating a road of the package": (
+    "calibrating a built-in road": (
         "scenario: 'ring' is not allowed; allowed: your own .sumocfg file",
         ["calibrate ring --detectors counts.csv"],
     ),
     "calibrating without measurements": ("'none.csv' is not a file", ["calibrate good.sumocfg --detectors none.csv"]),
-    "measurements that are words": (
+    "measurements that are text": (
         "counts.csv: line 2: flow_veh_per_h: 'many' is not allowed; allowed: a number >= 0",
         ["calibrate good.sumocfg --detectors counts.csv"],
     ),
-    "detector that is nowhere": (
+    "detector on a missing edge": (
         "edge: 'nowhere' is not allowed; allowed: one of good.net.xml",
         ["calibrate good.sumocfg --detectors astray.csv"],
     ),
-    "calibrating what there is not": (
+    "calibrating an unknown factor": (
         "did you mean 'tau'",
         ["calibrate good.sumocfg --detectors counts.csv --vary tua=1..2"],
     ),
-    "exporting to a file of another kind": ("ends in .unjam", ["export pi --to pi.zip"]),
-    "exporting Python code": ("is Python code", ["export mine.py:gentle --to mine.unjam"]),
-    "verifying what is not there": ("does not exist", ["verify none.unjam"]),
-    "verifying what is no controller": ("not a controller", ["verify torn.unjam"]),
+    "exporting to a file of another kind": ("ends in .unjam", ["export pi --out pi.zip"]),
+    "exporting Python code": ("is Python code", ["export mine.py:gentle --out mine.unjam"]),
+    "verifying a missing file": ("does not exist", ["verify none.unjam"]),
+    "verifying a file that is not a controller": ("not a controller", ["verify torn.unjam"]),
     "driver of a long name": ("is not a file", [f"drive ring --driver {'a' * 300}.py:x"]),
-    "configuration nested without end": ("not TOML", ["train ring --config nested.toml"]),
+    "deeply nested configuration": ("not TOML", ["train ring --config nested.toml"]),
     "configuration with a number too long": ("not TOML", ["train ring --config number.toml"]),
     "number too long": ("steps: '999", [f"train ring --set steps={'9' * 5000}"]),
     "expert with a NUL in its path": (r"'a\x00.py:x' is not allowed", ["train ring --config nul.toml"]),
-    "people that are a device": ("population: '/dev/zero'", ["drive ring --driver pi --humans /dev/zero"]),
+    "population that is a device": ("population: '/dev/zero'", ["drive ring --driver pi --humans /dev/zero"]),
     "key of too many parts": ("a key of more than 100 parts", ["train ring --config deep.toml"]),
     "hexadecimal number too long": ("steps: a number of 2000 bits", ["train ring --config long.toml"]),
     "network with a NUL in its path": (r"scenario: 'a\x00.sumocfg'", ["train --config nuls.toml"]),
     "weight of a reward too large": (
-        "released: headway: 1",
-        [f"drive ring --driver pi --reward released:headway=1{'0' * 400}"],
+        "released: time_gap: 1",
+        [f"drive ring --driver pi --reward released:time_gap=1{'0' * 400}"],
     ),
-    "seed too large to tune with": ("seed: 4294967296", ["tune ring --seed 4294967296"]),
+    "seed too large to tune with": ("'--seed': 4294967296", ["tune ring --seed 4294967296"]),
     "text that is not UTF-8": ("allowed: text in UTF-8", ["drive ring --driver pi --out a\udcff"]),
     "weights that are complex": ("complex64", ["verify complex.unjam"]),
     "weights that are booleans": ("bool", ["verify boolean.unjam"]),
-    "film of an unknown kind": (".gif, .webp, .mp4", ["watch ring --driver pi --video film.avi"]),
+    "video of an unknown format": (".gif, .webp, .mp4", ["watch ring --driver pi --video video.avi"]),
 }
 
 
@@ -210,18 +219,18 @@ def files(tmp_path: Path, my_drivers: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "precious.txt").write_text("keep me")
     (tmp_path / "model-free").mkdir()
-    (tmp_path / "model-free" / "config.toml").write_text("[virtual]\nvirtual_ratio = 0.0\n")
+    (tmp_path / "model-free" / "config.toml").write_text("[model]\nmodel_ratio = 0.0\n")
     (tmp_path / "damaged").mkdir()
     (tmp_path / "damaged" / "evaluation.json").write_text('{"rows": [')
 
 
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("name", INVALID)
 @pytest.mark.usefixtures("files")
-def test_wrong_input_gets_one_line_and_exit_code_2(name: str, unjam: Run, tmp_path: Path) -> None:
-    words, (line,) = WRONG[name]
+def test_invalid_input_is_refused_in_one_line_with_exit_code_2(name: str, unjam: Run, tmp_path: Path) -> None:
+    message, (line,) = INVALID[name]
     ran = unjam(*line.split())
     assert ran.returncode == 2, ran.stderr
-    assert words in ran.stderr
+    assert message in ran.stderr
     assert one_line(ran.stderr)
     assert ran.stdout == ""
     assert (tmp_path / "full" / "precious.txt").read_text() == "keep me"
@@ -242,16 +251,16 @@ def test_special_files_are_not_written_to(unjam: Run, tmp_path: Path) -> None:
     assert (tmp_path / "pipe.html").is_fifo()
 
 
-def test_names_with_brackets_and_dollars_are_shown_as_they_are(unjam: Run) -> None:
+def test_names_with_brackets_and_dollars_are_printed_unchanged(unjam: Run) -> None:
     out = "x$HOME[b][bold]"
     ran = unjam("drive", "ring", "--driver", "pi", *SMALL, "--out", out, pictures=False)
     assert (ran.returncode, f"report: {out}/report.html" in ran.stderr) == (0, True), ran.stderr
     train = ["train", "ring", "--config", f"{out}.toml"]
     assert f"config file {out}.toml" in unjam(*train).stderr
-    assert out in unjam("runs", "--under", out).stderr
+    assert out in unjam("runs", "--folder", out).stderr
 
 
-def test_the_densest_ring_is_driven(unjam: Run) -> None:
+def test_the_densest_ring_runs(unjam: Run) -> None:
     dense = ["--vehicles", "22", "--length", "154", "--set", "horizon=5", "--no-report"]
     ran = unjam("drive", "ring", "--driver", "pi", *dense, "--json")
     assert ran.returncode == 0, ran.stderr
@@ -264,11 +273,11 @@ def test_a_closed_standard_output_is_no_error(unjam: Run, tmp_path: Path) -> Non
     assert (ran.returncode, ran.stderr) == (0, "")
 
 
-def test_few_file_descriptors_are_told_in_one_line(unjam: Run) -> None:
-    def few() -> None:
+def test_too_few_file_descriptors_are_reported_in_one_line(unjam: Run) -> None:
+    def limit_descriptors() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (16, 16))
 
-    ran = unjam("drive", "ring", "--driver", "pi", *SMALL, "--workers", "4", "-n", "4", preexec_fn=few)
+    ran = unjam("drive", "ring", "--driver", "pi", *SMALL, "--workers", "4", "-n", "4", preexec_fn=limit_descriptors)
     assert ran.returncode == 2
     assert one_line(ran.stderr), ran.stderr
     assert "Too many open files" in ran.stderr
@@ -279,11 +288,11 @@ def one_line(stderr: str) -> bool:
     return len(lines) == 1 and lines[0].startswith("unjam: ") and "Traceback" not in stderr
 
 
-def test_there_are_enough_wrong_inputs() -> None:
-    assert len(WRONG) >= 30
+def test_there_are_enough_invalid_inputs() -> None:
+    assert len(INVALID) >= 30
 
 
-def test_missing_sumo_is_code_3_and_how_to_install_it(unjam: Run, tmp_path: Path) -> None:
+def test_missing_sumo_has_exit_code_3_and_a_remedy(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "libsumo").mkdir()
     (tmp_path / "libsumo" / "__init__.py").write_text("raise ImportError('libproj.so.25: cannot open')")
     ran = unjam("drive", "ring", "--driver", "pi", environment={"PYTHONPATH": str(tmp_path)})
@@ -293,7 +302,7 @@ def test_missing_sumo_is_code_3_and_how_to_install_it(unjam: Run, tmp_path: Path
     assert "pip install libsumo" in ran.stderr
 
 
-def test_doctor_names_what_is_missing(unjam: Run, tmp_path: Path) -> None:
+def test_doctor_reports_missing_parts(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "libsumo").mkdir()
     (tmp_path / "libsumo" / "__init__.py").write_text("raise ImportError('gone')")
     ran = unjam("doctor", environment={"PYTHONPATH": str(tmp_path)})
@@ -302,11 +311,11 @@ def test_doctor_names_what_is_missing(unjam: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_disk_that_fills_up_is_code_74(unjam: Run, tmp_path: Path) -> None:
+def test_a_full_disk_has_exit_code_74(unjam: Run, tmp_path: Path) -> None:
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 
-    unjam("drive", "ring", "--driver", "pi", *SMALL, "--no-report")  # so that the network is made already
+    unjam("drive", "ring", "--driver", "pi", *SMALL, "--no-report")  # so that the network exists
     ran = unjam("drive", "ring", "--driver", "pi", *SMALL, "--out", "new", preexec_fn=little_space)
     assert ran.returncode == 74, ran.stderr
     assert one_line(ran.stderr)
@@ -315,7 +324,7 @@ def test_disk_that_fills_up_is_code_74(unjam: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_cache_that_cannot_be_written_is_code_74(unjam: Run, tmp_path: Path) -> None:
+def test_a_read_only_cache_has_exit_code_74(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     ran = unjam("drive", "ring", "--driver", "pi", environment={"UNJAM_CACHE": str(tmp_path / "file")})
     assert ran.returncode == 74, ran.stderr
@@ -323,7 +332,7 @@ def test_cache_that_cannot_be_written_is_code_74(unjam: Run, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_disk_that_fills_up_in_training_leaves_a_whole_checkpoint(unjam: Run, tmp_path: Path) -> None:
+def test_a_full_disk_in_training_leaves_a_complete_checkpoint(unjam: Run, tmp_path: Path) -> None:
     def little_space() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (90_000, 90_000))
 

@@ -1,4 +1,4 @@
-"""Links that a stranger has planted in a folder: no verb writes through them, whatever it writes."""
+"""No command writes through links that a foreign folder contains."""
 
 import os
 import re
@@ -12,10 +12,10 @@ from typing import NamedTuple
 import pytest
 
 from tests.faults.links import KINDS, plant, state_of, with_temporary_names
-from tests.paper.test_field import table
+from tests.paper.test_field_data import table
 from tests.system.conftest import PLAIN, UNJAM, Run
-from tests.system.test_calibrate import CALIBRATE, PEOPLE, ROWS
-from tests.system.test_verbs import SMALL, TINY_RUN
+from tests.system.test_calibrate import CALIBRATE, DEMAND, ROWS
+from tests.system.test_commands import SMALL, TINY_RUN
 from tests.worlds.sumo.user_networks import straight
 from unjam.processes import LOCK_FILE
 
@@ -30,26 +30,26 @@ SEARCH = ["search", "ring", *(word for key, value in TRIAL.items() for word in (
 SEARCH += ["--vary", "trpo.target_kl=0.01,0.02", "--workers", "1", "--out", "searched"]
 TUNE = ["tune", "ring", "--length", "60", "--vehicles", "5", "--set", "horizon=20", "--expert", "pi"]
 TUNE += ["--vary", "window=10,30", "--steps", "3000", "--out", "tuned"]
-ASSESS = ["assess", "straight.sumocfg", "--shares", "0.5", "-d", "acc", "--set", "horizon=40", "-n", "36"]
+ASSESS = ["assess", "straight.sumocfg", "--penetration-rates", "0.5", "-d", "acc", "--set", "horizon=40", "-n", "36"]
 FIT = ["fit-drivers", "data.parquet", "--set", "calibration.generations=2", "--out", "files/people.json"]
 STUDY = ["reproduce", "table-1", "--seeds", "1", "--workers", "1", "--out", "studies"]
 DRIVE = ["drive", "ring", "-d", "pi", "-n", "1", *SMALL, "--out", "new"]
-FILM = ["watch", "ring", *SMALL, "-d", "pi", "--video"]
-TWO_ROADS = '[[tasks]]\nroad = {length = [70, 70]}\n[[tasks]]\nname = "short"\n[virtual]\nvirtual_ratio = 0\n'
+VIDEO = ["watch", "ring", *SMALL, "-d", "pi", "--video"]
+TWO_ROADS = '[[tasks]]\nscenario_options = {length = [70, 70]}\n[[tasks]]\nname = "short"\n[model]\nmodel_ratio = 0\n'
 
 
 class Case(NamedTuple):
-    """A command line, the folder that it writes to, and whether it reads only."""
+    """A command line, the folder that it writes to, and whether it only reads."""
 
     words: list[str]
     folder: str
-    reads: bool = False
+    is_read_only: bool = False
 
 
 CASES = {
     "train": Case([*TINY_RUN, "--steps", "160", "--set", "model.model_ratio=0", "--out", "new"], "new"),
-    "train on": Case(["train", "--resume", "run", "--steps", "320", "--tensorboard"], "run"),
-    "train on, several roads": Case(["train", "--resume", "roads", "--steps", "640"], "roads"),
+    "resume": Case(["train", "--resume", "run", "--steps", "320", "--tensorboard"], "run"),
+    "resume, several roads": Case(["train", "--resume", "roads", "--steps", "640"], "roads"),
     "evaluate": Case(["evaluate", "run", "-n", "1", "--workers", "1"], "run"),
     "model": Case(["model", "run"], "run"),
     "report": Case(["report", "run"], "run"),
@@ -58,32 +58,32 @@ CASES = {
     "calibrate": Case([*map(str, CALIBRATE), "--out", "calibrated"], "calibrated"),
     "drive": Case(DRIVE, "new"),
     "assess": Case([*ASSESS, "--out", "new"], "new"),
-    "export": Case(["export", "run", "--to", "files/ring.unjam"], "files"),
+    "export": Case(["export", "run", "--out", "files/ring.unjam"], "files"),
     "certify": Case(["certify", "files/it.unjam"], "files"),
     "keys": Case(["keys", "files/another"], "files"),
     "sign": Case(["sign", "files/it.unjam", "--key", "files/maker.key"], "files"),
-    "watch": Case([*FILM, "files/film.gif"], "files"),
-    "watch, .mp4": Case([*FILM, "files/film.mp4"], "files"),
+    "watch": Case([*VIDEO, "files/video.gif"], "files"),
+    "watch, .mp4": Case([*VIDEO, "files/video.mp4"], "files"),
     "scenarios": Case(["scenarios", "ring", "--picture", "files/road.png"], "files"),
     "fit-drivers": Case(FIT, "files"),
-    "runs": Case(["runs", "--under", "."], "run", reads=True),
-    "verify": Case(["verify", "run"], "run", reads=True),
-    "runs remove": Case(["runs", "remove", "run", "--under", ".", "--yes"], "run"),
+    "runs": Case(["runs", "--folder", "."], "run", is_read_only=True),
+    "verify": Case(["verify", "run"], "run", is_read_only=True),
+    "runs remove": Case(["runs", "remove", "run", "--folder", ".", "--yes"], "run"),
 }
-NEVER_ENDS = {"reproduce": (Case(STUDY, "studies"), ("plans", "runs", "logs", "drives", "table-1"))}
-"""what would take hours; what it writes, where links are refused before it begins"""
+TOO_LONG = {"reproduce": (Case(STUDY, "studies"), ("configs", "runs", "logs", "references", "table-1"))}
+"""commands that take hours, and the names that they write, where links are refused at the start"""
 SYMBOLIC = [kind for kind in KINDS if kind != "hard link"]
 RANDOM = re.compile(r"\.[0-9a-f]{16}(\.part)?$")
-"""how names end that nobody can guess"""
+"""end of random names"""
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory, warm: Run) -> Path:
-    """A folder with one of everything that verbs write or go on with."""
+def base(tmp_path_factory: pytest.TempPathFactory, preloaded: Run) -> Path:
+    """Make a folder with examples of all files that commands write or continue."""
     place = tmp_path_factory.mktemp("base")
     (place / "files").mkdir()
     (place / "studies").mkdir()
-    straight(place, PEOPLE, length=100.0)
+    straight(place, DEMAND, length=100.0)
     (place / "detectors.csv").write_text("\n".join(ROWS).replace("100", "50"))
     table(place / "data.parquet", [{}, {}])
     (place / "roads.toml").write_text(TWO_ROADS)
@@ -93,16 +93,16 @@ def base(tmp_path_factory: pytest.TempPathFactory, warm: Run) -> Path:
         [*SEARCH, "--trials", "1"],
         TUNE,
         CASES["calibrate"].words,
-        ["export", "run", "--to", "files/it.unjam"],
+        ["export", "run", "--out", "files/it.unjam"],
         ["keys", "files/maker"],
     ):
-        made = warm(*words, folder=place, pictures=False)
-        assert made.returncode == 0, made.stderr
+        ran = preloaded(*words, folder=place, pictures=False)
+        assert ran.returncode == 0, ran.stderr
     return place
 
 
-class Scene:
-    """A copy of the base, with links to canaries elsewhere."""
+class Sandbox:
+    """A copy of the base, with links to files outside."""
 
     def __init__(self, base: Path, tmp_path: Path, folder: str) -> None:
         self.place, self.outside = tmp_path / "place", tmp_path / "outside"
@@ -110,10 +110,10 @@ class Scene:
         self.outside.mkdir()
         self.folder = self.place / folder
 
-    def run(self, warm: Run, case: Case) -> None:
-        """Run a verb: it ends well, or with one line, and nothing has changed outside."""
+    def run(self, preloaded: Run, case: Case) -> None:
+        """Run a command: it succeeds, or ends with one line, and nothing outside has changed."""
         before = state_of(self.outside)
-        ran = warm(*case.words, folder=self.place, pictures=False)
+        ran = preloaded(*case.words, folder=self.place, pictures=False)
         assert "Traceback" not in ran.stderr, ran.stderr
         assert ran.returncode in (0, 2), ran.stderr
         if ran.returncode == 2:
@@ -122,11 +122,11 @@ class Scene:
         assert {path.name for path in self.place.parent.iterdir()} == {"place", "outside"}
 
 
-def written_by(case: Case, base: Path, tmp_path: Path, warm: Run) -> dict[str, bool]:
-    """The names that a verb writes below its folder, and which are folders, found by running it."""
-    scene = Scene(base, tmp_path, case.folder)
+def written_by(case: Case, base: Path, tmp_path: Path, preloaded: Run) -> dict[str, bool]:
+    """Return the names that a command writes in its folder, and whether they are folders."""
+    scene = Sandbox(base, tmp_path, case.folder)
     before = state_of(scene.folder) if scene.folder.is_dir() else {}
-    ran = warm(*case.words, folder=scene.place, pictures=False)
+    ran = preloaded(*case.words, folder=scene.place, pictures=False)
     assert ran.returncode == 0, ran.stderr
     after = state_of(scene.folder) if scene.folder.is_dir() else {}
     changed = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
@@ -138,7 +138,7 @@ def written_by(case: Case, base: Path, tmp_path: Path, warm: Run) -> dict[str, b
 
 
 def plantings(written: dict[str, bool]) -> list[list[tuple[str, str]]]:
-    """What to plant together, name and kind: those in subfolders at once, as no verb sees them at first."""
+    """Return groups of names and kinds of links to plant together: those in subfolders at the same time."""
     files = [name for name, is_folder in written.items() if not is_folder]
     top = [name for name in written if "/" not in name] or ["progress.jsonl"]
     deep = [name for name in files if "/" in name]
@@ -152,40 +152,40 @@ def plantings(written: dict[str, bool]) -> list[list[tuple[str, str]]]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("verb", CASES)
-def test_no_verb_writes_through_a_link(verb: str, base: Path, tmp_path: Path, warm: Run) -> None:
-    case = CASES[verb]
-    written = written_by(case, base, tmp_path / "first", warm)
-    assert not case.reads or not written
+@pytest.mark.parametrize("command", CASES)
+def test_commands_do_not_write_through_links(command: str, base: Path, tmp_path: Path, preloaded: Run) -> None:
+    case = CASES[command]
+    written = written_by(case, base, tmp_path / "first", preloaded)
+    assert not case.is_read_only or not written
     for number, planted in enumerate(filter(None, plantings(written))):
-        scene = Scene(base, tmp_path / str(number), case.folder)
+        scene = Sandbox(base, tmp_path / str(number), case.folder)
         for name, kind in planted:
             plant(scene.folder / name, kind, scene.outside)
-        scene.run(warm, case)
+        scene.run(preloaded, case)
         shutil.rmtree(scene.place.parent)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("verb", NEVER_ENDS)
-def test_what_takes_hours_refuses_links_before_it_begins(verb: str, base: Path, tmp_path: Path, warm: Run) -> None:
-    case, names = NEVER_ENDS[verb]
+@pytest.mark.parametrize("command", TOO_LONG)
+def test_long_commands_refuse_links_at_the_start(command: str, base: Path, tmp_path: Path, preloaded: Run) -> None:
+    case, names = TOO_LONG[command]
     for number, (name, kind) in enumerate(zip(with_temporary_names([*names]), cycle(SYMBOLIC), strict=False)):
-        scene = Scene(base, tmp_path / str(number), case.folder)
+        scene = Sandbox(base, tmp_path / str(number), case.folder)
         plant(scene.folder / name, kind, scene.outside)
-        scene.run(warm, case)
+        scene.run(preloaded, case)
         assert [path.name for path in scene.folder.iterdir()] == [Path(name).name]
 
 
 @pytest.mark.long
-def test_a_folder_may_be_reached_through_links(base: Path, tmp_path: Path, warm: Run) -> None:
-    scene = Scene(base, tmp_path, "run")
+def test_a_folder_may_be_reached_through_links(base: Path, tmp_path: Path, preloaded: Run) -> None:
+    scene = Sandbox(base, tmp_path, "run")
     (scene.place / "data").mkdir()
     shutil.move(scene.folder, scene.place / "data" / "run")
     (scene.place / "link").symlink_to("data")
-    ran = warm("report", "link/run", folder=scene.place, pictures=False)
+    ran = preloaded("report", "link/run", folder=scene.place, pictures=False)
     assert ran.returncode == 0, ran.stderr
     (scene.place / "last").symlink_to("data/run")
-    ran = warm("evaluate", "last", "-n", "1", folder=scene.place, pictures=False)
+    ran = preloaded("evaluate", "last", "-n", "1", folder=scene.place, pictures=False)
     assert ran.returncode == 0, ran.stderr
 
 
@@ -196,10 +196,10 @@ CHANGES = "mkdir,mkdirat,rename,renameat,renameat2,unlink,unlinkat,rmdir,link,li
 
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("strace"), reason="no strace")
-@pytest.mark.parametrize("verb", CASES)
-def test_whatever_a_verb_writes_it_names_from_an_open_folder(verb: str, base: Path, tmp_path: Path) -> None:
-    """Also what other packages and programs write: each of the system's calls is looked at."""
-    case, scene, log = CASES[verb], Scene(base, tmp_path, CASES[verb].folder), tmp_path / "log"
+@pytest.mark.parametrize("command", CASES)
+def test_commands_write_relative_to_open_folders(command: str, base: Path, tmp_path: Path) -> None:
+    """All system calls are checked, including those of other packages and programs."""
+    case, scene, log = CASES[command], Sandbox(base, tmp_path, CASES[command].folder), tmp_path / "log"
     trace = ["strace", "-f", "-qq", "-y", "-s", "4096", "-e", f"trace=open,creat,openat,{CHANGES}", "-o", str(log)]
     environment = {**os.environ, **PLAIN}
     ran = subprocess.run(
@@ -211,7 +211,7 @@ def test_whatever_a_verb_writes_it_names_from_an_open_folder(verb: str, base: Pa
 
 
 def is_unsafe(line: str, folder: Path) -> bool:
-    """Whether a line of strace changes something inside a folder by a path that may lead through links."""
+    """Return whether a line of strace modifies a folder by a path that may contain links."""
     found = CALL.search(line)
     if found is None:
         return False

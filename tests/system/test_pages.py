@@ -1,4 +1,4 @@
-"""How the cells of the documentation are run and kept."""
+"""Are the cells of the documentation run and cached?"""
 
 import re
 from importlib import import_module
@@ -17,7 +17,7 @@ def cells(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return import_module("cells")
 
 
-def test_what_cells_made_is_kept_until_a_measured_file_or_code_changes(
+def test_outputs_of_cells_are_cached_until_results_or_code_change(
     cells: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cells, "ROOT", tmp_path)
@@ -36,7 +36,7 @@ def test_what_cells_made_is_kept_until_a_measured_file_or_code_changes(
     assert list(build.iterdir()) == [found[-1]]
 
 
-def test_pages_share_a_kernel_and_know_nothing_of_each_other(cells: ModuleType, tmp_path: Path) -> None:
+def test_pages_share_a_kernel_but_no_variables(cells: ModuleType, tmp_path: Path) -> None:
     process = "import os, sys; print(os.getpid(), os.getcwd(), 'mine' in globals(), 'unjam' in sys.modules)"
     words = []
     for name in ("one", "other"):
@@ -53,8 +53,8 @@ def test_pages_share_a_kernel_and_know_nothing_of_each_other(cells: ModuleType, 
     assert of_other == [str(tmp_path / "other"), "False", "True"]
 
 
-def test_every_picture_that_a_cell_draws_is_told_in_words() -> None:
-    """Without them a reader who does not see it is read the name of a file."""
+def test_every_figure_of_a_cell_has_an_alternative_text() -> None:
+    """Screen readers would read the name of the file instead."""
     drawn = [
         (page.name, cell)
         for page in (ROOT / "docs").glob("*.md")

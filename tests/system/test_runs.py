@@ -1,4 +1,4 @@
-"""`unjam runs` as it is typed, on folders that look like runs."""
+"""Does `unjam runs` list, compare and remove runs?"""
 
 import json
 from pathlib import Path
@@ -10,12 +10,12 @@ from tests.training.test_runs import CONFIG, made
 
 
 @pytest.fixture(autouse=True)
-def there(tmp_path: Path) -> None:
+def runs(tmp_path: Path) -> None:
     made(tmp_path / "runs" / "ring-001", CONFIG, 1000, gain=7.0)
     made(tmp_path / "runs" / "ring-002", CONFIG, 400)
 
 
-def test_they_are_listed_compared_and_told_as_csv(unjam: Run) -> None:
+def test_runs_are_listed_compared_and_printed_as_csv(unjam: Run) -> None:
     lines = unjam("runs").stdout.splitlines()
     assert lines[1].split() == ["ring-001", "ring", "–", "finished", "1,000", "+7", "[+7,", "+7]"]
     assert "400 of 1,000" in lines[2]
@@ -24,25 +24,25 @@ def test_they_are_listed_compared_and_told_as_csv(unjam: Run) -> None:
     compared = unjam("runs", "compare", "ring-001", "ring-002")
     assert "their settings are the same" in compared.stdout
     assert "unjam report runs/ring-001 runs/ring-002 --out compared.html" in compared.stderr
-    assert unjam("runs", "progress", "ring-002").stdout.splitlines() == ["iteration,actual_steps", "1,400"]
+    assert unjam("runs", "progress", "ring-002").stdout.splitlines() == ["iteration,environment_steps", "1,400"]
 
 
-def test_removing_asks_and_spares_what_is_no_run(unjam: Run, tmp_path: Path) -> None:
-    asked = unjam("runs", "remove", "ring-001")
-    assert (asked.returncode, asked.stdout) == (2, "")
-    assert "with --yes" in asked.stderr
+def test_remove_asks_and_refuses_other_folders(unjam: Run, tmp_path: Path) -> None:
+    unconfirmed = unjam("runs", "remove", "ring-001")
+    assert (unconfirmed.returncode, unconfirmed.stdout) == (2, "")
+    assert "with --yes" in unconfirmed.stderr
     assert unjam("runs", "remove", "ring-001", "runs", "--yes").returncode == 2
     assert (tmp_path / "runs" / "ring-001").is_dir()
-    elsewhere = unjam("runs", "--under", "studies", "remove", "ring-001", "--yes")
+    elsewhere = unjam("runs", "--folder", "studies", "remove", "ring-001", "--yes")
     assert elsewhere.returncode == 2
-    assert "allowed: behind it, as in unjam runs remove --under studies" in elsewhere.stderr
+    assert "allowed: after it, as in unjam runs remove --folder studies" in elsewhere.stderr
     assert (tmp_path / "runs" / "ring-001").is_dir()
     assert unjam("runs", "remove", "ring-001", "runs/ring-001", "--yes").returncode == 0
     assert not (tmp_path / "runs" / "ring-001").exists()
     assert (tmp_path / "runs" / "ring-002").is_dir()
 
 
-def test_where_there_are_none_the_first_is_suggested(unjam: Run) -> None:
+def test_an_empty_list_suggests_a_training(unjam: Run) -> None:
     ran = unjam("runs", "--scenario", "merge")
     assert ran.returncode == 0
     assert "unjam train ring --preset demo" in ran.stderr

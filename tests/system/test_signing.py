@@ -1,4 +1,4 @@
-"""Signing a controller, and telling who signed it, as a user does."""
+"""Sign a controller and verify its signature on the command line."""
 
 import json
 import re
@@ -12,7 +12,7 @@ import pytest
 from tests.controller.test_signature import FORGED, NO_PRIVATE_KEYS, forge
 from tests.controller.test_verify import content_of
 from tests.system.conftest import ROOT, Run
-from tests.system.test_wrong_inputs import one_line
+from tests.system.test_invalid_inputs import one_line
 from unjam.controller.file import WEIGHTS_PART, pack_parts, unpack_parts
 
 DRIVE = ("drive", "ring", "--set", "horizon=5", "--set", "warmup=0", "-n", "1", "--no-report", "--driver")
@@ -20,7 +20,7 @@ DRIVE = ("drive", "ring", "--set", "horizon=5", "--set", "warmup=0", "-n", "1", 
 
 @pytest.fixture
 def maker(unjam: Run, tmp_path: Path) -> str:
-    """The fingerprint of `maker.pub`, beside whose private key lies a controller."""
+    """Return the fingerprint of `maker.pub`; its private key and a controller are in the same folder."""
     (tmp_path / "it.unjam").write_bytes(content_of())
     return json.loads(unjam("keys", "maker", "--json").stdout)["fingerprint"]
 
@@ -32,15 +32,15 @@ def refused(unjam: Run, *words: str) -> str:
     return ran.stderr
 
 
-def test_what_was_signed_is_verified_and_drives(unjam: Run, tmp_path: Path, maker: str) -> None:
+def test_a_signed_controller_is_verified_and_drives(unjam: Run, tmp_path: Path, maker: str) -> None:
     plain = json.loads(unjam("verify", "it.unjam", "--json").stdout)
     assert (plain["signed_by"], plain["signer"]) == (None, None)
     ran = unjam("sign", "it.unjam", "--key", "maker.key")
     assert (ran.stdout, ran.stderr) == (f"it.unjam: signed by {maker}\n", "")
-    told = json.loads(unjam("verify", "it.unjam", "--json").stdout)
-    assert (told["ok"], told["signed_by"], told["signer"]) == (True, maker, None)
-    told = json.loads(unjam("verify", "it.unjam", "--signer", "maker.pub", "--json").stdout)
-    assert (told["ok"], told["signed_by"], told["signer"]) == (True, maker, "maker.pub")
+    verified = json.loads(unjam("verify", "it.unjam", "--json").stdout)
+    assert (verified["ok"], verified["signed_by"], verified["signer"]) == (True, maker, None)
+    verified = json.loads(unjam("verify", "it.unjam", "--signer", "maker.pub", "--json").stdout)
+    assert (verified["ok"], verified["signed_by"], verified["signer"]) == (True, maker, "maker.pub")
     (line,) = [
         line
         for line in unjam("verify", "it.unjam", "--signer", "maker.pub").stdout.splitlines()
@@ -66,13 +66,13 @@ def test_the_documented_check_without_unjam_agrees(unjam: Run, tmp_path: Path, m
     assert "InvalidSignature" in run().stderr
 
 
-def test_a_signature_that_is_gone_is_missed_by_who_wants_one(unjam: Run, maker: str) -> None:
+def test_a_missing_signature_is_refused_if_a_signer_is_required(unjam: Run, maker: str) -> None:
     assert "it is not signed" in refused(unjam, "verify", "it.unjam", "--signer", "maker.pub")
     assert unjam("verify", "it.unjam").returncode == 0
 
 
-@pytest.mark.parametrize("verb", ["drive", "verify", "certify", "export", "sign"])
-def test_no_reader_takes_a_forged_controller(verb: str, unjam: Run, tmp_path: Path, maker: str) -> None:
+@pytest.mark.parametrize("command", ["drive", "verify", "certify", "export", "sign"])
+def test_a_forged_controller_is_refused(command: str, unjam: Run, tmp_path: Path, maker: str) -> None:
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
     path = tmp_path / "it.unjam"
     parts = unpack_parts(path)
@@ -81,17 +81,17 @@ def test_no_reader_takes_a_forged_controller(verb: str, unjam: Run, tmp_path: Pa
         "drive": (*DRIVE, "it.unjam"),
         "verify": ("verify", "it.unjam"),
         "certify": ("certify", "it.unjam"),
-        "export": ("export", "it.unjam", "--to", "other.unjam"),
+        "export": ("export", "it.unjam", "--out", "other.unjam"),
         "sign": ("sign", "it.unjam", "--key", "maker.key", "--replace"),
-    }[verb]
-    for content, why in ((forge(changed), FORGED), (pack_parts(changed), "controller it.unjam: damaged: ")):
+    }[command]
+    for content, reason in ((forge(changed), FORGED), (pack_parts(changed), "controller it.unjam: damaged: ")):
         path.write_bytes(content)
-        assert why in refused(unjam, *words)
+        assert reason in refused(unjam, *words)
         assert path.read_bytes() == content
     assert sorted(each.name for each in tmp_path.iterdir()) == ["it.unjam", "maker.key", "maker.pub"]
 
 
-def test_a_signed_file_is_not_certified_again(unjam: Run, tmp_path: Path, maker: str) -> None:
+def test_a_signed_file_is_not_certified(unjam: Run, tmp_path: Path, maker: str) -> None:
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
     before = (tmp_path / "it.unjam").read_bytes()
     words = f"a file that is signed (by {maker}) is not allowed; allowed: one that is not: certify it first"
@@ -100,18 +100,18 @@ def test_a_signed_file_is_not_certified_again(unjam: Run, tmp_path: Path, maker:
     assert not (tmp_path / "it.html").exists()
 
 
-def test_what_another_has_signed_is_signed_again_on_demand_alone(unjam: Run, maker: str) -> None:
+def test_a_signature_of_another_key_is_replaced_only_on_demand(unjam: Run, maker: str) -> None:
     other = json.loads(unjam("keys", "other", "--json").stdout)["fingerprint"]
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
     assert f"(it is signed by {maker}); or --replace" in refused(unjam, "sign", "it.unjam", "--key", "other.key")
     ran = unjam("sign", "it.unjam", "--key", "other.key", "--replace", "--json")
-    assert json.loads(ran.stdout) == {"file": "it.unjam", "fingerprint": other, "replaced": maker}
+    assert json.loads(ran.stdout) == {"file": "it.unjam", "fingerprint": other, "previous_fingerprint": maker}
     words = f"it is signed by another key, {other}; allowed: signed by 'maker.pub', {maker}"
     assert words in refused(unjam, "verify", "it.unjam", "--signer", "maker.pub")
 
 
-def test_keys_are_made_once(unjam: Run, tmp_path: Path, maker: str) -> None:
+def test_existing_keys_are_not_overwritten(unjam: Run, tmp_path: Path, maker: str) -> None:
     before = (tmp_path / "maker.key").read_bytes()
     assert "name: 'maker' is not allowed; allowed: one of which there are no " in refused(unjam, "keys", "maker")
     assert (tmp_path / "maker.key").read_bytes() == before
@@ -133,8 +133,8 @@ def test_other_keys_are_refused(name: str, unjam: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("maker")
-def test_a_key_that_others_may_use_is_told_of(unjam: Run, tmp_path: Path) -> None:
+def test_a_key_that_others_can_read_is_noted(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "maker.key").chmod(0o640)
     ran = unjam("sign", "it.unjam", "--key", "maker.key")
     assert ran.returncode == 0
-    assert ran.stderr == "note: others on this machine may use maker.key: chmod 600\n"
+    assert ran.stderr == "note: other users of this machine can read maker.key: chmod 600\n"

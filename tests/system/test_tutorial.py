@@ -8,9 +8,9 @@ TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.ipynb"
 
 
 @pytest.mark.slow
-def test_the_tutorial_runs(tmp_path: Path) -> None:
+def test_tutorial_runs(tmp_path: Path) -> None:
     notebook = nbformat.read(TUTORIAL, as_version=4)
     NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    words = "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
-    assert "pi     mean speed" in words
-    assert "return beyond the expert" in words
+    text = "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
+    assert "pi     mean speed" in text
+    assert "return beyond the expert" in text

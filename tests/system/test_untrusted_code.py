@@ -1,4 +1,4 @@
-"""A folder that somebody else has made names Python code: it runs only where its user says so."""
+"""Python code that a foreign folder names runs only if the user trusts it."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from tests.conftest import strangers_driver
 from tests.controller.test_file import residual
 from tests.system.conftest import Run
-from tests.system.test_wrong_inputs import one_line
+from tests.system.test_invalid_inputs import one_line
 from tests.training.test_run import small_config
 from tests.worlds.sumo.user_networks import straight
 from unjam.cli import CODE_RUNNING_COMMANDS
@@ -20,21 +20,21 @@ from unjam.trust import TRUSTED_VARIABLE
 DRIVER = "def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n"
 ROAD = ("ring", "--set", "horizon=20", "--set", "warmup=0")
 DRIVE = ("drive", *ROAD, "--episodes", "1", "--workers", "1", "--no-report", "--driver")
-KINDS = "trpo.target_kl=0.1,0.2"
-VERBS = {
+VARY = "trpo.target_kl=0.1,0.2"
+COMMANDS = {
     "drive": (*DRIVE, "run"),
-    "drive beside another": (*DRIVE, "pi+run"),
-    "watch": ("watch", *ROAD, "--driver", "run", "--video", "film.gif"),
-    "assess": ("assess", "straight.sumocfg", "-d", "run", "--shares", "0.5", "--set", "horizon=20"),
-    "train on it": ("train", "ring", "--expert", "run", "--steps", "100"),
-    "train as it": ("train", "--config", "run/config.toml", "--out", "new"),
-    "train beside it": ("train", "--config", "run/best.toml", "--out", "new"),
-    "go on": ("train", "--resume", "run"),
-    "search": ("search", "ring", "--expert", "run", "--vary", KINDS, "--out", "new"),
-    "search as it": ("search", "--config", "run/config.toml", "--vary", KINDS, "--out", "new"),
+    "drive together with another": (*DRIVE, "pi+run"),
+    "watch": ("watch", *ROAD, "--driver", "run", "--video", "video.gif"),
+    "assess": ("assess", "straight.sumocfg", "-d", "run", "--penetration-rates", "0.5", "--set", "horizon=20"),
+    "train with it as expert": ("train", "ring", "--expert", "run", "--steps", "100"),
+    "train with its configuration": ("train", "--config", "run/config.toml", "--out", "new"),
+    "train with its best configuration": ("train", "--config", "run/best.toml", "--out", "new"),
+    "resume": ("train", "--resume", "run"),
+    "search": ("search", "ring", "--expert", "run", "--vary", VARY, "--out", "new"),
+    "search with its configuration": ("search", "--config", "run/config.toml", "--vary", VARY, "--out", "new"),
     "evaluate": ("evaluate", "run", "--episodes", "1"),
     "model": ("model", "run"),
-    "export": ("export", "run", "--to", "it.unjam"),
+    "export": ("export", "run", "--out", "it.unjam"),
     "certify": ("certify", "run"),
     "verify": ("verify", "run"),
 }
@@ -42,9 +42,9 @@ VERBS = {
 
 @pytest.fixture
 def ran(tmp_path: Path) -> Path:
-    """What appears when the code runs that the folder `run` names, which somebody else has made."""
+    """Return a file that appears if the code runs that the foreign folder `run` names."""
     run, code, ran = tmp_path / "run", tmp_path / "run" / "code.py", tmp_path / "ran"
-    create_run_folder(run, small_config(expert=f"{code}:gentle", road__horizon=20))
+    create_run_folder(run, small_config(expert=f"{code}:gentle", scenario_options__horizon=20))
     (run / "best.toml").write_text((run / "config.toml").read_text())
     code.write_text(DRIVER)
     driver = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
@@ -53,10 +53,10 @@ def ran(tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("verb", VERBS)
-def test_code_that_a_folder_names_does_not_run(verb: str, unjam: Run, tmp_path: Path, ran: Path) -> None:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_untrusted_code_does_not_run(command: str, unjam: Run, tmp_path: Path, ran: Path) -> None:
     straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
-    done = unjam(*VERBS[verb], pictures=False)
+    done = unjam(*COMMANDS[command], pictures=False)
     assert (done.returncode, done.stdout) == (2, ""), done.stderr
     assert one_line(done.stderr), done.stderr
     assert f"{str(tmp_path / 'run' / 'code.py')!r}" in done.stderr
@@ -65,22 +65,22 @@ def test_code_that_a_folder_names_does_not_run(verb: str, unjam: Run, tmp_path: 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("verb", ["drive", "watch", "go on", "evaluate"])
-def test_code_that_its_user_trusts_runs(verb: str, unjam: Run, ran: Path) -> None:
-    done = unjam(*VERBS[verb], "--trust-code", pictures=False)
+@pytest.mark.parametrize("command", ["drive", "watch", "resume", "evaluate"])
+def test_trusted_code_runs(command: str, unjam: Run, ran: Path) -> None:
+    done = unjam(*COMMANDS[command], "--trust-code", pictures=False)
     assert done.returncode == 0, done.stderr
     assert ran.exists()
 
 
-def test_certify_goes_on_to_what_it_needs_where_the_code_is_trusted(unjam: Run, ran: Path) -> None:
-    done = unjam(*VERBS["certify"], "--trust-code")
+def test_certify_of_trusted_code_checks_its_requirements(unjam: Run, ran: Path) -> None:
+    done = unjam(*COMMANDS["certify"], "--trust-code")
     assert (done.returncode, done.stdout, one_line(done.stderr)) == (2, "", True), done.stderr
     assert "a controller without its safety filter and sample is not allowed" in done.stderr
     assert ran.exists()
 
 
-def test_every_verb_that_can_be_told_so_knows_how_to_trust_code() -> None:
-    assert {words[0] for words in VERBS.values()} == {verb.__name__ for verb in CODE_RUNNING_COMMANDS}
+def test_all_commands_that_run_code_are_tested() -> None:
+    assert {words[0] for words in COMMANDS.values()} == CODE_RUNNING_COMMANDS
 
 
 def test_code_that_ran_is_trusted_until_it_changes(unjam: Run, tmp_path: Path, ran: Path) -> None:
@@ -91,7 +91,7 @@ def test_code_that_ran_is_trusted_until_it_changes(unjam: Run, tmp_path: Path, r
     code = tmp_path / "run" / "code.py"
     code.write_text(f"{code.read_text()}# changed\n")
     ran.unlink()
-    for arguments in (VERBS["drive"], VERBS["go on"]):
+    for arguments in (COMMANDS["drive"], COMMANDS["resume"]):
         done = unjam(*arguments)
         assert (done.returncode, one_line(done.stderr)) == (2, True), done.stderr
     assert not ran.exists()
@@ -107,17 +107,17 @@ def test_the_same_code_in_another_folder_is_not_trusted(unjam: Run, tmp_path: Pa
     assert not ran.exists()
 
 
-def test_folders_are_listed_and_reported_without_their_code(unjam: Run, ran: Path) -> None:
-    listed = unjam("runs", "--under", ".")
+def test_listing_folders_does_not_run_their_code(unjam: Run, ran: Path) -> None:
+    listed = unjam("runs", "--folder", ".")
     assert listed.returncode == 0, listed.stderr
     assert "run" in listed.stdout
     assert not ran.exists()
 
 
 @pytest.mark.long
-def test_who_names_his_own_code_is_asked_for_nothing(unjam: Run, tmp_path: Path) -> None:
+def test_code_that_the_user_names_is_trusted(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(DRIVER)
-    (tmp_path / "small.toml").write_text(to_toml(small_config(road__horizon=20)))
+    (tmp_path / "small.toml").write_text(to_toml(small_config(scenario_options__horizon=20)))
     named = ("--config", "small.toml", "--expert", "mine.py:gentle", "--out", "run")
     for arguments in (("train", *named), (*DRIVE, "run")):
         done = unjam(*arguments, pictures=False)
@@ -126,10 +126,10 @@ def test_who_names_his_own_code_is_asked_for_nothing(unjam: Run, tmp_path: Path)
 
 @pytest.mark.long
 @pytest.mark.usefixtures("without_pictures")
-def test_own_code_runs_to_the_end_where_nothing_can_be_remembered(
+def test_own_code_runs_without_a_state_folder(
     my_drivers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("UNJAM_STATE", str(my_drivers / "no folder"))
     monkeypatch.setenv(TRUSTED_VARIABLE, "")
-    trained = train(small_config(expert=f"{my_drivers}:gentle", road__horizon=20), tmp_path / "run")
+    trained = train(small_config(expert=f"{my_drivers}:gentle", scenario_options__horizon=20), tmp_path / "run")
     assert trained.controller.is_file()

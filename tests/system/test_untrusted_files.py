@@ -1,4 +1,4 @@
-"""Files of others on the command line: what is in them harms nobody who looks at them."""
+"""Foreign files and folders do no harm on the command line."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 
 from tests.controller.test_verify import content_of
 from tests.system.conftest import Run
-from tests.system.test_wrong_inputs import one_line
+from tests.system.test_invalid_inputs import one_line
 from tests.test_processes import holder
 from tests.training.test_tasks import mixture
 from tests.worlds.sumo.user_networks import straight
@@ -16,7 +16,7 @@ from unjam.drivers import Constant
 from unjam.training.run_folder import create_run_folder
 
 
-def test_a_graph_that_wants_all_memory_is_refused_in_one_line(unjam: Run, tmp_path: Path) -> None:
+def test_a_graph_that_needs_too_much_memory_is_refused_in_one_line(unjam: Run, tmp_path: Path) -> None:
     helper, graph = (pytest.importorskip("onnx").helper, pytest.importorskip("tests.controller.test_graph").graph)
     pytest.importorskip("onnxruntime")
 
@@ -38,9 +38,9 @@ def test_a_graph_that_wants_all_memory_is_refused_in_one_line(unjam: Run, tmp_pa
     assert "graph: cannot be run" in ran.stderr
 
 
-def test_a_folder_that_another_process_writes_is_left_alone(unjam: Run, tmp_path: Path) -> None:
-    made = ["drive", "ring", "--driver", "pi", "--episodes", "1", "--set", "horizon=20", "--out", "run"]
-    assert unjam(*made, pictures=False).returncode == 0
+def test_a_report_in_a_locked_folder_is_refused(unjam: Run, tmp_path: Path) -> None:
+    drive = ["drive", "ring", "--driver", "pi", "--episodes", "1", "--set", "horizon=20", "--out", "run"]
+    assert unjam(*drive, pictures=False).returncode == 0
     before = (tmp_path / "run" / "report.html").read_bytes()
     process = holder(tmp_path / "run")
     for arguments in (["report", "run"], ["report", "run", "--out", "run/other.html"]):
@@ -53,45 +53,43 @@ def test_a_folder_that_another_process_writes_is_left_alone(unjam: Run, tmp_path
     assert not (tmp_path / "run" / "other.html").exists()
 
 
-ON_ROAD = ("ring", "--set", "horizon=20")
+SHORT_RING = ("ring", "--set", "horizon=20")
 WRITERS = [
-    ("drive", *ON_ROAD, "--driver", "pi", "--episodes", "1", "--out", "held"),
-    ("tune", *ON_ROAD, "--steps", "10000", "--out", "held"),
-    ("search", "ring", "--set", "scenario_options.horizon=20", "--vary", "trpo.target_kl=0.1,0.2", "--out", "held"),
-    ("train", "ring", "--set", "scenario_options.horizon=20", "--steps", "100", "--out", "held"),
-    ("reproduce", "theory", "--out", "held"),
-    ("assess", "straight.sumocfg", "-d", "acc", "--shares", "0.5", "--set", "horizon=20", "--out", "held"),
+    ("drive", *SHORT_RING, "--driver", "pi", "--episodes", "1", "--out", "locked"),
+    ("tune", *SHORT_RING, "--steps", "10000", "--out", "locked"),
+    ("search", "ring", "--set", "scenario_options.horizon=20", "--vary", "trpo.target_kl=0.1,0.2", "--out", "locked"),
+    ("train", "ring", "--set", "scenario_options.horizon=20", "--steps", "100", "--out", "locked"),
+    ("reproduce", "theory", "--out", "locked"),
+    ("assess", "straight.sumocfg", "-d", "acc", "--penetration-rates", "0.5", "--set", "horizon=20", "--out", "locked"),
 ]
 
 
 @pytest.mark.parametrize("arguments", WRITERS, ids=lambda arguments: arguments[0])
-def test_two_of_a_verb_cannot_write_one_folder(arguments: tuple[str, ...], unjam: Run, tmp_path: Path) -> None:
+def test_a_locked_output_folder_is_refused(arguments: tuple[str, ...], unjam: Run, tmp_path: Path) -> None:
     straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
-    held = tmp_path / "held"
-    held.mkdir()
-    process = holder(held)
+    locked = tmp_path / "locked"
+    locked.mkdir()
+    process = holder(locked)
     ran = unjam(*arguments)
     assert (ran.returncode, ran.stdout) == (2, ""), ran.stderr
-    assert ran.stderr.splitlines()[-1].startswith("unjam: run: 'held' is being written by another process")
+    assert ran.stderr.splitlines()[-1].startswith("unjam: run: 'locked' is being written by another process")
     assert "Traceback" not in ran.stderr
-    assert [path.name for path in held.iterdir()] == [".lock"]
+    assert [path.name for path in locked.iterdir()] == [".lock"]
     process.communicate("")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "held"),
+    ("arguments", "locked"),
     [(("model", "run"), "run"), (("train", "--resume", "run"), "run"), (("train", "--resume", "run"), "run/ring")],
-    ids=["model", "train", "train, a road of several"],
+    ids=["model", "train", "train, one of several roads"],
 )
-def test_a_run_that_another_process_writes_is_left_alone(
-    arguments: tuple[str, ...], held: str, unjam: Run, tmp_path: Path
-) -> None:
+def test_a_locked_run_is_refused(arguments: tuple[str, ...], locked: str, unjam: Run, tmp_path: Path) -> None:
     create_run_folder(tmp_path / "run", mixture())
     (tmp_path / "run" / "ring").mkdir()
-    process = holder(tmp_path / held)
+    process = holder(tmp_path / locked)
     ran = unjam(*arguments)
     assert ran.returncode == 2, ran.stderr
-    words = f"unjam: run: {held!r} is being written by another process; allowed: one at a time"
-    assert ran.stderr.splitlines()[-1] == words
+    message = f"unjam: run: {locked!r} is being written by another process; allowed: one at a time"
+    assert ran.stderr.splitlines()[-1] == message
     assert not (tmp_path / "run" / "progress.jsonl").exists()
     process.communicate("")

@@ -22,7 +22,7 @@ RING = Ring(length=(230, 230), horizon=30)
 
 @pytest.fixture(scope="module")
 def display() -> Iterator[str]:
-    """A screen that nobody looks at."""
+    """Start a virtual display."""
     assert XVFB is not None
     reader, writer = os.pipe()
     command = [XVFB, "-displayfd", str(writer), "-screen", "0", "1024x768x24", "-nolisten", "tcp"]
@@ -35,7 +35,7 @@ def display() -> Iterator[str]:
 
 
 @needs_display
-def test_watching_in_the_window_ends_by_itself_and_says_what_happened(unjam: Run, display: str) -> None:
+def test_watching_in_the_window_ends_after_the_episode(unjam: Run, display: str) -> None:
     done = unjam(*WATCH, "--pace", "1000", "--json", environment={"DISPLAY": display})
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
@@ -44,7 +44,7 @@ def test_watching_in_the_window_ends_by_itself_and_says_what_happened(unjam: Run
 
 
 @needs_display
-def test_what_the_window_shows_is_the_episode_of_that_seed(display: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window_shows_the_episode_of_the_seed(display: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DISPLAY", display)
     watched = watch_in_window(RING, PISaturation(), (4,), pace=1000.0)
     assert watched.speeds.tolist() == run_episode(RING, PISaturation(), (4,)).speeds.tolist()
@@ -52,14 +52,14 @@ def test_what_the_window_shows_is_the_episode_of_that_seed(display: str, monkeyp
 
 @needs_display
 @pytest.mark.slow
-def test_the_window_runs_no_faster_than_asked(display: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window_runs_at_the_requested_pace(display: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DISPLAY", display)
     started = time.monotonic()
     watch_in_window(RING, PISaturation(), (0,), pace=1.0)
     assert time.monotonic() - started > 0.9 * 30 * 0.1
 
 
-def test_without_a_display_one_line_names_the_way_out(unjam: Run) -> None:
+def test_a_missing_display_is_refused_with_a_remedy(unjam: Run) -> None:
     done = unjam(*WATCH, environment={"DISPLAY": ""})
     assert done.returncode == 3
     assert done.stdout == ""
@@ -69,14 +69,14 @@ def test_without_a_display_one_line_names_the_way_out(unjam: Run) -> None:
 
 
 @pytest.mark.long
-def test_a_film_needs_no_display(unjam: Run, tmp_path: Path) -> None:
+def test_a_video_needs_no_display(unjam: Run, tmp_path: Path) -> None:
     done = unjam(*WATCH, "--video", "out.gif", environment={"DISPLAY": ""})
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "out.gif"
     assert (tmp_path / "out.gif").stat().st_size > 10_000
 
 
-def test_a_film_that_cannot_be_written_gets_one_clear_line(unjam: Run) -> None:
+def test_a_video_that_cannot_be_written_is_refused(unjam: Run) -> None:
     done = unjam(*WATCH, "--video", "nowhere/out.gif")
     assert done.returncode == 74
     assert "Traceback" not in done.stderr
