@@ -1,6 +1,6 @@
-"""How soon drivers settle where a road changes under them: a wave arrives, people change, a CAV leaves.
+"""Time until traffic settles after a change of the road: a wave arrives, human drivers change, a CAV switches off.
 
-Rings are stepped in batches, as SUMO's but for rounding. What changes is unknown to every driver.
+Rings are stepped in batches, which equal SUMO's except for rounding. Drivers do not know of the change.
 """
 
 from dataclasses import dataclass, replace
@@ -15,12 +15,11 @@ from matplotlib.figure import Figure
 
 from unjam.controller import make_driver
 from unjam.drivers.command import Command
-from unjam.files import atomic_write
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.statistics import estimate
 from unjam.physics.arrays import Array, Floats, clamp_min
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
-from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, new_figure, png_bytes
+from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, new_figure
 from unjam.scenarios.ring import Ring
 from unjam.training.road_family import AGGRESSIVE_IDM, SHORT_WARM_UP
 from unjam.training.seeds import make_test_seeds
@@ -28,141 +27,130 @@ from unjam.worlds.batch.leaders import Leader
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.drive import finish_drive
-from unjam_paper.all_roads import PI_TUNED_ON_RINGS
+from unjam_paper.all_roads import PI_ON_RINGS_LABEL, PI_TUNED_ON_RINGS
 from unjam_paper.parts import measure_parts
-from unjam_paper.results_file import read_part
-from unjam_paper.study import Study, StudyFolder
+from unjam_paper.results_file import read_part, write_figure
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder
 
 ADAPTATION_EPISODES = 20
-CHANGE_STEP, END_STEP = 3000, 7200
-"""decision in which the road changes, and the last one, of 0.1 s each"""
-WAVE_BRAKING, WAVE_SPEED, WAVE_STEPS = 2.0, 0.5, 200
-"""how somebody makes a wave: braking [m/s2] to a speed [m/s], for so many decisions"""
 STEPS_PER_SECOND = 10
-"""decisions of a second"""
+CHANGE_STEP, END_STEP = 3000, 7200
+CHANGE_SECOND = CHANGE_STEP // STEPS_PER_SECOND
+"""control step of the change and the last one; second of the change"""
+WAVE_BRAKING, WAVE_SPEED, WAVE_STEPS = 2.0, 0.5, 200
+"""how a vehicle makes a wave: braking [m/s2], the speed that it keeps then [m/s], and the number of control steps"""
 SMOOTHING_SECONDS, FINAL_SECONDS = 10, 60
-"""seconds over which a mean speed is taken: to see whether it has settled, and in the end"""
+"""intervals over which the mean speed is averaged: to see whether it has settled, and at the end [s]"""
 SETTLED_SHARE = 0.95
-"""share of what the road allows that counts as settled once it is kept"""
+"""share of the speed limit of the road from which on the mean speed counts as settled"""
 ADAPTATION_DRIVERS = {
-    HUMAN_LABEL: "human",
-    "PI, tuned on the rings": PI_TUNED_ON_RINGS,
-    "FollowerStopper": "follower-stopper",
-    "unjam:best": "unjam:best",
+    **{HUMAN_LABEL: "human", PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
+    **{"FollowerStopper": "follower-stopper", "unjam:best": "unjam:best"},
 }
-
-
 HURRIED_IDM = replace(PAPER_IDM, **AGGRESSIVE_IDM)
 
 
 class ChangingRings(RingBatch):
-    """Rings on which something happens in decision `CHANGE`."""
+    """Rings on which something changes in control step `CHANGE_STEP`."""
 
     @property
     def has_changed(self) -> bool:
-        """Whether it has happened."""
+        """Whether the change has happened."""
         return self.control_steps >= CHANGE_STEP
 
 
 class WaveArrives(ChangingRings):
-    """Halfway round from the first CAV somebody brakes, and crawls for twenty seconds."""
+    """The vehicle halfway around the ring from the first CAV brakes, and drives slowly for twenty seconds."""
 
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
-        """Return the speeds after this step of all vehicles, if people drive them."""
-        found = super()._human_speeds(speed, leader)
+        speeds = super()._human_speeds(speed, leader)
         if self.has_changed and self.control_steps < CHANGE_STEP + WAVE_STEPS:
-            place = (self._cav_indices[0] + len(speed) // 2) % len(speed)
-            crawls = clamp_min(speed[place] - WAVE_BRAKING * self.scenario.simulation_step, WAVE_SPEED)
-            found[place] = np.minimum(found[place], crawls)
-        return found
+            index = (self._cav_indices[0] + len(speed) // 2) % len(speed)
+            slow = clamp_min(speed[index] - WAVE_BRAKING * self.scenario.simulation_step, WAVE_SPEED)
+            speeds[index] = np.minimum(speeds[index], slow)
+        return speeds
 
 
 class HumansChange(ChangingRings):
-    """People follow closer, accelerate and brake harder from then on."""
+    """Human drivers follow closer, and accelerate and brake harder after the change."""
 
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
-        """Return the speeds after this step of all vehicles, if people drive them."""
         if self.has_changed:
             self._human_parameters = HURRIED_IDM
         return super()._human_speeds(speed, leader)
 
 
 class CAVSwitchesOff(ChangingRings):
-    """The last CAV drives as people do from then on, within what a CAV may command."""
+    """The last CAV drives as human drivers do after the change, within the limits for commands of CAVs."""
 
     def advance(self, command: Command | None) -> None:
-        """Simulate one decision."""
+        """Simulate one control step."""
         if command is not None and self.has_changed:
-            seen = self.local_state()
-            rows = np.arange(self.cav_count) >= self.cav_count - len(self.roads)
-            alone = idm_acceleration(seen.speed, seen.leader_speed, seen.leader_gap, self.scenario.humans)
-            command = command._replace(acceleration=np.where(rows, alone, command.acceleration))
+            state = self.local_state()
+            is_off = np.arange(self.cav_count) >= self.cav_count - len(self.roads)
+            human = idm_acceleration(state.speed, state.leader_speed, state.leader_gap, self.scenario.humans)
+            command = command._replace(acceleration=np.where(is_off, human, command.acceleration))
         super().advance(command)
 
 
 @dataclass(frozen=True)
 class RoadChange:
-    """Something that happens on a road."""
+    """A change on a road."""
 
     ring: Ring
     world: type[ChangingRings]
     humans: IDMParameters = PAPER_IDM
-    """how people drive afterwards"""
+    """parameters of the human drivers after the change"""
 
 
+TWO_CAVS = Ring(length=(440, 540), vehicles=44, cavs=2, horizon=END_STEP, warmup=SHORT_WARM_UP)
 ROAD_CHANGES: dict[str, RoadChange] = {
     "a wave arrives": RoadChange(Ring(horizon=END_STEP), WaveArrives),
-    "people change": RoadChange(Ring(horizon=END_STEP, warmup=SHORT_WARM_UP), HumansChange, HURRIED_IDM),
-    "a CAV of two leaves": RoadChange(
-        Ring(length=(440, 540), vehicles=44, cavs=2, horizon=END_STEP, warmup=SHORT_WARM_UP), CAVSwitchesOff
-    ),
+    "human drivers change": RoadChange(Ring(horizon=END_STEP, warmup=SHORT_WARM_UP), HumansChange, HURRIED_IDM),
+    "one of two CAVs switches off": RoadChange(TWO_CAVS, CAVSwitchesOff),
 }
-"""by name"""
 
 
 def _measure_speeds(name: str, driver: str) -> dict[str, list[Any]]:
-    """Return the mean speed of all over each second, and the limit after the change, by episode [m/s]."""
+    """Return the mean speed of all vehicles in each second and the limit after the change, by episode [m/s]."""
     change = ROAD_CHANGES[name]
     rings = [change.ring.stratum(number, ADAPTATION_EPISODES) for number in range(ADAPTATION_EPISODES)]
     world = change.world(rings, make_test_seeds(ADAPTATION_EPISODES))
-    found = finish_drive(start_batch_drive(world, make_driver(driver, rings[0].control_step)))
-    each = [episode.speeds[1:].mean(1).reshape(-1, STEPS_PER_SECOND).mean(1) for episode in found.episodes]
+    episodes = finish_drive(start_batch_drive(world, make_driver(driver, rings[0].control_step))).episodes
+    speeds = [episode.speeds[1:].mean(1).reshape(-1, STEPS_PER_SECOND).mean(1) for episode in episodes]
     after = replace(change.ring, humans=change.humans)
-    limits = [after.limit_speed(episode.drawn[after.size_parameter]) for episode in found.episodes]
-    return {"limits": limits, "speeds": [values.round(4).tolist() for values in each]}
+    limits = [after.limit_speed(episode.drawn_values[after.size_parameter]) for episode in episodes]
+    return {"limits": limits, "speeds": [values.round(4).tolist() for values in speeds]}
 
 
 def _write_adaptation(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     parts = {
-        f"{number}-{place}": (_measure_speeds, (name, driver))
+        f"{number}-{position}": (_measure_speeds, (name, driver))
         for number, name in enumerate(ROAD_CHANGES)
-        for place, driver in enumerate(ADAPTATION_DRIVERS.values())
+        for position, driver in enumerate(ADAPTATION_DRIVERS.values())
     }
     measure_parts(folder, parts, workers)
-    atomic_write(folder / "adaptation.png", png_bytes(adaptation_figure(folder)))
+    write_figure(folder, "adaptation", adaptation_figure(folder), reduce_colors=True)
 
 
 def read_speeds(folder: Path, name: str, label: str) -> dict[str, Floats]:
-    """Return what was measured of a driver where something changes [m/s].
-
-    `speeds` of all in the mean, shape (episodes, seconds), and `limits`, shape (episodes,).
-    """
-    number, place = list(ROAD_CHANGES).index(name), list(ADAPTATION_DRIVERS).index(label)
-    return {key: np.array(found) for key, found in read_part(folder, f"{number}-{place}").items()}
+    """Return the speeds of a driver at a change: `speeds` (episodes, seconds) and `limits` (episodes,) [m/s]."""
+    number, position = list(ROAD_CHANGES).index(name), list(ADAPTATION_DRIVERS).index(label)
+    return {key: np.array(values) for key, values in read_part(folder, f"{number}-{position}").items()}
 
 
 def settling_times(speeds: Floats, limits: Floats) -> Floats:
-    """Return how long after the change everybody's mean speed has settled [s], shape (episodes,).
+    """Return how long after the change the mean speed has settled [s], shape (episodes,); NaN where it never does.
 
-    It has, once its mean over ten seconds stays at `SETTLED` or more of the limit for at least a minute until
-    the end; NaN where it never does.
+    It has settled when its average over ten seconds stays at `SETTLED_SHARE` of the limit or above until the end, and
+    for at least a minute.
     """
-    found = []
+    times = []
     for values, limit in zip(speeds, limits, strict=True):
-        low = np.flatnonzero(_moving_average(values[CHANGE_STEP // STEPS_PER_SECOND :]) < SETTLED_SHARE * limit)
-        after = float(low[-1] + 1 if len(low) else 0)
-        found.append(after if CHANGE_STEP // STEPS_PER_SECOND + after <= speeds.shape[1] - FINAL_SECONDS else np.nan)
-    return np.array(found)
+        low = np.flatnonzero(_moving_average(values[CHANGE_SECOND:]) < SETTLED_SHARE * limit)
+        time = float(low[-1] + 1 if len(low) else 0)
+        times.append(time if CHANGE_SECOND + time <= speeds.shape[1] - FINAL_SECONDS else np.nan)
+    return np.array(times)
 
 
 def _moving_average(values: Floats) -> Floats:
@@ -170,23 +158,18 @@ def _moving_average(values: Floats) -> Floats:
 
 
 def adaptation_table(name: str, folder: Path) -> pd.DataFrame:
-    """Return how fast everybody drives before and after a change, and how soon that is so."""
+    """Return the mean speed before and after a change, and the settling time, by driver."""
     rows = []
     for label in ADAPTATION_DRIVERS:
-        found, at = read_speeds(folder, name, label), CHANGE_STEP // STEPS_PER_SECOND
-        speeds, after = found["speeds"], settling_times(**found)
-        settled, slowest = np.isfinite(after), [_moving_average(values[at:]).min() for values in speeds]
-        median = np.median(np.where(settled, after, np.inf))  # of all: who never settles is the last
-        rows.append(
-            {
-                "": label,
-                "before [m/s]": _mean_cell(speeds[:, at - FINAL_SECONDS : at].mean(1)),
-                "slowest ten seconds after [m/s]": _mean_cell(np.array(slowest)),
-                "last minute [m/s]": _mean_cell(speeds[:, -FINAL_SECONDS:].mean(1)),
-                "settled": f"{settled.sum()} of {len(after)}",
-                "after, in the median [s]": f"{median:.0f}" if np.isfinite(median) else "–",
-            }
-        )
+        results = read_speeds(folder, name, label)
+        speeds, times = results["speeds"], settling_times(**results)
+        slowest = np.array([_moving_average(values[CHANGE_SECOND:]).min() for values in speeds])
+        median = np.median(np.where(np.isfinite(times), times, np.inf))  # episodes that never settle come last
+        row = {"": label, "before [m/s]": _mean_cell(speeds[:, CHANGE_SECOND - FINAL_SECONDS : CHANGE_SECOND].mean(1))}
+        row |= {"slowest ten seconds after [m/s]": _mean_cell(slowest)}
+        row |= {"last minute [m/s]": _mean_cell(speeds[:, -FINAL_SECONDS:].mean(1))}
+        row |= {"settled": f"{np.isfinite(times).sum()} of {len(times)}"}
+        rows.append({**row, "after, median [s]": f"{median:.0f}" if np.isfinite(median) else NO_VALUE_TEXT})
     return pd.DataFrame(rows)
 
 
@@ -196,27 +179,25 @@ def _mean_cell(values: Floats) -> str:
 
 @rc_context(PLOT_STYLE)
 def adaptation_figure(folder: Path) -> Figure:
-    """Return everybody's mean speed over time, the mean of all episodes and the middle half of them."""
+    """Return the mean speed over time: the mean and the interquartile range over the episodes."""
     figure = new_figure(2.4 * len(ROAD_CHANGES))
     panels = figure.subplots(len(ROAD_CHANGES), 1, sharex=True)
     for axes, name in zip(panels, ROAD_CHANGES, strict=True):
-        axes.set_title(f"{name} after {CHANGE_STEP // STEPS_PER_SECOND} s")
-        for label, colour in zip(ADAPTATION_DRIVERS, LINE_COLORS, strict=False):
+        for label, color in zip(ADAPTATION_DRIVERS, LINE_COLORS, strict=False):
             speeds = read_speeds(folder, name, label)["speeds"]
             low, high = np.quantile(speeds, (0.25, 0.75), axis=0)
             seconds = np.arange(speeds.shape[1])
-            axes.plot(seconds, speeds.mean(0), color=colour, label=label)
-            axes.fill_between(seconds, low, high, color=colour, alpha=0.15, linewidth=0)
+            axes.plot(seconds, speeds.mean(0), color=color, label=label)
+            axes.fill_between(seconds, low, high, color=color, alpha=0.15, linewidth=0)
         axes.axvline(CHANGE_STEP / STEPS_PER_SECOND, color=MUTED_COLOR, linestyle=":")
-        axes.set_ylabel("mean speed [m/s]")
+        axes.set(title=f"{name} after {CHANGE_SECOND} s", ylabel="mean speed [m/s]")
     panels[0].legend(ncols=len(ADAPTATION_DRIVERS), loc="lower right")
     panels[-1].set_xlabel("time [s]")
     return figure
 
 
 ADAPTATION = Study(
-    title="how soon drivers settle where the road changes while they drive",
-    make_runs=lambda seeds: [],
+    title="time until traffic settles after a change of the road",
     write=_write_adaptation,
     minutes=10.0,
     is_resumable=True,

@@ -1,14 +1,7 @@
-"""What `unjam assess` answers on five small roads, as networks of a user's own.
+"""Assessments of `unjam assess` on five small roads, as user networks."""
 
-    python -m unjam_paper.assess_examples --out results/assess.json
-
-The file is written after each road; a road whose entry has the same settings is not driven again.
-"""
-
-import argparse
-import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
@@ -17,40 +10,49 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from unjam.files import atomic_write, to_json
-from unjam.manifest import manifest
 from unjam.measures.effect import ControllerResult
+from unjam.measures.statistics import Estimate, format_difference
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.training.assess import Assessment, assess, make_request
 from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE, sumo_inputs
-from unjam.worlds.sumo.networks import network_file, run_netconvert, xml_element
+from unjam.worlds.sumo.networks import network_file, xml_element
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.open_test_roads import EPISODE_SECONDS, OpenTestRoad, RoadSection, write_road_files
+from unjam_paper.open_test_roads import OpenTestRoad, RoadSection, write_road_files
+from unjam_paper.results_file import read_part, write_part
+from unjam_paper.road_files import (
+    EPISODE_SECONDS,
+    connection_element,
+    edge_element,
+    node_element,
+    write_configuration,
+    write_network,
+)
+from unjam_paper.study import NO_VALUE_TEXT, Study
 
-EPISODES = 51
-"""of a road, at most: with the default controllers ten test seeds are left for the comparison"""
+EXAMPLES_PART = "roads"
+MAX_EPISODES = 51
+"""maximum number of episodes per road: with the default controllers ten test seeds are left for the comparison"""
 PRECISION = 0.02
-"""half-width of the interval of travel time that is narrow enough, as a share of it"""
-BLOCK = 250.0
-"""between two signals of the grid [m]"""
-SIGNALS = 3
-"""of the grid, in each direction"""
+"""half-width of the CI of travel time that is sufficient, relative to it"""
+BLOCK_LENGTH, SIGNALS = 250.0, 3
+"""distance between two signals of the grid [m], and signals in each direction"""
 GRID_FLOW, TURNING_FLOW = 300.0, 60.0
-"""vehicles on each straight route through the grid, and on each that turns [veh/h]"""
+"""flow on each straight route through the grid, and on each that turns [veh/h]"""
 MOTORWAY_FLOW, RAMP_FLOW = 3000.0, 500.0
-"""vehicles on SUMO's motorway, and on its ramp [veh/h]"""
-ON_RAMP = OnRamp(peak=(100.0, 700.0), horizon=int(EPISODE_SECONDS))
-"""the built-in scenario that is exported; its demand is drawn once"""
+"""flow on the motorway with SUMO's default vehicles, and on its ramp [veh/h]"""
+ON_RAMP_DEMAND = OnRamp(peak=(100.0, 700.0), horizon=int(EPISODE_SECONDS))
 DEMAND_SEED = 1
+"""the built-in scenario that is exported, and the seed of its demand"""
 
 
 @dataclass(frozen=True)
 class Example:
-    """A road, and at which penetration rate CAVs are assessed there."""
+    """A road and the penetration rate of its assessment."""
 
     write: Callable[[Path], Path]
-    """writes its files into a folder, and returns the configuration"""
+    """writes its files into a folder and returns the configuration"""
     rate: float
 
 
@@ -58,57 +60,67 @@ def write_grid(folder: Path) -> Path:
     """Write a grid of signals; vehicles of SUMO's default type go straight, or turn left once."""
     inside, ends = range(1, SIGNALS + 1), (0, SIGNALS + 1)
     signals = [(x, y) for x in inside for y in inside]
-    arms = [(x, y) for x in (0, *inside, SIGNALS + 1) for y in (0, *inside, SIGNALS + 1)]
-    arms = [(x, y) for x, y in arms if (x in ends) != (y in ends)]
-    nodes = [_node(f"n{x}{y}", BLOCK * x, BLOCK * y, "traffic_light") for x, y in signals]
-    nodes += [_node(f"n{x}{y}", BLOCK * x, BLOCK * y, "priority") for x, y in arms]
+    every = [(x, y) for x in (0, *inside, SIGNALS + 1) for y in (0, *inside, SIGNALS + 1)]
+    arms = [(x, y) for x, y in every if (x in ends) != (y in ends)]
+    kinds = {**dict.fromkeys(signals, "traffic_light"), **dict.fromkeys(arms, "priority")}
+    nodes = [node_element(f"n{x}{y}", BLOCK_LENGTH * x, BLOCK_LENGTH * y, kind) for (x, y), kind in kinds.items()]
     edges = [
-        _edge(f"{x}{y}to{to_x}{to_y}", f"n{x}{y}", f"n{to_x}{to_y}", 2, 13.89)
-        for x, y in (*signals, *arms)
-        for to_x, to_y in (*signals, *arms)
+        edge_element(f"{x}{y}to{to_x}{to_y}", f"n{x}{y}", f"n{to_x}{to_y}", 2, 13.89)
+        for x, y in kinds
+        for to_x, to_y in kinds
         if abs(x - to_x) + abs(y - to_y) == 1 and ((x, y) in signals or (to_x, to_y) in signals)
     ]
     last, routes = SIGNALS + 1, dict[str, float]()
     for row in inside:
-        east, west = (_edges([(x, row) for x in way]) for way in (range(last + 1), range(last, -1, -1)))
-        north, south = (_edges([(row, y) for y in way]) for way in (range(last + 1), range(last, -1, -1)))
+        east, west = (_route([(x, row) for x in way]) for way in (range(last + 1), range(last, -1, -1)))
+        north, south = (_route([(row, y) for y in way]) for way in (range(last + 1), range(last, -1, -1)))
         routes |= dict.fromkeys((east, west, north, south), GRID_FLOW)
         left = [*((x, row) for x in range(row + 1)), *((row, y) for y in range(row + 1, last + 1))]
-        routes[_edges(left)] = TURNING_FLOW
-    return _write_files(folder, nodes, edges, [], routes)
+        routes[_route(left)] = TURNING_FLOW
+    return write_network(folder, nodes, edges, [], _default_traffic(routes))
+
+
+def _route(nodes: Sequence[tuple[int, int]]) -> str:
+    """Return the edges between successive nodes of the grid."""
+    return " ".join(f"{x}{y}to{to_x}{to_y}" for (x, y), (to_x, to_y) in pairwise(nodes))
 
 
 def write_ramp(folder: Path) -> Path:
-    """Write a motorway of two lanes that a ramp joins; SUMO's default vehicles."""
-    places = {"a": (0.0, 0.0), "b": (1500.0, 0.0), "c": (1800.0, 0.0), "d": (2500.0, 0.0), "r": (1100.0, -80.0)}
-    nodes = [_node(name, x, y, "priority") for name, (x, y) in places.items()]
+    """Write a motorway of two lanes with an on-ramp and SUMO's default vehicles."""
+    positions = {"a": (0.0, 0.0), "b": (1500.0, 0.0), "c": (1800.0, 0.0), "d": (2500.0, 0.0), "r": (1100.0, -80.0)}
+    nodes = [node_element(name, x, y) for name, (x, y) in positions.items()]
     edges = [
-        *(_edge("before", "a", "b", 2, 33.33), _edge("merging", "b", "c", 3, 33.33)),
-        *(_edge("after", "c", "d", 2, 33.33), _edge("ramp", "r", "b", 1, 22.22)),
+        *(edge_element("before", "a", "b", 2, 33.33), edge_element("merging", "b", "c", 3, 33.33)),
+        *(edge_element("after", "c", "d", 2, 33.33), edge_element("ramp", "r", "b", 1, 22.22)),
     ]
-    links = [
-        xml_element("connection", **{"from": start, "to": end}, fromLane=lane, toLane=next_lane)
-        for start, end, lane, next_lane in (
-            *(("before", "merging", 0, 1), ("before", "merging", 1, 2), ("ramp", "merging", 0, 0)),
-            *(("merging", "after", 1, 0), ("merging", "after", 2, 1)),
-        )
+    lanes = [("before", "merging", 0, 1), ("before", "merging", 1, 2), ("ramp", "merging", 0, 0)]
+    lanes += [("merging", "after", 1, 0), ("merging", "after", 2, 1)]
+    traffic = _default_traffic({"before merging after": MOTORWAY_FLOW, "ramp merging after": RAMP_FLOW})
+    return write_network(folder, nodes, edges, [connection_element(*each) for each in lanes], traffic)
+
+
+def _default_traffic(routes: Mapping[str, float]) -> list[str]:
+    """Return a flow of default vehicles for each route [veh/h]."""
+    elements = [xml_element("route", id=f"r{number}", edges=edges) for number, edges in enumerate(routes)]
+    entry = {"begin": 0, "end": EPISODE_SECONDS, "departLane": "best", "departSpeed": "max"}
+    return elements + [
+        xml_element("flow", id=f"f{number}", route=f"r{number}", vehsPerHour=flow, **entry)
+        for number, flow in enumerate(routes.values())
     ]
-    routes = {"before merging after": MOTORWAY_FLOW, "ramp merging after": RAMP_FLOW}
-    return _write_files(folder, nodes, edges, links, routes)
 
 
 def write_on_ramp(folder: Path) -> Path:
-    """Write the built-in scenario `on-ramp` as files of a user's own: network, types and drawn vehicles."""
-    road = ON_RAMP.draw(np.random.default_rng(DEMAND_SEED))
+    """Write the built-in scenario `on-ramp` as a user network, with its vehicle types and one drawn demand."""
+    road = ON_RAMP_DEMAND.draw(np.random.default_rng(DEMAND_SEED))
     shutil.copy(network_file(road.network), folder / "road.net.xml")
-    files = sumo_inputs(ON_RAMP, road)
-    own_types = f'id="{CAV_TYPE_TEMPLATE.format("")}'  # of CAVs: unjam adds them again
-    lines = [line for line in files.traffic.splitlines() if own_types not in line]
+    files = sumo_inputs(ON_RAMP_DEMAND, road)
+    cav_type = f'id="{CAV_TYPE_TEMPLATE.format("")}'  # unjam adds the types of CAVs
+    lines = [line for line in files.traffic_xml.splitlines() if cav_type not in line]
     (folder / "road.rou.xml").write_text("\n".join(lines))
     names = (name.removeprefix("--") for name in files.options[::2])
     options = dict(zip(names, files.options[1::2], strict=True))
-    del options["max-depart-delay"]  # it has SUMO's default
-    return _write_configuration(folder, options)
+    del options["max-depart-delay"]  # SUMO's default applies
+    return write_configuration(folder, options)
 
 
 EXAMPLES: dict[str, Example] = {
@@ -120,77 +132,60 @@ EXAMPLES: dict[str, Example] = {
     "an on-ramp with SUMO's default vehicles": Example(write_ramp, 0.05),
     "the scenario on-ramp as files": Example(write_on_ramp, 0.1),
 }
-"""by name"""
 
 
-def assess_examples(
-    out: Path,
-    workers: int = 2,
-    episodes: int = EPISODES,
-    seconds: float | None = None,
-    examples: dict[str, Example] | None = None,
-) -> None:
-    """Assess the roads that `out` has no entry of with these settings, and write it after each of them.
+def assess_examples(folder: Path, workers: int = 2, episodes: int = MAX_EPISODES, seconds: float | None = None) -> None:
+    """Assess the roads that have no results with these settings yet, and write the results after each of them.
 
     Args:
-        out: the JSON file.
-        workers: processes that drive.
-        episodes: of each road, at most.
-        seconds: of an episode; None: as the configuration says.
-        examples: the roads by name; None: all of them.
+        folder: the working folder of the study.
+        workers: worker processes.
+        episodes: maximum number of episodes per road.
+        seconds: length of an episode; None: as in the configuration.
     """
-    known = json.loads(out.read_text(encoding="utf-8"))["roads"] if out.is_file() else {}
-    about, found = {key: value for key, value in manifest().items() if key != "command"}, dict[str, Any]()
-    for name, example in (EXAMPLES if examples is None else examples).items():
+    roads = read_part(folder, EXAMPLES_PART) if (folder / f"{EXAMPLES_PART}.json").is_file() else {}
+    for name, example in EXAMPLES.items():
         settings = {"rate": example.rate, "episodes": episodes, "seconds": seconds, "precision": PRECISION}
-        found[name] = known.get(name)
-        if found[name] is None or found[name]["settings"] != settings:
+        if roads.get(name, {}).get("settings") != settings:
             with TemporaryDirectory() as place:
-                answer = _assess_road(example, Path(place), workers, episodes, seconds)
-            found[name] = {"settings": settings, **answer, "commit": about["commit"]}
-            # Entries of further roads stay, whatever their settings.
-            atomic_write(out, to_json({"manifest": about, "roads": {**known, **found}}, indent=1))
-        print(f"{name}: {found[name]['headline']}", flush=True)
+                roads[name] = {"settings": settings, **_assess_road(example, Path(place), workers, episodes, seconds)}
+            write_part(folder, EXAMPLES_PART, roads)
 
 
 def _assess_road(example: Example, folder: Path, workers: int, episodes: int, seconds: float | None) -> dict[str, Any]:
     (folder / "road").mkdir()
     file = example.write(folder / "road")
     changes = {} if seconds is None else {"end": seconds}
-    asked = make_request(str(file), [example.rate], episodes, PRECISION, changes=changes)
+    request = make_request(str(file), [example.rate], episodes, PRECISION, options=changes)
     with WorkerPool(workers) as pool:
-        answer = assess(asked, folder / "answer", pool, on_message=partial(print, flush=True))
+        assessment = assess(request, folder / "assessment", pool, on_message=partial(print, flush=True))
+    document = assessment.document
     return {
-        "headline": answer.document["headline"],
-        "sentences": [each.words for each in (*answer.judged, *answer.acc)],
-        "notes": answer.document["notes"],
-        "drivers": driver_table(answer),
-        "rejection_reasons": {each["driver"]: each["rejection_reasons"] for each in answer.document["tried"]},
-        "test_seeds": answer.document["seeds"]["judging"],
-        "episodes": answer.document["episodes"],
+        "headline": document["headline"],
+        "sentences": [each.summary for each in (*assessment.controller_results, *assessment.acc_results)],
+        "notes": document["notes"],
+        "drivers": driver_rows(assessment),
+        "rejection_reasons": {each["driver"]: each["rejection_reason"] for each in document["candidates"]},
+        "test_seeds": document["seeds"]["test"],
+        "episodes": document["episodes"],
     }
 
 
-def driver_table(answer: Assessment) -> list[dict[str, Any]]:
+def driver_rows(assessment: Assessment) -> list[dict[str, Any]]:
     """Return a row for the human baseline, for ACC vehicles and for the controller.
 
-    Differences are paired, with 95 % confidence intervals: `difference` to the human baseline and
-    `difference_to_acc` [s], `flow_difference` to the human baseline [veh/h].
+    Differences are paired, with 95 % CI: `difference` to the human baseline and `difference_to_acc` [s],
+    `flow_difference` to the human baseline [veh/h].
     """
-    people = answer.document["people"]
-    time, flow = people["travel_time"]["mean"], people["outflow_veh_per_h"]["mean"]
+    baseline = assessment.document["baseline"]
+    time, flow = baseline["travel_time"]["mean"], baseline["outflow_veh_per_h"]["mean"]
     rows: list[dict[str, Any]] = [{"driver": "human", "travel_time": time, "flow": flow}]
-    for each in (*answer.acc, *answer.judged):
+    for each in (*assessment.acc_results, *assessment.controller_results):
         effect = each.effect
-        row = {
-            "driver": getattr(each, "driver", "cruise"),
-            "rate": each.share,
-            "travel_time": effect.baseline_travel_time + effect.travel_time.mean,
-            "difference": asdict(effect.travel_time),
-            "flow": effect.baseline_flow + effect.flow.mean,
-            "flow_difference": asdict(effect.flow),
-            "feasibility": effect.drivable,
-        }
+        row = {"driver": getattr(each, "driver", "cruise"), "rate": each.penetration_rate}
+        row |= {"travel_time": effect.baseline_travel_time + effect.travel_time.mean}
+        row |= {"difference": asdict(effect.travel_time), "flow": effect.baseline_flow + effect.flow.mean}
+        row |= {"flow_difference": asdict(effect.flow), "feasibility": effect.feasibility}
         if isinstance(each, ControllerResult):
             row["difference_to_acc"] = asdict(each.difference_to_acc)
             row["verdict"] = "; ".join(each.reasons) or "recommended"
@@ -198,62 +193,28 @@ def driver_table(answer: Assessment) -> list[dict[str, Any]]:
     return rows
 
 
-def _write_files(
-    folder: Path, nodes: Sequence[str], edges: Sequence[str], links: Sequence[str], routes: dict[str, float]
-) -> Path:
-    """Write a road, and a flow of default vehicles for each route [veh/h]; return the configuration."""
-    inputs = {
-        ("--node-files", "road.nod.xml"): _document("nodes", nodes),
-        ("--edge-files", "road.edg.xml"): _document("edges", edges),
-    }
-    if links:
-        inputs["--connection-files", "road.con.xml"] = _document("connections", links)
-    run_netconvert(inputs, ["--no-turnarounds=true"], folder)
-    traffic = [xml_element("route", id=f"r{number}", edges=edges) for number, edges in enumerate(routes)]
-    enters = {"begin": 0, "end": EPISODE_SECONDS, "departLane": "best", "departSpeed": "max"}
-    traffic += [
-        xml_element("flow", id=f"f{number}", route=f"r{number}", vehsPerHour=flow, **enters)
-        for number, flow in enumerate(routes.values())
-    ]
-    (folder / "road.rou.xml").write_text(_document("routes", traffic))
-    return _write_configuration(folder, {})
+def examples_table(folder: Path) -> pd.DataFrame:
+    """Return travel time and flow of the human baseline, of ACC vehicles and of the controller on each road."""
+    rows = []
+    for name, results in read_part(folder, EXAMPLES_PART).items():
+        for own in results["drivers"]:
+            row = {"road": name, "CAVs": f"{100 * own['rate']:g} %" if "rate" in own else "none"}
+            row |= {"driver": own["driver"], "travel time [s]": f"{own['travel_time']:.1f}"}
+            row |= {"difference to human baseline [s]": _difference_text(own, "difference", 1)}
+            row |= {"difference to ACC [s]": _difference_text(own, "difference_to_acc", 1)}
+            row |= {"flow, difference to human baseline [veh/h]": _difference_text(own, "flow_difference", 0)}
+            rows.append({**row, "feasible": own.get("feasibility", NO_VALUE_TEXT)})
+    return pd.DataFrame(rows)
 
 
-def _write_configuration(folder: Path, options: dict[str, str]) -> Path:
-    files = {"net-file": "road.net.xml", "route-files": "road.rou.xml", "end": EPISODE_SECONDS, "step-length": 0.5}
-    path = folder / "road.sumocfg"
-    lines = [xml_element(name, value=value) for name, value in {**files, **options}.items()]
-    path.write_text(_document("configuration", lines))
-    return path
+def _difference_text(row: Mapping[str, Any], name: str, digits: int) -> str:
+    return format_difference(Estimate(**row[name]), digits) if name in row else NO_VALUE_TEXT
 
 
-def _document(root: str, elements: Sequence[str]) -> str:
-    return f"<{root}>{''.join(elements)}</{root}>"
-
-
-def _node(name: str, x: float, y: float, kind: str) -> str:
-    return xml_element("node", id=name, x=x, y=y, type=kind)
-
-
-def _edge(name: str, start: str, end: str, lanes: int, speed: float) -> str:
-    return xml_element("edge", id=name, **{"from": start, "to": end}, numLanes=lanes, speed=speed, priority=3)
-
-
-def _edges(way: Sequence[tuple[int, int]]) -> str:
-    """Return the edges of a way through the grid."""
-    return " ".join(f"{x}{y}to{to_x}{to_y}" for (x, y), (to_x, to_y) in pairwise(way))
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Assess all roads as the command line says."""
-    parser = argparse.ArgumentParser(description="Assess five small roads, and write one JSON file.")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file; roads that it holds are kept")
-    parser.add_argument("--workers", type=int, default=2, help="worker processes")
-    parser.add_argument("--episodes", type=int, default=EPISODES, help="episodes of each road, at most")
-    parser.add_argument("--seconds", type=float, help="length of an episode, for a trial")
-    asked = parser.parse_args(words)
-    assess_examples(asked.out, asked.workers, asked.episodes, asked.seconds)
-
-
-if __name__ == "__main__":
-    main()
+ASSESS_EXAMPLES = Study(
+    title="assessments of five small roads",
+    write=lambda study_folder, seeds, folder, workers: assess_examples(folder, workers),
+    minutes=25.0,
+    is_resumable=True,
+    tables={"roads": examples_table},
+)

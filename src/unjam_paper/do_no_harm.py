@@ -1,7 +1,7 @@
-"""Whether `unjam:best` does worse than the ACC alone: a verdict on each of several users' own open roads.
+"""Harm check of `unjam:best`: a verdict against the ACC alone on each of several open roads.
 
-Seeds are paired, and added in batches until the confidence intervals allow a verdict, or `MAX_SEEDS` are
-driven. Of several looks at an interval some err: its 95 % hold for each look by itself.
+Seeds are paired, and added in batches until the confidence intervals allow a verdict or `MAX_SEEDS` are used. The 95 %
+of an interval hold for a single evaluation: with several of them, intervals miss the true mean more often.
 """
 
 import json
@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
 from unjam.controller import make_driver
-from unjam.files import atomic_write, to_json
+from unjam.files import to_json
 from unjam.measures.effect import FLOW_METRIC, HARD_BRAKING_METRIC, TIME_METRIC
 from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL
@@ -39,97 +39,82 @@ from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.open_test_roads import OPEN_TEST_ROADS, OpenTestRoad, write_road_files
 from unjam_paper.parts import controller_digest
-from unjam_paper.results_file import read_part
+from unjam_paper.results_file import read_part, write_part
 from unjam_paper.study import Study, StudyFolder, Table
 
 TESTED_CONTROLLER, ACC_BASELINE = "unjam:best", "cruise"
 PENETRATION_RATES = (0.05, 0.1)
 SEED_BATCH, MAX_SEEDS = 4, 16
-"""seeds that are added at a time, and at most"""
+"""number of seeds that are added at a time, and their maximum"""
 STEPS_PER_CONTROL_STEP = 2
 MAX_TIME_INCREASE = {False: 0.005, True: 0.02}
-"""share of the ACC's travel time that the interval must stay below, without and with a breakdown"""
+"""upper limit for the CI of the travel time, relative to the ACC alone, without and with a breakdown"""
 MIN_FLOW_CHANGE = -0.01
-"""share of the ACC's flow that the interval must stay above"""
+"""lower limit for the CI of the flow, relative to the ACC alone"""
 BREAKDOWN_SPEED_SHARE, BREAKDOWN_SECONDS = 0.6, 120.0
-"""a breakdown: mean speed below this share of the free speed, for so long [s]"""
+"""a breakdown: mean speed below this share of the free-flow speed for this time [s]"""
 MIN_FLOW_SHARE = 0.2
-"""share of the capacity that must flow there meanwhile: a few slow vehicles are no breakdown"""
+"""minimum flow in a breakdown as a share of the capacity: a few slow vehicles are no breakdown"""
 SECTION_LENGTH, SECTION_SECONDS = 250.0, 30.0
 """length [m] and time [s] over which mean speeds are taken"""
-RESULTS = "do-no-harm"
+RESULTS_FILE = "do-no-harm"
 HARM_METRICS = (
-    *(
-        "seed",
-        "status",
-        TIME_METRIC,
-        FLOW_METRIC,
-        "collisions",
-        "drivable",
-        "floor",
-        "lanes",
-        "overridden",
-        HARD_BRAKING_METRIC,
-    ),
-    *("min_time_gap", "share_short_time_gap", "cav_min_ttc", "cav_max_braking", "cut_in_max_braking"),
+    *("seed", "status", TIME_METRIC, FLOW_METRIC, "collisions", "feasibility", "required_time_gap", "has_lanes"),
+    *("override_share", HARD_BRAKING_METRIC, "min_time_gap", "share_short_time_gap", "cav_min_ttc"),
+    *("cav_max_braking", "cut_in_max_braking"),
 )
-"""of what is measured of an episode: the comparison, and what its feasibility follows from"""
+"""metrics of the comparison, and those from which the feasibility follows"""
 NO_HARM, HARM, UNDECIDED = "no harm", "harm", "undecided"
 
 
 class HarmVerdict(NamedTuple):
-    """What is known of a controller compared with the ACC alone, on a road at a penetration rate."""
+    """Comparison of a controller with the ACC alone on a road at a penetration rate."""
 
     time: Estimate
-    """paired difference in travel time, as a share of the ACC's"""
+    """paired difference in travel time relative to the ACC"""
     flow: Estimate
-    """paired difference in flow, as a share of the ACC's"""
+    """paired difference in flow relative to the ACC"""
     verdict: str
 
 
 def evaluate_harm(rows: Sequence[dict[str, Any]], acc_rows: Sequence[dict[str, Any]], breakdown: bool) -> HarmVerdict:
-    """Return the paired differences to the ACC alone, and what they say of harm."""
+    """Return the paired differences to the ACC alone and the verdict."""
     time, flow = (_relative_difference(rows, acc_rows, name) for name in (TIME_METRIC, FLOW_METRIC))
     limit = MAX_TIME_INCREASE[breakdown]
+    verdict = UNDECIDED
     if time.high < limit and flow.low > MIN_FLOW_CHANGE:
         verdict = NO_HARM
     elif time.low > limit or flow.high < MIN_FLOW_CHANGE:
         verdict = HARM
-    else:
-        verdict = UNDECIDED
     return HarmVerdict(time, flow, verdict)
 
 
 def _relative_difference(rows: Sequence[dict[str, Any]], acc_rows: Sequence[dict[str, Any]], name: str) -> Estimate:
-    """Return the paired difference in a metric as a share of the ACC's."""
     values = np.array([(row[name], acc[name]) for row, acc in pair_rows(rows, acc_rows)]).reshape(-1, 2)
-    shares = linearized_ratio(values[:, 0] - values[:, 1], values[:, 1]) if len(values) else values[:, 0]
-    return estimate(shares.tolist())
+    ratios = linearized_ratio(values[:, 0] - values[:, 1], values[:, 1]) if len(values) else values[:, 0]
+    return estimate(ratios.tolist())
 
 
 def has_breakdown(episode: Episode, road: OpenTestRoad) -> bool:
-    """Return whether a section is slow for `PATIENCE` seconds while vehicles flow through it.
+    """Return whether a section is slow for `BREAKDOWN_SECONDS` while vehicles flow through it.
 
-    On a road with signals there is no such thing: queues at red lights would count.
+    It is never so on a road with signals, where queues at red lights would count.
     """
     if road.has_signals:
         return False
-    place, moment = (
-        episode.positions,
-        np.arange(len(episode.positions)) * episode.snapshot_stride * episode.control_step,
-    )
-    speeds = episode.speeds[:: episode.snapshot_stride][: len(place)]
-    there = np.isfinite(place) & np.isfinite(speeds)
-    length = sum(stretch.length for stretch in road.sections)
-    shape = int(np.ceil(moment[-1] / SECTION_SECONDS)) + 1, int(np.ceil(length / SECTION_LENGTH))
-    period = np.broadcast_to((moment // SECTION_SECONDS)[:, None], place.shape)[there].astype(int)
-    section = (place[there] // SECTION_LENGTH).clip(0, shape[1] - 1).astype(int)
-    cells = period * shape[1] + section
-    count, total = (np.bincount(cells, weight, shape[0] * shape[1]).reshape(shape) for weight in (None, speeds[there]))
+    snapshot_step = episode.snapshot_stride * episode.control_step
+    positions, times = episode.positions, np.arange(len(episode.positions)) * snapshot_step
+    speeds = episode.speeds[:: episode.snapshot_stride][: len(positions)]
+    is_present = np.isfinite(positions) & np.isfinite(speeds)
+    length = sum(section.length for section in road.sections)
+    shape = int(np.ceil(times[-1] / SECTION_SECONDS)) + 1, int(np.ceil(length / SECTION_LENGTH))
+    period = np.broadcast_to((times // SECTION_SECONDS)[:, None], positions.shape)[is_present].astype(int)
+    section = (positions[is_present] // SECTION_LENGTH).clip(0, shape[1] - 1).astype(int)
+    cells, size = period * shape[1] + section, shape[0] * shape[1]
+    count, total = (np.bincount(cells, weights, size).reshape(shape) for weights in (None, speeds[is_present]))
     # Vehicles brake before a lower limit, and accelerate behind it: it counts on the adjacent sections, too.
     free = [road.free_speed(SECTION_LENGTH * (number - 1), SECTION_LENGTH * (number + 2)) for number in range(shape[1])]
-    looks = SECTION_SECONDS / (episode.snapshot_stride * episode.control_step)
-    flow = 3600.0 * total / (SECTION_LENGTH * looks)
+    flow = 3600.0 * total / (SECTION_LENGTH * SECTION_SECONDS / snapshot_step)
     slow = (total < BREAKDOWN_SPEED_SHARE * np.array(free) * count) & (flow > MIN_FLOW_SHARE * road.capacity)
     window = round(BREAKDOWN_SECONDS / SECTION_SECONDS)
     return len(slow) >= window and bool(sliding_window_view(slow, window, axis=0).all(-1).any())
@@ -140,67 +125,57 @@ def _rate_label(driver: str, rate: float) -> str:
 
 
 def _evaluate_rate(results: Mapping[str, Any], rate: float) -> HarmVerdict:
-    """Return what the rows of a road say at a penetration rate."""
-    rows, acc_rows = (
-        results["rows"].get(_rate_label(driver, rate), []) for driver in (TESTED_CONTROLLER, ACC_BASELINE)
-    )
-    return evaluate_harm(rows, acc_rows, _human_breakdown(results))
-
-
-def _human_breakdown(results: Mapping[str, Any]) -> bool:
-    """Return whether human-only traffic breaks down on at least half of the seeds."""
-    slow = [row["breakdown"] for row in results["rows"].get(HUMAN_LABEL, [])]
-    return 2 * sum(slow) >= max(len(slow), 1)
+    labels = (_rate_label(driver, rate) for driver in (TESTED_CONTROLLER, ACC_BASELINE))
+    rows, acc_rows = (results["rows"].get(label, []) for label in labels)
+    breakdowns = [row["breakdown"] for row in results["rows"].get(HUMAN_LABEL, [])]
+    is_frequent = 2 * sum(breakdowns) >= max(len(breakdowns), 1)  # on at least half of the seeds
+    return evaluate_harm(rows, acc_rows, is_frequent)
 
 
 def _write_harm(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    """Drive what is missing; what is there stays, unless the controller or the road is another one now."""
-    path = folder / f"{RESULTS}.json"
-    results = _read_results(folder) if path.is_file() else {}
+    """Run what is missing; results are kept unless the controller or the road has changed."""
+    results = _read_results(folder) if (folder / f"{RESULTS_FILE}.json").is_file() else {}
     with TemporaryDirectory() as place, WorkerPool(workers) as pool:
         for number, (name, road) in enumerate(OPEN_TEST_ROADS.items()):
             about = {"controller": controller_digest(TESTED_CONTROLLER), "road": json.loads(to_json(asdict(road)))}
             if results.get(name, {}).get("about") != about:
                 results[name] = {"about": about, "rows": {}}
-            found, files = results[name], Path(place, str(number))
+            files = Path(place, str(number))
             files.mkdir()
             file = write_road_files(road, files)
-            while rates := [rate for rate in PENETRATION_RATES if _needs_seeds(found, rate)]:
-                for label, rows in _drive_batch(file, road, found, rates, pool).items():
-                    found["rows"].setdefault(label, []).extend(rows)
-                atomic_write(path, to_json(results, indent=1))
+            while rates := [rate for rate in PENETRATION_RATES if _needs_seeds(results[name], rate)]:
+                for label, rows in _run_seed_batch(file, road, results[name], rates, pool).items():
+                    results[name]["rows"].setdefault(label, []).extend(rows)
+                write_part(folder, RESULTS_FILE, results)
 
 
 def _read_results(study: Path) -> dict[str, Any]:
-    """Return what is known of each road; numbers that are null in the file are NaN."""
-    results: dict[str, Any] = read_part(study, RESULTS)
-    for row in (row for found in results.values() for rows in found["rows"].values() for row in rows):
+    """Return the results by road, with NaN for null."""
+    results: dict[str, Any] = read_part(study, RESULTS_FILE)
+    for row in (row for road in results.values() for rows in road["rows"].values() for row in rows):
         row |= {name: nan for name, value in row.items() if value is None}
     return results
 
 
 def _needs_seeds(results: Mapping[str, Any], rate: float) -> bool:
-    """Return whether more seeds are needed, and allowed."""
-    driven = len(results["rows"].get(_rate_label(ACC_BASELINE, rate), ()))
-    return driven < MAX_SEEDS and _evaluate_rate(results, rate).verdict == UNDECIDED
+    count = len(results["rows"].get(_rate_label(ACC_BASELINE, rate), ()))
+    return count < MAX_SEEDS and _evaluate_rate(results, rate).verdict == UNDECIDED
 
 
-def _drive_batch(
+def _run_seed_batch(
     file: Path, road: OpenTestRoad, results: Mapping[str, Any], rates: Sequence[float], pool: WorkerPool
 ) -> dict[str, Table]:
-    """Return the rows of the next seeds, by label: human drivers, and at these rates both others."""
+    """Return the rows of the next seeds by label: the human baseline, and at these rates both drivers."""
     seeds = make_test_seeds(SEED_BATCH, first=len(results["rows"].get(HUMAN_LABEL, ())))
-    driven = {HUMAN_LABEL: (HUMAN_LABEL, rates[0])}
-    driven |= {
-        _rate_label(driver, rate): (driver, rate) for rate in rates for driver in (ACC_BASELINE, TESTED_CONTROLLER)
-    }
+    drivers = {HUMAN_LABEL: (HUMAN_LABEL, rates[0])}
+    drivers |= {_rate_label(name, rate): (name, rate) for rate in rates for name in (ACC_BASELINE, TESTED_CONTROLLER)}
     labels, tasks = list[str](), list[EpisodeTask]()
-    for label, (driver, rate) in driven.items():
+    for label, (name, rate) in drivers.items():
         changes = {"penetration_rate": rate, "steps_per_control_step": STEPS_PER_CONTROL_STEP, **ACC_SETTINGS}
         scenario = make_scenario(str(file), changes)
-        made = make_driver(driver, scenario.control_step)
+        driver = make_driver(name, scenario.control_step)
         labels += [label] * len(seeds)
-        tasks += [EpisodeTask(scenario, made, seed, record_details=label == HUMAN_LABEL) for seed in seeds]
+        tasks += [EpisodeTask(scenario, driver, seed, record_details=label == HUMAN_LABEL) for seed in seeds]
 
     def episode_row(number: int, episode: Episode) -> dict[str, Any]:
         measured = measure(episode)
@@ -217,23 +192,23 @@ def _drive_batch(
 def harm_table(folder: Path) -> pd.DataFrame:
     """Return the comparison with the ACC alone and the verdict, for each road and penetration rate."""
     table: Table = []
-    for (name, found), rate in product(_read_results(folder).items(), PENETRATION_RATES):
-        road, rows = OPEN_TEST_ROADS[name], found["rows"]
+    for (name, results), rate in product(_read_results(folder).items(), PENETRATION_RATES):
+        road, rows = OPEN_TEST_ROADS[name], results["rows"]
         acc, own = (rows[_rate_label(driver, rate)] for driver in (ACC_BASELINE, TESTED_CONTROLLER))
-        judged, slow = _evaluate_rate(found, rate), [row["breakdown"] for row in rows[HUMAN_LABEL]]
+        verdict, breakdowns = _evaluate_rate(results, rate), [row["breakdown"] for row in rows[HUMAN_LABEL]]
         table.append(
             {
                 "road": name,
                 "demand [veh/h]": " → ".join(f"{share * road.capacity:,.0f}" for share in road.demand),
                 "CAVs": f"{100 * rate:g} %",
-                "breakdown": "signals" if road.has_signals else f"{sum(slow)} of {len(slow)} seeds",
+                "breakdown": "signals" if road.has_signals else f"{sum(breakdowns)} of {len(breakdowns)} seeds",
                 "human baseline [s]": f"{metric_estimate(rows[HUMAN_LABEL], TIME_METRIC).mean:.1f}",
                 "ACC alone [s]": f"{metric_estimate(acc, TIME_METRIC).mean:.1f}",
-                "travel time, difference to the ACC": _percent_text(judged.time),
-                "flow, difference to the ACC": _percent_text(judged.flow),
-                "seeds": judged.time.count,
+                "travel time, difference to the ACC": _percent_text(verdict.time),
+                "flow, difference to the ACC": _percent_text(verdict.flow),
+                "seeds": verdict.time.count,
                 "feasible": overall_feasibility(own, rows[HUMAN_LABEL]),
-                "verdict": judged.verdict,
+                "verdict": verdict.verdict,
             }
         )
     return pd.DataFrame(table)
@@ -245,8 +220,7 @@ def _percent_text(share: Estimate) -> str:
 
 
 DO_NO_HARM = Study(
-    title="whether unjam:best does worse than the ACC alone on any open road of a user's own",
-    make_runs=lambda seeds: [],
+    title="harm check of unjam:best against the ACC alone on open roads",
     write=_write_harm,
     minutes=40.0,
     is_resumable=True,

@@ -1,15 +1,14 @@
-"""How far from its own road a shipped controller stays drivable, and what late cars and wrong sensors cost.
+"""Feasibility of packaged controllers far from their training roads, with actuation delay and with sensor errors.
 
-Rings from 5 to 44 vehicles, shorter and longer than trained on, jammed or not, with one to three CAVs; figure
-eights smaller and larger; the rings and a lane of a motorway without SUMO's own safety; and the usual ring
-with cars that obey late, and whose sensors err.
+Rings with 5 to 44 vehicles, shorter and longer than in training, jammed or not, with one to three CAVs; smaller and
+larger figure eights; the rings and a motorway lane without SUMO's safety checks; and the default ring with actuation
+delay, lag and sensor errors.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -34,39 +33,32 @@ from unjam.training.export import export_controller
 from unjam.training.road_family import LONG_WARM_UP
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.parts import controller_digest
-from unjam_paper.results_file import read_part
-from unjam_paper.study import Study, StudyFolder, evaluate_on_test_seeds
+from unjam_paper.results_file import read_part, write_part
+from unjam_paper.study import NO_VALUE_TEXT, DriverComparison, Study, StudyFolder, evaluate_on_test_seeds
 
-ENVELOPE_SEEDS = 2
-"""of each driver on each road"""
-RAW_ACTUATION_SEEDS, IMPAIRED_SEEDS = 5, 8
+ENVELOPE_SEEDS, RAW_ACTUATION_SEEDS, IMPAIRED_SEEDS = 2, 5, 8
+"""test seeds of each driver on each road"""
 CONTROLLER_ROADS: dict[str, str] = {
     "unjam:best": "ring-jammed",
-    "unjam:ring-best": "ring",
-    "unjam:ring-gap-tuned": "ring",
-    "unjam:ring-tuned": "ring",
-    "unjam:rings-tuned": "ring",
-    "unjam:shared-rings-tuned": "ring",
-    "unjam:ring-jammed-best": "ring-jammed",
-    "unjam:ring-jammed-tuned": "ring-jammed",
-    "unjam:figure-eight-best": "figure-eight",
-    "unjam:figure-eight-tuned": "figure-eight",
+    **{f"unjam:{name}": "ring" for name in ("ring-best", "ring-gap-tuned", "ring-tuned")},
+    **{f"unjam:{name}": "ring" for name in ("rings-tuned", "shared-rings-tuned")},
+    **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
+    **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned")},
 }
-"""what ships for closed roads, and the road that it is for"""
+"""packaged controllers for closed roads, and the road of each"""
 LANE_CONTROLLERS = ("unjam:on-ramp-tuned", *(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight"))
 IMPAIRED_DRIVERS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
 VEHICLE_SPACINGS = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
-"""road for each vehicle [m], from and to"""
-WORST_FILE, CONTROLLER_HASHES_FILE = "worst", "drove"
-"""names of files: of the worst cases; and which shipped file drove each part, for others replace it"""
+"""range of the road length per vehicle [m]"""
+WORST_FILE, CONTROLLER_HASHES_FILE = "worst", "controller-hashes"
+"""names of parts: the worst cases of the certificates, and the digests of the controllers by part"""
 ENVELOPE_METRICS = ("return", "mean_speed", "min_time_gap", "cav_max_braking", "steps", "collisions")
-"""of each episode"""
 LANE_CONDITIONS: dict[str, dict[str, Any]] = {
     "a free lane": {"inflow": 1200.0, "off_peak_inflow": 1200.0},
     "a full lane": {"inflow": 2400.0, "off_peak_inflow": 2000.0},
     "a full lane, half of all automated": {"inflow": 2400.0, "off_peak_inflow": 2000.0, "penetration_rate": 0.5},
 }
-"""one lane of a motorway, onto which nobody cuts in, by label"""
+"""demand on one lane of a motorway without cut-ins"""
 IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "at once, exact": {},
     "lag 0.2 s": {"actuator": Actuator(lag=0.2)},
@@ -74,187 +66,166 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "delay 0.2 s": {"actuator": Actuator(delay=0.2)},
     "delay 0.5 s": {"actuator": Actuator(delay=0.5)},
     "lag 0.3 s, delay 0.2 s": {"actuator": Actuator(lag=0.3, delay=0.2)},
-    "gap and speed off by up to 0.3": {
-        "sensors": Sensors(gap_error=0.3, speed_error=0.3),
-        "safety": SafetyFilter(gap_error=0.3, speed_error=0.3),
-    },
-    "off by up to 1.0": {
-        "sensors": Sensors(gap_error=1.0, speed_error=1.0),
-        "safety": SafetyFilter(gap_error=1.0, speed_error=1.0),
+    **{
+        label: {
+            "sensors": Sensors(gap_error=error, speed_error=error),
+            "safety": SafetyFilter(gap_error=error, speed_error=error),
+        }
+        for label, error in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
     },
     "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},
     "every third reading missing": {"sensors": Sensors(dropout=1.0 / 3.0)},
 }
-"""what is worse about cars, by label"""
+"""changes to the actuation and the sensors of CAVs"""
+
+NamedRoads = Iterator[tuple[str, Scenario]]
+"""scenarios with their names"""
 
 
-def envelope_rings() -> Iterator[tuple[str, Ring]]:
-    """Yield the rings, by name."""
+def envelope_rings(**changes: Any) -> Iterator[tuple[str, Ring]]:
+    """Yield the rings by name, with changes to all of them."""
     each = product((5, 11, 22, 44), (1, 2, 3), VEHICLE_SPACINGS.items(), (0, LONG_WARM_UP))
     for vehicles, cavs, (words, (low, high)), warmup in each:
-        length = low * vehicles, high * vehicles
         name = f"{vehicles} vehicles, {cavs} automated, {words}{', jammed' if warmup else ''}"
-        yield name, Ring(vehicles=vehicles, cavs=cavs, length=length, warmup=warmup)
+        length = low * vehicles, high * vehicles
+        yield name, Ring(vehicles=vehicles, cavs=cavs, length=length, warmup=warmup, **changes)
 
 
 def envelope_figure_eights() -> Iterator[tuple[str, FigureEight]]:
-    """Yield the figure eights, by name."""
+    """Yield the figure eights by name."""
     for low, high in ((27, 29), (30, 31), (32, 35), (36, 40), (41, 50)):
         yield f"radius {low} to {high} m", FigureEight(radius=(low, high))
 
 
-def without_sumo_safety(roads: Iterator[tuple[str, Ring]]) -> Iterator[tuple[str, Ring]]:
-    """Yield rings on which SUMO does not keep CAVs apart."""
-    for name, road in roads:
-        yield name, replace(road, actuation="raw")
-
-
 def envelope_lanes() -> Iterator[tuple[str, OnRamp]]:
-    """Yield lanes of a motorway on which the filter keeps CAVs apart, and not SUMO, by name."""
+    """Yield motorway lanes by name on which the safety filter is active and the checks of SUMO are not."""
     for name, changes in LANE_CONDITIONS.items():
-        nobody = OnRamp(lanes=1, ramp_flow=0.0, off_peak_ramp_flow=0.0, horizon=900)
-        yield name, replace(nobody, actuation="raw", safety=SafetyFilter(), **changes)
+        lane = OnRamp(lanes=1, ramp_flow=0.0, off_peak_ramp_flow=0.0, horizon=900)
+        yield name, replace(lane, actuation="raw", safety=SafetyFilter(), **changes)
 
 
 def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
-    """Yield the usual ring with cars that are worse, by what is worse about them."""
-    for words, changes in IMPAIRMENTS.items():
-        yield words, replace(Ring(warmup=warmup), **changes)
+    """Yield the default ring with each impairment, by its name."""
+    for name, changes in IMPAIRMENTS.items():
+        yield name, replace(Ring(warmup=warmup), **changes)
 
 
 def _write_envelope(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    parts: dict[str, tuple[Iterator[tuple[str, Scenario]], tuple[str, ...], int]] = {
-        "rings": (envelope_rings(), tuple(CONTROLLER_ROADS), ENVELOPE_SEEDS),
-        "figure-eights": (envelope_figure_eights(), tuple(CONTROLLER_ROADS), ENVELOPE_SEEDS),
-        "rings-raw": (without_sumo_safety(envelope_rings()), tuple(CONTROLLER_ROADS), RAW_ACTUATION_SEEDS),
+    closed = tuple(CONTROLLER_ROADS)
+    parts: dict[str, tuple[NamedRoads, tuple[str, ...], int]] = {
+        WORST_FILE: (iter(()), closed, 1),
+        "rings": (envelope_rings(), closed, ENVELOPE_SEEDS),
+        "figure-eights": (envelope_figure_eights(), closed, ENVELOPE_SEEDS),
+        "rings-raw": (envelope_rings(actuation="raw"), closed, RAW_ACTUATION_SEEDS),
         "lanes-raw": (envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
         "impaired": (impaired_rings(0), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
         "impaired-jammed": (impaired_rings(LONG_WARM_UP), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
     }
-    drove = _read_optional_part(folder, CONTROLLER_HASHES_FILE)
+    digests = _read_optional_part(folder, CONTROLLER_HASHES_FILE)
     with WorkerPool(workers) as pool:
-        for part, (roads, drivers, count) in {WORST_FILE: (iter(()), tuple(CONTROLLER_ROADS), 1), **parts}.items():
-            known = drove.setdefault(part, {})
+        for part, (roads, drivers, count) in parts.items():
+            known = digests.setdefault(part, {})
             missing = [driver for driver in drivers if known.get(driver) != controller_digest(driver)]
             if not missing:
                 continue
-            found = _read_optional_part(folder, part)
+            results = _read_optional_part(folder, part)
             if part == WORST_FILE:
-                found |= {driver: _certify_worst_cases(driver, CONTROLLER_ROADS[driver]) for driver in missing}
+                results |= {driver: _certify_worst_cases(driver, CONTROLLER_ROADS[driver]) for driver in missing}
             for name, road in roads:
                 made = {driver: make_driver(driver, road.control_step) for driver in (HUMAN_LABEL, *missing)}
-                found[name] = found.get(name, {}) | evaluate_on_test_seeds(road, made, count, ENVELOPE_METRICS, pool)
-            atomic_write(folder / f"{part}.json", to_json(found))
+                found = evaluate_on_test_seeds(road, made, count, ENVELOPE_METRICS, pool)
+                results[name] = results.get(name, {}) | found
+            atomic_write(folder / f"{part}.json", to_json(results))
             known |= {driver: controller_digest(driver) for driver in missing}
-            atomic_write(folder / f"{CONTROLLER_HASHES_FILE}.json", to_json(drove, indent=1))
+            write_part(folder, CONTROLLER_HASHES_FILE, digests)
 
 
 def _read_optional_part(folder: Path, name: str) -> dict[str, Any]:
-    """Return what a file of the study holds; nothing where there is none yet."""
     return read_part(folder, name) if (folder / f"{name}.json").is_file() else {}
 
 
 def _certify_worst_cases(controller: str, road: str) -> dict[str, Any]:
-    """Return what was tried to make a controller touch its leader, from all that it visits on its road."""
+    """Return the worst cases that the certificate finds for a controller on its road."""
     with TemporaryDirectory() as folder:
         file = Path(folder, f"controller{SUFFIX}")
         export_controller(controller, file, scenario=road)
-        return make_certificate(read_controller(file))["worst"]
+        return make_certificate(read_controller(file))["worst_cases"]
 
 
 def worst_table(folder: Path) -> pd.DataFrame:
-    """Return how close leaders that brake and attack came to each controller."""
+    """Return how close each controller came to leaders that brake to a stop and to leaders found by a search."""
     return pd.DataFrame(
         {
             "controller": controller,
             "road": CONTROLLER_ROADS[controller],
-            "stops": f"{worst['stops']:,}",
+            "stops": f"{worst['leader_stops']:,}",
             "steps": f"{worst['steps']:,}",
             "contacts": worst["contacts"],
-            "smallest gap [m]": f"{worst['min_gap']:.2f}",
-            "smallest headway [s]": f"{worst['min_time_gap']:.2f}",
-            "hardest braking [m/s²]": f"{worst['max_braking']:.1f}",
+            "min gap [m]": f"{worst['min_gap']:.2f}",
+            "min time gap [s]": f"{worst['min_time_gap']:.2f}",
+            "max braking [m/s²]": f"{worst['max_braking']:.1f}",
         }
         for controller, worst in read_part(folder, WORST_FILE).items()
     )
 
 
-def _min_time_gap(episodes: list[dict[str, Any]]) -> float:
-    """Return the smallest time headway of all episodes [s]; in some nobody was faster than 1 m/s."""
-    headways = (row["min_time_gap"] for row in episodes)
-    return min((headway for headway in headways if headway is not None), default=np.inf)
-
-
-def _speed_gain(results: dict[str, Any], driver: str) -> float:
-    """Return how much faster the mean of all is than people alone [m/s]."""
-    own, people = ([row["mean_speed"] for row in results[each]["episodes"]] for each in (driver, HUMAN_LABEL))
-    return float(np.mean(own) - np.mean(people))
-
-
 def domain_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return on how many roads each controller is drivable, and where it is worst."""
-    roads = read_part(folder, part)
-    rows: list[dict[str, Any]] = []
-    for driver in next(iter(roads.values())):
-        if driver == HUMAN_LABEL:
-            continue
-        drivable = [name for name, found in roads.items() if found[driver]["drivable"] == FEASIBLE]
-        closest = min(_min_time_gap(found[driver]["episodes"]) for found in roads.values())
-        gains = {name: _speed_gain(found, driver) for name, found in roads.items()}
-        slowest = min(gains, key=lambda name: gains[name])
-        hardest = max(row["cav_max_braking"] for found in roads.values() for row in found[driver]["episodes"])
+    """Return on how many roads each controller is feasible, and its gain in speed in the mean and on the worst road."""
+    roads, rows = read_part(folder, part), []
+    comparison = DriverComparison([*roads.values()])
+    for driver in (driver for driver in comparison.roads[0] if driver != HUMAN_LABEL):
+        speeds = (comparison.values([label], "mean_speed").mean((1, 2)) for label in (driver, HUMAN_LABEL))
+        gains = np.subtract(*speeds)
+        least = int(np.argmin(gains))
         rows.append(
             {
                 "controller": driver,
-                "drivable on": f"{len(drivable)} of {len(roads)} roads",
-                "smallest headway [s]": f"{closest:.2f}",
-                "hardest braking [m/s²]": f"{hardest:.1f}",
-                "beyond people, mean [m/s]": f"{np.mean(list(gains.values())):+.2f}",
-                "least beyond people [m/s]": f"{gains[slowest]:+.2f} ({slowest})",
+                "feasible on": f"{comparison.verdicts([driver]).count(FEASIBLE)} of {len(roads)} roads",
+                **_safety_cells(comparison, driver),
+                "mean difference to human baseline [m/s]": f"{gains.mean():+.2f}",
+                "smallest difference [m/s]": f"{gains[least]:+.2f} ({list(roads)[least]})",
             }
         )
     return pd.DataFrame(rows)
 
 
 def contact_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return how many touched somebody, and how close they came, where SUMO does not keep CAVs apart."""
-    roads = read_part(folder, part)
-    found: list[dict[str, Any]] = []
-    for driver in next(iter(roads.values())):
-        episodes = [row for each in roads.values() for row in each[driver]["episodes"]]
-        if driver == HUMAN_LABEL:
-            continue
-        found.append(
-            {
-                "controller": driver,
-                "episodes": len(episodes),
-                "decisions": f"{sum(row['steps'] for row in episodes):,}",
-                "in contact": int(sum(row["collisions"] for row in episodes)),
-                "smallest headway [s]": f"{_min_time_gap(episodes):.2f}",
-                "hardest braking [m/s²]": f"{max(row['cav_max_braking'] for row in episodes):.1f}",
-            }
-        )
-    return pd.DataFrame(found)
+    """Return the contacts and the smallest time gap of each controller where SUMO's safety checks are off."""
+    comparison = DriverComparison([*read_part(folder, part).values()])
+    return pd.DataFrame(
+        {
+            "controller": driver,
+            "episodes": comparison.values([driver], "steps").size,
+            "control steps": f"{comparison.values([driver], 'steps').sum():,.0f}",
+            "in contact": int(comparison.values([driver], "collisions").sum()),
+            **_safety_cells(comparison, driver),
+        }
+        for driver in comparison.roads[0]
+        if driver != HUMAN_LABEL
+    )
+
+
+def _safety_cells(comparison: DriverComparison, driver: str) -> dict[str, str]:
+    max_braking = comparison.values([driver], "cav_max_braking").max()
+    return {"min time gap [s]": comparison.min_time_gap([driver]), "max braking [m/s²]": f"{max_braking:.1f}"}
 
 
 def impaired_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return what each controller earns with cars that are worse, and whether it is drivable with them."""
+    """Return the return of each controller with impaired vehicles, its minimum time gap, and why it is infeasible."""
     rows: list[dict[str, Any]] = []
-    for words, found in read_part(folder, part).items():
-        row: dict[str, Any] = {"cars": words}
-        for driver, of in found.items():
-            cell = str(estimate_cell(estimate([each["return"] for each in of["episodes"]]), 0))
-            headway = _min_time_gap(of["episodes"])
-            if isfinite(headway) and driver != HUMAN_LABEL:
-                cell += f"; {headway:.2f} s" + ("" if of["drivable"] == FEASIBLE else f", {of['drivable']}")
-            row[driver] = cell
+    for name, results in read_part(folder, part).items():
+        comparison, row = DriverComparison([results]), {"impairment": name}
+        for driver in results:
+            row[driver] = str(estimate_cell(estimate(comparison.values([driver], "return").ravel().tolist()), 0))
+            time_gap, verdict = comparison.min_time_gap([driver]), comparison.feasibility([driver])
+            if driver != HUMAN_LABEL and time_gap != NO_VALUE_TEXT:
+                row[driver] += f"; {time_gap} s" + ("" if verdict == "yes" else f", {verdict}")
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 ENVELOPE = Study(
-    title="how far from its own road a shipped controller stays drivable, also late and with wrong sensors",
-    make_runs=lambda seeds: [],
+    title="feasibility of packaged controllers far from their training roads, with actuation delay and sensor errors",
     write=_write_envelope,
     minutes=30.0,
     is_resumable=True,

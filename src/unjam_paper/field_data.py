@@ -1,8 +1,8 @@
-"""Models of drivers on field data: one step ahead, and driving on behind a recorded leader.
+"""Car-following models on field data: errors one step ahead, and in open loop behind a recorded leader.
 
-The data are the user's files: the reconstructed NGSIM I-80 as leader-follower pairs with a published split,
-and OpenACC's AstaZero platoons, as plain tables (`unjam.following.loaders`). AstaZero has no published split;
-here one day (or platoon) is for learning, another for judging.
+The data are files of the user: the reconstructed NGSIM I-80 data as leader-follower pairs with a published split, and
+OpenACC's AstaZero platoons, as plain tables (`unjam.following.loaders`). AstaZero has no published split; here one day
+or platoon is for training and another for testing.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,6 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from unjam.files import atomic_write, to_json
 from unjam.following.calibration import CALIBRATED_PARAMETERS, CalibrationSettings, calibrate_groups, calibrate_idm
 from unjam.following.loaders import ReadOptions, read_pairs
 from unjam.following.networks import (
@@ -39,16 +38,16 @@ from unjam.following.open_loop import (
 )
 from unjam.following.pairs import Pair, Segments, following_samples, make_segments, pairs_in_splits, split_by_driver
 from unjam.physics.idm import PAPER_IDM, stack_idm_parameters
-from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure, png_bytes
-from unjam_paper.parts import PartCallback, StudyPart, measure_parts
+from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
+from unjam_paper.parts import PartCallback, measure_parts
+from unjam_paper.results_file import write_figure, write_part
 from unjam_paper.study import Table, study_manifest
 
 ACCELERATION_LIMITS: AccelerationBounds = (-4.0, 2.0)
-TRAINING_SEED_COUNTS = {"ngsim": 3, "astazero": 1}
+TRAINING_SEED_COUNTS, ROW_STRIDES = {"ngsim": 3, "astazero": 1}, {"ngsim": 1, "astazero": 5}
+"""trainings of each network, and stride of the training rows one step ahead: neighboring rows hardly differ"""
 MAX_SEGMENT_SECONDS = 120.0
-"""longest stretch that is driven on in [s]"""
-ROW_STRIDES = {"ngsim": 1, "astazero": 5}
-"""every so many-th row is learned from, one step ahead: neighbours hardly differ"""
+"""maximum length of an open-loop segment [s]"""
 ONE_STEP_SETTINGS = NetworkSettings(learning_rate=1e-3, epochs=40, patience=8)
 MULTI_STEP_SETTINGS = MultiStepSettings()
 BOOTSTRAP_DRAWS = 2000
@@ -61,46 +60,50 @@ KNOWLEDGE_MODELS: dict[str, AccelerationBounds | None] = {
     "knowledge, paper's IDM": None,
     "knowledge, paper's IDM clipped": ACCELERATION_LIMITS,
 }
-"""the paper's IDM within these limits, alone and below a network"""
+"""the paper's IDM within these limits, alone and as the base of a network"""
 FIELD_CALIBRATION = CalibrationSettings(limits=ACCELERATION_LIMITS, segment_seconds=MAX_SEGMENT_SECONDS)
+WEIGHTED_MODEL = "IDM, initial headway weighted"
 CALIBRATED_MODELS = {
-    "IDM, every moment": replace(FIELD_CALIBRATION, weighting="sample"),
+    "IDM, samples weighted equally": replace(FIELD_CALIBRATION, weighting="sample"),
     "IDM": FIELD_CALIBRATION,
-    "IDM, headway kept": replace(FIELD_CALIBRATION, initial_headway_weight=(0.0, 1.0)),
+    WEIGHTED_MODEL: replace(FIELD_CALIBRATION, initial_headway_weight=(0.0, 1.0)),
 }
 ONE_STEP_MODELS = ("vanilla", *KNOWLEDGE_MODELS, "knowledge, IDM")
-MULTI_STEP_MODELS = ("IDM + multi-step", "IDM, headway kept + multi-step")
-PERSONAL_MODELS = {"IDM, own headway": ("time_headway",), "IDM, all own": CALIBRATED_PARAMETERS}
-"""what is each driver's own, calibrated on the first half of each test trajectory: judged on the second
-halves alone"""
+MULTI_STEP_SUFFIX = " + multi-step"
+MULTI_STEP_MODELS = (f"IDM{MULTI_STEP_SUFFIX}", f"{WEIGHTED_MODEL}{MULTI_STEP_SUFFIX}")
+PERSONAL_MODELS = {
+    "IDM, personal time headway": ("time_headway",),
+    "IDM, all parameters personal": CALIBRATED_PARAMETERS,
+}
+"""parameters of each driver that are calibrated on the first half of its test trajectory, and tested on the second"""
 PUBLISHED_GAP_ERROR = 3.64
-"""error of the gap of a calibrated IDM on the published test pairs of NGSIM [m]"""
+"""gap error of a calibrated IDM on the published test pairs of NGSIM [m]"""
 MODEL_LABELS = {
     "paper's IDM": "paper's IDM",
     "IDM": "IDM, calibrated",
-    "IDM, headway kept": "IDM, calibrated, headway kept",
+    WEIGHTED_MODEL: "IDM, calibrated, initial headway weighted",
     "vanilla": "network alone",
     "knowledge, paper's IDM": "paper's IDM + residual",
     "knowledge, paper's IDM clipped": "paper's IDM, clipped + residual",
     "knowledge, IDM": "calibrated IDM + residual",
-    "IDM + multi-step": "calibrated IDM + multi-step residual",
-    "IDM, headway kept + multi-step": "headway kept + multi-step residual",
+    MULTI_STEP_MODELS[0]: "calibrated IDM + multi-step residual",
+    MULTI_STEP_MODELS[1]: "initial headway weighted + multi-step residual",
 }
-"""of the models that are shown, from below to above"""
-TEST_SET_LABELS = {"test": "the 20 published test pairs", "others": "218 other drivers"}
+"""models of the figure, from top to bottom"""
+TEST_SET_LABELS = {"test": "the 20 published test pairs", "other drivers": "218 other drivers"}
 ERROR_AXIS_LIMITS = {"gap": (2.0, 12.0), "one_step": (0.4, 1.9)}
-"""errors beyond this leave the picture, and are written at its edge [m, m/s2]"""
+"""larger errors are written at the edge of the figure [m, m/s2]"""
 
 
 @dataclass(frozen=True)
 class FieldData:
-    """A data set, split into who is learned from and who judges."""
+    """A data set, split into training and test pairs."""
 
     training: list[Pair]
     test: dict[str, list[Pair]]
-    """by name; the main one is `test`"""
+    """test sets by name; the main one is `test`"""
     max_segment: float | None = MAX_SEGMENT_SECONDS
-    """longest stretch of open loop [s]: an AstaZero drive lasts twenty minutes; None: all of it"""
+    """maximum length of an open-loop segment [s]: an AstaZero drive lasts twenty minutes; None: no limit"""
 
 
 @dataclass(frozen=True)
@@ -108,69 +111,70 @@ class FieldFit:
     """One model on one data set."""
 
     data_set: str
-    """in DATA"""
+    """a name in `FIELD_DATA_LOADERS`"""
     file: str
     model: str
     seed: int = 0
 
     @property
     def name(self) -> str:
-        """A name for its file."""
+        """The name of its part."""
         plain = self.model.replace(", ", "-").replace(" + ", "-").replace(" ", "-").replace("'", "")
         return f"{self.data_set}-{plain}-{self.seed}"
 
 
 def _load_ngsim(path: Path) -> FieldData:
     pairs = read_pairs(path, "table", ReadOptions(driver_columns=("period", "follower"))).pairs
-    tests = {"test": pairs_in_splits(pairs, "paper_test"), "others": pairs_in_splits(pairs, "extra")}
+    tests = {"test": pairs_in_splits(pairs, "paper_test"), "other drivers": pairs_in_splits(pairs, "extra")}
     return FieldData(pairs_in_splits(pairs, "paper_train"), tests, max_segment=None)
 
 
 def _load_astazero(path: Path, kind: str, training_runs: tuple[str, ...], test_runs: tuple[str, ...]) -> FieldData:
     reading = ReadOptions(driver_columns=("run", "follower"), kind_columns=("acc", "setting"))
     pairs = [pair for pair in read_pairs(path, "table", reading).pairs if pair.kind == kind]
-    learned, judged = ([pair for pair in pairs if pair.driver.startswith(runs)] for runs in (training_runs, test_runs))
-    return FieldData(learned, {"test": judged})
+    training, test = ([pair for pair in pairs if pair.driver.startswith(runs)] for runs in (training_runs, test_runs))
+    return FieldData(training, {"test": test})
 
 
 TEN_VEHICLE_PLATOON, THREE_VEHICLE_PLATOON = ("040719_platoon10-",), ("040719_platoon3-",)
 FIRST_DAY_PLATOONS = tuple(f"040719_platoon{number}-" for number in range(5, 10))
 SECOND_DAY_PLATOONS = ("050719_platoon1-", "050719_platoon2-")
+ASTAZERO_SPLITS = {
+    "human": ("False-none", TEN_VEHICLE_PLATOON, THREE_VEHICLE_PLATOON),
+    "human-reversed": ("False-none", THREE_VEHICLE_PLATOON, TEN_VEHICLE_PLATOON),
+    "acc": ("True-min", FIRST_DAY_PLATOONS, SECOND_DAY_PLATOONS),
+}
+"""kind of the pairs, training runs and test runs"""
 FIELD_DATA_LOADERS: dict[str, Callable[[Path], FieldData]] = {
     "ngsim": _load_ngsim,
-    "astazero-human": partial(
-        _load_astazero, kind="False-none", training_runs=TEN_VEHICLE_PLATOON, test_runs=THREE_VEHICLE_PLATOON
-    ),
-    "astazero-human-reversed": partial(
-        _load_astazero, kind="False-none", training_runs=THREE_VEHICLE_PLATOON, test_runs=TEN_VEHICLE_PLATOON
-    ),
-    "astazero-acc": partial(
-        _load_astazero, kind="True-min", training_runs=FIRST_DAY_PLATOONS, test_runs=SECOND_DAY_PLATOONS
-    ),
+    **{
+        f"astazero-{name}": partial(_load_astazero, kind=kind, training_runs=training, test_runs=test)
+        for name, (kind, training, test) in ASTAZERO_SPLITS.items()
+    },
 }
 
 
 @cache
 def load_field_data(name: str, file: str) -> FieldData:
-    """Return a data set, read once in a process."""
+    """Return a data set, read once per process."""
     return FIELD_DATA_LOADERS[name](Path(file))
 
 
 def field_fits(files: dict[str, str]) -> list[FieldFit]:
-    """Return all models on all data; `files` are those of `ngsim` and `astazero`."""
-    found = []
+    """Return the fits of all models to all data sets; `files` are those of `ngsim` and `astazero`."""
+    fits = []
     for data in FIELD_DATA_LOADERS:
         source = data.partition("-")[0]
-        file, seeds = files[source], range(TRAINING_SEED_COUNTS[source])
-        found += [FieldFit(data, file, model) for model in (*PAPER_IDM_MODELS, *CALIBRATED_MODELS, *PERSONAL_MODELS)]
-        found += [FieldFit(data, file, model, seed) for seed in seeds for model in ONE_STEP_MODELS]
-        multi_steps = MULTI_STEP_MODELS if data == "ngsim" else MULTI_STEP_MODELS[1:]
-        found += [FieldFit(data, file, model, seed) for seed in seeds for model in multi_steps]
-    return found
+        multi_step = MULTI_STEP_MODELS if data == "ngsim" else MULTI_STEP_MODELS[1:]
+        single = [(model, 0) for model in (*PAPER_IDM_MODELS, *CALIBRATED_MODELS, *PERSONAL_MODELS)]
+        seeds = range(TRAINING_SEED_COUNTS[source])
+        repeated = [(model, seed) for models in (ONE_STEP_MODELS, multi_step) for seed in seeds for model in models]
+        fits += [FieldFit(data, files[source], model, seed) for model, seed in (*single, *repeated)]
+    return fits
 
 
 def evaluate_fit(fit: FieldFit) -> dict[str, Any]:
-    """Return what a model is worth on each test set, trajectory by trajectory."""
+    """Return the errors of a model on each test set, by trajectory."""
     data = load_field_data(fit.data_set, fit.file)
     own = fit.model in PERSONAL_MODELS
     model, facts = _fit_personal_idm(data, PERSONAL_MODELS[fit.model]) if own else _fit_model(fit, data)
@@ -186,24 +190,24 @@ def split_halves(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Pair]]:
 
 
 def trajectory_errors(model: DriverModel, segments: Segments) -> dict[str, list[float]]:
-    """Return the errors of each trajectory: what intervals are made of."""
-    drove = simulate_open_loop(model, segments)
+    """Return the errors of each trajectory, from which the confidence intervals are computed."""
+    simulated = simulate_open_loop(model, segments)
     owned = [segments.pair_index == owner for owner in np.unique(segments.pair_index)]
 
     def by_owner(values: np.ndarray) -> list[float]:
-        return [float(np.average(values[own], weights=drove.sample_counts[own])) for own in owned]
+        return [float(np.average(values[own], weights=simulated.sample_counts[own])) for own in owned]
 
     return {
-        "moments": [float(drove.sample_counts[own].sum()) for own in owned],
-        "gap_mse": by_owner(drove.gap_mse),
-        "speed_mse": by_owner(drove.speed_mse),
+        "samples": [float(simulated.sample_counts[own].sum()) for own in owned],
+        "gap_square": by_owner(simulated.gap_mse),
+        "speed_square": by_owner(simulated.speed_mse),
         "one_step_square": by_owner(one_step_error(model, segments)),
-        "collided": [float(drove.has_collided[own].mean()) for own in owned],
+        "collision_share": [float(simulated.has_collided[own].mean()) for own in owned],
     }
 
 
 def _fit_model(fit: FieldFit, data: FieldData) -> tuple[DriverModel, dict[str, Any]]:
-    """Return a model that was made from the data for learning, and how."""
+    """Return a model fitted to the training data, and facts about the fit."""
     if fit.model in PAPER_IDM_MODELS:
         return fixed_driver(idm_function(PAPER_IDM, PAPER_IDM_MODELS[fit.model])), {}
     if fit.model in CALIBRATED_MODELS:
@@ -212,56 +216,53 @@ def _fit_model(fit: FieldFit, data: FieldData) -> tuple[DriverModel, dict[str, A
     chosen = split_by_driver(data.training, (0.8, 0.2, 0.0), seed=0)
     learn, validation = pairs_in_splits(chosen, "train"), pairs_in_splits(chosen, "validation")
     if fit.model in MULTI_STEP_MODELS:
-        # The base must not have seen who decides whether a residual is better than none.
-        found = calibrate_idm(learn, CALIBRATED_MODELS[fit.model.removesuffix(" + multi-step")])
-        people, kept = found.parameters, found.initial_headway_weight
-        known, judges = (CalibratedPairs(pairs, [people] * len(pairs), kept) for pairs in (learn, validation))
-        fitted = fit_multi_step(known, judges, ACCELERATION_LIMITS, MULTI_STEP_SETTINGS, fit.seed)
+        # The base must not use the validation pairs, which decide whether a residual is better than none.
+        found = calibrate_idm(learn, CALIBRATED_MODELS[fit.model.removesuffix(MULTI_STEP_SUFFIX)])
+        learning, checking = (
+            CalibratedPairs(pairs, [found.parameters] * len(pairs), found.initial_headway_weight)
+            for pairs in (learn, validation)
+        )
+        fitted = fit_multi_step(learning, checking, ACCELERATION_LIMITS, MULTI_STEP_SETTINGS, fit.seed)
         best = int(np.argmin(fitted.validation_errors)) * MULTI_STEP_SETTINGS.validation_interval
         facts = {"validation": fitted.validation_errors, "best_step": best}
-        return add_residual(
-            found.model(ACCELERATION_LIMITS), batched_network(fitted.network.to_numpy_network()), ACCELERATION_LIMITS
-        ), facts
+        residual = batched_network(fitted.network.to_numpy_network())
+        return add_residual(found.model(ACCELERATION_LIMITS), residual, ACCELERATION_LIMITS), facts
     base = idm_function(PAPER_IDM, KNOWLEDGE_MODELS[fit.model]) if fit.model in KNOWLEDGE_MODELS else None
     if fit.model == "knowledge, IDM":
         base = idm_function(calibrate_idm(learn).parameters, ACCELERATION_LIMITS)
-    apart = ROW_STRIDES[fit.data_set.partition("-")[0]]
-    rows, judges = (following_samples(pairs) for pairs in (learn, validation))
-    rows, judges = (each.select(np.arange(0, len(each), apart)) for each in (rows, judges))
-    network, losses = fit_one_step(rows, judges, base, ONE_STEP_SETTINGS, fit.seed)
+    stride = ROW_STRIDES[fit.data_set.partition("-")[0]]
+    samples = (following_samples(pairs) for pairs in (learn, validation))
+    rows, checking = (each.select(np.arange(0, len(each), stride)) for each in samples)
+    network, losses = fit_one_step(rows, checking, base, ONE_STEP_SETTINGS, fit.seed)
     model = add_residual(fixed_driver(base) if base else None, batched_network(network.to_numpy_network()))
     return model, {"epochs": len(losses.training)}
 
 
 def _fit_personal_idm(data: FieldData, personal_parameters: Sequence[str]) -> tuple[DriverModel, dict[str, Any]]:
-    """Return IDMs of which some parameters are calibrated on the first half of each test trajectory."""
+    """Return IDMs with some parameters calibrated on the first half of each test trajectory."""
     first, second = split_halves(data.test["test"])
     typical = calibrate_idm(data.training, CALIBRATED_MODELS["IDM"]).parameters
     found = calibrate_groups([[pair] for pair in first], typical, personal_parameters, CALIBRATED_MODELS["IDM"])
     rows = [found[number].parameters for number in make_segments(second, data.max_segment).pair_index]
-    return individual_idm(stack_idm_parameters(rows), 0.0, ACCELERATION_LIMITS), {
-        "calibrated": [asdict(one) for one in found]
-    }
+    model = individual_idm(stack_idm_parameters(rows), 0.0, ACCELERATION_LIMITS)
+    return model, {"calibrated": [asdict(one) for one in found]}
 
 
 def run_field_study(
     folder: Path, ngsim: Path, astazero: Path, workers: int = 2, on_part: PartCallback = lambda name: None
 ) -> None:
-    """Measure what is missing, and write `field.json` and `field.png` into `folder`.
-
-    The study goes on where it was stopped: what is measured lies in `folder/parts`.
-    """
+    """Measure the parts that are missing in `folder/parts`, and write `field.json` and `field.png`."""
     about = study_manifest(folder)
-    wanted = field_fits({"ngsim": str(ngsim), "astazero": str(astazero)})
-    parts: dict[str, StudyPart] = {task.name: (evaluate_fit, (task,)) for task in wanted}
+    fits = field_fits({"ngsim": str(ngsim), "astazero": str(astazero)})
+    parts = {fit.name: (evaluate_fit, (fit,)) for fit in fits}
     rows = field_rows(measure_parts(folder / "parts", parts, workers, on_part))
     about["command"] = [about["command"][0], "FOLDER", ngsim.name, astazero.name]
-    atomic_write(folder / "field.json", to_json({"manifest": about, "rows": rows}, indent=1))
-    atomic_write(folder / "field.png", png_bytes(field_figure(rows), reduce_colors=False))
+    write_part(folder, "field", {"manifest": about, "rows": rows})
+    write_figure(folder, "field", field_figure(rows))
 
 
 def field_rows(results: Table) -> Table:
-    """Return a row for each model, test set and seed; intervals are from a bootstrap over trajectories."""
+    """Return a row for each model, test set and seed, with confidence intervals from a bootstrap over trajectories."""
     rows = []
     for part in results:
         facts = {key: value for key, value in part.items() if key != "tests"}
@@ -271,10 +272,10 @@ def field_rows(results: Table) -> Table:
 
 def _bootstrap_errors(square_errors: dict[str, list[float]]) -> dict[str, Any]:
     values = {name: np.array(each) for name, each in square_errors.items()}
-    weights = values["moments"]
+    weights = values["samples"]
     draws = np.random.default_rng(0).integers(len(weights), size=(BOOTSTRAP_DRAWS, len(weights)))
-    each = np.sqrt(values["gap_mse"])
-    errors: dict[str, Any] = {"trajectories": len(weights), "collided": float(values["collided"].mean())}
+    each = np.sqrt(values["gap_square"])
+    errors: dict[str, Any] = {"trajectories": len(weights), "collision_share": float(values["collision_share"].mean())}
     for name in ("gap", "speed", "one_step"):
         squares = values[f"{name}_square"] * weights
         drawn = np.sqrt(squares[draws].sum(1) / weights[draws].sum(1))
@@ -287,20 +288,18 @@ def _bootstrap_errors(square_errors: dict[str, list[float]]) -> dict[str, Any]:
 
 @rc_context(PLOT_STYLE)
 def field_figure(rows: Table) -> Figure:
-    """Return, for NGSIM, the errors of the simulated gap, and beside them those of one step."""
+    """Return the errors on NGSIM: of the gap in open loop and of one step."""
     figure = new_figure(4.2, width=11)
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     styles = zip(TEST_SET_LABELS.items(), (LINE_COLORS[2], LINE_COLORS[0]), (0.14, -0.14), strict=True)
-    for (test, label), colour, shift in styles:
-        judged = [row for row in rows if row["data_set"] == "ngsim" and row["test"] == test]
+    for (test, label), color, shift in styles:
+        tested = [row for row in rows if row["data_set"] == "ngsim" and row["test"] == test]
         for axes, name in ((left, "gap"), (right, "one_step")):
-            _draw_seed_errors(axes, judged, name, colour, shift, label)
+            _draw_seed_errors(axes, tested, name, color, shift, label)
     left.axvline(PUBLISHED_GAP_ERROR, color=TEXT_COLOR, lw=0.9, ls=":")
     left.annotate("published", (PUBLISHED_GAP_ERROR + 0.1, len(MODEL_LABELS) - 0.45), fontsize=8, color=TEXT_COLOR)
     left.set_yticks(range(len(MODEL_LABELS)), list(MODEL_LABELS.values())[::-1])
-    left.set(
-        xlim=ERROR_AXIS_LIMITS["gap"], ylim=(-0.6, len(MODEL_LABELS) - 0.2), xlabel="error of the gap, driving on [m]"
-    )
+    left.set(xlim=ERROR_AXIS_LIMITS["gap"], ylim=(-0.6, len(MODEL_LABELS) - 0.2), xlabel="gap error in open loop [m]")
     right.set(xlim=ERROR_AXIS_LIMITS["one_step"], xlabel="error of the acceleration, one step [m/s²]")
     left.plot([], [], "o", ms=4.5, color=TEXT_COLOR, mfc="white", label="some collide")
     left.legend(loc="lower right")
@@ -308,17 +307,17 @@ def field_figure(rows: Table) -> Figure:
 
 
 def _draw_seed_errors(axes: Axes, rows: Table, name: str, color: str, offset: float, label: str | None) -> None:
-    """Draw each seed as a dot with its interval; who collides has an open one."""
-    most = ERROR_AXIS_LIMITS[name][1]
+    """Draw each seed as a dot with its CI; the dot is open if some trajectories end in a collision."""
+    limit = ERROR_AXIS_LIMITS[name][1]
     for place, model in enumerate(reversed(MODEL_LABELS)):
         found = [row for row in rows if row["model"] == model]
         for seed, row in enumerate(found):
             height = place + offset + 0.08 * (seed - (len(found) - 1) / 2)
             axes.plot(row[f"{name}_interval"], [height, height], color=color, lw=1.2, alpha=0.6)
-            face = "white" if row["collided"] else color
+            face = "white" if row["collision_share"] else color
             axes.plot(row[name], height, marker="o", ms=4.5, color=color, mfc=face, label=label)
             label = None  # once is enough for the legend
-        beyond = [row[name] for row in found if row[name] > most]
+        beyond = [row[name] for row in found if row[name] > limit]
         if beyond:
-            words = f"{sum(beyond) / len(beyond):.1f} →"
-            axes.annotate(words, (most, place + offset), ha="right", va="bottom", fontsize=8, color=color)
+            mean = f"{sum(beyond) / len(beyond):.1f} →"
+            axes.annotate(mean, (limit, place + offset), ha="right", va="bottom", fontsize=8, color=color)

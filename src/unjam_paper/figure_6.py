@@ -1,9 +1,9 @@
-"""Fig. 6 of the paper: does knowledge of car following help a network to learn it? On made-up data.
+"""Fig. 6 of the paper: whether a car-following model helps a network to learn car following, on synthetic data.
 
-A network alone (`vanilla`) and one that learns what the paper's IDM leaves (`knowledge`) are trained on
-shares of the four-regime set, and judged on trajectories that neither has seen, the same for all. The paper
-is silent on who made its data. Here it is either a driver of other parameters than the paper's IDM (`other`),
-or that very IDM (`same`), so that the base is the truth.
+A network alone (`vanilla`) and one that learns the residual of the paper's IDM (`knowledge`) are trained on shares of
+the four-regime data set, and tested on the same unseen trajectories. The paper does not say which driver generated its
+data. Here it is either a driver with other parameters than the paper's IDM (`other`), or the paper's IDM (`same`), so
+that the base is the truth.
 """
 
 from collections.abc import Sequence
@@ -21,35 +21,32 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from unjam.files import atomic_write, to_json
 from unjam.following.four_regimes import MIN_REGIME_GAP, FourRegimesSettings, make_four_regimes
 from unjam.following.networks import NetworkSettings, batched_network, fit_one_step
 from unjam.following.open_loop import add_residual, fixed_driver, idm_function
 from unjam.following.pairs import SPLITS, Floats, FollowingSamples, following_samples, pairs_in_splits, split_by_driver
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
-from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure, png_bytes
-from unjam_paper.parts import PartCallback, StudyPart, measure_parts
+from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
+from unjam_paper.parts import PartCallback, measure_parts
+from unjam_paper.results_file import write_figure, write_part
 from unjam_paper.study import Study, Table, study_manifest
 
 SplitKind = Literal["trajectories", "rows", "released"]
-"""How test rows are kept from training: `trajectories`: none of their trajectory is in it. `rows`: rows are
-drawn one by one, so that a test row's neighbours, 0.1 s before and after, are. `released_reward`: as the authors'
-code, test rows are drawn from all rows, also from those of training."""
+"""How test rows are separated from training rows. `trajectories`: no row of their trajectory is in training. `rows`:
+rows are drawn one by one, so that the neighbors of a test row, 0.1 s before and after, can be in training. `released`:
+as in the authors' code, test rows are drawn from all rows, including those of training."""
 SPLIT_SHARES = (0.7, 0.1, 0.2)
-TRAINING_SIZES = (0.01, 0.1, 0.3, 0.5, 1.0)
-FIT_REPEATS = 5
+TRAINING_SIZES, LEAKING_SIZES = (0.01, 0.1, 0.3, 0.5, 1.0), (0.01, 0.1)
+"""shares of the training rows; the latter for the splits that leak"""
+FIT_REPEATS, FEWER_REPEATS = 5, 3
 LONG_PASS_REPEATS = 30
-"""at 1 % of the data the networks are also trained with each row so often in a pass: as many gradient steps
-as at 30 %"""
+"""how often each row occurs in a pass of the long fits at 1 % of the data: as many gradient steps as at 30 %"""
 MAX_VALIDATION_ROWS = 5000
-"""that judge each pass"""
-FEWER_REPEATS = 3
-LEAKING_SIZES = (0.01, 0.1)
 DATA_SETTINGS = {"other": FourRegimesSettings(), "same": FourRegimesSettings(driver=PAPER_IDM)}
 FIGURE_6_NETWORKS = ("knowledge", "vanilla")
 NEAREST_ROW = "nearest row"
-"""no network: it answers what the most similar row of training did"""
+"""no network: the acceleration of the most similar training row"""
 NETWORK_COLORS = {"knowledge": LINE_COLORS[2], "vanilla": LINE_COLORS[1]}
 NETWORK_LABELS = {"knowledge": "IDM + residual", "vanilla": "network alone"}
 
@@ -59,21 +56,21 @@ class FourRegimeFit:
     """One fit."""
 
     driver: str
-    """a name in SETTINGS"""
+    """a name in `DATA_SETTINGS`"""
     network: str
-    """in NETWORKS, or NEAREST"""
+    """in `FIGURE_6_NETWORKS`, or `NEAREST_ROW`"""
     size: float
     """share of the training rows"""
     repeat: int
     split: SplitKind = "trajectories"
     is_long: bool = False
-    """whether each row is in a pass `LONGER` times"""
+    """whether each row occurs `LONG_PASS_REPEATS` times in a pass"""
 
     @property
     def name(self) -> str:
-        """A name for its file."""
-        words = [self.driver, self.split, self.network.replace(" ", "-"), f"{100 * self.size:g}"]
-        return "-".join([*words, f"{self.repeat}", *(["is_long"] if self.is_long else [])])
+        """The name of its part."""
+        words = [self.driver, self.split, self.network.replace(" ", "-"), f"{100 * self.size:g}", f"{self.repeat}"]
+        return "-".join([*words, *(["is_long"] if self.is_long else [])])
 
 
 class DataSplit(NamedTuple):
@@ -87,7 +84,7 @@ class DataSplit(NamedTuple):
 
 
 def four_regime_fits(repeats: int = FIT_REPEATS) -> list[FourRegimeFit]:
-    """Return all fits of the study, the most telling first."""
+    """Return all fits of the study, the most important first."""
 
     def make_fits(
         count: int,
@@ -97,8 +94,8 @@ def four_regime_fits(repeats: int = FIT_REPEATS) -> list[FourRegimeFit]:
         driver: str = "other",
         is_long: bool = False,
     ) -> list[FourRegimeFit]:
-        found = product(range(count), splits, sizes, networks)
-        return [FourRegimeFit(driver, net, size, repeat, split, is_long) for repeat, split, size, net in found]
+        each = product(range(count), splits, sizes, networks)
+        return [FourRegimeFit(driver, net, size, repeat, split, is_long) for repeat, split, size, net in each]
 
     fewer = min(FEWER_REPEATS, repeats)
     return [
@@ -127,27 +124,25 @@ def split_rows(driver: str, split: SplitKind) -> DataSplit:
 
 
 def measure_fit(fit: FourRegimeFit) -> dict[str, Any]:
-    """Return a fit's errors on the test rows [m/s2], and its losses.
+    """Return the errors of a fit on the test rows [m/s2], and its losses.
 
-    `error` is against what happened, noise included; `error_of_driver` against what the driver does there on
-    average; `noise` is the former of somebody who knows the latter.
+    `error` is the error to the data, noise included; `driver_error` is the error to the mean acceleration of the driver
+    that generated them; `noise` is the error of that mean to the data.
     """
     started = perf_counter()
     rows = split_rows(fit.driver, fit.split)
     generator = np.random.default_rng([fit.repeat, round(1000 * fit.size)])
     count = max(1, round(fit.size * len(rows.training)))
     training = rows.training.select(generator.permutation(len(rows.training))[:count])
-    if fit.network == NEAREST_ROW:
-        predicted, facts = _predict_nearest(training, rows.test), {}
-    else:
-        predicted, facts = _predict_learned(fit, training, rows)
+    predict = _predict_nearest if fit.network == NEAREST_ROW else _predict_learned
+    predicted, facts = predict(fit, training, rows)
     average = average_acceleration(rows.test, DATA_SETTINGS[fit.driver])
     return {
         **asdict(fit),
         "rows": count,
         "overlap": rows.overlap,
         "error": _rms(predicted - rows.test.acceleration),
-        "error_of_driver": _rms(predicted - average),
+        "driver_error": _rms(predicted - average),
         "noise": _rms(average - rows.test.acceleration),
         "seconds": perf_counter() - started,
         **facts,
@@ -155,18 +150,18 @@ def measure_fit(fit: FourRegimeFit) -> dict[str, Any]:
 
 
 def average_acceleration(rows: FollowingSamples, settings: FourRegimesSettings) -> Floats:
-    """Return what the driver of the data does on average, over the noise, in each row [m/s2].
+    """Return the mean acceleration of the driver of the data in each row, over the noise [m/s2].
 
-    That is its IDM, but for those who nearly stand: as nobody drives backwards, noise only lets them start.
+    It is that of its IDM except near standstill: no vehicle drives backwards, so noise can only start it.
     """
     from scipy.stats import norm
 
     gap = clamp_min(rows.gap, MIN_REGIME_GAP)
-    wanted = idm_acceleration(rows.speed, rows.leader_speed, gap, settings.driver)
+    idm = idm_acceleration(rows.speed, rows.leader_speed, gap, settings.driver)
     least = -rows.speed / settings.step
     if settings.noise == 0:
-        return np.maximum(wanted, least)
-    above = (wanted - least) / settings.noise
+        return np.maximum(idm, least)
+    above = (idm - least) / settings.noise
     return least + settings.noise * (norm.pdf(above) + above * norm.cdf(above))
 
 
@@ -174,8 +169,8 @@ def _predict_learned(fit: FourRegimeFit, training: FollowingSamples, rows: DataS
     base = idm_function(PAPER_IDM) if fit.network == "knowledge" else None
     if fit.is_long:
         training = training.select(np.tile(np.arange(len(training)), LONG_PASS_REPEATS))
-    judges = np.random.default_rng(0).permutation(len(rows.validation))[:MAX_VALIDATION_ROWS]
-    validation, test = rows.validation.select(judges), rows.test
+    chosen = np.random.default_rng(0).permutation(len(rows.validation))[:MAX_VALIDATION_ROWS]
+    validation, test = rows.validation.select(chosen), rows.test
     network, losses = fit_one_step(training, validation, base, NetworkSettings(), fit.repeat)
     model = add_residual(fixed_driver(base) if base else None, batched_network(network.to_numpy_network()))
     predicted = model(test.speed[:1], test.gap[:1])(test.speed, test.leader_speed, test.gap)
@@ -183,14 +178,14 @@ def _predict_learned(fit: FourRegimeFit, training: FollowingSamples, rows: DataS
     return predicted, {"epochs": len(losses.training), **facts}
 
 
-def _predict_nearest(training: FollowingSamples, test: FollowingSamples) -> Floats:
-    """Return the acceleration of the training row that is most similar to each test row."""
+def _predict_nearest(fit: FourRegimeFit, training: FollowingSamples, rows: DataSplit) -> tuple[Floats, dict[str, Any]]:
+    """Return the acceleration of the most similar training row for each test row."""
     from scipy.spatial import KDTree
 
-    seen, wanted = (np.column_stack([rows.speed, rows.leader_speed, rows.gap]) for rows in (training, test))
-    scale = seen.std(0)
-    _, places = KDTree(seen / scale).query(wanted / scale)
-    return training.acceleration[np.asarray(places, np.int64)]
+    known, asked = (np.column_stack([each.speed, each.leader_speed, each.gap]) for each in (training, rows.test))
+    scale = known.std(0)
+    _, nearest = KDTree(known / scale).query(asked / scale)
+    return training.acceleration[np.asarray(nearest, np.int64)], {}
 
 
 def _rms(error: Floats) -> float:
@@ -200,18 +195,15 @@ def _rms(error: Floats) -> float:
 def run_figure_6(
     folder: Path, workers: int = 2, on_part: PartCallback = lambda name: None, repeats: int = FIT_REPEATS
 ) -> None:
-    """Measure what is missing, and write `figure-6.json` and `figure-6.png` into `folder`.
-
-    The study goes on where it was stopped: what is measured lies in `folder/parts`.
-    """
+    """Measure the parts that are missing in `folder/parts`, and write `figure-6.json` and `figure-6.png`."""
     about = study_manifest(folder)
-    parts: dict[str, StudyPart] = {task.name: (measure_fit, (task,)) for task in four_regime_fits(repeats)}
+    parts = {fit.name: (measure_fit, (fit,)) for fit in four_regime_fits(repeats)}
     rows = measure_parts(folder / "parts", parts, workers, on_part)
-    kept = [  # losses of the whole data alone
+    stored = [  # with the losses of fits to all data only
         {key: value for key, value in row.items() if row["size"] == 1.0 or not key.endswith("_loss")} for row in rows
     ]
-    atomic_write(folder / "figure-6.json", to_json({"manifest": about, "rows": kept}, indent=1))
-    atomic_write(folder / "figure-6.png", png_bytes(figure_6(rows), reduce_colors=False))
+    write_part(folder, "figure-6", {"manifest": about, "rows": stored})
+    write_figure(folder, "figure-6", figure_6(rows))
 
 
 @rc_context(PLOT_STYLE)
@@ -222,18 +214,18 @@ def figure_6(rows: Table) -> Figure:
     left, middle, right = figure.subplots(1, 3)
     _draw_losses(left, [row for row in main if row["size"] == 1.0])
     _draw_errors(middle, [row for row in main if not row["is_long"]], "200 passes, as in the paper")
-    longer = [row for row in main if row["is_long"] or row["size"] == 0.3]
-    _draw_errors(right, longer, "at 1 % as many gradient steps as at 30 %")
+    long = [row for row in main if row["is_long"] or row["size"] == 0.3]
+    _draw_errors(right, long, "at 1 % as many gradient steps as at 30 %")
     right.sharey(middle)
-    middle.set_ylabel("error of the acceleration, noise aside [m/s²]")
+    middle.set_ylabel("error of the acceleration without noise [m/s²]")
     middle.legend()
     return figure
 
 
 def _draw_losses(axes: Axes, rows: Table) -> None:
-    for network, colour in NETWORK_COLORS.items():
+    for network, color in NETWORK_COLORS.items():
         for curve in (row["training_loss"] for row in rows if row["network"] == network):
-            axes.plot(np.arange(1, len(curve) + 1), curve, color=colour, lw=1.0, alpha=0.7)
+            axes.plot(np.arange(1, len(curve) + 1), curve, color=color, lw=1.0, alpha=0.7)
     noise = next(row["noise"] for row in rows)
     axes.axhline(noise**2, color=TEXT_COLOR, lw=0.9, ls=":")
     axes.annotate("noise", (1.2, noise**2), va="bottom", fontsize=8, color=TEXT_COLOR)
@@ -243,11 +235,11 @@ def _draw_losses(axes: Axes, rows: Table) -> None:
 
 def _draw_errors(axes: Axes, rows: Table, title: str) -> None:
     fits = pd.DataFrame(rows).assign(share=lambda fits: 100 * fits["size"])
-    for network, colour in NETWORK_COLORS.items():
-        errors: Any = fits[fits["network"] == network].groupby("share")["error_of_driver"]
-        mean, spread = errors.mean(), errors.std(ddof=0)
-        look = {"color": colour, "lw": 1.5, "marker": "o", "ms": 4, "capsize": 3}
-        axes.errorbar(mean.index, mean, spread, label=NETWORK_LABELS[network], **look)
+    for network, color in NETWORK_COLORS.items():
+        errors: Any = fits[fits["network"] == network].groupby("share")["driver_error"]
+        mean, std = errors.mean(), errors.std(ddof=0)
+        look = {"color": color, "lw": 1.5, "marker": "o", "ms": 4, "capsize": 3}
+        axes.errorbar(mean.index, mean, std, label=NETWORK_LABELS[network], **look)
     axes.set_xlabel("share of the training rows [%]")
     _set_log_axes(axes, title)
     ticks = sorted(fits["share"].unique())
@@ -256,18 +248,15 @@ def _draw_errors(axes: Axes, rows: Table, title: str) -> None:
 
 
 def _set_log_axes(axes: Axes, title: str) -> None:
-    """Make both axes logarithmic, the vertical one with numbers that can be read within a decade."""
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    """Make both axes logarithmic, the vertical one with legible numbers within a decade."""
+    axes.set(title=title, xscale="log", yscale="log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 4.0, 6.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_title(title)
 
 
 FIGURE_6 = Study(
-    "networks that learn how people drive, with knowledge and without",
-    lambda seeds: [],
-    lambda studies, seeds, folder, workers: run_figure_6(folder, workers),
+    title="networks that learn car following, with and without a car-following model",
+    write=lambda study_folder, seeds, folder, workers: run_figure_6(folder, workers),
     minutes=25.0,
 )

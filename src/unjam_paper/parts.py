@@ -1,6 +1,5 @@
-"""Parts of a study: each is measured once, and again where a shipped controller in it is another file."""
+"""Parts of a study: each is measured once, and again if a packaged controller that drives in it has changed."""
 
-import json
 import multiprocessing
 import os
 import sys
@@ -13,63 +12,63 @@ from typing import Any
 from unjam.child_processes import isolated_start
 from unjam.controller import PACKAGED_PREFIX, packaged_file
 from unjam.files import atomic_write, make_folder, to_json
-from unjam_paper.results_file import read_part
+from unjam_paper.results_file import read_part, write_part
 
-CONTROLLERS_FILE = "shipped-then.json"
-"""which files the shipped controllers were that drove in parts of a study, by part"""
+CONTROLLERS_FILE = "controllers"
+"""name of the part with the digests of the packaged controllers that drove, by part"""
 StudyPart = tuple[Callable[..., Any], tuple[Any, ...]]
-"""a function of a module, and its arguments; it answers what JSON can hold"""
+"""a function of a module and its arguments; it returns a JSON value"""
 PartCallback = Callable[[str], None]
-"""told the name of what is there, when it is there"""
+"""receives the name of each part that is finished"""
 
 
 def measure_parts(
     folder: Path, parts: dict[str, StudyPart], workers: int, on_part: PartCallback = lambda name: None
 ) -> list[Any]:
-    """Return the answers of all parts; those without a `folder/NAME.json` are measured, and get one.
+    """Return the results of all parts; those without a current `folder/NAME.json` are measured and written.
 
-    So are those in which a shipped controller drove that is another file now.
+    A part is not current if a packaged controller in it has another digest than when it was measured.
     """
-    file = folder / CONTROLLERS_FILE
-    then: dict[str, dict[str, str]] = json.loads(file.read_text()) if file.is_file() else {}
+    file = folder / f"{CONTROLLERS_FILE}.json"
+    digests: dict[str, dict[str, str]] = read_part(folder, CONTROLLERS_FILE) if file.is_file() else {}
 
-    def is_current(name: str, controllers: dict[str, str]) -> bool:
-        return (folder / f"{name}.json").is_file() and then.get(name, controllers) == controllers
+    def is_current(name: str) -> bool:
+        current = _packaged_digests(parts[name][1])
+        return (folder / f"{name}.json").is_file() and digests.get(name, current) == current
 
-    def save_part(name: str, answer: Any) -> None:
-        atomic_write(folder / f"{name}.json", to_json(answer))
-        if shipped := _packaged_digests(parts[name][1]):
-            then[name] = shipped
-            atomic_write(file, to_json(then, indent=1))
+    def save_part(name: str, result: Any) -> None:
+        atomic_write(folder / f"{name}.json", to_json(result))
+        if packaged := _packaged_digests(parts[name][1]):
+            digests[name] = packaged
+            write_part(folder, CONTROLLERS_FILE, digests)
         on_part(name)
 
     make_folder(folder)
-    missing = {name: part for name, part in parts.items() if not is_current(name, _packaged_digests(part[1]))}
+    missing = {name: part for name, part in parts.items() if not is_current(name)}
     if workers == 1 or len(missing) < 2:
         for name, (function, arguments) in missing.items():
             save_part(name, function(*arguments))
     else:
-        # Fresh processes: a forked one would inherit threads of torch that are not there.
+        # Spawned processes: a forked one would inherit the locks of torch's threads without the threads.
         context = multiprocessing.get_context("spawn")
-        absolute = filter(os.path.isabs, sys.path)  # in a notebook the working folder is on it
+        absolute = filter(os.path.isabs, sys.path)  # in a notebook it holds the working folder
         with isolated_start(absolute), ProcessPoolExecutor(workers, mp_context=context) as pool:
-            running = {pool.submit(function, *given): name for name, (function, given) in missing.items()}
+            running = {pool.submit(function, *arguments): name for name, (function, arguments) in missing.items()}
             for done in as_completed(running):
                 save_part(running[done], done.result())
     return [read_part(folder, name) for name in parts]
 
 
 def controller_digest(driver: str) -> str:
-    """Return which file a shipped controller is; nothing for others, whose name says what they are."""
+    """Return the digest of a packaged controller; an empty text for other drivers, which their name identifies."""
     name = driver.removeprefix(PACKAGED_PREFIX)
     return "" if name == driver else sha256(packaged_file(name).read_bytes()).hexdigest()[:12]
 
 
 def _packaged_digests(arguments: Any) -> dict[str, str]:
-    """Return which file each shipped controller is that arguments name."""
+    """Return the digest of each packaged controller that arguments name."""
     if isinstance(arguments, str):
         return {arguments: controller_digest(arguments)} if arguments.startswith(PACKAGED_PREFIX) else {}
-    if isinstance(arguments, Mapping):
-        return _packaged_digests(list(arguments.values()))
-    inner = arguments if isinstance(arguments, list | tuple) else ()
-    return {name: file for each in inner for name, file in _packaged_digests(each).items()}
+    inner = list(arguments.values()) if isinstance(arguments, Mapping) else arguments
+    inner = inner if isinstance(inner, list | tuple) else ()
+    return {name: digest for each in inner for name, digest in _packaged_digests(each).items()}

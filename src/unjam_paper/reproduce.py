@@ -1,4 +1,4 @@
-"""Making what studies need, each training once, and drawing them. `unjam reproduce`."""
+"""Run the trainings that studies need, each once, and write the studies: `unjam reproduce`."""
 
 import json
 from collections.abc import Sequence
@@ -8,16 +8,16 @@ from typing import Any
 
 from unjam.controller.file import WEIGHTS_PART, sha256_of, unpack_parts
 from unjam.errors import InputError, unknown_name
-from unjam.files import atomic_write, make_folder, to_json
+from unjam.files import make_folder
 from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE
 from unjam.scenarios import SCENARIOS
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.run_folder import read_config
-from unjam_paper import STUDIES, STUDY_GROUPS
 from unjam_paper.parts import PartCallback
 from unjam_paper.references import drive_references
-from unjam_paper.results_file import collect_results
+from unjam_paper.results_file import collect_results, write_part
+from unjam_paper.studies import STUDIES, STUDY_GROUPS
 from unjam_paper.study import STUDY_ROADS, PlannedRun, Study, StudyFolder, study_manifest
 
 TRAINING_SECONDS: dict[str, dict[str, float]] = {
@@ -25,44 +25,65 @@ TRAINING_SECONDS: dict[str, dict[str, float]] = {
     "ppo": {"ring": 75, "figure-eight": 110, "merge": 930, "on-ramp": 190},
     "sac": {"ring": 450, "figure-eight": 480, "merge": 1300},
 }
-"""what 300,000 actual steps took on one core of the machine of results/, model-free, on the on-ramp in
-batches [s]"""
+"""duration of 300,000 environment steps without a model, on one core of the machine of results/ [s]; on the on-ramp in
+batches"""
 SUMO_ON_RAMP_SECONDS = 1150.0
-"""what more they take on the on-ramp where its episodes are SUMO's [s]"""
+"""additional duration where episodes of the on-ramp run in SUMO [s]"""
 MODEL_ROLLOUT_SECONDS = 60.0
-"""what the virtual environment adds, for each virtual decision per actual one up to one [s]"""
+"""additional duration with a model of rows, for a model ratio up to one [s]"""
 REFERENCE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0, "on-ramp": 1500.0}
-"""what the drivers that do not learn take on a road [s]"""
+"""duration of the reference drivers on a road [s]"""
 
 
-def make_plan(names: Sequence[str], seeds: int, study_folder: StudyFolder) -> "StudyPlan":
-    """Return what is still to do.
+@dataclass(frozen=True)
+class StudyPlan:
+    """The work that remains for some studies."""
+
+    names: tuple[str, ...]
+    seeds: int
+    """number of trainings of each variant"""
+    study_folder: StudyFolder
+    runs: list[PlannedRun]
+    """trainings that are not finished"""
+    finished_count: int
+    """number of finished trainings"""
+    roads: list[str]
+    """roads on which the reference drivers have not been evaluated"""
+
+    def seconds(self, workers: int) -> float:
+        """Return the estimated duration on `workers` cores [s]."""
+        total = sum(estimated_seconds(run) for run in self.runs)
+        total += sum(REFERENCE_SECONDS[_scenario_kind(road)] for road in self.roads)
+        return total / workers + 60.0 * sum(STUDIES[name].minutes for name in self.names)
+
+
+def make_plan(names: Sequence[str], seeds: int, study_folder: StudyFolder) -> StudyPlan:
+    """Return the work that remains.
 
     Raises:
-        InputError: an unknown study, or the folder holds such a training with other settings.
+        InputError: an unknown study, or the folder has such a training with other settings.
     """
-    chosen = find_studies(names)
-    wanted = list(dict.fromkeys(run for study in chosen.values() for run in study.make_runs(seeds)))
-    for run in wanted:
+    studies = find_studies(names)
+    runs = list(dict.fromkeys(run for study in studies.values() for run in study.make_runs(seeds)))
+    for run in runs:
         folder = study_folder.run_folder(run)
         if (folder / "config.toml").is_file():
             before = replace(read_config(folder), workers=run.config.workers, steps=run.config.steps)
             if before != run.config:
-                words = f"out: {str(folder)!r} was trained with other settings; allowed: a new folder"
-                raise InputError(words)
-    for name in (name for name, study in chosen.items() if study.is_resumable):
-        begun = study_folder.folder / name / "manifest.json"
-        before = json.loads(begun.read_text()).get("seeds", seeds) if begun.is_file() else seeds
-        if before != seeds:  # what is there already is of so many trainings
-            raise InputError(f"seeds: {seeds} is not allowed; allowed: {before}, as in {begun}, or a new --out")
-    missing = [run for run in wanted if not study_folder.is_finished(run)]
-    roads = dict.fromkeys(road for study in chosen.values() for road in study.roads)
+                raise InputError(f"out: {str(folder)!r} was trained with other settings; allowed: a new folder")
+    for name in (name for name, study in studies.items() if study.is_resumable):
+        file = study_folder.folder / name / "manifest.json"
+        before = json.loads(file.read_text(encoding="utf-8")).get("seeds", seeds) if file.is_file() else seeds
+        if before != seeds:  # its parts are those of so many trainings
+            raise InputError(f"seeds: {seeds} is not allowed; allowed: {before}, as in {file}, or a new --out")
+    missing = [run for run in runs if not study_folder.is_finished(run)]
+    roads = dict.fromkeys(road for study in studies.values() for road in study.roads)
     undriven = [road for road in roads if not (study_folder.reference_folder(road) / EVALUATION_FILE).is_file()]
-    return StudyPlan(tuple(chosen), seeds, study_folder, missing, len(wanted) - len(missing), undriven)
+    return StudyPlan(tuple(studies), seeds, study_folder, missing, len(runs) - len(missing), undriven)
 
 
 def find_studies(names: Sequence[str]) -> dict[str, Study]:
-    """Return the studies of these names; `all` is all of them."""
+    """Return the studies with these names; `all` is all of them."""
     for name in names:
         if name not in (*STUDIES, *STUDY_GROUPS):
             raise unknown_name("study", name, [*STUDIES, *STUDY_GROUPS])
@@ -71,12 +92,12 @@ def find_studies(names: Sequence[str]) -> dict[str, Study]:
 
 
 def estimated_seconds(run: PlannedRun) -> float:
-    """Return about how long a training takes on one core [s]."""
-    config = run.config
-    actual, virtual = TRAINING_SECONDS[config.agent][_scenario_kind(run.road)], config.model
-    rows, roads = MODEL_ROLLOUT_SECONDS * min(1.0, virtual.model_ratio), actual * virtual.model_ratio
-    in_sumo = SUMO_ON_RAMP_SECONDS if _scenario_kind(run.road) == "on-ramp" and config.simulator == "sumo" else 0.0
-    return config.steps / 300_000 * (actual + in_sumo + (roads if virtual.kind == "road" else rows))
+    """Return the estimated duration of a training on one core [s]."""
+    config, kind = run.config, _scenario_kind(run.road)
+    seconds, ratio = TRAINING_SECONDS[config.agent][kind], config.model.model_ratio
+    model = seconds * ratio if config.model.kind == "road" else MODEL_ROLLOUT_SECONDS * min(1.0, ratio)
+    in_sumo = SUMO_ON_RAMP_SECONDS if kind == "on-ramp" and config.simulator == "sumo" else 0.0
+    return config.steps / 300_000 * (seconds + in_sumo + model)
 
 
 def _scenario_kind(road: str) -> str:
@@ -84,69 +105,44 @@ def _scenario_kind(road: str) -> str:
 
 
 def run_plan(
-    plan: "StudyPlan", workers: int, executor: Executor = "local", on_message: PartCallback = lambda line: None
+    plan: StudyPlan, workers: int, executor: Executor = "local", on_message: PartCallback = lambda line: None
 ) -> list[Path]:
-    """Make what is missing, `workers` trainings at once, draw the studies, and return their folders.
+    """Run what is missing, `workers` trainings at once, write the studies, and return their folders.
 
-    Beside the folder of each study lies its results file, NAME.json.
-
-    A study that was stopped goes on where it was: trainings from their last checkpoint. With `ray` they run
-    on a cluster whose machines share the folder.
+    The results file NAME.json is written next to the folder of each study. A stopped study is continued: trainings from
+    their last checkpoint. With `ray` trainings run on a cluster whose machines share the folder.
 
     Raises:
-        UnjamError: a training failed; the others are there.
+        UnjamError: a training failed; the others are finished.
     """
     studies = plan.study_folder
     make_folder(studies.folder)
     for road in plan.roads:
-        on_message(f"drivers that do not learn: {road}")
+        on_message(f"reference drivers: {road}")
         drive_references(road, studies, workers)
-    plans, logs = studies.folder / "plans", studies.folder / "logs"
+    configs, logs = studies.folder / "configs", studies.folder / "logs"
     commands = {
         run.name: training_command(
-            run.config, studies.run_folder(run), plans / f"{run.name}.toml", logs / f"{run.name}.log"
+            *(run.config, studies.run_folder(run), configs / f"{run.name}.toml", logs / f"{run.name}.log")
         )
         for run in plan.runs
     }
     run_all(commands, workers, executor, on_message)
     for name in plan.names:
-        study, target = STUDIES[name], studies.folder / name
+        study, folder = STUDIES[name], studies.folder / name
         on_message(f"writing {name}: {study.title}")
-        make_folder(target)
-        begun = study_manifest(target, seeds=plan.seeds) if study.is_resumable else manifest()
-        study.write(studies, plan.seeds, target, workers)
-        about = {"study": name, "title": study.title, "seeds": plan.seeds, **begun}
+        make_folder(folder)
+        origin = study_manifest(folder, seeds=plan.seeds) if study.is_resumable else manifest()
+        study.write(studies, plan.seeds, folder, workers)
+        about = {"study": name, "title": study.title, "seeds": plan.seeds, **origin}
         about["trainings"] = [_training_record(run, studies) for run in study.make_runs(plan.seeds)]
-        atomic_write(target / "manifest.json", to_json(about, indent=1))
-        collect_results(target)
+        write_part(folder, "manifest", about)
+        collect_results(folder)
     return [studies.folder / name for name in plan.names]
 
 
 def _training_record(run: PlannedRun, study_folder: StudyFolder) -> dict[str, Any]:
-    """Return what is needed to repeat a training, and what its network is known by, whoever repeats it."""
-    folder = study_folder.run_folder(run)
-    commit = json.loads((folder / "manifest.json").read_text())["commit"]
+    """Return what is needed to repeat a training, and the digest of its network."""
+    commit = json.loads((study_folder.run_folder(run) / "manifest.json").read_text(encoding="utf-8"))["commit"]
     weights = unpack_parts(study_folder.controller_folder(run) / "controller.unjam")[WEIGHTS_PART]
     return {"run": run.name, "commit": commit, "weights_sha256": sha256_of(weights)}
-
-
-@dataclass(frozen=True)
-class StudyPlan:
-    """What is still to do for some studies."""
-
-    names: tuple[str, ...]
-    seeds: int
-    """of each training"""
-    study_folder: StudyFolder
-    runs: list[PlannedRun]
-    """trainings, those that are finished left out"""
-    finished_count: int
-    """trainings that are there already"""
-    roads: list[str]
-    """where drivers that do not learn must still drive"""
-
-    def seconds(self, workers: int) -> float:
-        """Return about how long it takes on `workers` cores [s]."""
-        alone = sum(estimated_seconds(run) for run in self.runs)
-        alone += sum(REFERENCE_SECONDS[_scenario_kind(road)] for road in self.roads)
-        return alone / workers + 60.0 * sum(STUDIES[name].minutes for name in self.names)

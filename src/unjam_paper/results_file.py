@@ -12,12 +12,25 @@ from pathlib import Path
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
+from matplotlib.figure import Figure
+
 from unjam.files import atomic_write, to_json
+from unjam.reports.figures import png_bytes
 
 COLUMNS = "columns"
 """the only key of a table that is stored by columns"""
 CONTROLLERS = "controllers"
-"""the subfolder of a study's working folder that holds its controllers"""
+"""subfolder with controllers, in the working folder of a study"""
+
+
+def write_part(folder: Path, name: str, part: Any) -> None:
+    """Write a part of a study into its working folder."""
+    atomic_write(folder / f"{name}.json", to_json(part, indent=1))
+
+
+def write_figure(folder: Path, name: str, figure: Figure, reduce_colors: bool = False) -> None:
+    """Write a figure of a study into its working folder."""
+    atomic_write(folder / f"{name}.png", png_bytes(figure, reduce_colors=reduce_colors))
 
 
 def write_results(path: Path, parts: Mapping[str, Any]) -> None:
@@ -27,17 +40,16 @@ def write_results(path: Path, parts: Mapping[str, Any]) -> None:
 
 
 def collect_results(folder: Path) -> Path:
-    """Write what the working folder of a study holds as one file beside it, and return this file.
+    """Write the content of the working folder of a study as one file next to it, and return this file.
 
-    The manifest comes first, then the parts in the order of their names. Pictures and controllers are copied.
+    The manifest comes first, then the parts ordered by name. Figures and controllers are copied.
     """
     path = folder.with_name(f"{folder.name}.json")
     parts = read_parts(folder)
-    manifest = {"manifest": parts.pop("manifest")} if "manifest" in parts else {}
-    write_results(path, manifest | parts)
-    for picture in sorted(folder.glob("*.png")):
-        name = picture.name if picture.stem == folder.name else f"{folder.name}-{picture.name}"
-        atomic_write(folder.with_name(name), picture.read_bytes())
+    write_results(path, {name: parts[name] for name in sorted(parts, key=lambda name: (name != "manifest", name))})
+    for figure in sorted(folder.glob("*.png")):
+        name = figure.name if figure.stem == folder.name else f"{folder.name}-{figure.name}"
+        atomic_write(folder.with_name(name), figure.read_bytes())
     controllers = sorted((folder / CONTROLLERS).glob("*.unjam"))
     if controllers:
         atomic_write(folder.with_name(f"{folder.name}-controllers.zip"), _zip_of(controllers))
@@ -63,7 +75,7 @@ def read_parts(path: Path) -> dict[str, Any]:
 
 
 def _zip_of(files: list[Path]) -> bytes:
-    """Return an archive that depends on nothing but the names and the contents of files."""
+    """Return an archive that depends only on the names and the content of the files."""
     content = BytesIO()
     with ZipFile(content, "w") as archive:
         for file in files:
@@ -85,25 +97,22 @@ def _by_columns(value: Any) -> Any:
         names = list(value[0])
         if all(list(row) == names for row in value):
             columns = {name: [row[name] for row in value] for name in names}
-            same = {name for name, entries in columns.items() if _is_constant(entries)}
-            if len(same) < len(names):  # a column tells how many rows there are
-                return {
-                    COLUMNS: {
-                        name: entries[0] if name in same else _by_columns(entries) for name, entries in columns.items()
-                    }
-                }
+            constant = {name for name, entries in columns.items() if _is_constant(entries)}
+            if len(constant) < len(names):  # the length of a column is the number of rows
+                values = {name: each[0] if name in constant else _by_columns(each) for name, each in columns.items()}
+                return {COLUMNS: values}
     return [_by_columns(entry) for entry in value]
 
 
 def _is_constant(entries: list[Any]) -> bool:
-    """Return whether all rows have one number or text; 1, 1.0 and true are three."""
+    """Return whether all rows have the same number or text; 1, 1.0 and true differ."""
     if isinstance(entries[0], (Mapping, list, tuple)):
         return False
     return len({(type(entry), str(entry)) for entry in entries}) == 1
 
 
 def _by_rows(value: Any) -> Any:
-    """Return what `_by_columns` was given."""
+    """Return the value that `_by_columns` converted."""
     if isinstance(value, list):
         return [_by_rows(entry) for entry in value]
     if not isinstance(value, dict):
@@ -112,5 +121,5 @@ def _by_rows(value: Any) -> Any:
         return {key: _by_rows(entry) for key, entry in value.items()}
     columns = {name: _by_rows(entry) for name, entry in value[COLUMNS].items()}
     rows = max(len(entries) for entries in columns.values() if isinstance(entries, list))
-    whole = (entries if isinstance(entries, list) else [entries] * rows for entries in columns.values())
-    return [dict(zip(columns, row, strict=True)) for row in zip(*whole, strict=True)]
+    full_columns = (entries if isinstance(entries, list) else [entries] * rows for entries in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*full_columns, strict=True)]

@@ -1,12 +1,13 @@
-"""What trainings tell beside what they earn: the paper's theorems, and what training costs (Figure 8).
+"""Measurable quantities of the theorems of the paper, and the cost of training (Figure 8).
 
-Theorem A1 is about untrained policies, A2 about convergence, A3 about the model and the bound: each has what
-can be measured of it. Costs are measured of all variants side by side, in one run.
+Theorem A1 is about untrained policies, A2 about convergence, A3 about the model and its bound. The cost of all variants
+is measured side by side in one run.
 """
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import partial
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -21,39 +22,37 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
-from unjam.files import atomic_write, to_json
 from unjam.measures.statistics import estimate_over_trainings, metric_estimate
-from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, new_figure, png_bytes, stacked_bars
+from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, new_figure, stacked_bars
 from unjam.reports.results import read_progress, seconds_by_part
 from unjam.training.evaluate import evaluate
 from unjam.training.run_folder import create_run_folder
 from unjam.training.seeds import make_test_seeds
 from unjam.training.train import Trainer
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.comparison import estimate_entries
-from unjam_paper.results_file import read_part
-from unjam_paper.study import PAPER_ROADS, VARIANTS, PlannedRun, Study, StudyFolder, Table, planned_runs
+from unjam_paper.results_file import read_part, write_figure, write_part
+from unjam_paper.study import PAPER_ROADS, PlannedRun, Study, StudyFolder, Table, planned_runs
+from unjam_paper.variants import VARIANTS
 
 THEORY_ROAD = "ring"
 MODEL_VARIANTS = ("proposed", "no-initial-policy", "mb-trpo", "ours")
 CONVERGENCE_VARIANTS = ("trpo", "ppo", "sac", "proposed", "ours")
 RANDOM_POLICIES, HIDDEN_UNITS = 10, 64
-"""networks that nobody has trained, and units of their two hidden layers"""
+"""number of untrained networks, and units of each of their two hidden layers"""
 CONVERGENCE_TOLERANCE = 0.05
 """share of the best known return within which a training counts as converged (A2)"""
 TIMED_VARIANTS = (
     *("trpo", "ppo", "sac", "mb-trpo", "without-model"),
     *("proposed", "proposed-ppo", "proposed-sac", "ours"),
 )
-TIMED_STEPS, TIMING_ROUNDS = 24_000, 3
-"""actual steps of each measured training, and how often all take their turn"""
-TIMED_START_STEPS = 3_000
+TIMED_STEPS, TIMED_START_STEPS, TIMING_ROUNDS = 24_000, 3_000, 3
+"""environment steps of each timed training, those before SAC's first update, and rounds over all variants"""
 EXCLUDED_PART = "validation"
-"""the part that is switched off, for it is the same for all"""
+"""the part of training that is switched off, because it is the same for all variants"""
 
 
 def random_network(inputs: int, authority: float, seed: int) -> Network:
-    """Return a policy network whose weights nobody has trained, drawn like those of torch's linear layers."""
+    """Return an untrained policy network with the initialization of torch's linear layers."""
     generator = np.random.default_rng(np.random.SeedSequence([seed]))
     layers = []
     for rows, columns in pairwise((inputs, HIDDEN_UNITS, HIDDEN_UNITS, 1)):
@@ -64,58 +63,47 @@ def random_network(inputs: int, authority: float, seed: int) -> Network:
 
 
 def untrained_rows(roads: Sequence[str] = PAPER_ROADS, policies: int = RANDOM_POLICIES, worker_count: int = 2) -> Table:
-    """A1: return of the expert plus a random residual beside a random network alone, on the same seeds."""
-    rows = []
+    """A1: return of the expert plus a random residual and of a random network alone, on the same seeds."""
+    rows: Table = []
     with WorkerPool(worker_count) as workers:
         for road in roads:
             config = PlannedRun(road, "proposed", 0).config
-            scenario, expert, parts = config.make_scenario(), config.make_expert(), config.policy.inputs
+            scenario, expert, inputs = config.make_scenario(), config.make_expert(), config.policy.inputs
             limit = scenario.action_limit
             drivers, bases = {"expert alone": expert}, {"expert + random": expert, "random": Constant()}
             for number, (kind, base) in product(range(policies), bases.items()):
-                network = random_network(observation_size(parts, base), limit, number)
-                drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, parts)
-            found = evaluate(scenario, drivers, make_test_seeds(4), workers)
-            returns = {label: metric_estimate(driven, "return").mean for label, driven in found.rows.items()}
+                network = random_network(observation_size(inputs, base), limit, number)
+                drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, inputs)
+            evaluation = evaluate(scenario, drivers, make_test_seeds(4), workers)
+            returns = {label: metric_estimate(own, "return").mean for label, own in evaluation.rows.items()}
             for kind in bases:
                 values = [returns[f"{kind} {number}"] for number in range(policies)]
-                rows.append(
-                    {
-                        "road": road,
-                        "policy": kind,
-                        "returns": values,
-                        **estimate_entries(estimate_over_trainings(values)),
-                    }
-                )
+                row = {"road": road, "policy": kind, "returns": values}
+                rows.append(row | asdict(estimate_over_trainings(values)))
             rows.append({"road": road, "policy": "expert alone", "mean": returns["expert alone"]})
     return rows
 
 
 def convergence_rows(study_folder: StudyFolder, seeds: int) -> Table:
-    """A2: which trainings come to within a share of the best return that is known, and when."""
+    """A2: which trainings come within a tolerance of the best known return, and after how many steps."""
     runs = {variant: study_folder.trained_runs(THEORY_ROAD, variant, seeds) for variant in CONVERGENCE_VARIANTS}
     best = max(row["return_mean"] for found in runs.values() for run in found for row in run.progress)
-    enough = best - CONVERGENCE_TOLERANCE * abs(best)
+    threshold = best - CONVERGENCE_TOLERANCE * abs(best)
     rows = []
     for variant, found in runs.items():
-        near = [[row for row in run.progress if row["return_mean"] >= enough] for run in found]
+        steps = [
+            next((row["environment_steps"] for row in run.progress if row["return_mean"] >= threshold), None)
+            for run in found
+        ]
         last = [run.final_training_mean("return_mean") for run in found]
-        rows.append(
-            {
-                "variant": variant,
-                "name": VARIANTS[variant].label,
-                "best_known": best,
-                "arrivals": [there[0]["environment_steps"] if there else None for there in near],
-                "stayed": sum(value >= enough for value in last),
-                "trainings": len(found),
-                "last": estimate_entries(estimate_over_trainings(last)),
-            }
-        )
+        row = {"variant": variant, "name": VARIANTS[variant].label, "best_known": best, "convergence_steps": steps}
+        row |= {"converged_at_end": sum(value >= threshold for value in last), "trainings": len(found)}
+        rows.append({**row, "last": asdict(estimate_over_trainings(last))})
     return rows
 
 
 def model_error_history(study_folder: StudyFolder, seeds: int) -> dict[str, list[Table]]:
-    """A3: eps_m, k*, the bound, and how far virtual returns are from actual ones; by variant and seed."""
+    """A3: eps_m, k*, the bound and the gap between returns in model and environment, by variant and seed."""
     return {
         variant: [
             [_model_facts(row) for row in run.progress]
@@ -126,110 +114,100 @@ def model_error_history(study_folder: StudyFolder, seeds: int) -> dict[str, list
 
 
 def _model_facts(row: dict[str, Any]) -> dict[str, Any]:
-    virtual = row["virtual"]
-    pair = virtual.get("return_virtual"), virtual.get("return_actual")
-    gap = None if None in pair else abs(pair[0] - pair[1])
+    model = row["model"]
+    returns = model.get("return_model"), model.get("return_environment")
+    gap = None if None in returns else abs(returns[0] - returns[1])
     names = ("k_star", "eps_m", "eps_m_by_estimator", "bound")
-    return {"steps": row["environment_steps"], "gap": gap, **{name: virtual.get(name) for name in names}}
+    return {"steps": row["environment_steps"], "gap": gap, **{name: model.get(name) for name in names}}
 
 
 @rc_context(PLOT_STYLE)
 def model_error_figure(by_variant: dict[str, list[Table]]) -> Figure:
-    """Draw the model error and the rollout length over training, a line per training."""
+    """Draw the model error and the rollout length over training, one line per training."""
     figure = new_figure(3.4)
     panels = figure.subplots(1, 2)
-    labels = {"eps_m": "model error eps_m (unexplained)", "k_star": "rollout length k* [decisions]"}
-    for (name, label), axes in zip(labels.items(), panels, strict=True):
-        for (variant, runs), colour in zip(by_variant.items(), LINE_COLORS[1:], strict=False):
+    titles = {"eps_m": "model error eps_m (unexplained variance)", "k_star": "rollout length k* [control steps]"}
+    for (name, title), axes in zip(titles.items(), panels, strict=True):
+        for (variant, runs), color in zip(by_variant.items(), LINE_COLORS[1:], strict=False):
             for number, run in enumerate(runs):
                 steps = [row["steps"] / 1000.0 for row in run]
-                words = VARIANTS[variant].label if number == 0 else None
-                axes.plot(steps, [row[name] for row in run], color=colour, lw=1.2, label=words)
-        axes.set_title(label)
-        axes.set_xlabel("actual simulator steps [thousands]")
+                label = VARIANTS[variant].label if number == 0 else None
+                axes.plot(steps, [row[name] for row in run], color=color, lw=1.2, label=label)
+        axes.set(title=title, xlabel="environment steps [thousands]")
     panels[1].set_yscale("log")  # from 2 to 500
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=5)
     return figure
 
 
 def _write_theory(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    found = {
-        "untrained": untrained_rows(worker_count=workers),
-        "convergence": convergence_rows(study_folder, seeds),
-        "model": model_error_history(study_folder, seeds),
-    }
-    atomic_write(folder / "theory.json", to_json(found, indent=1))
-    atomic_write(folder / "model.png", png_bytes(model_error_figure(found["model"]), reduce_colors=False))
+    model = model_error_history(study_folder, seeds)
+    results = {"untrained": untrained_rows(worker_count=workers), "convergence": convergence_rows(study_folder, seeds)}
+    write_part(folder, "theory", {**results, "model": model})
+    write_figure(folder, "model", model_error_figure(model))
 
 
 def training_seconds(steps: int = TIMED_STEPS, rounds: int = TIMING_ROUNDS) -> dict[str, list[dict[str, float]]]:
-    """Return the wall time of the parts of training per 1,000 actual steps [s], by variant and round.
+    """Return the wall time of the parts of training per 1,000 environment steps [s], by variant and round.
 
-    The variants take turns, so that what else the machine does meets all of them alike.
+    The variants are trained in turn, so that other load of the machine affects all of them equally.
     """
     torch.set_num_threads(1)
-    found: dict[str, list[dict[str, float]]] = {variant: [] for variant in TIMED_VARIANTS}
+    seconds: dict[str, list[dict[str, float]]] = {variant: [] for variant in TIMED_VARIANTS}
     with WorkerPool(1) as workers, tempfile.TemporaryDirectory() as place:
-        for turn in range(rounds):
-            for variant in TIMED_VARIANTS:
-                config = PlannedRun(THEORY_ROAD, variant, turn).config
-                config = replace(config, steps=steps, evaluation=replace(config.evaluation, every=0))
-                # Or sac would measure hardly more than its start.
-                config = replace(config, sac=replace(config.sac, learning_starts=TIMED_START_STEPS))
-                folder = Path(place) / f"{variant}-{turn}"
-                create_run_folder(folder, config)
-                Trainer(folder, config, workers).train()
-                rows = read_progress(folder)
-                thousands, parts = rows[-1]["environment_steps"] / 1000.0, seconds_by_part(rows)
-                parts.pop(EXCLUDED_PART, None)
-                found[variant].append({part: seconds / thousands for part, seconds in parts.items()})
-    return found
+        for number, variant in product(range(rounds), TIMED_VARIANTS):
+            config = PlannedRun(THEORY_ROAD, variant, number).config
+            # SAC begins earlier, otherwise mostly its start would be measured.
+            sac = replace(config.sac, learning_starts=TIMED_START_STEPS)
+            evaluation = replace(config.evaluation, validation_interval=0)
+            config = replace(config, steps=steps, sac=sac, evaluation=evaluation)
+            folder = Path(place) / f"{variant}-{number}"
+            create_run_folder(folder, config)
+            Trainer(folder, config, workers).train()
+            rows = read_progress(folder)
+            thousands, parts = rows[-1]["environment_steps"] / 1000.0, seconds_by_part(rows)
+            parts.pop(EXCLUDED_PART, None)
+            seconds[variant].append({part: each / thousands for part, each in parts.items()})
+    return seconds
 
 
 def _write_time(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    found = training_seconds()
-    # A turn that something else on the machine slowed down does not count.
+    rounds = training_seconds()
+    # The median round: other load of the machine may slow down single rounds.
     medians = {
-        variant: sorted(turns, key=lambda parts: sum(parts.values()))[len(turns) // 2]
-        for variant, turns in found.items()
+        variant: sorted(each, key=lambda parts: sum(parts.values()))[len(each) // 2] for variant, each in rounds.items()
     }
-    of_trpo = sum(medians["trpo"].values())
-    over_trpo = {variant: sum(parts.values()) / of_trpo for variant, parts in medians.items()}
-    numbers = {"turns": found, "median": medians, "over_trpo": over_trpo}
-    atomic_write(folder / "time.json", to_json(numbers, indent=1))
-    atomic_write(folder / "time.png", png_bytes(training_time_bars(medians), reduce_colors=False))
+    totals = {variant: sum(parts.values()) for variant, parts in medians.items()}
+    relative = {variant: total / totals["trpo"] for variant, total in totals.items()}
+    write_part(folder, "time", {"rounds": rounds, "median": medians, "relative_to_trpo": relative})
+    write_figure(folder, "time", training_time_bars(medians))
 
 
 def training_time_bars(seconds: dict[str, dict[str, float]]) -> Figure:
-    """Draw the parts of training, a bar per variant."""
+    """Draw the parts of training as one stacked bar per variant."""
     bars = {VARIANTS[variant].label: parts for variant, parts in seconds.items()}
-    figure = stacked_bars(bars, "wall time per 1,000 actual steps [s]", height=0.4 * len(bars) + 1.2)
+    figure = stacked_bars(bars, "wall time per 1,000 environment steps [s]", height=0.4 * len(bars) + 1.2)
     figure.axes[0].invert_yaxis()
     figure.axes[0].grid(axis="y", visible=False)
     return figure
 
 
 def _time_table(folder: Path) -> pd.DataFrame:
-    """Return the wall time per 1,000 actual steps by variant and part, and how many times TRPO's it is."""
-    found = read_part(folder, "time")
-    table = []
-    for variant, parts in found["median"].items():
-        cells = {"": VARIANTS[variant].label}
-        cells |= {f"{part} [s]": f"{seconds:.2f}" for part, seconds in parts.items()}
-        table.append({**cells, "times TRPO's": f"{found['over_trpo'][variant]:.2f}"})
-    return pd.DataFrame(table).fillna("")
+    """Return the wall time per 1,000 environment steps by variant and part, and relative to TRPO."""
+    results = read_part(folder, "time")
+    rows = [
+        {"": VARIANTS[variant].label, **{f"{part} [s]": f"{seconds:.2f}" for part, seconds in parts.items()}}
+        for variant, parts in results["median"].items()
+    ]
+    relative = (f"{value:.2f}" for value in results["relative_to_trpo"].values())
+    return pd.DataFrame(rows).assign(**{"relative to TRPO": list(relative)}).fillna("")
 
 
 THEORY = Study(
-    "what can be measured of the theorems A1, A2 and A3",
-    lambda seeds: planned_runs([THEORY_ROAD], tuple(dict.fromkeys((*CONVERGENCE_VARIANTS, *MODEL_VARIANTS))), seeds),
-    _write_theory,
+    title="measurable quantities of the theorems A1, A2 and A3",
+    write=_write_theory,
+    make_runs=partial(planned_runs, [THEORY_ROAD], tuple(dict.fromkeys((*CONVERGENCE_VARIANTS, *MODEL_VARIANTS)))),
     minutes=8.0,
 )
 FIGURE_8 = Study(
-    "training time, measured side by side",
-    lambda seeds: [],
-    _write_time,
-    minutes=12.0,
-    tables={"training time": _time_table},
+    title="training time, measured side by side", write=_write_time, minutes=12.0, tables={"training time": _time_table}
 )

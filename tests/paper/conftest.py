@@ -1,4 +1,4 @@
-"""Studies of a road so small that training takes a second."""
+"""A study of a road so small that a training takes a second."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,11 +8,13 @@ import pytest
 
 from unjam.cli import app
 from unjam.training.executors import CommandLine
-from unjam_paper import STUDIES, references, study
+from unjam_paper import references, study
 from unjam_paper import reproduce as reproduction
 from unjam_paper.comparison import comparison_study
 from unjam_paper.reproduce import make_plan, run_plan
-from unjam_paper.study import StudyFolder, Variant
+from unjam_paper.studies import STUDIES
+from unjam_paper.study import StudyFolder
+from unjam_paper.variants import VARIANTS, Variant
 
 SMALL: dict[str, Any] = {
     "scenario": "ring",
@@ -25,44 +27,44 @@ SMALL: dict[str, Any] = {
     "model.epochs": 1,
     "model.members": 2,
 }
-LITTLE = comparison_study("two ways to learn on a little ring", ("plain", "virtual"), "little")
+SMALL_STUDY = comparison_study("two variants on a small ring", ("plain", "with-model"), "small")
 
 
 REFERENCES = {"human": "human", "PI": "pi", "ACC": "acc"}
 TUNED = {"tuned PI": "pi:window=20"}
-VARIANTS = {
+SMALL_VARIANTS = {
     "plain": Variant("plain", "", {"model.model_ratio": 0.0}, 320),
-    "virtual": Variant("with a model", "", {"model.model_ratio": 1.0}, 320),
+    "with-model": Variant("with a model", "", {"model.model_ratio": 1.0}, 320),
 }
 
 
 @pytest.fixture(scope="module")
-def little() -> Iterator[pytest.MonkeyPatch]:
-    """Have the study `little` beside the others."""
+def small_study() -> Iterator[pytest.MonkeyPatch]:
+    """Add the study `small`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(STUDIES, "little", LITTLE)
-        patch.setitem(study.STUDY_ROADS, "little", SMALL)
-        for name, variant in VARIANTS.items():
-            patch.setitem(study.VARIANTS, name, variant)
-        patch.setattr(references, "REFERENCES", REFERENCES)
-        patch.setitem(references.TUNED_REFERENCES, "little", TUNED)
+        patch.setitem(STUDIES, "small", SMALL_STUDY)
+        patch.setitem(study.STUDY_ROADS, "small", SMALL)
+        for name, variant in SMALL_VARIANTS.items():
+            patch.setitem(VARIANTS, name, variant)
+        patch.setattr(references, "REFERENCE_DRIVERS", REFERENCES)
+        patch.setitem(references.TUNED_REFERENCES, "small", TUNED)
         yield patch
 
 
 @pytest.fixture(scope="module")
-def reproduced(tmp_path_factory: pytest.TempPathFactory, little: pytest.MonkeyPatch) -> tuple[Path, list[str]]:
-    """A study that was made, its trainings in this process and without reports: its folder, what was told."""
-    little.setattr(reproduction, "run_all", run_here)
-    little.setattr("unjam.training.train.write_report", lambda folders, path: path.touch())
-    folder, told = tmp_path_factory.mktemp("studies"), []
-    to_do = make_plan(["little"], 2, StudyFolder(folder))
-    assert len(to_do.runs) == 4
-    run_plan(to_do, 2, on_message=told.append)
-    return folder, told
+def reproduced(tmp_path_factory: pytest.TempPathFactory, small_study: pytest.MonkeyPatch) -> tuple[Path, list[str]]:
+    """The folder of a study, with trainings in this process and without reports, and the messages."""
+    small_study.setattr(reproduction, "run_all", run_here)
+    small_study.setattr("unjam.training.train.write_report", lambda folders, path: path.touch())
+    folder, messages = tmp_path_factory.mktemp("studies"), []
+    plan = make_plan(["small"], 2, StudyFolder(folder))
+    assert len(plan.runs) == 4
+    run_plan(plan, 2, on_message=messages.append)
+    return folder, messages
 
 
-def run_here(commands: dict[str, CommandLine], workers: int, executor: str, on_line: Callable[[str], None]) -> None:
+def run_here(commands: dict[str, CommandLine], workers: int, executor: str, on_message: Callable[[str], None]) -> None:
     """Run command lines of `unjam` in this process."""
     for name, command in commands.items():
         app(command.argv()[4:], standalone_mode=False)
-        on_line(name)
+        on_message(name)

@@ -1,4 +1,4 @@
-"""Does something happen on the road where the study says so, and is it seen when a driver has settled?"""
+"""Changes of the road in the study `adaptation`, and settling times."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,50 +32,50 @@ AT = 40
 
 
 @pytest.fixture
-def early(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adaptation, "CHANGE", AT)
+def early_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adaptation, "CHANGE_STEP", AT)
 
 
 def speeds_on(world: type[RingBatch], ring: Ring = RING, driver: str = "pi") -> Floats:
-    """Speeds of all vehicles, shape (decisions + 1, vehicles)."""
+    """Speeds of all vehicles, shape (control steps + 1, vehicles)."""
     made = start_batch_drive(world([ring], [(1,)]), driver_from_name(driver, ring.control_step))
     return finish_drive(made).episodes[0].speeds
 
 
-@pytest.mark.usefixtures("early")
+@pytest.mark.usefixtures("early_change")
 @pytest.mark.parametrize("world", [WaveArrives, HumansChange, CAVSwitchesOff])
-def test_nothing_happens_before_the_change_and_something_after(world: type[ChangingRings]) -> None:
+def test_speeds_differ_only_after_the_change(world: type[ChangingRings]) -> None:
     ring = replace(RING, cavs=1) if world is WaveArrives else RING
-    as_ever, found = speeds_on(RingBatch, ring), speeds_on(world, ring)
-    np.testing.assert_array_equal(found[: AT + 1], as_ever[: AT + 1])
-    assert not np.array_equal(found[AT + 10 :], as_ever[AT + 10 :])
+    unchanged, changed = speeds_on(RingBatch, ring), speeds_on(world, ring)
+    np.testing.assert_array_equal(changed[: AT + 1], unchanged[: AT + 1])
+    assert not np.array_equal(changed[AT + 10 :], unchanged[AT + 10 :])
 
 
-@pytest.mark.usefixtures("early")
-def test_somebody_who_is_no_cav_brakes_to_a_crawl() -> None:
+@pytest.mark.usefixtures("early_change")
+def test_a_human_driven_vehicle_brakes_to_a_low_speed() -> None:
     ring = replace(RING, cavs=1, warmup=400)
     before, after = speeds_on(WaveArrives, ring)[[AT, AT + 60]]
-    crawls = np.flatnonzero((after <= 0.5 + 0.3) & (before > 1.5))
-    assert len(crawls), "noise is added to what was commanded"
+    slow = np.flatnonzero((after <= 0.5 + 0.3) & (before > 1.5))
+    assert len(slow), "noise is added to the commanded speed"
 
 
-@pytest.mark.usefixtures("early")
-def test_people_who_follow_closer_drive_faster_in_the_end() -> None:
+@pytest.mark.usefixtures("early_change")
+def test_human_drivers_that_follow_closer_are_faster_in_the_end() -> None:
     calm = replace(RING, horizon=900, noise=0.0)
     assert speeds_on(HumansChange, calm, "idm")[-1].mean() > 1.05 * speeds_on(RingBatch, calm, "idm")[-1].mean()
-    changed = ROAD_CHANGES["people change"]
+    changed = ROAD_CHANGES["human drivers change"]
     assert changed.humans == HURRIED_IDM != ROAD_CHANGES["a wave arrives"].humans
 
 
-@pytest.mark.usefixtures("early")
-def test_who_leaves_drives_as_people_do_and_the_other_goes_on() -> None:
+@pytest.mark.usefixtures("early_change")
+def test_only_the_last_cav_switches_off() -> None:
     lone = replace(RING, noise=0.0)
-    places = [index for index, name in enumerate(_names(lone)) if name in _cavs(lone)]
-    as_ever, found = speeds_on(RingBatch, lone), speeds_on(CAVSwitchesOff, lone)
-    first, last = places
-    changed = np.abs(found - as_ever)[AT + 1]
-    assert changed[last] > 0.0
-    assert changed[first] == 0.0
+    indices = [index for index, name in enumerate(_names(lone)) if name in _cavs(lone)]
+    unchanged, changed = speeds_on(RingBatch, lone), speeds_on(CAVSwitchesOff, lone)
+    first, last = indices
+    difference = np.abs(changed - unchanged)[AT + 1]
+    assert difference[last] > 0.0
+    assert difference[first] == 0.0
 
 
 def _names(ring: Ring) -> tuple[str, ...]:
@@ -86,25 +86,25 @@ def _cavs(ring: Ring) -> tuple[str, ...]:
     return RingBatch([ring], [(1,)]).roads[0].cav_ids
 
 
-def test_settled_is_who_stays_near_the_limit_for_a_minute_until_the_end() -> None:
+def test_a_driver_has_settled_when_it_stays_near_the_limit_for_the_last_minute() -> None:
     change, end = adaptation.CHANGE_STEP // STEPS_PER_SECOND, adaptation.END_STEP // STEPS_PER_SECOND
     speeds = np.full((4, end), 4.0)
     speeds[1, change : change + 50] = 2.0
     speeds[2, change:] = 3.7
     speeds[3, -30:] = 2.0
-    found = settling_times(speeds, np.full(4, 4.0))
-    assert found[0] == 0.0
-    assert 45.0 < found[1] <= 50.0, "a mean over ten seconds sees it a little earlier"
-    assert np.isnan(found[2])
-    assert np.isnan(found[3])
+    times = settling_times(speeds, np.full(4, 4.0))
+    assert times[0] == 0.0
+    assert 45.0 < times[1] <= 50.0, "the mean over ten seconds reaches it a little earlier"
+    assert np.isnan(times[2])
+    assert np.isnan(times[3])
 
 
 def test_a_table_has_a_row_for_each_driver(tmp_path: Path) -> None:
     speeds = np.full((3, adaptation.END_STEP // STEPS_PER_SECOND), 4.0)
-    for place in range(len(ADAPTATION_DRIVERS)):
-        content = {"limits": [4.0] * 3, "speeds": (speeds - 0.5 * (place == 0)).tolist()}
-        (tmp_path / f"1-{place}.json").write_text(to_json(content))
-    shown = adaptation_table("people change", tmp_path)
-    assert list(shown[""]) == list(ADAPTATION_DRIVERS)
-    assert list(shown["settled"]) == ["0 of 3", *["3 of 3"] * (len(ADAPTATION_DRIVERS) - 1)]
-    assert list(shown["after, in the median [s]"])[:2] == ["–", "0"]
+    for number in range(len(ADAPTATION_DRIVERS)):
+        content = {"limits": [4.0] * 3, "speeds": (speeds - 0.5 * (number == 0)).tolist()}
+        (tmp_path / f"1-{number}.json").write_text(to_json(content))
+    table = adaptation_table("human drivers change", tmp_path)
+    assert list(table[""]) == list(ADAPTATION_DRIVERS)
+    assert list(table["settled"]) == ["0 of 3", *["3 of 3"] * (len(ADAPTATION_DRIVERS) - 1)]
+    assert list(table["after, median [s]"])[:2] == ["–", "0"]

@@ -1,4 +1,4 @@
-"""Does the study of all roads say what its files hold?"""
+"""Tables and resumption of the study `all-roads`."""
 
 from functools import partial
 from math import nan
@@ -25,55 +25,55 @@ from unjam_paper.all_roads import (
 )
 from unjam_paper.results_file import read_part
 
-RESULTS = Path(__file__).parents[2] / "results/everywhere.json"
+RESULTS = Path(__file__).parents[2] / "results/all-roads.json"
 
 
-def test_each_road_has_a_row_and_the_mean_and_the_worst_follow() -> None:
+def test_each_road_has_a_row_followed_by_mean_and_worst() -> None:
     roads = road_gains(RESULTS)
     assert set(roads) <= set(FAMILY)
-    for parts in (("seen",), UNSEEN_PARTS):
-        shown = all_roads_table(parts, RESULTS)
+    for parts in (("training",), UNSEEN_PARTS):
+        table = all_roads_table(parts, RESULTS)
         names = [name for name, road in roads.items() if road["part"] in parts]
-        assert list(shown["road"]) == [*names, "mean", "mean, where there is something to gain", "worst"]
+        assert list(table["road"]) == [*names, "mean", "mean, roads with a potential gain", "worst"]
         worst = min(roads[name]["gains"]["unjam:best"].mean for name in names)
-        assert shown["unjam:best"].iloc[-1] == f"{worst:+.2f}"
+        assert table["unjam:best"].iloc[-1] == f"{worst:+.2f}"
 
 
-def test_each_driver_has_its_means_and_what_the_first_gains_more() -> None:
-    shown = all_drivers_table(RESULTS).set_index("")
+def test_each_driver_has_mean_gains_and_the_difference_to_the_first() -> None:
+    table = all_drivers_table(RESULTS).set_index("")
     first, *others = FAMILY_DRIVERS
-    assert list(shown.index) == [first, TWO_LAWS_LABEL, *others]
-    for heading, parts in {"seen": ("seen",), "held out": UNSEEN_PARTS}.items():
-        laws = all_roads_table(parts, RESULTS).set_index("road")
+    assert list(table.index) == [first, TWO_LAWS_LABEL, *others]
+    for heading, parts in {"training": ("training",), "unseen": UNSEEN_PARTS}.items():
+        by_road = all_roads_table(parts, RESULTS).set_index("road")
         for label in SINGLE_CONTROLLERS:
-            assert shown.loc[label, heading] == laws.loc["mean", label]
-            assert shown.loc[label, f"worst, {heading}"] == laws.loc["worst", label]
-        mean = shown[heading].str.split().str[0].astype(float)
-        more = shown[f"unjam:best beyond it, {heading}"].iloc[1:].str.split().str[0].astype(float)
+            assert table.loc[label, heading] == by_road.loc["mean", label]
+            assert table.loc[label, f"worst, {heading}"] == by_road.loc["worst", label]
+        mean = table[heading].str.split().str[0].astype(float)
+        more = table[f"unjam:best, difference to it, {heading}"].iloc[1:].str.split().str[0].astype(float)
         assert list(mean.iloc[0] - mean.iloc[1:]) == pytest.approx(list(more), abs=0.011)
-    assert shown.iloc[0]["unjam:best beyond it, seen"] == ""
+    assert table.iloc[0]["unjam:best, difference to it, training"] == ""
 
 
-def test_two_laws_have_what_each_has_on_its_kind_of_road() -> None:
-    shown, laws = all_drivers_table(RESULTS).set_index(""), road_gains(RESULTS)
-    seen = {name: road["by_seed"] for name, road in laws.items() if road["part"] == "seen"}
+def test_the_combination_of_two_controllers_has_the_gain_of_each_on_its_road_type() -> None:
+    table, roads = all_drivers_table(RESULTS).set_index(""), road_gains(RESULTS)
+    gains = {name: road["by_seed"] for name, road in roads.items() if road["part"] == "training"}
     mean = sum(
-        of["jam-ahead, tuned on all" if name.startswith("on-ramp") else "PI, tuned on all"].mean()
-        for name, of in seen.items()
-    ) / len(seen)
-    assert float(shown.loc[TWO_LAWS_LABEL, "seen"].split()[0]) == pytest.approx(mean, abs=0.005)
+        own["jam-ahead, tuned on all roads" if name.startswith("on-ramp") else "PI, tuned on all roads"].mean()
+        for name, own in gains.items()
+    ) / len(gains)
+    assert float(table.loc[TWO_LAWS_LABEL, "training"].split()[0]) == pytest.approx(mean, abs=0.005)
 
 
-def test_the_best_of_a_road_gains_what_its_one_says() -> None:
+def test_the_gain_of_the_best_expert_is_one() -> None:
     for road in road_gains(RESULTS).values():
         assert all(MIN_GAIN <= found.mean <= MAX_GAIN for found in road["gains"].values())
         one = road["gains"].get(road["best"])
-        assert one is None or one.mean in (0.0, pytest.approx(1.0)), "nothing counts, or it is the one"
+        assert one is None or one.mean in (0.0, pytest.approx(1.0)), "no potential gain, or the reference"
 
 
-def test_the_best_of_a_road_could_have_driven_so_in_every_episode() -> None:
+def test_the_best_driver_is_feasible_in_every_episode() -> None:
     rows = read_part(RESULTS, "00")["rows"]
-    measured = {who: [{**row, "travel_time": nan} for row in rows[who]] for who in (HUMAN_LABEL, "unjam:best")}
+    measured = {label: [{**row, "travel_time": nan} for row in rows[label]] for label in (HUMAN_LABEL, "unjam:best")}
     careful = measured["unjam:best"]
     reckless = [{**row, "mean_speed_second_half": 9.0} for row in careful]
     reckless[1] |= {"status": "collision", "collisions": 1.0}
@@ -81,53 +81,51 @@ def test_the_best_of_a_road_could_have_driven_so_in_every_episode() -> None:
     assert best_feasible_driver({HUMAN_LABEL: measured[HUMAN_LABEL], "reckless": reckless}) == HUMAN_LABEL
 
 
-def test_the_picture_has_a_field_for_each_driver_on_each_road() -> None:
+def test_the_figure_has_a_cell_for_each_driver_on_each_road() -> None:
     axes = all_roads_figure(RESULTS).axes[0]
     assert len(axes.texts) == len(road_gains(RESULTS)) * len(FAMILY_DRIVERS)
 
 
-def test_only_what_is_not_known_is_driven_and_the_best_may_be_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A row is known while the shipped file that drove it is the one that is there."""
-    asked: list[list[str]] = []
+def test_only_missing_drivers_run_and_the_best_can_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row is current while the digest of its packaged file is the same."""
+    runs: list[list[str]] = []
     speeds = {HUMAN_LABEL: 3.0, "pi": 4.0, "unjam:ring-tuned": 4.5}
 
-    def driven(scenario: object, drivers: dict[str, str], seeds: object, run: object) -> dict[str, Any]:
-        asked.append([*drivers.values()])
+    def drive(scenario: object, drivers: dict[str, str], seeds: object, run: object) -> dict[str, Any]:
+        runs.append([*drivers.values()])
         return {label: [{**row, "mean_speed_second_half": speeds[name]}] for label, name in drivers.items()}
 
     found = read_part(RESULTS, "00")
     row = {**found["rows"]["unjam:best"][0], "travel_time": nan}
     files = {"unjam:ring-tuned": "one"}
-    monkeypatch.setattr(all_roads, "driven", driven)
-    monkeypatch.setattr(all_roads, "JUDGED", {"PI": "pi"})
-    monkeypatch.setattr(all_roads, "file_of", lambda driver: files.get(driver, ""))
+    monkeypatch.setattr(all_roads, "drive_by_label", drive)
+    monkeypatch.setattr(all_roads, "FAMILY_DRIVERS", {"PI": "pi"})
+    monkeypatch.setattr(all_roads, "controller_digest", lambda driver: files.get(driver, ""))
 
-    road: dict[str, Any] = {"best": HUMAN_LABEL, "tried": {}, "drove": {}, "rows": {}}
-    go_on = partial(all_roads._drive_missing, Ring(), results=road, run_episodes=lambda tasks: [])
-    go_on(("pi",))
-    assert (asked, road["best"]) == ([[HUMAN_LABEL, "pi"], [HUMAN_LABEL, "pi", "pi"]], "pi")
-    go_on(("pi",))
-    assert len(asked) == 2, "all is known"
-    go_on(("pi", "unjam:ring-tuned"))
-    assert (asked[2:], road["best"]) == (
+    road: dict[str, Any] = {"best": HUMAN_LABEL, "expert_files": {}, "driver_files": {}, "rows": {}}
+    resume = partial(all_roads._drive_missing, Ring(), results=road, run_episodes=lambda tasks: [])
+    resume(("pi",))
+    assert (runs, road["best"]) == ([[HUMAN_LABEL, "pi"], [HUMAN_LABEL, "pi", "pi"]], "pi")
+    resume(("pi",))
+    assert len(runs) == 2, "all results are current"
+    resume(("pi", "unjam:ring-tuned"))
+    assert (runs[2:], road["best"]) == (
         [[HUMAN_LABEL, "pi", "unjam:ring-tuned"], ["unjam:ring-tuned"]],
         "unjam:ring-tuned",
     )
     files["unjam:ring-tuned"] = "another"
-    go_on(("pi", "unjam:ring-tuned"))
-    assert asked[4:] == [[HUMAN_LABEL, "pi", "unjam:ring-tuned"], ["unjam:ring-tuned"]], "the best may be another"
-    del road["drove"][HUMAN_LABEL]  # as files of before have it
-    go_on(("pi", "unjam:ring-tuned"))
-    assert asked[6:] == [[HUMAN_LABEL]]
-    monkeypatch.setattr(all_roads, "JUDGED", {"PI": "pi:window=9"})
+    resume(("pi", "unjam:ring-tuned"))
+    assert runs[4:] == [[HUMAN_LABEL, "pi", "unjam:ring-tuned"], ["unjam:ring-tuned"]], "the best can change"
+    del road["driver_files"][HUMAN_LABEL]  # as in older files
+    resume(("pi", "unjam:ring-tuned"))
+    assert runs[6:] == [[HUMAN_LABEL]]
+    monkeypatch.setattr(all_roads, "FAMILY_DRIVERS", {"PI": "pi:window=9"})
     speeds["pi:window=9"] = 4.1
-    go_on(("pi", "unjam:ring-tuned"))
-    assert asked[7:] == [["pi:window=9"]], "other parameters are another law"
+    resume(("pi", "unjam:ring-tuned"))
+    assert runs[7:] == [["pi:window=9"]], "other parameters are another driver"
 
 
-def test_a_shipped_controller_is_known_by_its_file_and_others_by_their_name() -> None:
+def test_only_packaged_controllers_have_a_digest() -> None:
     assert all_roads.controller_digest("pi:window=23") == ""
     names = ("unjam:best", "unjam:ring-tuned")
     assert len({all_roads.controller_digest(name) for name in names} - {""}) == 2

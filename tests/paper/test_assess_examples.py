@@ -1,6 +1,5 @@
-"""Do the roads of the examples of `unjam assess` load and carry traffic, and is no road assessed twice?"""
+"""Roads and results of the examples of `unjam assess`."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,9 @@ from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 from unjam_paper import assess_examples
-from unjam_paper.assess_examples import EXAMPLES, Example, main
+from unjam_paper.assess_examples import EXAMPLES, EXAMPLES_PART, Example, examples_table
+from unjam_paper.assess_examples import assess_examples as run_examples
+from unjam_paper.results_file import read_part
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -25,10 +26,11 @@ def test_a_road_of_the_examples_carries_traffic(name: str, tmp_path: Path, simul
 
 
 @pytest.mark.long
-def test_a_road_is_assessed_once_and_its_entry_has_all_drivers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    road, out = EXAMPLES["an on-ramp with SUMO's default vehicles"], tmp_path / "assess.json"
+    road, out = EXAMPLES["an on-ramp with SUMO's default vehicles"], tmp_path / "out"
+    out.mkdir()
     written = list[Path]()
 
     def write(folder: Path) -> Path:
@@ -37,9 +39,8 @@ def test_a_road_is_assessed_once_and_its_entry_has_all_drivers(
 
     short: dict[str, Example] = {"first": Example(write, 0.3)}
     monkeypatch.setattr(assess_examples, "EXAMPLES", short)
-    words = ["--out", str(out), "--episodes", "15", "--seconds", "60"]
-    main(words)
-    found: dict[str, Any] = json.loads(out.read_text())["roads"]["first"]
+    run_examples(out, 2, episodes=15, seconds=60.0)
+    found: dict[str, Any] = read_part(out, EXAMPLES_PART)["first"]
     human, acc, controller = found["drivers"]
     assert (human["driver"], acc["driver"]) == ("human", "cruise")
     assert controller["driver"] in found["rejection_reasons"]
@@ -47,9 +48,9 @@ def test_a_road_is_assessed_once_and_its_entry_has_all_drivers(
     assert controller["verdict"].startswith("3 test seeds are too few")
     assert acc["travel_time"] == pytest.approx(human["travel_time"] + acc["difference"]["mean"])
     assert len(found["sentences"]) == 2
-    assert found["headline"] in capsys.readouterr().out
+    assert list(examples_table(out)["driver"]) == ["human", "cruise", controller["driver"]]
     short["second"] = Example(write, 0.3)
-    main(words)
+    run_examples(out, 2, episodes=15, seconds=60.0)
     assert len(written) == 2
-    assert list(json.loads(out.read_text())["roads"]) == ["first", "second"]
-    assert json.loads(out.read_text())["roads"]["first"] == found
+    assert list(read_part(out, EXAMPLES_PART)) == ["first", "second"]
+    assert read_part(out, EXAMPLES_PART)["first"] == found

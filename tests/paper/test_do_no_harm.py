@@ -1,4 +1,4 @@
-"""Does the study of harm find harm where there is some, and only there?"""
+"""Verdicts, breakdowns and roads of the study `do-no-harm`."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper import do_no_harm, open_test_roads
+from unjam_paper import do_no_harm, open_test_roads, road_files
 from unjam_paper.do_no_harm import (
     ACC_BASELINE,
     DO_NO_HARM,
@@ -29,6 +29,7 @@ from unjam_paper.do_no_harm import (
     has_breakdown,
 )
 from unjam_paper.open_test_roads import OPEN_TEST_ROADS, OpenTestRoad, RoadSection, write_road_files
+from unjam_paper.road_files import EPISODE_SECONDS
 from unjam_paper.study import StudyFolder
 
 
@@ -55,7 +56,7 @@ ACC_ROWS = rows((100.0, 4000.0), (110.0, 4000.0), (120.0, 4000.0))
         ([], True, UNDECIDED),
     ],
 )
-def test_a_verdict_follows_from_both_intervals(own: list[dict[str, Any]], breakdown: bool, verdict: str) -> None:
+def test_the_verdict_follows_from_both_intervals(own: list[dict[str, Any]], breakdown: bool, verdict: str) -> None:
     assert evaluate_harm(own, ACC_ROWS, breakdown).verdict == verdict
 
 
@@ -63,12 +64,11 @@ ROAD = OpenTestRoad((RoadSection(1000, 2, 30), RoadSection(1000, 2, 20)), (0.5,)
 
 
 def episode(speed: float, seconds: int, spacing: float = 25.0) -> Episode:
-    """Vehicles that leave a slow section of 250 m behind them as the next ones enter it."""
-    places = np.arange(0.0, 1000.0, spacing)
-    moments = np.arange(600)
-    slow = (places >= 250.0) & (places < 500.0)
-    speeds = np.where(slow & (moments[:, None] < seconds), speed, 29.0)
-    return Episode((0,), "completed", control_step=1.0, speeds=speeds, positions=np.tile(places, (600, 1)))
+    """Vehicles at fixed positions, slow in a section of 250 m for some seconds."""
+    positions = np.arange(0.0, 1000.0, spacing)
+    is_slow = (positions >= 250.0) & (positions < 500.0)
+    speeds = np.where(is_slow & (np.arange(600)[:, None] < seconds), speed, 29.0)
+    return Episode((0,), "completed", control_step=1.0, speeds=speeds, positions=np.tile(positions, (600, 1)))
 
 
 def test_a_breakdown_is_slow_for_two_minutes_with_flow() -> None:
@@ -78,38 +78,43 @@ def test_a_breakdown_is_slow_for_two_minutes_with_flow() -> None:
     assert not has_breakdown(episode(4.0, 180, spacing=125.0), ROAD), "hardly any flow"
 
 
-def test_where_there_are_signals_queues_are_no_breakdown() -> None:
+def test_queues_at_signals_are_no_breakdown() -> None:
     signals = OpenTestRoad((RoadSection(1000, 2, 30, has_signal=True), RoadSection(1000, 2, 20)), (0.5,))
     assert not has_breakdown(episode(10.0, 600), signals)
 
 
-def test_vehicles_that_slow_down_for_a_lower_limit_are_no_breakdown() -> None:
+def test_braking_before_a_lower_speed_limit_is_no_breakdown() -> None:
     curve = OpenTestRoad((RoadSection(500, 2, 40), RoadSection(500, 2, 20)), (0.5,))
     assert not has_breakdown(episode(17.0, 600), curve)
 
 
-def test_the_roads_are_those_of_the_promise() -> None:
-    stretches = [stretch for road in OPEN_TEST_ROADS.values() for stretch in road.sections]
+def test_roads_have_the_documented_range() -> None:
+    sections = [section for road in OPEN_TEST_ROADS.values() for section in road.sections]
     assert len(OPEN_TEST_ROADS) >= 10
-    assert {min(each.speed for each in stretches) < 25, max(each.speed for each in stretches)} == {True, 45}
-    assert {stretch.lanes for stretch in stretches} == {1, 2, 3, 4, 5}
+    assert {min(each.speed for each in sections) < 25, max(each.speed for each in sections)} == {True, 45}
+    assert {section.lanes for section in sections} == {1, 2, 3, 4, 5}
     demands = [share for road in OPEN_TEST_ROADS.values() for share in road.demand]
     assert (min(demands), max(demands)) == (0.3, 1.1)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", OPEN_TEST_ROADS)
-def test_sumo_takes_the_files_of_each_road(name: str, tmp_path: Path) -> None:
+def test_sumo_loads_the_files_of_each_road(name: str, tmp_path: Path) -> None:
     road = OPEN_TEST_ROADS[name]
     scenario: Any = make_scenario(str(write_road_files(road, tmp_path)), {"penetration_rate": 0.1})
-    assert scenario.horizon * scenario.control_step == open_test_roads.EPISODE_SECONDS
+    assert scenario.horizon * scenario.control_step == EPISODE_SECONDS
     network = (tmp_path / "road.net.xml").read_text()
     assert ('type="traffic_light"' in network) == road.has_signals
 
 
+def set_episode_seconds(patch: pytest.MonkeyPatch, seconds: float) -> None:
+    for module in (open_test_roads, road_files):
+        patch.setattr(module, "EPISODE_SECONDS", seconds)
+
+
 def travel_time(road: OpenTestRoad, driver: str, seconds: float, folder: Path, simulation: Simulation) -> float:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(open_test_roads, "SECONDS", seconds)
+        set_episode_seconds(patch, seconds)
         file = write_road_files(road, folder)
     scenario = make_scenario(str(file), {"penetration_rate": 0.1, "steps_per_control_step": 2, **ACC_SETTINGS})
     made = make_driver(driver, scenario.control_step)
@@ -117,51 +122,53 @@ def travel_time(road: OpenTestRoad, driver: str, seconds: float, folder: Path, s
 
 
 @pytest.mark.long
-def test_no_cav_is_held_back_in_dense_free_flow_far_below_the_limit(
+def test_no_set_speed_is_reduced_in_dense_free_flow_far_below_the_limit(
     tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the report it is: the mean speed ahead is below three quarters of what is allowed."""
+    """Without the congestion report it is: the mean speed ahead is below three quarters of the limit."""
     road = OPEN_TEST_ROADS["limit far above the flow"]
-    alone, held = (travel_time(road, each, 700.0, tmp_path, simulation) for each in (ACC_BASELINE, TESTED_CONTROLLER))
-    assert held == alone
+    acc, controller = (
+        travel_time(road, each, 700.0, tmp_path, simulation) for each in (ACC_BASELINE, TESTED_CONTROLLER)
+    )
+    assert controller == acc
     monkeypatch.setattr(CongestionMonitor, "update", lambda monitor, counts, sums: np.ones(len(counts), bool))
-    assert travel_time(road, TESTED_CONTROLLER, 700.0, tmp_path, simulation) > 1.01 * alone
+    assert travel_time(road, TESTED_CONTROLLER, 700.0, tmp_path, simulation) > 1.01 * acc
 
 
 @pytest.mark.long
-def test_cavs_are_held_back_upstream_of_a_ramp_that_is_overloaded(tmp_path: Path, simulation: Simulation) -> None:
+def test_set_speeds_are_reduced_upstream_of_an_overloaded_ramp(tmp_path: Path, simulation: Simulation) -> None:
     road = OPEN_TEST_ROADS["on-ramp, overloaded"]
-    alone, held = (travel_time(road, each, 700.0, tmp_path, simulation) for each in (ACC_BASELINE, TESTED_CONTROLLER))
-    assert held != alone
+    acc, controller = (
+        travel_time(road, each, 700.0, tmp_path, simulation) for each in (ACC_BASELINE, TESTED_CONTROLLER)
+    )
+    assert controller != acc
 
 
 @pytest.mark.long
-def test_the_study_ends_by_itself_and_goes_on_where_it_was_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_study_ends_by_itself_and_can_be_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     short = {name: OpenTestRoad((RoadSection(400, 1, 25),), (share,)) for name, share in (("a", 0.5), ("b", 0.6))}
     monkeypatch.setattr(do_no_harm, "OPEN_TEST_ROADS", short)
-    monkeypatch.setattr(do_no_harm, "BATCH", 3)
+    monkeypatch.setattr(do_no_harm, "SEED_BATCH", 3)
     monkeypatch.setattr(do_no_harm, "PENETRATION_RATES", (0.4, 0.6))
-    monkeypatch.setattr(open_test_roads, "SECONDS", 60.0)
+    set_episode_seconds(monkeypatch, 60.0)
     run_each = WorkerPool.run_and_map
     batches: list[int] = []
 
-    def stopped_in_the_second(pool: WorkerPool, tasks: Any, keep: Any, progress: Any = None) -> Any:
+    def stop_in_the_second(pool: WorkerPool, tasks: Any, transform: Any, on_progress: Any = None) -> Any:
         batches.append(len(tasks))
         if len(batches) == 2:
             raise KeyboardInterrupt
-        return run_each(pool, tasks, keep, progress)
+        return run_each(pool, tasks, transform, on_progress)
 
-    monkeypatch.setattr(WorkerPool, "run_and_map", stopped_in_the_second)
+    monkeypatch.setattr(WorkerPool, "run_and_map", stop_in_the_second)
     with pytest.raises(KeyboardInterrupt):
         DO_NO_HARM.write(StudyFolder(tmp_path), 1, tmp_path, 1)
-    first = json.loads((tmp_path / f"{RESULTS}.json").read_text())
+    first = json.loads((tmp_path / f"{RESULTS_FILE}.json").read_text())
     assert list(first) == ["a"]
-    for _ in range(2):  # the second time nothing is left to drive
+    for _ in range(2):  # the second call finds nothing to run
         DO_NO_HARM.write(StudyFolder(tmp_path), 1, tmp_path, 1)
-    assert batches == [15, 15, 15], "human drivers, and both others at two penetration rates, on three seeds"
-    assert json.loads((tmp_path / f"{RESULTS}.json").read_text())["a"] == first["a"]
+    assert batches == [15, 15, 15], "the baseline, and both drivers at two penetration rates, on three seeds"
+    assert json.loads((tmp_path / f"{RESULTS_FILE}.json").read_text())["a"] == first["a"]
     table = DO_NO_HARM.tables["harm"](tmp_path)
     assert table["road"].tolist() == ["a", "a", "b", "b"]
     assert set(table["verdict"]) == {NO_HARM}

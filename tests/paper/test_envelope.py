@@ -9,12 +9,12 @@ from unjam_paper.envelope import ENVELOPE
 from unjam_paper.study import StudyFolder
 
 
-def test_all_that_ships_for_closed_roads_is_tried() -> None:
+def test_all_packaged_controllers_for_closed_roads_are_tested() -> None:
     closed = {f"{PACKAGED_PREFIX}{name}" for name in packaged_names() if not name.startswith("on-ramp")}
     assert set(envelope.CONTROLLER_ROADS) == closed
 
 
-def test_its_rings_are_those_of_the_promise() -> None:
+def test_rings_have_the_documented_range() -> None:
     rings = [ring for _, ring in envelope.envelope_rings()]
     assert {ring.vehicles for ring in rings} == {5, 11, 22, 44}
     assert {ring.cavs for ring in rings} == {1, 2, 3}
@@ -23,27 +23,27 @@ def test_its_rings_are_those_of_the_promise() -> None:
     assert min(low for low, _ in of_22) < 220 < 270 < max(high for _, high in of_22)
 
 
-def test_where_sumo_does_not_keep_cars_apart_only_the_filter_does() -> None:
-    for roads in (envelope.without_sumo_safety(envelope.envelope_rings()), envelope.envelope_lanes()):
+def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None:
+    for roads in (envelope.envelope_rings(actuation="raw"), envelope.envelope_lanes()):
         for _, road in roads:
             assert road.actuation == "raw"
             assert road.safety.active
 
 
 @pytest.mark.long
-def test_every_table_of_its_page_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = "unjam:ring-gap-tuned"
-    monkeypatch.setattr(envelope, "ROADS", {one: "ring"})
+    monkeypatch.setattr(envelope, "CONTROLLER_ROADS", {one: "ring"})
     for name in ("IMPAIRED_DRIVERS", "LANE_CONTROLLERS"):
         monkeypatch.setattr(envelope, name, (one,))
-    for name in ("SEEDS", "RAW_ACTUATION_SEEDS", "IMPAIRED_SEEDS"):
+    for name in ("ENVELOPE_SEEDS", "RAW_ACTUATION_SEEDS", "IMPAIRED_SEEDS"):
         monkeypatch.setattr(envelope, name, 1)
     short = Ring(length=(60, 60), vehicles=5, horizon=60)
-    for name in ("rings", "envelope_figure_eights"):
-        monkeypatch.setattr(envelope, name, lambda: iter([("a short ring", short)]))
-    monkeypatch.setattr(envelope, "lanes", lambda: iter([("a short lane", OnRamp(lanes=1, horizon=60))]))
-    monkeypatch.setattr(envelope, "impaired", lambda warmup: iter([("late", short)]))
-    monkeypatch.setattr(certificate, "GENERATIONS", 1)
+    for name in ("envelope_rings", "envelope_figure_eights"):
+        monkeypatch.setattr(envelope, name, lambda **changes: iter([("a short ring", short)]))
+    monkeypatch.setattr(envelope, "envelope_lanes", lambda: iter([("a short lane", OnRamp(lanes=1, horizon=60))]))
+    monkeypatch.setattr(envelope, "impaired_rings", lambda warmup: iter([("late", short)]))
+    monkeypatch.setattr(certificate, "ATTACK_GENERATIONS", 1)
     monkeypatch.setattr(certificate, "STRING_SPEED_RATIOS", ())
 
     ENVELOPE.write(StudyFolder(tmp_path), 1, tmp_path, 1)
@@ -51,6 +51,6 @@ def test_every_table_of_its_page_is_written(tmp_path: Path, monkeypatch: pytest.
     tables = {name: table(tmp_path) for name, table in ENVELOPE.tables.items()}
     assert {name: len(table) for name, table in tables.items()} == dict.fromkeys(tables, 1)
     assert tables["worst"].loc[0, "contacts"] == 0
-    assert tables["rings"].loc[0, "drivable on"] == "1 of 1 roads"
-    assert tables["rings-raw"].loc[0, ["decisions", "in contact"]].tolist() == ["60", 0]
-    assert tables["impaired"].columns.tolist() == ["cars", "human", one]
+    assert tables["rings"].loc[0, "feasible on"] == "1 of 1 roads"
+    assert tables["rings-raw"].loc[0, ["control steps", "in contact"]].tolist() == ["60", 0]
+    assert tables["impaired"].columns.tolist() == ["impairment", "human", one]

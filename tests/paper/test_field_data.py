@@ -13,11 +13,11 @@ from unjam_paper.field_data import FIELD_DATA_LOADERS, FieldFit, evaluate_fit, f
 
 
 def table(path: Path, groups: list[dict[str, object]]) -> str:
-    """A file with a made-up driver for each group of columns."""
+    """A file with a synthetic driver for each group of columns."""
     parts = []
     for number, columns in enumerate(groups):
         pair = idm_driver(IDMParameters(time_headway=0.9 + 0.05 * number), seed=number, seconds=24.0)
-        times = [0.1 * moment for moment in range(len(pair.speed))]
+        times = [0.1 * step for step in range(len(pair.speed))]
         numbers = {"t": times, "v_foll": pair.speed, "v_lead": pair.leader_speed, "gap": pair.gap}
         parts.append(pd.DataFrame({"pair": number, **numbers}).assign(**columns))
     pd.concat(parts).to_parquet(path)
@@ -30,7 +30,7 @@ def ngsim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setattr(field_data, "MULTI_STEP_SETTINGS", quick)
     monkeypatch.setattr(field_data, "ONE_STEP_SETTINGS", NetworkSettings(hidden=(4,), epochs=2))
     settings = dict.fromkeys(field_data.CALIBRATED_MODELS, CalibrationSettings(generations=2))
-    monkeypatch.setattr(field_data, "CALIBRATED", settings)
+    monkeypatch.setattr(field_data, "CALIBRATED_MODELS", settings)
     splits = ["paper_train"] * 5 + ["paper_test"] * 2 + ["extra"]
     groups = [{"split": split, "period": 400, "follower": number} for number, split in enumerate(splits)]
     return table(tmp_path / "ngsim.parquet", groups)
@@ -44,43 +44,45 @@ def astazero(tmp_path: Path) -> str:
     return table(tmp_path / "astazero.parquet", groups)
 
 
-def test_nobody_judges_who_was_learned_from(ngsim: str, astazero: str) -> None:
+def test_test_pairs_are_not_used_for_training(ngsim: str, astazero: str) -> None:
     found = load_field_data("ngsim", ngsim)
     assert (len(found.training), {name: len(pairs) for name, pairs in found.test.items()}) == (
         5,
-        {"test": 2, "others": 1},
+        {"test": 2, "other drivers": 1},
     )
     for name in FIELD_DATA_LOADERS:
         data = load_field_data(name, ngsim if name == "ngsim" else astazero)
-        learned = {pair.name for pair in data.training}
-        assert learned
+        training = {pair.name for pair in data.training}
+        assert training
         for pairs in data.test.values():
             assert pairs
-            assert not learned & {pair.name for pair in pairs}
+            assert not training & {pair.name for pair in pairs}
 
 
-@pytest.mark.parametrize("model", ["paper's IDM", "IDM, headway kept", "vanilla", "knowledge, IDM", "IDM + multi-step"])
-def test_every_model_is_judged_on_every_test(ngsim: str, model: str) -> None:
+@pytest.mark.parametrize(
+    "model", ["paper's IDM", "IDM, initial headway weighted", "vanilla", "knowledge, IDM", "IDM + multi-step"]
+)
+def test_every_model_is_evaluated_on_every_test_set(ngsim: str, model: str) -> None:
     rows = field_rows([evaluate_fit(FieldFit("ngsim", ngsim, model))])
-    assert [row["test"] for row in rows] == ["test", "others", "second halves"]
+    assert [row["test"] for row in rows] == ["test", "other drivers", "second halves"]
     for row in rows:
         low, high = row["gap_interval"]
         assert low <= row["gap"] <= high
         assert len(row["gap_each"]) == row["trajectories"]
 
 
-def test_a_drivers_own_headway_is_judged_on_second_halves_alone(ngsim: str) -> None:
-    rows = field_rows([evaluate_fit(FieldFit("ngsim", ngsim, "IDM, own headway"))])
+def test_personal_parameters_are_evaluated_on_second_halves_only(ngsim: str) -> None:
+    rows = field_rows([evaluate_fit(FieldFit("ngsim", ngsim, "IDM, personal time headway"))])
     assert [row["test"] for row in rows] == ["second halves"]
     first, second = split_halves(load_field_data("ngsim", ngsim).training)
     assert len(first[0].speed) + len(second[0].speed) == len(load_field_data("ngsim", ngsim).training[0].speed)
 
 
-def test_the_study_writes_numbers_and_a_picture(
+def test_the_study_writes_results_and_a_figure(
     ngsim: str, astazero: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen = [FieldFit("ngsim", ngsim, model) for model in ("paper's IDM", "IDM", "vanilla")]
-    monkeypatch.setattr(field_data, "tasks", lambda files: chosen)
+    monkeypatch.setattr(field_data, "field_fits", lambda files: chosen)
     field_data.run_field_study(tmp_path / "out", Path(ngsim), Path(astazero), workers=1)
     document = json.loads((tmp_path / "out" / "field.json").read_text())
     assert len(document["rows"]) == 9

@@ -26,7 +26,7 @@ from unjam_paper.figure_6 import (
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     settings = {name: FourRegimesSettings(rows=6000, driver=one.driver) for name, one in figure_6.DATA_SETTINGS.items()}
-    monkeypatch.setattr(figure_6, "SETTINGS", settings)
+    monkeypatch.setattr(figure_6, "DATA_SETTINGS", settings)
     monkeypatch.setattr(figure_6, "NetworkSettings", lambda: NetworkSettings(hidden=(4,), epochs=2))
     split_rows.cache_clear()
     yield
@@ -35,16 +35,14 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_every_size_is_repeated_five_times_with_both_networks() -> None:
     main = [
-        task
-        for task in four_regime_fits()
-        if (task.driver, task.split, task.is_long) == ("other", "trajectories", False)
+        fit for fit in four_regime_fits() if (fit.driver, fit.split, fit.is_long) == ("other", "trajectories", False)
     ]
-    counts = Counter((task.size, task.network) for task in main if task.network != NEAREST_ROW)
+    counts = Counter((fit.size, fit.network) for fit in main if fit.network != NEAREST_ROW)
     assert counts == {(size, network): 5 for size in TRAINING_SIZES for network in ("knowledge", "vanilla")}
-    assert len({task.name for task in four_regime_fits()}) == len(four_regime_fits())
+    assert len({fit.name for fit in four_regime_fits()}) == len(four_regime_fits())
 
 
-def test_the_test_rows_are_the_same_throughout_and_only_the_released_split_leaks(small: None) -> None:
+def test_test_rows_are_always_the_same_and_only_the_released_split_leaks(small: None) -> None:
     overlaps = {split: split_rows("other", split).overlap for split in ("trajectories", "rows", "released")}
     assert overlaps["trajectories"] == overlaps["rows"] == 0.0
     assert overlaps["released"] == pytest.approx(0.696, abs=0.03)
@@ -55,34 +53,34 @@ def test_the_test_rows_are_the_same_throughout_and_only_the_released_split_leaks
 
 
 @pytest.mark.parametrize("network", ["knowledge", "vanilla", NEAREST_ROW])
-def test_a_fit_is_judged_with_and_without_noise(small: None, network: str) -> None:
+def test_a_fit_has_an_error_with_and_without_noise(small: None, network: str) -> None:
     row = measure_fit(FourRegimeFit("same", network, 0.1, 0))
     assert row["noise"] == pytest.approx(0.2, abs=0.02)
     assert row["rows"] == round(0.1 * 4200)
-    assert row["error_of_driver"] < row["error"] or network == "vanilla"
+    assert row["driver_error"] < row["error"] or network == "vanilla"
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.01, 10.0])
-def test_who_stands_can_only_start(speed: float) -> None:
+def test_noise_can_only_start_a_standing_vehicle(speed: float) -> None:
     count, settings = 200_000, FourRegimesSettings()
     rows = FollowingSamples(*(np.full(count, value) for value in (speed, 0.0, 2.0 + speed * 5, 0.0)))
     noise = np.random.default_rng(0).normal(0.0, settings.noise, count)
-    wanted = idm_acceleration(rows.speed, rows.leader_speed, rows.gap, settings.driver) + noise
-    drawn = (next_speed(rows.speed, wanted, settings.step) - rows.speed) / settings.step
+    accelerations = idm_acceleration(rows.speed, rows.leader_speed, rows.gap, settings.driver) + noise
+    drawn = (next_speed(rows.speed, accelerations, settings.step) - rows.speed) / settings.step
     assert average_acceleration(rows, settings)[0] == pytest.approx(drawn.mean(), abs=2e-3)
 
 
-def test_knowledge_of_the_truth_leaves_noise_alone(small: None) -> None:
+def test_with_the_true_model_as_base_the_error_is_smaller(small: None) -> None:
     errors = {
-        name: measure_fit(FourRegimeFit("same", name, 1.0, 0))["error_of_driver"] for name in ("knowledge", "vanilla")
+        name: measure_fit(FourRegimeFit("same", name, 1.0, 0))["driver_error"] for name in ("knowledge", "vanilla")
     }
     assert errors["knowledge"] < errors["vanilla"]
 
 
-def test_the_study_writes_numbers_and_a_picture(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_study_writes_results_and_a_figure(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = [FourRegimeFit("other", name, size, 0) for name in ("knowledge", "vanilla") for size in (0.3, 1.0)]
-    longer = [FourRegimeFit("other", name, 0.01, 0, is_long=True) for name in ("knowledge", "vanilla")]
-    monkeypatch.setattr(figure_6, "tasks", lambda repeats: [*chosen, *longer])
+    long_fits = [FourRegimeFit("other", name, 0.01, 0, is_long=True) for name in ("knowledge", "vanilla")]
+    monkeypatch.setattr(figure_6, "four_regime_fits", lambda repeats: [*chosen, *long_fits])
     figure_6.run_figure_6(tmp_path, workers=1)
     rows = json.loads((tmp_path / "figure-6.json").read_text())["rows"]
     assert len(rows) == 6

@@ -1,4 +1,4 @@
-"""Do studies of what is trained on many roads together say what their files hold?"""
+"""Tables and controllers of studies that train on many roads together."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from unjam.drivers.road_type_switch import MIN_SHARED_PENETRATION_RATE
-from unjam.training.presets import RINGS_EXPERT
 from unjam.training.road_family import FAMILY, family_roads
 from unjam_paper.all_roads import FAMILY_TEST_SEEDS
 from unjam_paper.joint_training import (
@@ -21,16 +20,17 @@ from unjam_paper.joint_training import (
 )
 from unjam_paper.results_file import read_part
 from unjam_paper.study import PlannedRun, StudyFolder
+from unjam_paper.variants import RINGS_EXPERT
 
-EVERYWHERE = Path(__file__).parents[2] / "results/everywhere.json"
+ALL_ROADS = Path(__file__).parents[2] / "results/all-roads.json"
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three rings with three trainings each, which drive as known drivers do."""
+    """Three rings with three trainings each, which have the rows of known drivers."""
     for number, name in enumerate(("ring-22-grown", "ring-44-grown", "ring-22-dense")):
         at = list(FAMILY).index(name)
-        found = read_part(EVERYWHERE, f"{at:02d}")
+        found = read_part(ALL_ROADS, f"{at:02d}")
         rows = found["rows"]
         careful, slow = rows["unjam:best"], rows["jam-ahead"]
         found["rows"] |= dict.fromkeys(RING_BASELINES, careful) | {found["best"]: careful}
@@ -39,25 +39,25 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_row_is_the_mean_of_the_trainings_and_of_what_they_are_beyond_the_expert(folder: Path) -> None:
-    shown = joint_training_table(["residual"], ("seen",), RING_BASELINES, folder).set_index("road")
-    assert list(shown.index) == ["ring-22-grown", "ring-44-grown", "mean", "worst", "not drivable"]
-    assert shown.loc["ring-22-grown", RINGS_EXPERT].startswith("+1.00")
-    # Two of three are the expert, and one gains next to nothing: 0.08 and 0.05 of what it gains.
-    assert shown.loc["ring-22-grown", "residual"].startswith("+0.69")
-    assert shown.loc["mean", f"residual, beyond {RINGS_EXPERT}"].startswith("-0.31")
-    faster = shown.loc["ring-22-grown", f"residual, mean speed beyond {RINGS_EXPERT} [m/s]"]
-    assert faster.startswith("-0."), "the whole episode, beside a driver that dissolves the wave"
-    assert shown.loc["worst", "residual"] == "+0.68"
-    assert shown.loc["not drivable", "residual"] == "0 of 6"
+def test_a_row_has_the_mean_of_trainings_and_their_difference_to_the_expert(folder: Path) -> None:
+    table = joint_training_table(["residual"], ("training",), RING_BASELINES, folder).set_index("road")
+    assert list(table.index) == ["ring-22-grown", "ring-44-grown", "mean", "worst", "infeasible"]
+    assert table.loc["ring-22-grown", RINGS_EXPERT].startswith("+1.00")
+    # Two of three are the expert, and one gains 0.08 and 0.05.
+    assert table.loc["ring-22-grown", "residual"].startswith("+0.69")
+    assert table.loc["mean", f"residual, difference to {RINGS_EXPERT}"].startswith("-0.31")
+    faster = table.loc["ring-22-grown", f"residual, mean speed, difference to {RINGS_EXPERT} [m/s]"]
+    assert faster.startswith("-0."), "of whole episodes, compared with a driver that dissolves the wave"
+    assert table.loc["worst", "residual"] == "+0.68"
+    assert table.loc["infeasible", "residual"] == "0 of 6"
 
 
-def test_roads_of_another_part_have_a_table_of_their_own(folder: Path) -> None:
+def test_a_table_has_only_the_roads_of_its_parts(folder: Path) -> None:
     rows = list(joint_training_table(["residual"], ("axis",), RING_BASELINES, folder)["road"])
-    assert rows == ["ring-22-dense", "mean", "worst", "not drivable"]
+    assert rows == ["ring-22-dense", "mean", "worst", "infeasible"]
 
 
-def test_shared_rings_are_judged_on_seeds_and_rings_that_chose_nothing() -> None:
+def test_shared_rings_are_evaluated_on_fresh_seeds_and_unseen_rings() -> None:
     assert not set(FRESH_TEST_SEEDS) & set(FAMILY_TEST_SEEDS)
     new = [name for name in SHARED_RING_ROADS if name not in FAMILY]
     assert len(new) == 8
@@ -66,39 +66,39 @@ def test_shared_rings_are_judged_on_seeds_and_rings_that_chose_nothing() -> None
         assert road.options["cavs"] >= MIN_SHARED_PENETRATION_RATE * road.options["vehicles"]
 
 
-def test_a_training_on_several_roads_is_finished_when_all_are_judged(tmp_path: Path) -> None:
+def test_a_training_on_several_roads_is_finished_when_all_are_evaluated(tmp_path: Path) -> None:
     studies, run = StudyFolder(tmp_path), PlannedRun("rings", "rings", 0)
-    assert studies.controller_folder(run) == studies.run_folder(run) / "ring-22-standing"
+    assert studies.controller_folder(run) == studies.run_folder(run) / "ring-22-no-warm-up"
     assert set(run.config.task_configs()) == {
-        name for name, ring in family_roads(RING_GROUP).items() if ring.part == "seen"
+        name for name, ring in family_roads(RING_GROUP).items() if ring.part == "training"
     }
     assert not studies.is_finished(run)
 
 
-def test_each_kind_of_road_is_driven_with_its_own_limits_and_decisions(tmp_path: Path) -> None:
-    studies, run = StudyFolder(tmp_path), PlannedRun("everywhere", "everywhere", 0)
-    for name, of in (
-        ("ring-88-grown", "ring-22-standing"),
+def test_each_road_type_is_driven_with_its_own_limits_and_control_step(tmp_path: Path) -> None:
+    studies, run = StudyFolder(tmp_path), PlannedRun("all-roads", "all-roads", 0)
+    for name, training_road in (
+        ("ring-88-grown", "ring-22-no-warm-up"),
         ("figure-eight-wide", "figure-eight-14"),
         ("one-lane-10", "on-ramp-5"),
     ):
-        assert joint_controller(FAMILY[name], run, studies) == studies.run_folder(run) / of
+        assert joint_controller(FAMILY[name], run, studies) == studies.run_folder(run) / training_road
 
 
-def test_a_ring_is_driven_by_all_on_the_same_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[set[str], list[tuple[int, ...]]]] = []
+def test_all_drivers_of_a_ring_have_the_same_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs: list[tuple[set[str], list[tuple[int, ...]]]] = []
 
-    def driven(scenario: object, drivers: dict[str, str], seeds: list[tuple[int, ...]], run: object) -> Any:
-        asked.append((set(drivers.values()), seeds))
+    def drive(scenario: object, drivers: dict[str, str], seeds: list[tuple[int, ...]], run: object) -> Any:
+        runs.append((set(drivers.values()), seeds))
         return {label: [] for label in drivers}
 
-    monkeypatch.setattr("unjam_paper.joint_training.driven", driven)
-    monkeypatch.setattr("unjam_paper.joint_training.best_of", lambda rows: "pi")
+    monkeypatch.setattr("unjam_paper.joint_training.drive_by_label", drive)
+    monkeypatch.setattr("unjam_paper.joint_training.best_feasible_driver", lambda rows: "pi")
     found = _measure_road(
         "ring-22-grown", FAMILY["ring-22-grown"], RING_BASELINES | {"residual 0": "runs/0"}, FAMILY_TEST_SEEDS
     )
-    (chose, tuning), (judged, judging) = asked
-    assert {"human", "pi", RINGS_EXPERT} <= judged
-    assert "runs/0" in judged - chose
-    assert not set(tuning) & set(judging)
-    assert (found["best"], found["part"]) == ("pi", "seen")
+    (candidates, tuning), (evaluated, testing) = runs
+    assert {"human", "pi", RINGS_EXPERT} <= evaluated
+    assert "runs/0" in evaluated - candidates
+    assert not set(tuning) & set(testing)
+    assert (found["best"], found["part"]) == ("pi", "training")

@@ -12,17 +12,18 @@ import pytest
 from unjam.errors import InputError
 from unjam.files import atomic_write
 from unjam.training.run_folder import read_config
-from unjam_paper import STUDIES, STUDY_GROUPS, study
 from unjam_paper.comparison import comparison_study
 from unjam_paper.reproduce import estimated_seconds, find_studies, make_plan, run_plan
 from unjam_paper.results_file import read_parts
+from unjam_paper.studies import STUDIES, STUDY_GROUPS
 from unjam_paper.study import PlannedRun, StudyFolder
+from unjam_paper.variants import VARIANTS
 
 Made = tuple[Path, list[str]]
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_every_study_lists_trainings_that_can_be_configured(name: str) -> None:
+def test_trainings_of_every_study_have_a_valid_configuration(name: str) -> None:
     runs = STUDIES[name].make_runs(2)
     assert len(set(runs)) == len(runs)
     for run in runs:
@@ -31,7 +32,7 @@ def test_every_study_lists_trainings_that_can_be_configured(name: str) -> None:
         assert config.make_scenario().horizon > 0
 
 
-def test_all_is_every_study_and_figures_are_drawn_with_their_tables() -> None:
+def test_groups_name_all_studies() -> None:
     assert set(find_studies(["all"])) == set(STUDIES)
     assert set(find_studies(["figure-7"])) == {"table-2"}
     assert set(find_studies(["figure-4"])) == set(find_studies(["table-1"]))
@@ -39,12 +40,12 @@ def test_all_is_every_study_and_figures_are_drawn_with_their_tables() -> None:
     assert {study for names in STUDY_GROUPS.values() for study in names} == set(STUDIES)
 
 
-def test_an_unknown_study_lists_the_known(tmp_path: Path) -> None:
+def test_an_unknown_study_is_refused_with_the_known_names(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="study: 'table-9' is not allowed; allowed: table-1"):
         make_plan(["table-9"], 1, StudyFolder(tmp_path))
 
 
-def test_a_training_that_two_studies_want_is_planned_once(tmp_path: Path) -> None:
+def test_a_training_of_two_studies_is_planned_once(tmp_path: Path) -> None:
     both = make_plan(["table-1", "table-2"], 2, StudyFolder(tmp_path))
     alone = [make_plan([name], 2, StudyFolder(tmp_path)) for name in ("table-1", "table-2")]
     assert len(set(both.runs)) == len(both.runs) < sum(len(part.runs) for part in alone)
@@ -52,7 +53,7 @@ def test_a_training_that_two_studies_want_is_planned_once(tmp_path: Path) -> Non
     assert both.seconds(4) < both.seconds(2)
 
 
-def test_a_study_that_was_begun_with_fewer_trainings_does_not_go_on_with_more(tmp_path: Path) -> None:
+def test_a_resumable_study_is_not_continued_with_more_trainings(tmp_path: Path) -> None:
     (tmp_path / "rings").mkdir()
     (tmp_path / "rings/manifest.json").write_text('{"seeds": 2}')
     assert make_plan(["rings"], 2, StudyFolder(tmp_path)).seeds == 2
@@ -60,90 +61,90 @@ def test_a_study_that_was_begun_with_fewer_trainings_does_not_go_on_with_more(tm
         make_plan(["rings"], 5, StudyFolder(tmp_path))
 
 
-def test_the_paper_settings_cost_what_their_budget_says() -> None:
+def test_the_estimated_time_is_proportional_to_the_steps() -> None:
     short, long = (estimated_seconds(PlannedRun("ring", name, 0)) for name in ("trpo", "trpo-exact"))
     assert long == pytest.approx(short * 4_000_000 / 300_000)
 
 
 @pytest.mark.long
-def test_a_study_leaves_its_trainings_numbers_picture_and_manifest(reproduced: Made) -> None:
-    folder, told = reproduced
-    for variant in ("plain", "virtual"):
+def test_a_study_writes_trainings_results_figure_and_manifest(reproduced: Made) -> None:
+    folder, messages = reproduced
+    for variant in ("plain", "with-model"):
         for seed in (0, 1):
-            assert (folder / "runs" / "little" / variant / str(seed) / "report.html").is_file()
-    assert {path.name for path in (folder / "little").iterdir()} == {
+            assert (folder / "runs" / "small" / variant / str(seed) / "report.html").is_file()
+    assert {path.name for path in (folder / "small").iterdir()} == {
         *("table.json", "table.csv", "curves.json", "curves.png", "manifest.json", "controllers")
     }
-    one_file = read_parts(folder / "little.json")
-    assert one_file == read_parts(folder / "little")
+    one_file = read_parts(folder / "small.json")
+    assert one_file == read_parts(folder / "small")
     assert list(one_file) == ["manifest", "curves", "table"]
-    assert (folder / "little-curves.png").read_bytes() == (folder / "little/curves.png").read_bytes()
-    with ZipFile(folder / "little-controllers.zip") as archive:
-        assert {*archive.namelist()} == {path.name for path in (folder / "little/controllers").iterdir()}
-    kept, made = folder / "little/controllers/virtual-1.unjam", folder / "runs/little/virtual/1"
+    assert (folder / "small-curves.png").read_bytes() == (folder / "small/curves.png").read_bytes()
+    with ZipFile(folder / "small-controllers.zip") as archive:
+        assert {*archive.namelist()} == {path.name for path in (folder / "small/controllers").iterdir()}
+    kept, made = folder / "small/controllers/with-model-1.unjam", folder / "runs/small/with-model/1"
     assert kept.read_bytes() == (made / "controller.unjam").read_bytes()
-    assert sum("failed" in line for line in told) == 0
-    manifest = json.loads((folder / "little" / "manifest.json").read_text())
+    assert sum("failed" in line for line in messages) == 0
+    manifest = json.loads((folder / "small" / "manifest.json").read_text())
     assert manifest["seeds"] == 2
     assert len({entry["weights_sha256"] for entry in manifest["trainings"]}) == 4
 
 
-def test_what_is_there_is_not_trained_again(reproduced: Made) -> None:
+def test_finished_trainings_are_not_repeated(reproduced: Made) -> None:
     folder, _ = reproduced
     before = {path: path.stat().st_mtime_ns for path in (folder / "runs").rglob("controller.unjam")}
-    plan_now = make_plan(["little"], 2, StudyFolder(folder))
+    plan_now = make_plan(["small"], 2, StudyFolder(folder))
     assert (plan_now.runs, plan_now.finished_count, plan_now.roads) == ([], 4, [])
-    told: list[str] = []
-    run_plan(plan_now, 2, on_message=told.append)
+    messages: list[str] = []
+    run_plan(plan_now, 2, on_message=messages.append)
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert len(told) == 1
+    assert len(messages) == 1
 
 
-def test_the_table_is_made_of_the_rows_of_its_trainings(reproduced: Made) -> None:
+def test_the_table_has_the_means_of_the_trainings(reproduced: Made) -> None:
     folder, _ = reproduced
-    table = {row["name"]: row for row in json.loads((folder / "little" / "table.json").read_text())}
+    table = {row["name"]: row for row in json.loads((folder / "small" / "table.json").read_text())}
     assert list(table) == ["human", "PI", "ACC", "tuned PI", "plain", "with a model"]
     experts = {name: table[name]["return"]["mean"] for name in ("PI", "ACC", "tuned PI")}
     best = max(experts, key=lambda name: experts[name])
     assert [name for name in experts if table[name]["best_expert"]] == [best]
     returns = []
     for seed in (0, 1):
-        run = folder / "runs" / "little" / "plain" / str(seed)
+        run = folder / "runs" / "small" / "plain" / str(seed)
         rows = json.loads((run / "evaluation.json").read_text())["rows"]
         returns.append(np.mean([row["return"] for row in rows if row["driver"] == "trained"]))
     assert table["plain"]["return"]["mean"] == pytest.approx(np.mean(returns))
-    assert [table[name]["drivable"] for name in ("human", "PI")] == ["", "drivable"]
-    assert len(table["plain"]["drivable"]) == 2
-    beyond = table["plain"]["beyond_best_expert"]["mean"]
-    assert beyond == pytest.approx(np.mean(returns) - experts[best])
+    assert [table[name]["feasibility"] for name in ("human", "PI")] == ["", "feasible"]
+    assert len(table["plain"]["feasibility"]) == 2
+    gain = table["plain"]["gain_over_best_expert"]["mean"]
+    assert gain == pytest.approx(np.mean(returns) - experts[best])
     progress = [
-        json.loads((folder / "runs/little/plain" / seed / "progress.jsonl").read_text().splitlines()[-1])
+        json.loads((folder / "runs/small/plain" / seed / "progress.jsonl").read_text().splitlines()[-1])
         for seed in ("0", "1")
     ]
-    lengths = table["plain"]["steady_by_draw"]["length"]
+    lengths = table["plain"]["steady_speed_by_value"]["length"]
     assert list(lengths) == sorted(lengths, key=float)
     assert min(lengths.values()) <= table["plain"]["mean_speed_steady"]["mean"] <= max(lengths.values())
-    assert table[best]["beyond_best_expert"]["mean"] == 0.0
-    assert table["human"]["beyond_best_expert"]["count"] > 0
-    assert math.isnan(beyond_of(table["plain"], "low"))  # two trainings have a range
-    assert beyond_of(table["plain"], "smallest") <= beyond <= beyond_of(table["plain"], "largest")
+    assert table[best]["gain_over_best_expert"]["mean"] == 0.0
+    assert table["human"]["gain_over_best_expert"]["count"] > 0
+    assert math.isnan(gain_entry(table["plain"], "low"))  # two trainings have only a range
+    assert gain_entry(table["plain"], "smallest") <= gain <= gain_entry(table["plain"], "largest")
     convention = table["plain"]["paper_convention"]
     assert convention["speed"]["mean"] == pytest.approx(np.mean([row["cav_mean_speed"] for row in progress]))
     assert math.isclose(convention["reward"]["mean"], np.mean([row["return_mean"] for row in progress]))
-    assert set(pd.read_csv(folder / "little" / "table.csv")["name"]) == set(table)
+    assert set(pd.read_csv(folder / "small" / "table.csv")["name"]) == set(table)
 
 
-def beyond_of(row: dict[str, Any], part: str) -> float:
-    value = row["beyond_best_expert"][part]
+def gain_entry(row: dict[str, Any], part: str) -> float:
+    value = row["gain_over_best_expert"][part]
     return math.nan if value is None else value
 
 
-def test_the_last_checkpoint_stands_beside_the_one_that_was_chosen(tmp_path: Path) -> None:
+def test_the_checkpoint_table_has_the_best_and_the_last_checkpoint(tmp_path: Path) -> None:
     curves = {"trpo": {"return_validation": [[1.0, 9.0, 5.0], [2.0, 3.0, 3.0], [1.0, 6.0, 0.0]]}}
     rows = [
         {"name": "PI", "gains": []},
         {"name": "TRPO", "variant": "trpo", "gains": [0.0, 2.0, 0.0]},
-        {"name": "SAC", "variant": "sac", "gains": [1.0, 2.0, 3.0]},  # of another reward: no returns here
+        {"name": "SAC", "variant": "sac", "gains": [1.0, 2.0, 3.0]},  # another reward: returns are not comparable
     ]
     (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
     (tmp_path / "table.json").write_text(json.dumps(rows))
@@ -153,28 +154,28 @@ def test_the_last_checkpoint_stands_beside_the_one_that_was_chosen(tmp_path: Pat
     assert row["kept the untrained network"] == "2 of 3"
 
 
-def test_a_training_with_other_settings_is_not_taken_for_ours(reproduced: Made) -> None:
+def test_a_training_with_other_settings_is_refused(reproduced: Made) -> None:
     folder, _ = reproduced
-    config = folder / "runs/little/plain/0/config.toml"
+    config = folder / "runs/small/plain/0/config.toml"
     before = config.read_text()
     try:
         atomic_write(config, before.replace("gamma = 0.99", "gamma = 0.9"))
         with pytest.raises(InputError, match="was trained with other settings; allowed: a new folder"):
-            make_plan(["little"], 2, StudyFolder(folder))
+            make_plan(["small"], 2, StudyFolder(folder))
     finally:
         atomic_write(config, before)
 
 
 @pytest.mark.long
-def test_a_stopped_training_goes_on(reproduced: Made, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a stop leaves: no judgement yet, and fewer steps than planned."""
+def test_a_stopped_training_is_continued(reproduced: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stopped training has no evaluation and fewer steps than planned."""
     folder, _ = reproduced
-    run = PlannedRun("little", "plain", 1)
-    monkeypatch.setitem(study.VARIANTS, "plain", replace(study.VARIANTS["plain"], steps=480))
+    run = PlannedRun("small", "plain", 1)
+    monkeypatch.setitem(VARIANTS, "plain", replace(VARIANTS["plain"], steps=480))
     (folder / "runs" / run.name / "evaluation.json").unlink()
-    to_do = make_plan(["little"], 2, StudyFolder(folder))
-    assert run in to_do.runs
-    run_plan(to_do, 2)
+    plan = make_plan(["small"], 2, StudyFolder(folder))
+    assert run in plan.runs
+    run_plan(plan, 2)
     assert read_config(folder / "runs" / run.name).steps == 480
     rows = (folder / "runs" / run.name / "progress.jsonl").read_text().splitlines()
     assert [json.loads(row)["environment_steps"] for row in rows] == [160, 320, 480]

@@ -1,39 +1,41 @@
-"""Does the table say who needs fewer actual steps?"""
+"""The table of environment steps that a road model saves."""
 
 import json
 from pathlib import Path
 
-from unjam_paper.road_model import ON_RAMP_EFFICIENCY_STEPS, compared_variants, road_model_study
+from unjam_paper.road_model import compared_variants, road_model_study
 
 
-def test_returns_stand_beside_those_of_as_few_steps_and_of_three_times_as_many(tmp_path: Path) -> None:
+def test_returns_are_compared_after_multiples_of_the_steps(tmp_path: Path) -> None:
     steps, ends = [12_000.0, 756_000.0], [[2000.0], [2000.0], [2000.0]]
     few = {"steps": steps, "return_validation": [[*end, 2063.0] for end in ends]}
     modelled = {"steps": steps, "return_validation": [[*end, 2126.0] for end in ends]}
     many = {"steps": [96_000.0, 6_000_000.0], "return_validation": [[1000.0, value] for value in (2e3, 2e3, 2e3)]}
-    middle = {"steps": [24_000.0, 1_512_000.0], "return_validation": [[*end, 2100.0] for end in ends]}
-    curves = dict(zip(compared_variants("best"), (modelled, few, middle, many), strict=True))
+    double = {"steps": [24_000.0, 1_512_000.0], "return_validation": [[*end, 2100.0] for end in ends]}
+    curves = dict(zip(compared_variants("best"), (modelled, few, double, many), strict=True))
     (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
     table = road_model_study("ring", "best").tables["efficiency"](tmp_path).set_index("")
-    assert table.loc["ours, few steps and whole roads imagined", "750,000"] == "2125"
+    assert table.loc["ours, few steps and road model", "750,000"] == "2125"
     assert table.loc["ours, few steps", "1,500,000"] == "–"
-    assert table.loc["ours, all its steps", "380,000"] == "–"  # nobody had looked
-    assert table.loc["with the model beyond “ours, few steps” after as many", "380,000"] == "+31"
-    assert table.loc["with the model beyond “ours, twice as many” after 2 times as many", "750,000"] == "+26"
-    assert table.loc["with the model beyond “ours, all its steps” after 3 times as many", "750,000"].startswith("+7")
+    assert table.loc["ours, all steps", "380,000"] == "–"  # before the first validation
+    assert table.loc["with the model, difference to “ours, few steps” after as many", "380,000"] == "+31"
+    assert table.loc["with the model, difference to “ours, double steps” after 2 times as many", "750,000"] == "+26"
+    assert table.loc["with the model, difference to “ours, all steps” after 3 times as many", "750,000"].startswith(
+        "+7"
+    )
 
 
-def test_on_the_on_ramp_both_sizes_of_iterations_stand_beside_the_model_by_how_many_steps_they_took(
-    tmp_path: Path,
-) -> None:
+def test_on_the_on_ramp_both_sizes_of_iterations_are_compared_with_the_model(tmp_path: Path) -> None:
     steps = [28_800.0, 57_600.0, 86_400.0]
     curves = {
-        "ramp-imagined": {"steps": steps[:1], "return_validation": [[-2450.0]] * 3},
+        "ramp-road-model": {"steps": steps[:1], "return_validation": [[-2450.0]] * 3},
         "ramp-few": {"steps": steps, "return_validation": [[-2760.0, -2660.0, -2620.0]] * 3},
         "ramp-small": {"steps": steps, "return_validation": [[-2710.0, -2610.0, -2560.0]] * 3},
     }
     (tmp_path / "curves.json").write_text(json.dumps({"on-ramp": curves}))
-    table = road_model_study("on-ramp", "ramp", ON_RAMP_EFFICIENCY_STEPS).tables["efficiency"](tmp_path).set_index("")
-    beyond = table["28,800"].tail(6)
-    assert list(beyond) == ["+310", "+210", "+170", "+260", "+160", "+110"]
-    assert beyond.index[5] == ("with the model beyond “ours, few steps in small iterations” after 3 times as many")
+    table = road_model_study("on-ramp", "ramp").tables["efficiency"](tmp_path).set_index("")
+    differences = table["28,800"].tail(6)
+    assert list(differences) == ["+310", "+210", "+170", "+260", "+160", "+110"]
+    assert differences.index[5] == (
+        "with the model, difference to “ours, few steps in small iterations” after 3 times as many"
+    )

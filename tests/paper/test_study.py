@@ -18,7 +18,7 @@ def square(number: int) -> dict[str, int]:
 
 
 def refuse(number: int) -> None:
-    raise AssertionError(f"{number} is there already")
+    raise AssertionError(f"{number} is finished already")
 
 
 def named(drivers: dict[str, str]) -> dict[str, str]:
@@ -30,39 +30,39 @@ def parts(count: int) -> dict[str, StudyPart]:
 
 
 def test_each_part_is_a_file(tmp_path: Path) -> None:
-    told: list[str] = []
-    measure_parts(tmp_path / "parts", parts(3), 1, told.append)
-    assert told == ["of-0", "of-1", "of-2"]
+    messages: list[str] = []
+    measure_parts(tmp_path / "parts", parts(3), 1, messages.append)
+    assert messages == ["of-0", "of-1", "of-2"]
     assert read_part(tmp_path / "parts", "of-2") == {"square": 4}
 
 
-def test_what_is_there_is_not_measured_again(tmp_path: Path) -> None:
+def test_finished_parts_are_not_measured_again(tmp_path: Path) -> None:
     measure_parts(tmp_path, parts(2), 1)
     again: dict[str, StudyPart] = {name: (refuse, (number,)) for number, name in enumerate(parts(2))}
     measure_parts(tmp_path, {**again, **parts(3)} | again, 1)
     assert read_part(tmp_path, "of-2") == {"square": 4}
 
 
-def test_a_part_is_measured_again_where_a_shipped_controller_in_it_is_another_file(
+def test_a_part_is_measured_again_if_a_packaged_controller_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[str] = []
+    messages: list[str] = []
     given: dict[str, StudyPart] = {
-        "shipped": (named, ({"ours": "unjam:ring-tuned"},)),
+        "packaged": (named, ({"ours": "unjam:ring-tuned"},)),
         "other": (named, ({"ours": "pi"},)),
     }
     for _ in range(2):
-        measure_parts(tmp_path, given, 1, told.append)
-    assert told == ["shipped", "other"]
-    monkeypatch.setattr("unjam_paper.parts.file_of", lambda driver: "another")
-    measure_parts(tmp_path, given, 1, told.append)
-    assert told == ["shipped", "other", "shipped"]
-    (tmp_path / CONTROLLERS_FILE).unlink()  # as folders of before have it
-    measure_parts(tmp_path, given, 1, told.append)
-    assert len(told) == 3
+        measure_parts(tmp_path, given, 1, messages.append)
+    assert messages == ["packaged", "other"]
+    monkeypatch.setattr("unjam_paper.parts.controller_digest", lambda driver: "another")
+    measure_parts(tmp_path, given, 1, messages.append)
+    assert messages == ["packaged", "other", "packaged"]
+    (tmp_path / f"{CONTROLLERS_FILE}.json").unlink()  # as in older folders
+    measure_parts(tmp_path, given, 1, messages.append)
+    assert len(messages) == 3
 
 
-def test_a_part_that_fails_leaves_the_others(tmp_path: Path) -> None:
+def test_a_failing_part_keeps_the_others(tmp_path: Path) -> None:
     broken: dict[str, StudyPart] = {**parts(1), "broken": (refuse, (1,))}
     with pytest.raises(AssertionError):
         measure_parts(tmp_path, broken, 1)
@@ -75,17 +75,17 @@ def test_processes_measure_the_same(tmp_path: Path) -> None:
     assert [read_part(tmp_path, f"of-{number}")["square"] for number in range(3)] == [0, 1, 4]
 
 
-def test_a_study_keeps_its_first_manifest_and_says_when_it_went_on(tmp_path: Path) -> None:
+def test_a_study_keeps_its_first_manifest_and_lists_resumptions(tmp_path: Path) -> None:
     first = study_manifest(tmp_path)
-    assert "went_on" not in first
+    assert "resumptions" not in first
     (tmp_path / "manifest.json").write_text(json.dumps({**first, "started": "long ago"}))
     study_manifest(tmp_path)
     found = study_manifest(tmp_path)
     assert found["started"] == "long ago"
-    assert [later["commit"] for later in found["went_on"]] == [first["commit"]] * 2
+    assert [one["commit"] for one in found["resumptions"]] == [first["commit"]] * 2
 
 
-def test_an_episode_that_failed_is_told_and_not_left_out_of_a_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_episode_raises_instead_of_being_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     failed = {"status": "failed", "error": "EpisodeError", "reason": "SUMO cannot start", "seed": [1, 0]}
     monkeypatch.setattr(study, "evaluate", lambda *given: Evaluation({"pi": [failed]}, {}))
     with WorkerPool(1) as workers, pytest.raises(EpisodeError, match=r"SUMO cannot start \(seed \[1, 0\]\)"):

@@ -1,0 +1,93 @@
+"""All studies by name, and the names of the paper's tables and figures."""
+
+from unjam.training.road_family import ALL_ROADS_GROUP, SHARED_RINGS_GROUP
+from unjam_paper.adaptation import ADAPTATION
+from unjam_paper.all_roads import ALL_ROADS_STUDY, FAMILY_TEST_SEEDS
+from unjam_paper.assess_examples import ASSESS_EXAMPLES
+from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study
+from unjam_paper.do_no_harm import DO_NO_HARM
+from unjam_paper.envelope import ENVELOPE
+from unjam_paper.feasible import FEASIBLE_FIGURE_EIGHT, FEASIBLE_RING, FEASIBLE_RING_JAMMED, on_ramp_study
+from unjam_paper.figure_6 import FIGURE_6
+from unjam_paper.joint_training import (
+    ALL_ROADS_BASELINES,
+    FRESH_TEST_SEEDS,
+    SHARED_RING_BASELINES,
+    SHARED_RING_ROADS,
+    joint_training_study,
+)
+from unjam_paper.road_model import road_model_study
+from unjam_paper.robustness import FIGURE_10, ROBUSTNESS
+from unjam_paper.study import PAPER_ROADS, Study
+from unjam_paper.theory import FIGURE_8, THEORY
+
+TABLE_1_STUDIES: dict[str, Study] = {
+    f"table-1-{road}": comparison_study(
+        f"TRPO, PPO, SAC, the proposed method and ours on {road}",
+        ("trpo", "ppo", "sac", "proposed", "without-model", "ours"),
+        road,
+    )
+    for road in PAPER_ROADS
+}
+PAPER_EXACT_STUDIES = {f"to-the-letter-{road}": paper_exact_study(road) for road in PAPER_ROADS}
+STUDIES: dict[str, Study] = {
+    **TABLE_1_STUDIES,
+    "figure-5": FIGURE_5,
+    "table-2": comparison_study(
+        "contribution of each part of the method, on the ring",
+        ("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed", "ours-without-model", "ours"),
+    ),
+    "figure-6": FIGURE_6,
+    "figure-8": FIGURE_8,
+    "figure-9": comparison_study(
+        "PPO and SAC within the framework, on the ring",
+        ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed", "without-model"),
+    ),
+    "figure-10": FIGURE_10,
+    "theory": THEORY,
+    "road-model": road_model_study("ring", "best"),
+    "road-model-jammed": road_model_study("ring-jammed", "jammed"),
+    "road-model-figure-eight": road_model_study("figure-eight", "eight"),
+    "road-model-on-ramp": road_model_study("on-ramp", "ramp"),
+    "eq16": comparison_study(
+        "Eq. 16 as printed and as intended, on the ring",
+        ("trpo-eq16", "trpo-as-printed", "proposed-eq16", "proposed-as-printed"),
+    ),
+    **PAPER_EXACT_STUDIES,
+    "robustness": ROBUSTNESS,
+    "feasible-ring": FEASIBLE_RING,
+    "feasible-figure-eight": FEASIBLE_FIGURE_EIGHT,
+    "feasible-ring-jammed": FEASIBLE_RING_JAMMED,
+    "on-ramp-trained": on_ramp_study({"ramp-long": "residual on the expert tuned with the larger budget"}),
+    "on-ramp-alternating": on_ramp_study({"ramp-alternating": "residual on unjam:on-ramp-tuned, alternating updates"}),
+    "envelope": ENVELOPE,
+    "do-no-harm": DO_NO_HARM,
+    "assess-examples": ASSESS_EXAMPLES,
+    "all-roads": ALL_ROADS_STUDY,
+    "adaptation": ADAPTATION,
+    "rings": joint_training_study(
+        "gain of one residual, trained on all rings of the family, on each ring", {"rings": 10}
+    ),
+    "shared-rings": joint_training_study(
+        "tuned and learned controllers where several CAVs share a ring, training rings and unseen rings",
+        {"shared-rings": 10},
+        *(SHARED_RINGS_GROUP, SHARED_RING_BASELINES, SHARED_RING_ROADS, FRESH_TEST_SEEDS),
+    ),
+    "rings-single": joint_training_study(
+        "gain of TRPO and PPO without an expert on the rings of the family", {"rings-trpo": 5, "rings-ppo": 5}
+    ),
+    "all-roads-trained": joint_training_study(
+        "gain of one residual, and of TRPO and PPO without an expert, on all roads of the family",
+        {"all-roads": 10, "all-roads-trpo": 5, "all-roads-ppo": 5},
+        *(ALL_ROADS_GROUP, ALL_ROADS_BASELINES, None, FAMILY_TEST_SEEDS[:5]),  # for each of twenty trainings
+    ),
+}
+"""every study by name"""
+STUDY_GROUPS: dict[str, tuple[str, ...]] = {
+    "table-1": tuple(TABLE_1_STUDIES),
+    "figure-4": tuple(TABLE_1_STUDIES),
+    "figure-7": ("table-2",),
+    "to-the-letter": tuple(PAPER_EXACT_STUDIES),
+    "all": tuple(STUDIES),
+}
+"""names for one study or several; a figure is drawn with the table of the same trainings"""

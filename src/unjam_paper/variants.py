@@ -1,0 +1,130 @@
+"""Variants of training: the methods of the paper with its settings, and those of unjam."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from unjam.models.settings import ModelSettings
+
+STEP_BUDGET, MILLION_STEPS = 300_000, 1_000_000
+"""environment steps of a training; the larger budget where it takes less than an hour"""
+PAPER_STEP_BUDGET = 4_000_000
+"""environment steps of a training in the paper"""
+RINGS_EXPERT, SHARED_RINGS_EXPERT = "unjam:rings-tuned", "unjam:shared-rings-tuned"
+"""best experts for all rings of the family, and for rings that several CAVs share"""
+ON_RAMP_JAM_AHEAD = (
+    "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,"
+    "max_deceleration=1.106,time_constant=1.681"
+)
+"""result of `unjam tune on-ramp --expert jam-ahead --set penetration_rate=0.05 --steps 4608000`, mostly in batches;
+with 710,400 steps, all in SUMO, it is `unjam:on-ramp-tuned`"""
+MERGE_JAM_ABSORBER = "jam-absorber:gap_gain=0,extra_acceleration=0.9,speed_gain=0.8"
+"""best expert on the merge"""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to train, as changes to a preset."""
+
+    label: str
+    preset: str
+    changes: dict[str, Any]
+    steps: int | None = STEP_BUDGET
+    """None: the steps of the preset"""
+    paper_variant: str = ""
+    """the variant whose numbers the paper reports, if it has another name here"""
+
+
+def reduced_step_variants(
+    prefix: str, batch_steps: int, steps: int, horizon: int = 3000, **common_changes: Any
+) -> dict[str, Variant]:
+    """Return `best` with an eighth of the steps of a road: alone, with twice as many, and with a model of the road.
+
+    With the model an eighth of each iteration is environment steps; the rest are episodes of `horizon` control steps in
+    the model. `common_changes` apply to all three.
+    """
+    few, double = (
+        {"simulator": "batch", **common_changes, "trpo.steps_per_iteration": times * batch_steps} for times in (1, 2)
+    )
+    model = {"model.model_ratio": 7.0, "model.kind": "road", "model.rollout_starts": "first", "model.k_max": horizon}
+    return {
+        f"{prefix}-few": Variant("ours, few steps", "best", few, steps),
+        f"{prefix}-double": Variant("ours, double steps", "best", double, 2 * steps),
+        f"{prefix}-road-model": Variant("ours, few steps and road model", "best", {**few, **model}, steps),
+    }
+
+
+NO_MODEL = {
+    **{f"model.{name}": getattr(ModelSettings, name) for name in ("kind", "rollout_starts", "k_max", "update_mode")},
+    "model.model_ratio": 0.0,
+}
+WEAK_EXPERT = {"expert": "jam-ahead:speed_margin=2,margin_by_penetration=0", "simulator": "sumo"}
+"""an expert without effect on the on-ramp: the tuned one leaves little to learn"""
+ON_RAMP_VARIANTS = reduced_step_variants("ramp", 9_600, 86_400, horizon=2400, **WEAK_EXPERT, **NO_MODEL)
+SMALL_ITERATIONS = {
+    **ON_RAMP_VARIANTS["ramp-few"].changes,
+    **{"trpo.steps_per_iteration": 4_800, "evaluation.validation_interval": 6},
+}
+"""twice as many updates from the same steps: as many as alternating updates make with three times their steps"""
+LONG_TRAINING = {
+    **{"expert": ON_RAMP_JAM_AHEAD, "simulator": "batch", "trpo.steps_per_iteration": 153_600, **NO_MODEL},
+    **{"evaluation.validation_interval": 10, "evaluation.validation_episodes": 128},
+}
+NO_EXPERT = {"expert": "none", "model.model_ratio": 0.0}
+NO_EARLY_STOPPING = {"evaluation.convergence_window": 0}
+TWO_EPISODES_PER_ROAD = {"evaluation.episodes": 2}
+"""the studies themselves evaluate on all roads, training roads and unseen roads"""
+FROM_SCRATCH = {
+    **{"expert": "none", "policy.exploration_std": 0.5, **TWO_EPISODES_PER_ROAD},
+    **{f"{agent}.steps_per_iteration": 60_000 for agent in ("trpo", "ppo")},
+    **{f"{agent}.gamma": 0.99 for agent in ("trpo", "ppo")},
+    **{"trpo.target_kl": 0.01, "ppo.epochs": 20},
+    **{"evaluation.validation_interval": 5, "evaluation.validation_episodes": 4},
+}
+"""learning without an expert on many roads: with the small exploration noise of a residual, CAVs learn to stand"""
+FIRST_150_SECONDS = {
+    **{"scenario_options.horizon": 1500, "trpo.steps_per_iteration": 48_000, "trpo.target_kl": 0.016},
+    **{"trpo.gamma": 0.996, "trpo.gae_lambda": 0.96, "policy.exploration_std": 0.05, "policy.action_duration": 1.5},
+}
+"""found by a search on the first half of the episodes of the jammed ring; `best` was found on whole episodes"""
+EXACT_TRPO = {**NO_EXPERT, **NO_EARLY_STOPPING}
+PPO, SAC = {"agent": "ppo"}, {"agent": "sac"}
+VARIANTS: dict[str, Variant] = {
+    "trpo": Variant("TRPO", "paper", NO_EXPERT),
+    "ppo": Variant("PPO", "paper", {**PPO, **NO_EXPERT}),
+    "sac": Variant("SAC", "paper", {**SAC, **NO_EXPERT}),
+    "mb-trpo": Variant("MB-TRPO", "paper", {"expert": "none", "model.base": "none"}),
+    "no-initial-policy": Variant("no initial policy", "paper", {"expert": "none"}),
+    "without-model": Variant("residual without model", "paper", {"model.model_ratio": 0.0}),
+    "proposed": Variant("proposed", "paper", {}),
+    "proposed-ppo": Variant("proposed with PPO", "paper", PPO),
+    "proposed-sac": Variant("proposed with SAC", "paper", SAC),
+    "trpo-eq16": Variant("TRPO, Eq. 16 as meant", "paper", {**NO_EXPERT, "reward": "eq16"}),
+    "trpo-as-printed": Variant("TRPO, Eq. 16 as printed", "paper", {**NO_EXPERT, "reward": "eq16-as-printed"}),
+    "proposed-eq16": Variant("proposed, Eq. 16 as meant", "paper", {"reward": "eq16"}),
+    "proposed-as-printed": Variant("proposed, Eq. 16 as printed", "paper", {"reward": "eq16-as-printed"}),
+    "trpo-exact": Variant("TRPO", "paper-exact", EXACT_TRPO, PAPER_STEP_BUDGET, "trpo"),
+    "proposed-exact": Variant("proposed", "paper-exact", NO_EARLY_STOPPING, PAPER_STEP_BUDGET, "proposed"),
+    "trpo-exact-million": Variant("TRPO", "paper-exact", EXACT_TRPO, MILLION_STEPS, "trpo"),
+    "proposed-exact-million": Variant("proposed", "paper-exact", NO_EARLY_STOPPING, MILLION_STEPS, "proposed"),
+    "ours": Variant("ours", "quick", {}),
+    "ours-without-model": Variant("ours without model", "quick", {"model.model_ratio": 0.0}),
+    "best": Variant("ours, all steps", "best", {}, None),
+    **reduced_step_variants("best", 12_000, 756_000),
+    **reduced_step_variants("jammed", 24_000, 768_000),
+    **reduced_step_variants("eight", 6_000, 612_000, horizon=1500),
+    **ON_RAMP_VARIANTS,
+    "ramp-road-model": replace(ON_RAMP_VARIANTS["ramp-road-model"], changes=WEAK_EXPERT, steps=28_800),
+    "ramp-alternating": Variant("ours, alternating updates", "best", {}, None),
+    "ramp-long": Variant("ours, on the expert tuned with the larger budget", "best", LONG_TRAINING, 4_608_000),
+    "ramp-small": Variant("ours, few steps in small iterations", "best", SMALL_ITERATIONS, 86_400),
+    "best-in-batches": Variant("ours, all steps", "best", {"simulator": "batch"}, None),
+    "first-150-seconds": Variant("residual", "best", FIRST_150_SECONDS, None),
+    "rings": Variant("residual", "rings", TWO_EPISODES_PER_ROAD, None),
+    "shared-rings": Variant("residual", "shared-rings", TWO_EPISODES_PER_ROAD, None),
+    "rings-trpo": Variant("TRPO", "rings", FROM_SCRATCH, 1_200_000),
+    "rings-ppo": Variant("PPO", "rings", {**PPO, **FROM_SCRATCH}, 1_200_000),
+    "all-roads": Variant("residual", "all-roads", TWO_EPISODES_PER_ROAD, None),
+    "all-roads-trpo": Variant("TRPO", "all-roads", FROM_SCRATCH, MILLION_STEPS),
+    "all-roads-ppo": Variant("PPO", "all-roads", {**PPO, **FROM_SCRATCH}, MILLION_STEPS),
+}
+"""variants by name"""
