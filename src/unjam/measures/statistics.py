@@ -131,7 +131,7 @@ def paired_difference(
 
 
 def linearized_ratio(numerators: Any, denominators: Any) -> Any:
-    """Return values whose mean is the ratio of the means, and whose CI is that of this ratio (delta method).
+    """Return values with the ratio of the means as mean, and its CI as CI (delta method).
 
     Numerators and denominators are measured on the same seeds, so their errors are correlated; shape (seeds,).
     Source: Cochran 1977, Sampling Techniques, section 6.3.

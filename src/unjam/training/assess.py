@@ -1,7 +1,7 @@
-"""What would CAVs do on the user's own road? Controllers at several penetration rates, and two baselines.
+"""Assessment of CAVs on a user's network: controllers at several penetration rates, compared with two baselines.
 
-The baselines are human drivers alone, and ACC vehicles without a controller. A controller is chosen for each
-penetration rate on tuning seeds and tested on others; a rule says whether it is recommended.
+The baselines are human drivers alone, and ACC vehicles without a controller. A controller is selected for each
+penetration rate on selection seeds and tested on others; a rule decides whether it is recommended.
 """
 
 import json
@@ -16,6 +16,7 @@ from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.effect import AccResult, ControllerResult, assessment_headline, plotted_result, recommended_result
+from unjam.measures.feasibility import HARD_BRAKING_METRIC
 from unjam.measures.notes import check_baseline, episode_notes
 from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
@@ -23,19 +24,19 @@ from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
 from unjam.training.evaluate import Evaluation, evaluate_on_roads, raise_failure, save_evaluation
+from unjam.training.executors import MessageCallback
 from unjam.training.run_folder import make_new_folder
 from unjam.training.seeds import make_test_seeds
 from unjam.training.selection import (
     ACC_DRIVER,
     HUMAN_BASELINE,
     UNCHANGED_ACC_DRIVER,
+    AssessmentFindings,
     EpisodeBudget,
     EpisodeSeed,
     Option,
-    OptionMessageCallback,
     OptionRows,
     Selection,
-    AssessmentFindings,
     compare_on_test_seeds,
     format_duration,
     min_episodes,
@@ -45,25 +46,25 @@ from unjam.worlds.episode import can_drive
 from unjam.worlds.worker_pool import WorkerPool
 
 DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
-"""controllers that are tried where none is named: they fit roads with ends"""
+"""default controllers, which suit open roads"""
 ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "speed_gain")
 """settings of the CAVs' ACC that replace a property of the vehicle"""
 MIN_BASELINE_EPISODES = 20
-"""episodes of the baseline for which early ends are counted before the last one: two of them are too many"""
+"""episodes of the baseline to which early ends are related before the last one: two of them are too many"""
 PLOT_EPISODE_COUNT = 2
-"""episodes of the budget that are kept for pictures"""
+"""episodes of the budget that are kept for figures"""
 ZERO_PENETRATION_RATE = 1e-12
-"""share of CAVs where people are alone: a network without any is not allowed"""
+"""penetration rate of human-only traffic: zero is not allowed on user networks"""
 SELECTION_FOLDER = "selection"
-"""folder within the results: the rows of the seeds that chose"""
+"""folder within the results with the rows of the selection seeds"""
 CAV_SELECTION_OPTIONS = "penetration_rate", "cav_types", "cavs"
-"""settings of a road that the penetration rates stand for"""
-BASELINE_METRICS = ("travel_time", "outflow_veh_per_h", "fuel_ml_per_km", "human_braking_beyond_4_5", "collisions")
+"""options of a road that the penetration rates replace"""
+BASELINE_METRICS = ("travel_time", "outflow_veh_per_h", "fuel_ml_per_km", HARD_BRAKING_METRIC, "collisions")
 
 
 @dataclass(frozen=True)
 class AssessmentRequest:
-    """What is asked of a road; everything in it has been checked."""
+    """The settings of an assessment, all of them checked."""
 
     file: str
     network: UserNetwork
@@ -72,36 +73,33 @@ class AssessmentRequest:
     """the controllers"""
     penetration_rates: tuple[float, ...]
     episodes: int
-    """at most, in all"""
+    """total budget"""
     minutes: float | None
-    """at most, looked at between batches"""
+    """time budget, checked between batches"""
     precision: float
-    """half-width of the interval of travel time that is narrow enough, as a share of people's"""
+    """target half-width of the CI of travel time, as a share of the baseline's travel time"""
 
     @property
     def options(self) -> list[Option]:
         """All penetration rates with all controllers."""
-        return [Option(share, driver) for share in self.penetration_rates for driver in self.drivers]
+        return [Option(rate, driver) for rate in self.penetration_rates for driver in self.drivers]
 
     @property
     def has_acc_properties(self) -> bool:
-        """Whether the user replaces a property of the vehicles by another one for CAVs."""
+        """Whether the user replaces a property of the vehicles for CAVs."""
         return any(getattr(self.network.cruise, name) is not None for name in ACC_PROPERTIES)
 
     def make_setup(self, option: Option) -> tuple[Scenario, Driver]:
-        """Return the road with so many CAVs, and their driver."""
+        """Return the road with this penetration rate, and the driver of the CAVs."""
         if option == HUMAN_BASELINE:
             return self.network, make_driver(HUMAN_BASELINE.driver, self.network.control_step)
         road = replace(self.network, penetration_rate=option.penetration_rate)
         if option.driver not in (ACC_DRIVER, UNCHANGED_ACC_DRIVER):
             return road, self.drivers[option.driver]
-        cruise = road.cruise
-        if option.driver == UNCHANGED_ACC_DRIVER:
-            cruise = replace(cruise, **dict.fromkeys(ACC_PROPERTIES))
-        safety = replace(road.safety, active=False)
-        return replace(road, actuation="cruise", safety=safety, cruise=cruise), make_driver(
-            ACC_DRIVER, road.control_step
-        )
+        unchanged = dict.fromkeys(ACC_PROPERTIES if option.driver == UNCHANGED_ACC_DRIVER else ())
+        safety, cruise = replace(road.safety, active=False), replace(road.cruise, **unchanged)
+        road = replace(road, actuation="cruise", safety=safety, cruise=cruise)
+        return road, make_driver(ACC_DRIVER, road.control_step)
 
 
 def make_request(
@@ -113,52 +111,50 @@ def make_request(
     drivers: Sequence[str] = DEFAULT_CONTROLLERS,
     options: dict[str, Any] | None = None,
 ) -> AssessmentRequest:
-    """Return a question whose parts have been checked; a share of 0 is always asked for.
+    """Return a checked request; raise `InputError` if an argument is wrong.
 
-    Raises:
-        InputError: one of them is wrong.
+    The human baseline is always included, with or without a penetration rate of 0.
     """
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
     for name in [name for name in options or {} if name in CAV_SELECTION_OPTIONS]:
         raise InputError(f"{name}: it is not allowed here: --penetration-rates says how many vehicles are CAVs")
-    for share in penetration_rates:
-        if not 0 <= share <= 1:
-            raise invalid_value("penetration_rates", share, ">= 0, <= 1")
-    asked = tuple(sorted(set(penetration_rates) - {0.0}))
-    if not asked:
-        raise invalid_value(
-            "penetration_rates", ",".join(f"{share:g}" for share in penetration_rates), "one above 0 at least"
-        )
+    for rate in penetration_rates:
+        if not 0 <= rate <= 1:
+            raise invalid_value("penetration_rates", rate, ">= 0, <= 1")
+    rates = tuple(sorted(set(penetration_rates) - {0.0}))
+    if not rates:
+        text = ",".join(f"{rate:g}" for rate in penetration_rates)
+        raise invalid_value("penetration_rates", text, "one above 0 at least")
     if minutes is not None and not minutes > 0:
         raise invalid_value("minutes", minutes, "> 0")
     if not 0 < precision < 1:
         raise invalid_value("precision", precision, "> 0, < 1")
     road = make_scenario(file, {**ACC_SETTINGS, **(options or {}), "penetration_rate": ZERO_PENETRATION_RATE})
     assert isinstance(road, UserNetwork)
-    made = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
-    for name, driver in made.items():
+    controllers = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
+    for name, driver in controllers.items():
         if driver.is_native or not can_drive(driver, road):
-            why = "the human baseline is driven anyway" if driver.is_native else "one that needs no closed road"
-            raise invalid_value("driver", name, why)
-    asked_for = AssessmentRequest(file, road, made, asked, episodes, minutes, precision)
-    least = min_episodes(len(asked), len(made), asked_for.has_acc_properties) + PLOT_EPISODE_COUNT
-    if episodes < least:
-        controllers = f"{len(asked)} penetration rates and {len(made)} controllers"
-        raise invalid_value("episodes", episodes, f">= {least} for {controllers}")
-    return asked_for
+            allowed = "the human baseline is always included" if driver.is_native else "one that needs no closed road"
+            raise invalid_value("driver", name, allowed)
+    request = AssessmentRequest(file, road, controllers, rates, episodes, minutes, precision)
+    minimum = min_episodes(len(rates), len(controllers), request.has_acc_properties) + PLOT_EPISODE_COUNT
+    if episodes < minimum:
+        allowed = f">= {minimum} for {len(rates)} penetration rates and {len(controllers)} controllers"
+        raise invalid_value("episodes", episodes, allowed)
+    return request
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """The answer."""
+    """The result of an assessment."""
 
     controller_results: list[ControllerResult]
-    """the controller that was chosen for each penetration rate; none where all were set aside"""
+    """of the selected controller of each penetration rate; empty if all were rejected"""
     acc_results: list[AccResult]
-    """what ACC vehicles alone do at each penetration rate"""
+    """of ACC vehicles alone at each penetration rate"""
     document: dict[str, Any]
-    """all of it but the rows, as `assessment.json` has it"""
+    """the content of `assessment.json`: everything except the rows"""
     page: Path
 
 
@@ -167,16 +163,13 @@ def assess(
     folder: Path,
     workers: WorkerPool,
     progress: Callable[[Any, int], None] | None = None,
-    on_message: OptionMessageCallback = lambda line: None,
+    on_message: MessageCallback = lambda line: None,
 ) -> Assessment:
-    """Answer a question, and write rows, `assessment.json` and the page into a new folder.
+    """Run an assessment, and write rows, `assessment.json` and the page into a new folder.
 
-    Nothing is written before all is known. The result does not depend on how many workers drive, where no
-    minutes are asked for. `progress` is told now and then how many decisions an episode has made, `on_line`
-    gets a line for each batch of episodes.
-
-    Raises:
-        InputError: the folder holds something, or no driver can drive this road.
+    Files are written at the end. Without `minutes`, the result does not depend on the number of workers. `progress` is
+    called repeatedly with the control steps of an episode, `on_message` with a line for each batch of episodes. Raise
+    `InputError` if the folder is not empty, or no driver can drive on this road.
     """
     make_new_folder(folder)
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
@@ -191,60 +184,57 @@ def assess(
             if progress is not None:
                 progress((batch, *episode), steps)
 
-        found = evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots)
+        evaluation = evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots)
         budget.spend(len(options) * len(seeds))
-        return found
+        return evaluation
 
     def run_options(options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
         rows = evaluate_options(options, seeds).rows
-        humans = rows[HUMAN_BASELINE.label]
-        baseline.extend(humans)
+        human_rows = rows[HUMAN_BASELINE.label]
+        baseline.extend(human_rows)
         check_baseline(baseline, MIN_BASELINE_EPISODES)
-        # On a seed with which a small share picks no vehicle, human drivers alone are driven.
+        # If a low penetration rate selects no vehicle for a seed, the traffic is the human baseline.
         return {
             option: [
-                alone if row["error"] == NoCavError.__name__ else row
-                for row, alone in zip(rows[option.label], humans, strict=True)
+                human if row["error"] == NoCavError.__name__ else row
+                for row, human in zip(rows[option.label], human_rows, strict=True)
             ]
             for option in options
         }
 
     first = evaluate_options([HUMAN_BASELINE], make_test_seeds(1), with_plots=True)
     raise_failure(first.rows[HUMAN_BASELINE.label])
-    took, whole = format_duration(budget.elapsed_seconds), format_duration(budget.estimate_seconds(budget.episodes))
+    duration, total = format_duration(budget.elapsed_seconds), format_duration(budget.estimate_seconds(budget.episodes))
     on_message(
-        f"an episode of the human baseline took {took}; all {request.episodes} episodes on {workers.count} "
-        f"workers may take {whole}" + (f", but at most {request.minutes:g} min" if request.minutes else "")
+        f"an episode of the human baseline took {duration}; all {request.episodes} episodes on {workers.count} "
+        f"workers may take {total}" + (f", but at most {request.minutes:g} min" if request.minutes else "")
     )
-    choice = select_controllers(request.options, run_options, budget, on_message)
-    chose = budget.used_episodes - 1
-    tested = compare_on_test_seeds(
-        choice.finalists,
-        request.penetration_rates,
-        request.has_acc_properties,
-        run_options,
-        budget,
-        request.precision,
-        on_message,
+    selection = select_controllers(request.options, run_options, budget, on_message)
+    selection_episodes = budget.used_episodes - 1
+    rates, precision = request.penetration_rates, request.precision
+    findings = compare_on_test_seeds(
+        selection.finalists, rates, request.has_acc_properties, run_options, budget, precision, on_message
     )
-    best = plotted_result(tested.controller_results)
-    option = Option(best.penetration_rate, best.driver) if best else Option(request.penetration_rates[-1], ACC_DRIVER)
-    shown = first.plot_episodes | evaluate_options([option], make_test_seeds(1), with_plots=True).plot_episodes
+    best = plotted_result(findings.controller_results)
+    plotted = Option(best.penetration_rate, best.driver) if best else Option(rates[-1], ACC_DRIVER)
+    plot_episodes = first.plot_episodes
+    plot_episodes |= evaluate_options([plotted], make_test_seeds(1), with_plots=True).plot_episodes
 
-    about = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
-    tried = {option.label: found for option, found in choice.rows.items()}
-    rows = {option.label: found for option, found in tested.rows.items()}
+    metadata = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
+    selection_rows = {option.label: rows for option, rows in selection.rows.items()}
+    test_rows = {option.label: rows for option, rows in findings.rows.items()}
     check_baseline(baseline)
-    notes = [
-        *episode_notes({label: [*tried.get(label, ()), *found] for label, found in rows.items()}),
-        *request.network.notes,
-    ]
-    document = {**about, **_assessment_document(request, choice, tested, chose, budget), "notes": notes}
-    save_evaluation(folder / SELECTION_FOLDER, Evaluation(tried, {}), about)
-    save_evaluation(folder, Evaluation(rows, shown), about)
+    all_rows = {label: [*selection_rows.get(label, ()), *rows] for label, rows in test_rows.items()}
+    document = {
+        **metadata,
+        **_assessment_document(request, selection, findings, selection_episodes, budget),
+        "notes": [*episode_notes(all_rows), *request.network.notes],
+    }
+    save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
+    save_evaluation(folder, Evaluation(test_rows, plot_episodes), metadata)
     atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
     page = write_assessment(folder, folder / ASSESSMENT_PAGE)
-    return Assessment(tested.controller_results, tested.acc_results, json.loads(to_json(document)), page)
+    return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
 
 
 def _assessment_document(
@@ -254,9 +244,9 @@ def _assessment_document(
     selection_episodes: int,
     budget: EpisodeBudget,
 ) -> dict[str, Any]:
-    """Return what is known in the end, but for the rows."""
     best = recommended_result(findings.controller_results)
-    tried = [
+    baseline_rows = findings.rows[HUMAN_BASELINE]
+    candidates = [
         {
             **option._asdict(),
             "rejection_reason": selection.rejection_reasons.get(option, ""),
@@ -267,9 +257,7 @@ def _assessment_document(
         if selection.rows[option]
     ]
     return {
-        "headline": assessment_headline(
-            findings.controller_results, findings.acc_results, findings.rows[HUMAN_BASELINE]
-        ),
+        "headline": assessment_headline(findings.controller_results, findings.acc_results, baseline_rows),
         "recommended": best and {"penetration_rate": best.penetration_rate, "driver": best.driver},
         "controller_results": [
             {**asdict(each), "reasons": each.reasons, "summary": each.summary} for each in findings.controller_results
@@ -277,8 +265,8 @@ def _assessment_document(
         "acc_results": [
             {**asdict(each), "driver": ACC_DRIVER, "summary": each.summary} for each in findings.acc_results
         ],
-        "candidates": tried,
-        "baseline": {name: asdict(metric_estimate(findings.rows[HUMAN_BASELINE], name)) for name in BASELINE_METRICS},
+        "candidates": candidates,
+        "baseline": {name: asdict(metric_estimate(baseline_rows, name)) for name in BASELINE_METRICS},
         "road": {**scenario_recipe(request.network), "file": request.file},
         "human_drivers": request.network.human_description,
         "drivers": {name: driver.recipe().get("parameters", {}) for name, driver in request.drivers.items()},
@@ -286,5 +274,5 @@ def _assessment_document(
         "precision": request.precision,
         "budget": {"episodes": request.episodes, "minutes": request.minutes},
         "episodes": {"selection": selection_episodes, "total": budget.used_episodes},
-        "seeds": {"selection": len(selection.rows[HUMAN_BASELINE]), "test": len(findings.rows[HUMAN_BASELINE])},
+        "seeds": {"selection": len(selection.rows[HUMAN_BASELINE]), "test": len(baseline_rows)},
     }

@@ -1,7 +1,7 @@
-"""Calibration: how people drive on a user's own road, and how many, so that detectors measure what they did.
+"""Calibration of the human drivers and the demand of a user's network, so that detectors measure what they did.
 
-`unjam calibrate`, with Optuna, in SUMO. What is varied are factors on what the network's own files say: types
-that differ go on differing. Some seeds choose, others judge.
+`unjam calibrate`, with Optuna, in SUMO. It varies factors on the values in the network's own files, so that differences
+between vehicle types remain. Tuning seeds select the factors, test seeds evaluate them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,37 +22,37 @@ from unjam.processes import PrivateFolder
 from unjam.sumo_files.variants import write_variant
 from unjam.training.corridor import FACTOR_RANGES, FLOW_FACTOR, CalibrationFactors, Corridor, scale_vehicle_types
 from unjam.training.search import import_optuna
-from unjam.training.search_space import SearchSpace
+from unjam.training.search_space import SearchSpace, suggest_values
 from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.training.trial_log import TrialLog
 from unjam.worlds.sumo.detector_pool import DetectorPool
 
 CALIBRATED_NETWORK_FILE, CALIBRATION_FILE = "calibrated.sumocfg", "calibration.json"
 CALIBRATION_FINALISTS = 3
-"""trials that drive again, on twice as many other seeds: else the luckiest would win"""
+"""trials that run again on twice as many other seeds, because the best of many trials is partly lucky"""
 CALIBRATION_TEST_SEEDS = 10
-"""seeds on which the best and the original are judged"""
+"""seeds on which the best and the original factors are evaluated"""
 
 
 @dataclass(frozen=True)
 class CalibrationTrial:
-    """Factors that were tried."""
+    """A trial of factors."""
 
     factors: CalibrationFactors
     score: float | None
-    """mean over the seeds; None where SUMO could not drive so"""
+    """mean over the seeds; None if SUMO failed"""
     failure: str
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """What a calibration found."""
+    """Result of a calibration."""
 
     factors: CalibrationFactors
     vehicle_types: dict[str, dict[str, str]]
-    """attributes that vehicle types have now, by id"""
+    """changed attributes of vehicle types, by id"""
     original: list[Agreement]
-    """on seeds that chose nothing"""
+    """on test seeds"""
     calibrated: list[Agreement]
     """on the same seeds"""
     trials: list[CalibrationTrial]
@@ -60,19 +60,19 @@ class CalibrationResult:
     """the new configuration"""
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
-        """Return each measure's mean with its interval: original, calibrated, and the difference by seed."""
-        found = {}
+        """Return the mean of each measure with its CI: original, calibrated, and the paired difference."""
+        estimates = {}
         for name in asdict(self.original[0]):
             before, after = (
-                np.array([getattr(one, name) for one in rows]) for rows in (self.original, self.calibrated)
+                np.array([getattr(each, name) for each in rows]) for rows in (self.original, self.calibrated)
             )
             columns = {"original": before, "calibrated": after, "difference": after - before}
-            most = 1.0 if name == "geh_below_5" else inf
-            found[name] = {
-                column: estimate(values.tolist(), bounds=UNBOUNDED if column == "difference" else (0.0, most))
+            bounds = (0.0, 1.0 if name == "geh_below_5" else inf)
+            estimates[name] = {
+                column: estimate(values.tolist(), bounds=UNBOUNDED if column == "difference" else bounds)
                 for column, values in columns.items()
             }
-        return found
+        return estimates
 
 
 def calibrate(
@@ -87,90 +87,86 @@ def calibrate(
 ) -> CalibrationResult:
     """Search factors on vehicle types and flows, and write the best as a network and `calibration.json`.
 
-    What was tried is kept in the folder: a calibration that was stopped goes on where it was, also with more
-    trials, and finds the same.
+    The trials are stored in the folder: an interrupted calibration resumes with the same result, also with more trials.
 
     Args:
-        asked: the network and its measurements.
+        corridor: the network and its measurements.
         folder: new, empty, or that of this calibration.
-        counting: simulates; the result does not depend on how many at once.
-        space: what is varied: factors by the names of `FACTOR_RANGES`.
-        trials: in all; the first is the network as it is, or what is nearest to it.
-        seeds: of each trial.
+        simulator: the result does not depend on its number of processes.
+        space: factors to vary, by the names of `FACTOR_RANGES`.
+        trials: total number; the first one has factors of one, or the nearest values in the space.
+        seeds_per_trial: number of seeds.
         seed: of the proposals.
-        on_line: gets a line for each trial.
+        on_message: called with a line for each trial.
 
     Raises:
-        InputError: the folder holds something else.
-        UnjamError: SUMO cannot drive the network as it is, or was lost again and again.
+        InputError: the folder is not empty and of something else.
+        UnjamError: SUMO cannot simulate the original network, or its process was lost repeatedly.
     """
     original = dict.fromkeys(space, 1.0)
-    tried = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})
+    log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})
+    measurements = corridor.measurements
 
     def simulate(factors: CalibrationFactors, seeds: Sequence[tuple[int, ...]]) -> list[Agreement]:
         with PrivateFolder() as private:
             scenario = corridor.scenario(_write_network(corridor, factors, Path(private) / CALIBRATED_NETWORK_FILE))
-            passed = simulator.run(scenario, seeds, corridor.loops)
-        return [
-            compute_agreement(
-                corridor.measurements, *aggregate_passages(corridor.measurements, corridor.loop_numbers, one)
-            )
-            for one in passed
-        ]
+            runs = simulator.run(scenario, seeds, corridor.loops)
+        flows_and_speeds = (aggregate_passages(measurements, corridor.loop_numbers, passages) for passages in runs)
+        return [compute_agreement(measurements, *each) for each in flows_and_speeds]
 
     def score_factors(factors: CalibrationFactors, first: int, count: int) -> CalibrationTrial:
         text = to_json(factors)
-        if (first, text) not in tried.verdicts:
+        if (first, text) not in log.verdicts:
             try:
                 rows = simulate(factors, tuning_seeds(count, first))
-                tried.add(first, text, (float(np.mean([row.score for row in rows])), ""))
-            except LostWorkerError:  # says nothing of these factors
+                log.add(first, text, (float(np.mean([row.score for row in rows])), ""))
+            except LostWorkerError:  # says nothing about these factors
                 raise
             except EpisodeError as error:
                 if factors == original:
                     raise UnjamError(f"{corridor.files.path.name}: as it is: {error}") from None
-                tried.add(first, text, (None, str(error)))
-        return CalibrationTrial(factors, *tried.verdicts[first, text])
+                log.add(first, text, (None, str(error)))
+        return CalibrationTrial(factors, *log.verdicts[first, text])
 
-    optuna, found = import_optuna("calibrate"), list[CalibrationTrial]()
+    optuna, results = import_optuna("calibrate"), list[CalibrationTrial]()
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed, multivariate=True))
-    ends = {name: values.boundary_values for name, values in space.items()}
-    study.enqueue_trial({name: min(max(1.0, low), high) for name, (low, high) in ends.items()})
-    as_it_is = score_factors(original, 0, seeds_per_trial)
+    limits = {name: values.boundary_values for name, values in space.items()}
+    study.enqueue_trial({name: min(max(1.0, low), high) for name, (low, high) in limits.items()})
+    original_trial = score_factors(original, 0, seeds_per_trial)
     for number in range(trials):
-        trial = study.ask()
-        for name, values in space.items():
-            values.suggest(trial, name)
-        factors = {name: float(f"{value:.4g}") for name, value in trial.params.items()}
-        found.append(one := score_factors(factors, 0, seeds_per_trial))
-        study.tell(trial, one.score, state=None if one.score is not None else optuna.trial.TrialState.FAIL)
-        said = one.failure if one.score is None else f"{one.score:.4g}"
-        on_message(f"{number + 1} of {trials}: {_factor_text(one.factors)}: {said}")
-    ranked = sorted((one for one in found if one.score is not None), key=_ranking_score)[:CALIBRATION_FINALISTS]
-    again = [score_factors(one.factors, seeds_per_trial, 2 * seeds_per_trial) for one in (*ranked, as_it_is)]
-    best = min(again, key=_ranking_score).factors
-    on_message(f"judged on {CALIBRATION_TEST_SEEDS} other seeds: {_factor_text(best)}")
+        asked = study.ask()
+        factors = {name: float(f"{value:.4g}") for name, value in suggest_values(asked, space).items()}
+        results.append(trial := score_factors(factors, 0, seeds_per_trial))
+        study.tell(asked, trial.score, state=None if trial.score is not None else optuna.trial.TrialState.FAIL)
+        text = trial.failure if trial.score is None else f"{trial.score:.4g}"
+        on_message(f"{number + 1} of {trials}: {_factor_text(trial.factors)}: {text}")
+    ranked = sorted((each for each in results if each.score is not None), key=_ranking_score)[:CALIBRATION_FINALISTS]
+    finalists = [
+        score_factors(each.factors, seeds_per_trial, 2 * seeds_per_trial) for each in (*ranked, original_trial)
+    ]
+    best = min(finalists, key=_ranking_score).factors
+    on_message(f"evaluating on {CALIBRATION_TEST_SEEDS} test seeds: {_factor_text(best)}")
     before, after = (simulate(factors, make_test_seeds(CALIBRATION_TEST_SEEDS)) for factors in (original, best))
     types, file = scale_vehicle_types(corridor.files, best), folder / CALIBRATED_NETWORK_FILE
-    calibrated = CalibrationResult(best, types, before, after, found, file)
-    _write_network(corridor, best, file)
-    about = {**corridor.metadata(), "seed": seed, "seeds": {"trial": seeds_per_trial, "test": CALIBRATION_TEST_SEEDS}}
-    atomic_write(
-        folder / CALIBRATION_FILE,
-        to_json(
-            {**about, **calibration_document(calibrated), "manifest": {**manifest(), "starts": tried.starts}}, indent=1
-        ),
-    )
-    return calibrated
+    result = CalibrationResult(best, types, before, after, results, _write_network(corridor, best, file))
+    document = {
+        **corridor.metadata(),
+        "seed": seed,
+        "seeds": {"trial": seeds_per_trial, "test": CALIBRATION_TEST_SEEDS},
+        **calibration_document(result),
+        "manifest": {**manifest(), "starts": log.starts},
+    }
+    atomic_write(folder / CALIBRATION_FILE, to_json(document, indent=1))
+    return result
 
 
 def calibration_document(result: CalibrationResult) -> dict[str, Any]:
-    """Return what a calibration found, as JSON."""
+    """Return the result of a calibration as JSON."""
     return {
         "factors": result.factors,
         "vehicle_types": result.vehicle_types,
         "agreement": {
-            name: {column: asdict(one) for column, one in columns.items()}
+            name: {column: asdict(each) for column, each in columns.items()}
             for name, columns in result.estimates().items()
         },
         "rows": {"original": list(map(asdict, result.original)), "calibrated": list(map(asdict, result.calibrated))},
@@ -187,6 +183,5 @@ def _factor_text(factors: Mapping[str, float]) -> str:
 
 
 def _write_network(corridor: Corridor, factors: CalibrationFactors, file: Path) -> Path:
-    return write_variant(
-        corridor.files, scale_vehicle_types(corridor.files, factors), factors.get(FLOW_FACTOR, 1.0), file
-    )
+    types = scale_vehicle_types(corridor.files, factors)
+    return write_variant(corridor.files, types, factors.get(FLOW_FACTOR, 1.0), file)

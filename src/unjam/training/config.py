@@ -1,4 +1,4 @@
-"""Everything that decides what a training run does: one validated configuration, as TOML and flags."""
+"""The validated configuration of a training run, from TOML, command-line options and Python."""
 
 import os
 from collections.abc import Sequence
@@ -41,11 +41,11 @@ from unjam.worlds.batch.support import statistically_unsupported_reason, unsuppo
 from unjam.worlds.episode import Task
 
 CONFIG_FILE = "config.toml"
-"""the configuration in a folder of a run, or of a search"""
+"""the configuration in the folder of a run or of a search"""
 
 
 def _without_tuples(options: dict[str, Any]) -> dict[str, Any]:
-    """Return changes as a TOML file gives them back, so that a run knows its own road again."""
+    """Return options as a TOML file gives them back, so that a stored configuration equals the original."""
     return {key: list(value) if isinstance(value, tuple) else value for key, value in options.items()}
 
 
@@ -54,37 +54,36 @@ ScenarioOptions = Annotated[dict[str, Any], AfterValidator(_without_tuples)]
 
 @dataclass(frozen=True, config=STRICT)
 class EvaluationSettings:
-    """How a run is judged, always with the deterministic policy; its steps are counted apart."""
+    """Validation and evaluation of a run, with the deterministic policy; their steps do not count as training."""
 
     validation_interval: NonNegativeInt = 5
-    """iterations between two validations; 0: none, and the last policy becomes the controller"""
+    """iterations between validations; 0: none, and the last policy becomes the controller"""
     patience: NonNegativeInt = 0
-    """validations in a row without a new best after which training ends; 0: it goes on to `steps`"""
+    """training ends after this number of validations without a new best; 0: it continues to `steps`"""
     convergence_window: NonNegativeInt = 0
-    """training ends where the mean return of so many iterations, exploration included, is no better than that
-    of as many before them, looked at whenever as many have been made: the paper's rule; 0: it goes on to
-    `steps`"""
+    """training ends if the mean return of this number of iterations, exploration included, is not better than that of
+    the same number before, checked once per window: the paper's rule; 0: it continues to `steps`"""
     validation_episodes: PositiveInt = 4
-    """episodes of a validation, the same seeds each time: they choose the controller"""
+    """episodes of a validation, with the same seeds each time; they select the controller"""
     episodes: PositiveInt = 20
-    """episodes of the final evaluation, on held-out seeds that chose nothing"""
+    """episodes of the final evaluation, on test seeds"""
     baselines: tuple[str, ...] = ("human", "pi", "follower-stopper")
-    """drivers that are evaluated beside the expert and the trained controller"""
+    """drivers that are evaluated in addition to the expert and the trained controller"""
 
 
 @dataclass(frozen=True, config=STRICT)
 class TaskConfig:
-    """One of several roads of a training; what is left out, or empty, is the run's own."""
+    """One of several roads of a training; missing and empty entries are those of the run."""
 
     scenario: str = ""
     scenario_options: ScenarioOptions = field(default_factory=dict)
-    """changes to the scenario's parameters, beside the run's"""
+    """changes to the scenario's parameters, in addition to the run's"""
     expert: str = ""
     reward: str = ""
     weight: Positive = 1.0
-    """share of the actual steps, beside the weights of the other tasks"""
+    """share of the environment steps, relative to the weights of the other tasks"""
     name: Annotated[str, Field(pattern=r"^[\w-]*$")] = ""
-    """of its folder; empty: the scenario's"""
+    """name of its folder; empty: the scenario's"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -95,77 +94,73 @@ class RunConfig(AgentSettings):
     scenario_options: ScenarioOptions = field(default_factory=dict)
     """changes to the scenario's parameters"""
     expert: str = "pi"
-    """driver that the residual is added to: a name, `path.py:name`, a run folder, a .unjam file; `none`:
-    the network drives alone"""
+    """driver to which the residual is added: a name, `path.py:name`, a run folder, a .unjam file; `none`: the network
+    drives alone"""
     reward: str = ""
     """a name or `path.py:name`; empty: the scenario's own"""
     steps: PositiveInt = 960_000
-    """actual steps of training"""
+    """environment steps of training"""
     seed: Annotated[int, Field(ge=0, lt=TRAINING_SEED_LIMIT)] = 0
-    """of the whole run; numbers from a million on are those of the episodes that judge"""
+    """of the whole run; larger numbers are reserved for validation, tuning and test seeds"""
     workers: PositiveInt = 2
     simulator: Literal["sumo", "batch"] = "sumo"
-    """where episodes of training and validation are driven: in SUMO, or, on rings, all of an iteration at
-    once in what equals it but for rounding; it pays where iterations are large. A figure eight alone is
-    driven so too, where episodes are SUMO's in distribution. Other roads of a mixture are driven in SUMO,
-    which judges in any case"""
+    """where training and validation episodes run: in SUMO, or all episodes of an iteration at once in the batch
+    simulator, which is faster for large iterations. On rings it equals SUMO except for rounding; a single figure eight
+    or on-ramp equals SUMO in distribution. Other roads of a mixture run in SUMO, as does the final evaluation"""
     stratified: bool = True
-    """whether the episodes of an iteration, and of a validation, cover the range of what they draw (the
-    ring's lengths) evenly"""
+    """whether the episodes of an iteration or validation cover the range of drawn values (the ring's length) evenly"""
     policy: PolicySettings = field(default_factory=PolicySettings)
     model: ModelSettings = field(default_factory=ModelSettings)
-    """the virtual environment, in which the agent learns between actual episodes"""
+    """the learned model (the paper: virtual environment), in which the agent learns between environment episodes"""
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     tasks: tuple[TaskConfig, ...] = ()
     """roads that are trained on together; empty: the one above"""
     task_sampling: TaskSampling = "weights"
-    """how many episodes each of several roads has: as its `weight` says; `regret`: from each validation to
-    the next, half of all steps go where the policy earns less than was seen there before"""
+    """how many episodes each of several roads has: by its `weight`; `regret`: from each validation to the next, half of
+    all steps go to roads on which the return is below the best return so far"""
     preset: str = ""
-    """which preset this started from, for the record"""
+    """name of the preset that it started from, for the record"""
 
     @model_validator(mode="after")
     def _check_combinations(self) -> "RunConfig":
-        why_none = unsupported_reason if self.tasks else statistically_unsupported_reason
+        policy, evaluation = self.policy, self.evaluation
         scenarios = [road.make_scenario() for road in self.task_configs().values()]
-        whys = [why_none(scenario) for scenario in scenarios]
-        if self.simulator == "batch" and all(whys):
-            raise ValueError(f"simulator: batch is not allowed; allowed: sumo, for {whys[0]}")
-        imagines = self.model.kind if self.model.model_ratio > 0 else ""
-        if self.policy.reward_after_exit and imagines == "row":
-            raise ValueError("policy.reward_after_exit: true is not allowed; allowed: false where rows are imagined")
-        own = any(is_file_reference(name) for name in self.policy.inputs)
-        if self.policy.history_features and "expert_memory" not in self.policy.inputs and not own:
-            raise ValueError(
-                "policy.history_features: true is not allowed; allowed: false, where expert_memory is not observed"
-            )
-        if self.evaluation.patience and not self.evaluation.validation_interval:
-            raise ValueError(
-                "evaluation.patience: it is not allowed without validations (evaluation.validation_interval 0)"
-            )
-        if imagines == "road" and self.model.device != "cpu":
-            raise ValueError(f"model.device: {self.model.device} is not allowed; allowed: cpu, for whole roads")
-        if self.policy.episode_noise and self.agent not in ("trpo", "ppo"):
-            kind = self.policy.exploration
-            raise ValueError(f"policy.exploration: {kind} is not allowed; allowed: per_step, for {self.agent}")
-        on_ramps = imagines == "road" and all(isinstance(road, OnRamp) for road in scenarios)
-        if self.policy.exploration == "antithetic" and imagines and not on_ramps:
-            allowed = "per_step, per_episode, for these model rollouts have no antithetic pairs"
-            raise ValueError(f"policy.exploration: antithetic is not allowed; allowed: {allowed}")
-        if self.task_sampling == "regret" and (len(self.tasks) < 2 or self.evaluation.validation_interval == 0):
-            raise ValueError("task_sampling: regret is not allowed; allowed: weights, but for several validated tasks")
+        reasons = list(map(unsupported_reason if self.tasks else statistically_unsupported_reason, scenarios))
+        model = self.model.kind if self.model.model_ratio > 0 else ""
+        has_memory = "expert_memory" in policy.inputs or any(map(is_file_reference, policy.inputs))
+        has_pairs = not model or (model == "road" and all(isinstance(road, OnRamp) for road in scenarios))
+        has_validated_tasks = len(self.tasks) > 1 and evaluation.validation_interval > 0
+        device, patience, exploration = self.model.device, evaluation.patience, policy.exploration
+        no_memory = policy.history_features and not has_memory
+        no_validation = patience and not evaluation.validation_interval
+        no_noise = policy.episode_noise and self.agent not in ("trpo", "ppo")
+        pairs = "per_step, per_episode, because these model rollouts have no antithetic pairs"
+        weights = "weights, except for several validated tasks"
+        checks = (
+            (self.simulator == "batch" and all(reasons), "simulator: batch", f"sumo ({reasons[0]})"),
+            (policy.reward_after_exit and model == "row", "policy.reward_after_exit: true", "false with a row model"),
+            (no_memory, "policy.history_features: true", "false without the input expert_memory"),
+            (no_validation, f"evaluation.patience: {patience}", "0 without validations"),
+            (model == "road" and device != "cpu", f"model.device: {device}", "cpu, for road models"),
+            (no_noise, f"policy.exploration: {exploration}", f"per_step, for {self.agent}"),
+            (exploration == "antithetic" and not has_pairs, "policy.exploration: antithetic", pairs),
+            (self.task_sampling == "regret" and not has_validated_tasks, "task_sampling: regret", weights),
+        )
+        for is_wrong, value, allowed in checks:
+            if is_wrong:
+                raise ValueError(f"{value} is not allowed; allowed: {allowed}")
         return self
 
     def task_configs(self) -> dict[str, "RunConfig"]:
-        """Return the configuration of each road alone, by its folder's name; one road has none."""
+        """Return the configuration of each task by the name of its folder; a single road has an empty name."""
         if not self.tasks:
             return {"": self}
-        found: dict[str, RunConfig] = {}
+        configs: dict[str, RunConfig] = {}
         for task in self.tasks:
             scenario = task.scenario or self.scenario
             name = base = task.name or Path(scenario).stem
             number = 1
-            while name in found:
+            while name in configs:
                 number += 1
                 name = f"{base}-{number}"
             road = replace(
@@ -179,37 +174,35 @@ class RunConfig(AgentSettings):
                 simulator="sumo",
             )
             batched = self.simulator == "batch" and not unsupported_reason(road.make_scenario())
-            found[name] = replace(road, simulator="batch") if batched else road
-        return found
+            configs[name] = replace(road, simulator="batch") if batched else road
+        return configs
 
     def make_tasks(self) -> list[Task]:
-        """Return what is trained on: a task per road.
+        """Return the tasks of the training, one for each road.
 
         Raises:
-            InputError: the network would see something else on one of them.
+            InputError: the inputs of the network would differ between tasks.
         """
         weights = [task.weight for task in self.tasks] or [1.0]
         tasks = [
             Task(road.make_scenario(), road.make_expert(), road.reward, weight, name)
             for (name, road), weight in zip(self.task_configs().items(), weights, strict=True)
         ]
-        first = tasks[0]
-        for task in tasks[1:]:
-            if observation_inputs(self.policy.inputs, task.expert) != observation_inputs(
-                self.policy.inputs, first.expert
-            ):
-                raise InputError(f"tasks: on {task.name} the network would see something else than on {first.name}")
+        first, *others = (observation_inputs(self.policy.inputs, task.expert) for task in tasks)
+        for task, inputs in zip(tasks[1:], others, strict=True):
+            if inputs != first:
+                raise InputError(f"tasks: the network would have other inputs on {task.name} than on {tasks[0].name}")
         return tasks
 
     def make_scenario(self) -> Scenario:
-        """Return the scenario with its changes."""
+        """Return the scenario with its options."""
         try:
             return make_scenario(self.scenario, self.scenario_options)
         except InputError as error:
             raise ValueError(str(error)) from None
 
     def make_expert(self) -> Driver:
-        """Return the driver that the residual is added to."""
+        """Return the driver to which the residual is added."""
         from unjam.controller import make_expert
 
         step = self.make_scenario().control_step
@@ -218,46 +211,46 @@ class RunConfig(AgentSettings):
 
 
 def planned_steps(config: RunConfig) -> int:
-    """Return how many actual steps a new training will make: whole iterations, unless episodes end early."""
+    """Return the environment steps of a new training: whole iterations, unless episodes end early."""
     tasks = config.make_tasks()
     counts = count_episodes(tasks, config.learner.steps_per_iteration, weight_shares(tasks))
-    each = sum(count * task.scenario.horizon for count, task in zip(counts, tasks, strict=True))
-    return ceil(config.steps / each) * each
+    steps = sum(count * task.scenario.horizon for count, task in zip(counts, tasks, strict=True))
+    return ceil(config.steps / steps) * steps
 
 
 def load_config(file: Path | None = None, preset: str = "", changes: dict[str, Any] | None = None) -> RunConfig:
-    """Return a configuration: the defaults, changed by a preset, by a TOML file, by `changes`, in this order.
+    """Return a configuration: the defaults, changed by a preset, a TOML file and `changes`, in this order.
 
     Keys of `changes` may have dots: `trpo.gamma`.
 
     Raises:
-        InputError: an unknown key or preset, a value out of range, an unreadable file; or a file in a run
-            folder names Python code that is not trusted.
+        InputError: an unknown key or preset, a value out of range, an unreadable file; or a file in a run folder
+            names Python code that is not trusted.
     """
-    read = read_toml(file) if file is not None else {}
-    if file is not None and _is_in_run_folder(file):  # by itself it is the user's own
-        check_trusted_values(f"config file {file}", read)
-    given = merge_changes(read, nest_keys(changes or {}))
-    values: dict[str, Any] = {}
-    road = SCENARIOS.get(str(given.get("scenario", RunConfig.scenario)), Scenario)
-    for name in given.keys() - {each.name for each in fields(RunConfig)}:
-        if hasattr(road, name):
+    file_values = read_toml(file) if file is not None else {}
+    if file is not None and _is_in_run_folder(file):  # other files are the user's own
+        check_trusted_values(f"config file {file}", file_values)
+    user_values = merge_changes(file_values, nest_keys(changes or {}))
+    scenario_name = str(user_values.get("scenario", RunConfig.scenario))
+    scenario = SCENARIOS.get(scenario_name, Scenario)
+    for name in user_values.keys() - {each.name for each in fields(RunConfig)}:
+        if hasattr(scenario, name):
             raise InputError(f"{name}: unknown name; did you mean 'scenario_options.{name}'?")
+    values: dict[str, Any] = {}
     if preset:
-        started = preset_values(preset, str(given.get("scenario", RunConfig.scenario)))
-        if "tasks" in started and "tasks" not in given:
-            _check_preset_conflicts(preset, started["tasks"], given)
-        values = {**started, "preset": preset}
-    wanted = merge_changes(values, given)
-    virtual = wanted.get("model", {})
-    if road.actuation == "cruise" and isinstance(virtual, dict) and virtual.get("kind", "row") == "row":
-        # Virtual rows know no ACC of a CAV's own: without a model, unless one is asked for.
-        wanted = merge_changes({"model": {"model_ratio": 0.0}}, wanted)
-    return build_dataclass(RunConfig, wanted, "")
+        values = {**preset_values(preset, scenario_name), "preset": preset}
+        if "tasks" in values and "tasks" not in user_values:
+            _check_preset_conflicts(preset, values["tasks"], user_values)
+    values = merge_changes(values, user_values)
+    model = values.get("model", {})
+    if scenario.actuation == "cruise" and isinstance(model, dict) and model.get("kind", "row") == "row":
+        # The row model cannot represent the ACC of a CAV: the default is to have no model.
+        values = merge_changes({"model": {"model_ratio": 0.0}}, values)
+    return build_dataclass(RunConfig, values, "")
 
 
 def _is_in_run_folder(file: Path) -> bool:
-    """Return whether a file lies in or below a folder of results; the search ends at the working folder."""
+    """Return whether a file lies in or below a run folder; the search ends at the working folder."""
     for folder in file.absolute().parents:
         if (folder / CONFIG_FILE).is_file():
             return True
@@ -267,24 +260,22 @@ def _is_in_run_folder(file: Path) -> bool:
 
 
 def _check_preset_conflicts(preset: str, tasks: Sequence[dict[str, Any]], user_values: dict[str, Any]) -> None:
-    """Raise `InputError` where the user says what every task of a preset says otherwise."""
-    said = {name: value for name, value in user_values.items() if name in ("scenario", "reward")}
-    changes = user_values.get("scenario_options", {})
-    said |= {f"scenario_options.{name}": value for name, value in changes.items()} if isinstance(changes, dict) else {}
-    for name, value in said.items():
+    """Raise `InputError` if a value of the user is another one in every task of a preset."""
+    names = ("scenario", "reward", "scenario_options")
+    for name, value in flatten_keys({key: value for key, value in user_values.items() if key in names}).items():
         if all(flatten_keys(task).get(name, "") not in ("", value) for task in tasks):
-            raise invalid_value(name, value, f"none with the preset {preset}, whose roads have their own")
+            raise invalid_value(name, value, f"none with the preset {preset}: its roads have their own")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return the content of a TOML file; raise `InputError` where it is missing or not TOML."""
+    """Return the content of a TOML file; raise `InputError` if it is missing or not TOML."""
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"config file {path}: not a file: a directory, a pipe or a device")
     try:
         return parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"config file {path}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # also a number too long, NUL in the path
+    except (ValueError, RecursionError) as error:  # also for too long numbers and NUL in the path
         raise InputError(f"config file {path}: not TOML: {error}") from None
 
 

@@ -1,4 +1,4 @@
-"""A road of the user's own with detectors, and what of its people and their number can be varied."""
+"""A user's network with detectors, and the factors on its human drivers and demand that can be varied."""
 
 import re
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ FACTOR_RANGES: SearchSpace = {
 }
 """factors on the attributes of passenger vehicle types, and on flows"""
 SUMO_TYPE_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
-"""of passenger types that do not say otherwise"""
+"""defaults of passenger types"""
 NORMAL_DISTRIBUTION = re.compile(r"(normc?)\(([^()]*)\)")
-"""a speed factor that each vehicle draws"""
+"""a speed factor that is drawn for each vehicle"""
 
 CalibrationFactors = dict[str, float]
 """by the names of `FACTOR_RANGES`"""
@@ -38,7 +38,7 @@ CalibrationFactors = dict[str, float]
 
 @dataclass(frozen=True)
 class Corridor:
-    """A network and what its detectors measured; everything in it has been checked."""
+    """A network and its detector measurements, both checked."""
 
     files: SumoFiles
     detectors: Path
@@ -47,20 +47,20 @@ class Corridor:
     end: float
     """[s]"""
     measurements: tuple[Measurement, ...]
-    """intervals that lie between these two"""
+    """intervals between `begin` and `end`"""
     excluded_count: int
-    """intervals that do not"""
+    """number of other intervals"""
     loops: tuple[InductionLoop, ...]
     loop_numbers: tuple[tuple[int, ...], ...]
-    """numbers of the loops of each interval"""
+    """numbers of the loops of each measurement"""
 
     def scenario(self, file: Path) -> UserNetwork:
-        """Return a network's traffic, people alone, until nothing more is measured."""
-        changes = {"penetration_rate": ZERO_PENETRATION_RATE, "cav_types": (), "begin": self.begin, "end": self.end}
-        return load_user_network(str(file), changes)
+        """Return the human-only traffic of a variant of the network, until the last measurement."""
+        options = {"penetration_rate": ZERO_PENETRATION_RATE, "cav_types": (), "begin": self.begin, "end": self.end}
+        return load_user_network(str(file), options)
 
     def metadata(self) -> dict[str, Any]:
-        """Return what a calibration is about: names and hashes of the files, and what is measured when."""
+        """Return names and hashes of the files, and the times of the measurements."""
         files = self.files
         return {
             "scenario": files.path.name,
@@ -73,48 +73,42 @@ class Corridor:
 
 
 def load_corridor(file: str, detectors: Path, begin: float | None = None, end: float | None = None) -> Corridor:
-    """Return a network and what its detectors measured, once both have been checked.
+    """Return a network and its detector measurements, both checked.
 
     Args:
         file: a .sumocfg file.
-        detectors: a CSV file, as `measures.detectors.read_detectors` reads it.
-        begin: when to begin [s]; None: as the configuration says.
-        end: when to end [s]; None: as the configuration says, or with the last interval.
+        detectors: a CSV file, as for `measures.detectors.read_detectors`.
+        begin: start time [s]; None: that of the configuration.
+        end: end time [s]; None: that of the configuration, or of the last interval.
 
     Raises:
-        InputError: one of them is wrong, a detector has no place on the road, or nothing can be varied.
+        InputError: an argument is wrong, a detector is not on the network, or nothing can be varied.
     """
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
     kind, rows = read_detectors(detectors)
-    # People alone: the share is so small that nobody has it.
+    # The penetration rate is so small that no vehicle is a CAV.
     times = {name: time for name, time in (("begin", begin), ("end", end)) if time is not None}
     checked = load_user_network(file, {"penetration_rate": ZERO_PENETRATION_RATE, "cav_classes": ROAD_CLASSES, **times})
     files = read_sumo_files(Path(checked.file))
     first = files.begin if begin is None else begin
     last = next((limit for limit in (end, files.end) if limit is not None), inf)
-    kept = [row for row in rows if row.begin >= first and row.end <= last]
-    if not kept:
+    used = [row for row in rows if row.begin >= first and row.end <= last]
+    if not used:
         raise InputError(f"{detectors.name}: no interval lies between {first:g} s and {last:g} s")
     if not passenger_types(files):
         known = ", ".join(sorted(files.used_types))
         raise InputError(f"{files.path.name}: no vehicle type is a passenger car; its types are {known}")
-    lanes = [_detector_loops(files.network, kind, row) for row in kept]
-    loops = {loop: number for number, loop in enumerate(dict.fromkeys(loop for each in lanes for loop in each))}
-    return Corridor(
-        files,
-        detectors,
-        first,
-        max(row.end for row in kept),
-        tuple(kept),
-        len(rows) - len(kept),
-        tuple(loops),
-        tuple(tuple(loops[loop] for loop in each) for each in lanes),
-    )
+    row_loops = [_detector_loops(files.network, kind, row) for row in used]
+    numbers = {loop: number for number, loop in enumerate(dict.fromkeys(loop for each in row_loops for loop in each))}
+    loop_numbers = tuple(tuple(numbers[loop] for loop in each) for each in row_loops)
+    end_time = max(row.end for row in used)
+    excluded = len(rows) - len(used)
+    return Corridor(files, detectors, first, end_time, tuple(used), excluded, tuple(numbers), loop_numbers)
 
 
 def _detector_loops(network: Path, kind: str, row: Measurement) -> list[InductionLoop]:
-    """Return the loops of a detector; raise `InputError` where the network has no such place."""
+    """Return the loops of a detector; raise `InputError` if the network has no such place."""
     _, lengths, counts = network_geometry(network)
     edge = row.place if kind == "edge" else row.place.rpartition("_")[0]
     all_lanes = [f"{edge}_{number}" for number in range(counts.get(edge, 0))]
@@ -127,31 +121,28 @@ def _detector_loops(network: Path, kind: str, row: Measurement) -> list[Inductio
 
 
 def scale_vehicle_types(files: SumoFiles, factors: CalibrationFactors) -> dict[str, dict[str, str]]:
-    """Return the attributes of all passenger types once they are multiplied by `factors`, by id.
+    """Return the changed attributes of all passenger types multiplied by `factors`, by id.
 
-    What would stay as it is is left out. A reaction time never falls below the simulation step: people would
-    collide.
-
-    Raises:
-        InputError: an attribute is no number.
+    A reaction time never falls below the simulation step, because vehicles would collide. Raise `InputError` if an
+    attribute is not a number.
     """
-    found: dict[str, dict[str, str]] = {}
+    scaled: dict[str, dict[str, str]] = {}
     for name in passenger_types(files):
-        own = {**{key: str(value) for key, value in SUMO_TYPE_DEFAULTS.items()}, **files.types.get(name, {})}
-        changed = {
-            key: _scale_attribute(f"vType {name}: {key}", own[key], factor, files.step if key == "tau" else 0.0)
+        attributes = {**{key: str(value) for key, value in SUMO_TYPE_DEFAULTS.items()}, **files.types.get(name, {})}
+        changes = {
+            key: _scale_attribute(f"vType {name}: {key}", attributes[key], factor, files.step if key == "tau" else 0.0)
             for key, factor in factors.items()
             if key != FLOW_FACTOR and factor != 1
         }
-        if changed:
-            found[name] = changed
-    return found
+        if changes:
+            scaled[name] = changes
+    return scaled
 
 
 def _scale_attribute(field: str, text: str, factor: float, minimum: float) -> str:
     drawn = NORMAL_DISTRIBUTION.fullmatch(text.replace(" ", ""))
     try:
-        if drawn:  # mean, deviation and bounds alike: every vehicle's own is multiplied
+        if drawn:  # mean, deviation and bounds: this multiplies the value of each vehicle
             return f"{drawn[1]}({','.join(f'{float(part) * factor:.6g}' for part in drawn[2].split(','))})"
         value = float(text)
     except ValueError:
@@ -160,16 +151,15 @@ def _scale_attribute(field: str, text: str, factor: float, minimum: float) -> st
 
 
 def parse_factor_space(texts: list[str]) -> SearchSpace:
-    """Return what is varied, from texts `tau=0.5..2` or `tau=0.5..2:log`; without any, all.
+    """Return a search space from texts `tau=0.5..2` or `tau=0.5..2:log`; without any, `FACTOR_RANGES`.
 
-    Raises:
-        InputError: a name is unknown, or these are no factors.
+    Raise `InputError` for unknown names and for values that are not positive ranges.
     """
-    found: SearchSpace = {}
+    space: SearchSpace = {}
     for name, values in (parse_search_space(texts) if texts else FACTOR_RANGES).items():
         if name not in FACTOR_RANGES:
             raise unknown_name("vary", name, FACTOR_RANGES)
         if not isinstance(values, NumericRange) or not values.low > 0:
             raise invalid_value(f"vary {name}", values.boundary_values, "a range of factors > 0, as 0.5..2")
-        found[name] = NumericRange(float(values.low), float(values.high), values.log)
-    return found
+        space[name] = NumericRange(float(values.low), float(values.high), values.log)
+    return space

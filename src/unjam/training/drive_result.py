@@ -1,6 +1,6 @@
-"""What `unjam.drive` returns: rows of metrics by driver, as numbers, tables of pandas, and in a notebook.
+"""The result of `unjam.drive`: rows of metrics by driver, as numbers, pandas tables, and in a notebook.
 
-What makes tables and draws is imported where it does: a command that says what is wrong needs none of it.
+pandas and matplotlib are imported late, so that commands start quickly.
 """
 
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def rows_to_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
-    """Return a row per episode and driver: `driver`, `seed` in words, `status`, and every metric."""
+    """Return a row per episode and driver: `driver`, `seed` as text, `status`, and every metric."""
     import pandas as pd
 
     return pd.DataFrame(
@@ -37,24 +37,24 @@ class DriveResult:
     rows: RowsByDriver = field(repr=False)
     """by driver: a row of metrics per episode"""
     folder: Path | None = None
-    """where everything was written"""
+    """folder of the results"""
     report: Path | None = None
     plot_episodes: dict[str, Episode] = field(default_factory=dict, repr=False)
-    """by driver: the episode that pictures show, the same seed for all"""
+    """by driver: the episode for figures, the same seed for all"""
     notes: list[str] = field(default_factory=list)
-    """what to know before trusting it: controllers on a road that they were not made for"""
+    """caveats, as controllers on a road that they were not made for"""
 
     @property
     def mean(self) -> dict[str, float]:
         """Mean of every metric over the episodes of the first driver."""
-        return {name: found.mean for name, found in self.summary(next(iter(self.rows))).items()}
+        return {name: each.mean for name, each in self.summary(next(iter(self.rows))).items()}
 
     def summary(self, driver: str) -> dict[str, Estimate]:
-        """Return mean and 95 % interval of every metric for a driver."""
+        """Return the mean and 95 % CI of every metric for a driver."""
         return summarize(self.rows[driver])
 
     def table(self) -> "pd.DataFrame":
-        """Return a row per metric and, for each driver, its mean and both ends of its 95 % interval.
+        """Return a row per metric with the mean and both ends of the 95 % CI of each driver.
 
         `result.table().loc["mean_speed", ("pi", "mean")]` is one number.
         """
@@ -69,11 +69,11 @@ class DriveResult:
         return frame.rename_axis(columns=("driver", None))
 
     def episodes(self) -> "pd.DataFrame":
-        """Return a row per episode and driver, with its seed, its status and every metric."""
+        """Return a row per episode and driver, with seed, status and every metric."""
         return rows_to_frame(self.rows)
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: every metric with its interval, and where each vehicle was at each time."""
+        """Return every metric with its CI, and the trajectories of all vehicles, for notebooks."""
         import pandas as pd
 
         from unjam.reports.figures import data_uri
@@ -88,22 +88,17 @@ class DriveResult:
         table = pd.DataFrame(cells, columns=headings).to_html(index=False, border=0)
         if not self.plot_episodes:
             return table
-        picture = data_uri(
-            space_time_figure([to_plot_episode(label, each) for label, each in self.plot_episodes.items()])
-        )
-        about = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
-        return f'{table}<img {about} src="{picture}">'
+        episodes = [to_plot_episode(label, each) for label, each in self.plot_episodes.items()]
+        attributes = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
+        return f'{table}<img {attributes} src="{data_uri(space_time_figure(episodes))}">'
 
     def document(self) -> dict[str, Any]:
-        """Return the result as `unjam drive --json` prints it; of several drivers, a list of such."""
-        said, effects, baseline = (
-            feasibility_by_driver(self.rows),
-            effects_by_driver(self.rows),
-            choose_baseline(self.rows),
-        )
+        """Return the result as `unjam drive --json` prints it; with several drivers, a list of documents."""
+        verdicts, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
+        baseline = choose_baseline(self.rows)
         documents = [
             {
-                **self._document(driver, said[driver], effects.get(driver)),
+                **self._document(driver, verdicts[driver], effects.get(driver)),
                 "baseline": baseline or None,
                 "difference_to_baseline": self._baseline_differences(driver, baseline),
             }
@@ -112,7 +107,7 @@ class DriveResult:
         return documents[0] if len(documents) == 1 else {"scenario": self.scenario, "drivers": documents}
 
     def _baseline_differences(self, driver: str, baseline: str) -> dict[str, list[float]] | None:
-        """Return the paired differences of all metrics; None of the baseline itself, and without one."""
+        """Return the paired differences of all metrics; None for the baseline itself, and without one."""
         if driver == baseline or not baseline:
             return None
         rows, others = self.rows[driver], self.rows[baseline]
@@ -136,7 +131,7 @@ class DriveResult:
 
 
 def _effect_document(effect: Effect) -> dict[str, Any]:
-    """Return the paired differences to people alone as JSON: mean and ends of the interval."""
+    """Return the paired differences to the human baseline as JSON: mean and ends of the CI."""
     names = ("travel_time", "delay_reduction", "speed", "flow", "fuel", "hard_braking")
     return {name: _mean_and_interval(getattr(effect, name)) for name in names}
 

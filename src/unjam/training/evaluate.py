@@ -1,6 +1,6 @@
-"""Drivers on fixed seeds, several on the same traffic: driven, judged, saved for reports.
+"""Evaluation: several drivers on the same seeds, measured and saved for reports.
 
-`unjam drive` takes any drivers and seeds; a run's controller is judged beside others on held-out seeds.
+`unjam drive` takes any drivers and seeds; the controller of a run is compared with others on test seeds.
 """
 
 import os
@@ -37,11 +37,11 @@ from unjam.worlds.reward import make_reward
 from unjam.worlds.sumo.sandboxed import open_simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-MISSING_ACC_NOTE = "holds back a car's own ACC, which none has: --set actuation=cruise --set safety.active=false"
+MISSING_ACC_NOTE = "limits the ACC of a CAV, but CAVs have none: --set actuation=cruise --set safety.active=false"
 TRAINED_LABEL = "trained"
-"""label of the trained controller in tables and pictures"""
+"""label of the trained controller in tables and figures"""
 EvaluationProgress = Callable[[tuple[str, int], int], None]
-"""called now and then with (the driver's label, the index of its episode), and the decisions made so far"""
+"""called repeatedly with (label of the driver, index of its episode) and the control steps so far"""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Evaluation:
 
     rows: RowsByDriver
     plot_episodes: dict[str, Episode] = field(repr=False)
-    """by driver: the episode that pictures show, the same seed for all"""
+    """by driver: the episode for figures, the same seed for all"""
 
     def means(self) -> dict[str, dict[str, float]]:
         """Return the mean of each metric, by driver."""
@@ -68,8 +68,8 @@ def evaluate(
     progress: EvaluationProgress | None = None,
 ) -> Evaluation:
     """Run every driver on every seed, and measure."""
-    on_road = {label: (scenario, driver) for label, driver in drivers.items()}
-    return evaluate_on_roads(on_road, seeds, workers, reward, progress)
+    setups = {label: (scenario, driver) for label, driver in drivers.items()}
+    return evaluate_on_roads(setups, seeds, workers, reward, progress)
 
 
 def evaluate_on_roads(
@@ -80,13 +80,13 @@ def evaluate_on_roads(
     progress: EvaluationProgress | None = None,
     with_plots: bool = True,
 ) -> Evaluation:
-    """Run every driver, each on a road of its own, on every seed, and measure.
+    """Run every driver, each on its own road, on every seed, and measure.
 
-    An episode of each is kept for pictures; not so where none are `pictured`, for it needs much memory.
+    With `with_plots` one episode of each is kept for figures, which needs much memory.
     """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
-    how: dict[str, Any] = {"reward": reward, "record_details": True, "stop_at_contact": False}
-    tasks = [EpisodeTask(*drivers[label], seeds[index], **how) for label, index in pairs]
+    settings: dict[str, Any] = {"reward": reward, "record_details": True, "stop_at_contact": False}
+    tasks = [EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs]
 
     def on_progress(task: int, steps: int) -> None:
         if progress is not None:
@@ -96,27 +96,21 @@ def evaluate_on_roads(
         _, index = pairs[task]
         return measure(episode), episode if with_plots and index == 0 and episode.has_run else None
 
-    away = [index for index, (label, _) in enumerate(pairs) if is_serializable(drivers[label][1])]
-    found = dict(
-        zip(
-            away,
-            workers.run_and_map(
-                [tasks[index] for index in away],
-                lambda number, episode: measure_task(away[number], episode),
-                lambda number, steps: on_progress(away[number], steps),
-            ),
-            strict=True,
-        )
+    remote = [index for index, (label, _) in enumerate(pairs) if is_serializable(drivers[label][1])]
+    measured = workers.run_and_map(
+        [tasks[index] for index in remote],
+        lambda number, episode: measure_task(remote[number], episode),
+        lambda number, steps: on_progress(remote[number], steps),
     )
-    found |= _run_in_process(tasks, found.keys(), measure_task, on_progress)
+    results = dict(zip(remote, measured, strict=True))
+    results |= _run_in_process(tasks, results.keys(), measure_task, on_progress)
     rows: RowsByDriver = {label: [] for label in drivers}
-    shown: dict[str, Episode] = {}
     for index, (label, _) in enumerate(pairs):
-        row, episode = found[index]
-        rows[label].append(row)
-        if episode is not None:
-            shown[label] = episode
-    return Evaluation(rows, shown)
+        rows[label].append(results[index][0])
+    plot_episodes = {
+        label: results[index][1] for index, (label, _) in enumerate(pairs) if results[index][1] is not None
+    }
+    return Evaluation(rows, plot_episodes)
 
 
 def _run_in_process(
@@ -125,56 +119,52 @@ def _run_in_process(
     process: Callable[[int, Episode], Any],
     on_progress: Callable[[int, int], None],
 ) -> dict[int, Any]:
-    """Run those tasks that are not done in this process; return what `keep` makes of each, by index."""
-    left = {index: task for index, task in enumerate(tasks) if index not in finished}
-    if not left:
+    """Run the tasks that are not `finished` in this process; return the results of `process` by index."""
+    remaining = {index: task for index, task in enumerate(tasks) if index not in finished}
+    if not remaining:
         return {}
-    with open_simulation(*(task.scenario for task in left.values())) as simulation:
-        return {
-            index: process(
-                index,
-                run_episode(
-                    *(task.scenario, task.driver, task.seed, task.reward, task.explore, task.record_details),
-                    simulation=simulation,
-                    on_progress=partial(on_progress, index),
-                    stop_at_contact=task.stop_at_contact,
-                ),
+    results: dict[int, Any] = {}
+    with open_simulation(*(task.scenario for task in remaining.values())) as simulation:
+        for index, task in remaining.items():
+            episode = run_episode(
+                *(task.scenario, task.driver, task.seed, task.reward, task.explore, task.record_details),
+                simulation=simulation,
+                on_progress=partial(on_progress, index),
+                stop_at_contact=task.stop_at_contact,
             )
-            for index, task in left.items()
-        }
+            results[index] = process(index, episode)
+    return results
 
 
 def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
-    """Raise the first failure among the rows of episodes, as the error that it was."""
+    """Raise the first failure among the rows of episodes, as the original kind of error."""
     for row in rows:
         if row["status"] == "failed":
-            again = "" if row["error"] == InputError.__name__ else f" (seed {row['seed']})"
-            raise error_from_name(row["error"], f"{row['reason']}{again}")
+            seed = "" if row["error"] == InputError.__name__ else f" (seed {row['seed']})"
+            raise error_from_name(row["error"], f"{row['reason']}{seed}")
 
 
 def raise_failures(result: "Evaluation | DriveResult") -> None:
-    """Raise the first failure among the episodes of a result, if there is one."""
+    """Raise the first failure among the episodes of a result, if any."""
     raise_failure([row for rows in result.rows.values() for row in rows])
 
 
 def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, Any]) -> None:
-    """Write an evaluation into a folder: what reports are made of.
+    """Write an evaluation into a folder, for reports.
 
-    `evaluation.json` (rows, and `about`), `episodes.parquet` (the rows as a table), and
-    `plot_episodes.safetensors` with the episode that pictures show.
+    `evaluation.json` has `metadata` and rows, `episodes.parquet` the rows as a table, and `plot_episodes.safetensors`
+    the episodes for figures.
     """
     make_folder(folder)
-    rows = [{"driver": label, **row} for label, found in evaluation.rows.items() for row in found]
-    shown = [to_plot_episode(label, episode) for label, episode in evaluation.plot_episodes.items()]
+    rows = [{"driver": label, **row} for label, of_driver in evaluation.rows.items() for row in of_driver]
+    episodes = [to_plot_episode(label, episode) for label, episode in evaluation.plot_episodes.items()]
     arrays = {
-        f"{number}.{name}": array for number, each in enumerate(shown) for name, array in pack_episode(each).items()
+        f"{index}.{name}": array for index, each in enumerate(episodes) for name, array in pack_episode(each).items()
     }
-    about_shown = [{"driver": each.driver, **{name: getattr(each, name) for name in EPISODE_ENTRIES}} for each in shown]
+    entries = [{"driver": each.driver, **{name: getattr(each, name) for name in EPISODE_ENTRIES}} for each in episodes]
     atomic_write(folder / "plot_episodes.safetensors", save(arrays))
     atomic_write(folder / "episodes.parquet", rows_to_frame(evaluation.rows).to_parquet())
-    atomic_write(
-        folder / "evaluation.json", to_json({**metadata, "rows": rows, "plot_episodes": about_shown}, indent=1)
-    )
+    atomic_write(folder / EVALUATION_FILE, to_json({**metadata, "rows": rows, "plot_episodes": entries}, indent=1))
 
 
 def drivers_to_compare(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:
@@ -185,19 +175,19 @@ def drivers_to_compare(config: RunConfig, folder: Path, baselines: Sequence[str]
     for name in baselines:
         driver = make_driver(name, scenario.control_step)
         if can_drive(driver, scenario):
-            # The description of a shipped driver has every parameter that was tuned.
-            shipped = name.startswith(PACKAGED_PREFIX) and name != config.expert
-            drivers[name if shipped else unique_label(driver, {**expert, **drivers})] = driver
+            # The description of a packaged driver has all tuned parameters: its name is shorter.
+            is_packaged = name.startswith(PACKAGED_PREFIX) and name != config.expert
+            drivers[name if is_packaged else unique_label(driver, {**expert, **drivers})] = driver
     return {**drivers, **expert, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)}
 
 
 def evaluation_steps(
     config: RunConfig, folder: Path, baselines: Sequence[str] | None = None, episodes: int | None = None
 ) -> int:
-    """Return how many decisions `judge` makes at most."""
-    chosen = config.evaluation
-    drivers = drivers_to_compare(config, folder, chosen.baselines if baselines is None else baselines)
-    return len(drivers) * (episodes or chosen.episodes) * config.make_scenario().horizon
+    """Return the largest number of control steps of `evaluate_run`."""
+    settings = config.evaluation
+    drivers = drivers_to_compare(config, folder, settings.baselines if baselines is None else baselines)
+    return len(drivers) * (episodes or settings.episodes) * config.make_scenario().horizon
 
 
 def evaluate_run(
@@ -209,49 +199,47 @@ def evaluate_run(
     progress: EvaluationProgress | None = None,
     out: Path | None = None,
 ) -> Evaluation:
-    """Evaluate a run's controller beside others on the same held-out seeds, and save it all in its folder.
+    """Evaluate a run's controller and others on the same test seeds, and save the results in its folder or in `out`.
 
-    `baselines` and `episodes` are the configuration's where they are not given; with `out` that is the folder
-    where it is saved.
+    `baselines` and `episodes` are those of the configuration by default.
     """
     scenario = config.make_scenario()
     drivers = drivers_to_compare(config, folder, config.evaluation.baselines if baselines is None else baselines)
     seeds = make_test_seeds(episodes or config.evaluation.episodes)
-    found = evaluate(scenario, drivers, seeds, workers, config.reward, progress)
-    about = {
+    evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress)
+    metadata = {
         "scenario": Path(config.scenario).name,
         "reward": config.reward or scenario.reward,
         "trained": TRAINED_LABEL,
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
         "controllers": _controller_hashes({TRAINED_LABEL: str(folder)}),
-        "notes": episode_notes(found.rows),
+        "notes": episode_notes(evaluation.rows),
         "manifest": manifest(),
     }
     target = out or folder
-    if (target / EVALUATION_FILE).is_file():  # what was judged before is not written over by less
-        raise_failure(found.rows[TRAINED_LABEL])
-    save_evaluation(target, found, about)
-    raise_failures(found)
-    return found
+    if (target / EVALUATION_FILE).is_file():  # a failure must not overwrite earlier results
+        raise_failure(evaluation.rows[TRAINED_LABEL])
+    save_evaluation(target, evaluation, metadata)
+    raise_failures(evaluation)
+    return evaluation
 
 
 def gain_over_expert(config: RunConfig, rows: RowsByDriver) -> Estimate | None:
-    """Return what the trained controller earns beyond its expert, same seeds paired."""
+    """Return the paired difference of return between the trained controller and its expert; None without one."""
     if config.expert == "none":
         return None
     return paired_difference(rows[TRAINED_LABEL], rows[config.make_expert().describe()], "return")
 
 
 def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
-    """Whether a driver is told of the road ahead to hold back an ACC which CAVs have not got."""
-    told = "lane_speeds" in driver.input_fields and "lane_speeds" in scenario.provided_fields
-    return told and scenario.actuation != "cruise"
+    """Return whether a driver uses the speeds ahead to limit the ACC of CAVs on a road where they have none."""
+    uses_lane_speeds = "lane_speeds" in driver.input_fields and "lane_speeds" in scenario.provided_fields
+    return uses_lane_speeds and scenario.actuation != "cruise"
 
 
 def _controller_hashes(controllers: dict[str, str]) -> dict[str, str]:
-    """Return the hashes of the files that were judged, by the driver's label; others are none."""
-    found = {label: controller_hash(text) for label, text in controllers.items()}
-    return {label: sha256 for label, sha256 in found.items() if sha256}
+    """Return the hashes of the controller files by the label of the driver."""
+    return {label: sha256 for label, text in controllers.items() if (sha256 := controller_hash(text))}
 
 
 def drive(
@@ -270,56 +258,57 @@ def drive(
 
     Args:
         scenario: its name.
-        driver: a name (`pi`), with parameters (`pi:window=30`), your own (`path.py:name`), a run folder, a
-            `.unjam` file; a driver, a function of the state or an object with `act` and `initial_memory`,
-            which drive in this process; or a list of them, to be compared on the same traffic.
-        episodes: of each driver; they have the seeds `seed`, `seed + 1`, ...
+        driver: a name (`pi`), with parameters (`pi:window=30`), your own (`path.py:name`), a run folder, a `.unjam`
+            file; a driver, a function of the state or an object with `act` and `initial_memory`, which run in this
+            process; or a list of them, to be compared on the same traffic.
+        episodes: number for each driver; they have the seeds `seed`, `seed + 1`, ...
         seed: of the first episode.
-        road: changes to the scenario's parameters, e.g. `{"length": 230}` or `{"length": (220, 270)}`.
+        scenario_options: changes to the scenario, e.g. `{"length": 230}` or `{"length": (220, 270)}`.
         reward: a name or `path.py:name`; empty: the scenario's own.
         workers: processes; all cores by default. The result does not depend on it.
         out: folder for the results and a report.html; None: nothing is written.
-        progress: told now and then how many decisions an episode has made.
-        held_out: on the seeds that judge trainings, instead of `seed` and those after it.
+        progress: called repeatedly with ((driver, episode), control steps so far).
+        test_seeds: whether to use the test seeds instead of `seed` and the following ones.
 
     Raises:
-        InputError: something is wrong with the arguments; nothing was started.
+        InputError: an argument is wrong; nothing was started.
     """
-    for name, number, least in (("episodes", episodes, 1), ("seed", seed, 0), ("workers", workers, 1)):
-        if number is not None and number < least:
-            raise invalid_value(name, number, f">= {least}")
+    for name, number, minimum in (("episodes", episodes, 1), ("seed", seed, 0), ("workers", workers, 1)):
+        if number is not None and number < minimum:
+            raise invalid_value(name, number, f">= {minimum}")
     if seed + episodes > TRAINING_SEED_LIMIT:
-        raise invalid_value("seed", seed, f"<= {TRAINING_SEED_LIMIT - episodes}: those above choose or judge")
+        raise invalid_value("seed", seed, f"<= {TRAINING_SEED_LIMIT - episodes}: larger ones are reserved")
     if test_seeds and seed:
-        raise invalid_value("seed", seed, "none with held-out seeds")
-    made = make_scenario(scenario, scenario_options)
+        raise invalid_value("seed", seed, "none with test seeds")
+    road = make_scenario(scenario, scenario_options)
     drivers: dict[str, Driver] = {}
-    if isinstance(driver, str) or not isinstance(driver, Sequence):
-        driver = [driver]
-    for entry in driver:
+    for entry in [driver] if isinstance(driver, str) or not isinstance(driver, Sequence) else driver:
         if isinstance(entry, str):
-            drivers[entry] = make_driver(entry, made.control_step)
+            drivers[entry] = make_driver(entry, road.control_step)
         else:
-            one = as_driver(entry)
-            drivers[unique_label(one, drivers)] = one
+            made = as_driver(entry)
+            drivers[unique_label(made, drivers)] = made
     if not drivers:
         raise invalid_value("driver", driver, driver_names())
-    make_reward(reward or made.reward)
-    folder = Path(out) if out is not None else None
+    make_reward(reward or road.reward)
+    folder, report = Path(out) if out is not None else None, None
     seeds = make_test_seeds(episodes) if test_seeds else [(seed + index,) for index in range(episodes)]
     pool = WorkerPool(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
     with lock_new_folder(folder) if folder is not None else nullcontext(), pool:
-        found = evaluate(made, drivers, seeds, pool, reward, progress)
-        report, notes = None, controller_notes(scenario_recipe(made), drivers, found.plot_episodes)
-        notes += [f"{name} {MISSING_ACC_NOTE}" for name, one in drivers.items() if _lacks_acc(one, made)]
-        notes = [*episode_notes(found.rows), *notes, *made.notes]
-        ran = any(row["status"] != "failed" for rows in found.rows.values() for row in rows)
-        if folder is not None and ran:
-            about = {"scenario": Path(scenario).name, "reward": reward or made.reward, "manifest": manifest()}
-            named = {label: label for label in drivers}
-            save_evaluation(folder, found, {**about, "controllers": _controller_hashes(named), "notes": notes})
-            from unjam.reports.html import write_report_page  # draws: so late that what is wrong is told at once
+        evaluation = evaluate(road, drivers, seeds, pool, reward, progress)
+        notes = [
+            *episode_notes(evaluation.rows),
+            *controller_notes(scenario_recipe(road), drivers, evaluation.plot_episodes),
+            *(f"{name} {MISSING_ACC_NOTE}" for name, one in drivers.items() if _lacks_acc(one, road)),
+            *road.notes,
+        ]
+        has_results = any(row["status"] != "failed" for rows in evaluation.rows.values() for row in rows)
+        if folder is not None and has_results:
+            metadata = {"scenario": Path(scenario).name, "reward": reward or road.reward, "manifest": manifest()}
+            hashes = _controller_hashes({label: label for label in drivers})
+            save_evaluation(folder, evaluation, {**metadata, "controllers": hashes, "notes": notes})
+            from unjam.reports.html import write_report_page  # imported late: it draws
 
             report = write_report_page([folder], folder / "report.html")
-    kept = folder if ran else None  # there is nothing to look at
-    return DriveResult(scenario, found.rows, kept, report, found.plot_episodes, notes)
+    used_folder = folder if has_results else None
+    return DriveResult(scenario, evaluation.rows, used_folder, report, evaluation.plot_episodes, notes)

@@ -1,8 +1,8 @@
-"""Trainings in processes of their own: many command lines at once, here or on a Ray cluster; or one alone.
+"""Trainings in subprocesses: many command lines at once, on this machine or on a Ray cluster; or a single training.
 
-The one alone is for a program that imported NumPy before unjam: see `unjam.kernels`. Its child, `python -m
-unjam.training.executors`, reads one line of JSON and answers lines: a list of a word and what belongs to it.
-After each row of progress it reads whether to go on.
+The single training is for a program that imported NumPy before unjam: see `unjam.kernels`. Its child, `python -m
+unjam.training.executors`, reads one line of JSON and writes lines: lists of a message kind and its values. After each
+row of progress it reads whether to continue.
 """
 
 import json
@@ -28,55 +28,55 @@ from unjam.parameters import build_dataclass
 from unjam.processes import bind_to_parent, exit_with_parent
 from unjam.trust import TRUST_CODE_OPTION, expecting_code, is_all_code_trusted
 
-if TYPE_CHECKING:  # the command line asks which executors there are: it is to be quick
+if TYPE_CHECKING:  # the command line imports this module and must start quickly
     from unjam.training.config import RunConfig
     from unjam.training.evaluate import EvaluationProgress, RowsByDriver
 
 Executor = Literal["local", "ray"]
 EXECUTORS: tuple[Executor, ...] = ("local", "ray")
 MessageCallback = Callable[[str], None]
-"""gets a line of progress"""
+"""called with a line of progress"""
 IterationCallback = Callable[[dict[str, Any]], object]
-"""called with each row of progress as it is written; False ends the training"""
+"""called with each row of progress; it returns False to end the training"""
 MAX_ATTEMPTS = 3
-"""how often a command line is started that a signal kills, or whose machine is lost"""
+"""starts of a command line that is killed by a signal or loses its machine"""
 
 
 class CommandLine(NamedTuple):
     """A command line of unjam."""
 
     arguments: Sequence[str]
-    """what follows `unjam`"""
+    """after `unjam`"""
     log: Path
-    """where what it prints is added"""
+    """file to which its output is appended"""
     resume_marker: Path | None = None
-    """the file whose presence says that it was begun before"""
+    """file that exists if the command was started before"""
     resume_arguments: Sequence[str] = ()
-    """words that go on with what was begun"""
+    """arguments that resume it"""
 
     def argv(self) -> list[str]:
-        """Return the whole command line, as it must be on this machine at this moment."""
-        begun = self.resume_marker is not None and self.resume_marker.is_file()
-        return python_command("-m", "unjam", *(self.resume_arguments if begun else self.arguments))
+        """Return the whole command line, which depends on whether it was started before."""
+        was_started = self.resume_marker is not None and self.resume_marker.is_file()
+        return python_command("-m", "unjam", *(self.resume_arguments if was_started else self.arguments))
 
 
 def training_command(config: "RunConfig", folder: Path, config_file: Path, log: Path) -> CommandLine:
-    """Return the command line that begins a training or goes on with it; `plan` gets its configuration."""
-    from unjam.training.config import to_toml
+    """Return the command line that starts or resumes a training; its configuration is written to `config_file`."""
+    from unjam.training.config import CONFIG_FILE, to_toml
 
     make_folder(config_file.parent)
     atomic_write(config_file, to_toml(config))
-    once = ["--workers", str(config.workers), *([TRUST_CODE_OPTION] if is_all_code_trusted() else [])]
+    options = ["--workers", str(config.workers), *([TRUST_CODE_OPTION] if is_all_code_trusted() else [])]
     return CommandLine(
-        ["train", "--config", str(config_file), *once, "--out", str(folder)],
+        ["train", "--config", str(config_file), *options, "--out", str(folder)],
         log,
-        folder / "config.toml",
-        ["train", "--resume", str(folder), *once, "--steps", str(config.steps)],
+        folder / CONFIG_FILE,
+        ["train", "--resume", str(folder), *options, "--steps", str(config.steps)],
     )
 
 
 class LocalExecutor:
-    """Runs command lines on this machine, and can end all that still run."""
+    """Runs command lines on this machine, and can stop all of them."""
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes]] = set()
@@ -84,7 +84,7 @@ class LocalExecutor:
         self._is_stopped = False
 
     def run(self, command: CommandLine) -> int:
-        """Run a command line to its end, anew where a signal kills it; return its exit code."""
+        """Run a command line, again if a signal kills it; return its exit code."""
         make_folder(command.log.parent)
         for _ in range(MAX_ATTEMPTS - 1):
             if (code := self._run_once(command)) >= 0 or self._is_stopped:
@@ -92,13 +92,11 @@ class LocalExecutor:
         return self._run_once(command)
 
     def _run_once(self, command: CommandLine) -> int:
-        line = command.argv()
+        argv, environment = command.argv(), child_environment()
         with open(open_in_place(command.log, APPEND_FLAGS), "ab") as log:
-            log.write(f"$ {shlex.join(line)}\n".encode())
+            log.write(f"$ {shlex.join(argv)}\n".encode())
             log.flush()
-            with subprocess.Popen(
-                line, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=child_environment()
-            ) as process:
+            with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment) as process:
                 with self._lock:
                     self._running.add(process)
                 code = process.wait()
@@ -107,7 +105,7 @@ class LocalExecutor:
         return code
 
     def stop(self) -> None:
-        """Ask all that still run to end: a training then writes its checkpoint."""
+        """Ask all running processes to end; a training then writes its checkpoint."""
         self._is_stopped = True
         with self._lock:
             for process in self._running:
@@ -116,26 +114,27 @@ class LocalExecutor:
 
 @contextmanager
 def open_executor(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine], Future[int]]]:
-    """Give what starts a command line and promises its exit code; an exception in the block ends them all.
+    """Yield a function that starts a command line and returns the future of its exit code.
 
-    At most `workers` run at once; on a Ray cluster, whose machines share the folders, so many are asked for.
+    At most `workers` run at once; on a Ray cluster its machines must share the folders. An exception in the block
+    ends all of them.
 
     Raises:
         MissingPartError: Ray is not installed.
     """
-    processes = LocalExecutor()
-    place = _open_ray(workers) if executor == "ray" else nullcontext(processes.run)
-    with ThreadPoolExecutor(workers) as threads, place as run:
+    local = LocalExecutor()
+    opened = _open_ray(workers) if executor == "ray" else nullcontext(local.run)
+    with ThreadPoolExecutor(workers) as threads, opened as run:
         try:
             yield lambda command: threads.submit(run, command)
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
-            processes.stop()
+            local.stop()
             raise
 
 
 def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, on_message: MessageCallback) -> None:
-    """Run command lines, given by name, `workers` at once; `on_line` gets a line when one has ended.
+    """Run command lines, given by name, `workers` at once; `on_message` is called when one has ended.
 
     Raises:
         UnjamError: one or several failed; all others have run.
@@ -153,13 +152,13 @@ def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, 
             if code != 0:
                 failed.append(name)
     if failed:
-        words = f"{len(failed)} of {len(commands)} failed: {', '.join(failed)}"
-        raise UnjamError(f"{words}; what the first of them said is in {commands[failed[0]].log}")
+        names_text = ", ".join(failed)
+        raise UnjamError(f"{len(failed)} of {len(commands)} failed: {names_text}; first log: {commands[failed[0]].log}")
 
 
 @contextmanager
 def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
-    """Give what runs a command line somewhere on the Ray cluster that is there, or on one of this machine."""
+    """Yield a function that runs a command line on the existing Ray cluster, or on one of this machine."""
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -176,9 +175,9 @@ def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
         ray.shutdown()
 
 
-def _run_on_node(command: CommandLine, held_folders: str) -> int:
-    """Run a command line in a process of the cluster, where folders are held that another machine holds."""
-    os.environ[PROTECTED_FOLDERS_VARIABLE] = held_folders
+def _run_on_node(command: CommandLine, protected_folders: str) -> int:
+    """Run a command line in a process of the cluster, with the protected folders of the starting machine."""
+    os.environ[PROTECTED_FOLDERS_VARIABLE] = protected_folders
     return LocalExecutor().run(command)
 
 
@@ -190,11 +189,7 @@ def train_in_subprocess(
     on_iteration: IterationCallback | None,
     progress: "EvaluationProgress | None",
 ) -> "dict[str, RowsByDriver]":
-    """Train as `unjam.train` does, and return the rows of the judgement, by road and driver.
-
-    Raises:
-        UnjamError: of the same kind as in this process.
-    """
+    """Train as `train_in_process` does, with the same errors, in a subprocess."""
     child = subprocess.Popen(
         python_command("-m", "unjam.training.executors"),
         stdin=subprocess.PIPE,
@@ -210,32 +205,32 @@ def train_in_subprocess(
         for line in child.stdout:
             match json.loads(line):
                 case ["row", row]:
-                    goes_on = on_iteration is None or on_iteration(row) is not False
-                    with suppress(BrokenPipeError):  # it was killed: its code is told below
-                        print(json.dumps(goes_on), file=child.stdin, flush=True)
+                    continues = on_iteration is None or on_iteration(row) is not False
+                    with suppress(BrokenPipeError):  # it was killed: its exit code is reported below
+                        print(json.dumps(continues), file=child.stdin, flush=True)
                 case ["evaluated", driver, episode, steps] if progress is not None:
                     progress((driver, episode), steps)
-                case ["error", kind, words]:
-                    raise error_from_name(kind, words)
+                case ["error", kind, text]:
+                    raise error_from_name(kind, text)
                 case ["done", rows]:
                     return rows
         raise UnjamError(f"training: its process ended with code {child.wait()}")
     finally:
-        child.terminate()  # where it has ended by itself, this does nothing
+        child.terminate()  # no effect if it has ended
         child.wait()
 
 
 def train_from_stdin() -> None:
-    """Train as the line on standard input says."""
+    """Train by the request on standard input, in the subprocess of `train_in_subprocess`."""
     exit_with_parent(signal.SIGTERM)
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # SUMO and user code may print: not into the answers
+    messages = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what SUMO and user code print must not mix with the messages
     values, folder, resume, path = json.loads(sys.stdin.readline())
-    # A user's driver may import what the program added to its path; last, it hides nothing that is installed.
+    # User code may need the import path of the parent; at the end it hides no installed package.
     sys.path.extend(each for each in path if each not in sys.path)
 
     def send(*message: Any) -> None:
-        print(json.dumps(message), file=answers, flush=True)
+        print(json.dumps(message), file=messages, flush=True)
 
     def report_iteration(row: dict[str, Any]) -> bool:
         send("row", row)

@@ -1,4 +1,4 @@
-"""Controllers as files: those that a run keeps in its folders, and what `unjam export` ships."""
+"""Controller files: those in run folders, and the export of controllers."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -36,13 +36,13 @@ ControllerKind = Literal["best", "latest"]
 
 
 class ControllerStore:
-    """The content of the controllers that are in a run's folders.
+    """The contents of the controllers in a run's folders.
 
-    `best` are those of validations that a longer run makes too; `remaining_rows` also those of its last iteration.
+    `best` come from validations that a longer run would also make; `latest` also from the last iteration.
     """
 
     def __init__(self, folders: Sequence[Path]) -> None:
-        """Prepare for one controller in each of the folders."""
+        """Prepare one controller for each folder."""
         self._folders = folders
         self._contents: dict[ControllerKind, list[bytes]] = {}
 
@@ -52,8 +52,8 @@ class ControllerStore:
         self._write("latest")
 
     def tensors(self) -> "Tensors":
-        """Return all of them for a checkpoint."""
-        import torch  # whoever exports a driver does without
+        """Return all contents for a checkpoint."""
+        import torch  # not needed to export a driver
 
         return {
             f"{kind}/{index}": torch.frombuffer(bytearray(content), dtype=torch.uint8)
@@ -62,13 +62,13 @@ class ControllerStore:
         }
 
     def restore(self, tensors: "Tensors", is_finished: bool) -> None:
-        """Take those of a checkpoint out of `tensors`, and write them: `remaining_rows` where the training has ended.
+        """Remove the contents of a checkpoint from `tensors` and write them: `latest` if the training has ended.
 
-        What was in the folders may be of a later iteration, or somebody else's.
+        The files in the folders may come from a later iteration, or may have been changed.
         """
         for kind in ("best", "latest") if "best/0" in tensors else ():
-            found = [tensors.pop(f"{kind}/{index}") for index in range(len(self._folders))]
-            self._contents[kind] = [each.numpy().tobytes() for each in found]
+            stored = [tensors.pop(f"{kind}/{index}") for index in range(len(self._folders))]
+            self._contents[kind] = [each.numpy().tobytes() for each in stored]
         if not is_finished and "best" in self._contents:
             self._contents["latest"] = self._contents["best"]
         self._write("latest")
@@ -81,32 +81,31 @@ class ControllerStore:
 
 @dataclass(frozen=True)
 class ExportResult:
-    """A controller that was exported."""
+    """An exported controller."""
 
     file: Path
     graph: Path | None
-    """the ONNX graph beside it; it is also in the file"""
+    """the ONNX graph; it is also in the controller's file"""
     driver: str
     sample_steps: int
-    """of the recorded sample"""
+    """length of the recorded sample"""
 
 
 @expecting_code()
 def export_controller(source: str | Path, out: str | Path, onnx: bool = False, scenario: str = "") -> ExportResult:
-    """Write a controller into a file that needs nothing else: `.unjam`, and on demand an ONNX graph.
+    """Write a controller into a self-contained file `.unjam`, and optionally an ONNX graph.
 
-    One held-out episode is driven for its recorded sample. What is written has the road's safety filter with
-    it, where the road has one.
+    One test episode is run for its recorded sample. The controller includes the road's safety filter, if there is one.
 
     Args:
-        source: a run folder, or any driver as `unjam.drive` takes it.
-        to: the file, ending in `.unjam`; the graph goes beside it, with `.onnx`.
-        onnx: whether to draw the graph of the whole controller.
-        scenario: whose time step and bounds a driver gets; a run and a controller's file have their own.
+        source: a run folder, or any driver as in `unjam.drive`.
+        out: the file, ending in `.unjam`; the graph has the same name with `.onnx`.
+        onnx: whether to write the graph of the whole controller.
+        scenario: the scenario for time step and bounds of a driver; a run and a controller's file have their own.
 
     Raises:
-        InputError: there is no such controller, or it is Python code, or, with `onnx`, cannot be drawn.
-        MissingPartError: with `onnx`, a package that draws or runs graphs is not installed.
+        InputError: there is no such controller, or it is Python code, or, with `onnx`, it has no graph.
+        MissingPartError: with `onnx`, a package for graphs is not installed.
     """
     source, out = Path(source), Path(out)
     if out.suffix != SUFFIX:
@@ -114,73 +113,72 @@ def export_controller(source: str | Path, out: str | Path, onnx: bool = False, s
     check_parent_folder(out)
     if _is_signed(out):
         raise InputError(f"out: {str(out)!r} is a signed controller; allowed: another file")
-    road, driver, about = (
-        _read_run_origin(source, scenario) if source.is_dir() else _read_driver_origin(str(source), scenario)
-    )
+    read_origin = _read_run_origin if source.is_dir() else _read_driver_origin
+    road, driver, metadata = read_origin(str(source), scenario)
     code = user_code_recipes(driver_recipe(driver)[0])
     if driver.is_native or code:
-        why = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
-        raise InputError(f"export: {driver.describe()} is not allowed: {why}; allowed: drivers that are data")
+        reason = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
+        raise InputError(f"export: {driver.describe()} is not allowed: {reason}; allowed: drivers without Python code")
     if road.safety.active and not road.actuator.is_instant:
-        late = f"actuator.delay {road.actuator.delay:g}, actuator.lag {road.actuator.lag:g}"
-        raise InputError(f"export: {late} is not allowed: the filter of a file does not know it; allowed: 0 and 0")
+        latency = f"actuator.delay {road.actuator.delay:g}, actuator.lag {road.actuator.lag:g}"
+        raise InputError(f"export: {latency} is not allowed: the filter of a file ignores them; allowed: 0 and 0")
     if road.safety.active and not isinstance(driver, FilteredDriver):
-        asked = (driver.limits or road.acceleration_limits).highest
-        driver = FilteredDriver(driver, asked, road.safety, road.control_step)
+        max_acceleration = (driver.limits or road.acceleration_limits).highest
+        driver = FilteredDriver(driver, max_acceleration, road.safety, road.control_step)
     low, high = driver.limits or road.acceleration_limits
     limit = max(-low, high)
     states, graph = _sample_states(road, driver), dict[str, bytes]()
     if onnx:
-        from unjam.controller.onnx_graph import onnx_graph  # torch.onnx takes its time, and not all want it
+        from unjam.controller.onnx_graph import onnx_graph  # imported late: torch.onnx is slow to import
 
-        missed = [name for name in driver.input_fields if getattr(states, name) is None]
-        if missed:  # the graph takes all that a driver may look at
-            why = f"{road.title} does not tell {', '.join(missed)}; allowed: --scenario of a road that does"
-            raise InputError(f"onnx: {driver.describe()} is not allowed: {why}")
+        missing = [name for name in driver.input_fields if getattr(states, name) is None]
+        if missing:  # the graph has all inputs of the driver
+            reason = f"{road.title} does not provide {', '.join(missing)}; allowed: --scenario of a road that does"
+            raise InputError(f"onnx: {driver.describe()} is not allowed: {reason}")
         graph = {GRAPH_PART: onnx_graph(driver, limit)}
-    made = controller_bytes(driver, about, {SAMPLE_PART: sample_bytes(driver, states, limit), **graph})
+    content = controller_bytes(driver, metadata, {SAMPLE_PART: sample_bytes(driver, states, limit), **graph})
     with PrivateFolder() as private:
         unverified = Path(private, out.name)
-        atomic_write(unverified, made)
+        atomic_write(unverified, content)
         verify_controller_file(unverified)
-    atomic_write(out, made)  # what was there before is good until then
-    beside = out.with_suffix(".onnx") if graph else None
-    if beside is not None:
-        atomic_write(beside, graph[GRAPH_PART])
-    return ExportResult(out, beside, driver.describe(), len(states.speed))
+    atomic_write(out, content)  # an earlier file stays until then
+    graph_file = out.with_suffix(".onnx") if graph else None
+    if graph_file is not None:
+        atomic_write(graph_file, graph[GRAPH_PART])
+    return ExportResult(out, graph_file, driver.describe(), len(states.speed))
 
 
 def _is_signed(file: Path) -> bool:
-    """Return whether a file is a controller that somebody has signed."""
+    """Return whether a file is a signed controller."""
     with suppress(InputError):
         return file.is_file() and read_controller(file).signed_by is not None
     return False
 
 
-def _read_run_origin(folder: Path, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
+def _read_run_origin(run: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
     """Return the road, controller and origin of a run."""
     if scenario:
-        raise invalid_value("scenario", scenario, "none beside a run, which has its own")
+        raise invalid_value("scenario", scenario, "none for a run, which has its own")
+    folder = Path(run)
     config = read_config(folder)
-    road, found = config.make_scenario(), read_controller(folder)
-    counted = {key: found.manifest.get(key) for key in ("iteration", "environment_steps")}
-    about = {
+    road, controller = config.make_scenario(), read_controller(folder)
+    metadata = {
         **controller_origin(road, config.make_expert()),
         "run": {"scenario": config.scenario, "agent": config.agent, "seed": config.seed},
-        **counted,
+        **{key: controller.manifest.get(key) for key in ("iteration", "environment_steps")},
         "metrics": _test_metrics(folder),
     }
-    return road, found.driver, about
+    return road, controller.driver, metadata
 
 
 def _read_driver_origin(driver_name: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
-    """Return the road, driver and origin of a driver by itself; those of a controller's file are kept."""
+    """Return the road, driver and origin of a driver; a controller's file keeps its own."""
     file = None if scenario else controller_path(driver_name)
     if file is not None:
-        found = read_controller(file)
-        about = {name: found.manifest[name] for name in PROVENANCE_ENTRIES if name in found.manifest}
-        road = scenario_from_recipe(about["scenario"]) if "scenario" in about else example_scenario("ring")
-        return road, found.driver, about
+        controller = read_controller(file)
+        metadata = {name: controller.manifest[name] for name in PROVENANCE_ENTRIES if name in controller.manifest}
+        road = scenario_from_recipe(metadata["scenario"]) if "scenario" in metadata else example_scenario("ring")
+        return road, controller.driver, metadata
     road = example_scenario(scenario or "ring")
     driver = make_driver(driver_name, road.control_step)
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
@@ -188,24 +186,23 @@ def _read_driver_origin(driver_name: str, scenario: str) -> tuple[Scenario, Driv
 
 
 def _test_metrics(folder: Path) -> dict[str, Any] | None:
-    """Return what the run's evaluation measured of the controller and of its expert; None before its end."""
+    """Return the test metrics of a run's controller and expert; None before its evaluation."""
     if not (folder / EVALUATION_FILE).is_file():
         return None
-    found, rows_of = read_evaluation(folder)
-    measured: dict[str, Any] = {"reward": found["reward"]}
-    for label in (TRAINED_LABEL, found["expert"]):
-        if rows := rows_of.get(label):
+    evaluation, rows_by_driver = read_evaluation(folder)
+    metrics: dict[str, Any] = {"reward": evaluation["reward"]}
+    for label in (TRAINED_LABEL, evaluation["expert"]):
+        if rows := rows_by_driver.get(label):
             estimates = {name: each.__dict__ for name, each in summarize(rows).items() if each.count}
-            measured[label] = {"episodes": len(rows), **estimates}
-    return measured
+            metrics[label] = {"episodes": len(rows), **estimates}
+    return metrics
 
 
 def _sample_states(scenario: Scenario, driver: Driver) -> LocalState:
-    """Return what the CAV that stays longest perceives in a held-out episode, arrays of shape (T,)."""
+    """Return the local states of the CAV with the longest trip in a test episode, arrays of shape (T,)."""
     with WorkerPool(1) as workers:
         (episode,) = workers.run([EpisodeTask(scenario, driver, make_test_seeds(1)[0])])
     raise_failure([measure(episode)] if not episode.has_run else [])
     longest = max(episode.trajectories, key=lambda trajectory: len(trajectory.applied_acceleration))
-    decisions = min(len(longest.applied_acceleration), MAX_SAMPLE_STEPS)
-    seen = longest.states.select(slice(decisions))
-    return LocalState(**{name: values for name, values in seen._asdict().items() if name in driver.input_fields})
+    states = longest.states.select(slice(min(len(longest.applied_acceleration), MAX_SAMPLE_STEPS)))
+    return LocalState(**{name: values for name, values in states._asdict().items() if name in driver.input_fields})

@@ -1,4 +1,4 @@
-"""What a training belongs to: its settings, and hashes of the code, networks and packages in it."""
+"""The fingerprint of a training: its settings, and hashes of its code, networks and packages."""
 
 import json
 import logging
@@ -26,24 +26,23 @@ _LOG = logging.getLogger(__name__)
 
 
 def fingerprint(config: RunConfig) -> dict[str, Any]:
-    """Return what a training's result depends on, as JSON.
+    """Return everything that the result of a training depends on, as JSON.
 
-    Returns:
-        `settings`: all but steps and workers, by name; `files`: hashes of the expert, and of the user's own
-        code and networks; `packages` and `kernel_info`: what it computes with.
+    `settings` has all but steps and workers, by name; `files` the hashes of the experts and of the user's code and
+    networks; `packages` and `kernels` the numerical environment.
     """
-    roads = zip(config.task_configs().values(), config.make_tasks(), strict=True)
-    files = {name: sha256 for road, task in roads for name, sha256 in _task_file_hashes(road, task).items()}
+    tasks = zip(config.task_configs().values(), config.make_tasks(), strict=True)
+    files = {name: sha256 for each, task in tasks for name, sha256 in _task_file_hashes(each, task).items()}
     settings = flatten_keys(asdict(replace(config, steps=1, workers=1)))
-    found = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
-    return json.loads(to_json(found))
+    entries = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
+    return json.loads(to_json(entries))
 
 
 def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
-    """Compare what a checkpoint belongs to with what would go on; other packages and kernels are only told.
+    """Compare the fingerprint of a checkpoint with the current one; other packages and kernels only give a warning.
 
     Raises:
-        InputError: a setting, the expert, or a file of the user's own is another one.
+        InputError: a setting, the expert or a file of the user has changed.
     """
     for name, value in current["settings"].items():
         if name in stored["settings"] and stored["settings"][name] != value:
@@ -51,22 +50,22 @@ def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
     check_file_hashes(stored, current, "resume")
     for part in ("packages", "kernels"):
         if stored[part] != current[part]:
-            _LOG.warning("resume: other %s than the checkpoint's: the result is not what it would be", part)
+            _LOG.warning("resume: other %s than in the checkpoint: the result may differ", part)
 
 
 def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:
-    """Raise `InputError` where the expert, or a file of the user's own, is another one."""
+    """Raise `InputError` if the expert or a file of the user has changed."""
     for name in sorted(stored["files"].keys() | current["files"].keys()):
         if stored["files"].get(name) != current["files"].get(name):
             raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
 
 
 def _task_file_hashes(config: RunConfig, task: Task) -> dict[str, str]:
-    """Return hashes by what they are of."""
+    """Return the hashes of a task by the name of what they cover."""
     recipe, arrays = driver_recipe(task.expert)
     weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
-    found = {f"expert {config.expert}": sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)}
-    return found | file_hashes((config.reward, *config.policy.inputs), task.scenario)
+    hashes = {f"expert {config.expert}": sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)}
+    return hashes | file_hashes((config.reward, *config.policy.inputs), task.scenario)
 
 
 def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""What Optuna remembers of a search, in a file of its own format; import it where Optuna is installed."""
+"""Optuna's log of a search in a file; import this module only if Optuna is installed."""
 
 import json
 from collections.abc import Iterable
@@ -11,13 +11,13 @@ from unjam.files import append_line, atomic_write, read_json_lines
 
 
 class Journal(BaseJournalBackend):
-    """Optuna's log of a study, which one process writes at a time: the one that holds the search's folder.
+    """Optuna's log of a study, which is written only by the process that has locked the search's folder.
 
-    Optuna's own class writes through links, and leaves a link as its lock.
+    Optuna's own class follows symbolic links, and leaves one as its lock.
     """
 
     def __init__(self, path: Path) -> None:
-        """Take the file, which may be missing; a line that a crash has cut short is left out."""
+        """Read the file, which may be missing; an incomplete line of a crash is left out."""
         self._path, self._lines = path, list(map(_json_line, read_json_lines(path)))
         if path.is_file():
             atomic_write(path, "".join(f"{line}\n" for line in self._lines))

@@ -1,9 +1,9 @@
-"""The family of roads on which one controller is trained and judged: what it sees, and what is held out.
+"""The family of roads on which one controller is trained and evaluated, divided into training and unseen roads.
 
-Each road draws its size, its people and their noise from the seed. Held out are whole axes (a density, a
-number of vehicles, people, a demand, a radius) and new combinations of what is seen; which, was fixed before
-anything was trained or tuned on them. Wrong sensors, very late cars and calibrated people came last, and are
-held out.
+Each road draws its size, its human drivers and their noise from the seed. Unseen are whole axes (a density, a
+number of vehicles, human drivers, a demand, a radius) and new combinations of training values; the division was
+fixed before anything was trained or tuned on these roads. Noisy sensors, long actuator delays and calibrated
+populations were added last, as unseen roads.
 """
 
 from dataclasses import dataclass, field
@@ -16,25 +16,22 @@ from unjam.scenarios.scenario import Scenario
 FamilyPart = Literal["training", "combination", "axis"]
 
 SHORT_WARM_UP, LONG_WARM_UP = 750, 6000
-"""all-human simulation steps before the CAVs take over: a wave begins, or is there"""
+"""human-only simulation steps before the CAVs are switched on: a wave begins, or is fully developed"""
 AGGRESSIVE_IDM = {"time_headway": 0.9, "max_acceleration": 1.3, "comfortable_deceleration": 2.0}
-"""people who follow closer and accelerate harder than the paper's"""
+"""human drivers that follow closer and accelerate harder than the paper's"""
 NGSIM_IDM = {
-    "desired_speed": 17.49,
-    "time_headway": 1.355,
-    "max_acceleration": 1.243,
-    "comfortable_deceleration": 1.424,
-    "minimum_gap": 2.157,
+    **{"desired_speed": 17.49, "time_headway": 1.355, "minimum_gap": 2.157},
+    **{"max_acceleration": 1.243, "comfortable_deceleration": 1.424},
 }
-"""the IDM that suits the 325 drivers of the NGSIM pairs best together, results/field/ngsim-drivers.json"""
+"""the common IDM of the 325 drivers of the NGSIM pairs, results/field.json"""
 ACTUATOR_LATENCY, LONG_ACTUATOR_LATENCY = {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}
-"""cars that do late what they are told [s]"""
+"""[s]"""
 SENSOR_ERRORS = {"gap_error": 0.5, "speed_error": 0.3}
 NOISY_SENSORS: dict[str, Any] = {"sensors": {**SENSOR_ERRORS, "dropout": 0.1}, "safety": SENSOR_ERRORS}
-"""sensors that err, and lose a tenth of the readings; the filter allows for it"""
+"""sensors with errors that lose a tenth of the readings; the safety filter allows for the errors"""
 NGSIM_DRIVERS: dict[str, Any] = {"population": "unjam:ngsim"}
 ASTAZERO_DRIVERS: dict[str, Any] = {"population": "unjam:astazero"}
-"""people each of whom drives as somebody did who was recorded; on the on-ramp with what they can carry"""
+"""populations of recorded drivers; on the on-ramp with a demand that they can serve"""
 
 
 @dataclass(frozen=True)
@@ -44,17 +41,17 @@ class FamilyRoad:
     scenario: str
     options: dict[str, Any] = field(default_factory=dict)
     part: FamilyPart = "training"
-    """`training` in training and tuning; held out: a new `combination` of what is seen, or a whole `axis`"""
+    """`training` also covers tuning; unseen: a new `combination` of training values, or a whole `axis`"""
 
     def make_scenario(self) -> Scenario:
-        """Return the road."""
+        """Return the scenario of the road."""
         return make_scenario(self.scenario, self.options)
 
 
 def ring_options(
     vehicles: int, cavs: int, warmup: int, spacing: tuple[float, float] = (10.0, 12.27), **extra: Any
 ) -> dict[str, Any]:
-    """Return a ring's parameters; `cav_spacing` is the road for each vehicle [m], the paper's by default."""
+    """Return the options of a ring; `spacing` is the road length per vehicle [m], the paper's by default."""
     length = [round(vehicles * each) for each in spacing]
     return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **extra}
 
@@ -103,30 +100,28 @@ FAMILY: dict[str, FamilyRoad] = {
         "on-ramp", {"penetration_rate": 0.1, "inflow": 2200.0, "ramp_flow": 350.0, **ASTAZERO_DRIVERS}, "axis"
     ),
 }
-"""every road by name"""
-
-
+"""all roads by name"""
 GROUP_BY_SCENARIO = {"ring": "rings", "figure-eight": "figure-eights", "on-ramp": "motorways", "on-ramp-1": "motorways"}
-"""for each scenario the group of roads that one law can be written for"""
+"""group of roads of each scenario, for which one expert exists"""
 SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "all-roads"
-"""names of the rings that several CAVs share, and of the whole family"""
+"""names of the rings with several CAVs, and of the whole family"""
 ROAD_GROUPS = (*dict.fromkeys(GROUP_BY_SCENARIO.values()), SHARED_RINGS_GROUP, ALL_ROADS_GROUP)
-"""names of several roads"""
+"""names of all groups"""
 
 
 def _is_in(road: FamilyRoad, group: str) -> bool:
     """Return whether a road belongs to a group, one of `ROAD_GROUPS`."""
     if group == SHARED_RINGS_GROUP:
-        changes = road.options
-        return road.scenario == "ring" and changes["cavs"] >= MIN_SHARED_PENETRATION_RATE * changes["vehicles"]
+        options = road.options
+        return road.scenario == "ring" and options["cavs"] >= MIN_SHARED_PENETRATION_RATE * options["vehicles"]
     return group in (GROUP_BY_SCENARIO[road.scenario], ALL_ROADS_GROUP)
 
 
 def family_roads(group: str) -> dict[str, FamilyRoad]:
-    """Return the roads of a group, one of `ROAD_GROUPS`, seen and held out, by name."""
+    """Return all roads of a group, one of `ROAD_GROUPS`, by name."""
     return {name: road for name, road in FAMILY.items() if _is_in(road, group)}
 
 
 def family_scenarios(group: str, *parts: FamilyPart) -> dict[str, Scenario]:
-    """Return the roads of some parts of a group, one of `ROAD_GROUPS`, by name."""
+    """Return the scenarios of some parts of a group, one of `ROAD_GROUPS`, by name."""
     return {name: road.make_scenario() for name, road in family_roads(group).items() if road.part in parts}

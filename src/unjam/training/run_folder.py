@@ -1,7 +1,7 @@
-"""The folder of a run: begun, read, gone on with, and its checkpoints and what they belong to.
+"""The folder of a run: its creation, resumption and checkpoints.
 
-Free of torch until there is a checkpoint to write or read, so that what is wrong is told at once. Checkpoints
-are made at the end of iterations: written whole, checked by hash, two generations kept.
+torch is only imported to read or write a checkpoint, so that errors are reported quickly. A checkpoint is written at
+the end of each iteration, as a whole, with a hash; the newest two are kept.
 """
 
 import json
@@ -33,7 +33,7 @@ from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
-from unjam.training.config import RunConfig, load_config, read_toml, to_toml
+from unjam.training.config import CONFIG_FILE, RunConfig, load_config, read_toml, to_toml
 from unjam.training.early_stopping import should_stop_early
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
@@ -48,22 +48,22 @@ MAX_CHECKPOINTS = 2
 MANIFEST_FILE, PROGRESS_FILE = "manifest.json", "progress.jsonl"
 CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE = "state.json", "tensors.safetensors"
 ROW_MODEL_FIELDS = {"distance_to_crossing", "penetration_rate"}
-"""of what a road tells a CAV, what virtual rows go on with"""
+"""optional inputs that the row model continues"""
 
 
 def check_config(config: RunConfig) -> None:
-    """Raise `InputError` where an expert, what the network sees, a reward or a baseline is at fault."""
-    for road in config.task_configs().values():
-        scenario = road.make_scenario()
-        check_policy_inputs(road.policy.inputs, scenario, "policy.inputs")
-        expert = road.make_expert()
+    """Raise `InputError` if an expert, an input of the network, a reward, a baseline or the model is not possible."""
+    for task in config.task_configs().values():
+        scenario = task.make_scenario()
+        check_policy_inputs(task.policy.inputs, scenario, "policy.inputs")
+        expert = task.make_expert()
         check_can_drive(expert, scenario)
-        observation_size(road.policy.inputs, expert)
-        make_reward(road.reward or scenario.reward)
-        for name in road.evaluation.baselines:
+        observation_size(task.policy.inputs, expert)
+        make_reward(task.reward or scenario.reward)
+        for name in task.evaluation.baselines:
             make_driver(name, scenario.control_step)
         if config.model.model_ratio > 0 and config.model.kind == "row":
-            _check_row_model(road, scenario, expert)
+            _check_row_model(task, scenario, expert)
         elif config.model.model_ratio > 0:
             from unjam.models.motorway_model import check_motorway_model  # which needs torch
             from unjam.models.road_model import check_road_model
@@ -76,21 +76,21 @@ def check_config(config: RunConfig) -> None:
 
 
 def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> None:
-    """Raise `InputError` where rows cannot go on with what a CAV is told, or with how it is driven."""
-    told = set(expert.measured_fields).union(*(feature(name).required_fields for name in config.policy.inputs))
-    missed = sorted(told & set(scenario.provided_fields) - ROW_MODEL_FIELDS)
-    why = f"{expert.describe()} and the network ask for {', '.join(missed)}" if missed else ""
+    """Raise `InputError` if the row model cannot continue an input, or the actuation of the scenario."""
+    inputs = set(expert.measured_fields).union(*(feature(name).required_fields for name in config.policy.inputs))
+    missing = sorted(inputs & set(scenario.provided_fields) - ROW_MODEL_FIELDS)
+    reason = f"{expert.describe()} and the network use {', '.join(missing)}" if missing else ""
     if scenario.actuation == "cruise":
-        why = "CAVs have an ACC of their own"
-    if why:
+        reason = "CAVs use their own ACC"
+    if reason:
         allowed = "allowed: road, or model.model_ratio 0"
-        raise InputError(f"model.kind: row is not allowed on {scenario.title}, where {why}; {allowed}")
+        raise InputError(f"model.kind: row is not allowed on {scenario.title}, where {reason}; {allowed}")
 
 
 def make_new_folder(folder: Path, alternative: str = "") -> None:
-    """Make a folder; raise `InputError` where it holds something already, `fallback` is allowed too.
+    """Make a folder; raise `InputError` if it is not empty. `alternative` is what else is allowed, for the message.
 
-    What somebody left who was killed before anything was written is nothing.
+    Leftovers of a process that was killed before it had written anything do not count.
     """
     try:
         if folder.exists() and not (
@@ -98,19 +98,19 @@ def make_new_folder(folder: Path, alternative: str = "") -> None:
         ):
             raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder{alternative}")
         make_folder(folder)
-    except OSError as error:  # no place for a folder at all: under /proc, or of a name too long
-        why = f"cannot be made ({error.strerror})"
-        raise InputError(f"out: {str(folder)!r} {why}; allowed: a new folder") from None
+    except OSError as error:  # for example under /proc, or with too long a name
+        reason = f"cannot be made ({error.strerror})"
+        raise InputError(f"out: {str(folder)!r} {reason}; allowed: a new folder") from None
 
 
 @contextmanager
 def lock_new_folder(folder: Path, resumable_file: str = "") -> Iterator[None]:
-    """Make a folder, and hold it for this process alone; one that stays empty is removed again.
+    """Make a folder and lock it for this process; a folder that stays empty is removed again.
 
-    It may be an old one where it has a file `or_with`.
+    An existing folder is allowed if it has the file `resumable_file`.
 
     Raises:
-        InputError: it holds something already, or another process holds it.
+        InputError: the folder is not empty, or another process has locked it.
     """
 
     def check() -> None:
@@ -120,62 +120,83 @@ def lock_new_folder(folder: Path, resumable_file: str = "") -> Iterator[None]:
     check()
     try:
         with lock_folder(folder):
-            check()  # another may have written it until just now
+            check()  # another process may have written to it in the meantime
             yield
     finally:
-        remove_if_empty(folder)  # it holds something where all went well
+        remove_if_empty(folder)
 
 
 def create_run_folder(folder: Path, config: RunConfig) -> None:
-    """Make the folder of a new run and write what it is about.
+    """Make the folder of a new run with its configuration and manifest.
 
     Raises:
-        InputError: the folder holds something already.
+        InputError: the folder is not empty.
     """
     make_new_folder(folder, f", or --resume {folder}")
-    atomic_write(folder / "config.toml", to_toml(config))
-    atomic_write(folder / MANIFEST_FILE, to_json(manifest(), indent=1))
+    atomic_write(folder / CONFIG_FILE, to_toml(config))
+    _write_manifest(folder)
+
+
+def _write_manifest(folder: Path) -> None:
+    atomic_write(folder / MANIFEST_FILE, to_json({"format": CHECKPOINT_FORMAT, **manifest()}, indent=1))
 
 
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
-    """Return the configuration of a run folder; raise `InputError` where it is none.
+    """Return the configuration of a run folder.
 
-    With `to_run` also where it names Python code that is not trusted: else nothing of it may be made.
+    Without `check_trust` the configuration may name Python code that is not trusted; then nothing of it may be run.
+
+    Raises:
+        InputError: it is not a run folder, or one of another format, or it names untrusted code.
     """
-    if not (folder / "config.toml").is_file():
-        raise InputError(f"run: {str(folder)!r} is not a run folder: it has no config.toml")
-    path = folder / "config.toml"
-    return load_config(path) if check_trust else build_dataclass(RunConfig, read_toml(path), "")
+    path = folder / CONFIG_FILE
+    if not path.is_file():
+        raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {CONFIG_FILE}")
+    try:
+        return load_config(path) if check_trust else build_dataclass(RunConfig, read_toml(path), "")
+    except InputError:
+        _check_format(folder)
+        raise
+
+
+def _check_format(folder: Path) -> None:
+    """Raise `InputError` if the manifest of a run folder says that it has another format."""
+    made: Any = {}
+    with suppress(OSError, ValueError, RecursionError):
+        made = json.loads((folder / MANIFEST_FILE).read_text())
+    if isinstance(made, dict) and "unjam" in made and made.get("format") != CHECKPOINT_FORMAT:
+        raise InputError(
+            f"run: {str(folder)!r} has format {made.get('format', 4)}, written by unjam {made['unjam']}, started "
+            f"{made.get('started')}; allowed: format {CHECKPOINT_FORMAT}: train again"
+        )
 
 
 def resume_run_folder(folder: Path, config: RunConfig) -> None:
-    """Check that `config` may go on with the run in `folder`, and write down its new budget.
+    """Check that `config` can resume the run in `folder`, and write its new budget.
 
     Raises:
-        InputError: something else than the budget or the number of workers differs, or the folder is that of
-            one road of a run of several.
+        InputError: more than the steps and the number of workers differs, or the folder belongs to one task of a run.
     """
-    whole = folder.absolute().parent
-    if folder.name in _task_names(whole):
-        raise InputError(f"resume: {str(folder)!r} is one road of a run of several; allowed: {whole}")
-    before = read_config(folder)
+    parent = folder.absolute().parent
+    if folder.name in _task_names(parent):
+        raise InputError(f"resume: {str(folder)!r} is one task of a run; allowed: {parent}")
+    before, progress = read_config(folder), read_progress(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
-        raise InputError("resume: only steps and workers may change; all else is the run's")
-    if config.steps > before.steps and should_stop_early(before, read_progress(folder)):
-        why = f"evaluation.patience or evaluation.convergence_window ended it; allowed: {before.steps}, or a new run"
-        raise InputError(f"steps: {config.steps} is not allowed: {why}")
-    if config.steps < before.steps:
-        made = max((row.get("environment_steps", 0) for row in read_progress(folder)), default=0)
-        if config.steps < made:
-            raise invalid_value("steps", config.steps, f">= {made}, which are made")
+        raise InputError("resume: only steps and workers may change")
+    if config.steps > before.steps and should_stop_early(before, progress):
+        reason = f"evaluation.patience or evaluation.convergence_window ended it; allowed: {before.steps}, or a new run"
+        raise InputError(f"steps: {config.steps} is not allowed: {reason}")
+    done = max((row.get("environment_steps", 0) for row in progress), default=0)
+    if config.steps < min(before.steps, done):
+        raise invalid_value("steps", config.steps, f">= {done}, which are done")
     if config != before:
-        atomic_write(folder / "config.toml", to_toml(config))
-    if not (folder / MANIFEST_FILE).is_file():  # it was stopped before it had written that
-        atomic_write(folder / MANIFEST_FILE, to_json(manifest(), indent=1))
+        atomic_write(folder / CONFIG_FILE, to_toml(config))
+    if not (folder / MANIFEST_FILE).is_file():  # the run was stopped before it wrote the manifest
+        _write_manifest(folder)
 
 
 def _task_names(folder: Path) -> Collection[str]:
-    """Return the names of the roads of a run of several; what is none has none."""
+    """Return the names of the tasks of a run folder; other folders have none."""
     with suppress(InputError):
         if (folder / MANIFEST_FILE).is_file():
             return read_config(folder, check_trust=False).task_configs()
@@ -183,7 +204,7 @@ def _task_names(folder: Path) -> Collection[str]:
 
 
 def append_lineage(folder: Path, iteration: int) -> None:
-    """Add to a run's manifest by what it goes on, and after which iteration."""
+    """Add to a run's manifest the environment in which it is resumed after an iteration."""
     path = folder / MANIFEST_FILE
     try:
         made = json.loads(path.read_text())
@@ -194,7 +215,7 @@ def append_lineage(folder: Path, iteration: int) -> None:
 
 
 def controller_origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
-    """Return where a controller comes from, for its own manifest: the same for the same run."""
+    """Return the origin of a controller for its manifest; it is the same for the same run."""
     return {
         "scenario": scenario_recipe(scenario),
         "time_step": scenario.control_step,
@@ -207,89 +228,85 @@ def controller_origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
 def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> None:
     """Write the checkpoint of an iteration under `folder`, and remove all but the newest two.
 
-    `state["iteration"]` names it. It appears whole or not at all; the state holds the hash of both parts.
+    `state["iteration"]` is its name. It is written as a whole or not at all; the state has the hash of both parts.
     """
     from safetensors.torch import save
 
     state, data = {**state, "format": CHECKPOINT_FORMAT}, save(tensors)
-    said = json.dumps({**state, "sha256": _checkpoint_hash(state, data)}, indent=1)
-    write_folder(folder / f"{state['iteration']:06d}", {CHECKPOINT_TENSORS_FILE: data, CHECKPOINT_STATE_FILE: said})
+    text = json.dumps({**state, "sha256": _checkpoint_hash(state, data)}, indent=1)
+    write_folder(folder / f"{state['iteration']:06d}", {CHECKPOINT_TENSORS_FILE: data, CHECKPOINT_STATE_FILE: text})
     _remove_old_checkpoints(folder)
 
 
 def restore_newest_checkpoint(
     folder: Path, progress_folders: Iterable[Path], expected: dict[str, Any] | None = None
 ) -> "tuple[dict[str, Any], Tensors] | None":
-    """Return the newest checkpoint of a run; None where it begins, or begins anew.
+    """Return the newest checkpoint of a run; None before the first one.
 
-    What the checkpoint does not know is removed: rows of progress in any of `places`, which will be made
-    again, and files that were not written to their end.
+    Everything later than the checkpoint is removed: rows of progress in `progress_folders`, and incomplete files.
 
     Raises:
-        InputError: none is whole, or it does not belong to what would go on with it, `belongs`.
+        InputError: no checkpoint is valid, or its fingerprint differs from the `expected` one.
     """
-    found = load_checkpoint(folder / "checkpoint")
-    if found and expected and "fingerprint" in found[0]:
-        check_fingerprint(found[0]["fingerprint"], expected)
+    checkpoint = load_checkpoint(folder / "checkpoint")
+    if checkpoint and expected and "fingerprint" in checkpoint[0]:
+        check_fingerprint(checkpoint[0]["fingerprint"], expected)
     _remove_old_checkpoints(folder / "checkpoint")
-    for left in [path for place in progress_folders for path in place.glob(".*") if is_leftover(path)]:
-        remove(left)
-    done = found[0]["iteration"] if found else 0
+    for leftover in [path for place in progress_folders for path in place.glob(".*") if is_leftover(path)]:
+        remove(leftover)
+    iteration = checkpoint[0]["iteration"] if checkpoint else 0
     for place in progress_folders:
         if (place / PROGRESS_FILE).is_file():
-            kept = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= done]
-            atomic_write(place / PROGRESS_FILE, "".join(kept))
-    return found
+            rows = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
+            atomic_write(place / PROGRESS_FILE, "".join(rows))
+    return checkpoint
 
 
 def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
-    """Return the newest checkpoint that is whole; None where there was never any.
+    """Return the newest valid checkpoint; None if there is none at all.
 
     Raises:
-        InputError: there are some, and all of them are damaged, or another unjam made them.
+        InputError: all checkpoints are damaged, or of another format.
     """
     from safetensors.torch import load
 
     for place, state, data in _valid_checkpoints(folder):
         try:
-            found, known = state.pop("format", 1), load(data)
+            found, tensors = state.pop("format", 1), load(data)
         except INVALID_DATA_ERRORS:
             continue
         if found != CHECKPOINT_FORMAT:
             raise InputError(
                 f"checkpoint: {place} has format {found!r}, of another version of unjam; allowed: {CHECKPOINT_FORMAT}"
             )
-        return state, known
+        return state, tensors
     if places := _checkpoint_folders(folder):
         raise InputError(f"checkpoint: all {len(places)} under {folder} are damaged")
     return None
 
 
 def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], bytes]]:
-    """Yield place, state and tensors of the checkpoints whose hash is right, the newest first."""
+    """Yield folder, state and tensors of the checkpoints with a correct hash, the newest first."""
     for place in reversed(_checkpoint_folders(folder)):
         try:
             state = json.loads((place / CHECKPOINT_STATE_FILE).read_text())
             data = (place / CHECKPOINT_TENSORS_FILE).read_bytes()
-            right = state.pop("sha256") == _checkpoint_hash(state, data)
+            is_valid = state.pop("sha256") == _checkpoint_hash(state, data)
         except INVALID_DATA_ERRORS:
             continue
-        if right:
+        if is_valid:
             yield place, state, data
 
 
 def check_run_files(folder: Path, config: RunConfig) -> None:
-    """Raise `InputError` where a run that is judged was trained with other files than there are now.
-
-    Runs without a checkpoint that is whole do not tell.
-    """
+    """Raise `InputError` if files that a run was trained with have changed; unknown without a valid checkpoint."""
     newest = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
-    if before := newest.get("fingerprint"):
-        check_file_hashes(before, fingerprint(config), "evaluate")
+    if stored := newest.get("fingerprint"):
+        check_file_hashes(stored, fingerprint(config), "evaluate")
 
 
 def _remove_old_checkpoints(folder: Path) -> None:
-    """Remove all but the newest two checkpoints, and those that were not written to their end."""
+    """Remove all but the newest two checkpoints, and incomplete ones."""
     for old in [*_checkpoint_folders(folder)[:-MAX_CHECKPOINTS], *filter(is_leftover, folder.glob(".*"))]:
         with suppress(DiskError):
             remove(old)

@@ -1,4 +1,4 @@
-"""Run folders as things: which there are, how far each is, in what they differ, and removing one."""
+"""Listing, comparing and removing run folders."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from unjam.measures.statistics import Estimate, paired_difference
 from unjam.parameters import flatten_keys
 from unjam.processes import check_not_locked, is_locked
 from unjam.reports.results import EVALUATION_FILE, damaged_results_error, read_evaluation, read_progress
-from unjam.training.config import RunConfig
+from unjam.training.config import CONFIG_FILE, RunConfig
 from unjam.training.early_stopping import should_stop_early
 from unjam.training.run_folder import MANIFEST_FILE, read_config
 
@@ -21,49 +21,48 @@ RunState = Literal["running", "finished", "stopped", "damaged"]
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder, as far as it has come."""
+    """A run folder and its progress."""
 
     name: str
-    """its path below the folder that was listed"""
+    """path below the listed folder"""
     folder: Path
     config: RunConfig = field(repr=False)
     state: RunState
-    """`open_executor`: a process of this machine writes it; `stop_reason`: it can go on with `unjam train --resume`"""
+    """`running`: a process of this machine writes it; `stopped`: `unjam train --resume` can continue it"""
     steps: int
-    """actual steps that are done, of `config.steps`"""
+    """completed environment steps, of `config.steps`"""
     gains: dict[str, Estimate | None]
-    """return beyond the expert on held-out seeds by road, whose name is empty where it is the only one"""
+    """return difference to the expert on test seeds by task; the name of a single task is empty"""
 
     def document(self) -> dict[str, Any]:
-        """Return it as JSON."""
+        """Return the run as JSON."""
         config = self.config
         return {
             **{"name": self.name, "folder": str(self.folder), "scenario": config.scenario},
             **{"preset": config.preset, "expert": config.expert, "agent": config.agent, "seed": config.seed},
             **{"state": self.state, "steps": self.steps, "steps_total": config.steps},
-            "test_gain": {road: asdict(gain) if gain else None for road, gain in self.gains.items()},
+            "test_gain": {task: asdict(gain) if gain else None for task, gain in self.gains.items()},
         }
 
 
 def list_runs(root: Path | str = "runs", scenario: str = "") -> list[Run]:
-    """Return the runs in a folder and all below it, by name; with `scenario`, those that train on it.
+    """Return the runs in a folder and below it, by name; with `scenario`, only those that train on it.
 
-    Raises:
-        InputError: there is no such folder.
+    Raise `InputError` if there is no such folder.
     """
     root = Path(root)
     if not root.is_dir():
-        raise InputError(f"root: {str(root)!r} is not a folder; allowed: one that holds run folders")
-    found = [_read_listed_run(folder, str(folder.relative_to(root))) for folder in sorted(_run_folders(root))]
+        raise InputError(f"root: {str(root)!r} is not a folder; allowed: a folder with run folders")
+    runs = [_read_listed_run(folder, str(folder.relative_to(root))) for folder in sorted(_run_folders(root))]
     return [
         run
-        for run in found
-        if not scenario or scenario in {Path(road.scenario).name for road in run.config.task_configs().values()}
+        for run in runs
+        if not scenario or scenario in {Path(task.scenario).name for task in run.config.task_configs().values()}
     ]
 
 
 def _read_listed_run(folder: Path, name: str) -> Run:
-    """Return how far a run is; one that is damaged is listed as such, beside the others."""
+    """Return a run; a damaged one has this state."""
     try:
         return read_run(folder, name)
     except InputError:
@@ -72,62 +71,61 @@ def _read_listed_run(folder: Path, name: str) -> Run:
 
 
 def _run_folders(root: Path) -> Iterator[Path]:
-    for place, below, files in os.walk(root):
-        if {"config.toml", MANIFEST_FILE} <= set(files):
-            below.clear()  # the roads of a run are no runs
+    for place, subfolders, files in os.walk(root):
+        if {CONFIG_FILE, MANIFEST_FILE} <= set(files):
+            subfolders.clear()  # the tasks of a run are not runs
             try:
                 read_config(Path(place), check_trust=False)
-            except UnjamError:  # of another unjam, or somebody else's
+            except UnjamError:  # of another version, or another program
                 continue
             yield Path(place)
 
 
 def read_run(folder: Path, name: str = "") -> Run:
-    """Return how far a run is; raise `InputError` where the folder is none of a run."""
+    """Return a run; raise `InputError` if the folder is not a run folder."""
     config, progress = read_config(folder, check_trust=False), read_progress(folder)
     if not (folder / MANIFEST_FILE).is_file():
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {MANIFEST_FILE}")
     try:
         steps = int(progress[-1]["environment_steps"]) if progress else 0
-        gains = {road: _test_gain(folder / road) for road in config.task_configs()}
+        gains = {task: _test_gain(folder / task) for task in config.task_configs()}
     except INVALID_DATA_ERRORS as error:
         raise damaged_results_error(folder, error) from None
-    judged = all((folder / road / EVALUATION_FILE).is_file() for road in gains)
-    over = steps >= config.steps or should_stop_early(config, progress)
-    done: RunState = "finished" if judged and over else "stopped"
-    return Run(name or str(folder), folder, config, "running" if is_locked(folder) else done, steps, gains)
+    is_evaluated = all((folder / task / EVALUATION_FILE).is_file() for task in gains)
+    is_trained = steps >= config.steps or should_stop_early(config, progress)
+    state: RunState = "finished" if is_evaluated and is_trained else "stopped"
+    return Run(name or str(folder), folder, config, "running" if is_locked(folder) else state, steps, gains)
 
 
 def _test_gain(folder: Path) -> Estimate | None:
-    """Return what a judged controller earns beyond its expert; None before that, or without an expert."""
+    """Return the return difference to the expert; None before the evaluation, or without an expert."""
     if not (folder / EVALUATION_FILE).is_file():
         return None
-    about, rows = read_evaluation(folder)
-    expert = rows.get(about.get("expert", ""))
-    return paired_difference(rows[about["trained"]], expert, "return") if expert else None
+    metadata, rows = read_evaluation(folder)
+    expert = rows.get(metadata.get("expert", ""))
+    return paired_difference(rows[metadata["trained"]], expert, "return") if expert else None
 
 
 def find_run(name: str, root: Path) -> Path:
-    """Return the folder of a run by its name below `tensors_with_prefix`, or by its path."""
+    """Return the folder of a run by its name below `root`, or by its path."""
     return root / name if (root / name).is_dir() else Path(name)
 
 
 def config_differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
-    """Return the settings in which runs differ, each with the value of every run; dots lead into tables."""
+    """Return the settings in which runs differ, with the value of each run; keys have dots."""
     settings = [flatten_keys(asdict(run.config)) for run in runs]
-    names = dict.fromkeys(name for of_one in settings for name in of_one)
-    values = {name: [of_one.get(name) for of_one in settings] for name in names}
+    names = dict.fromkeys(name for each in settings for name in each)
+    values = {name: [each.get(name) for each in settings] for name in names}
     return {name: each for name, each in values.items() if any(value != each[0] for value in each)}
 
 
 def remove_run(folder: Path) -> None:
-    """Remove a run folder for good.
+    """Remove a run folder permanently.
 
-    Raises:
-        InputError: it is none, a process writes it, or it is a link or holds the working folder.
+    Raise `InputError` if it is not a run folder, if a process writes it, or if it is a link or has the working folder.
     """
     read_run(folder)
     if folder.is_symlink() or Path.cwd().is_relative_to(folder.resolve()):
-        raise InputError(f"run: {str(folder)!r} is a link, or where you are; allowed: a run folder elsewhere")
+        raise InputError(f"run: {str(folder)!r} is a link or has the working folder; allowed: a run folder elsewhere")
     check_not_locked(folder)
     remove(folder)

@@ -1,7 +1,7 @@
-"""Search: which settings learn best. `unjam search`, with Optuna.
+"""Search for the settings with which a training learns best. `unjam search`, with Optuna.
 
-Each trial is a training like any other, in a folder of its own. It is judged by the validation seeds, which
-choose a training's controller anyway; the held-out ones stay unseen.
+Each trial is a training in its own folder. Its objective is the validation return, which also selects the controller of
+a training; test seeds are not used.
 """
 
 import math
@@ -20,23 +20,23 @@ from unjam.reports.results import read_progress, validation_gains
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, MessageCallback, open_executor, training_command
 from unjam.training.run_folder import check_config, make_new_folder, read_config
-from unjam.training.search_space import Categorical, NumericRange, SearchSpace
+from unjam.training.search_space import Categorical, NumericRange, SearchSpace, suggest_values
 
 if TYPE_CHECKING:
     from optuna import Study
 
 SEARCH_CONFIG_FILE, SEARCH_FILE, BEST_CONFIG_FILE = "config.toml", "search.json", "best.toml"
 JOURNAL_FILE = "journal.log"
-"""what Optuna remembers: which trials there were, and what became of them"""
+"""Optuna's log of the trials"""
 
 
 def check_search_space(base: RunConfig, space: SearchSpace) -> None:
-    """Raise `InputError` where a search cannot work: an unknown key, a value out of range, no validation."""
+    """Raise `InputError` for an unknown key, a value out of range, and without validations."""
     if base.evaluation.validation_interval == 0:
-        raise invalid_value("evaluation.validation_interval", 0, ">= 1: trials are judged by validations")
+        raise invalid_value("evaluation.validation_interval", 0, ">= 1: trials are compared by validations")
     for key, values in space.items():
-        for end in values.boundary_values:
-            check_config(trial_config(base, {key: end}))
+        for value in values.boundary_values:
+            check_config(trial_config(base, {key: value}))
 
 
 def trial_config(base: RunConfig, values: dict[str, Any]) -> RunConfig:
@@ -52,9 +52,9 @@ class SearchTrial:
     values: dict[str, Any]
     folder: Path
     gain: float | None
-    """return beyond the expert's on the validation seeds, of the best controller; None where it failed"""
+    """validation return of the best controller minus that of the expert; None if it failed"""
     last_gain: float | None
-    """the same of the last checkpoint"""
+    """the same for the last checkpoint"""
 
 
 def search(
@@ -68,12 +68,12 @@ def search(
 ) -> list[SearchTrial]:
     """Train with settings that Optuna proposes, `workers` at once, and return all trials, the best first.
 
-    The folder gets `search.json`, and `best.toml` for `unjam train --config`. A search that was stopped goes
-    on where it was, and one that has ended goes on if `trials`, those of an earlier call included, is larger.
-    `base` and `space` are checked with `check_search_space`; `on_line` gets a line when a training has ended.
+    The folder gets `search.json`, and `best.toml` for `unjam train --config`. An interrupted search resumes, also with
+    more `trials`, which include those of earlier calls. `base` and `space` must pass `check_search_space`; `on_message`
+    is called with a line when a training has ended.
 
     Raises:
-        InputError: the folder holds another search.
+        InputError: the folder has another search.
         MissingPartError: Optuna is not installed.
         UnjamError: all trainings failed.
     """
@@ -88,27 +88,27 @@ def search(
                 break
             for done in wait(jobs, return_when=FIRST_COMPLETED).done:
                 number = jobs.pop(done)
-                failed = done.result() != 0
-                _report_gain(study, number, None if failed else _objective(_trial_folder(folder, number), space))
+                has_failed = done.result() != 0
+                _report_gain(study, number, None if has_failed else _objective(_trial_folder(folder, number), space))
                 on_message(_progress_line(study, number, trials))
     ended = study.get_trials()
     ended.sort(key=lambda one: -math.inf if one.value is None else one.value, reverse=True)
-    found = [_make_trial(folder, one.number, one.params, one.value is None) for one in ended]
+    results = [_make_trial(folder, one.number, one.params, one.value is None) for one in ended]
     rows = [
         {"trial": one.number, "gain": one.gain, "last_gain": one.last_gain, "folder": str(one.folder), **one.values}
-        for one in found
+        for one in results
     ]
     atomic_write(folder / SEARCH_FILE, to_json({"manifest": manifest(), "trials": rows}, indent=1))
-    if found[0].gain is None:
-        raise UnjamError(f"all {len(found)} trainings failed; what they said is in {folder / 'plans'}")
-    atomic_write(folder / BEST_CONFIG_FILE, to_toml(trial_config(base, found[0].values)))
-    return found
+    if results[0].gain is None:
+        raise UnjamError(f"all {len(results)} trainings failed; their logs are in {folder / 'configs'}")
+    atomic_write(folder / BEST_CONFIG_FILE, to_toml(trial_config(base, results[0].values)))
+    return results
 
 
 def _make_trial(folder: Path, number: int, values: dict[str, Any], has_failed: bool) -> SearchTrial:
-    place = _trial_folder(folder, number)
-    validated = None if has_failed else validation_gains(read_progress(place))
-    return SearchTrial(number, values, place, *(validated or (None, None)))
+    trial_folder = _trial_folder(folder, number)
+    gains = None if has_failed else validation_gains(read_progress(trial_folder))
+    return SearchTrial(number, values, trial_folder, *(gains or (None, None)))
 
 
 def _trial_folder(folder: Path, number: int) -> Path:
@@ -118,14 +118,14 @@ def _trial_folder(folder: Path, number: int) -> Path:
 def _trial_command(base: RunConfig, folder: Path, number: int, values: dict[str, Any]) -> CommandLine:
     """Return the command line of a trial."""
     config = trial_config(base, values)
-    few = replace(config.evaluation, baselines=(), episodes=1)  # the held-out seeds decide nothing here
-    plan, log = (folder / "configs" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
-    config = replace(config, workers=1, evaluation=few)
-    return training_command(config, _trial_folder(folder, number), plan, log)
+    short_evaluation = replace(config.evaluation, baselines=(), episodes=1)  # test seeds do not count in a search
+    config_file, log = (folder / "configs" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
+    config = replace(config, workers=1, evaluation=short_evaluation)
+    return training_command(config, _trial_folder(folder, number), config_file, log)
 
 
 def import_optuna(command: str) -> Any:
-    """Return Optuna, which says nothing but warnings; raise `MissingPartError` where it is not installed."""
+    """Return Optuna with only its warnings; raise `MissingPartError` if it is not installed."""
     try:
         import optuna
     except ImportError:
@@ -140,47 +140,44 @@ def _open_study(base: RunConfig, space: SearchSpace, folder: Path) -> "Study":
 
     from unjam.training.journal import Journal
 
-    known = (folder / SEARCH_CONFIG_FILE).is_file()
-    if not known:
+    if not (folder / SEARCH_CONFIG_FILE).is_file():
         make_new_folder(folder, ", or that of a search")
-    if known and read_config(folder, check_trust=False) != base:
-        raise InputError(f"out: {str(folder)!r} is of another configuration; allowed: a new folder")
+    elif read_config(folder, check_trust=False) != base:
+        raise InputError(f"out: {str(folder)!r} has another configuration; allowed: a new folder")
     atomic_write(folder / SEARCH_CONFIG_FILE, to_toml(base))
     storage = JournalStorage(Journal(folder / JOURNAL_FILE))
     study = optuna.create_study(storage=storage, study_name="search", direction="maximize", load_if_exists=True)
-    # Who begins anew with the same seed would propose again what it has proposed before.
+    # A new sampler with the same seed would repeat earlier proposals.
     study.sampler = optuna.samplers.TPESampler(seed=base.seed + 1_000_003 * len(study.get_trials()))
     before = study.user_attrs.get("space")
     if before is not None and before != repr(space):
-        raise InputError(f"vary: {str(folder)!r} is of other ranges; allowed: a new folder")
+        raise InputError(f"vary: {str(folder)!r} has other ranges; allowed: a new folder")
     study.set_user_attr("space", repr(space))
     return study
 
 
 def _propose_trials(study: "Study", space: SearchSpace, trials: int) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield number and values of what is to be tried: what was stopped, then new ones, so many in all."""
+    """Yield number and values of interrupted trials, then of new ones, up to a total number."""
     for stored in study.get_trials():
         for key, value in stored.params.items():
             _check_in_space(key, value, space.get(key))
         if stored.state.name == "WAITING":
-            raise InputError(f"out: {JOURNAL_FILE} holds a trial that no search began; allowed: a new folder")
+            raise InputError(f"out: {JOURNAL_FILE} has a trial that was not started by a search; allowed: a new folder")
         if stored.state.is_finished():
             continue
         if stored.state.name == "RUNNING" and stored.params.keys() == space.keys():
             yield stored.number, stored.params
         else:
-            _report_gain(study, stored.number, None)  # it was stopped before it had all its values
+            _report_gain(study, stored.number, None)  # it was interrupted before it had all its values
     while len(study.get_trials(deepcopy=False)) < trials:
         trial = study.ask()
-        for key, values in space.items():
-            values.suggest(trial, key)
-        yield trial.number, {key: trial.params[key] for key in space}
+        yield trial.number, suggest_values(trial, space)
 
 
 def _check_in_space(key: str, value: Any, values: NumericRange | Categorical | None) -> None:
-    """Raise `InputError` where a value that a folder holds was not offered: a text may name code."""
+    """Raise `InputError` if a stored value is not in the search space, because a text may name code."""
     if values is None or (not isinstance(value, int | float) and value not in values.boundary_values):
-        raise InputError(f"out: {key}: {value!r} in {JOURNAL_FILE} was not offered; allowed: a new folder")
+        raise InputError(f"out: {key}: {value!r} in {JOURNAL_FILE} is not in the search space; allowed: a new folder")
 
 
 def _report_gain(study: "Study", number: int, gain: float | None) -> None:
@@ -193,13 +190,13 @@ def _report_gain(study: "Study", number: int, gain: float | None) -> None:
 
 
 def validation_gain(folder: Path) -> float | None:
-    """Return a training's best validation beyond its expert's; None where there was no validation."""
-    found = validation_gains(read_progress(folder))
-    return found and found[0]
+    """Return the best validation return of a training minus that of its expert; None without validations."""
+    gains = validation_gains(read_progress(folder))
+    return gains and gains[0]
 
 
 def _objective(folder: Path, space: SearchSpace) -> float | None:
-    """Return what a search maximises: the gain or, as gains beyond other experts say little, the return."""
+    """Return the objective of a search: the gain or, because gains over different experts differ, the return."""
     gain = validation_gain(folder)
     if gain is None or "expert" not in space:
         return gain
@@ -207,18 +204,18 @@ def _objective(folder: Path, space: SearchSpace) -> float | None:
 
 
 def describe_trial(trial: SearchTrial) -> str:
-    """Return what a trial has reached: the controller that validation chose, and the last checkpoint."""
+    """Return the gains of a trial as text: of the selected controller and of the last checkpoint."""
     values = ", ".join(f"{key}={value}" for key, value in trial.values.items())
     if trial.gain is None or trial.last_gain is None:
         return f"trial {trial.number}: failed: {values}"
-    kept = "" if trial.gain > 0 else " (the untrained network was kept)"
+    untrained = "" if trial.gain > 0 else " (the controller is the untrained network)"
     last = f"last checkpoint {trial.last_gain:+.1f}"
-    return f"trial {trial.number}: {trial.gain:+.1f} beyond the expert, {last}, validation seeds{kept}: {values}"
+    return f"trial {trial.number}: validation gain over expert {trial.gain:+.1f}, {last}{untrained}: {values}"
 
 
 def _progress_line(study: "Study", number: int, trials: int) -> str:
-    trial = study.get_trials(deepcopy=False)[number]
-    ended = sum(one.state.is_finished() for one in study.get_trials(deepcopy=False))
+    stored = study.get_trials(deepcopy=False)
+    trial, ended = stored[number], sum(one.state.is_finished() for one in stored)
     values = ", ".join(
         f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in trial.params.items()
     )

@@ -1,4 +1,4 @@
-"""What is varied: ranges and choices by name, as a user asks for them or around an expert's parameters."""
+"""Search spaces of searches, tunings and calibrations: ranges and choices by name."""
 
 import math
 from collections.abc import Sequence
@@ -13,32 +13,32 @@ if TYPE_CHECKING:
     from optuna.trial import Trial as OptunaTrial
 
 RANGE_FACTOR = 4.0
-"""a parameter is varied from its default over this to its default times this"""
+"""default ranges go from the default value divided by this factor to its product with it"""
 ZERO_DEFAULT_HIGH = 1.0
-"""upper end for a parameter that is zero by default"""
+"""upper end of the range of a parameter that is zero by default"""
 
 
 @dataclass(frozen=True)
 class NumericRange:
-    """Numbers between two, both included."""
+    """Numbers between two limits, both included."""
 
     low: float
     high: float
     log: bool = False
-    """whether as many are tried between 0.01 and 0.1 as between 0.1 and 1"""
+    """whether values are proposed on a logarithmic scale"""
 
     @property
     def is_integer(self) -> bool:
-        """Whether they are integers."""
+        """Whether the values are integers."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @property
     def boundary_values(self) -> tuple[Any, ...]:
-        """What is checked before the search: if these can be, those between can."""
+        """The values to check before a search; if they are valid, so are those between."""
         return self.low, self.high
 
     def suggest(self, trial: "OptunaTrial", key: str) -> None:
-        """Let Optuna choose one."""
+        """Let Optuna propose a value."""
         if self.is_integer:
             trial.suggest_int(key, int(self.low), int(self.high), log=self.log)
         else:
@@ -52,18 +52,24 @@ class Categorical:
     boundary_values: tuple[Any, ...]
 
     def suggest(self, trial: "OptunaTrial", key: str) -> None:
-        """Let Optuna choose one."""
+        """Let Optuna propose a value."""
         trial.suggest_categorical(key, self.boundary_values)
 
 
 SearchSpace = dict[str, NumericRange | Categorical]
 
 
-def parse_search_space(texts: Sequence[str]) -> SearchSpace:
-    """Return what is varied, from texts `key=low..high`, `key=low..high:log` or `key=a,b,c`.
+def suggest_values(trial: "OptunaTrial", space: SearchSpace) -> dict[str, Any]:
+    """Let Optuna propose a value for each name, and return them."""
+    for key, values in space.items():
+        values.suggest(trial, key)
+    return {key: trial.params[key] for key in space}
 
-    Raises:
-        InputError: a text is none of these, or the range is empty.
+
+def parse_search_space(texts: Sequence[str]) -> SearchSpace:
+    """Return a search space from texts `key=low..high`, `key=low..high:log` or `key=a,b,c`.
+
+    Raise `InputError` for other texts and empty ranges.
     """
     space: SearchSpace = {}
     for text in texts:
@@ -81,43 +87,38 @@ def parse_search_space(texts: Sequence[str]) -> SearchSpace:
 
 def _parse_range(text: str, values: str) -> NumericRange:
     values, log = values.removesuffix(":log"), values.endswith(":log")
-    low, high, *more = (parse_value(end.strip()) for end in values.split(".."))
-    numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high))
-    if more or not numbers or not low < high or not math.isfinite(high - low) or (log and low <= 0):
+    low, high, *rest = (parse_value(limit.strip()) for limit in values.split(".."))
+    are_numbers = all(isinstance(limit, int | float) and not isinstance(limit, bool) for limit in (low, high))
+    if rest or not are_numbers or not low < high or not math.isfinite(high - low) or (log and low <= 0):
         raise invalid_value("vary", text, "low < high, with :log low > 0")
     return NumericRange(low, high, log)
 
 
 def default_search_space(expert: str, time_step: float) -> SearchSpace:
-    """Return the ranges around an expert's parameters: four times less and more, all words, both truths.
+    """Return the default ranges of an expert's parameters: numbers within a factor of four, all words, both booleans.
 
-    Raises:
-        InputError: there is no such expert, or nothing of it can be varied.
+    Raise `InputError` if there is no such expert, or if it has nothing to vary.
     """
-    known = [name for name, kind in DRIVERS.items() if not kind.is_native]
-    if expert not in known:
-        raise unknown_name("expert", expert, known)
+    names = [name for name, kind in DRIVERS.items() if not kind.is_native]
+    if expert not in names:
+        raise unknown_name("expert", expert, names)
     default = driver_from_name(expert, time_step)
-    space: SearchSpace = {}
     hints = get_type_hints(type(default))
-    for field in fields(default):  # pyright: ignore[reportArgumentType]
-        around = _default_range(getattr(default, field.name), hints[field.name])
-        if around is not None and field.name != "time_step":
-            space[field.name] = around
+    ranges = {
+        field.name: _default_range(getattr(default, field.name), hints[field.name])
+        for field in fields(default)  # pyright: ignore[reportArgumentType]
+        if field.name != "time_step"
+    }
+    space: SearchSpace = {name: values for name, values in ranges.items() if values is not None}
     if not space:
         raise InputError(f"expert: {expert!r} has nothing to tune")
     return space
 
 
 def expert_search_space(texts: Sequence[str], defaults: SearchSpace) -> SearchSpace:
-    """Return what a user wants to vary of an expert; whole ends of a parameter that is none are no integers.
+    """Return the search space of an expert from texts as in `parse_search_space`.
 
-    Args:
-        texts: as `search.parse_search_space` reads them.
-        around: of `default_search_space`.
-
-    Raises:
-        InputError: a text is wrong.
+    A range with integer limits is still one of numbers if that of `defaults` (`default_search_space`) is.
     """
     space = parse_search_space(texts)
     for name, values in space.items():
@@ -128,7 +129,7 @@ def expert_search_space(texts: Sequence[str], defaults: SearchSpace) -> SearchSp
 
 
 def _default_range(value: Any, hint: Any) -> NumericRange | Categorical | None:
-    """Return what is tried of a parameter; None where nothing is near, as for a list."""
+    """Return the default range of a parameter; None for types without one, as lists."""
     if isinstance(value, bool):
         return Categorical((False, True))
     if get_origin(hint) is Literal:
@@ -139,5 +140,5 @@ def _default_range(value: Any, hint: Any) -> NumericRange | Categorical | None:
         return NumericRange(0, round(RANGE_FACTOR)) if isinstance(value, int) else NumericRange(0.0, ZERO_DEFAULT_HIGH)
     if isinstance(value, int):
         return NumericRange(max(1, round(value / RANGE_FACTOR)), round(value * RANGE_FACTOR), log=True)
-    ends = sorted((float(value) / RANGE_FACTOR, float(value) * RANGE_FACTOR))
-    return NumericRange(*ends, log=value > 0)
+    limits = sorted((float(value) / RANGE_FACTOR, float(value) * RANGE_FACTOR))
+    return NumericRange(*limits, log=value > 0)

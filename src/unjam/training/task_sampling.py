@@ -1,4 +1,4 @@
-"""How the episodes of an iteration are shared among the roads of a training."""
+"""Distribution of the episodes of an iteration among the tasks of a training."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -12,76 +12,72 @@ from unjam.worlds.worker_pool import EpisodeTask
 
 TaskSampling = Literal["weights", "regret"]
 REGRET_FRACTION = 0.5
-"""part of the actual steps that regret shares out; weights share the rest, so that no road is forgotten"""
+"""part of the environment steps that is distributed by regret; the rest by weights, so that no task is forgotten"""
 MAX_WARM_UP_ITERATIONS = 8
-"""iterations whose rings are warmed up at once: a few rings cost nearly as much as many"""
+"""iterations with a common warm-up of their rings: a few rings cost nearly as much as many"""
 
 
 class TaskSampler:
-    """How many episodes each task has now; with `regret`, each validation changes it."""
+    """The current number of episodes of each task; with `regret`, each validation changes it."""
 
     def __init__(self, tasks: Sequence[Task], kind: TaskSampling, best_returns: Sequence[float]) -> None:
-        """Begin with what weights say; `reached` is the best return of each task so far."""
+        """Begin with the weights; `best_returns` has the best return of each task so far."""
         self._tasks, self._kind, self.best_returns = tasks, kind, list(best_returns)
         self._shares = self._weight_shares = weight_shares(tasks)
 
     def update(self, returns: Sequence[float]) -> None:
-        """Note what a validation has found, task by task."""
+        """Take the returns of a validation into account, task by task."""
         self.best_returns = [max(pair) for pair in zip(self.best_returns, returns, strict=True)]
         if self._kind == "regret":
             self._shares = regret_shares(self._weight_shares, self.best_returns, returns)
 
     def episode_counts(self, steps: int) -> list[int]:
-        """Return how many episodes each task has in an iteration of so many actual steps."""
+        """Return the number of episodes of each task in an iteration of so many environment steps."""
         return count_episodes(self._tasks, steps, self._shares)
 
     def state(self) -> dict[str, list[float]]:
-        """Return all that is needed to go on."""
+        """Return the state for a checkpoint."""
         return {"best_returns": self.best_returns, "shares": self._shares}
 
     def restore(self, state: dict[str, list[float]]) -> None:
-        """Go on from what `state` returned; without `penetration_rates`, of a checkpoint of before, as weights say."""
-        self.best_returns, self._shares = state["best_returns"], state.get("shares", self._weight_shares)
+        """Continue from a value of `state`."""
+        self.best_returns, self._shares = state["best_returns"], state["shares"]
 
     def weighted_mean(self, values: Sequence[float]) -> float:
-        """Return the mean of what each task has, by weight."""
+        """Return the mean over the tasks by weight."""
         return sum(share * value for share, value in zip(self._weight_shares, values, strict=True))
 
 
 def weight_shares(tasks: Sequence[Task]) -> list[float]:
-    """Return each task's share of the actual steps, as its weight says."""
+    """Return each task's share of the environment steps by weight."""
     total = sum(task.weight for task in tasks)
     return [task.weight / total for task in tasks]
 
 
 def regret_shares(shares: Sequence[float], best_returns: Sequence[float], returns: Sequence[float]) -> list[float]:
-    """Return each task's share where half of all follows what the policy lacks.
+    """Return each task's share of the environment steps, `REGRET_FRACTION` of which follows the regret.
 
-    What it lacks on a road is by how much its return in validation is below the best that was seen there, by
-    itself before or by its expert: there is something to gain that is known to be possible. A level-based
-    sampling in the manner of prioritised level replay (Jiang et al. 2021, arXiv:2010.03934), with a regret
-    that is measured instead of guessed from the critic.
+    The regret is the difference between the best validation return so far, of the policy or of its expert, and the
+    current one: so much is known to be possible. It is a level-based sampling like prioritized level replay (Jiang et
+    al. 2021, arXiv:2010.03934), with a measured regret instead of one estimated from the critic.
 
     Args:
-        by_weight: shares without regard to it; they sum to one.
-        reached: best return of each task so far.
-        now: return of each task, as the policy is now; the returns of all tasks must be of the same size.
+        shares: those by weight; they sum to one.
+        best_returns: best return of each task so far.
+        returns: current return of each task; the returns of all tasks must be of similar size.
     """
-    lacks = [share * max(best - here, 0.0) for share, best, here in zip(shares, best_returns, returns, strict=True)]
-    total = sum(lacks)
+    regrets = [share * max(best - now, 0.0) for share, best, now in zip(shares, best_returns, returns, strict=True)]
+    total = sum(regrets)
     if total == 0.0:
         return list(shares)
-    return [
-        (1.0 - REGRET_FRACTION) * share + REGRET_FRACTION * lack / total
-        for share, lack in zip(shares, lacks, strict=True)
-    ]
+    pairs = zip(shares, regrets, strict=True)
+    return [(1.0 - REGRET_FRACTION) * share + REGRET_FRACTION * regret / total for share, regret in pairs]
 
 
 def count_episodes(tasks: Sequence[Task], steps: int, shares: Sequence[float]) -> list[int]:
-    """Return how many episodes an iteration of so many actual steps has on each road, at least one."""
-    return [
-        max(1, ceil(round(share * steps / task.scenario.horizon, 9))) for task, share in zip(tasks, shares, strict=True)
-    ]
+    """Return the number of episodes of each task in an iteration of so many environment steps, at least one."""
+    pairs = zip(tasks, shares, strict=True)
+    return [max(1, ceil(round(share * steps / task.scenario.horizon, 9))) for task, share in pairs]
 
 
 def make_episodes(
@@ -93,37 +89,36 @@ def make_episodes(
     stratified: bool,
     exploration_scales: Sequence[float],
 ) -> list[EpisodeTask]:
-    """Return `counts` episodes of each task, one after the other; each has a number behind the seed.
+    """Return `counts` episodes of each task; each adds a number to the seed.
 
-    With `spread` those of a road cover the range of what its scenario draws. As many as `explore` says by how
-    much exploration counts, in turn, are alike but for that.
+    If `stratified`, those of a task cover the range of its drawn values. Groups of episodes that differ only in the
+    scale of their exploration share a seed, one episode for each of `exploration_scales`.
     """
-    wanted: list[EpisodeTask] = []
+    episodes: list[EpisodeTask] = []
     for task, driver, count in zip(tasks, drivers, counts, strict=True):
-        for part in range(count):
-            turn = part % len(exploration_scales)
-            together = part // len(exploration_scales), ceil(count / len(exploration_scales))
-            scenario = task.scenario.stratum(*together) if stratified else task.scenario
-            own = (*seed, len(wanted) - turn)
-            wanted.append(EpisodeTask(scenario, driver, own, task.reward, exploration_scales[turn]))
-    return wanted
+        for index in range(count):
+            group, member = divmod(index, len(exploration_scales))
+            groups = ceil(count / len(exploration_scales))
+            scenario = task.scenario.stratum(group, groups) if stratified else task.scenario
+            episode_seed = (*seed, len(episodes) - member)
+            episodes.append(EpisodeTask(scenario, driver, episode_seed, task.reward, exploration_scales[member]))
+    return episodes
 
 
 def warm_up_iterations(
     iteration: int, remaining_steps: int, steps_per_iteration: int, tasks: Sequence[Task], counts: Sequence[int]
 ) -> range:
-    """Return an iteration and those that follow whose rings are warmed up along with its own.
+    """Return the iterations with a common warm-up of their rings: `iteration` and some that follow.
 
     Args:
-        iteration: number of this one.
-        left: actual steps that are left, this iteration's among them.
-        steps: of an iteration.
-        tasks: roads.
-        counts: episodes of each in an iteration; so many that the next ones' would not be kept warm up alone.
+        iteration: number of the current one.
+        remaining_steps: environment steps, including those of the current iteration.
+        steps_per_iteration: environment steps of an iteration.
+        tasks: tasks of the training.
+        counts: episodes of each task in an iteration; if they fill the cache of warm-up states, there is no other one.
     """
-    roads = zip((task.scenario for task in tasks), counts, strict=True)
-    cavs = sum(count * road.cavs for road, count in roads if isinstance(road, Ring))
-    together = min(
-        MAX_WARM_UP_ITERATIONS, MAX_CACHED_CAVS // (2 * max(cavs, 1)), ceil(remaining_steps / steps_per_iteration)
-    )
-    return range(iteration, iteration + max(together, 1))
+    pairs = zip((task.scenario for task in tasks), counts, strict=True)
+    cavs = sum(count * scenario.cavs for scenario, count in pairs if isinstance(scenario, Ring))
+    cached = MAX_CACHED_CAVS // (2 * max(cavs, 1))
+    length = min(MAX_WARM_UP_ITERATIONS, cached, ceil(remaining_steps / steps_per_iteration))
+    return range(iteration, iteration + max(length, 1))

@@ -1,4 +1,4 @@
-"""Progress of a training as TensorBoard shows it."""
+"""Progress of a training for TensorBoard."""
 
 import secrets
 from importlib.util import find_spec
@@ -11,18 +11,15 @@ from unjam.parameters import flatten_keys
 from unjam.training.executors import IterationCallback
 
 TENSORBOARD_FOLDER = "tensorboard"
-"""of a run: what `tensorboard --logdir` is given"""
+"""folder within a run, for `tensorboard --logdir`"""
 
 
 def tensorboard_writer(folder: Path | str) -> IterationCallback:
-    """Return what writes each row of progress into a run's folder: for `on_iteration` of `unjam.train`.
+    """Return an `on_iteration` of `unjam.train` that writes each row of progress into the run's folder.
 
-    Every number of a row has its curve over actual steps; those of one kind have one group.
-
-    Raises:
-        MissingPartError: TensorBoard is not installed.
+    Each number has a curve over environment steps. Raise `MissingPartError` if TensorBoard is not installed.
     """
-    if find_spec("tensorboard") is None:  # else only the first iteration would tell
+    if find_spec("tensorboard") is None:  # otherwise the error would come after the first iteration
         raise MissingPartError("tensorboard: it is not installed: pip install 'unjam[train]'")
     from torch.utils.tensorboard.writer import SummaryWriter
 
@@ -31,8 +28,8 @@ def tensorboard_writer(folder: Path | str) -> IterationCallback:
 
     def write(row: dict[str, Any]) -> None:
         nonlocal writer
-        if writer is None:  # the run makes its folder first
-            make_folder(place)  # no link is followed there, and nobody can guess the name of the file
+        if writer is None:  # the run creates its folder first
+            make_folder(place)  # follows no links; the name of the file cannot be guessed
             writer = SummaryWriter(str(place), filename_suffix=f".{secrets.token_hex(8)}")
         for name, value in flatten_keys(row).items():
             if isinstance(value, int | float) and name not in ("iteration", "environment_steps"):
