@@ -4,13 +4,13 @@
     result = unjam.drive("ring-jammed", driver="pi", episodes=5, out="runs/first")
     print(result.mean["time_to_dissolve"], result.report)
 
-With it Gymnasium knows `unjam/Ring-v0` and `unjam/FigureEight-v0`.
+The import registers `unjam/Ring-v0` and other environments with Gymnasium.
 The same on the command line: `unjam --help`.
 """
 
 import sys
 
-# `python -m unjam` searches the working folder first, which may be a downloaded one. `unjam` does not.
+# `python -m unjam` searches the working folder first, which can be a downloaded one. `unjam` does not.
 if sys.argv[:1] == ["-m"] and sys.orig_argv[-len(sys.argv)].endswith("unjam") and not sys.flags.safe_path:
     del sys.path[0]
 
@@ -43,46 +43,30 @@ if TYPE_CHECKING:
 
 # Imported when first used: workers must stay free of torch, and the command line quick.
 _LAZY_IMPORTS = {
-    "drive": "unjam.training.evaluate",
-    "train": "unjam.training.train",
-    "load_config": "unjam.training.config",
-    "load_controller": "unjam.controller",
-    "export_controller": "unjam.training.export",
-    "verify_controller": "unjam.resource_limits",
-    "make_driver": "unjam.controller",
-    "make_scenario": "unjam.scenarios",
-    "measure": "unjam.measures.metrics",
-    "list_runs": "unjam.training.runs",
-    "run_episode": "unjam.worlds.episode",
-    "parallel_env": "unjam.environments.pettingzoo_env",
-    "trusting_code": "unjam.trust",
-    "write_report": "unjam.resource_limits",
-    "Driver": "unjam.drivers",
-    "LocalState": "unjam.drivers",
-    "check_driver": "unjam.drivers",
+    name: module
+    for module, names in {
+        "unjam.controller": "load_controller make_driver",
+        "unjam.drivers": "Driver LocalState check_driver",
+        "unjam.environments.pettingzoo_env": "parallel_env",
+        "unjam.measures.metrics": "measure",
+        "unjam.resource_limits": "verify_controller write_report",
+        "unjam.scenarios": "make_scenario",
+        "unjam.training.config": "load_config",
+        "unjam.training.evaluate": "drive",
+        "unjam.training.export": "export_controller",
+        "unjam.training.runs": "list_runs",
+        "unjam.training.train": "train",
+        "unjam.trust": "trusting_code",
+        "unjam.worlds.episode": "run_episode",
+    }.items()
+    for name in names.split()
 }
 
 register_environments()
 
-__all__ = [
-    "Driver",
-    "LocalState",
-    "check_driver",
-    "drive",
-    "export_controller",
-    "list_runs",
-    "load_config",
-    "load_controller",
-    "make_driver",
-    "make_scenario",
-    "measure",
-    "parallel_env",
-    "run_episode",
-    "train",
-    "trusting_code",
-    "verify_controller",
-    "write_report",
-]
+__all__ = ["Driver", "LocalState", "check_driver", "drive", "export_controller", "list_runs", "load_config"]
+__all__ += ["load_controller", "make_driver", "make_scenario", "measure", "parallel_env", "run_episode", "train"]
+__all__ += ["trusting_code", "verify_controller", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

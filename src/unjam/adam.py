@@ -1,4 +1,4 @@
-"""Adam, without what torch would load to compile it."""
+"""Adam without the compiler that torch would load."""
 
 from collections.abc import Callable
 from inspect import unwrap
@@ -10,9 +10,9 @@ _adam = torch.optim.Adam
 
 
 class Adam(_adam):
-    """torch's Adam, the same to the bit, without torch's compiler: a second of each process that learns.
+    """torch's Adam with identical results, but without torch's compiler, which takes a second in each learning process.
 
-    What torch's own methods are wrapped in loads it, to tell it not to compile them. Not for `torch.compile`.
+    The wrappers of torch's own methods load it, to exclude them from compilation. Not for `torch.compile`.
     """
 
     add_param_group = cast(Callable[..., None], unwrap(_adam.add_param_group))

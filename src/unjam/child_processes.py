@@ -1,6 +1,6 @@
-"""How Python children start: none imports anything from the working folder, or from a script's folder.
+"""Start Python child processes that import nothing from the working folder, or from a script's folder.
 
-`python -m` and `python -c` search the working folder first, and that may be a downloaded one.
+`python -m` and `python -c` search the working folder first, and that can be a downloaded one.
 """
 
 import os
@@ -14,34 +14,38 @@ from unjam.trust import expected_code_environment
 from unjam.user_code import is_package_folder
 
 PACKAGE_PARENT = str(Path(__file__).parents[1])
-"""folder that unjam itself is imported from"""
+"""folder from which unjam itself is imported"""
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Return the command line of a Python child; it goes with `child_environment`."""
+    """Return the command line of a Python child; use it with `child_environment`."""
     return [sys.executable, "-P", *arguments]
 
 
 def child_environment(**changes: str) -> dict[str, str]:
-    """Return the environment of a child that ends with this process; its own children are isolated, too."""
+    """Return the environment of a child that ends with this process; its own children are isolated too."""
     return bind_to_parent({**os.environ, **_isolation_variables(), **expected_code_environment(), **changes})
 
 
 def child_import_path() -> list[str]:
     """Return the folders of `sys.path` that a child may search: not the working folder, nor the script's."""
     script = getattr(sys.modules["__main__"], "__file__", None) or sys.argv[0]
-    dropped = {os.path.realpath(os.curdir), os.path.realpath(os.path.dirname(script))}
-    return [each for each in sys.path if is_package_folder(each) or _is_allowed_folder(each, dropped)]
+    excluded = {os.path.realpath(os.curdir), os.path.realpath(os.path.dirname(script))}
+    return [
+        folder
+        for folder in sys.path
+        if is_package_folder(folder) or (os.path.isabs(folder) and os.path.realpath(folder) not in excluded)
+    ]
 
 
 def isolate_children() -> None:
-    """Isolate all Python processes that this one starts from now on, in whatever way."""
+    """Isolate all Python processes that this one starts from now on."""
     os.environ.update(_isolation_variables())
 
 
 @contextmanager
 def isolated_start(import_path: Iterable[str]) -> Iterator[None]:
-    """Isolate Python processes that a library starts within the block; they get this import path."""
+    """Isolate Python processes that a library starts within the block, and give them this import path."""
     path, before = sys.path[:], {name: os.environ.get(name) for name in _isolation_variables()}
     sys.path[:] = import_path
     isolate_children()
@@ -55,11 +59,7 @@ def isolated_start(import_path: Iterable[str]) -> Iterator[None]:
 
 
 def _isolation_variables() -> dict[str, str]:
-    """Return the variables that isolate a Python process: a relative folder is below the working folder."""
-    folders = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    kept = (each for each in folders if os.path.isabs(each) or (each and os.path.abspath(each) == PACKAGE_PARENT))
-    return {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(map(os.path.abspath, kept))}
-
-
-def _is_allowed_folder(folder: str, excluded: set[str]) -> bool:
-    return os.path.isabs(folder) and os.path.realpath(folder) not in excluded
+    """Return the variables that isolate a Python process: relative folders lie below the working folder."""
+    folders = [folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder]
+    safe = [folder for folder in folders if os.path.isabs(folder) or os.path.abspath(folder) == PACKAGE_PARENT]
+    return {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(map(os.path.abspath, safe))}

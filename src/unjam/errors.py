@@ -1,6 +1,6 @@
-"""What can go wrong, and the exit code that the command line gives it.
+"""Errors of unjam, with the exit codes of the command line.
 
-Every error that a user can cause or mend is one of these: one clear line, no traceback.
+Every error that a user can cause or correct is one of these: one clear line, no traceback.
 """
 
 import errno
@@ -10,36 +10,36 @@ from difflib import get_close_matches
 
 
 class UnjamError(Exception):
-    """An error with one line that a user understands; `exit_code` is what the command line returns."""
+    """An error with a message of one line for users; `exit_code` is that of the command line."""
 
     exit_code = 1
 
 
 class InputError(UnjamError):
-    """Wrong input: the message names the field, the value and what is allowed."""
+    """Invalid input: the message names the field, the value and what is allowed."""
 
     exit_code = 2
 
 
 class NoCavError(InputError):
-    """A driver had nobody to drive: by chance, or because too few vehicles are CAVs."""
+    """A driver had no vehicle to drive: by chance, or because too few vehicles are CAVs."""
 
 
 class MissingPartError(UnjamError):
-    """A program or package that is needed is not there: the message says how to get it."""
+    """A required program or package is missing: the message says how to install it."""
 
     exit_code = 3
 
 
 TRAIN_PACKAGES = "torch", "stable_baselines3", "sb3_contrib", "onnx", "onnxscript", "onnxruntime"
-"""packages of the extra `train`: what drives, measures and calibrates needs none of them"""
+"""packages of the extra `train`; driving, measuring and calibrating need none of them"""
 
 
 def missing_package_error(error: ModuleNotFoundError) -> MissingPartError:
-    """Return the line for a package of the extra `train`; the error itself is raised for any other."""
+    """Return the error for a missing package of the extra `train`; raise the given error for any other."""
     if error.name is None or error.name.partition(".")[0] not in TRAIN_PACKAGES:
         raise error
-    return MissingPartError(f"{error.name} is not installed; what learns needs it: pip install 'unjam[train]'")
+    return MissingPartError(f"{error.name} is not installed; learning needs it: pip install 'unjam[train]'")
 
 
 class DiskError(UnjamError):
@@ -49,17 +49,17 @@ class DiskError(UnjamError):
 
 
 class EpisodeError(UnjamError):
-    """An episode failed again and again: the message holds what is needed to repeat it."""
+    """An episode failed repeatedly: the message says how to repeat it."""
 
 
 class SumoInputError(EpisodeError):
-    """SUMO refuses the files that it was given, and says why."""
+    """SUMO refuses its input files; the message is its reason."""
 
     exit_code = 2
 
 
 class LostWorkerError(EpisodeError):
-    """The process that ran an episode was lost, for whatever reason: the same may well run again."""
+    """The process that ran an episode was lost; the same episode may succeed when repeated."""
 
 
 DISK_ERRNOS = (
@@ -74,14 +74,14 @@ def disk_error(error: OSError, path: object) -> DiskError:
 
 
 def error_from_name(name: str, message: str) -> UnjamError:
-    """Return the error that another process told of; of a kind that is not ours, it is an `UnjamError`."""
-    known = UnjamError, InputError, EpisodeError
-    kinds = {each.__name__: each for kind in known for each in kind.__subclasses__()}
-    return kinds.get(name, UnjamError)(message)
+    """Return the error that another process reported; for an unknown class an `UnjamError`."""
+    parents = UnjamError, InputError, EpisodeError
+    classes = {error.__name__: error for parent in parents for error in parent.__subclasses__()}
+    return classes.get(name, UnjamError)(message)
 
 
 def as_unjam_error(error: Exception) -> UnjamError:
-    """Return any error as one of ours, to be told to another process."""
+    """Return any error as an `UnjamError`, to report it to another process."""
     if isinstance(error, OSError) and error.errno in DISK_ERRNOS:
         return disk_error(error, error.filename or "a temporary file")
     if isinstance(error, UnjamError):
@@ -93,22 +93,22 @@ def as_unjam_error(error: Exception) -> UnjamError:
 
 
 def invalid_value(field: str, value: object, allowed: str) -> InputError:
-    """Return the error for a wrong value, in the form that all of unjam uses."""
+    """Return the error for an invalid value, in the form that all of unjam uses."""
     return InputError(f"{field}: {value!r} is not allowed; allowed: {allowed}")
 
 
 def unknown_name(field: str, value: object, names: Iterable[str]) -> InputError:
-    """Return the error for a name that is not among `names`, with the one that may have been meant."""
+    """Return the error for a name that is not among `names`, with a suggestion."""
     known = list(names)
     return invalid_value(field, value, f"{', '.join(known)}{spelling_hint(value, known)}")
 
 
 def resume_hint(folder: object) -> str:
-    """Return `; go on with: ` and the command that goes on with a training, to be copied."""
-    return f"; go on with: unjam train --resume {shlex.quote(str(folder))}"
+    """Return `; resume with: ` and the command that resumes a training, ready to copy."""
+    return f"; resume with: unjam train --resume {shlex.quote(str(folder))}"
 
 
 def spelling_hint(value: object, names: Iterable[str]) -> str:
-    """Return `; did you mean 'ring'?`; empty where no name is like it."""
+    """Return `; did you mean 'ring'?`, or an empty text if no name is similar."""
     close = get_close_matches(str(value), list(names), 1)
     return f"; did you mean {close[0]!r}?" if close else ""

@@ -1,6 +1,8 @@
-"""Writing files so that nothing is lost or half-written, and nothing outside is written through a link.
+"""Write files so that nothing is lost or half-written, and nothing outside is written through a link.
 
-All of unjam writes, renames and removes through these functions; `tests/test_layers.py` checks it.
+All of unjam writes, renames and removes through these functions; `tests/test_layers.py` checks it. They raise
+`InputError` for a link, or for a path through a link inside a protected folder (`unjam.folders`), and `DiskError` if
+the disk is full or cannot be written.
 """
 
 import errno
@@ -19,64 +21,69 @@ from typing import Any
 from safetensors import SafetensorError
 
 from unjam.errors import DISK_ERRNOS, DiskError, InputError, disk_error
-from unjam.folders import link_error, open_folder, protected_root
+from unjam.folders import Folder, link_error, open_folder, protected_root
 
 MAX_INTEGER_LENGTH = 20
 """characters of an integer of 64 bits"""
 PACKAGED_PREFIX = "unjam:"
-"""what the names of controllers and of people that are part of the package begin with"""
+"""beginning of the names of controllers and populations that are part of the package"""
 INVALID_DATA_ERRORS = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
     SafetensorError,
 )
-"""what reading JSON and arrays can raise where they are not what unjam writes"""
+"""errors of reading JSON and arrays that unjam did not write"""
 UNREADABLE_ERRORS = (*INVALID_DATA_ERRORS, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
-"""what reading can raise where a file is none; `RuntimeError`: of a kind that zipfile does not know"""
+"""errors of reading a damaged file; `RuntimeError`: of a kind that zipfile does not know"""
 
 APPEND_FLAGS = os.O_WRONLY | os.O_APPEND | os.O_CREAT
-"""flags of `open_in_place`: append to a file, and make a missing one"""
+"""flags of `open_in_place`: append to a file, and create a missing one"""
 
 
 @contextmanager
 def reject_damaged(name: str) -> Iterator[None]:
-    """Raise `InputError` where something that is read within is none of ours, or damaged."""
+    """Raise `InputError` if what is read within the block is damaged, or was not written by unjam."""
     try:
         yield
     except UNREADABLE_ERRORS as error:
         raise InputError(f"{name}: the controller is damaged: {' '.join(f'{error!r}'.split())}") from None
 
 
-def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write a file whole or not at all: to a random temporary name, to the disk, then in place.
-
-    Raises:
-        InputError: it is a link, or inside a held folder it is reached through one.
-        DiskError: the disk is full or cannot be written; what was there before is still there.
-    """
-    name, temporary = path.name or ".", _temporary_name()
+@contextmanager
+def _disk_errors(path: Path, *extra_errnos: int) -> Iterator[None]:
+    """Raise `DiskError` instead of an `OSError` of the disk, or with one of these error numbers."""
     try:
-        with open_folder(path.parent) as folder:
-            folder.check_writable(name)
-            try:
-                _write_and_sync(folder.create(temporary), content)
-                folder.rename(temporary, name)
-            except OSError:
-                with suppress(OSError):
-                    folder.remove(temporary)
-                raise
+        yield
     except OSError as error:
-        raise _as_disk_error(error, path) from None
+        if error.errno in (*DISK_ERRNOS, *extra_errnos):
+            raise disk_error(error, path) from None
+        raise
+
+
+@contextmanager
+def _replacement(path: Path) -> Iterator[tuple[Folder, str]]:
+    """Yield the folder of `path` and a temporary name, which is renamed to `path`, or removed after an error."""
+    temporary = f".{secrets.token_hex(8)}.part"  # a name that cannot be guessed, see `is_leftover`
+    with _disk_errors(path), open_folder(path.parent) as folder:
+        try:
+            yield folder, temporary
+            folder.rename(temporary, path.name or ".")
+        except OSError:
+            with suppress(OSError):
+                folder.remove(temporary)
+            raise
+
+
+def atomic_write(path: Path, content: bytes | str) -> None:
+    """Write a complete file, or keep the previous one: under a temporary name, synced to the disk, then renamed."""
+    with _replacement(path) as (folder, temporary):
+        folder.check_writable(path.name or ".")
+        _write_and_sync(folder.create(temporary), content)
 
 
 def write_new_file(path: Path, content: bytes, mode: int) -> None:
-    """Write a file that is not there yet, whole or not at all; from the first byte on it has this `mode`.
-
-    Raises:
-        InputError: there is one.
-        DiskError: the disk is full or cannot be written.
-    """
+    """Write a complete new file or none, with this `mode` from its first byte on; `InputError` if it exists."""
     try:
-        with open_folder(path.parent) as folder:
+        with _disk_errors(path), open_folder(path.parent) as folder:
             descriptor = folder.create(path.name, mode)
             try:
                 _write_and_sync(descriptor, content)
@@ -86,51 +93,27 @@ def write_new_file(path: Path, content: bytes, mode: int) -> None:
                 raise
     except FileExistsError:
         raise InputError(f"file: {str(path)!r} exists; allowed: a new one") from None
-    except OSError as error:
-        raise _as_disk_error(error, path) from None
 
 
 def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
-    """Write a folder of files whole or not at all: it appears by one change of its name, files and all.
-
-    What has its name already is removed before.
-
-    Raises:
-        InputError: inside a held folder it is reached through a link.
-        DiskError: the disk is full or cannot be written.
-    """
+    """Write a complete folder of files or none, by renaming; what has its name is removed first."""
     remove(folder)
     make_folder(folder.parent)
-    temporary = _temporary_name()
-    try:
-        with open_folder(folder.parent) as above:
-            try:
-                above.make_subfolder(temporary)
-                with above.enter(temporary) as inner:
-                    for name, content in files.items():
-                        _write_and_sync(inner.create(name), content)
-                    inner.sync()
-                above.rename(temporary, folder.name)
-            except OSError:
-                with suppress(OSError):
-                    above.remove(temporary)
-                raise
-    except OSError as error:
-        raise _as_disk_error(error, folder) from None
-
-
-def _temporary_name() -> str:
-    """Return a name that nobody can guess, of what `is_leftover` where its process is killed."""
-    return f".{secrets.token_hex(8)}.part"
+    with _replacement(folder) as (parent, temporary):
+        parent.make_subfolder(temporary)
+        with parent.enter(temporary) as inner:
+            for name, content in files.items():
+                _write_and_sync(inner.create(name), content)
+            inner.sync()
 
 
 def is_leftover(path: Path) -> bool:
-    """Return whether a file is what a process left behind that was killed while it wrote."""
+    """Return whether a file is the unfinished one of a process that was killed."""
     return path.name.startswith(".") and path.name.endswith(".part")
 
 
 def _write_and_sync(descriptor: int, content: bytes | str) -> None:
-    """Write an open file, and to the disk, and close it."""
+    """Write an open file, sync it to the disk, and close it."""
     with open(descriptor, "wb") as file:
         file.write(content.encode() if isinstance(content, str) else content)
         file.flush()
@@ -138,13 +121,9 @@ def _write_and_sync(descriptor: int, content: bytes | str) -> None:
 
 
 def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
-    """Open a file as it is, with the flags of `os.open`, and return its descriptor.
+    """Open a regular file as it is, with the flags of `os.open`, and return its descriptor.
 
-    Raises:
-        InputError: it is a link, is reached through one inside a held folder, or is to be written and has
-            other names (hard links), which may be those of a file elsewhere.
-        DiskError: it is something else than a file.
-        OSError: it cannot be opened.
+    To be written it must not have other names (hard links), which can be those of a file elsewhere: `InputError`.
     """
     with open_folder(path.parent) as folder:
         folder.check_writable(path.name)
@@ -158,40 +137,25 @@ def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Append a line to a file, and to the disk.
-
-    Raises:
-        InputError: it is a link, or has other names (hard links).
-        DiskError: the disk is full or cannot be written.
-    """
-    try:
+    """Append a line to a file, and sync it to the disk."""
+    with _disk_errors(path):
         _write_and_sync(open_in_place(path, APPEND_FLAGS), f"{line}\n")
-    except OSError as error:
-        raise _as_disk_error(error, path) from None
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with everything in it; of a link the link itself. It may be missing.
-
-    Raises:
-        InputError: inside a held folder it is reached through a link.
-        DiskError: it cannot be removed.
-    """
-    try:
-        with suppress(FileNotFoundError), open_folder(path.parent) as folder:
-            folder.remove(path.name)
-    except OSError as error:
-        raise _as_disk_error(error, path) from None
+    """Remove a file, a link itself, or a folder with its content, if it exists."""
+    with _disk_errors(path), suppress(FileNotFoundError), open_folder(path.parent) as folder:
+        folder.remove(path.name)
 
 
 def remove_if_empty(folder: Path) -> None:
-    """Remove a folder that is empty; any other stays as it is."""
+    """Remove a folder if it is empty."""
     with suppress(OSError):
         folder.rmdir()
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """Return the tables in a file of JSON lines; what is damaged, or cut short by a crash, is left out."""
+    """Return the objects in a file of JSON lines; damaged lines, or lines cut short by a crash, are left out."""
     rows = []
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         with suppress(ValueError, RecursionError):
@@ -201,40 +165,33 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def check_parent_folder(path: Path) -> None:
-    """Raise `DiskError` unless the folder that `path` would be written to is there."""
+    """Raise `DiskError` unless the folder of `path` exists."""
     if not path.absolute().parent.is_dir():
         raise DiskError(f"cannot write {path}: no such folder")
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it.
-
-    Raises:
-        InputError: it is a link that leads nowhere, or inside a held folder it is reached through a link.
-        DiskError: it cannot be made.
-    """
-    whole = path.absolute()
-    try:
-        if protected_root(whole) != whole:
-            with open_folder(whole, make=True):
-                return
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        if path.is_symlink():
-            raise link_error(path) from None
-        raise _as_disk_error(error, path, errno.EEXIST) from None
-
-
-def _as_disk_error(error: OSError, path: Path, *extra_errnos: int) -> OSError | DiskError:
-    return disk_error(error, path) if error.errno in (*DISK_ERRNOS, *extra_errnos) else error
+    """Make a folder and its parents, unless it exists."""
+    absolute = path.absolute()
+    with _disk_errors(path, errno.EEXIST):
+        try:
+            if protected_root(absolute) == absolute:
+                path.mkdir(parents=True, exist_ok=True)
+            else:
+                with open_folder(absolute, make=True):
+                    pass
+        except OSError:
+            if path.is_symlink():
+                raise link_error(path) from None
+            raise
 
 
 def parse_json(content: bytes | str) -> Any:
     """Return the document in strict JSON.
 
     Raises:
-        ValueError: it is none in UTF-8, nested too deep, names a key twice, or has a number that is not
-            finite, or an integer of more than 64 bits.
+        ValueError: it is not JSON in UTF-8, is nested too deep, names a key twice, or has a number that is not finite,
+            or an integer of more than 64 bits.
     """
     text = content.decode() if isinstance(content, bytes) else content
     try:
@@ -270,7 +227,7 @@ def _integer_64_bits(text: str) -> int:
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
-    """Return `value` as strict JSON: NaN and infinities, which JSON does not know, become null."""
+    """Return `value` as strict JSON: NaN and infinities, which JSON does not have, become null."""
     return json.dumps(_replace_nonfinite(value), indent=indent, allow_nan=False)
 
 

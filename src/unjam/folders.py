@@ -1,8 +1,8 @@
-"""Folders that are reached without following links which a stranger may have planted in them.
+"""Folders that are opened without following links that a stranger may have planted in them.
 
-Links on the way to a folder that the user names are the user's own choice. Inside a folder that a process
-holds (`protect_folder`) none is followed: each part of a path is opened from the handle of the one before.
-Where the system has no such handles (Windows), paths are looked at before they are used.
+Links on the way to a folder that the user names are the user's own choice. Inside a protected folder
+(`protect_folder`) no link is followed: each part of a path is opened from the handle of its parent. On systems without
+such handles (Windows), paths are checked before they are used.
 """
 
 import json
@@ -16,79 +16,79 @@ from pathlib import Path
 from unjam.errors import DiskError, InputError
 
 PROTECTED_FOLDERS_VARIABLE = "UNJAM_PROTECTED_FOLDERS"
-"""the variable that tells a child process which folders are held by the processes that started it"""
+"""environment variable with the folders that the parent processes of a child protect"""
 NO_FOLLOW_FLAGS = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
-"""flags of `os.open`: follow no link, and wait for no pipe; not every system has all of them"""
+"""flags of `os.open`: follow no link, and do not wait for a pipe; not every system has all of them"""
 FOLDER_FLAGS = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)
 _protected: list[Path] = []
 
 
 class Folder:
-    """An open folder, whose entries are named relative to its handle."""
+    """An open folder; its entries are named relative to its handle."""
 
     def __init__(self, path: Path, handle: int | None) -> None:
-        """Take the folder's handle; None where the system has no such handles."""
+        """Take the folder's handle; None on systems without such handles."""
         self.path, self.handle = path, handle
 
     def entry_path(self, name: str) -> str:
-        """Return the name of an entry as system calls take it, beside `dir_fd`."""
+        """Return the name of an entry for a system call with `dir_fd`."""
         return name if self.handle is not None else str(self.path / name)
 
     def mode(self, name: str) -> int:
-        """Return the mode of an entry, of a link its own; 0 where there is none."""
+        """Return the mode of an entry, of a link itself; 0: there is none."""
         try:
             return os.stat(self.entry_path(name), dir_fd=self.handle, follow_symlinks=False).st_mode
         except FileNotFoundError:
             return 0
 
     def check_writable(self, name: str) -> None:
-        """Raise `InputError` where an entry is a link, `DiskError` where it is something else than a file."""
+        """Raise `InputError` if an entry is a link, `DiskError` if it is not a regular file."""
         if stat.S_ISLNK(mode := self.mode(name)):
             raise link_error(self.path / name)
         if mode and not stat.S_ISREG(mode):
-            raise DiskError(f"cannot write {_short_path(self.path / name)}: it is no file")
+            raise DiskError(f"cannot write {_short_path(self.path / name)}: it is not a file")
 
     def open(self, name: str, flags: int, mode: int = 0o666) -> int:
         """Open a file that is not a link, as `os.open` does, and return its descriptor."""
         return os.open(self.entry_path(name), flags | NO_FOLLOW_FLAGS, mode, dir_fd=self.handle)
 
     def create(self, name: str, mode: int = 0o666) -> int:
-        """Open a new file for writing; raise `FileExistsError` where there is an entry of that name."""
+        """Open a new file for writing; raise `FileExistsError` if an entry has that name."""
         return self.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
 
     def make_subfolder(self, name: str) -> None:
-        """Make a folder in this one; raise `FileExistsError` where there is an entry of that name."""
+        """Make a folder in this one; raise `FileExistsError` if an entry has that name."""
         os.mkdir(self.entry_path(name), dir_fd=self.handle)
 
     @contextmanager
     def enter(self, name: str) -> Iterator["Folder"]:
-        """Open a folder in this one; raise `InputError` where it is a link, or leads out."""
+        """Open a folder in this one; raise `InputError` if it is a link, or leads out."""
         if name == ".." or stat.S_ISLNK(self.mode(name)):
             raise link_error(self.path / name)
         with _open_by_name(self.path / name, name, self.handle) as inner:
             yield inner
 
     def rename(self, source: str, target: str) -> None:
-        """Rename an entry, in place of any other file of that name; the disk has it when this returns."""
+        """Rename an entry, replace another file of that name, and sync it to the disk."""
         os.replace(self.entry_path(source), self.entry_path(target), src_dir_fd=self.handle, dst_dir_fd=self.handle)
         self.sync()
 
     def remove(self, name: str) -> None:
-        """Remove a file, or a folder with everything in it; of a link the link itself."""
+        """Remove a file, a link itself, or a folder with its content."""
         if stat.S_ISDIR(self.mode(name)):
             shutil.rmtree(self.entry_path(name), dir_fd=self.handle)
         else:
             os.unlink(self.entry_path(name), dir_fd=self.handle)
 
     def sync(self) -> None:
-        """Let the disk keep the names of the entries; on Windows the system does so by itself."""
+        """Sync the names of the entries to the disk; Windows does so itself."""
         if self.handle is not None:
             os.fsync(self.handle)
 
 
 @contextmanager
 def _open_by_name(path: Path, name: Path | str, parent: int | None) -> Iterator[Folder]:
-    """Open a folder by its name in the open folder `above`, or by its path where that is None."""
+    """Open a folder by its name in the open folder `parent`, or by its path if that is None."""
     if os.open not in os.supports_dir_fd:
         yield Folder(path, None)
         return
@@ -101,12 +101,12 @@ def _open_by_name(path: Path, name: Path | str, parent: int | None) -> Iterator[
 
 @contextmanager
 def open_folder(path: Path, make: bool = False) -> Iterator[Folder]:
-    """Open a folder, following links to a folder that is held, or to any other, but none inside a held one.
+    """Open a folder; links are followed, except inside a protected folder.
 
-    With `make` what is missing inside a held folder is made.
+    With `make`, missing folders inside a protected folder are made.
 
     Raises:
-        InputError: inside a held folder the path leads through a link, or out again.
+        InputError: inside a protected folder the path leads through a link, or out again.
         OSError: it cannot be opened.
     """
     path = path.absolute()
@@ -122,19 +122,19 @@ def open_folder(path: Path, make: bool = False) -> Iterator[Folder]:
 
 
 def protected_root(path: Path) -> Path:
-    """Return the outermost held folder that contains an absolute path; the path itself where none does."""
-    around = [root for root in protected_folders() if path.is_relative_to(root)]
-    return min(around, key=lambda root: len(root.parts), default=path)
+    """Return the outermost protected folder that contains an absolute path; else the path itself."""
+    roots = [root for root in protected_folders() if path.is_relative_to(root)]
+    return min(roots, key=lambda root: len(root.parts), default=path)
 
 
 def protected_folders() -> list[Path]:
-    """Return the folders that this process holds, and those that the processes hold that started it."""
+    """Return the folders that this process and its parent processes protect."""
     return [*map(Path, json.loads(os.environ.get(PROTECTED_FOLDERS_VARIABLE, "[]"))), *_protected]
 
 
 @contextmanager
 def protect_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder: inside it no link is followed while the block runs.
+    """Protect a folder: inside it no link is followed within the block.
 
     Raises:
         InputError: one of its entries is a link.
@@ -152,12 +152,11 @@ def protect_folder(folder: Path) -> Iterator[None]:
 
 
 def link_error(path: Path) -> InputError:
-    """Return the error for a path on which a link, or `..`, leads out of a folder."""
+    """Return the error for a path that leads out of a folder through a link or `..`."""
     why = "is a symbolic link or leads out of its folder, so nothing is written there"
     return InputError(f"file: {_short_path(path)!r} {why}; allowed: a file or folder itself, or a new name")
 
 
 def _short_path(path: Path) -> str:
-    """Return a path as short as it is clear: relative to the working folder where it is inside."""
-    here = Path.cwd()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+    """Return a path relative to the working folder, if it is inside."""
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)

@@ -1,11 +1,11 @@
-"""The same bits on every x86-64 machine with AVX2: which kernels NumPy and torch compute with.
+"""The same bits on every x86-64 machine with AVX2: the kernels with which NumPy and torch compute.
 
-Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin_kernels` asks all for
-those that every processor with AVX2 has; it must come before NumPy is imported. `UNJAM_KERNELS=native` leaves
-all as it is. What was tried on which processors, and what still differs, is in docs/training.md.
+Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin_kernels` selects those
+that every processor with AVX2 has; it must run before NumPy is imported. `UNJAM_KERNELS=native` changes nothing.
+docs/training.md says which processors were tested, and what still differs.
 
-MKL's square roots begin with an estimate that each make of processor has its own of, in every mode: so Adam
-is fused, and square roots of tensors are those of `unjam.physics.arrays`.
+MKL's square roots begin with an estimate that depends on the processor's maker, in every mode: so Adam is fused, and
+square roots of tensors are those of `unjam.physics.arrays`.
 """
 
 import ctypes
@@ -20,29 +20,29 @@ from typing import Any
 KERNELS_VARIABLE = "UNJAM_KERNELS"
 KERNEL_SETTINGS = {
     "OPENBLAS_CORETYPE": "Haswell",
-    # Threads round products of thousands of rows by the number of cores; at small ones they only wait.
+    # Threads round products of thousands of rows by the number of cores, and small products only wait for them.
     "OPENBLAS_NUM_THREADS": "1",
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "ATEN_CPU_CAPABILITY": "avx2",
-    # AVX2 would hold on Intel's processors alone: on others MKL takes it for COMPATIBLE, without a word.
+    # AVX2 would be valid on Intel's processors alone: on others MKL silently replaces it by COMPATIBLE.
     "MKL_CBWR": "COMPATIBLE",
 }
-"""NumPy's products, on how many cores; its functions; torch's functions; its products and long functions"""
+"""NumPy's products and their cores, its functions, torch's functions, its products and long functions"""
 OLD_NUMPY_FEATURES = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
-"""what NumPy before 2.4 calls the same"""
+"""the same for NumPy before 2.4"""
 KERNEL_LIBRARIES = ("numpy", "torch")
 
 
 def pin_kernels() -> None:
-    """Set the variables, over whatever they were; processes that are started from here inherit them."""
+    """Set the variables, for this process and its children."""
     global _unpinned_reason
     _unpinned_reason = _find_obstacle()
     if _unpinned_reason is None:
-        wanted = kernel_settings()
-        late = [name for name in KERNEL_LIBRARIES if name in sys.modules]
-        if late and any(os.environ.get(name) != value for name, value in wanted.items()):
-            _unpinned_reason = f"{late[0]} was imported before unjam"
-        os.environ.update(wanted)
+        settings = kernel_settings()
+        loaded = [name for name in KERNEL_LIBRARIES if name in sys.modules]
+        if loaded and any(os.environ.get(name) != value for name, value in settings.items()):
+            _unpinned_reason = f"{loaded[0]} was imported before unjam"
+        os.environ.update(settings)
 
 
 def has_pinned_kernels() -> bool:
@@ -51,12 +51,12 @@ def has_pinned_kernels() -> bool:
 
 
 def needs_new_process() -> bool:
-    """Return whether this process came too late, and a new one would not."""
+    """Return whether only a new process can have the pinned kernels."""
     return _unpinned_reason is not None and _find_obstacle() is None
 
 
 def kernel_settings() -> dict[str, str]:
-    """Return the variables for the installed NumPy; it warns of names that it does not know."""
+    """Return the variables for the installed NumPy, which warns of unknown names."""
     with suppress(PackageNotFoundError, ValueError):
         if tuple(map(int, version("numpy").split(".")[:2])) < (2, 4):
             return {**KERNEL_SETTINGS, "NPY_DISABLE_CPU_FEATURES": OLD_NUMPY_FEATURES}
@@ -64,7 +64,7 @@ def kernel_settings() -> dict[str, str]:
 
 
 def kernel_info() -> dict[str, Any]:
-    """Return the processor and what is in force, as far as it is loaded: for the record."""
+    """Return the processor and the active kernels of the loaded libraries, for manifests."""
     numpy, torch = (sys.modules.get(name) for name in KERNEL_LIBRARIES)
     return {
         "processor": processor_info().get("model name", platform.processor() or platform.machine()),
@@ -78,42 +78,42 @@ def kernel_info() -> dict[str, Any]:
 
 
 def processor_info() -> dict[str, str]:
-    """Return what Linux says of the first processor; nothing elsewhere."""
-    found: dict[str, str] = {}
+    """Return Linux's description of the first processor; empty on other systems."""
+    info: dict[str, str] = {}
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
         for line in lines:
             name, colon, value = line.partition(":")
             if not colon:
                 break
-            found[name.strip()] = value.strip()
-    return found
+            info[name.strip()] = value.strip()
+    return info
 
 
 def _find_obstacle() -> str | None:
-    """Return why nothing can be pinned here; None where it can."""
+    """Return why kernels cannot be pinned here; None: they can."""
     if os.environ.get(KERNELS_VARIABLE) == "native":
         return f"{KERNELS_VARIABLE}=native"
     if platform.machine() not in ("x86_64", "AMD64"):
-        return f"the processor is no x86-64: {platform.machine()}"
+        return f"the processor is not x86-64: {platform.machine()}"
     if not {"avx2", "fma"} <= set(processor_info().get("flags", "").split()):
         return "the processor has no AVX2, or does not say so"
     return None
 
 
 def _openblas_core(numpy: Any) -> str | None:
-    """Return the processor whose kernels NumPy's own OpenBLAS has chosen; None where it is another BLAS."""
+    """Return the processor whose kernels NumPy's own OpenBLAS has chosen; None: another BLAS."""
     for library in (Path(numpy.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas64_*"):
         with suppress(OSError, AttributeError):
-            ask = ctypes.CDLL(str(library)).scipy_openblas_get_corename64_
-            ask.restype = ctypes.c_char_p
-            return ask().decode()
+            core_name = ctypes.CDLL(str(library)).scipy_openblas_get_corename64_
+            core_name.restype = ctypes.c_char_p
+            return core_name().decode()
     return None
 
 
 def _numpy_features() -> list[str]:
-    """Return the groups of instructions that NumPy chooses kernels from, beside its least."""
-    inside = sys.modules["numpy._core._multiarray_umath"]
-    return [name for name in inside.__cpu_dispatch__ if inside.__cpu_features__.get(name)]
+    """Return the groups of instructions from which NumPy chooses kernels, in addition to its baseline."""
+    core = sys.modules["numpy._core._multiarray_umath"]
+    return [name for name in core.__cpu_dispatch__ if core.__cpu_features__.get(name)]
 
 
 _unpinned_reason: str | None = "pin_kernels() was not called"

@@ -1,4 +1,4 @@
-"""Where a result comes from: versions, machine, commit, command."""
+"""The origin of a result: versions, machine, commit, command."""
 
 import os
 import platform
@@ -16,7 +16,7 @@ RECORDED_PACKAGES = ("libsumo", "eclipse-sumo", "numpy", "torch", "stable-baseli
 
 
 def manifest() -> dict[str, Any]:
-    """Return what is needed to repeat a result made now, by this process."""
+    """Return what is needed to repeat a result that this process makes now."""
     return {
         "unjam": __version__,
         "commit": _source_commit(),
@@ -30,7 +30,7 @@ def manifest() -> dict[str, Any]:
 
 
 def package_versions() -> dict[str, str | None]:
-    """Return the installed versions of what results depend on; None of what is not there."""
+    """Return the installed versions of the packages that results depend on; None: not installed."""
     return {name: _package_version(name) for name in RECORDED_PACKAGES}
 
 
@@ -42,20 +42,14 @@ def _package_version(package: str) -> str | None:
 
 
 def _source_commit() -> str | None:
-    """Return the commit of the source tree that this runs from, `+` where it was changed; None elsewhere."""
+    """Return the commit of the source tree, with `+` if it was changed; None outside a checkout."""
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():  # the settings of another repository can name programs
         return None
+    describe = ["git", "describe", "--always", "--abbrev=12", "--dirty=+"]
     try:
-        found = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=12", "--dirty=+"],
-            cwd=root,
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
+        commit = subprocess.run(describe, cwd=root, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
     tracked = subprocess.run(["git", "ls-files", "--error-unmatch", __file__], cwd=root, capture_output=True)
-    return found.stdout.strip() if tracked.returncode == 0 else None
+    return commit.stdout.strip() if tracked.returncode == 0 else None

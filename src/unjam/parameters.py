@@ -1,4 +1,4 @@
-"""How unjam's frozen dataclasses check what they are given: types, ranges, unknown names."""
+"""Check the values of unjam's frozen dataclasses: types, ranges, unknown names."""
 
 import re
 from collections.abc import Sequence
@@ -9,9 +9,9 @@ from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, Validation
 from unjam.errors import InputError, invalid_value, spelling_hint
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-"""Configuration of every parameter dataclass: an unknown name or a NaN is an error, not a surprise.
+"""Configuration of every parameter dataclass: an unknown name or a NaN is an error.
 
-The texts under its fields are what `unjam drivers` and the documentation show.
+`unjam drivers` and the documentation show the texts under the fields.
 """
 
 Positive = Annotated[float, Field(gt=0)]
@@ -22,18 +22,16 @@ NonNegativeInt = Annotated[int, Field(ge=0)]
 
 
 def as_range(value: Any) -> Any:
-    """Return (230, 230) for 230, which is the range of one value, and everything else as it is."""
+    """Return the range (230, 230) for the number 230, and other values unchanged."""
     if isinstance(value, str):
         raise ValueError("a number, or two like (220, 270)")
     return (value, value) if isinstance(value, int | float) else value
 
 
 NumberOrRange = BeforeValidator(as_range)
-"""lets a parameter that is a range be a single number too"""
-
+"""allows a single number for a parameter that is a range"""
 MAX_INTEGER_BITS = 63
-"""of the size of an integer"""
-
+"""of the absolute value of an integer"""
 MAX_KEY_PARTS = 100
 """parts of a key between its dots"""
 _DEEP_KEY = re.compile(rf"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{MAX_KEY_PARTS}}}""")
@@ -42,9 +40,9 @@ DataclassT = TypeVar("DataclassT")
 
 
 def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) -> DataclassT:
-    """Return `kind(**values)`, or raise `InputError` with one line that names the first wrong value.
+    """Return `kind(**values)`, or raise `InputError` with one line that names the first invalid value.
 
-    `field` says where the values come from, for the message.
+    `field` is the origin of the values, for the message.
     """
     _check_values(values, field)
     try:
@@ -54,10 +52,9 @@ def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) 
 
 
 def _check_values(value: Any, name: str) -> None:
-    """Raise `InputError` where `value` holds what no file of ours can: a huge integer, or NUL in a text.
+    """Raise `InputError` if `value` contains a huge integer, or a text with NUL.
 
-    TOML has 64 bits for integers; longer ones fit into no array, no float, and cannot always be written.
-    With NUL in its name no file can be asked for.
+    TOML has 64 bits for integers; longer ones fit into no array and no float. No name of a file contains NUL.
     """
     if isinstance(value, dict):
         for key, inner in value.items():
@@ -66,8 +63,9 @@ def _check_values(value: Any, name: str) -> None:
         for inner in value:
             _check_values(inner, name)
     elif isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
-        found = f"a number of {value.bit_length()} bits"
-        raise InputError(f"{name}: {found} is not allowed; allowed: at most {MAX_INTEGER_BITS}")
+        raise InputError(
+            f"{name}: a number of {value.bit_length()} bits is not allowed; allowed: at most {MAX_INTEGER_BITS}"
+        )
     elif isinstance(value, str) and "\0" in value:
         raise invalid_value(name, value, "a text without NUL")
 
@@ -93,18 +91,18 @@ def validation_message(error: ValidationError, field: str, kind: Any) -> str:
 
 
 def _field_names(kind: Any, path: Sequence[object]) -> list[str]:
-    """Return the names of a dataclass's parameters, or of the one that a path leads to within it."""
+    """Return the parameter names of a dataclass, or of the nested one at the end of a path."""
     for part in path:
         kind = getattr(getattr(kind, "__pydantic_fields__", {}).get(part), "annotation", None)
     return list(getattr(kind, "__pydantic_fields__", {}))
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return what a text in TOML says.
+    """Return the content of a text in TOML.
 
     Raises:
-        ValueError, RecursionError: it is none, or nested without end: a key of many parts takes memory as
-            the square of their number.
+        ValueError, RecursionError: it is not TOML, or is nested too deep: a key of many parts takes memory as the
+            square of their number.
     """
     import tomllib
 
@@ -114,15 +112,15 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def parse_value(text: str) -> Any:
-    """Return what `text` means as a TOML value (number, boolean, list); itself where it is none."""
+    """Return `text` as a TOML value (number, boolean, list), or itself if it is none."""
     try:
         return parse_toml(f"value = {text}")["value"]
-    except (ValueError, RecursionError):  # also of a number too long to be one
+    except (ValueError, RecursionError):  # also for a number with too many digits
         return text
 
 
 def parse_assignments(texts: list[str], field: str) -> dict[str, Any]:
-    """Return `{"key": value}` for texts `key=value`; raise `InputError` where one has no `=`."""
+    """Return `{"key": value}` for texts `key=value`; raise `InputError` for a text without `=`."""
     values: dict[str, Any] = {}
     for text in texts:
         key, equals, value = text.partition("=")
@@ -161,20 +159,19 @@ def merge_changes(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, 
 
 
 def nest_keys(changes: dict[str, Any]) -> dict[str, Any]:
-    """Return changes whose keys may have dots as tables: `trpo.gamma` becomes `gamma` of the table `trpo`."""
+    """Return changes with dotted keys as nested tables: `trpo.gamma` becomes `gamma` of the table `trpo`."""
     tables: dict[str, Any] = {}
     for key, value in changes.items():
-        inner: Any = value
         for part in reversed(key.split(".")):
-            inner = {part: inner}
-        tables = merge_changes(tables, inner)
+            value = {part: value}
+        tables = merge_changes(tables, value)
     return tables
 
 
 def flatten_keys(tables: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return tables within tables as one, whose keys have dots: `nest_keys` undoes it."""
-    found: dict[str, Any] = {}
+    """Return nested tables as one table with dotted keys; the inverse of `nest_keys`."""
+    flat: dict[str, Any] = {}
     for key, value in tables.items():
         name = f"{prefix}{key}"
-        found |= flatten_keys(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return found
+        flat |= flatten_keys(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return flat

@@ -1,8 +1,8 @@
-"""What a process may still do that reads files of others: little memory and time, no writing, no network.
+"""Restrict a process that reads untrusted files: little memory and time, no writing, no network.
 
-The kernel sees to it, for children too, and for good: Landlock keeps the disk as it is, and a filter of
-system calls (seccomp) leaves no sockets. Run as a program, this file runs another one so; it needs Python's
-own library alone.
+The kernel enforces it, for children too, and permanently: Landlock protects the disk, and a filter of system calls
+(seccomp) blocks sockets. Run as a program, this file runs another program in this way; it needs only Python's standard
+library.
 """
 
 import ctypes
@@ -17,17 +17,17 @@ CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
 """Landlock's system calls, the same on all processors"""
 WRITE_FILE, TRUNCATE = 1 << 1, 1 << 14
 REMOVE_AND_CREATE = 0b1_1111_1111 << 4
-"""folders, files, devices, sockets, pipes, links"""
+"""of folders, files, devices, sockets, pipes, links"""
 REFER = 1 << 13
 """moving to another folder"""
 NO_NEW_PRIVILEGES, SET_SECCOMP, SECCOMP_FILTER_MODE = 38, 22, 2
-"""of `prctl`"""
+"""options of `prctl`"""
 SOCKET_SYSCALLS = {"x86_64": (0xC000003E, 41), "aarch64": (0xC00000B7, 198), "riscv64": (0xC00000F3, 198)}
-"""what the kernel calls a processor, and the number of `socket` there"""
+"""by processor: its number in the kernel, and the number of the system call `socket`"""
 IO_URING_SETUP = 425
-"""`io_uring_setup`, by which sockets can be had too"""
+"""a system call that can open sockets too"""
 X32_SYSCALL_BIT = 0x40000000
-"""the same calls by other numbers (x32)"""
+"""marks other numbers of the same system calls (x32)"""
 EPERM = 1
 
 
@@ -46,23 +46,23 @@ class _Program(ctypes.Structure):
 
 
 def limit_resources(memory: int, seconds: int = 0) -> None:
-    """Let this process end where it takes more memory [bytes] or time [s] than that; not on Windows."""
+    """End this process if it takes more memory [bytes] or time [s]; not on Windows."""
     with suppress(ImportError):
         import resource
         import signal
 
-        for what, wanted in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds)):
-            limits = [each for each in resource.getrlimit(what) if each != resource.RLIM_INFINITY]
-            if wanted:  # somebody may have set less already (ulimit -v)
-                resource.setrlimit(what, (least := min([wanted, *limits]), least))
+        for kind, limit in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds)):
+            limits = [old for old in resource.getrlimit(kind) if old != resource.RLIM_INFINITY]
+            if limit:  # a smaller limit can exist already (ulimit -v)
+                resource.setrlimit(kind, (smallest := min([limit, *limits]), smallest))
         if seconds:
-            signal.alarm(seconds)  # also where it only waits
+            signal.alarm(seconds)  # also if it only waits
 
 
 def confine_process(*writable: Path) -> None:
-    """Leave this thread and its children no sockets, and no writing but under these folders; for good.
+    """Permanently deny sockets to this thread and its children, and writing except into these folders.
 
-    Where the kernel offers one of both, that holds; where none, nothing changes.
+    Each of both applies if the kernel supports it.
     """
     restrict_writing(*writable)
     if sys.platform == "linux":
@@ -70,7 +70,7 @@ def confine_process(*writable: Path) -> None:
 
 
 def restrict_writing(*writable: Path) -> None:
-    """Leave this thread and its children no writing but under these folders, and all sockets; for good."""
+    """Permanently deny writing to this thread and its children, except into these folders."""
     if sys.platform != "linux":
         return
     libc = ctypes.CDLL(None)
@@ -102,14 +102,14 @@ def _block_sockets(libc: ctypes.CDLL) -> None:
         (at_least, 3, 0, X32_SYSCALL_BIT),
         (equal, 2, 0, socket),
         (equal, 1, 0, IO_URING_SETUP),
-        (answer, 0, 0, 0x7FFF0000),  # yes
+        (answer, 0, 0, 0x7FFF0000),  # allowed
         (answer, 0, 0, 0x00050000 | EPERM),
     )
     libc.prctl(SET_SECCOMP, SECCOMP_FILTER_MODE, ctypes.byref(_Program(len(instructions), instructions)), 0, 0)
 
 
 def run_sandboxed(memory: str, seconds: str, writable: str, program: str, *arguments: str) -> None:
-    """Run a Python program with its arguments so, where `writable` is a folder or empty."""
+    """Run a Python program with its arguments in a sandbox; `writable` is a folder or empty."""
     limit_resources(int(memory), int(seconds))
     confine_process(*map(Path, filter(None, [writable])))
     sys.argv = [program, *arguments]

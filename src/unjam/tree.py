@@ -1,8 +1,8 @@
-"""Any record as JSON and arrays, and back: what files and messages to workers are made of.
+"""Convert records to JSON and arrays, and back: the format of files and of messages to workers.
 
-A tree is made of dataclasses, named tuples, dicts, tuples and lists; its leaves are arrays and plain values.
-`pack` takes it apart, `unpack` puts it together again by the types that its records declare. Nothing is ever
-executed, and what does not fit the declared types is refused.
+A tree is made of dataclasses, named tuples, dicts, tuples and lists; its leaves are arrays and plain values. `pack`
+converts it, and `unpack` restores it by the declared types of its records. Nothing is ever executed, and what does not
+fit the declared types is refused.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,22 +14,22 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 Arrays = dict[str, np.ndarray]
-"""by their path in the tree: `trajectories.0.states.speed`"""
+"""by path in the tree: `trajectories.0.states.speed`"""
 ARRAY_KEY = "array"
-"""key of the JSON object that stands for an array; its value is the path"""
+"""key of the JSON object that represents an array; its value is the path"""
 
 
 def pack(tree: Any, path: str = "") -> tuple[Any, Arrays]:
-    """Return a tree as JSON and arrays; `unpack` undoes it exactly."""
+    """Return a tree as JSON and arrays; `unpack` is the exact inverse."""
     arrays: Arrays = {}
 
     def pack_value(value: Any, path: str) -> Any:
         if isinstance(value, np.ndarray):
             arrays[path] = value
             return {ARRAY_KEY: path}
-        inner = _named_parts(value)
-        if inner is not None:
-            return {name: pack_value(part, _join_path(path, name)) for name, part in inner.items()}
+        parts = _named_parts(value)
+        if parts is not None:
+            return {name: pack_value(part, _join_path(path, name)) for name, part in parts.items()}
         if isinstance(value, (tuple, list)):
             return [pack_value(part, _join_path(path, str(index))) for index, part in enumerate(value)]
         return value.item() if isinstance(value, np.generic) else value
@@ -38,10 +38,10 @@ def pack(tree: Any, path: str = "") -> tuple[Any, Arrays]:
 
 
 def unpack(kind: Any, packed: Any, arrays: Arrays) -> Any:
-    """Return the tree of type `kind` that `pack` took apart.
+    """Return the tree of type `kind` that `pack` converted.
 
     Raises:
-        ValueError: it is not one: a name, a type or an array is missing, unknown or wrong.
+        ValueError: it has another type: a name, a type or an array is missing, unknown or wrong.
     """
     if isinstance(packed, dict) and packed.keys() == {ARRAY_KEY} and isinstance(packed[ARRAY_KEY], str):
         if packed[ARRAY_KEY] not in arrays or not (kind is Any or _is_array(kind)):
@@ -55,7 +55,7 @@ def unpack(kind: Any, packed: Any, arrays: Arrays) -> Any:
     if origin in (Union, UnionType):
         if packed is None and NoneType in inner:
             return None
-        (kind,) = (one for one in inner if one is not NoneType)
+        (kind,) = (member for member in inner if member is not NoneType)
         return unpack(kind, packed, arrays)
     types = _field_types(kind)
     if types is not None:
@@ -69,10 +69,10 @@ def unpack(kind: Any, packed: Any, arrays: Arrays) -> Any:
         return {name: unpack(inner[1], part, arrays) for name, part in packed.items()}
     if origin in (tuple, list):
         _check_type(list, packed, kind)
-        ends = (inner[0],) * len(packed) if origin is list or inner[1:] == (...,) else inner
-        if len(ends) != len(packed):
-            raise ValueError(f"{len(packed)} values are not allowed; allowed: {len(ends)}")
-        return origin(unpack(one, part, arrays) for one, part in zip(ends, packed, strict=True))
+        kinds = (inner[0],) * len(packed) if origin is list or inner[1:] == (...,) else inner
+        if len(kinds) != len(packed):
+            raise ValueError(f"{len(packed)} values are not allowed; allowed: {len(kinds)}")
+        return origin(unpack(each, part, arrays) for each, part in zip(kinds, packed, strict=True))
     if kind is float and (packed is None or type(packed) is int):
         return float("nan") if packed is None else float(packed)
     if isinstance(kind, type):
@@ -81,7 +81,7 @@ def unpack(kind: Any, packed: Any, arrays: Arrays) -> Any:
 
 
 def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each leaf of nested dicts with its path, the names joined by dots."""
+    """Yield each leaf of nested dicts with its path, names joined by dots."""
     if isinstance(tree, dict):
         for name, part in tree.items():
             yield from leaves(part, _join_path(path, name))
@@ -90,14 +90,14 @@ def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """Return nested dicts with `function` of each leaf, and of the same leaf of the other trees."""
+    """Return nested dicts with `function` applied to each leaf and the same leaf of the other trees."""
     if isinstance(tree, dict):
         return {name: map_leaves(function, part, *(other[name] for other in others)) for name, part in tree.items()}
     return function(tree, *others)
 
 
 def replace_leaves(tree: Any, values: dict[str, Any], path: str = "") -> Any:
-    """Return nested dicts like `tree` with the `values` that `leaves` would name."""
+    """Return nested dicts like `tree` with new leaves, by the paths of `leaves`."""
     if isinstance(tree, dict):
         return {name: replace_leaves(part, values, _join_path(path, name)) for name, part in tree.items()}
     return values[path]
@@ -108,7 +108,7 @@ def _join_path(path: str, name: str) -> str:
 
 
 def _named_parts(value: Any) -> dict[str, Any] | None:
-    """Return the parts of a value that has names for them."""
+    """Return the named parts of a dict or record; None: the value is neither."""
     if isinstance(value, dict):
         return value
     if hasattr(value, "_asdict"):
@@ -120,7 +120,7 @@ def _named_parts(value: Any) -> dict[str, Any] | None:
 
 @cache
 def _field_types(kind: Any) -> dict[str, Any] | None:
-    """Return the declared types of a record's parts; None of what is no record."""
+    """Return the declared types of a record's parts; None: not a record."""
     if is_dataclass(kind):
         hints = get_type_hints(kind)
         return {field.name: hints[field.name] for field in fields(kind) if field.init}

@@ -1,4 +1,4 @@
-"""Which Python code that a folder names may run: what its user ran before, as it is and where it is."""
+"""Trust in Python code that a folder names: it runs if its user ran the same code at the same place before."""
 
 import hashlib
 import json
@@ -16,25 +16,24 @@ from unjam.files import atomic_write, make_folder
 from unjam.user_code import UserCode, read_code
 
 TRUSTED_VARIABLE = "UNJAM_TRUSTED"
-"""the variable that tells this process and its children what may run beside what is remembered"""
+"""environment variable with the keys of trusted code, in addition to the remembered ones"""
 TRUST_ALL = "all"
 TRUST_CODE_OPTION = "--trust-code"
+EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"
+"""environment variable with the hashes of code, by path, at the check of the configuration of a child"""
 _lock = threading.Lock()
 _saved_values: list[str | None] = []
-"""for each running block of `trusting_code` the variable before the first of them"""
-EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"
-"""the variable that tells a child the hashes of code, by path, with which its configuration was checked"""
+"""for each running block of `trusting_code` the value of the variable before the first of them"""
 _expected_hashes: dict[str, str] = json.loads(os.environ.get(EXPECTED_CODE_VARIABLE, "{}"))
 
 
 @contextmanager
 def trusting_code() -> Iterator[None]:
-    """Let the Python code that folders of others name run within the block; what runs is remembered.
+    """Allow untrusted Python code that folders name to run within the block, and remember it.
 
     `with unjam.trusting_code(): unjam.drive("ring", "runs/downloaded")`
 
-    It holds for all threads of the process, and for the processes that they start, until the last of several
-    blocks ends.
+    It applies to all threads of the process and to their child processes, until the last of several blocks ends.
     """
     with _lock:
         _saved_values.append(_saved_values[0] if _saved_values else os.environ.get(TRUSTED_VARIABLE))
@@ -50,27 +49,28 @@ def trusting_code() -> Iterator[None]:
 
 
 def is_all_code_trusted() -> bool:
-    """Return whether code may run that nobody has named."""
+    """Return whether all code may run."""
     return TRUST_ALL in _trusted_keys()
 
 
 def check_trusted(context: str, code: Path) -> str:
-    """Return the hash of code that `where` names; of what is no file nothing.
+    """Return the hash of code that `context` names; empty if it is not a file, or all code may run.
 
     Raises:
-        InputError: it has not run before as it is, with what it imports from its folder, nor may run unseen.
+        InputError: this code, with its imports from its folder, is not trusted.
     """
     if not os.path.isfile(code) or is_all_code_trusted():
         return ""
     sha256 = read_code(code).sha256
     if not _is_remembered(_trust_key(code, sha256)):
-        why = "which you have not named yourself, or not as it is now"
-        raise InputError(f"{context} names Python code ({str(code)!r}), {why}: it runs only with {TRUST_CODE_OPTION}")
+        reason = "which you have not run yourself in this version"
+        message = f"{context} names Python code ({str(code)!r}), {reason}"
+        raise InputError(f"{message}: it runs only with {TRUST_CODE_OPTION}")
     return sha256
 
 
 def check_trusted_values(context: str, values: Any) -> None:
-    """Check as `check_trusted` all files that texts within `values` can name, and expect them to stay so."""
+    """Check all files that texts in `values` can name, as `check_trusted`, and store their hashes."""
     if isinstance(values, str):
         for code in _code_files(values):
             if sha256 := check_trusted(context, code):
@@ -81,20 +81,20 @@ def check_trusted_values(context: str, values: Any) -> None:
 
 
 def check_code_unchanged(code: UserCode) -> None:
-    """Raise `InputError` where code is another than when a configuration that names it was checked."""
+    """Raise `InputError` if code has changed since the check of the configuration that names it."""
     if _expected_hashes.get(str(code.path), code.sha256) != code.sha256 and not is_all_code_trusted():
         allowed = f"allowed: as it was then, or {TRUST_CODE_OPTION}"
         raise InputError(f"{code.path.name}: has changed since the configuration was checked; {allowed}")
 
 
 def expected_code_environment() -> dict[str, str]:
-    """Return the variable that tells a child what code must be."""
+    """Return the environment variable for a child with the hashes that code must have."""
     return {EXPECTED_CODE_VARIABLE: json.dumps(_expected_hashes)}
 
 
 @contextmanager
 def expecting_code() -> Iterator[None]:
-    """Forget at the end what code was expected to be: a program's user may change it, and name it again."""
+    """Forget the hashes at the end of the block: the user can change the code, and name it again."""
     try:
         yield
     finally:
@@ -102,13 +102,13 @@ def expecting_code() -> Iterator[None]:
 
 
 def remember_trusted(code: Path, sha256: str = "") -> None:
-    """Keep for later, and for children, that this user runs this code; else, for children alone.
+    """Remember that this user runs this code at this place; if that cannot be stored, for children alone.
 
-    The place belongs to it. Without a hash it is code as it is now.
+    Without a hash it is the current code.
     """
     try:
         key = _trust_key(code, sha256 or read_code(code).sha256)
-    except OSError:  # who loads it will be told
+    except OSError:  # loading it will report the error
         return
     if _is_remembered(key):
         return
@@ -121,22 +121,21 @@ def remember_trusted(code: Path, sha256: str = "") -> None:
 
 
 def _code_files(text: str) -> Iterable[Path]:
-    """Return all files that a text can name as `path.py:name`, whatever else is in it."""
+    """Return all files that a text can name as `path.py:name`, whatever else it contains."""
     if ".py:" not in text:
         return set()
-    starts = [0, *(place + 1 for place, letter in enumerate(text) if letter == "+")]
-    ends = [place for place, letter in enumerate(text) if letter == ":"]
-    found = {text[start:end] for start in starts for end in ends if start < end}
-    return {Path(name).resolve() for name in found if os.path.isfile(name)}
+    starts = [0, *(index + 1 for index, letter in enumerate(text) if letter == "+")]
+    ends = [index for index, letter in enumerate(text) if letter == ":"]
+    names = {text[start:end] for start in starts for end in ends if start < end}
+    return {Path(name).resolve() for name in names if os.path.isfile(name)}
 
 
 def _trust_key(code: Path, sha256: str) -> str:
-    """Return the hash of where code is and of what it is."""
+    """Return the hash of the path and content of code."""
     return hashlib.sha256(os.fsencode(code) + b"\0" + sha256.encode()).hexdigest()
 
 
 def _is_remembered(key: str) -> bool:
-    """Return whether code ran before."""
     return key in _trusted_keys() or (_trust_folder() / key).is_file()
 
 
@@ -145,5 +144,5 @@ def _trusted_keys() -> list[str]:
 
 
 def _trust_folder() -> Path:
-    """Return where is kept what ran: below `$UNJAM_STATE`, or the user's folder for the state of programs."""
+    """Return the folder of remembered keys: below `$UNJAM_STATE`, or the user's folder for the state of programs."""
     return Path(os.environ.get("UNJAM_STATE") or platformdirs.user_state_dir("unjam"), "trusted")

@@ -1,8 +1,8 @@
-"""Users' Python files: read once with the modules that they import from their folder, hashed, run as read.
+"""Users' Python files: read once with the modules that they import from their folder, hashed, and run as read.
 
-What runs is compiled from the bytes that were hashed. Bytecode in the folder is neither read nor written, and
-a file that is replaced after it was read changes nothing. Modules of several folders may have the same names:
-they are in `sys.modules` below a name that belongs to the file, and only they find each other by `import`.
+The bytes that were hashed are compiled and run. Bytecode in the folder is neither read nor written, and replacing a
+file after reading has no effect. Modules of several folders can have the same names: in `sys.modules` their names
+begin with one that belongs to the file, and only they find each other by `import`.
 """
 
 import ast
@@ -24,22 +24,22 @@ from typing import Any
 from unjam.errors import InputError
 
 USER_MODULE_PREFIX = "unjam_user_"
-"""what names of users' modules in `sys.modules` begin with"""
+"""beginning of the names of users' modules in `sys.modules`"""
 INIT_FILE = "__init__.py"
 
 
 @dataclass(frozen=True)
 class UserCode:
-    """A Python file and the modules of its folder that it imports, also in functions, as they were read."""
+    """A Python file and the modules of its folder that it imports, also in functions, as read."""
 
     path: Path
     modules: Mapping[str, tuple[Path, bytes]]
-    """place and source by the name within the folder; the file's own is empty; a folder without `__init__.py`
-    is a package without source"""
+    """path and source by the name within the folder; the file's own name is empty; a folder without `__init__.py` is a
+    package without source"""
 
     @property
     def sha256(self) -> str:
-        """Return the hash of all that can run: of the file alone, that of its bytes."""
+        """The hash of all code that can run; for a single file, that of its bytes."""
         hashes = {name: hashlib.sha256(source).hexdigest() for name, (_, source) in self.modules.items()}
         if len(hashes) == 1:
             return hashes[""]
@@ -47,41 +47,41 @@ class UserCode:
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
     def run(self) -> ModuleType:
-        """Run the file and return its module; all that it imports from its folder runs anew, too."""
+        """Run the file and return its module; its imports from its folder run again too."""
         return _Modules(self).run()
 
 
 def read_code(path: Path) -> UserCode:
-    """Read a Python file and, as its import statements name them, the modules of its folder.
+    """Read a Python file and the modules of its folder that its import statements name.
 
-    Installed packages come before modules of the folder that have the same name.
+    Installed packages take precedence over modules of the folder with the same name.
 
     Raises:
         InputError: it imports a compiled module of its folder.
         OSError: a file cannot be read.
     """
-    found = {"": (path, path.read_bytes())}
-    waiting = [""]
-    while waiting:
-        name = waiting.pop()
-        place, source = found[name]
-        for wanted in _imported_names(source, _package_name(name, place)):
-            parts = wanted.split(".")
+    modules = {"": (path, path.read_bytes())}
+    unread = [""]
+    while unread:
+        name = unread.pop()
+        file, source = modules[name]
+        for imported in _imported_names(source, _package_name(name, file)):
+            parts = imported.split(".")
             for end in range(1, len(parts) + 1):
                 inner, parent = ".".join(parts[:end]), ".".join(parts[: end - 1])
-                if inner in found:
+                if inner in modules:
                     continue
-                if parent and not _is_package(found[parent][0]):
+                if parent and not _is_package(modules[parent][0]):
                     break
                 if (file := _find_source(path, inner)) is None:
                     break
-                found[inner] = file, file.read_bytes() if file.suffix == ".py" else b""
-                waiting.append(inner)
-    return UserCode(path, found)
+                modules[inner] = file, file.read_bytes() if file.suffix == ".py" else b""
+                unread.append(inner)
+    return UserCode(path, modules)
 
 
 def _find_source(path: Path, name: str) -> Path | None:
-    """Return the source of a module of a file's folder, or the folder of a package that has none."""
+    """Return the source of a module in a file's folder, or the folder of a package without source."""
     base = path.parent.joinpath(*name.split("."))
     sources = [file for file in (base / INIT_FILE, base.with_name(f"{base.name}.py")) if file.is_file()]
     compiled = [
@@ -101,24 +101,23 @@ def _find_source(path: Path, name: str) -> Path | None:
 
 @lru_cache(1024)
 def _is_installed(name: str) -> bool:
-    """Return whether a module is unjam's own, of the standard library, or of an installed package."""
-    folders = [each for each in sys.path if is_package_folder(each)]
-    spec = PathFinder.find_spec(name, folders)
-    is_package = spec is not None and spec.origin is not None  # not merely a folder
+    """Return whether a module belongs to unjam, the standard library, or an installed package."""
+    spec = PathFinder.find_spec(name, list(filter(is_package_folder, sys.path)))
+    is_package = spec is not None and spec.origin is not None  # not only a folder
     return is_package or name == "unjam" or name in sys.stdlib_module_names
 
 
 def is_package_folder(folder: str) -> bool:
-    """Return whether a folder of `sys.path` is one that packages are installed into."""
+    """Return whether a folder of `sys.path` is one for installed packages."""
     return Path(folder).name in ("site-packages", "dist-packages")
 
 
 @lru_cache(1024)
 def _imported_names(source: bytes, package: str) -> tuple[str, ...]:
-    """Return what the import statements of a source can name, in a package or, if that is empty, in none."""
+    """Return all names that the import statements of a source can mean; `package` is empty outside packages."""
     try:
         tree = ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):  # running it says what is wrong
+    except (SyntaxError, ValueError, RecursionError, MemoryError):  # running it reports the error
         return ()
     names = dict[str, None]()
     for node in ast.walk(tree):
@@ -147,7 +146,7 @@ def _package_name(name: str, path: Path) -> str:
 
 
 class _Modules(InspectLoader):
-    """The modules of one run of a file, and how `import` within them finds and runs them."""
+    """The modules of one run of a file; `import` in them finds and runs modules of the folder."""
 
     def __init__(self, code: UserCode) -> None:
         self._code = code
@@ -157,10 +156,10 @@ class _Modules(InspectLoader):
         self._builtins = {**vars(builtins), "__import__": self._import}
 
     def run(self) -> ModuleType:
-        """Run the file; meanwhile its modules have their short names, too, for other ways to import."""
+        """Run the file; meanwhile its modules have their short names too, for other ways to import."""
         for name in list(sys.modules):
             if f"{name}.".startswith(f"{self._root}."):
-                del sys.modules[name]  # of the run before
+                del sys.modules[name]  # of the previous run
         missing = [name for name in self._code.modules if name and name not in sys.modules]
         self._is_running = True
         try:
@@ -175,15 +174,15 @@ class _Modules(InspectLoader):
         return importlib.util.decode_source(self._code.modules[self._local_name(fullname)][1])
 
     def get_code(self, fullname: str) -> CodeType:
-        """Return the compiled source of a module; the lines that tracebacks show are those that run."""
-        place, source = self._code.modules[self._local_name(fullname)]
-        code = _compile_source(source, str(place))
+        """Return the compiled source of a module, and register its lines for tracebacks."""
+        path, source = self._code.modules[self._local_name(fullname)]
+        code = _compile_source(source, str(path))
         lines = self.get_source(fullname).splitlines(keepends=True)
-        linecache.cache[str(place)] = (len(source), None, lines, str(place))
+        linecache.cache[str(path)] = (len(source), None, lines, str(path))
         return code
 
     def is_package(self, fullname: str) -> bool:
-        """Return whether a module has modules below it."""
+        """Return whether a module is a package."""
         inner = self._local_name(fullname)
         return bool(inner) and _is_package(self._code.modules[inner][0])
 
@@ -191,19 +190,19 @@ class _Modules(InspectLoader):
         return fullname[len(self._root) + 1 :]
 
     def _load(self, local_name: str) -> ModuleType:
-        """Return a module, which runs where it is imported first."""
+        """Return a module; it runs at its first import."""
         parent, _, own = local_name.rpartition(".")
         if parent:
             self._load(parent)
         if local_name in self._modules:
             return self._modules[local_name]
-        place, _ = self._code.modules[local_name]
+        path, _ = self._code.modules[local_name]
         name = f"{self._root}.{local_name}" if local_name else self._root
-        below = [str(place.parent if place.name == INIT_FILE else place)] if self.is_package(name) else None
-        spec = importlib.util.spec_from_file_location(name, place, loader=self, submodule_search_locations=below)
+        below = [str(path.parent if path.name == INIT_FILE else path)] if self.is_package(name) else None
+        spec = importlib.util.spec_from_file_location(name, path, loader=self, submodule_search_locations=below)
         assert spec is not None
         if below is not None:
-            spec.submodule_search_locations = []  # or Python itself would search the folder, unhashed
+            spec.submodule_search_locations = []  # otherwise Python would search the folder, unhashed
         module = importlib.util.module_from_spec(spec)
         module.__dict__["__builtins__"] = self._builtins
         self._modules[local_name] = sys.modules[name] = module
@@ -226,7 +225,7 @@ class _Modules(InspectLoader):
         fromlist: Sequence[str] | None = (),
         level: int = 0,
     ) -> ModuleType:
-        """Do what `import` does in these modules: first of the folder, then as anywhere else."""
+        """Do what `import` does in these modules: first from the folder, then as usual."""
         inner = name
         if level:
             own = self._local_name(str((globals or {})["__name__"]))

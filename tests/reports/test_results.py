@@ -91,7 +91,7 @@ def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
 
 def test_an_unfinished_run_is_refused_with_the_command_to_resume(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text("steps = 100\n")
-    with pytest.raises(InputError, match="go on with: unjam train --resume"):
+    with pytest.raises(InputError, match="resume with: unjam train --resume"):
         read_results(tmp_path)
 
 

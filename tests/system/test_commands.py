@@ -372,7 +372,7 @@ def test_a_stopped_run_leaves_no_process_and_can_be_resumed(
         _, errors = process.communicate(timeout=10)
     assert process.returncode == code
     assert "Traceback" not in errors
-    assert "go on with: unjam train --resume run --workers 1\n" in errors
+    assert "resume with: unjam train --resume run --workers 1\n" in errors
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
     last = json.loads(progress.read_text().splitlines()[-1])["environment_steps"]
     assert unjam("train", "--resume", "run", "--steps", last + 1).returncode == 0
