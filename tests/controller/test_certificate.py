@@ -179,7 +179,7 @@ def test_a_controller_that_names_no_road_is_not_certified(tmp_path: Path) -> Non
     manifest = json.loads(parts.pop(MANIFEST_PART))
     del manifest["scenario"]
     file.write_bytes(pack_parts({MANIFEST_PART: json.dumps(manifest).encode(), **parts}))
-    with pytest.raises(InputError, match="a controller that names no road is not allowed"):
+    with pytest.raises(InputError, match="a controller without a scenario is not allowed"):
         make_certificate(read_controller(file))
 
 
@@ -196,7 +196,7 @@ def test_a_controller_of_cars_that_obey_late_is_not_certified(tmp_path: Path) ->
     manifest = json.loads(parts.pop(MANIFEST_PART))
     manifest["scenario"]["actuator"]["lag"] = 0.5
     file.write_bytes(pack_parts({MANIFEST_PART: json.dumps(manifest).encode(), **parts}))
-    with pytest.raises(InputError, match="a road whose cars obey late is not allowed"):
+    with pytest.raises(InputError, match="actuators with delay or lag are not allowed"):
         make_certificate(read_controller(file))
 
 

@@ -59,6 +59,6 @@ def test_only_controllers_on_another_road_get_a_note() -> None:
 def test_a_controller_that_counts_time_otherwise_gets_a_note() -> None:
     loop = make_driver("unjam:best", 0.1).inner_drivers["loop"]
     slow = scenario_recipe(make_scenario("ring-jammed", {"steps_per_control_step": 10}))
-    assert step_mismatch(loop, slow) == "counts time in steps of 0.1 s, and decisions here take 1 s"
+    assert step_mismatch(loop, slow) == "was made for control steps of 0.1 s, and control steps here take 1 s"
     assert step_mismatch(loop, scenario_recipe(make_scenario("ring-jammed"))) == ""
     assert step_mismatch(IDM(), slow) == ""

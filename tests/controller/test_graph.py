@@ -52,7 +52,7 @@ def test_cavs_that_perceive_the_same_must_get_the_same_answers() -> None:
 
     part, states = graph(answer_by_row), perceived()
     np.testing.assert_array_equal(run_graph(part, Constant(), states), states.leader_speed - states.speed)
-    with pytest.raises(InputError, match="graph: 3 CAVs that perceive the same get different answers"):
+    with pytest.raises(InputError, match="graph: 3 CAVs with the same observation get different answers"):
         run_graph(part, Constant(), states, rows=3)
 
 

@@ -147,7 +147,7 @@ def test_a_driver_that_cannot_be_drawn_says_so_in_one_line(name: str, my_drivers
 
 
 def test_who_asks_for_time_headways_is_not_drawn_without_them() -> None:
-    with pytest.raises(InputError, match="gap-maker is not allowed: a graph asks for no time headways"):
+    with pytest.raises(InputError, match="gap-maker is not allowed: a graph cannot command time gaps"):
         onnx_graph(driver_from_name("gap-maker", 0.1), 1.0)
 
 

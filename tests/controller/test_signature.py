@@ -83,7 +83,7 @@ def found(path: Path, signer: Path | None = None) -> str:
 def test_who_signed_is_told(tmp_path: Path) -> None:
     path = signed(tmp_path)
     said = found(path)
-    assert f", by the key {FINGERPRINT}; whose key that is was not checked: " in said
+    assert f", by the key {FINGERPRINT}; the owner of the key was not checked: " in said
     of_maker = f", by {str(tmp_path / 'maker.pub')!r}, the key {FINGERPRINT}"
     assert found(path, public_file(tmp_path)).endswith(of_maker)
     assert read_controller(path).signed_by == FINGERPRINT
@@ -403,7 +403,7 @@ def test_a_private_key_is_its_owners_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ending", [".key", ".pub"])
 def test_files_that_are_there_are_not_written_over(tmp_path: Path, ending: str) -> None:
     (tmp_path / f"maker{ending}").symlink_to(tmp_path / "nowhere")
-    with pytest.raises(InputError, match="one of which there are no keys yet"):
+    with pytest.raises(InputError, match="a name without keys"):
         make_keys(tmp_path / "maker")
     assert [path.name for path in tmp_path.iterdir()] == [f"maker{ending}"]
 

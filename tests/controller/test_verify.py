@@ -71,7 +71,7 @@ def test_each_part_of_a_controller_is_checked_absent_or_stated(tmp_path: Path) -
     path = written(tmp_path, content_of())
     assert statuses(path) == {**FORMULA_IN_FOLDER, "sample": "checked"}
     (sample,) = [each.detail for each in verify_controller_file(path) if each.part == "sample"]
-    assert sample.startswith("40 decisions: the driver repeats them within 0.0e+00 m/s2 (allowed 1e-09); ")
+    assert sample.startswith("40 control steps: the driver repeats them within 0.0e+00 m/s2 (allowed 1e-09); ")
 
 
 def test_what_a_recipe_leaves_out_is_said_to_be_a_default(tmp_path: Path) -> None:
@@ -79,8 +79,8 @@ def test_what_a_recipe_leaves_out_is_said_to_be_a_default(tmp_path: Path) -> Non
         del manifest["driver"]["expert"]["parameters"]["time_constant"]
 
     for content, words in (
-        (content_of(), "nothing of which was ignored"),
-        (changed(tmp_path, leave_out).read_bytes(), "what it leaves out has this version's default"),
+        (content_of(), "of which nothing was ignored"),
+        (changed(tmp_path, leave_out).read_bytes(), "missing parameters have the defaults of this version"),
     ):
         found = verify_controller_file(written(tmp_path, content))
         assert [each.detail.endswith(words) for each in found if each.part == "driver"] == [True]
@@ -163,7 +163,7 @@ def test_a_sample_that_checks_nothing_or_takes_long_is_refused(tmp_path: Path, c
     longest = load(sample_bytes(HELD, perceived(1001), 1.0))
     sample = save({name: values[:count] for name, values in longest.items()})
     words = refused(written(tmp_path, content_of(parts={SAMPLE_PART: sample})))
-    assert words == f"sample: decisions: {count} is not allowed; allowed: 1 to 1000"
+    assert words == f"sample: control steps: {count} is not allowed; allowed: 1 to 1000"
 
 
 def test_a_graph_without_a_sample_is_refused(tmp_path: Path) -> None:

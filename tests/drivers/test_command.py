@@ -44,11 +44,11 @@ def test_an_acc_keeps_at_least_its_own_time_headway() -> None:
     assert commanded_time_gaps(Command(np.zeros(3), np.array([np.nan, 0.5, 2.0])), 1.1, "abc", 0) == [1.1, 1.1, 2.0]
     assert commanded_time_gaps(Command(np.zeros(2)), 1.1, "ab", 0) == [1.1, 1.1]
     assert commanded_time_gaps(None, 1.1, [], 0) == []
-    with pytest.raises(InputError, match=r"driver: step 4: time headway has shape \(1,\); allowed: \(2,\)"):
+    with pytest.raises(InputError, match=r"driver: step 4: time gap has shape \(1,\); allowed: \(2,\)"):
         commanded_time_gaps(Command(np.zeros(2), np.ones(1)), 1.1, "ab", 4)
 
 
 def test_no_acc_keeps_an_infinite_time_headway() -> None:
     asked = Command(np.zeros(2), np.array([2.0, np.inf]))
-    with pytest.raises(InputError, match="driver: step 7: time headway of b is inf; allowed: finite, or NaN"):
+    with pytest.raises(InputError, match="driver: step 7: time gap of b is inf; allowed: finite, or NaN"):
         commanded_time_gaps(asked, 1.1, "ab", 7)

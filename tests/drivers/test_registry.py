@@ -34,7 +34,7 @@ def test_description_names_what_differs_from_the_defaults() -> None:
         ("constant:acceleration=[1]", "driver constant.acceleration"),
         ("pi:gap_upper=7", "driver pi.gap_upper: 7 is not allowed; allowed: > gap_lower, 7"),
         ("ovm:go_gap=2", "driver ovm.go_gap: 2 is not allowed; allowed: > stop_gap, 2"),
-        ("follower-stopper:gaps=[4.5,4.5,6]", "driver follower-stopper.gaps: .* each larger than the last"),
+        ("follower-stopper:gaps=[4.5,4.5,6]", "driver follower-stopper.gaps: .* each larger than the previous one"),
     ],
 )
 def test_wrong_names_and_values_get_one_clear_line(text: str, words: str) -> None:

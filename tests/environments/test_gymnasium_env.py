@@ -309,7 +309,7 @@ def test_a_reward_that_is_not_finite_is_refused_as_in_an_episode(tmp_path: Path)
         ({"features": "local"}, "features: 'local' is not allowed; allowed: a list of features"),
         ({"features": []}, r"features: \[\] is not allowed; allowed: a list of features"),
         ({"features": ["locla"]}, "features: 'locla' is not allowed; .* did you mean 'local'"),
-        ({"expert": "human"}, "expert: 'human' is not allowed; .* idm drives like people"),
+        ({"expert": "human"}, "expert: 'human' is not allowed; .* 'idm' drives like a human driver"),
     ],
 )
 def test_what_cannot_be_observed_or_added_to_is_told(asked: dict[str, Any], words: str) -> None:

@@ -13,7 +13,7 @@ from unjam.training.run_folder import check_config, create_run_folder, read_conf
 from unjam.training.train import train
 
 
-def test_an_empty_folder_may_be_there(tmp_path: Path) -> None:
+def test_empty_folder_is_allowed(tmp_path: Path) -> None:
     create_run_folder(tmp_path, small_config())
     assert read_config(tmp_path) == small_config()
 
@@ -31,31 +31,31 @@ def test_an_empty_folder_may_be_there(tmp_path: Path) -> None:
     ],
     ids=["expert", "file of it", "reward", "baseline", "nothing to observe", "no place", "expert of loops"],
 )
-def test_what_cannot_work_is_told_before_anything_is_written(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_impossible_configuration_is_refused_before_writing(tmp_path: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(InputError) as caught:
         train(small_config(**changes), tmp_path / "run")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
 
 
-def test_rows_are_not_imagined_where_a_cav_is_told_more_than_they_know(tmp_path: Path) -> None:
+def test_row_model_is_refused_for_inputs_that_it_cannot_continue(tmp_path: Path) -> None:
     assert load_config(changes={"scenario": "on-ramp"}).model.model_ratio == 0.0
     assert load_config(changes={"scenario": "on-ramp", "model.kind": "road"}).model.model_ratio > 0.0
-    with pytest.raises(InputError, match="not allowed on on-ramp, where CAVs have an ACC"):
+    with pytest.raises(InputError, match="not allowed on on-ramp, where CAVs use their own ACC"):
         check_config(load_config(changes={"scenario": "on-ramp", "model.model_ratio": 5.0}))
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     asked = {"scenario": str(file), "scenario_options.penetration_rate": 0.5, "expert": "jam-ahead"}
-    with pytest.raises(InputError, match=r"jam-ahead and the network ask for .*lane_speeds"):
+    with pytest.raises(InputError, match=r"jam-ahead and the network use .*lane_speeds"):
         check_config(load_config(changes=asked))
     check_config(load_config(changes={**asked, "expert": "acc"}))
 
 
-def test_the_simulator_is_no_expert() -> None:
-    with pytest.raises(InputError, match=r"expert: 'human' is not allowed; .* idm drives like people"):
+def test_simulator_is_refused_as_an_expert() -> None:
+    with pytest.raises(InputError, match=r"expert: 'human' is not allowed; .* 'idm' drives like a human driver"):
         check_config(load_config(changes={"expert": "human"}))
 
 
-def test_vehicles_on_a_network_of_ones_own_know_no_position(tmp_path: Path) -> None:
+def test_user_networks_have_no_route_position(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     changes = {"scenario": str(file), "scenario_options.cav_types": ["car"], "policy.inputs": ["route_position"]}
     with pytest.raises(InputError, match="'route_position' is not allowed on a user's network"):
@@ -86,7 +86,7 @@ def test_only_a_run_can_be_resumed(tmp_path: Path, content: dict[str, str]) -> N
     ],
     ids=str,
 )
-def test_what_a_run_is_cannot_change_when_it_goes_on(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_resumed_run_keeps_its_settings(tmp_path: Path, changes: dict[str, Any]) -> None:
     create_run_folder(tmp_path, small_config())
     before = (tmp_path / "config.toml").read_bytes()
     changed = load_config(tmp_path / "config.toml", changes={"steps": 900, **changes})
@@ -95,14 +95,14 @@ def test_what_a_run_is_cannot_change_when_it_goes_on(tmp_path: Path, changes: di
     assert (tmp_path / "config.toml").read_bytes() == before
 
 
-def test_budget_and_workers_may_change_when_a_run_goes_on(tmp_path: Path) -> None:
+def test_resumed_run_may_change_steps_and_workers(tmp_path: Path) -> None:
     create_run_folder(tmp_path, small_config())
     changed = replace(small_config(), steps=9 * STEPS, workers=7)
     resume_run_folder(tmp_path, changed)
     assert read_config(tmp_path) == changed
 
 
-def test_a_run_that_gave_up_takes_no_more_steps(tmp_path: Path) -> None:
+def test_run_out_of_patience_takes_no_more_steps(tmp_path: Path) -> None:
     config = small_config(evaluation__validation_interval=1, evaluation__patience=2)
     create_run_folder(tmp_path, config)
     rows = [{"iteration": n, "return_expert": 5.0, "return_validation": 4.0} for n in (1, 2, 3)]
@@ -114,13 +114,13 @@ def test_a_run_that_gave_up_takes_no_more_steps(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", ['title = "mine"\n', "[[tasks]]\nname = 'ring'\n"])
-def test_a_run_beside_a_strangers_config_goes_on(words: str, tmp_path: Path) -> None:
+def test_foreign_config_in_the_parent_folder_is_ignored(words: str, tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text(words)
     create_run_folder(tmp_path / "ring", small_config())
     resume_run_folder(tmp_path / "ring", small_config())
 
 
-def test_a_run_whose_road_was_given_in_python_goes_on(tmp_path: Path) -> None:
+def test_run_with_tuple_options_resumes(tmp_path: Path) -> None:
     config = small_config(scenario_options__length=(120, 130))
     create_run_folder(tmp_path, config)
     resume_run_folder(tmp_path, config)

@@ -1,4 +1,4 @@
-"""What a controller is for: the road that it was trained on, what it met there, and notes on others."""
+"""The intended use of a controller: its training scenario, its certified domain, and notes on other scenarios."""
 
 import json
 import os
@@ -19,38 +19,38 @@ from unjam.parameters import build_dataclass, flatten_keys
 from unjam.worlds.record import Episode
 
 IRRELEVANT_PARAMETERS = {"horizon", "emission_class", "remember_warmup", "population"}
-"""parameters of a scenario that make no other road of it"""
+"""scenario parameters that do not make it another scenario"""
 KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")
-"""parameters that tell roads of a kind apart at a glance"""
+"""parameters that distinguish scenarios of a kind in a short description"""
 MAX_LISTED_PARAMETERS = 3
-"""parameters that a note names"""
+"""maximum number of parameters in a note"""
 OUTSIDE_DOMAIN_THRESHOLD = 0.05
-"""share of decisions outside of what a controller is certified for, from which a note says so"""
+"""share of control steps outside of the certified domain from which a note reports it"""
 
 
 def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[str, Episode]) -> list[str]:
-    """Return a line for each controller that was not made for this road, or met there what it never had.
+    """Return a note for each controller that was made for another scenario, or left its certified domain.
 
-    `road` is the recipe of the scenario; `shown` is what some of the drivers met, by name.
+    `road` is the recipe of the scenario; `episodes` has episodes of some of the drivers, by name.
     """
     notes = []
     for name in names:
-        controller = find_controller(name)
+        controller = _find_controller(name)
         if controller is None:
             continue
-        if (other := road_mismatch(controller.manifest, road)) or (other := step_mismatch(controller.driver, road)):
-            notes.append(f"{name} {other}")
+        if mismatch := road_mismatch(controller.manifest, road) or step_mismatch(controller.driver, road):
+            notes.append(f"{name} {mismatch}")
         states = [each.states for each in episodes[name].trajectories] if name in episodes else []
         share = max((outside_domain_share(controller, each) for each in states), default=0.0)
         if share > OUTSIDE_DOMAIN_THRESHOLD:
-            notes.append(f"{name} was outside of its certified domain in {100 * share:.0f} % of decisions")
+            notes.append(f"{name} was outside of its certified domain in {100 * share:.0f} % of control steps")
     return notes
 
 
-def find_controller(driver_name: str) -> Controller | None:
-    """Return the controller that a driver's name stands for; None where it is none, or cannot be read."""
-    shipped = driver_name.startswith(PACKAGED_PREFIX)
-    path = packaged_file(driver_name.removeprefix(PACKAGED_PREFIX)) if shipped else Path(driver_name)
+def _find_controller(driver_name: str) -> Controller | None:
+    """Return the controller with a driver's name; None if the driver is none, or it cannot be read."""
+    is_packaged = driver_name.startswith(PACKAGED_PREFIX)
+    path = packaged_file(driver_name.removeprefix(PACKAGED_PREFIX)) if is_packaged else Path(driver_name)
     try:
         return read_controller(path) if os.path.exists(path) and not driver_name.endswith(".py") else None
     except InputError:
@@ -58,9 +58,9 @@ def find_controller(driver_name: str) -> Controller | None:
 
 
 def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
-    """Return in what a road is not the one that a controller was trained on; empty where it is, or unknown.
+    """Return the differences of a scenario from that of a controller's training; empty if none is known.
 
-    `road` is the recipe of the scenario, as the manifest has one. A range within the trained one is the same.
+    `road` is the recipe of the scenario, as in manifests. A range within the trained one is no difference.
     """
     trained = manifest.get("scenario")
     if not isinstance(trained, dict):
@@ -68,31 +68,32 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     made = "tuned" if "tuning" in manifest else "trained"
     if trained.get("kind") != road["kind"]:
         return f"was {made} on the {_printable(trained.get('kind'))}, not on the {road['kind']}"
-    there, here = flatten_keys(trained), flatten_keys(road)
-    known = [name for name in here if name in there and name not in IRRELEVANT_PARAMETERS]
-    differ = [name for name in known if not _is_within(there[name], here[name])]
-    words = [
-        f"{name} {_printable(here[name])} (there {_printable(there[name])})" for name in differ[:MAX_LISTED_PARAMETERS]
-    ]
-    more = [f"{len(differ) - MAX_LISTED_PARAMETERS} more"] if len(differ) > MAX_LISTED_PARAMETERS else []
-    return f"was {made} on another {road['kind']}: {', '.join(words + more)}" if differ else ""
+    before, now = flatten_keys(trained), flatten_keys(road)
+    known = [name for name in now if name in before and name not in IRRELEVANT_PARAMETERS]
+    differ = [name for name in known if not _is_within(before[name], now[name])]
+    if not differ:
+        return ""
+    listed = differ[:MAX_LISTED_PARAMETERS]
+    words = [f"{name} {_printable(now[name])} (there {_printable(before[name])})" for name in listed]
+    more = [f"{len(differ) - len(listed)} more"] if len(differ) > len(listed) else []
+    return f"was {made} on another {road['kind']}: {', '.join(words + more)}"
 
 
 def step_mismatch(driver: Driver, road: dict[str, Any]) -> str:
-    """Return that a driver counts time in steps which are not a road's decisions; empty where it does not.
+    """Return that the control step of a driver differs from that of a scenario; empty if it does not.
 
-    `road` is the recipe of the scenario. Of a driver by kind of road it is not known which of them drives.
+    `road` is the recipe of the scenario. For a `RoadTypeSwitch` the active driver is not known.
     """
     step, recipe = road["simulation_step"] * road["steps_per_control_step"], driver.recipe()
     steps = set(_time_steps(recipe)) if recipe["kind"] != "road-type-switch" else set()
     if not steps or any(abs(each - step) < 1e-9 for each in steps):
         return ""
-    counted = ", ".join(f"{each:g}" for each in sorted(steps))
-    return f"counts time in steps of {counted} s, and decisions here take {step:g} s"
+    made = ", ".join(f"{each:g}" for each in sorted(steps))
+    return f"was made for control steps of {made} s, and control steps here take {step:g} s"
 
 
 def _time_steps(recipe: Any) -> Iterator[float]:
-    """Yield each time step in a driver's recipe [s]."""
+    """Yield each time step in the recipe of a driver [s]."""
     if isinstance(recipe, dict):
         for name, part in recipe.items():
             yield from [part] if name == "time_step" else _time_steps(part)
@@ -102,35 +103,34 @@ def _time_steps(recipe: Any) -> Iterator[float]:
 
 
 def road_description(manifest: dict[str, Any]) -> str:
-    """Return in words for which road a controller was made; empty where its manifest names none."""
-    made = manifest.get("scenario")
-    if not isinstance(made, dict):
+    """Return a short description of the scenario in a manifest; empty if it has none."""
+    road = manifest.get("scenario")
+    if not isinstance(road, dict):
         return ""
-    facts = [f"{name} {_printable(made[name])}" for name in KEY_PARAMETERS if made.get(name) is not None]
-    return ", ".join([_printable(made.get("kind")), *facts])
+    facts = [f"{name} {_printable(road[name])}" for name in KEY_PARAMETERS if road.get(name) is not None]
+    return ", ".join([_printable(road.get("kind")), *facts])
 
 
 def _is_within(training_value: Any, value: Any) -> bool:
-    """Return whether a value is that of the training; of a range, whether it lies within."""
-    training_value, value = json.loads(json.dumps([training_value, value]))  # tuples are lists there
+    """Return whether a value is that of the training; for ranges, whether it lies within."""
+    training_value, value = json.loads(json.dumps([training_value, value]))  # turns tuples into lists
     pair = isinstance(value, list) and isinstance(training_value, list) and len(value) == len(training_value) == 2
     return training_value == value or (pair and training_value[0] <= value[0] and value[1] <= training_value[1])
 
 
 def _printable(value: Any) -> str:
-    """Return a value that somebody else wrote, on one line and without what a terminal would act on."""
+    """Return a value from an untrusted file on one line, without control characters for a terminal."""
     text = "-".join(map(str, dict.fromkeys(value))) if isinstance(value, list | tuple) else str(value)
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def outside_domain_share(controller: Controller, states: LocalState) -> float:
-    """Return the share of states in which a certified controller was never seen; 0 of one without."""
+    """Return the share of states outside of a controller's certified domain; 0 without a certificate."""
     if CERTIFICATE_PART not in controller.parts:
         return 0.0
     try:
-        domain = build_dataclass(
-            OperatingDomain, parse_json(controller.parts[CERTIFICATE_PART])["domain"], "certificate: domain"
-        )
-    except (*UNREADABLE_ERRORS, InputError):  # `unjam verify` says so; what was driven is not lost for it
+        values = parse_json(controller.parts[CERTIFICATE_PART])["domain"]
+        domain = build_dataclass(OperatingDomain, values, "certificate: domain")
+    except (*UNREADABLE_ERRORS, InputError):  # `unjam verify` reports it; the results of a drive must not be lost
         return 0.0
     return float(1.0 - np.mean(domain.contains(states)))

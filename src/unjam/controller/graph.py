@@ -1,7 +1,7 @@
-"""The ONNX graph of a controller: its inputs and outputs, what it may consist of, and how it is run.
+"""The ONNX graph of a controller: its inputs and outputs, its allowed content, and its execution.
 
-A graph of others is data only as long as it is arithmetic: ONNX knows loops, functions, operators of other
-domains, and tensors that lie in other files. So whatever is not listed here is refused, at any depth.
+An untrusted graph is only data if it is pure arithmetic: ONNX has loops, functions, operators of other domains, and
+tensors in external files. Therefore anything that is not listed here is refused, at any depth.
 """
 
 from importlib import import_module
@@ -17,9 +17,9 @@ from unjam.physics.arrays import Floats
 from unjam.tree import leaves
 
 ONNX_OPSET = 20
-"""version of ONNX's operators"""
+"""version of the ONNX operators"""
 ONNX_IR_VERSIONS = range(10, 14)
-"""versions of ONNX's format in which a graph of this opset is written"""
+"""versions of the ONNX format for graphs of this opset"""
 ALLOWED_OPERATORS: dict[str, dict[str, str]] = {
     **{
         name: {}
@@ -44,7 +44,7 @@ ALLOWED_OPERATORS: dict[str, dict[str, str]] = {
     "Shape": {"end": "i", "start": "i"},
     "Transpose": {"perm": "ints"},
 }
-"""all operators of a graph: arithmetic, without subgraphs; with the field that each attribute is in"""
+"""all allowed operators: arithmetic, without subgraphs; with the field that stores each of their attributes"""
 ALLOWED_FIELDS = {
     "ModelProto": {"ir_version", "producer_name", "producer_version", "opset_import", "graph"},
     "OperatorSetIdProto": {"domain", "version"},
@@ -59,42 +59,41 @@ ALLOWED_FIELDS = {
     "TensorShapeProto": {"dim"},
     "Dimension": {"dim_param", "dim_value"},
 }
-"""all fields that a graph's messages may set: no function, subgraph, sparse or external tensor, metadata"""
+"""all fields that messages of a graph may set: no function, subgraph, sparse or external tensor, metadata"""
 BATCH_TOLERANCE = 1e-9
-"""by how much equal rows may differ [m/s2]: matrix products of another size are rounded otherwise"""
+"""allowed difference between equal rows [m/s2]: rounding of matrix products depends on their size"""
 
 
 def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
     """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
-    remembered = [name for name, _ in leaves(driver.initial_memory(1))]
-    inputs = [*driver.input_fields, *(f"memory.{name}" for name in remembered)]
-    return inputs, [ACTION_NAME, *(f"next.{name}" for name in remembered)]
+    memory = [name for name, _ in leaves(driver.initial_memory(1))]
+    inputs = [*driver.input_fields, *(f"memory.{name}" for name in memory)]
+    return inputs, [ACTION_NAME, *(f"next.{name}" for name in memory)]
 
 
 def check_graph(part: bytes, driver: Driver) -> None:
-    """Raise `InputError` unless a graph has a controller's inputs and outputs, and only arithmetic between.
+    """Raise `InputError` unless a graph has the inputs and outputs of a controller, and only arithmetic between them.
 
-    Raises:
-        MissingPartError: onnx is not installed.
+    Raise `MissingPartError` if onnx is not installed.
     """
     onnx = require_package("onnx")
     try:
         model = onnx.load_model_from_string(part)
-    except Exception as error:  # protobuf's own kinds of error
+    except Exception as error:  # protobuf has its own error classes
         raise InputError(f"graph: cannot be read: {error}") from None
     _check_fields(model)
     model.DiscardUnknownFields()
     if model.ByteSize() != len(part):
-        raise InputError("graph: it holds bytes that ONNX does not know; allowed: what `unjam export` writes")
+        raise InputError("graph: it contains bytes that ONNX does not know; allowed: output of `unjam export`")
     if model.ir_version not in ONNX_IR_VERSIONS:
         raise invalid_value("graph: ir_version", model.ir_version, f"{ONNX_IR_VERSIONS[0]} to {ONNX_IR_VERSIONS[-1]}")
     imported = [(each.domain, each.version) for each in model.opset_import]
     if imported != [("", ONNX_OPSET)]:
         raise invalid_value("graph: opset_import", imported, f"{[('', ONNX_OPSET)]}")
-    graph, wanted = model.graph, graph_names(driver)
+    graph, expected = model.graph, graph_names(driver)
     found = [value.name for value in graph.input], [value.name for value in graph.output]
-    if found != wanted:
-        raise InputError(f"graph: inputs and outputs {found} are not allowed; allowed: {wanted}")
+    if found != expected:
+        raise InputError(f"graph: inputs and outputs {found} are not allowed; allowed: {expected}")
     kinds = {value.type.tensor_type.elem_type for value in (*graph.input, *graph.output)}
     if kinds != {onnx.TensorProto.DOUBLE}:
         raise InputError("graph: inputs and outputs of another type are not allowed; allowed: float64")
@@ -105,11 +104,11 @@ def check_graph(part: bytes, driver: Driver) -> None:
 
 
 def _check_fields(message: Any) -> None:
-    """Raise `InputError` where a message, or one nested in it, sets a field that no graph of ours has."""
+    """Raise `InputError` if a message, or one nested in it, sets a field that is not allowed."""
     kind = message.DESCRIPTOR.name
     for each, value in message.ListFields():
         if each.name not in ALLOWED_FIELDS.get(kind, ()):
-            allowed = ", ".join(sorted(ALLOWED_FIELDS.get(kind, ()))) or "nothing of this kind"
+            allowed = ", ".join(sorted(ALLOWED_FIELDS.get(kind, ()))) or "no message of this kind"
             raise InputError(f"graph: {kind}.{each.name} is not allowed; allowed: {allowed}")
         if each.message_type is not None:
             for inner in (value,) if hasattr(value, "ListFields") else value:
@@ -117,57 +116,58 @@ def _check_fields(message: Any) -> None:
 
 
 def _check_node(node: Any, types: Any) -> None:
-    """Raise `InputError` unless a node is an operator of the list with attributes of the list."""
+    """Raise `InputError` unless a node is an allowed operator with allowed attributes."""
     if node.domain or node.op_type not in ALLOWED_OPERATORS:
         operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
         raise InputError(f"graph: operator {operator!r} is not allowed; allowed: arithmetic")
     allowed, seen = ALLOWED_OPERATORS[node.op_type], set[str]()
     types_of = {"i": types.INT, "f": types.FLOAT, "s": types.STRING, "t": types.TENSOR, "ints": types.INTS}
     for attribute in node.attribute:
-        held = allowed.get(attribute.name)
+        value_field = allowed.get(attribute.name)
         fields = {each.name for each, _ in attribute.ListFields()}
-        if held is None or attribute.name in seen or fields != {"name", "type", held}:
+        if value_field is None or attribute.name in seen or fields != {"name", "type", value_field}:
             names = ", ".join(allowed) or "none"
             raise invalid_value(f"graph: attribute of {node.op_type}", attribute.name, f"{names}, each once")
-        if attribute.type != types_of[held]:
-            raise invalid_value(f"graph: type of {node.op_type}.{attribute.name}", attribute.type, types_of[held])
+        if attribute.type != types_of[value_field]:
+            field = f"graph: type of {node.op_type}.{attribute.name}"
+            raise invalid_value(field, attribute.type, types_of[value_field])
         seen.add(attribute.name)
 
 
 def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) -> Floats:
-    """Return what a checked graph answers when it perceives `states` one after the other [m/s2].
+    """Return the accelerations of a checked graph for consecutive `states` [m/s2].
 
-    It begins with the first memory of `driver`, whose graph it is; all arrays have the shape (T,). It runs
-    for so many CAVs at once, in `rows`, that perceive the same.
+    It begins with the initial memory of its `driver`; all arrays have the shape (T,). It runs for `rows` CAVs with the
+    same observation at once.
 
     Raises:
-        InputError: onnxruntime refuses it, or CAVs that perceive the same get other answers.
+        InputError: onnxruntime refuses it, or CAVs with the same observation get different answers.
         MissingPartError: onnxruntime is not installed.
     """
     runtime = require_package("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    (inputs, _), answers, alike = graph_names(driver), np.zeros(len(states.speed)), True
+    (inputs, _), answers, is_equal = graph_names(driver), np.zeros(len(states.speed)), True
     memory: list[Any] = [rows for _, rows in leaves(driver.initial_memory(rows))]
     try:
         session = runtime.InferenceSession(part, options, providers=["CPUExecutionProvider"])
         for step in range(len(answers)):
             now = states.select(np.full(rows, step))
-            seen = [getattr(now, name) for name in driver.input_fields]
-            acceleration, *memory = session.run(None, dict(zip(inputs, [*seen, *memory], strict=True)))
+            values = [*(getattr(now, name) for name in driver.input_fields), *memory]
+            acceleration, *memory = session.run(None, dict(zip(inputs, values, strict=True)))
             answers[step] = acceleration[0]
-            alike &= np.shape(acceleration) == (rows,)
-            alike &= bool(np.all(np.abs(acceleration - answers[step]) <= BATCH_TOLERANCE))
-    except Exception as error:  # the runtime's own kinds of error
+            is_equal &= np.shape(acceleration) == (rows,)
+            is_equal &= bool(np.all(np.abs(acceleration - answers[step]) <= BATCH_TOLERANCE))
+    except Exception as error:  # the runtime has its own error classes
         raise InputError(f"graph: cannot be run: {error}") from None
-    if not alike:
-        raise InputError(f"graph: {rows} CAVs that perceive the same get different answers")
+    if not is_equal:
+        raise InputError(f"graph: {rows} CAVs with the same observation get different answers")
     return answers
 
 
 def require_package(name: str) -> Any:
-    """Return a package that only graphs need; raise `MissingPartError` where it is not installed."""
+    """Return a package that only graphs need; raise `MissingPartError` if it is not installed."""
     try:
         return import_module(name)
     except ImportError:

@@ -1,4 +1,4 @@
-"""Car following at the wheel of a CAV: how people and cruise controls answer the nearest vehicles."""
+"""Car-following drivers of a CAV: human-like models and cruise controls."""
 
 from math import pi
 from typing import ClassVar
@@ -13,13 +13,13 @@ from unjam.parameters import STRICT, NonNegative, Positive
 from unjam.physics.arrays import Array, clamp_min, clip, namespace
 from unjam.physics.idm import IDMParameters, idm_acceleration
 
-_MIN_GAP = 0.01
-"""[m]; the intelligent driver model divides by the gap"""
+MIN_IDM_GAP = 0.01
+"""smallest gap in the Intelligent Driver Model, which divides by it [m]"""
 
 
 @dataclass(frozen=True, config=STRICT)
 class IDM(IDMParameters, FormulaDriver):
-    """A CAV that follows like an ideal human driver, without noise and within the action limit.
+    """A CAV that drives like an ideal human driver, without noise and within the action limit.
 
     Source: Treiber, Hennecke, Helbing 2000; paper Eq. 5-6 with the parameters of Table B1.
     """
@@ -27,23 +27,20 @@ class IDM(IDMParameters, FormulaDriver):
     name: ClassVar[str] = "idm"
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the IDM acceleration; nothing is remembered."""
-        gap = clamp_min(state.leader_gap, _MIN_GAP)
+        """Return the IDM acceleration."""
+        gap = clamp_min(state.leader_gap, MIN_IDM_GAP)
         return idm_acceleration(state.speed, state.leader_speed, gap, self), memory
 
 
 @dataclass(frozen=True, config=STRICT)
 class Human(FormulaDriver):
-    """Nobody automated: the vehicle stays one of the road's human drivers, with their noise.
-
-    With this driver the traffic is all-human. It is the simulator that drives.
-    """
+    """The human baseline: the simulator drives the vehicle as one of its human drivers, with their noise."""
 
     name: ClassVar[str] = "human"
     is_native: ClassVar[bool] = True
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return what the paper's IDM would do; the simulator does not ask."""
+        """Return the acceleration of the paper's IDM; the simulator does not use it."""
         return IDM().act(state, memory)
 
 
@@ -63,19 +60,18 @@ class OVM(FormulaDriver):
     stop_gap: NonNegative = 2.0
     """h_st: gap below which the optimal speed is zero [m]"""
     go_gap: Positive = 15.0
-    """h_go: gap from which on it is the largest [m]"""
+    """h_go: gap above which the optimal speed is `max_speed` [m]"""
     max_speed: Positive = 30.0
     """v_max [m/s]"""
 
     @model_validator(mode="after")
     def _check_gap_order(self) -> "OVM":
         if self.go_gap <= self.stop_gap:
-            allowed = f"> stop_gap, {self.stop_gap:g}"
-            raise ValueError(f"go_gap: {self.go_gap:g} is not allowed; allowed: {allowed}")
+            raise ValueError(f"go_gap: {self.go_gap:g} is not allowed; allowed: > stop_gap, {self.stop_gap:g}")
         return self
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration towards the optimal speed; nothing is remembered."""
+        """Return the acceleration towards the optimal speed."""
         share = clip((state.leader_gap - self.stop_gap) / (self.go_gap - self.stop_gap), 0.0, 1.0)
         optimal = self.max_speed / 2.0 * (1.0 - namespace(share).cos(pi * share))
         acceleration = self.gap_gain * (optimal - state.speed)
@@ -84,9 +80,9 @@ class OVM(FormulaDriver):
 
 @dataclass(frozen=True, config=STRICT)
 class BCM(FormulaDriver):
-    """Steers towards equal gaps and equal relative speeds ahead and behind, and towards a desired speed.
+    """Controls towards equal gaps and equal relative speeds ahead and behind, and towards a desired speed.
 
-    Where all drive so, waves cannot grow; one among people is another matter.
+    If all vehicles use it, waves cannot grow; this does not hold for one CAV among human drivers.
     Source: Horn and Wang 2017, IEEE Trans. Intell. Transp. Syst. 19(10); defaults as Flow's `BCMController`.
     """
 
@@ -102,7 +98,7 @@ class BCM(FormulaDriver):
     """[m/s]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the bilateral acceleration; nothing is remembered."""
+        """Return the bilateral acceleration."""
         speed = state.speed
         between = (state.leader_speed - speed) - (speed - state.follower_speed)
         acceleration = (
@@ -117,27 +113,27 @@ class BCM(FormulaDriver):
 class ACC(FormulaDriver):
     """Keeps a constant time gap to the leader, and never drives faster than its set speed.
 
-    The defaults are those fitted to production cars. Source: Milanés and Shladover 2014, Transp. Res. C
-    48:285-300, Eq. 4 and 5.
+    The defaults were fitted to production cars. Source: Milanés and Shladover 2014, Transp. Res. C 48:285-300,
+    Eq. 4 and 5.
     """
 
     name: ClassVar[str] = "acc"
 
     time_gap: Positive = 1.1
-    """wanted gap over own speed [s]"""
+    """desired time gap [s]"""
     standstill_gap: NonNegative = 2.0
-    """wanted gap of a standing vehicle [m]"""
+    """desired gap at standstill [m]"""
     set_speed: Positive = 30.0
     """speed on a free road [m/s]"""
     gap_gain: NonNegative = 0.23
-    """acceleration for each metre of gap too much [1/s2]"""
+    """acceleration per meter of excess gap [1/s2]"""
     speed_gain: NonNegative = 0.07
-    """acceleration for each m/s that the leader is faster [1/s]"""
+    """acceleration per m/s of relative speed of the leader [1/s]"""
     set_speed_gain: NonNegative = 0.4
-    """acceleration for each m/s below the set speed [1/s]"""
+    """acceleration per m/s below the set speed [1/s]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the smaller of following and free driving; nothing is remembered."""
+        """Return the smaller of the accelerations for following and for free driving."""
         excess = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
         following = self.gap_gain * excess + self.speed_gain * (state.leader_speed - state.speed)
         free = self.set_speed_gain * (self.set_speed - state.speed)
@@ -161,18 +157,18 @@ class LACC(FormulaDriver):
     time_gap: NonNegative = 1.0
     """h [s]"""
     standstill_gap: NonNegative = 5.0
-    """wanted gap of a standing vehicle [m]"""
+    """desired gap at standstill [m]"""
     lag: Positive = 0.1
-    """tau: time after which the acceleration has come near the command [s]"""
+    """tau: time constant with which the acceleration follows the command [s]"""
     time_step: Positive = 0.1
-    """time between two decisions [s]; set by the road"""
+    """control step [s]; set by the road"""
 
     def initial_memory(self, n: int) -> Memory:
         """Return zero accelerations."""
         return {"acceleration": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the lagged acceleration, and remember it."""
+        """Return the lagged acceleration, which is also the memory."""
         excess = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
         command = self.gap_gain * excess + self.speed_gain * (state.leader_speed - state.speed)
         share = min(1.0, self.time_step / self.lag)  # a step longer than the lag reaches the command
@@ -182,7 +178,7 @@ class LACC(FormulaDriver):
 
 @dataclass(frozen=True, config=STRICT)
 class Constant(FormulaDriver):
-    """Asks for the same acceleration in every step; only the shield keeps it from the car ahead."""
+    """Commands the same acceleration in every step; only SUMO's own safety check prevents a collision."""
 
     name: ClassVar[str] = "constant"
 
@@ -190,5 +186,5 @@ class Constant(FormulaDriver):
     """[m/s2]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the constant; nothing is remembered."""
+        """Return the constant."""
         return state.speed * 0.0 + self.acceleration, memory

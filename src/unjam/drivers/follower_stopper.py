@@ -16,9 +16,8 @@ from unjam.physics.arrays import Array, clip, namespace
 class FollowerStopper(FormulaDriver):
     """Drives at the desired speed while the gap allows it, and below it in three regions of the gap.
 
-    In the field the desired speed was set from outside, as an estimate of the speed of traffic. By default
-    it is the mean speed of the leader over the last `window` seconds: the own mean would keep a vehicle
-    that stands standing for ever.
+    In the field experiment the desired speed was an external estimate of the speed of traffic. By default it is the
+    mean speed of the leader over the last `window` seconds: with the own mean, a stopped vehicle would never start.
     Source: Stern et al. 2018, Transp. Res. C 89:205-221, section 3.1.
     """
 
@@ -29,19 +28,19 @@ class FollowerStopper(FormulaDriver):
     window: Positive = 38.0
     """time over which the leader's speed is averaged [s]"""
     gaps: tuple[Positive, Positive, Positive] = (4.5, 5.25, 6.0)
-    """borders of the three regions at equal speeds [m]"""
+    """boundaries of the three regions at equal speeds [m]"""
     decelerations: tuple[Positive, Positive, Positive] = (1.5, 1.0, 0.5)
-    """how fast the borders grow when closing in [m/s2]"""
+    """decelerations by which the boundaries grow with the closing speed [m/s2]"""
     time_constant: NonNegative = 0.0
-    """time over which the wanted speed is reached [s]; 0: one time step"""
+    """time constant of the approach to the command [s]; 0: one time step"""
     time_step: Positive = 0.1
-    """time between two decisions [s]; set by the road"""
+    """control step [s]; set by the road"""
 
     @model_validator(mode="after")
     def _check_gap_order(self) -> "FollowerStopper":
         stop, follow, free = self.gaps
         if not stop < follow < free:
-            raise ValueError(f"gaps: {list(self.gaps)} is not allowed; allowed: each larger than the last")
+            raise ValueError(f"gaps: {list(self.gaps)} is not allowed; allowed: each larger than the previous one")
         return self
 
     def initial_memory(self, n: int) -> Memory:
@@ -49,7 +48,7 @@ class FollowerStopper(FormulaDriver):
         return empty_window(n, self.window, self.time_step)
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return `memory` with the leader's speeds of the warm-up in its window."""
+        """Return `memory` with the leader's speeds from the warm-up in its window."""
         return fill_window(memory, history.leader_speed)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:

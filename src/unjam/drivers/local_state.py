@@ -1,4 +1,4 @@
-"""What a CAV perceives, in every world."""
+"""The observation of a CAV, the same in every world."""
 
 from collections.abc import Callable, Sequence
 from math import pi
@@ -10,9 +10,8 @@ from unjam.physics.arrays import Array
 class LocalState(NamedTuple):
     """The surroundings of n CAVs, one row each; NumPy arrays or torch tensors of shape (n,), SI units.
 
-    Drivers that take plain numbers (`Driver.accepts_floats`) may also be given floats, for a single CAV.
-
-    Where nobody is ahead (or behind), the gap is `MAX_OBSERVED_GAP` and the leader (follower) as fast as the CAV.
+    Drivers with `Driver.accepts_floats` may also be given floats, for a single CAV. Without a vehicle ahead (or
+    behind), the gap is `MAX_OBSERVED_GAP` and the speed of the leader (follower) is that of the CAV.
     """
 
     speed: Array
@@ -26,46 +25,46 @@ class LocalState(NamedTuple):
     follower_gap: Array
     """the follower's front bumper to own rear bumper [m]"""
     route_position: Array
-    """own front bumper along the route [m]; NaN where the road has no coordinate of its own"""
+    """own front bumper along the route [m]; NaN on roads without a coordinate"""
     loop_length: Array
     """length of the closed road [m]; NaN on an open one"""
 
-    # What only some roads offer; None elsewhere.
+    # Fields that only some roads provide; None elsewhere.
 
     distance_to_crossing: Array = None
-    """how far ahead a closed road next crosses itself [m]"""
+    """distance to the next crossing of a closed road with itself [m]"""
     allowed_speed: Array = None
-    """as fast as it may and wants to drive here [m/s]"""
+    """speed limit at the current position times the speed factor of the vehicle [m/s]"""
     distance_to_merge: Array = None
-    """how far ahead a ramp's lane begins to run beside the road [m]; negative behind it"""
+    """distance to the point where the lane of a ramp begins to run next to the road [m]; negative behind it"""
     lane_speeds: Array = None
-    """mean speeds in its own lane of the sections of `ROAD_SECTION_LENGTH` metres ahead, its own first, as a message
-    said: (n, SECTIONS_AHEAD) [m/s]; where nobody is, what is allowed"""
+    """last received mean speeds of the road sections ahead in the own lane, beginning with the own section:
+    (n, SECTIONS_AHEAD) [m/s]; empty sections have the allowed speed"""
     road_speeds: Array = None
     """the same over all lanes of the main road"""
     adjacent_gaps: Array = None
-    """gaps to those on the lanes beside it, as in `BESIDE`: (n, 4) [m]; negative alongside, `MAX_OBSERVED_GAP`
-    where nobody or no lane is. Before a ramp joins, its vehicles are on the lane that it becomes"""
+    """gaps to vehicles on adjacent lanes, ordered as `ADJACENT_POSITIONS`: (n, 4) [m]; negative for vehicles alongside,
+    `MAX_OBSERVED_GAP` without a vehicle or lane. Before a merge, the ramp counts as the lane that it becomes"""
     adjacent_speeds: Array = None
-    """their speeds [m/s]; its own where nobody is"""
+    """speeds of these vehicles [m/s]; the own speed where there is none"""
     penetration_rate: Array = None
-    """how many of all that have entered so far are CAVs, as a roadside service counts"""
+    """share of CAVs among all vehicles that have entered so far, as counted by a roadside service"""
     congestion: Array = None
-    """whether the sections of `lane_speeds` are congested, as a service reports: (n, SECTIONS_AHEAD);
-    1 or 0, between these where messages are smoothed"""
+    """1 where a roadside service reports a section of `lane_speeds` as congested, else 0: (n, SECTIONS_AHEAD); values
+    between these where messages are smoothed"""
 
     def map(self, function: Callable[..., Any], *others: "LocalState") -> "LocalState":
-        """Return `function` of each quantity, and of the same quantity of the other states."""
+        """Return `function` applied to each field, together with the same field of the other states."""
         return LocalState(
             *(None if values[0] is None else function(*values) for values in zip(self, *others, strict=True))
         )
 
     def select(self, index: Any) -> "LocalState":
-        """Return the state of some rows or moments, as an array's `index` says."""
+        """Return the state of some rows or steps; `index` is any array index."""
         return self.map(lambda values: values[index])
 
     def as_read_only(self) -> "LocalState":
-        """Return a copy of arrays that cannot be changed; by force they can, and this one stays as it is."""
+        """Return a copy with write-protected arrays."""
         copy = self.map(lambda values: values.copy())
         for values in copy:
             if values is not None:
@@ -74,41 +73,34 @@ class LocalState(NamedTuple):
 
 
 MAX_OBSERVED_GAP = 100.0
-"""The gap that stands for `nobody there` [m]."""
-
+"""the largest observed gap, which also stands for "no vehicle" [m]"""
 ROAD_SECTION_LENGTH = 100.0
-"""of a road whose mean speeds are told [m]"""
+"""length of the road sections with measured mean speeds [m]"""
 SECTIONS_AHEAD = 11
-
 SPEED_SCALE = 10.0
-"""what speeds are divided by before a network sees them [m/s]"""
+"""divisor of speeds in network inputs [m/s]"""
 
 _FIELD_UNITS = ("m/s", "m/s", "m", "m/s", "m", "m", "m", "m", "m/s", "m", "m/s", "m/s", "m", "m/s", "", "")
 STATE_UNITS = dict(zip(LocalState._fields, _FIELD_UNITS, strict=True))
-"""units of a `LocalState`, in its order"""
-
-
+"""units of the fields of `LocalState`"""
 COMMON_FIELDS = tuple(name for name in LocalState._fields if name not in LocalState._field_defaults)
-"""what every road offers"""
+"""fields that every road provides"""
 ADJACENT_POSITIONS = ("ahead on the left", "behind on the left", "ahead on the right", "behind on the right")
 FIELD_SIZES = {
-    "lane_speeds": SECTIONS_AHEAD,
-    "road_speeds": SECTIONS_AHEAD,
-    "congestion": SECTIONS_AHEAD,
-    "adjacent_gaps": len(ADJACENT_POSITIONS),
-    "adjacent_speeds": len(ADJACENT_POSITIONS),
+    **dict.fromkeys(("lane_speeds", "road_speeds", "congestion"), SECTIONS_AHEAD),
+    **dict.fromkeys(("adjacent_gaps", "adjacent_speeds"), len(ADJACENT_POSITIONS)),
 }
-"""what has several numbers for each CAV, and how many"""
+"""numbers per CAV of the fields that have several"""
 
 
 def state_of_ones(names: Sequence[str], make_ones: Callable[..., Any], rows: int = 1) -> LocalState:
-    """Return a state of which `names` are there, all ones: for drivers that are asked what they answer."""
+    """Return a state in which the fields `names` are ones, as an example input for drivers."""
     shapes = {name: (rows, FIELD_SIZES[name]) if name in FIELD_SIZES else (rows,) for name in names}
     return LocalState(**{name: make_ones(shape) for name, shape in shapes.items()})
 
 
 class ScaledInput(NamedTuple):
-    """One number that a network sees: a quantity divided by a fixed scale."""
+    """One input of a network: a quantity divided by a fixed scale."""
 
     name: str
     scale: float
@@ -119,5 +111,5 @@ class ScaledInput(NamedTuple):
 
 
 def lap_angle(state: LocalState) -> Array:
-    """Return the place on a closed road as an angle, 0 to 2 pi from its start, shape (n,)."""
+    """Return the position on a closed road as an angle, 0 to 2 pi from its start, shape (n,)."""
     return 2.0 * pi * state.route_position / state.loop_length

@@ -1,4 +1,4 @@
-"""The small network that drives: in workers while learning, and in a shipped controller. NumPy alone."""
+"""The small policy network, as it drives in workers and in exported controllers: on NumPy alone."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,33 +10,30 @@ from unjam.errors import InputError
 from unjam.physics.arrays import Array, Floats, namespace
 
 LOG_STD_RANGE = (-20.0, 2.0)
-"""bounds of a log standard deviation that the network gives itself: those of SB3's SAC"""
+"""bounds of a log standard deviation that is an output of the network: those of Stable-Baselines3's SAC"""
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
     """A perceptron with ReLU layers and a bounded output: `authority * tanh(last layer)`.
 
-    It explores with noise of `exploration_std` beside that. Where the last layer has a second output, this is
-    the log of the noise's standard deviation, and the noise is added before the tanh: `authority *
-    tanh(first output + noise)` (soft actor-critic).
+    Exploration adds noise with standard deviation `exploration_std`. If the last layer has a second output, it is
+    the log of the standard deviation, and the noise is added before the tanh: `authority * tanh(first output +
+    noise)` (soft actor-critic).
 
-    Weights are float64, so that n rows at once equal n single rows to 1e-12 and the trained float32
-    network to 1e-6.
+    Weights are float64, so that n rows at once equal n single rows to 1e-12 and the trained float32 network to 1e-6.
     """
 
     layers: tuple[tuple[Floats, Floats], ...] = field(repr=False)
-    """(weight of shape (inputs, outputs), bias of shape (outputs,)) of each layer; one output at the end,
-    or two"""
+    """(weight of shape (inputs, outputs), bias of shape (outputs,)) of each layer; the last has one output or two"""
     authority: float
     """largest residual acceleration [m/s2]"""
     exploration_std: float = 0.0
-    """standard deviation of the exploration noise [m/s2], where the network does not give it"""
+    """standard deviation of the exploration noise [m/s2], unless it is an output of the network"""
     episode_noise: bool = False
-    """whether noise changes what the last hidden layer is weighed with, and the bias; `exploration_std` is
-    then that of each of them"""
+    """whether noise is added to the weights and bias of the last layer, with standard deviation `exploration_std`"""
     squashes_noise: bool = field(init=False)
-    """whether the network gives its noise's log standard deviation, and adds the noise before the tanh"""
+    """whether the log standard deviation is an output of the network, and noise is added before the tanh"""
     _hidden_weights: tuple[Floats, ...] = field(init=False, repr=False, compare=False)
     _last_weights: Floats = field(init=False, repr=False, compare=False)
     _residual_weights: Floats = field(init=False, repr=False, compare=False)
@@ -51,7 +48,7 @@ class Network:
     def __call__(self, observation: Any) -> Any:
         """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple.
 
-        Torch tensors are answered with tensors, in their own precision and on their own device.
+        The result for torch tensors is a tensor of their precision, on their device.
         """
         if isinstance(observation, tuple):
             return self.authority * math.tanh(self._outputs_on_arrays(observation, self._residual_weights))
@@ -62,9 +59,9 @@ class Network:
     def explore(self, observation: Any, noise: Any) -> Any:
         """Return the residual with exploration.
 
-        `noise` is standard normal, shaped like the residual; where it `lasts`, a number for each unit of the
-        last hidden layer and one for the bias, shape (n, units + 1), or (units + 1,) for a tuple. Source:
-        generalised state-dependent exploration, Raffin et al. 2022, CoRL, which leaves the bias out.
+        `noise` is standard normal and has the shape of the residual; with `episode_noise` it has a number for each
+        unit of the last hidden layer and one for the bias, shape (n, units + 1), or (units + 1,) for a tuple.
+        Source: generalized state-dependent exploration, Raffin et al. 2022, CoRL, which leaves the bias out.
         """
         if self.episode_noise:
             shift = self.exploration_std * (self._hidden_units(observation) * noise).sum(-1)
@@ -80,13 +77,11 @@ class Network:
         return float(found) if isinstance(observation, tuple) else found
 
     def _outputs_on_tensors(self, observation: Array) -> Array:
-        """Return the last layer's outputs, shape (n, outputs)."""
         hidden = self._hidden_units_of_tensors(observation)
         weight, bias = _as_tensors_like(hidden, self.layers[-1])
         return namespace(hidden).addmm(bias, hidden, weight)
 
     def _hidden_units_of_tensors(self, observation: Array) -> Array:
-        """Return the last hidden layer, shape (n, units)."""
         hidden = observation
         for layer in self.layers[:-1]:
             weight, bias = _as_tensors_like(hidden, layer)
@@ -100,11 +95,10 @@ class Network:
         return append_ones(self._hidden_units_of_tensors(observation))
 
     def _outputs_on_arrays(self, observation: Any, last_weights: Floats) -> Any:
-        """Return what the weights `last` make of the last hidden layer."""
         return self._hidden_units_of_arrays(observation).dot(last_weights)
 
     def _hidden_units_of_arrays(self, observation: Any) -> Floats:
-        """Return the last hidden layer, with one unit more that is always 1."""
+        """Return the last hidden layer, with an additional unit that is always 1."""
         if isinstance(observation, tuple):
             hidden = np.array((*observation, 1.0))
         else:
@@ -116,67 +110,57 @@ class Network:
 
     @property
     def input_size(self) -> int:
-        """How many numbers the network sees."""
+        """Number of inputs."""
         return self.layers[0][0].shape[0]
 
     @property
     def episode_noise_size(self) -> int:
-        """How many numbers it explores with that stay as they are; 0: a new one each time."""
+        """Count of exploration noise numbers that stay constant for an episode; 0: new noise in each control step."""
         return self.layers[-1][0].shape[0] + 1 if self.episode_noise else 0
 
 
 def append_ones(units: Array) -> Array:
-    """Return a layer of tensors with one unit more, which is always 1."""
+    """Return a layer of tensors with an additional unit that is always 1."""
     return namespace(units).cat([units, units.new_ones((len(units), 1))], -1)
 
 
 def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...]:
-    """Return the layers with their biases inside the weights.
+    """Return the layers with biases as part of the weights, which saves a NumPy call a layer.
 
-    The input and each hidden layer get one unit more, which is always 1. It saves a NumPy call a layer.
+    The input and each hidden layer get an additional unit that is always 1.
     """
-    folded = []
-    for weight, bias in layers:
-        with_bias = np.vstack([weight, bias])
-        keep_one = np.zeros((len(with_bias), 1))
-        keep_one[-1] = 1.0
-        folded.append(np.hstack([with_bias, keep_one]))
-    return tuple(folded)
+    folded = (np.vstack([weight, bias]) for weight, bias in layers)
+    return tuple(np.hstack([weights, np.eye(len(weights))[:, -1:]]) for weights in folded)
 
 
 def _as_tensors_like(tensor: Any, layer: tuple[Floats, Floats]) -> Any:
-    """Return weight and bias as tensors of the precision and on the device of another."""
+    """Return weight and bias as tensors of the precision and on the device of `tensor`."""
     return (namespace(tensor).as_tensor(part, dtype=tensor.dtype, device=tensor.device) for part in layer)
 
 
 def network_weights(network: Network) -> dict[str, Floats]:
     """Return the weights of a network under the names that `network_from_weights` reads."""
-    arrays = {}
-    for index, (weight, bias) in enumerate(network.layers):
-        arrays[f"{index}.weight"] = weight
-        arrays[f"{index}.bias"] = bias
-    return arrays
+    weights = {f"{index}.weight": weight for index, (weight, _) in enumerate(network.layers)}
+    return weights | {f"{index}.bias": bias for index, (_, bias) in enumerate(network.layers)}
 
 
 def network_from_weights(
     weights: dict[str, Floats], authority: float, exploration_std: float, episode_noise: bool = False
 ) -> Network:
-    """Return the network whose weights `network_weights` wrote; raise `InputError` where they do not fit."""
+    """Return the network with the weights of `network_weights`; raise `InputError` if they do not fit together."""
     layers: list[tuple[Floats, Floats]] = []
     for index in range(sum(name.endswith(".weight") for name in weights)):
         weight, bias = weights.get(f"{index}.weight"), weights.get(f"{index}.bias")
         if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[1:]:
             raise InputError(f"network layer {index}: weight and bias do not fit together")
         if layers and layers[-1][0].shape[1] != weight.shape[0]:
-            raise InputError(
-                f"network layer {index}: {weight.shape[0]} inputs are not allowed; "
-                f"allowed: {layers[-1][0].shape[1]}, the outputs of the layer before"
-            )
+            allowed = f"{layers[-1][0].shape[1]}, the outputs of the previous layer"
+            raise InputError(f"network layer {index}: {weight.shape[0]} inputs are not allowed; allowed: {allowed}")
         if not (np.issubdtype(weight.dtype, np.floating) and np.issubdtype(bias.dtype, np.floating)):
             raise InputError(f"network layer {index}: weights are {weight.dtype}, {bias.dtype}; allowed: floats")
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"network layer {index}: a weight is not finite")
         layers.append((np.asarray(weight, np.float64), np.asarray(bias, np.float64)))
     if not layers or layers[-1][0].shape[1] not in (1, 2):
-        raise InputError("network: the last layer must have one output, or two with that of its noise")
+        raise InputError("network: the last layer must have one output, or two with the log std of its noise")
     return Network(tuple(layers), authority, exploration_std, episode_noise)

@@ -1,4 +1,4 @@
-"""PI with saturation (Stern et al. 2018): the paper's traffic expert, Eq. 9-11."""
+"""PI with saturation (Stern et al. 2018): the traffic expert of the paper, Eq. 9-11."""
 
 from typing import ClassVar, Literal
 
@@ -15,12 +15,12 @@ from unjam.physics.arrays import Array, clamp_min, clip, namespace, stack_column
 
 @dataclass(frozen=True, config=STRICT)
 class PISaturation(FormulaDriver):
-    """Drives at the mean of its own speed, a little faster behind a large gap, and yields when close.
+    """Drives at the mean of its own speed, slightly faster behind a large gap, and follows the leader when close.
 
-    The defaults are Table B2 of the paper, but for `time_constant`. The paper divides the wanted change of
-    speed by the time step. Close behind a leader that makes the CAV its copy: it stops and starts with
-    it, never opens a gap, and in a fully grown jam stays part of the wave. Spread over 3 s, the same
-    controller dissolves the wave. `pi:time_constant=0` is the paper's.
+    The defaults are Table B2 of the paper, except `time_constant`. The paper divides the desired change of speed by
+    the time step. Close behind a leader, the CAV then copies its leader: it stops and starts with it, never opens a
+    gap, and stays part of the wave in a fully developed jam. With 3 s, the same controller dissolves the wave.
+    `pi:time_constant=0` is the version of the paper.
     Source: Stern et al. 2018, Transp. Res. C 89:205-221; paper Eq. 9-11.
     """
 
@@ -33,21 +33,21 @@ class PISaturation(FormulaDriver):
     window: Positive = 38.0
     """time over which the own speed is averaged [s]"""
     catch_up_speed: NonNegative = 1.0
-    """v_c: speed beyond the mean where the gap is large [m/s]"""
+    """v_c: speed above the mean behind a large gap [m/s]"""
     gap_lower: NonNegative = 7.0
-    """s_l: from this gap on it speeds up [m]"""
+    """s_l: gap above which it drives faster than the mean [m]"""
     gap_upper: Positive = 30.0
-    """s_u: from this gap on it drives the whole `catch_up_speed` faster [m]"""
+    """s_u: gap above which it drives faster by `catch_up_speed` [m]"""
     safe_gap: NonNegative = 4.0
-    """dx_s: below this gap it follows the leader's speed [m]"""
+    """dx_s: gap below which it follows the leader's speed [m]"""
     safe_gap_rule: Literal["constant", "closing"] = "constant"
-    """`constant` as the paper; `is_merging`: max(2 s (v_lead - v), safe_gap), as Stern et al. and Flow"""
+    """`constant` as in the paper; `closing`: max(2 s (v_lead - v), safe_gap), as in Stern et al. and Flow"""
     time_constant: NonNegative = 3.0
-    """time over which the wanted speed is reached [s]; 0: one time step, as the paper"""
+    """time constant of the approach to the command [s]; 0: one time step, as in the paper"""
     first_command: Literal["own-speed", "zero"] = "own-speed"
-    """commanded speed before the first step; Flow starts from zero"""
+    """commanded speed before the first step; Flow starts with zero"""
     time_step: Positive = 0.1
-    """time between two decisions [s]; set by the road"""
+    """control step [s]; set by the road"""
 
     @model_validator(mode="after")
     def _check_gap_order(self) -> "PISaturation":
@@ -61,7 +61,7 @@ class PISaturation(FormulaDriver):
         return {**empty_window(n, self.window, self.time_step), "command": np.full(n, first)}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return `memory` with the own speeds of the warm-up in its window."""
+        """Return `memory` with the own speeds from the warm-up in its window."""
         return {**memory, **fill_window(memory, history.speed)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
@@ -71,18 +71,17 @@ class PISaturation(FormulaDriver):
         return acceleration, {**window, "command": command}
 
     def _acceleration_and_command(self, mean: Array, state: LocalState, last_command: Array) -> tuple[Array, Array]:
-        """Return the acceleration and the commanded speed that a mean and the `last` command lead to."""
+        """Return the acceleration and the commanded speed for a mean speed and the last command."""
         xp = namespace(state.speed)
         command = xp.where(xp.isnan(last_command), state.speed, last_command)
-        room = (state.leader_gap - self.gap_lower) / (self.gap_upper - self.gap_lower)
-        target = mean + self.catch_up_speed * clip(room, 0.0, 1.0)
+        gap_share = (state.leader_gap - self.gap_lower) / (self.gap_upper - self.gap_lower)
+        target = mean + self.catch_up_speed * clip(gap_share, 0.0, 1.0)
         safe_gap = self.safe_gap
         if self.safe_gap_rule == "closing":
             safe_gap = clamp_min(2.0 * (state.leader_speed - state.speed), self.safe_gap)
         alpha = clip((state.leader_gap - safe_gap) / 2.0, 0.0, 1.0)
         beta = 1.0 - 0.5 * alpha
         command = beta * (alpha * target + (1.0 - alpha) * state.leader_speed) + (1.0 - beta) * command
-
         return (command - state.speed) / max(self.time_constant, self.time_step), command
 
     def memory_features(self, memory: Memory) -> Array:
@@ -93,30 +92,30 @@ class PISaturation(FormulaDriver):
 
 @dataclass(frozen=True, config=STRICT)
 class PIFromGap(PISaturation):
-    """PI with saturation whose mean begins with the speed at which people drive behind its first gap.
+    """PI with saturation whose mean speed starts with that of human drivers at its first gap.
 
-    The plain one starts slowly: its mean is that of a car which stood. Where people stand evenly spaced, the
-    own gap says how fast all can drive alike. Where it takes over in traffic that it has watched, its mean
-    begins with a share of what it watched: who is slower at first opens the gap that swallows a wave.
+    `pi` starts slowly, because its mean is that of a stopped vehicle. If human drivers stand evenly spaced, the own
+    gap determines the speed at which all can drive. After a warm-up the mean starts with a share of the observed
+    mean: a CAV that is slower at first opens the gap that absorbs a wave.
     """
 
     name: ClassVar[str] = "pi-from-gap"
 
     human_time_headway: Positive = 1.0
-    """time headway that people keep [s]"""
+    """time headway T of human drivers [s]"""
     human_standstill_gap: NonNegative = 2.0
-    """gap of people who stand [m]"""
+    """gap of human drivers at standstill [m]"""
     fade_time: Positive = 40.0
-    """time in which the first speed fades from the mean [s]"""
+    """time in which the initial speed fades from the mean [s]"""
     history_factor: NonNegative = 1.0
-    """share of the mean speed that was watched before, with which it begins in traffic"""
+    """share of the mean speed in the warm-up that is the initial speed"""
 
     def initial_memory(self, n: int) -> Memory:
-        """Return that of the plain one, that the first speed is not known (NaN), and that none faded."""
+        """Return the memory of `pi`, with an unknown initial speed (NaN)."""
         return {**super().initial_memory(n), "initial_speed": np.full(n, np.nan), "steps": np.zeros(n)}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return `memory` with the own speeds of the warm-up in its window, and where it begins then."""
+        """Return `memory` with the own speeds from the warm-up in its window, and the initial speed after it."""
         recalled = super().recall(memory, history)
         return {**recalled, "initial_speed": self.history_factor * window_mean_speed(recalled)}
 
@@ -124,10 +123,12 @@ class PIFromGap(PISaturation):
         """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
         xp = namespace(state.speed)
         allowed = clamp_min((state.leader_gap - self.human_standstill_gap) / self.human_time_headway, 0.0)
-        first = xp.where(xp.isnan(memory["initial_speed"]), allowed, memory["initial_speed"])
+        initial = xp.where(xp.isnan(memory["initial_speed"]), allowed, memory["initial_speed"])
         window = slide_window(memory, state.speed)
-        left = clip(1.0 - memory["steps"] * (self.time_step / self.fade_time), 0.0, 1.0)
+        weight = clip(1.0 - memory["steps"] * (self.time_step / self.fade_time), 0.0, 1.0)
         mean = window_mean_speed(window)
-        acceleration, command = self._acceleration_and_command(mean + left * (first - mean), state, memory["command"])
-        begun = {"initial_speed": first, "steps": memory["steps"] + 1.0}
-        return acceleration, {**window, "command": command, **begun}
+        acceleration, command = self._acceleration_and_command(
+            mean + weight * (initial - mean), state, memory["command"]
+        )
+        fading = {"initial_speed": initial, "steps": memory["steps"] + 1.0}
+        return acceleration, {**window, "command": command, **fading}

@@ -1,7 +1,8 @@
-"""All drivers by name, and every driver from how it is written down, so that another process can make it."""
+"""All drivers by name, and the construction of every driver from its recipe, so that other processes can build it."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,40 +17,34 @@ from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.network import network_from_weights
 from unjam.drivers.observation import FEATURES, FeatureName, check_user_files, observation_size
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
-from unjam.drivers.queue_fallback import FALLBACK_KEY, PRIMARY_KEY, QueueFallback
+from unjam.drivers.queue_fallback import QueueFallback
 from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
-from unjam.drivers.road_type_switch import ROAD_TYPES, RoadTypeSwitch
-from unjam.drivers.safety import SafetyFilter
-from unjam.drivers.speed_history import MAX_WINDOW_STEPS
+from unjam.drivers.road_type_switch import RoadTypeSwitch
 from unjam.drivers.user_driver import FileDriver, FileReference, is_file_reference
-from unjam.drivers.wrappers import INNER_KEY, FilteredDriver, HistoryDriver, ImpairedDriver, MixedDriver
+from unjam.drivers.wrappers import INNER_KEY, DriverWrapper, FilteredDriver, HistoryDriver, ImpairedDriver, MixedDriver
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, build_dataclass, split_parameters
 from unjam.tree import Arrays
 
 _DRIVER_CLASSES = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
-    *(Pacer, JamAbsorber, Cruise, JamAhead, GapMaker, AdaptiveACC),
-    Constant,
+    *(Pacer, JamAbsorber, Cruise, JamAhead, GapMaker, AdaptiveACC, Constant),
 )
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _DRIVER_CLASSES}
 
-InnerDriverBuilder = Callable[[Recipe, str], Driver]
-"""makes a driver that another one holds, by the name that its networks' weights begin with"""
+InnerDriverBuilder = Callable[[Any, str], Driver]
+"""builds an inner driver from its recipe and the prefix of its networks' weights"""
 
 
 def driver_names() -> str:
     """Return what `--driver` allows, for messages."""
-    return ", ".join(
-        [*DRIVERS, "path.py:name", "a run folder", "a .unjam file", "unjam:ring-best", "several joined by +"]
-    )
+    others = ["path.py:name", "a run folder", "a .unjam file", "unjam:ring-best", "several joined by +"]
+    return ", ".join([*DRIVERS, *others])
 
 
 def driver_from_name(text: str, time_step: float) -> Driver:
-    """Return the driver for `name`, `name:key=value,...` or `path.py:name`.
-
-    `time_step` is the time between two decisions of the road [s].
+    """Return the driver for `name`, `name:key=value,...` or `path.py:name`; `time_step` is the control step [s].
 
     Raises:
         InputError: unknown name or parameter, or a value out of range.
@@ -68,7 +63,7 @@ def driver_from_name(text: str, time_step: float) -> Driver:
 
 @dataclass(frozen=True, config=STRICT)
 class _ResidualRecipe:
-    """How a residual driver is written down, without its weights."""
+    """The recipe of a residual driver, without its weights."""
 
     kind: Literal["residual"]
     expert: dict[str, Any]
@@ -82,21 +77,19 @@ class _ResidualRecipe:
 
 
 def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
-    """Return the recipe of a driver and the arrays of its networks; `driver_from_recipe` undoes it.
+    """Return the recipe of a driver and the weights of its networks; `driver_from_recipe` is the inverse.
 
     Raises:
-        InputError: no other process could make such a driver.
+        InputError: no other process could build such a driver.
     """
     recipe = driver.recipe()
-    for part in _iterate_recipes(recipe):
-        if part["kind"] == "named" and not part["name"]:
-            allowed = f"{driver_names()} (put your class in a file: path.py:name)"
-            raise invalid_value("driver", driver.describe(), allowed)
+    if any(part["kind"] == "named" and not part["name"] for part in _iterate_recipes(recipe)):
+        raise invalid_value("driver", driver.describe(), f"{driver_names()} (put your class in a file: path.py:name)")
     return recipe, driver.weights()
 
 
 def is_serializable(driver: Driver) -> bool:
-    """Return whether another process can make a driver; what a notebook defines drives where it is."""
+    """Return whether another process can build a driver; drivers defined in a notebook drive in their own process."""
     try:
         return bool(driver_recipe(driver))
     except InputError:
@@ -104,12 +97,12 @@ def is_serializable(driver: Driver) -> bool:
 
 
 def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
-    """Return the driver that `recipe_of` wrote down; raise `InputError` where the recipe is not valid."""
+    """Return the driver for a recipe of `driver_recipe`; raise `InputError` if the recipe is not valid."""
 
-    def build_inner(recipe: Recipe, name: str) -> Driver:
+    def build_inner(recipe: Any, name: str) -> Driver:
         prefix = f"{name}."
-        within = {key.removeprefix(prefix): array for key, array in weights.items() if key.startswith(prefix)}
-        return driver_from_recipe(recipe, within)
+        inner = {key.removeprefix(prefix): array for key, array in weights.items() if key.startswith(prefix)}
+        return driver_from_recipe(recipe, inner)
 
     kind = recipe.get("kind") if isinstance(recipe, dict) else recipe
     if kind not in RECIPE_BUILDERS:
@@ -131,110 +124,58 @@ def _build_residual(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBui
     network = network_from_weights(own, found.authority, found.exploration_std, found.episode_noise)
     if found.files:
         check_user_files(found.inputs, found.files)
-    shown = observation_size(found.inputs, expert)
-    if network.input_size != shown:
-        raise InputError(f"network: {network.input_size} inputs are not allowed; allowed: {shown}")
+    size = observation_size(found.inputs, expert)
+    if network.input_size != size:
+        raise InputError(f"network: {network.input_size} inputs are not allowed; allowed: {size}")
     return ResidualDriver(expert, network, found.action_limit, found.inputs, found.action_repeat)
 
 
-@dataclass(frozen=True, config=STRICT)
-class _ImpairedRecipe:
-    """How a driver with what is worse about it is written down."""
-
-    kind: Literal["impaired"]
-    driver: dict[str, Any]
-    delay: NonNegative
-    gap_noise: NonNegative
-    time_step: Positive
+def _build_wrapper(
+    driver_class: type[DriverWrapper], recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder
+) -> Driver:
+    settings = {key: value for key, value in recipe.items() if key != "kind"}
+    inner = build_inner(recipe.get("driver"), INNER_KEY)
+    return build_dataclass(driver_class, {**settings, "driver": inner}, "driver recipe")
 
 
-def _build_impaired(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder) -> Driver:
-    found = build_dataclass(_ImpairedRecipe, recipe, "driver recipe")
-    if found.delay / found.time_step > MAX_WINDOW_STEPS:
-        raise invalid_value("delay", found.delay, f"at most {MAX_WINDOW_STEPS:,} steps of {found.time_step:g} s")
-    return ImpairedDriver(build_inner(found.driver, INNER_KEY), found.delay, found.gap_noise, found.time_step)
-
-
-@dataclass(frozen=True, config=STRICT)
-class _QueueFallbackRecipe:
-    """How a driver that leads while all are gathered is written down, with who drives otherwise."""
-
-    kind: Literal["queue-fallback"]
-    drivers: dict[str, dict[str, Any]]
-    time_step: Positive
-
-
-def _build_queue_fallback(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder) -> Driver:
-    found = build_dataclass(_QueueFallbackRecipe, recipe, "driver recipe")
-    leading, otherwise = (build_inner(found.drivers[name], name) for name in (PRIMARY_KEY, FALLBACK_KEY))
-    return QueueFallback(leading, otherwise, found.time_step)
-
-
-@dataclass(frozen=True, config=STRICT)
-class _HistoryRecipe:
-    """How a driver that remembers means is written down."""
-
-    kind: Literal["history"]
-    driver: dict[str, Any]
-    time_step: Positive
-
-
-def _build_history(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder) -> Driver:
-    found = build_dataclass(_HistoryRecipe, recipe, "driver recipe")
-    return HistoryDriver(build_inner(found.driver, INNER_KEY), found.time_step)
-
-
-@dataclass(frozen=True, config=STRICT)
-class _FilteredRecipe:
-    """How a driver with its filter is written down."""
-
-    kind: Literal["filtered"]
-    driver: dict[str, Any]
-    action_limit: Positive
-    safety: SafetyFilter
-    time_step: Positive
-
-
-def _build_filtered(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder) -> Driver:
-    found = build_dataclass(_FilteredRecipe, recipe, "driver recipe")
-    return FilteredDriver(build_inner(found.driver, INNER_KEY), found.action_limit, found.safety, found.time_step)
+def _build_switch(
+    driver_class: type[Driver], recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder
+) -> Driver:
+    settings = {key: value for key, value in recipe.items() if key not in ("kind", "drivers")}
+    inner = {name: build_inner(part, name) for name, part in recipe["drivers"].items()}
+    return build_dataclass(driver_class, {**settings, **inner}, "driver recipe")
 
 
 RECIPE_BUILDERS: dict[str, Callable[[Recipe, Arrays, InnerDriverBuilder], Driver]] = {
     "named": _build_named,
-    "file": lambda recipe, arrays, held: FileDriver(
+    "file": lambda recipe, weights, build_inner: FileDriver(
         Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"], recipe["sha256"]
     ),
     "residual": _build_residual,
-    "mixed": lambda recipe, arrays, held: MixedDriver(
-        tuple(held(part, str(number)) for number, part in enumerate(recipe["drivers"]))
+    "mixed": lambda recipe, weights, build_inner: MixedDriver(
+        tuple(build_inner(part, str(number)) for number, part in enumerate(recipe["drivers"]))
     ),
-    "impaired": _build_impaired,
-    "filtered": _build_filtered,
-    "road-type-switch": lambda recipe, arrays, held: RoadTypeSwitch(
-        **{kind: held(recipe["drivers"][kind], kind) for kind in ROAD_TYPES if kind in recipe["drivers"]}
-    ),
-    "queue-fallback": _build_queue_fallback,
-    "history": _build_history,
+    **{kind.kind: partial(_build_wrapper, kind) for kind in (ImpairedDriver, FilteredDriver, HistoryDriver)},
+    "road-type-switch": partial(_build_switch, RoadTypeSwitch),
+    "queue-fallback": partial(_build_switch, QueueFallback),
 }
-"""how each kind of recipe becomes a driver again"""
+"""functions that build a driver, by the kind of its recipe"""
 
 
 def user_code_recipes(recipe: Any) -> list[Recipe]:
-    """Return what within `recipe` refers to the users' own files: it is Python code.
+    """Return the parts of `recipe` that refer to the user's own files, which are Python code.
 
     Raises:
-        InputError: a network sees a feature of a file that is not listed beside it with its hash.
+        InputError: a network reads a feature from a file that is not listed with its hash.
     """
-    held = list(_iterate_recipes(recipe))
-    for part in held:
+    parts = list(_iterate_recipes(recipe))
+    for part in parts:
         if part["kind"] == "residual":
             _check_user_features_listed(part)
-    return [part for part in held if part["kind"] == "file"]
+    return [part for part in parts if part["kind"] == "file"]
 
 
 def _check_user_features_listed(recipe: Recipe) -> None:
-    """Raise `InputError` where a residual sees a feature whose file is not among those that it lists."""
     found = build_dataclass(_ResidualRecipe, recipe, "driver recipe")
     listed = [(file.get("path"), file.get("name")) for file in found.files if file.get("kind") == "file"]
     for name in found.inputs:
@@ -246,19 +187,18 @@ def _check_user_features_listed(recipe: Recipe) -> None:
 
 
 def _iterate_recipes(recipe: Any) -> Iterator[Recipe]:
-    """Yield a recipe and all that it holds."""
+    """Yield a recipe and all recipes within it."""
     if isinstance(recipe, dict):
         if "kind" in recipe:
             yield recipe
-        for part in recipe.values():
-            yield from _iterate_recipes(part)
-    elif isinstance(recipe, list):
+        recipe = list(recipe.values())
+    if isinstance(recipe, list):
         for part in recipe:
             yield from _iterate_recipes(part)
 
 
 def unique_label(driver: Driver, drivers_by_label: dict[str, Driver]) -> str:
-    """Return the description of a driver, numbered where another driver has it already."""
+    """Return the description of a driver, with a number if another driver already has it."""
     label, number = driver.describe(), 1
     while label in drivers_by_label and not _is_same_driver(drivers_by_label[label], driver):
         number += 1

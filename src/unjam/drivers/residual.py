@@ -1,4 +1,4 @@
-"""An expert plus a learned residual: the paper's full policy, Eq. 8."""
+"""An expert plus a learned residual: the full policy of the paper, Eq. 8."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,14 +23,14 @@ from unjam.physics.arrays import Array, namespace
 from unjam.tree import Arrays
 
 EXPERT_KEY, RESIDUAL_KEY, RESIDUAL_AGE_KEY = "expert", "residual", "age"
-"""names in the memory: the expert's own; the residual that is held, and for how many decisions it was"""
+"""names in the memory: memory of the expert; the repeated residual, and its control steps so far"""
 
 
 @dataclass(frozen=True)
 class ResidualDriver(CompositeDriver):
-    """Adds what a network has learned to what an expert does, within the action limit: the paper's Eq. 8.
+    """Adds the output of a network to an expert, within the action limit: Eq. 8 of the paper.
 
-    Any driver can be the expert, another `ResidualDriver` too.
+    Any driver can be the expert, including another `ResidualDriver`.
     """
 
     expert: Driver
@@ -38,13 +38,13 @@ class ResidualDriver(CompositeDriver):
     action_limit: float
     """largest acceleration in either direction [m/s2]"""
     inputs: tuple[str, ...] = ("local",)
-    """what the network sees: features by name"""
+    """features that the network reads"""
     action_repeat: int = 1
-    """decisions for which one residual is held; the expert goes on deciding in each of them"""
+    """control steps for which one residual is repeated; the expert decides in each of them"""
 
     @cached_property
     def limits(self) -> Limits:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Within which expert and sum are kept."""
+        """Limits of the expert and of the sum."""
         return Limits.symmetric(self.action_limit)
 
     @cached_property
@@ -54,60 +54,59 @@ class ResidualDriver(CompositeDriver):
 
     @property
     def episode_noise_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """How many numbers its network explores with that stay as they are."""
+        """That of its network."""
         return self.network.episode_noise_size
 
     @property
     def required_fields(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What the features look at."""
-        return tuple(name for part in self.inputs for name in feature(part).required_fields)
+        """Those of the features."""
+        return tuple(field for name in self.inputs for field in feature(name).required_fields)
 
     @property
     def policy_inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The features of its network, and those of networks in its expert."""
+        """The features of its network, and of networks in its expert."""
         return (*self.inputs, *self.expert.policy_inputs)
 
     @property
     def measured_fields(self) -> frozenset[str]:
-        """What the expert and the features look at; features of the user's own, at all that is told."""
+        """Those of the expert and of the features; for the user's own features all fields."""
         return super().measured_fields | feature_fields(self.inputs)
 
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What the expert's `memory_features` are."""
+        """Those of the expert."""
         return self.expert.memory_inputs
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the expert's memory and, where a residual is held, the residual and its age."""
-        memory = super().initial_memory(n)
-        return (
-            memory if self.action_repeat == 1 else {**memory, RESIDUAL_KEY: np.zeros(n), RESIDUAL_AGE_KEY: np.zeros(n)}
-        )
+        """Return the memory of the expert and, with an action repeat, the residual and its age."""
+        own = {} if self.action_repeat == 1 else {RESIDUAL_KEY: np.zeros(n), RESIDUAL_AGE_KEY: np.zeros(n)}
+        return {**super().initial_memory(n), **own}
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
-        """Return the decision taken apart; with `noise`, the network explores."""
-        wanted, after = self.expert.act(state, memory[EXPERT_KEY])
-        limits, hold = self.limits, self.action_repeat
-        expert = limits.clip(wanted)
-        due: Any = True if hold == 1 else memory[RESIDUAL_AGE_KEY] % hold == 0
-        if due is False:  # where one age counts for all rows, as in plain numbers, no network is asked
+        """Return the decision with its components; with `noise`, the network explores."""
+        acceleration, expert_memory = self.expert.act(state, memory[EXPERT_KEY])
+        limits, repeat = self.limits, self.action_repeat
+        expert = limits.clip(acceleration)
+        is_due: Any = True if repeat == 1 else memory[RESIDUAL_AGE_KEY] % repeat == 0
+        if is_due is False:  # only for plain numbers: the network is not evaluated
             observation, residual = (), memory[RESIDUAL_KEY]
         else:
-            observation = compute_observation(self.inputs, FeatureInputs(state, expert, self.expert, after))
+            observation = compute_observation(self.inputs, FeatureInputs(state, expert, self.expert, expert_memory))
             network = self.network
             residual = network(observation) if noise is None else network.explore(observation, noise())
-            if due is not True:
-                residual = namespace(residual).where(due, residual, memory[RESIDUAL_KEY])
-        remembered = {EXPERT_KEY: after}
-        if hold > 1:
-            remembered = {EXPERT_KEY: after, RESIDUAL_KEY: residual, RESIDUAL_AGE_KEY: memory[RESIDUAL_AGE_KEY] + 1.0}
+            if is_due is not True:
+                residual = namespace(residual).where(is_due, residual, memory[RESIDUAL_KEY])
+        after = {EXPERT_KEY: expert_memory}
+        if repeat > 1:
+            after |= {RESIDUAL_KEY: residual, RESIDUAL_AGE_KEY: memory[RESIDUAL_AGE_KEY] + 1.0}
         command = Command(limits.clip(expert + residual), self.time_gaps(state, memory))
-        return Decision(command, expert, residual, observation, remembered)
+        return Decision(command, expert, residual, observation, after)
 
     def observation(self, state: LocalState, memory: Memory) -> Array:
-        """Return what the network would see now, whether or not its residual is being held."""
-        wanted, after = self.expert.act(state, memory[EXPERT_KEY])
-        return compute_observation(self.inputs, FeatureInputs(state, self.limits.clip(wanted), self.expert, after))
+        """Return the current input of the network, also while its residual is repeated."""
+        acceleration, after = self.expert.act(state, memory[EXPERT_KEY])
+        inputs = FeatureInputs(state, self.limits.clip(acceleration), self.expert, after)
+        return compute_observation(self.inputs, inputs)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the deterministic acceleration, clip(expert + residual), and the new memory."""
@@ -115,11 +114,11 @@ class ResidualDriver(CompositeDriver):
         return decision.command.acceleration, decision.memory
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return the expert's."""
+        """Return those of the expert."""
         return self.expert.time_gaps(state, memory[EXPERT_KEY])
 
     def memory_features(self, memory: Memory) -> Array | None:
-        """Return the expert's."""
+        """Return those of the expert."""
         return self.expert.memory_features(memory[EXPERT_KEY])
 
     @property
@@ -129,15 +128,15 @@ class ResidualDriver(CompositeDriver):
 
     @property
     def network_inputs(self) -> tuple[ScaledInput, ...]:
-        """What its own network sees, in order."""
+        """Inputs of its own network, in order."""
         return observation_inputs(self.inputs, self.expert)
 
     def describe(self) -> str:
-        """Return the expert in a few words, and that there is a residual."""
+        """Return the description of the expert, and that there is a residual."""
         return f"{self.expert.describe()} + residual"
 
     def recipe(self) -> Recipe:
-        """Return what it is made from, without the network's weights."""
+        """Return its specification, without the weights of the network."""
         files = user_files(self.inputs)
         return {
             "kind": "residual",

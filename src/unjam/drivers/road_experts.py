@@ -1,4 +1,4 @@
-"""The experts of the figure eight, the merge and motorways: they know where they are, and what is ahead."""
+"""Experts for the figure eight, the merge and motorways, which use positions and roadside information."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -18,25 +18,24 @@ from unjam.physics.arrays import Array, as_column, clamp_min, namespace
 Harmonics = tuple[float, ...]
 LapFraction = Annotated[float, Field(ge=0, lt=1)]
 GATHERED_LAP_FRACTION, BROKEN_LAP_FRACTION = 0.5, 0.45
-"""shares of the lap that are free ahead: once all have gathered behind, and when their queue is broken"""
+"""free shares of the lap ahead: from the first on, all have gathered behind; below the second, their queue is broken"""
 MIN_PACE = 1.0
-"""[m/s]: whoever stands still never gathers anybody"""
+"""[m/s]; at standstill no queue would form"""
 MAX_JAM_DISTANCE = 60.0
-"""a jam farther away is not yet waited for [m]"""
+"""distance to a jam from which it waits [m]"""
 FREE_ROAD_GAP = 99.0
-"""gap from which on there is no leader [m]"""
+"""gap from which the road counts as free [m]"""
 MAX_OVERRUN = 50.0
-"""[m] beyond `last_position`, where it waits no longer"""
+"""distance after `last_position` at which it stops waiting [m]"""
 UNBOUNDED_ACCELERATION = 100.0
-"""acceleration that no ACC has: nothing holds it back [m/s2]"""
+"""acceleration above that of any ACC, which does not limit the vehicle [m/s2]"""
 MIN_REPORTED_CONGESTION = 0.5
-"""from which on a smoothed report says that a section is congested"""
+"""value of a smoothed report from which a section counts as congested"""
 
 SectionIndex = Annotated[int, Field(ge=0, lt=SECTIONS_AHEAD)]
 
 
 def _tuned_pacer(harmonics: Harmonics, gap_gain: float, target_gap: float) -> dict[str, Any]:
-    """Return the fields of a tuned pacer; all gather until half the lap is free."""
     gathering = {"gathering_gap": GATHERED_LAP_FRACTION, "regathering_gap": BROKEN_LAP_FRACTION}
     return {"harmonics": harmonics, "gap_gain": gap_gain, "target_gap": target_gap, **gathering}
 
@@ -48,20 +47,19 @@ TUNED_PACERS: dict[float, dict[str, Any]] = {
     475.9: _tuned_pacer((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
     489.3: _tuned_pacer((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
 }
-"""what `use_tuned` uses, by the length of the lap [m], found by results/experts/tune_pacer.py.
+"""parameters for `use_tuned`, by the length of the lap [m]: of the figure eight with radii 30, 32, 33, 34 and 35 m.
 
-Of the figure eight with radii 30, 32, 33, 34 and 35 m; at 34 m 0.1 m/s slower than what the search found,
-which broke on one seed of ten.
+Found by a search over the pace; at 34 m it is 0.1 m/s lower than in the search result, which broke on one of ten seeds.
 """
 
 
 @dataclass(frozen=True, config=STRICT)
 class Pacer(FormulaDriver):
-    """Waits until all have gathered behind it, then leads them round at a pace that they can keep together.
+    """Waits until all vehicles have gathered behind it, then leads them at a pace at which the queue holds.
 
-    On the figure eight a queue that is longer than half a lap meets its own tail at the crossing. Driven
-    slowly at first, the CAV collects everybody into one queue; then it drives a lap in `lap_time`, or at a
-    pace that varies over the lap. It must know where it is on the road.
+    On the figure eight a queue that is longer than half a lap meets its own tail at the crossing. The CAV drives
+    slowly at first, until all vehicles are in one queue; then it drives a lap in `lap_time`, or at a pace that varies
+    over the lap. It needs its position on the road.
     """
 
     name: ClassVar[str] = "pacer"
@@ -69,25 +67,24 @@ class Pacer(FormulaDriver):
     memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("queue has gathered", 1.0, ""),)
 
     lap_time: Positive = 69.0
-    """time for a lap [s]: 6.5 m/s at a radius of 32 m, 7.1 m/s at 35 m"""
+    """time for a lap [s]; the default gives 6.5 m/s at a radius of 32 m and 7.1 m/s at 35 m"""
     harmonics: Annotated[Harmonics, Field(max_length=9)] = ()
     """(V, a1, b1, a2, b2, ...) [m/s] instead of `lap_time`: pace V + a1 cos x + b1 sin x + a2 cos 2x + ...,
-    where x is the place on the lap, 0 to 2 pi from its start"""
+    where x is the position on the lap, 0 to 2 pi from its start"""
     gap_gain: NonNegative = 0.0
-    """how much faster it drives for each metre of free road ahead beyond `target_gap` [1/s], and slower for
-    each that lacks: a queue that has grown long may close up"""
+    """change of the pace per meter of free road ahead above or below `target_gap` [1/s]: a long queue may close up"""
     target_gap: LapFraction = 0.5
-    """share of the lap that is free ahead at the pace itself"""
+    """free share of the lap ahead at which the pace is unchanged"""
     use_tuned: bool = False
-    """whether to use, instead of all this, what was found for the figure eight of the nearest radius"""
+    """whether to use `TUNED_PACERS` for the nearest radius of a figure eight instead of these parameters"""
     gathering_speed: NonNegative = 2.0
-    """speed while the others gather behind [m/s]"""
+    """speed while the others gather behind it [m/s]"""
     gathering_gap: LapFraction = 0.4
-    """share of the lap that must be free ahead before the pace begins"""
+    """free share of the lap ahead from which it drives at the pace"""
     regathering_gap: LapFraction = 0.0
-    """share of the lap below which the queue counts as broken, and the others gather anew"""
+    """free share of the lap ahead below which the queue counts as broken, and the others gather again"""
     time_constant: Positive = 0.1
-    """time over which the wanted speed is reached [s]"""
+    """time constant of the approach to the pace [s]"""
 
     @model_validator(mode="after")
     def _check_harmonics(self) -> "Pacer":
@@ -96,11 +93,11 @@ class Pacer(FormulaDriver):
         return self
 
     def initial_memory(self, n: int) -> Memory:
-        """Return that nobody has gathered yet."""
+        """Return that the queue has not gathered yet."""
         return {"has_gathered": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration towards the pace, and whether all have gathered by now."""
+        """Return the acceleration towards the pace, and whether the queue has gathered."""
         if not self.use_tuned:
             return self._lead_queue(state, memory)
         loop = state.loop_length
@@ -115,7 +112,7 @@ class Pacer(FormulaDriver):
         return acceleration, {"has_gathered": gathered}
 
     def _nearest_laps(self, loop_length: Array) -> Iterable[float]:
-        """Return the laps of those pacers that drive somebody; of tensors, which may be traced, all."""
+        """Return the laps that are nearest for any row; for tensors, which may be traced, all laps."""
         if isinstance(loop_length, float):
             return [min(self._tuned_pacers, key=lambda lap: abs(loop_length - lap))]
         if not isinstance(loop_length, np.ndarray):
@@ -134,78 +131,77 @@ class Pacer(FormulaDriver):
         gathered = xp.where(ready, free * 0.0 + 1.0, xp.where(broken, free * 0.0, memory["has_gathered"]))
         pace = self._pace(state) + self.gap_gain * (free - self.target_gap * loop)
         pace = clamp_min(pace, MIN_PACE)
-        wanted = xp.where(gathered > 0.0, pace, free * 0.0 + self.gathering_speed)
-        return (wanted - state.speed) / self.time_constant, {"has_gathered": gathered}
+        target = xp.where(gathered > 0.0, pace, free * 0.0 + self.gathering_speed)
+        return (target - state.speed) / self.time_constant, {"has_gathered": gathered}
 
     def _pace(self, state: LocalState) -> Array:
-        """Return the pace where the vehicles are, before what the free road ahead changes."""
+        """Return the pace at the current position, before the change for the free road ahead."""
         if not self.harmonics:
             return state.loop_length / self.lap_time
         xp = namespace(state.speed)
         mean, *rest = self.harmonics
-        place = lap_angle(state)
-        pace = place * 0.0 + mean
+        angle = lap_angle(state)
+        pace = angle * 0.0 + mean
         for number, (cosine, sine) in enumerate(zip(rest[::2], rest[1::2], strict=True), start=1):
-            pace = pace + cosine * xp.cos(number * place) + sine * xp.sin(number * place)
+            pace = pace + cosine * xp.cos(number * angle) + sine * xp.sin(number * angle)
         return pace
 
     def memory_features(self, memory: Memory) -> Array:
-        """Return whether all have gathered, shape (n, 1)."""
+        """Return whether the queue has gathered, shape (n, 1)."""
         return as_column(memory["has_gathered"])
 
 
 @dataclass(frozen=True, config=STRICT)
 class JamAbsorber(FormulaDriver):
-    """Follows its leader linearly; where that one is caught in a jam, it crawls until there is room ahead.
+    """Follows its leader linearly; if the leader is in a jam, it crawls until there is free road ahead.
 
-    While it crawls less arrives at the bottleneck than leaves it, and the jam ahead of it dissolves; those
-    behind it then pass at speed. It crawls only within a stretch before the bottleneck, so it must know its
-    position along the road; where there is none it only follows. After jam-absorption driving, "slow in, fast
-    out": Nishi et al. 2013, Transp. Res. B 50:116-129.
+    While it crawls, the inflow of the bottleneck is smaller than its outflow, and the jam ahead dissolves; the vehicles
+    behind then pass at speed. It crawls only on a section before the bottleneck, so it needs its position along the
+    road; without one it only follows. Based on jam-absorption driving, "slow in, fast out": Nishi et al. 2013,
+    Transp. Res. B 50:116-129.
     """
 
     name: ClassVar[str] = "jam-absorber"
     memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("waits for the jam to dissolve", 1.0, ""),)
 
     jam_speed: NonNegative = 10.0
-    """a leader slower than this is caught in a jam [m/s]"""
+    """speed of the leader below which it counts as jammed [m/s]"""
     crawl_speed: NonNegative = 3.5
     """speed while it waits [m/s]"""
     release_gap: Positive = 22.0
-    """gap at which it may go on [m], where the leader is fast enough"""
+    """gap from which it continues [m], behind a leader with `release_speed`"""
     release_speed: NonNegative = 8.3
-    """what is fast enough [m/s]"""
+    """minimum speed of the leader to continue [m/s]"""
     first_position: float = -580.0
-    """along the road, from where it may begin to wait [m]"""
+    """position along the road from which it may begin to wait [m]"""
     last_position: float = -270.0
-    """up to where it may begin to wait [m]"""
+    """position up to which it may begin to wait [m]"""
     gap_gain: NonNegative = 0.25
-    """acceleration for each metre of gap too much [1/s2]"""
+    """acceleration per meter of excess gap [1/s2]"""
     speed_gain: NonNegative = 1.2
-    """acceleration for each m/s that the leader is faster [1/s]"""
+    """acceleration per m/s of relative speed of the leader [1/s]"""
     time_gap: NonNegative = 1.4
-    """wanted gap over own speed [s]"""
+    """desired time gap [s]"""
     standstill_gap: NonNegative = 4.0
-    """wanted gap of a standing vehicle [m]"""
+    """desired gap at standstill [m]"""
     extra_acceleration: NonNegative = 0.0
-    """acceleration besides [m/s2]; without a `gap_gain` it so closes up as far as the shield lets it"""
+    """additional acceleration [m/s2]; without a `gap_gain` it closes up as far as SUMO's safety check allows"""
 
     def initial_memory(self, n: int) -> Memory:
-        """Return that nobody waits."""
+        """Return that it does not wait."""
         return {"is_waiting": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration, and who waits from now on."""
+        """Return the acceleration, and whether it waits from now on."""
         xp, zero = namespace(state.speed), state.speed * 0.0
-        place, gap, ahead = state.route_position, state.leader_gap, state.leader_speed
-        within = (place > self.first_position) & (place < self.last_position)
-        jam = within & (ahead < self.jam_speed) & (gap < MAX_JAM_DISTANCE)
+        position, gap, leader_speed = state.route_position, state.leader_gap, state.leader_speed
+        within = (position > self.first_position) & (position < self.last_position)
+        jam = within & (leader_speed < self.jam_speed) & (gap < MAX_JAM_DISTANCE)
         waits = xp.where(jam, zero + 1.0, memory["is_waiting"])
-        gone = ((gap >= self.release_gap) & (ahead >= self.release_speed)) | (gap >= FREE_ROAD_GAP)
-        too_far = place > self.last_position + MAX_OVERRUN
-        waits = xp.where(gone | too_far, zero, waits)
+        dissolved = ((gap >= self.release_gap) & (leader_speed >= self.release_speed)) | (gap >= FREE_ROAD_GAP)
+        waits = xp.where(dissolved | (position > self.last_position + MAX_OVERRUN), zero, waits)
         excess = gap - self.standstill_gap - self.time_gap * state.speed
-        follow = self.gap_gain * excess + self.speed_gain * (ahead - state.speed) + self.extra_acceleration
+        follow = self.gap_gain * excess + self.speed_gain * (leader_speed - state.speed) + self.extra_acceleration
         crawl = xp.minimum(self.crawl_speed - state.speed, follow)
         return xp.where(waits > 0.0, crawl, follow), {"is_waiting": waits}
 
@@ -216,30 +212,30 @@ class JamAbsorber(FormulaDriver):
 
 @dataclass(frozen=True, config=STRICT)
 class Cruise(FormulaDriver):
-    """Never holds the car back: where it has its own ACC, that one drives.
+    """Does not limit the vehicle: on roads with ACC, the vehicle's own ACC drives.
 
-    What the ACC is like is the road's to say (`cruise.time_gap`, `cruise.acceleration`). Without an ACC
-    it accelerates as hard as it may.
+    The scenario has the parameters of the ACC (`cruise.time_gap`, `cruise.acceleration`). Without an ACC the vehicle
+    accelerates at its limit.
     """
 
     name: ClassVar[str] = "cruise"
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return an acceleration beyond what any ACC wants; nothing is remembered."""
+        """Return an acceleration above that of any ACC."""
         return state.speed * 0.0 + UNBOUNDED_ACCELERATION, memory
 
 
 @dataclass(frozen=True, config=STRICT)
 class JamAhead(FormulaDriver):
-    """Upstream of a ramp or a jam, drives no faster than its own lane does a few hundred metres ahead.
+    """Caps the speed upstream of a ramp or a jam near the mean speed of its own lane a few hundred meters ahead.
 
-    So it arrives at the tail of a jam hardly faster than the jam moves, keeps room for those who merge, and
-    the jam ahead gets less than it lets go. Elsewhere, and where no message says how fast the road ahead is,
-    its own ACC drives. It gives way to nobody on purpose: those behind pass where there are lanes.
+    Therefore it reaches the tail of a jam hardly faster than the jam moves, leaves gaps for merging vehicles, and the
+    inflow of the jam ahead is smaller than its outflow. Elsewhere, and without messages about the road ahead, its own
+    ACC drives. It does not yield on purpose: vehicles behind it can overtake on other lanes.
 
-    Where no map says where ramps join, it slows down only for sections that the roadside service reports as
-    congested: dense free flow may be far slower than a road allows. Without such a report it never does.
-    `congestion` is not in `told`: graphs and manifests describe the road with a map, which does not use it.
+    Without a map of ramps it slows down only for sections that the roadside service reports as congested: dense free
+    traffic may be far slower than the speed limit. Without such a report it never slows down. `congestion` is not in
+    `required_fields`: graphs and manifests describe the road with a map, on which it is not used.
     """
 
     name: ClassVar[str] = "jam-ahead"
@@ -253,86 +249,78 @@ class JamAhead(FormulaDriver):
     )
 
     first_section: SectionIndex = 0
-    """first section ahead that counts, of 100 m each; 0 is the one that it is in"""
+    """first section ahead in the mean, of 100 m each; 0 is the own section"""
     last_section: SectionIndex = 4
-    """last section ahead that counts"""
+    """last section ahead in the mean"""
     speed_margin: float = -2.0
-    """how much faster than the mean ahead it may drive where CAVs are few [m/s]"""
+    """cap above the mean speed ahead at low penetration rates [m/s]"""
     margin_by_penetration: float = 20.0
-    """what more it may, times the share of CAVs [m/s]: where they are many, the mean ahead is that of others
-    who hold back, and each would be slower than the next"""
+    """increase of the cap with the penetration rate [m/s]: if CAVs are many, the mean ahead is that of other CAVs with
+    caps, and each would be slower than the next"""
     min_speed: NonNegative = 5.0
-    """it is never held back below this [m/s]"""
+    """lowest cap [m/s]"""
     max_deceleration: Positive = 1.5
-    """largest braking for the sake of the cap [m/s2]"""
+    """maximum braking towards the cap [m/s2]"""
     all_lanes: bool = False
-    """whether the mean is that of all lanes of the main road"""
+    """whether the mean is over all lanes of the main road"""
     time_constant: Positive = 3.0
-    """time over which the cap is reached [s]"""
+    """time constant of the approach to the cap [s]"""
     jam_speed_ratio: Positive = 0.75
-    """share of what is allowed that the mean ahead must be below, too, where no map says where ramps join"""
+    """share of the allowed speed below which the mean ahead counts as a jam, on roads without a map of ramps"""
 
     @model_validator(mode="after")
     def _check_section_order(self) -> "JamAhead":
-        if self.last_section < self.first_section:
-            raise ValueError(
-                f"last_section: {self.last_section} is not allowed; allowed: >= first_section, {self.first_section}"
-            )
+        first, last = self.first_section, self.last_section
+        if last < first:
+            raise ValueError(f"last_section: {last} is not allowed; allowed: >= first_section, {first}")
         return self
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration towards the cap, beyond any ACC's where there is none."""
+        """Return the acceleration towards the cap; without a cap one above that of any ACC."""
         speeds = state.road_speeds if self.all_lanes else state.lane_speeds
         free = state.speed * 0.0 + UNBOUNDED_ACCELERATION
         if speeds is None:
             return free, memory
-        ahead = speeds[..., self.first_section : self.last_section + 1].mean(-1)
-        xp = namespace(free)
-        share = 0.0 if state.penetration_rate is None else state.penetration_rate
-        wanted = ahead + self.speed_margin + self.margin_by_penetration * share
-        cap = xp.minimum(clamp_min(wanted, self.min_speed), state.allowed_speed)
+        xp, sections = namespace(free), slice(self.first_section, self.last_section + 1)
+        ahead = speeds[..., sections].mean(-1)
+        rate = 0.0 if state.penetration_rate is None else state.penetration_rate
+        cap = clamp_min(ahead + self.speed_margin + self.margin_by_penetration * rate, self.min_speed)
+        cap = xp.minimum(cap, state.allowed_speed)
         towards = clamp_min((cap - state.speed) / self.time_constant, -self.max_deceleration)
         if state.distance_to_merge is not None:
             return xp.where(state.distance_to_merge > 0.0, towards, free), memory
         if state.congestion is None:
             return free, memory
-        congested = (state.congestion[..., self.first_section : self.last_section + 1] >= MIN_REPORTED_CONGESTION).any(
-            -1
-        )
+        congested = (state.congestion[..., sections] >= MIN_REPORTED_CONGESTION).any(-1)
         return xp.where(congested & (ahead < self.jam_speed_ratio * state.allowed_speed), towards, free), memory
 
 
 @dataclass(frozen=True, config=STRICT)
 class GapMaker(JamAhead):
-    """As `jam-ahead`, and just before a ramp joins keeps a longer time headway while others are on its right.
+    """As `jam-ahead`, with a longer time gap shortly before a merge while there are vehicles on its right.
 
-    There somebody from the ramp, or from the lane that the ramp's vehicles push into, finds a gap without
-    making anybody brake. It needs a car with an ACC of its own. After cooperative merging, as in Scarinci and
-    Heydecker 2014, Transp. Rev. 34:775-797.
+    Vehicles from the ramp, or from the lane next to it, then find a gap in which no vehicle must brake. It needs a
+    vehicle with its own ACC. Based on cooperative merging, as in Scarinci and Heydecker 2014, Transp. Rev. 34:775-797.
     """
 
     name: ClassVar[str] = "gap-maker"
     required_fields: ClassVar[tuple[str, ...]] = (*JamAhead.required_fields, "adjacent_gaps")
 
     merge_time_gap: Positive = 2.0
-    """time headway while it makes room [s]"""
+    """time gap while it opens a gap [s]"""
     upstream_distance: NonNegative = 300.0
-    """how far before a ramp joins it begins [m]"""
+    """distance before the merge at which it begins [m]"""
     downstream_distance: NonNegative = 0.0
-    """how far behind it it ends [m]: there the ramp's lane runs beside the road"""
+    """distance after the merge at which it ends [m]; there the ramp's lane runs next to the road"""
     max_neighbor_gap: Positive = 40.0
-    """gap to somebody on the right, ahead or behind, for whom it makes room [m]"""
+    """gap to a vehicle on the right, ahead or behind, below which it opens a gap [m]"""
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return the time headway of those who make room [s], NaN for the others."""
-        if state.adjacent_gaps is None or state.distance_to_merge is None:
+        """Return the time gap while it opens a gap [s], else NaN."""
+        gaps, distance = state.adjacent_gaps, state.distance_to_merge
+        if gaps is None or distance is None:
             return None
-        xp, beside = namespace(state.speed), state.adjacent_gaps[..., 2:]
-        somebody = (beside < self.max_neighbor_gap).any(-1)
-        makes = (
-            somebody
-            & (state.distance_to_merge > -self.downstream_distance)
-            & (state.distance_to_merge < self.upstream_distance)
-        )
+        has_neighbor = (gaps[..., 2:] < self.max_neighbor_gap).any(-1)
+        opens_gap = has_neighbor & (distance > -self.downstream_distance) & (distance < self.upstream_distance)
         zero = state.speed * 0.0
-        return xp.where(makes, zero + self.merge_time_gap, zero + nan)
+        return namespace(zero).where(opens_gap, zero + self.merge_time_gap, zero + nan)

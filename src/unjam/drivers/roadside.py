@@ -1,4 +1,4 @@
-"""What a roadside or cloud service tells of the road: mean speeds by lane and section, late and smoothed."""
+"""Roadside information: mean speeds by lane and section, and congestion, as delayed and smoothed I2V messages."""
 
 from collections import deque
 from math import exp, prod
@@ -16,30 +16,30 @@ from unjam.physics.arrays import Floats
 
 @dataclass(frozen=True, config=STRICT)
 class RoadsideSettings:
-    """How a message differs from what is there now."""
+    """Differences between a message and the current measurement."""
 
     latency: NonNegative = 0.0
     """time from measurement to arrival [s]"""
     smoothing_time: NonNegative = 0.0
     """time constant of exponential smoothing [s]"""
     loss_rate: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """share of messages that are lost: the last one that came is used"""
+    """share of lost messages: the last received one is used instead"""
 
 
 class RoadsideMessages:
-    """What was measured all along the road, as it arrives decision by decision."""
+    """The measurements of a road as received messages, one per control step."""
 
     def __init__(self, settings: RoadsideSettings, step: float, generator: np.random.Generator) -> None:
-        """Begin without a message; `step` is the time between two decisions [s]."""
+        """Start without a message; `step` is the control step [s]."""
         self._smoothing_factor = exp(-step / settings.smoothing_time) if settings.smoothing_time else 0.0
         self._delay_queue: deque[Floats] = deque(maxlen=1 + round(settings.latency / step))
         self._loss_rate, self._generator = settings.loss_rate, generator
         self._mean: Floats | None = None
         self.latest: Floats = np.zeros(0)
-        """the last message that came"""
+        """the last received message"""
 
     def send(self, measurement: Floats) -> None:
-        """Take what is measured now, of the same shape each time."""
+        """Send the current measurement, of the same shape each time."""
         if self._mean is not None:
             measurement = self._smoothing_factor * self._mean + (1.0 - self._smoothing_factor) * measurement
         self._mean = measurement
@@ -51,20 +51,19 @@ class RoadsideMessages:
 DENSITY_AVERAGING_TIME = 60.0
 """time constant of the mean flow and density of a section [s]; a wave passes 100 m in half a minute"""
 JAM_ENTRY_SPEED_RATIO, JAM_EXIT_SPEED_RATIO = 0.8, 0.9
-"""shares of the speed at highest flow: below the first a section becomes congested, up to the second it
-remains so"""
+"""shares of the speed at highest flow: a section becomes congested below the first, and is free above the second"""
 
 
 class CongestionMonitor:
-    """Tells congestion from free flow in each section, by the highest flow that the section has carried.
+    """Detects congestion in each section, relative to the highest flow that the section has carried.
 
-    While traffic flows freely, flow rises with density, also where all drive far below the speed limit. A
-    section is congested once it is denser and much slower than it was at its highest flow. Where an episode
-    begins in a jam, the jam has the highest flow, and nothing is congested before more flow is seen.
+    In free traffic, flow increases with density, even if all vehicles drive far below the speed limit. A section is
+    congested once it is denser and much slower than at its highest flow. If an episode starts in a jam, the jam
+    has the highest flow, and no section is congested before a higher flow has been observed.
     """
 
     def __init__(self, sections: int, step: float) -> None:
-        """Begin with empty sections; `step` is the time between two measurements [s]."""
+        """Start with empty sections; `step` is the time between two measurements [s]."""
         self._update_weight = 1.0 - exp(-step / DENSITY_AVERAGING_TIME)
         self._density, self._flow, self._critical_density, self._highest_flow = np.zeros((4, sections))
         self._is_congested = np.zeros(sections, bool)
@@ -72,40 +71,40 @@ class CongestionMonitor:
     def update(self, counts: Floats, speed_sums: Floats) -> NDArray[np.bool_]:
         """Return which sections are congested, after one more measurement of their vehicles.
 
-        Densities are in vehicles of a section, and flows their speeds' sums [m/s]: only ratios matter.
+        Density is in vehicles per section, flow is the sum of their speeds [m/s]: only ratios matter.
         """
         self._density += self._update_weight * (counts - self._density)
         self._flow += self._update_weight * (speed_sums - self._flow)
         higher = self._flow > self._highest_flow
         self._highest_flow = np.where(higher, self._flow, self._highest_flow)
         self._critical_density = np.where(higher, self._density, self._critical_density)
-        share = np.where(self._is_congested, JAM_EXIT_SPEED_RATIO, JAM_ENTRY_SPEED_RATIO)
-        # speed < share * speed at highest flow, without a division by empty sections
-        slower = self._flow * self._critical_density < share * self._highest_flow * self._density
+        ratio = np.where(self._is_congested, JAM_EXIT_SPEED_RATIO, JAM_ENTRY_SPEED_RATIO)
+        # speed < ratio * speed at highest flow, without a division by empty sections
+        slower = self._flow * self._critical_density < ratio * self._highest_flow * self._density
         self._is_congested = slower & (self._density > self._critical_density)
         return self._is_congested
 
 
 class RoadSections:
-    """The sections of a main road and of its ramps by way, and which of them lie ahead."""
+    """The sections of main roads and their ramps, by lane."""
 
     def __init__(self, lane_count: int, length: float, road_count: int = 1) -> None:
-        """Cut roads that are alike, of a length [m], into sections; way 0 is the ramp's."""
+        """Divide equal roads of a length [m] into sections; lane 0 is that of the ramp."""
         self._shape = road_count, lane_count, int(np.ceil(length / ROAD_SECTION_LENGTH))
 
     def mean_speeds(
         self, lanes: NDArray[np.intp], positions: Floats, speeds: Floats, allowed_speed: float, roads: Any = 0
     ) -> Floats:
-        """Return mean speeds by road, way and section, in the last row of all ways of a main road [m/s].
+        """Return mean speeds by road, lane and section [m/s]; the last lane stands for all lanes of the main road.
 
-        A section where nobody is counts as `speed_limits`, and so do those behind the end. Arrays of shape
-        (vehicles,): the way that each is on, its place along the road [m], its speed, and which road it is.
+        Empty sections and those beyond the end have `allowed_speed`. The arrays have the shape (vehicles,): lane
+        index, position along the road [m], speed, and index of the road.
         """
-        _, rows, sections = self._shape
+        _, lane_count, sections = self._shape
         section = (positions // ROAD_SECTION_LENGTH).astype(np.intp).clip(0, sections - 1)
-        cell = (roads * rows + lanes) * sections + section
+        cell = (roads * lane_count + lanes) * sections + section
         count, total = (np.bincount(cell, weight, prod(self._shape)) for weight in (None, speeds))
-        # the last row is of all ways of the main road, which are those from 1 on
+        # The main road has the lanes from 1 on.
         count, total = (each.reshape(self._shape).astype(np.float64) for each in (count, total))
         count, total = (np.hstack([each, each[:, 1:].sum(1, keepdims=True)]) for each in (count, total))
         mean = np.where(count > 0, total / count.clip(1), allowed_speed)
@@ -114,7 +113,7 @@ class RoadSections:
     def speeds_ahead(
         self, mean_speeds: Floats, lanes: NDArray[np.intp], positions: Floats, roads: Any = 0
     ) -> tuple[Floats, Floats]:
-        """Return the means of the sections ahead, on the own way and on the whole main road: (n, ahead)."""
+        """Return the means of the sections ahead, on the own lane and on the whole main road: (n, ahead)."""
         first = (positions // ROAD_SECTION_LENGTH).astype(np.intp).clip(0, self._shape[-1] - 1)
         columns = first[:, None] + np.arange(SECTIONS_AHEAD)
         road = np.broadcast_to(roads, lanes.shape)[:, None]

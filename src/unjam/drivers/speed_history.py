@@ -12,28 +12,26 @@ from unjam.physics.arrays import Array, clip, namespace
 SpeedWindow = dict[str, Any]
 
 MIN_SPARE_STEPS = 64
-"""a tape is never written anew more often than after so many steps"""
+"""minimum number of steps between two copies of a buffer"""
 MAX_WINDOW_STEPS = 1_000_000
-"""steps of a window: beyond it the memory of one vehicle would fill that of a machine"""
+"""steps of a window: longer ones would make the memory of one vehicle too large"""
 
 
 @dataclass
 class _SpeedBuffer:
-    """Speeds of rows, step after step; memories that follow each other share one."""
+    """Speeds of rows over time; consecutive memories share one buffer."""
 
     speeds: Array
     """[m/s], shape (steps, n)"""
     filled_steps: int
-    """steps of it that have a speed"""
 
 
 @dataclass(frozen=True)
 class BufferedWindow:
-    """A window of torch rows, oldest speed first: a stretch of a tape.
+    """A window of torch rows, oldest speed first: a part of a buffer.
 
-    To slide it, the newest speed is written behind it on the tape. So nothing is copied and the older
-    window stays what it was, until the tape is full or its next place is taken by another memory that
-    began from the same window.
+    A slide writes the newest speed behind the window in the buffer. Nothing is copied and the older window stays
+    valid, until the buffer is full or another memory that started from the same window has written there.
     """
 
     buffer: _SpeedBuffer
@@ -42,33 +40,33 @@ class BufferedWindow:
 
     @classmethod
     def from_speeds(cls, speeds: Array) -> "BufferedWindow":
-        """Return the window of `speeds`, shape (steps, n), on a new tape that has room for more."""
+        """Return the window of `speeds`, shape (steps, n), in a new buffer with spare steps."""
         steps, n = speeds.shape
-        tape = speeds.new_empty((steps + max(steps, MIN_SPARE_STEPS), n))
-        tape[:steps] = speeds
-        return cls(_SpeedBuffer(tape, steps), 0, steps)
+        buffer = speeds.new_empty((steps + max(steps, MIN_SPARE_STEPS), n))
+        buffer[:steps] = speeds
+        return cls(_SpeedBuffer(buffer, steps), 0, steps)
 
     def slide(self, speed: Array) -> tuple["BufferedWindow", Array]:
-        """Return the window moved on by one step, and the speed that it left behind, shape (n,)."""
-        tape, end = self.buffer, self.start + self.steps
-        if tape.filled_steps != end or end == len(tape.speeds):
-            return BufferedWindow.from_speeds(tape.speeds[self.start : end]).slide(speed)
-        tape.speeds[end] = speed
-        tape.filled_steps += 1
-        return BufferedWindow(tape, self.start + 1, self.steps), tape.speeds[self.start]
+        """Return the window one step later, and the speed that left it, shape (n,)."""
+        buffer, end = self.buffer, self.start + self.steps
+        if buffer.filled_steps != end or end == len(buffer.speeds):
+            return BufferedWindow.from_speeds(buffer.speeds[self.start : end]).slide(speed)
+        buffer.speeds[end] = speed
+        buffer.filled_steps += 1
+        return BufferedWindow(buffer, self.start + 1, self.steps), buffer.speeds[self.start]
 
 
 @dataclass(frozen=True)
 class CircularWindow:
-    """A window of torch rows in the order of `empty_window`, moved on without anything shared.
+    """A window of torch rows in the order of `empty_window`, without a shared buffer.
 
-    Slower than a tape, but a pure function of its rows: what a graph of a whole controller needs.
+    Slower than `BufferedWindow`, but a pure function of its rows, as the graph of a controller requires.
     """
 
     rows: Array
     """[m/s], shape (n, steps)"""
     count: Array
-    """how many speeds were seen since the beginning, shape (n,)"""
+    """number of speeds since the start, shape (n,)"""
 
     @property
     def steps(self) -> int:
@@ -76,26 +74,25 @@ class CircularWindow:
         return self.rows.shape[1]
 
     def slide(self, speed: Array) -> tuple["CircularWindow", Array]:
-        """Return the window moved on by one step, and the speed that it left behind, shape (n,)."""
-        place = (self.count % self.steps).long()[:, None]
-        oldest = self.rows.gather(1, place)[:, 0]
-        return CircularWindow(self.rows.scatter(1, place, speed[:, None]), self.count + 1.0), oldest
+        """Return the window one step later, and the speed that left it, shape (n,)."""
+        position = (self.count % self.steps).long()[:, None]
+        oldest = self.rows.gather(1, position)[:, 0]
+        return CircularWindow(self.rows.scatter(1, position, speed[:, None]), self.count + 1.0), oldest
 
 
 def _buffered_window(window: Array, count: Array) -> BufferedWindow:
-    """Return the window of torch rows, shape (n, steps) as `empty_window` makes it, oldest speed first."""
-    xp = namespace(window)
+    """Return the window of torch rows, shape (n, steps) as from `empty_window`, oldest speed first."""
     steps = window.shape[1]
-    order = (count[:, None] + xp.arange(steps, device=window.device)) % steps
+    order = (count[:, None] + namespace(window).arange(steps, device=window.device)) % steps
     return BufferedWindow.from_speeds(window.take_along_dim(order.long(), 1).T)
 
 
 def empty_window(n: int, window: float, time_step: float) -> SpeedWindow:
-    """Return the memory of `n` vehicles that have seen nothing yet, for a window of `window` seconds.
+    """Return the memory of `n` vehicles before the first speed, for a window of `window` seconds.
 
     Returns:
-        `window` (n, steps): the last speeds, a new one in the place of the oldest, zeros where nothing was
-        seen yet; `total` (n,): their sum; `seen` (n,): how many speeds were seen since the beginning.
+        `window` (n, steps): the last speeds, the newest in place of the oldest, zeros before the first;
+        `total` (n,): their sum; `count` (n,): number of speeds since the start.
 
     Raises:
         InputError: the window has too many steps.
@@ -107,29 +104,29 @@ def empty_window(n: int, window: float, time_step: float) -> SpeedWindow:
 
 
 def slide_window(memory: SpeedWindow, speed: Array) -> SpeedWindow:
-    """Return the window moved on by one step, `speed` [m/s] of shape (n,) being the newest.
+    """Return the window one step later, with `speed` [m/s] of shape (n,) as the newest.
 
-    The old window stays as it is; that of torch rows becomes `BufferedWindow`, unless it is `CircularWindow`.
+    The old window is not changed; that of torch rows becomes a `BufferedWindow`, unless it is a `CircularWindow`.
     """
-    window, seen = memory["window"], memory["count"]
+    window, count = memory["window"], memory["count"]
     if type(speed) is float:
         window = window[:]
-        place = int(seen) % len(window)
-        oldest = window[place]
-        window[place] = speed
+        position = int(count) % len(window)
+        oldest = window[position]
+        window[position] = speed
     elif isinstance(speed, np.ndarray):
         window = window.copy()
-        place = (np.arange(len(window)), (seen % window.shape[1]).astype(np.int64))
-        oldest = window[place]
-        window[place] = speed
+        position = (np.arange(len(window)), (count % window.shape[1]).astype(np.int64))
+        oldest = window[position]
+        window[position] = speed
     else:
-        past = window if isinstance(window, (BufferedWindow, CircularWindow)) else _buffered_window(window, seen)
-        window, oldest = past.slide(speed)
-    return {"window": window, "total": memory["total"] + speed - oldest, "count": seen + 1.0}
+        is_window = isinstance(window, (BufferedWindow, CircularWindow))
+        window, oldest = (window if is_window else _buffered_window(window, count)).slide(speed)
+    return {"window": window, "total": memory["total"] + speed - oldest, "count": count + 1.0}
 
 
 def window_mean_speed(memory: SpeedWindow) -> Array:
-    """Return the mean of what was seen [m/s], shape (n,); zero where nothing was."""
+    """Return the mean of the speeds so far [m/s], shape (n,); zero before the first."""
     window = memory["window"]
     if isinstance(window, array):
         steps = len(window)
@@ -139,8 +136,8 @@ def window_mean_speed(memory: SpeedWindow) -> Array:
 
 
 def fill_window(memory: SpeedWindow, speeds: Array) -> SpeedWindow:
-    """Return an empty window after watching `speeds`, shape (n, any number of steps), oldest first."""
+    """Return an empty window after `speeds`, shape (n, any number of steps), oldest first."""
     window = memory["window"].copy()
-    watched = speeds[:, -window.shape[1] :]
-    window[:, : watched.shape[1]] = watched
-    return {"window": window, "total": window.sum(1), "count": memory["count"] + watched.shape[1]}
+    last = speeds[:, -window.shape[1] :]
+    window[:, : last.shape[1]] = last
+    return {"window": window, "total": window.sum(1), "count": memory["count"] + last.shape[1]}

@@ -1,6 +1,6 @@
-"""What users bring in their own Python files, given as `path.py:name`.
+"""Drivers and functions in the user's own Python files, named `path.py:name`.
 
-Such a file is code and is run as such: use only files that you trust.
+Such a file is executed as code: use only files that you trust.
 """
 
 import inspect
@@ -24,7 +24,7 @@ from unjam.trust import check_code_unchanged, remember_trusted
 from unjam.user_code import UserCode, read_code
 
 _module_lock = RLock()
-"""held while a file runs: its modules then have their short names in `sys.modules`, of which there is one"""
+"""held while a file runs: its modules then have their short names in the global `sys.modules`"""
 
 
 def is_file_reference(text: str) -> bool:
@@ -42,25 +42,24 @@ class FileReference:
 
     @classmethod
     def parse(cls, text: str) -> "FileReference":
-        """Return what `path.py:name` refers to."""
-        path, _, name = text.rpartition(":")
+        """Return the reference for `path.py:name`."""
         if "\0" in text:
             raise InputError(f"driver file: {text!r} is not allowed; allowed: path.py:name")
+        path, _, name = text.rpartition(":")
         return cls(Path(path).resolve(), name)
 
     def __str__(self) -> str:
         return f"{self.path.name}:{self.name}"
 
     def file_recipe(self, sha256: str) -> Recipe:
-        """Return where the code is, and its hash."""
+        """Return path and hash of the code."""
         return {"kind": "file", "path": str(self.path), "name": self.name, "sha256": sha256}
 
     def read_code(self) -> UserCode:
-        """Return the code of the file as it is now.
+        """Return the current code of the file.
 
         Raises:
-            InputError: the file is missing, unreadable or no Python file, or imports a compiled module of its
-                folder.
+            InputError: the file is missing, unreadable or not Python, or imports a compiled module of its folder.
         """
         if not os.path.isfile(self.path):
             raise InputError(f"driver file: {str(self.path)!r} is not a file")
@@ -72,18 +71,18 @@ class FileReference:
             raise InputError(f"driver file: {str(error.filename)!r}: {error.strerror}") from None
 
     def load_object(self, code: UserCode | None = None) -> Any:
-        """Return what has the name, running the file: as it was read, else as it is now.
+        """Run the file, from `code` if given, and return the object with the name.
 
         Raises:
-            InputError: as `read`; the file fails when run, or has no such name.
+            InputError: as `read_code`; the file fails when run, or has no such name.
         """
         code = code or self.read_code()
         check_code_unchanged(code)
-        remember_trusted(code.path, code.sha256)  # what a folder names was checked before it comes here
+        remember_trusted(code.path, code.sha256)  # references in run folders were checked before this call
         try:
             with _module_lock, redirect_user_output():
                 module = code.run()
-        except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to mend
+        except (Exception, SystemExit) as error:  # any error of the user's code is the user's to fix
             raise InputError(f"{self.path.name}: {type(error).__name__} when loading it: {error}") from error
         if not hasattr(module, self.name):
             public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
@@ -91,89 +90,88 @@ class FileReference:
         return getattr(module, self.name)
 
     def load_function(self, argument: str, code: UserCode | None = None) -> Callable[..., Any]:
-        """Return the function of that name, which takes `of`; raise `InputError` where it is none."""
+        """Return the function with the name, which takes `argument`; raise `InputError` if it is not a function."""
         found = self.load_object(code)
         if not callable(found) or inspect.isclass(found):
             raise InputError(f"{self}: is not a function of {argument}")
         return found
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return what the user's function answers.
+        """Return the result of the user's function.
 
         Raises:
-            InputError: it fails; with the last line of the file that ran.
+            InputError: it fails; with the last executed line of the file.
         """
         try:
             return function(*arguments)
         except (Exception, SystemExit) as error:
             frames = extract_tb(error.__traceback__)
             lines = [str(frame.lineno) for frame in frames if frame.filename == str(self.path)]
-            place = f" (line {lines[-1]})" if lines else ""
-            raise InputError(f"{self}: {type(error).__name__}: {error}{place}") from error
+            line = f" (line {lines[-1]})" if lines else ""
+            raise InputError(f"{self}: {type(error).__name__}: {error}{line}") from error
 
 
 class UserDriver(Driver):
-    """A driver of the user's own, by what it holds: anything with `act` and `initial_memory`."""
+    """A user's own driver: `implementation` is any object with `act` and `initial_memory`."""
 
     implementation: Any
 
     @property
     def measured_fields(self) -> frozenset[str]:
-        """All that a road tells: what the user's code looks at it alone knows."""
+        """All fields, because only the user's code determines which it reads."""
         return frozenset(LocalState._fields)
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return what the user's function answers."""
+        """Return the result of the user's function."""
         return function(*arguments)
 
     def initial_memory(self, n: int) -> Memory:
-        """Return what the user's driver remembers before its first step."""
+        """Return the initial memory of the user's driver."""
         return self.call_user_code(self.implementation.initial_memory, n)
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return what the user's driver makes of the warm-up, if it has `recall`."""
+        """Return the memory of the user's driver after the warm-up, if it has `recall`."""
         recall = getattr(self.implementation, "recall", None)
         return self.call_user_code(recall, memory, history) if recall else memory
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the user's acceleration and memory; raise `InputError` where the user's code fails.
+        """Return the user's acceleration and memory; raise `InputError` if the user's code fails.
 
-        While no CAV is on the road it is not asked: the smallest gap of nobody is an error in NumPy.
+        It is not called while no CAV is on the road: the minimum of an empty array is an error in NumPy.
         """
         if np.size(state.speed) == 0:
             return np.zeros(0), memory
         found = self.call_user_code(self.implementation.act, state, memory)
         if not (isinstance(found, tuple) and len(found) == 2):
-            raise InputError(f"{self.describe()}: act() answers {found!r:.60}; allowed: (accelerations, memory)")
+            raise InputError(f"{self.describe()}: act() returns {found!r:.60}; allowed: (accelerations, memory)")
         accelerations, memory = found
-        if type(accelerations) in (list, tuple):  # what is around it counts with arrays
+        if type(accelerations) in (list, tuple):  # wrappers need arrays
             accelerations = answer_as_array(accelerations, np.size(state.speed), self.describe())
         return accelerations, memory
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return what the user's driver asks of its cars' ACCs, if it asks for anything."""
-        asked = getattr(self.implementation, "time_gaps", None)
-        return self.call_user_code(asked, state, memory) if asked and np.size(state.speed) else None
+        """Return the time gaps of the user's driver, if it has `time_gaps`."""
+        time_gaps = getattr(self.implementation, "time_gaps", None)
+        return self.call_user_code(time_gaps, state, memory) if time_gaps and np.size(state.speed) else None
 
     def memory_features(self, memory: Memory) -> Array | None:
-        """Return the user's features of the memory, if the driver has any."""
+        """Return the memory features of the user's driver, if it has `memory_features`."""
         features = getattr(self.implementation, "memory_features", None)
         return self.call_user_code(features, memory) if features else None
 
 
 @dataclass(frozen=True)
 class FileDriver(FileReference, UserDriver):
-    """The driver `name` of the user's file: a function of the state, a class, or an instance of one."""
+    """The driver `name` of a user's file: a function of the state, a class, or an instance of a class."""
 
     parameters: dict[str, Any] = field(default_factory=dict)
     time_step: float = 0.1
     sha256: str = field(default="", repr=False, compare=False)
-    """of the file; given: of what it must be"""
+    """hash of the file; if given, the file must have it"""
     implementation: Any = field(init=False, repr=False, compare=False)
-    """what the file has, as a driver"""
 
     def __post_init__(self) -> None:
-        """Load it; raise `InputError` where the file is another than it must be."""
+        """Load it; raise `InputError` if the file does not have the given hash."""
         object.__setattr__(self, "path", self.path.resolve())
         code = self.read_code()
         if self.sha256 and self.sha256 != code.sha256:
@@ -196,13 +194,12 @@ class FileDriver(FileReference, UserDriver):
         return as_implementation(found, str(self))
 
     def describe(self) -> str:
-        """Return the names of file and driver, and the parameters that were given."""
+        """Return the names of file and driver, and the given parameters."""
         return label_with_parameters(str(self), self.parameters)
 
     def recipe(self) -> Recipe:
-        """Return where the code is, and the hash of what was loaded."""
-        made = {"parameters": self.parameters, "time_step": self.time_step}
-        return {**self.file_recipe(self.sha256), **made}
+        """Return path and hash of the loaded code, and the parameters."""
+        return {**self.file_recipe(self.sha256), "parameters": self.parameters, "time_step": self.time_step}
 
 
 @dataclass(frozen=True)
@@ -212,13 +209,13 @@ class FunctionDriver(Driver):
     function: Callable[[LocalState], Array]
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the function's acceleration; nothing is remembered."""
+        """Return the function's acceleration."""
         return self.function(state), memory
 
 
 @dataclass(frozen=True, eq=False)
 class PythonDriver(UserDriver):
-    """A function or an object of this process as a driver: no other could make it."""
+    """A function or an object of this process as a driver, which other processes cannot build."""
 
     implementation: Any
     label: str
@@ -228,12 +225,12 @@ class PythonDriver(UserDriver):
         return self.label
 
     def recipe(self) -> Recipe:
-        """Return that of a driver without a name, which stays in its process."""
+        """Return the recipe of a driver without a name, which cannot be built from it."""
         return {"kind": "named", "name": "", "parameters": {}}
 
 
 class DriverProtocol(Protocol):
-    """Anything that drives and remembers, as `unjam.Driver` says of the two methods."""
+    """The methods that a driver must have, as documented in `unjam.Driver`."""
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of `n` CAVs before their first step."""
@@ -245,11 +242,11 @@ class DriverProtocol(Protocol):
 
 
 DriverLike = Driver | DriverProtocol | Callable[[LocalState], Any]
-"""what drives where a program asks for it: a driver, what acts like one, or a function of the state"""
+"""a driver, an object with its two required methods, or a function of the state"""
 
 
 def as_driver(driver: DriverLike) -> Driver:
-    """Return whatever drives as a `Driver`; raise `InputError` where it is a class, or does not drive."""
+    """Return any `DriverLike` as a `Driver`; raise `InputError` if it is a class, or not a driver."""
     if isinstance(driver, Driver):
         return driver
     name = getattr(driver, "__name__", type(driver).__name__)
@@ -259,7 +256,7 @@ def as_driver(driver: DriverLike) -> Driver:
 
 
 def as_implementation(candidate: Any, context: str) -> Any:
-    """Return what has `act` and `initial_memory`, or a function as such; else raise `InputError`."""
+    """Return an object with `act` and `initial_memory`; raise `InputError` if `candidate` is none, and no function."""
     if callable(getattr(candidate, "act", None)):
         if not callable(getattr(candidate, "initial_memory", None)):
             raise InputError(f"{context}: has act() but no initial_memory(n)")

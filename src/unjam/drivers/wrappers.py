@@ -1,124 +1,135 @@
-"""Drivers around drivers: several side by side, worse sensors, the safety filter, a memory of the past."""
+"""Drivers that contain other drivers: mixtures, impaired sensing, the safety filter, history features."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from math import exp
 from typing import ClassVar
 
 import numpy as np
+from pydantic import ConfigDict, model_validator
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
 from unjam.drivers.safety import FollowingState, SafetyFilter
 from unjam.drivers.sensors import MIN_SENSED_GAP
+from unjam.drivers.speed_history import MAX_WINDOW_STEPS
 from unjam.errors import InputError
-from unjam.parameters import NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive
 from unjam.physics.arrays import Array, clamp_min, join_columns, namespace, square_root, stack_columns
 
+COMPOSITE_CONFIG = ConfigDict(**STRICT, arbitrary_types_allowed=True)
+"""configuration of parameter dataclasses with drivers among their fields"""
 DRIVER_INDEX_KEY = "driver_index"
-"""name in the memory of a mixture: which driver a CAV has"""
+"""name in the memory of a mixture: the driver of a CAV"""
 INNER_KEY, STEP_KEY, PENDING_KEY = "inner", "step", "pending"
-"""names in the memory of a wrapper: the other driver's own; of an impaired one besides: decisions made so
-far; what was said and not yet done"""
+"""names in the memory of a wrapper: memory of the inner driver; control steps so far; delayed accelerations"""
 AVERAGING_TIMES = (10.0, 40.0, 160.0)
-"""time constants of the means [s]: within a wave, of a wave, of several"""
+"""time constants of the means [s]: within a wave, of a wave, of several waves"""
 SPEED_STD_SCALE, MEAN_GAP_SCALE = 2.0, 20.0
-"""of the spread of speeds [m/s] and of the mean gap [m], before a network sees them"""
+"""divisors of the standard deviation of speed [m/s] and of the mean gap [m] in network inputs"""
 HISTORY_STEPS_KEY = "steps"
-"""name in the memory: moments that were watched"""
-MEAN_SPEED_KEY, MEAN_SQUARE_KEY, MEAN_GAP_KEY = "mean_speed", "mean_square", "mean_gap"
-"""names of the means in the memory, by their span"""
+"""name in the memory: observed control steps"""
+MEAN_KEYS = ("mean_speed", "mean_square", "mean_gap")
+"""names of the means in the memory, before their averaging time"""
 
 
 class CompositeDriver(Driver):
-    """A driver that drives by those which it holds."""
+    """A driver that contains other drivers."""
 
     @property
     def accepts_tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether all that it holds take tensors."""
-        return all(held.accepts_tensors for held in self.inner_drivers.values())
+        """Whether all inner drivers take tensors."""
+        return all(inner.accepts_tensors for inner in self.inner_drivers.values())
 
     @property
     def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether one that it holds must know its place on a closed road."""
-        return any(held.needs_loop for held in self.inner_drivers.values())
+        """Whether an inner driver needs the position on a closed road."""
+        return any(inner.needs_loop for inner in self.inner_drivers.values())
 
     @property
     def policy_inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What networks in those that it holds see."""
-        return tuple(name for held in self.inner_drivers.values() for name in held.policy_inputs)
+        """Features that the networks of inner drivers read."""
+        return tuple(name for inner in self.inner_drivers.values() for name in inner.policy_inputs)
 
 
 class DriverWrapper(CompositeDriver):
-    """A driver around one other."""
+    """A driver around one inner driver."""
 
+    kind: ClassVar[str] = ""
+    """kind of its recipe"""
     driver: Driver
 
     @property
     def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether the other driver takes plain numbers."""
+        """Whether the inner driver takes plain numbers."""
         return self.driver.accepts_floats
 
     @property
     def inner_drivers(self) -> dict[str, Driver]:
-        """The other driver."""
+        """The inner driver."""
         return {INNER_KEY: self.driver}
 
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What the other driver's are."""
+        """Those of the inner driver."""
         return self.driver.memory_inputs
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return those of the other driver."""
+        """Return those of the inner driver."""
         return self.driver.time_gaps(state, memory[INNER_KEY])
 
     def memory_features(self, memory: Memory) -> Array | None:
-        """Return the other driver's."""
+        """Return those of the inner driver."""
         return self.driver.memory_features(memory[INNER_KEY])
+
+    def recipe(self) -> Recipe:
+        """Return its settings, and the recipe of the inner driver."""
+        settings = {field.name: getattr(self, field.name) for field in fields(self)}  # pyright: ignore[reportArgumentType]
+        return {"kind": self.kind, **settings, "driver": self.driver.recipe()}
 
 
 @dataclass(frozen=True)
 class MixedDriver(CompositeDriver):
-    """Gives the CAVs different drivers: the first CAV has the first driver, the next the next, and so on.
+    """Assigns drivers to CAVs in turn: the first CAV has the first driver, the next the next, and so on.
 
-    After the last driver it begins anew; where CAVs come and go, they are counted as they enter.
+    After the last driver it starts again with the first; CAVs that enter an open road count in order of entry.
     """
 
     drivers: tuple[Driver, ...]
 
     def __post_init__(self) -> None:
-        """Raise `InputError` where one of them is the simulator itself."""
+        """Raise `InputError` if one of them is the simulator itself."""
         if any(driver.is_native for driver in self.drivers):
-            raise InputError("driver: 'human' is not allowed among several; idm drives like people")
+            raise InputError("driver: 'human' is not allowed among several; 'idm' drives like a human driver")
 
     @property
     def inner_drivers(self) -> dict[str, Driver]:
-        """All of them, by their number."""
+        """All of them, by number."""
         return {str(number): driver for number, driver in enumerate(self.drivers)}
 
     def initial_memory(self, n: int) -> Memory:
-        """Return which driver each CAV has, and what all drivers would remember of it."""
+        """Return the driver of each CAV, and the memories of all drivers for all CAVs."""
         return {DRIVER_INDEX_KEY: np.arange(n, dtype=np.float64) % len(self.drivers), **super().initial_memory(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration that each CAV's own driver wants, and the new memory."""
+        """Return the acceleration by the driver of each CAV, and the new memory."""
         after, chosen = dict(memory), None
         for number, (key, driver) in enumerate(self.inner_drivers.items()):
-            wanted, after[key] = driver.act(state, memory[key])
-            mine = memory[DRIVER_INDEX_KEY] == number
-            chosen = wanted if chosen is None else namespace(wanted).where(mine, wanted, chosen)
+            acceleration, after[key] = driver.act(state, memory[key])
+            is_chosen = memory[DRIVER_INDEX_KEY] == number
+            chosen = acceleration if chosen is None else namespace(acceleration).where(is_chosen, acceleration, chosen)
         return chosen, after
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return for each CAV that of its own driver."""
+        """Return the time gap by the driver of each CAV."""
         chosen = None
         for number, (key, driver) in enumerate(self.inner_drivers.items()):
-            wanted = driver.time_gaps(state, memory[key])
-            if wanted is not None:
+            time_gaps = driver.time_gaps(state, memory[key])
+            if time_gaps is not None:
                 others = np.nan if chosen is None else chosen
-                chosen = np.where(memory[DRIVER_INDEX_KEY] == number, wanted, others)
+                chosen = np.where(memory[DRIVER_INDEX_KEY] == number, time_gaps, others)
         return chosen
 
     def describe(self) -> str:
@@ -126,40 +137,48 @@ class MixedDriver(CompositeDriver):
         return "+".join(driver.describe() for driver in self.drivers)
 
     def recipe(self) -> Recipe:
-        """Return what all of them are made from."""
+        """Return the recipes of all of them."""
         return {"kind": "mixed", "drivers": [driver.recipe() for driver in self.drivers]}
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class ImpairedDriver(DriverWrapper):
-    """Passes what it sees, with noise, to another driver, and hands on what that one said a while ago."""
+    """Drives as another driver does with noisy gaps and delayed commands."""
 
+    kind: ClassVar[str] = "impaired"
     accepts_tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
     accepts_floats: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
 
     driver: Driver
     delay: NonNegative = 0.0
-    """time after which a command is carried out, rounded to whole decisions [s]"""
+    """delay of a command, rounded to whole control steps [s]"""
     gap_noise: NonNegative = 0.0
-    """standard deviation of both gaps, anew in every decision [m]"""
-    time_step: float = 0.1
-    """time between two decisions [s]"""
+    """standard deviation of the errors of both gaps, independent in each control step [m]"""
+    time_step: Positive = 0.1
+    """control step [s]"""
+
+    @model_validator(mode="after")
+    def _check_delay(self) -> "ImpairedDriver":
+        if self.delay / self.time_step > MAX_WINDOW_STEPS:
+            allowed = f"at most {MAX_WINDOW_STEPS:,} steps of {self.time_step:g} s"
+            raise ValueError(f"delay: {self.delay:g} is not allowed; allowed: {allowed}")
+        return self
 
     def initial_memory(self, n: int) -> Memory:
-        """Return that of the other driver, that nothing was said yet, and that no decision was made."""
-        late = round(self.delay / self.time_step)
-        return {**super().initial_memory(n), STEP_KEY: np.zeros(n), PENDING_KEY: np.zeros((n, late))}
+        """Return the memory of the inner driver, no elapsed step, and zero accelerations until the delay has passed."""
+        delay_steps = round(self.delay / self.time_step)
+        return {**super().initial_memory(n), STEP_KEY: np.zeros(n), PENDING_KEY: np.zeros((n, delay_steps))}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return what was said `delay` ago, and remember what is said now."""
-        said, after = self.driver.act(self._add_gap_noise(state, memory[STEP_KEY]), memory[INNER_KEY])
-        sent = np.concatenate([memory[PENDING_KEY], np.asarray(said)[:, None]], axis=1)
-        return sent[:, 0], {INNER_KEY: after, STEP_KEY: memory[STEP_KEY] + 1.0, PENDING_KEY: sent[:, 1:]}
+        """Return the acceleration of the inner driver from `delay` ago, and store the current one."""
+        acceleration, after = self.driver.act(self._add_gap_noise(state, memory[STEP_KEY]), memory[INNER_KEY])
+        pending = np.concatenate([memory[PENDING_KEY], np.asarray(acceleration)[:, None]], axis=1)
+        return pending[:, 0], {INNER_KEY: after, STEP_KEY: memory[STEP_KEY] + 1.0, PENDING_KEY: pending[:, 1:]}
 
     def _add_gap_noise(self, state: LocalState, step: Array) -> LocalState:
         if self.gap_noise == 0.0 or not len(step):
             return state
-        # A driver's answer must not depend on who drives beside it: what it sees is the seed.
+        # The answer of a driver must not depend on other rows, so the observation of a row seeds its noise.
         rows = np.stack([step, state.speed, state.leader_gap, state.follower_gap], -1)
         noise = [np.random.default_rng(row.view(np.uint64).tolist()).normal(size=2) for row in rows]
         ahead, behind = self.gap_noise * np.array(noise).T
@@ -169,136 +188,124 @@ class ImpairedDriver(DriverWrapper):
         )
 
     def describe(self) -> str:
-        """Return the other driver, and what is worse about it."""
-        worse = (("delay", self.delay, "s"), ("gap noise", self.gap_noise, "m"))
-        words = [f"{name} {value:g} {unit}" for name, value, unit in worse if value]
+        """Return the inner driver and its impairments."""
+        impairments = (("delay", self.delay, "s"), ("gap noise", self.gap_noise, "m"))
+        words = [f"{name} {value:g} {unit}" for name, value, unit in impairments if value]
         return f"{self.driver.describe()} ({', '.join(words) or 'unimpaired'})"
 
-    def recipe(self) -> Recipe:
-        """Return what the other driver is made from, and what is worse about it."""
-        worse = {"delay": self.delay, "gap_noise": self.gap_noise, "time_step": self.time_step}
-        return {"kind": "impaired", "driver": self.driver.recipe(), **worse}
 
-
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class FilteredDriver(DriverWrapper):
-    """Another driver with the limits and the safety filter of a road, for a car that has none of its own.
+    """Another driver with the limits and the safety filter of a road, for a vehicle without its own filter.
 
-    A controller is shipped so: what drives elsewhere is what was proven, of a car that obeys at once. Where
-    the road filters as well, and a decision is one simulation step, nothing changes.
+    Controllers are exported in this form: the driver carries the proven filter with it, for a vehicle without
+    actuator delay. On a road with the same filter and one simulation step per control step, nothing changes.
     """
 
+    kind: ClassVar[str] = "filtered"
+
     driver: Driver
-    action_limit: float
-    """largest acceleration in either direction that the driver may ask for [m/s2]"""
+    action_limit: Positive
+    """largest acceleration in either direction that the driver may command [m/s2]"""
     safety: SafetyFilter
-    time_step: float
-    """time between two decisions [s]"""
+    time_step: Positive
+    """control step [s]"""
 
     @cached_property
     def limits(self) -> Limits:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What comes out: the driver's limits, and a car's brakes."""
+        """Limits of the result: those of the driver, and the brakes of the vehicle."""
         return Limits(-max(self.action_limit, self.safety.braking), self.action_limit)
 
     @cached_property
     def _driver_limits(self) -> Limits:
-        """Within which the driver may ask."""
         return Limits.symmetric(self.action_limit)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return what the filter lets pass of what the other driver wants, and the new memory."""
-        wanted, after = self.driver.act(state, memory[INNER_KEY])
-        return self.safety.limit(self._driver_limits.clip(wanted), FollowingState(*state[:3]), self.time_step), {
-            INNER_KEY: after
-        }
+        """Return the filtered acceleration of the inner driver, and the new memory."""
+        acceleration, after = self.driver.act(state, memory[INNER_KEY])
+        acceleration = self._driver_limits.clip(acceleration)
+        return self.safety.limit(acceleration, FollowingState(*state[:3]), self.time_step), {INNER_KEY: after}
 
     def describe(self) -> str:
-        """Return the other driver, and that it is filtered."""
+        """Return the inner driver, and that it is filtered."""
         return f"{self.driver.describe()}, filtered"
 
     def recipe(self) -> Recipe:
-        """Return what the other driver is made from, and the filter's settings."""
-        settings = {"action_limit": self.action_limit, "safety": asdict(self.safety)}
-        return {"kind": "filtered", "driver": self.driver.recipe(), **settings, "time_step": self.time_step}
+        """Return the settings of the filter, and the recipe of the inner driver."""
+        return super().recipe() | {"safety": asdict(self.safety)}
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class HistoryDriver(DriverWrapper):
-    """Drives as another driver does, and remembers means of its own speed, its square, and its gap.
+    """Drives as another driver does, and keeps means of its own speed, its square, and its gap for a network.
 
-    Until a span has passed, its mean is that of all that was watched.
+    Until an averaging time has passed, its mean is that of all control steps so far.
     """
+
+    kind: ClassVar[str] = "history"
 
     driver: Driver
     time_step: Positive
-    """time between two decisions [s]"""
+    """control step [s]"""
 
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What the other driver's are, and its own."""
-        mine: list[ScaledInput] = []
-        for span in AVERAGING_TIMES:
-            mine += [
-                ScaledInput(f"mean own speed over {span:g} s", SPEED_SCALE, "m/s"),
-                ScaledInput(f"standard deviation of own speed over {span:g} s", SPEED_STD_SCALE, "m/s"),
-                ScaledInput(f"mean gap over {span:g} s", MEAN_GAP_SCALE, "m"),
-            ]
-        return (*self.driver.memory_inputs, *mine)
+        """Those of the inner driver, and its own."""
+        own = (
+            entry
+            for time in AVERAGING_TIMES
+            for entry in (
+                ScaledInput(f"mean own speed over {time:g} s", SPEED_SCALE, "m/s"),
+                ScaledInput(f"standard deviation of own speed over {time:g} s", SPEED_STD_SCALE, "m/s"),
+                ScaledInput(f"mean gap over {time:g} s", MEAN_GAP_SCALE, "m"),
+            )
+        )
+        return (*self.driver.memory_inputs, *own)
 
     @cached_property
     def _step_weights(self) -> tuple[tuple[float, float], ...]:
-        """Spans, and what a step weighs in their means."""
-        return tuple((span, 1.0 - exp(-self.time_step / span)) for span in AVERAGING_TIMES)
+        """Averaging times, and the weights of one step in their means."""
+        return tuple((time, 1.0 - exp(-self.time_step / time)) for time in AVERAGING_TIMES)
 
     def initial_memory(self, n: int) -> Memory:
-        """Return that of the other driver, and that nothing was watched yet."""
-        means = {
-            f"{name}_{span:g}": np.zeros(n)
-            for span in AVERAGING_TIMES
-            for name in (MEAN_SPEED_KEY, MEAN_SQUARE_KEY, MEAN_GAP_KEY)
-        }
+        """Return the memory of the inner driver, and means over no steps."""
+        means = {f"{name}_{time:g}": np.zeros(n) for time in AVERAGING_TIMES for name in MEAN_KEYS}
         return {**super().initial_memory(n), HISTORY_STEPS_KEY: np.zeros(n), **means}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return `memory` as if both had watched `history`."""
+        """Return `memory` as if both had observed `history`."""
         memory = super().recall(memory, history)
-        for moment in range(history.speed.shape[1]):
-            memory = self._update_means(memory, history.speed[:, moment], history.leader_gap[:, moment])
+        for step in range(history.speed.shape[1]):
+            memory = self._update_means(memory, history.speed[:, step], history.leader_gap[:, step])
         return memory
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return what the other driver wants, and the new memory."""
-        wanted, after = self.driver.act(state, memory[INNER_KEY])
-        return wanted, {**self._update_means(memory, state.speed, state.leader_gap), INNER_KEY: after}
+        """Return the acceleration of the inner driver, and the new memory."""
+        acceleration, after = self.driver.act(state, memory[INNER_KEY])
+        return acceleration, {**self._update_means(memory, state.speed, state.leader_gap), INNER_KEY: after}
 
     def _update_means(self, memory: Memory, speed: Array, gap: Array) -> Memory:
         xp, after = namespace(speed), dict(memory)
         after[HISTORY_STEPS_KEY] = memory[HISTORY_STEPS_KEY] + 1.0
-        early = 1.0 / after[HISTORY_STEPS_KEY]
-        for span, fading in self._step_weights:
-            weight = xp.where(early > fading, early, early * 0.0 + fading)
-            for name, now in ((MEAN_SPEED_KEY, speed), (MEAN_SQUARE_KEY, speed * speed), (MEAN_GAP_KEY, gap)):
-                before = memory[f"{name}_{span:g}"]
-                after[f"{name}_{span:g}"] = before + weight * (now - before)
+        early_weight = 1.0 / after[HISTORY_STEPS_KEY]
+        for time, late_weight in self._step_weights:
+            weight = xp.where(early_weight > late_weight, early_weight, early_weight * 0.0 + late_weight)
+            for name, value in zip(MEAN_KEYS, (speed, speed * speed, gap), strict=True):
+                mean = memory[f"{name}_{time:g}"]
+                after[f"{name}_{time:g}"] = mean + weight * (value - mean)
         return after
 
     def memory_features(self, memory: Memory) -> Array:
-        """Return the other driver's features, and for each span mean speed, its spread and the mean gap."""
+        """Return those of the inner driver; mean and standard deviation of speed and mean gap by averaging time."""
         columns: list[Array] = []
-        for span in AVERAGING_TIMES:
-            speed, square, room = (
-                memory[f"{name}_{span:g}"] for name in (MEAN_SPEED_KEY, MEAN_SQUARE_KEY, MEAN_GAP_KEY)
-            )
-            spread = square_root(clamp_min(square - speed * speed, 0.0) + 1e-9)  # never the root of zero
-            columns += [speed / SPEED_SCALE, spread / SPEED_STD_SCALE, room / MEAN_GAP_SCALE]
-        mine = stack_columns(tuple(columns))
+        for time in AVERAGING_TIMES:
+            speed, square, gap = (memory[f"{name}_{time:g}"] for name in MEAN_KEYS)
+            deviation = square_root(clamp_min(square - speed * speed, 0.0) + 1e-9)  # never the root of zero
+            columns += [speed / SPEED_SCALE, deviation / SPEED_STD_SCALE, gap / MEAN_GAP_SCALE]
+        own = stack_columns(tuple(columns))
         others = self.driver.memory_features(memory[INNER_KEY])
-        return mine if others is None else join_columns([others, mine])
+        return own if others is None else join_columns([others, own])
 
     def describe(self) -> str:
-        """Return the other driver, and that it remembers."""
+        """Return the inner driver, and that it has a history."""
         return f"{self.driver.describe()}, with history"
-
-    def recipe(self) -> Recipe:
-        """Return what the other driver is made from, and the time between two decisions."""
-        return {"kind": "history", "driver": self.driver.recipe(), "time_step": self.time_step}

@@ -1,4 +1,4 @@
-"""The roads as Gymnasium and PettingZoo environments: they step what `run_episode` steps."""
+"""Scenarios as Gymnasium and PettingZoo environments, with the same episodes as `run_episode`."""
 
 from gymnasium.envs.registration import register, registry
 
@@ -9,11 +9,11 @@ ENVIRONMENT_ARGUMENTS = {
     "unjam/OnRamp-v0": {"scenario": "on-ramp", "cavs": 1},
     "unjam/UserNetwork-v0": {"scenario": "my.sumocfg", "cavs": 1},
 }
-"""what each environment that Gymnasium makes by name is made of"""
+"""arguments of `RoadEnv`, by the Gymnasium id of the environment"""
 
 
 def register_environments() -> None:
-    """Tell Gymnasium of the environments; they are imported when one is made."""
+    """Register the environments with Gymnasium; their module is imported when one is made."""
     for name, arguments in ENVIRONMENT_ARGUMENTS.items():
         if name not in registry:
             register(name, "unjam.environments.gymnasium_env:RoadEnv", kwargs=arguments)

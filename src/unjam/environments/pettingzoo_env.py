@@ -1,4 +1,4 @@
-"""A road with several CAVs as a PettingZoo environment."""
+"""A scenario with several CAVs as a PettingZoo environment."""
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
@@ -15,11 +15,11 @@ from unjam.errors import InputError
 
 
 class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
-    """Several CAVs among people; all earn the same reward, that of the road.
+    """Several CAVs among human drivers, with a common reward.
 
-    Action and observation of each are those of `RoadEnv`. On the merge `agents` changes: a CAV appears at the
-    first decision after it entered, and is truncated when it leaves; while none is on the road, time goes on
-    by itself. On a network of your own they are called cav_0, cav_1, ... as they enter, at most `cavs`.
+    Action and observation of each CAV are those of `RoadEnv`. On the merge `agents` changes: a CAV appears at the
+    first control step after its entry, and is truncated when it leaves; without CAVs on the road, the simulation
+    continues by itself. On a user network the agents are cav_0, cav_1, ... in order of entry, at most `cavs`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "unjam_road_v0", "render_modes": []}  # pyright: ignore
@@ -37,9 +37,8 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
         self.possible_agents = list(self._road.scenario.possible_cav_ids())
         self.agents: list[str] = []
         self._agent_by_vehicle: dict[str, str] = {}
-        """by vehicle"""
         self._departed_agents: set[str] = set()
-        """whose vehicle has left: where it comes back, only its expert drives it, as no agent does"""
+        """agents with a vehicle that has left; if the vehicle returns, its expert drives it without the agent"""
         self.render_mode = None
         self.observation_spaces = {agent: deepcopy(self._road.observation_space) for agent in self.possible_agents}
         self.action_spaces = {agent: deepcopy(self._road.action_space) for agent in self.possible_agents}
@@ -56,7 +55,7 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode: that of `seed`; without one, the next after the last seed's."""
+        """Start an episode: that of `seed`; without one, the next after that of the last seed."""
         observations = self._road.reset(seed, np.random.default_rng())
         self._agent_by_vehicle.clear()
         self._departed_agents.clear()
@@ -65,39 +64,34 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
 
     @synchronized
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Make one decision of every CAV."""
+        """Advance one control step with the actions of all CAVs."""
         if not self.agents:
             return {}, {}, {}, {}, {}
-        acted = self.agents
-        if missing := [agent for agent in acted if agent not in actions]:
+        if missing := [agent for agent in self.agents if agent not in actions]:
             raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each of the agents")
-        driven = [
-            0.0 if name in self._departed_agents else actions[name]
-            for name in self._agents_of(self._road.traffic.cav_ids)
-        ]
-        done = self._road.step([float(np.asarray(each).reshape(())) for each in driven])
-        ended = done.terminated or done.truncated
-        left = dict(zip(self._agents_of(done.departed), done.departed.values(), strict=True))
-        now = dict(zip(self._agents_of(done.cav_ids), done.observations, strict=True))
-        now, left = (
-            {name: seen for name, seen in each.items() if name not in self._departed_agents} for each in (now, left)
+        acted, departed = self.agents, self._departed_agents
+        present = self._agents_of(self._road.traffic.cav_ids)
+        values = [0.0 if agent in departed else float(np.asarray(actions[agent]).reshape(())) for agent in present]
+        done = self._road.step(values)
+        is_over = done.terminated or done.truncated
+        left, now = (
+            {agent: each for agent, each in zip(self._agents_of(ids), rows, strict=True) if agent not in departed}
+            for ids, rows in ((done.departed, done.departed.values()), (done.cav_ids, done.observations))
         )
-        self._departed_agents |= left.keys()
-        there, seen = list(now), {**left, **now}
-        # Who enters as the episode ends never was an agent.
-        observations = {name: seen[name] for name in seen if name in acted or not ended}
-        agents = list(observations)
-        self.agents = [] if ended else there
+        departed.update(left)
+        # A vehicle that enters as the episode ends never becomes an agent.
+        observations = {agent: each for agent, each in (left | now).items() if agent in acted or not is_over}
+        self.agents = [] if is_over else list(now)
         return (
             observations,
-            {agent: done.reward if agent in acted else 0.0 for agent in agents},
-            dict.fromkeys(agents, done.terminated),
-            {agent: done.truncated or (agent in left and not done.terminated) for agent in agents},
-            {agent: {"reward_terms": done.reward_terms} for agent in agents},
+            {agent: done.reward if agent in acted else 0.0 for agent in observations},
+            dict.fromkeys(observations, done.terminated),
+            {agent: done.truncated or (agent in left and not done.terminated) for agent in observations},
+            {agent: {"reward_terms": done.reward_terms} for agent in observations},
         )
 
     def _agents_of(self, vehicles: Iterable[str]) -> list[str]:
-        """Return the agents that drive these vehicles; where names cannot be foretold, in order of entry."""
+        """Return the agents of vehicles; if their names are not known in advance, in order of entry."""
         for name in vehicles:
             if name not in self._agent_by_vehicle:
                 taken = self._agent_by_vehicle.values()
@@ -110,10 +104,10 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
 
     @synchronized
     def close(self) -> None:
-        """End SUMO; may be called twice."""
+        """Close SUMO; may be called twice."""
         self._road.close()
 
 
 def parallel_env(scenario: str = "ring", **arguments: Any) -> ParallelRoadEnv:
-    """Return a road with several CAVs as a PettingZoo environment; arguments are those of `RoadEnv`."""
+    """Return a scenario with several CAVs as a PettingZoo environment; arguments are those of `RoadEnv`."""
     return ParallelRoadEnv(scenario, **arguments)

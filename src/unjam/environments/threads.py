@@ -1,4 +1,4 @@
-"""Environments that several threads call: one call at a time."""
+"""Thread safety of environments: one call at a time."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -11,10 +11,10 @@ T = TypeVar("T")
 
 
 class CopyableLock:
-    """A lock that a thread may take again; copies of its owner get their own."""
+    """A reentrant lock; copies of its owner get their own."""
 
     def __init__(self) -> None:
-        """Make it; no thread holds it."""
+        """Create it unlocked."""
         self._lock = RLock()
 
     def __enter__(self) -> None:
@@ -28,7 +28,7 @@ class CopyableLock:
 
 
 def synchronized(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
-    """Return a method of an environment for which a second thread waits until the first has returned."""
+    """Return a method of an environment in which a second thread waits until the first has returned."""
 
     @wraps(method)
     def call(self: S, /, *arguments: P.args, **keywords: P.kwargs) -> T:

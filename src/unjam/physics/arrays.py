@@ -1,9 +1,9 @@
-"""One formula, three kinds of numbers: NumPy arrays, torch tensors, and plain Python floats.
+"""One formula for three kinds of numbers: NumPy arrays, torch tensors, and plain Python floats.
 
 Every formula of unjam is written once, with the functions of this module. It runs on NumPy arrays in
-workers, on torch tensors in the virtual environment, and on plain floats where a single vehicle is driven:
+workers, on torch tensors in the learned model, and on plain floats where a single vehicle is driven:
 between two steps of SUMO the processor's caches are cold, and a NumPy call on one number then costs some
-3 us against 0.1 us for a float. (`array_api_compat` knows arrays only, and asking it costs 2 us.)
+3 us against 0.1 us for a float. (`array_api_compat` supports arrays only, and each of its calls costs 2 us.)
 """
 
 import math
@@ -27,13 +27,12 @@ _FLOAT_NAMESPACE = SimpleNamespace(
     sin=math.sin,
     where=lambda condition, then, otherwise: then if condition else otherwise,
 )
-"""the few array functions that formulas use, for plain floats"""
 
 
 def namespace(array: Array) -> Any:
-    """Return what has `where`, `minimum`, `required_time_gap`, `isnan`, `cos` and `sin` for this kind of number.
+    """Return the module with `where`, `minimum`, `floor`, `isnan`, `cos` and `sin` for this kind of number.
 
-    That is `numpy`, `torch`, or their like for plain floats.
+    It is `numpy`, `torch`, or a namespace with these functions for plain floats.
     """
     if type(array) is float:
         return _FLOAT_NAMESPACE
@@ -43,14 +42,14 @@ def namespace(array: Array) -> Any:
 
 
 def clip(array: Array, low: float, high: float) -> Array:
-    """Return `to_array` with its entries kept within [low, high]; NaN stays NaN."""
+    """Return `array` with its entries limited to [low, high]; NaN stays NaN."""
     if type(array) is float:
         return low if array < low else high if array > high else array
     return array.clip(low, high)
 
 
 def clamp_min(array: Array, low: Array) -> Array:
-    """Return the larger of each entry and `required_time_gap`; NaN stays NaN."""
+    """Return the larger of each entry and `low`; NaN stays NaN."""
     if type(array) is float:
         return low if array < low else array
     if isinstance(array, (np.ndarray, np.generic)):
@@ -59,7 +58,7 @@ def clamp_min(array: Array, low: Array) -> Array:
 
 
 def clamp_max(array: Array, high: Array) -> Array:
-    """Return the smaller of each entry and `ceiling`."""
+    """Return the smaller of each entry and `high`; NaN stays NaN."""
     if type(array) is float:
         return high if array > high else array
     if isinstance(array, (np.ndarray, np.generic)):
@@ -73,17 +72,17 @@ def square_root(array: Array) -> Array:
         return math.sqrt(array)
     if isinstance(array, (np.ndarray, np.generic)):
         return np.sqrt(array)
-    # Those of torch are MKL's, which differ from one make of processor to another: see `unjam.kernels`.
+    # torch takes square roots from MKL, which differ between processor models: see `unjam.kernels`.
     return array.rsqrt().reciprocal()
 
 
 def running_maximum(array: Array) -> Array:
-    """Return the largest of all entries so far, of an array of shape (n,)."""
+    """Return the largest of all entries so far, for an array of shape (n,)."""
     return np.maximum.accumulate(array) if isinstance(array, np.ndarray) else array.cummax(0).values
 
 
 def scatter_minimum(array: Array, rows: Array, values: Array) -> None:
-    """Let entries of `to_array` be no larger than values for their rows, which may come several times."""
+    """Reduce entries of `array` to at most the values for their rows; a row may occur several times."""
     if isinstance(array, np.ndarray):
         np.minimum.at(array, rows, values)
     else:
@@ -91,7 +90,7 @@ def scatter_minimum(array: Array, rows: Array, values: Array) -> None:
 
 
 def as_column(array: Array) -> Array:
-    """Return `to_array` of shape (n,) as (n, 1); a float as a tuple of one."""
+    """Return an array of shape (n,) as (n, 1); a float as a tuple of one."""
     return (array,) if type(array) is float else array[..., None]
 
 
@@ -106,10 +105,8 @@ def stack_columns(columns: tuple[Array, ...]) -> Array:
 
 
 def join_columns(blocks: list[Array]) -> Array:
-    """Return blocks of shape (n, m) side by side; tuples of floats as one tuple."""
+    """Return blocks of shape (n, m) concatenated along the columns; tuples of floats as one tuple."""
     first = blocks[0]
     if len(blocks) == 1:
         return first
-    if isinstance(first, tuple):
-        return sum(blocks, ())
-    return (np if isinstance(first, np.ndarray) else sys.modules["torch"]).concatenate(blocks, -1)
+    return sum(blocks, ()) if isinstance(first, tuple) else namespace(first).concatenate(blocks, -1)

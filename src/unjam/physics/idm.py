@@ -1,4 +1,4 @@
-"""The Intelligent Driver Model (Treiber, Hennecke, Helbing 2000): how people follow the car ahead."""
+"""The Intelligent Driver Model (Treiber, Hennecke, Helbing 2000): car following of human drivers."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -31,17 +31,12 @@ class IDMParameters:
 
     @cached_property
     def interaction_scale(self) -> float:
-        """2 sqrt(a b) of Eq. 6 [m/s2]; kept, for a simulator asks for it in every step."""
-        return _twice_geometric_mean(self.max_acceleration, self.comfortable_deceleration)
-
-
-def _twice_geometric_mean(first: Array, second: Array) -> Array:
-    """Return twice the geometric mean of both."""
-    return 2.0 * square_root(first * second)
+        """2 sqrt(a b) of Eq. 6 [m/s2]; cached, because a simulator needs it in every step."""
+        return 2.0 * square_root(self.max_acceleration * self.comfortable_deceleration)
 
 
 class IDMArrays(NamedTuple):
-    """The parameters of many drivers at once: as `IDMParameters`, arrays that broadcast with the states."""
+    """The parameters of many drivers, as in `IDMParameters`: arrays that broadcast with the states."""
 
     desired_speed: Array
     time_headway: Array
@@ -53,13 +48,13 @@ class IDMArrays(NamedTuple):
     @property
     def interaction_scale(self) -> Array:
         """2 sqrt(a b) of Eq. 6 [m/s2]."""
-        return _twice_geometric_mean(self.max_acceleration, self.comfortable_deceleration)
+        return 2.0 * square_root(self.max_acceleration * self.comfortable_deceleration)
 
 
 PAPER_IDM = IDMParameters()
 IDM_PARAMETER_NAMES = IDMArrays._fields
 BISECTION_STEPS = 60
-"""of the interval in which the equilibrium speed lies: to the last bit"""
+"""bisections for an equilibrium speed that is exact to the last bit"""
 
 
 def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
@@ -68,12 +63,12 @@ def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
 
 
 def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM) -> Array:
-    """Return the gap s* that a driver wants at this speed and approach rate (Eq. 6).
+    """Return the desired gap s* at this speed and approach rate (Eq. 6).
 
     Args:
         speed: own speed [m/s], any shape.
         approach_rate: own speed minus the leader's [m/s], same shape.
-        parameters: of the driver, or of the driver of each row.
+        parameters: of one driver, or of the driver of each row.
 
     Returns:
         Desired bumper-to-bumper gap [m], same shape.
@@ -83,9 +78,9 @@ def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | 
 
 
 def fast_power(base: Array, exponent: Array) -> Array:
-    """Return `base` to the power of `exponent`; to the fourth by squaring twice, equal but for rounding.
+    """Return `base` to the power of `exponent`; the fourth power by squaring twice, equal except for rounding.
 
-    On many float32 tensors that takes a fiftieth of the time of a power.
+    For large float32 tensors this takes a fiftieth of the time of a general power.
     """
     if type(exponent) is float and exponent == 4.0:
         square = base * base
@@ -106,8 +101,8 @@ def idm_acceleration(
         speed: own speed [m/s], any shape.
         leader_speed: speed of the vehicle ahead [m/s], same shape.
         gap: bumper-to-bumper distance [m], same shape; positive (the model divides by it).
-        parameters: of the driver, or of the driver of each row.
-        power: how powers are taken: exactly, or `fast_power`.
+        parameters: of one driver, or of the driver of each row.
+        power: function that computes powers: `pow`, or `fast_power`.
 
     Returns:
         Acceleration [m/s2], same shape; unbounded below as the gap closes.
@@ -121,9 +116,9 @@ def idm_acceleration(
 def desired_speed_from_acceleration(
     acceleration: Array, speed: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM
 ) -> Array:
-    """Return the desired speed v0 with which a driver accelerates so where nobody is ahead [m/s].
+    """Return the desired speed v0 at which a driver without a leader has this acceleration [m/s].
 
-    Closed form of Eq. 5 without its interaction; `acceleration` below the largest, `speed` in m/s, any shape.
+    Closed form of Eq. 5 without its interaction term; `acceleration` is below the maximum, `speed` in m/s, any shape.
     """
     return speed / (1.0 - acceleration / parameters.max_acceleration) ** (1.0 / parameters.exponent)
 
@@ -140,14 +135,14 @@ def equilibrium_gap(speed: float, parameters: IDMParameters = PAPER_IDM) -> floa
 
 
 def equilibrium_speed(gap: float, parameters: IDMParameters = PAPER_IDM) -> float:
-    """Return the constant speed that drivers settle at when all gaps are `gap` metres [m/s].
+    """Return the constant speed of drivers when all gaps are `gap` meters [m/s].
 
     The inverse of `equilibrium_gap`; 0 where the gap is not above the standstill gap.
     """
     if gap <= parameters.minimum_gap:
         return 0.0
     low, high = 0.0, parameters.desired_speed
-    # Halving by hand: importing scipy's root finder would cost a worker half a second at its start.
+    # Own bisection: importing the root finder of scipy would add half a second to the start of a worker.
     for _ in range(BISECTION_STEPS):
         middle = (low + high) / 2.0
         if equilibrium_gap(middle, parameters) < gap:

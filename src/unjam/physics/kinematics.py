@@ -1,4 +1,4 @@
-"""How a vehicle moves in one step, and until it stands: exactly as SUMO moves it."""
+"""Motion of a vehicle in one step and until standstill: exactly as in SUMO."""
 
 from unjam.physics.arrays import Array, clamp_min, namespace, square_root
 
@@ -22,10 +22,10 @@ def next_position(position: Array, new_speed: Array, time_step: float) -> Array:
 
 
 def distance_driven(speed: Array, new_speed: Array, time_step: float, steps: int) -> Array:
-    """Return how far a vehicle gets in `steps` steps in which its speed changes evenly to `new_speed`.
+    """Return the distance driven in `steps` steps in which the speed changes linearly to `new_speed`.
 
     Each step is the Euler step of `next_position`, so that one step gives v' dt.
-    Shapes: any, broadcast together. Units: m/s, s; the answer in m.
+    Shapes: any, broadcast together. Units: m/s, s; the result in m.
     """
     return time_step * (steps * speed + (steps + 1) / 2 * (new_speed - speed))
 
@@ -33,18 +33,18 @@ def distance_driven(speed: Array, new_speed: Array, time_step: float, steps: int
 def gap_on_loop(position: Array, leader_position: Array, loop_length: Array, leader_length: float) -> Array:
     """Return the bumper-to-bumper gap to the leader on a closed road.
 
-    Positions are those of front bumpers along the road; they may run past the loop's length.
+    Positions are those of front bumpers along the road; they may exceed the length of the loop.
     Shapes: any, broadcast together. Units: m.
     """
     return (leader_position - position) % loop_length - leader_length
 
 
 def stopping_distance(speed: Array, braking: Array, time_step: float) -> Array:
-    """Return how far a vehicle drives that brakes with `braking` from the next step on [m].
+    """Return the distance that a vehicle drives if it brakes with `braking` from the next step on [m].
 
-    With v_j = max(0, v - j b h) after j steps of length h that is h (v_1 + v_2 + ...), of which the n = floor
-    (v / (b h)) first are not zero: h (n v - b h n (n + 1) / 2). It grows with v, and is at least
-    v^2 / (2 b) - v h / 2, by at most b h^2 / 8 more.
+    With v_j = max(0, v - j b h) after j steps of length h it is h (v_1 + v_2 + ...). The first
+    n = floor(v / (b h)) terms are not zero, so the sum is h (n v - b h n (n + 1) / 2). It increases with v, and
+    exceeds v^2 / (2 b) - v h / 2 by 0 to b h^2 / 8.
 
     Shapes: any. Units: m/s, m/s2, s.
     Source: SUMO's Euler update, https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
@@ -55,9 +55,9 @@ def stopping_distance(speed: Array, braking: Array, time_step: float) -> Array:
 
 
 def max_speed_to_stop(distance: Array, braking: float, time_step: float) -> Array:
-    """Return the highest speed after this step from which a vehicle still stands within `distance` [m/s].
+    """Return the highest speed after this step from which a vehicle still stops within `distance` [m/s].
 
-    It drives one step at the answer v and then brakes: v h + `stopping_distance`(v) = `distance`, which is
+    It drives one step at the result v and then brakes: v h + `stopping_distance`(v) = `distance`, which is
     piecewise linear in v; n is the number of whole steps of braking. Zero where the distance is not positive.
 
     Shapes: any. Units: m, m/s2, s.
