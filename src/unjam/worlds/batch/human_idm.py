@@ -1,4 +1,4 @@
-"""How SUMO moves people who drive its IDM, as one formula on arrays: the model, and what SUMO clips of it.
+"""SUMO's IDM of human drivers as one formula on arrays: the model and the limits that SUMO applies to it.
 
 Sources: SUMO's MSCFModel_IDM (`_v`), MSCFModel (`finalizeSpeed`) and MSVehicle (`executeMove`).
 """
@@ -23,33 +23,32 @@ from unjam.worlds.batch.leaders import Leader, lane_end_leader, leaders
 from unjam.worlds.batch.noise import ArrayFactory
 
 HumanSpeedModel = Callable[[Array, Array, Array], Array]
-"""speeds, leaders' speeds and gaps to them, shape (vehicles, W), to the speeds after a step without noise"""
+"""from speeds, leader speeds and gaps, shape (vehicles, W), to the speeds after a step without noise"""
 
 SUMO_MIN_GAP = 1e-3
-"""gap below which `_v` takes this one, SUMO's NUMERICAL_EPS [m]"""
+"""minimum gap in `_v`: SUMO's NUMERICAL_EPS [m]"""
 EMERGENCY_BRAKING = 9.0
-"""`emergencyDecel` of a passenger car, beyond which `finalizeSpeed` lets nobody brake [m/s2]"""
+"""`emergencyDecel` of a passenger car, the braking limit of `finalizeSpeed` [m/s2]"""
 MIN_OVERSPEED_BRAKING = 1.5
-"""deceleration that `executeMove` allows at least to who is faster than he wants [m/s2]"""
+"""braking that `executeMove` allows at least above the desired speed [m/s2]"""
 OVERSPEED_BRAKING_TOLERANCE = 1e-3
-"""what it allows beyond, SUMO's NUMERICAL_EPS [m/s]"""
+"""tolerance of that limit: SUMO's NUMERICAL_EPS [m/s]"""
 STANDSTILL_ACCELERATION = 1e-4
-"""SUMO's NUMERICAL_EPS_SPEED over the time step: people no faster than that after a step stand [m/s2]"""
+"""SUMO's NUMERICAL_EPS_SPEED over the time step: slower vehicles stand after a step [m/s2]"""
 
 
 def human_idm_speed(
     speed: Array, leader_speed: Array, gap: Array, parameters: IDMParameters | IDMArrays, step: float
 ) -> Array:
-    """Return the speeds after a step of people behind leaders, before noise is added [m/s].
+    """Return the speeds of human drivers after a step behind their leaders, before noise is added [m/s].
 
-    Shapes: any, broadcast together. Units: m/s, m/s, m, s. SUMO divides steps of more than 0.375 s; those
-    are not here.
+    Shapes: any, broadcast together. Units: m/s, m/s, m, s. Steps are at most 0.375 s; SUMO divides longer ones.
     """
     gap = clamp_min(gap, SUMO_MIN_GAP)
     acceleration = idm_acceleration(speed, leader_speed, gap, parameters, fast_power)
-    wanted = next_speed(speed, clamp_min(acceleration, -EMERGENCY_BRAKING), step)
-    wanted = clamp_max(wanted, parameters.desired_speed)
-    return wanted * (wanted > STANDSTILL_ACCELERATION * step)
+    desired = next_speed(speed, clamp_min(acceleration, -EMERGENCY_BRAKING), step)
+    desired = clamp_max(desired, parameters.desired_speed)
+    return desired * (desired > STANDSTILL_ACCELERATION * step)
 
 
 def human_ring_speed(
@@ -60,34 +59,31 @@ def human_ring_speed(
     parameters: IDMParameters | IDMArrays,
     step: float,
 ) -> Array:
-    """Return the speeds after a step of people on a ring of four lanes, before noise is added [m/s].
+    """Return the speeds of human drivers after a step on a ring of four lanes, before noise is added [m/s].
 
-    Arguments as of `lanes.leaders`.
+    Arguments as in `unjam.worlds.batch.leaders.leaders`.
     """
-    xp, seen = namespace(speed), leaders(speed, position, leader, loop_length, parameters, step)
-    found = reduce(xp.minimum, (human_idm_speed(speed, *each, parameters, step) for each in seen))
-    beyond = speed > parameters.desired_speed  # noise did it
-    if bool(beyond.any()):
+    xp, visible = namespace(speed), leaders(speed, position, leader, loop_length, parameters, step)
+    new_speed = reduce(xp.minimum, (human_idm_speed(speed, *each, parameters, step) for each in visible))
+    is_too_fast = speed > parameters.desired_speed  # because of noise
+    if bool(is_too_fast.any()):
         end = lane_end_leader(speed, position, loop_length, parameters)
         slower = human_idm_speed(speed, *end, without_minimum_gap(parameters), step)
-        slowest = (
-            speed
-            - clamp_min(parameters.comfortable_deceleration, MIN_OVERSPEED_BRAKING) * step
-            - OVERSPEED_BRAKING_TOLERANCE
-        )
-        found = xp.where(beyond, xp.minimum(found, xp.maximum(slower, slowest)), found)
-    return found
+        braking = clamp_min(parameters.comfortable_deceleration, MIN_OVERSPEED_BRAKING)
+        min_speed = speed - braking * step - OVERSPEED_BRAKING_TOLERANCE
+        new_speed = xp.where(is_too_fast, xp.minimum(new_speed, xp.maximum(slower, min_speed)), new_speed)
+    return new_speed
 
 
 def without_minimum_gap(parameters: IDMParameters | IDMArrays) -> IDMArrays:
-    """Return people who keep no gap at standstill, as to the end of a lane."""
+    """Return drivers with a standstill gap of zero, as at the end of a lane."""
     return IDMArrays(**{name: getattr(parameters, name) for name in IDM_PARAMETER_NAMES})._replace(minimum_gap=0.0)
 
 
 def human_parameters(
     roads: Sequence[ClosedRoad], shared_parameters: IDMParameters, to_array: ArrayFactory
 ) -> IDMParameters | IDMArrays:
-    """Return how the people of W roads drive: all alike, or each vehicle's driver, shape (vehicles, W)."""
+    """Return the parameters of the human drivers of W roads: shared, or of each vehicle, shape (vehicles, W)."""
     if not roads[0].human_parameters:
         return shared_parameters
     drivers = [stack_idm_parameters([road.human_parameters[name] for name in road.vehicle_ids]) for road in roads]

@@ -1,8 +1,8 @@
-"""Whom SUMO's people follow on a ring of four lanes, one behind the other: the last car of each they see.
+"""The leaders of human drivers on SUMO's rings, which have four lanes in a row: the last vehicle on each visible lane.
 
-On their own lane it is the car ahead. On a lane beyond it is the last car there; where the car ahead is still
-on their own lane that is another one, and if it is much slower, it is what they brake for. The next lane is
-always seen, others as far as it takes to stop, but 25 m of lanes at least.
+On a driver's own lane, the leader is the vehicle ahead. On a lane further ahead, it is the last vehicle on that lane.
+If the vehicle ahead is still on the own lane, this is another vehicle, and drivers brake for it if it is much slower.
+Drivers always see the next lane, and further lanes as far as they need to stop, but at least 25 m of lanes.
 Source: SUMO's MSVehicle (`planMoveInternal`), MSCFModel (`brakeGap`).
 """
 
@@ -16,15 +16,15 @@ from unjam.scenarios.ring import RING_EDGES
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 
 MIN_LOOK_AHEAD = 5 * VEHICLE_LENGTH
-"""lanes beyond the own one that are seen at least: SUMO's CRLL_LOOK_AHEAD lengths of a vehicle [m]"""
+"""minimum length of visible lanes beyond the own one: SUMO's CRLL_LOOK_AHEAD vehicle lengths [m]"""
 CONTACT_GAP = -1e-3
-"""gap below which SUMO says that vehicles collide: its NUMERICAL_EPS [m]"""
+"""gap below which SUMO reports a collision: its NUMERICAL_EPS [m]"""
 FREE_GAP = 1e6
-"""gap that SUMO's `freeSpeed` takes where nobody is ahead, behind who drives as fast as is wanted [m]"""
+"""gap in SUMO's `freeSpeed` without a leader; the leader then drives at the desired speed [m]"""
 
 
 class Leader(NamedTuple):
-    """Whom people follow; arrays of shape (vehicles, W)."""
+    """Leaders of drivers; arrays of shape (vehicles, W)."""
 
     speed: Array
     """[m/s]"""
@@ -40,47 +40,47 @@ def leaders(
     parameters: IDMParameters | IDMArrays,
     step: float,
 ) -> Iterator[Leader]:
-    """Yield whom each vehicle follows on its own lane, on the next one, and so on as far as anybody sees.
+    """Yield the leader of each vehicle on its own lane, on the next one, and so on as far as any driver sees.
 
     Args:
         speed: [m/s], shape (vehicles, W).
         position: front bumpers along the ring, wrapped or not [m], shape (vehicles, W).
-        ahead: the vehicle ahead of each.
-        loop: lengths of the rings [m], shape (W,).
-        people: how they drive.
-        step: of simulation [s].
+        leader: the vehicle ahead of each.
+        loop_length: lengths of the rings [m], shape (W,).
+        parameters: of the drivers.
+        step: of the simulation [s].
     """
     xp, lane_length, place = namespace(speed), loop_length / RING_EDGES, position % loop_length
     lane = xp.floor(place / lane_length)
-    seen = (lane + 1.0) * lane_length - place
+    distance = (lane + 1.0) * lane_length - place  # to the end of the lanes seen so far
 
     def leader_if_present(is_present: Array, leader_speed: Array, gap: Array) -> Leader:
         return Leader(xp.where(is_present, leader_speed, parameters.desired_speed), xp.where(is_present, gap, FREE_GAP))
 
-    yield leader_if_present(leader.gap <= seen, *leader)
-    fastest = clamp_max(speed + parameters.max_acceleration * step, parameters.desired_speed)
-    braking, headway = parameters.comfortable_deceleration, parameters.time_headway
-    farthest = look_ahead_distance(fastest, headway, braking, step)
-    # A remainder takes longer than all else here; that of less than a loop is known.
-    beyond = xp.stack([place - edge * lane_length for edge in range(RING_EDGES)])
-    beyond = xp.where(beyond < 0.0, beyond + loop_length, beyond)
-    last, columns = beyond.argmin(1), xp.arange(speed.shape[1])
-    first, speeds = beyond[xp.arange(RING_EDGES)[:, None], last, columns], speed[last, columns]
-    sees, looked_at = seen > 0.0, 0.0 * loop_length
+    yield leader_if_present(leader.gap <= distance, *leader)
+    max_speed = clamp_max(speed + parameters.max_acceleration * step, parameters.desired_speed)
+    braking, time_headway = parameters.comfortable_deceleration, parameters.time_headway
+    look_ahead = look_ahead_distance(max_speed, time_headway, braking, step)
+    # A remainder takes longer than everything else here; the remainder of less than one loop needs no division.
+    offsets = xp.stack([place - edge * lane_length for edge in range(RING_EDGES)])
+    offsets = xp.where(offsets < 0.0, offsets + loop_length, offsets)
+    last, columns = offsets.argmin(1), xp.arange(speed.shape[1])
+    fronts, speeds = offsets[xp.arange(RING_EDGES)[:, None], last, columns], speed[last, columns]
+    sees, seen_length = distance > 0.0, 0.0 * loop_length
     while bool(sees.any()):
         lane = xp.where(lane == RING_EDGES - 1.0, 0.0, lane + 1.0)
-        number = xp.asarray(lane, dtype=xp.int64)
-        front, there = first[number, columns], speeds[number, columns]
-        # Whoever's rear bumper is still on a lane is there too.
-        occupied = sees & (front < lane_length + VEHICLE_LENGTH)
-        yield leader_if_present(occupied, there, seen + front - VEHICLE_LENGTH)
-        looked_at = looked_at + lane_length
-        seen = seen + lane_length
-        sees = sees & ((seen <= farthest) | (looked_at <= MIN_LOOK_AHEAD))
+        index = xp.asarray(lane, dtype=xp.int64)
+        front, leader_speed = fronts[index, columns], speeds[index, columns]
+        # A vehicle with its rear bumper on a lane is on that lane, too.
+        is_occupied = sees & (front < lane_length + VEHICLE_LENGTH)
+        yield leader_if_present(is_occupied, leader_speed, distance + front - VEHICLE_LENGTH)
+        seen_length = seen_length + lane_length
+        distance = distance + lane_length
+        sees = sees & ((distance <= look_ahead) | (seen_length <= MIN_LOOK_AHEAD))
 
 
 def look_ahead_distance(max_speed: Array, time_headway: Array, braking: Array, step: float) -> Array:
-    """Return how far vehicles look ahead that may be so fast after this step: to stand after a headway [m].
+    """Return how far drivers look ahead who reach `max_speed` in this step: far enough to stop after a headway [m].
 
     Shapes: any, broadcast together. Units: m/s, s, m/s2, s.
     """
@@ -88,23 +88,22 @@ def look_ahead_distance(max_speed: Array, time_headway: Array, braking: Array, s
 
 
 def lane_end_leader(speed: Array, position: Array, loop_length: Array, parameters: IDMParameters | IDMArrays) -> Leader:
-    """Return whom people follow who drive faster than they want: the end of their lane, as if it stood there.
+    """Return the leader of drivers above their desired speed: the end of their lane, as a standing vehicle.
 
-    Shapes as in `leaders`. The gap is at least what SUMO's `getSecureGap` says of the desired speed.
+    Shapes as in `leaders`. The gap is at least that of SUMO's `getSecureGap` at the desired speed.
     """
-    lane_length = loop_length / RING_EDGES
-    wanted = parameters.desired_speed
-    secure = wanted * (parameters.time_headway + wanted / parameters.interaction_scale)
-    return Leader(0.0 * speed, clamp_min(lane_length - position % lane_length, secure))
+    lane_length, desired = loop_length / RING_EDGES, parameters.desired_speed
+    secure_gap = desired * (parameters.time_headway + desired / parameters.interaction_scale)
+    return Leader(0.0 * speed, clamp_min(lane_length - position % lane_length, secure_gap))
 
 
 def ring_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
-    """Return which vehicles touch the one ahead as SUMO sees it: where both fronts are on the same lane.
+    """Return which vehicles touch the vehicle ahead according to SUMO, which requires both fronts on the same lane.
 
     Args:
         position: front bumpers along the ring [m], shape (vehicles, ...).
         gap: to the vehicle ahead [m], likewise.
-        loop: length of the ring [m].
+        loop_length: length of the ring [m].
     """
     xp = namespace(position)
     lane = xp.floor(position % loop_length / (loop_length / RING_EDGES))

@@ -33,12 +33,12 @@ from unjam.worlds.reward import make_reward
 from unjam.worlds.worker_pool import EpisodeTask
 
 _WarmUpKey = tuple[LoopScenario, tuple[int, ...], frozenset[str]]
-"""a ring, an episode's seed, and what of all that is told drivers ask for"""
+"""a scenario, the seed of an episode, and the fields that the driver measures"""
 WARM_UP_CACHE = WarmUpCache[_WarmUpKey]()
 MAX_BATCH_ROADS = 128
-"""rings that are stepped at once at most, where whole episodes are kept: some 130 MB for 22 vehicles each"""
+"""maximum number of rings in a batch that keeps whole episodes: some 130 MB for 22 vehicles each"""
 MAX_BATCH_MOTORWAYS = 64
-"""motorways, likewise: some 40 MB each"""
+"""the same for motorways: some 40 MB each"""
 
 
 def start_batch_drive(
@@ -48,25 +48,27 @@ def start_batch_drive(
     explore: float = 0.0,
     memory: Memory | None = None,
 ) -> DriveLoop:
-    """Return a driver who has just begun in a batch, and remembers in its arrays.
+    """Return the loop of a driver that starts to drive all CAVs of a batch.
 
     Args:
-        world: where.
-        driver: of every CAV; where arrays are tensors, one who takes them.
-        numbers: makes the world's arrays.
-        explore: by how much exploration noise of what was learned counts.
-        memory: what the driver remembers already; None: nothing but what the world began with.
+        world: the batch.
+        driver: of every CAV; if arrays are tensors, it must accept tensors.
+        to_array: makes the world's arrays.
+        explore: factor of the exploration noise of networks.
+        memory: the driver's memory; None: it remembers only the warm-up.
     """
     world.measured_fields = driver.measured_fields
-    if memory is None:  # who drives which CAV of a ring does not depend on the other rings
+    if memory is None:  # the driver of each CAV of a ring does not depend on the other rings
         rings = len(world.roads)
-        each_ring = driver.initial_memory(world.cav_count // rings)
-        memory = map_leaves(lambda values: np.repeat(values, rings, axis=0), each_ring)
-    driving = DriveLoop(world, driver, explore, memory)
-    driving.memory = map_leaves(to_array, driving.memory)
-    if driver.action_repeat > 1 and RESIDUAL_AGE_KEY in driving.memory:
-        driving.memory[RESIDUAL_AGE_KEY] = 0.0  # all rows began together: no network is asked while residuals are held
-    return driving
+        ring_memory = driver.initial_memory(world.cav_count // rings)
+        memory = map_leaves(lambda values: np.repeat(values, rings, axis=0), ring_memory)
+    loop = DriveLoop(world, driver, explore, memory)
+    loop.memory = map_leaves(to_array, loop.memory)
+    if driver.action_repeat > 1 and RESIDUAL_AGE_KEY in loop.memory:
+        loop.memory[RESIDUAL_AGE_KEY] = (
+            0.0  # the same for all rows, so that no network is called while residuals are held
+        )
+    return loop
 
 
 def run_batch(
@@ -75,79 +77,80 @@ def run_batch(
     upcoming: Sequence[EpisodeTask] = (),
     allow_statistical: bool = False,
 ) -> list[Episode]:
-    """Return the episodes of tasks, as `run_episode` does in SUMO, but for rounding; all are stepped at once.
+    """Return the episodes of tasks, which are simulated at once; equal to `run_episode` in SUMO except for rounding.
 
     Args:
-        tasks: roads that differ in length, seed and driver alone; motorways also in exploration.
-        numbers: makes the arrays that are stepped.
-        coming: tasks that will follow, alike; they are warmed up beforehand where these have to be.
-        statistical: whether roads are allowed whose episodes are SUMO's in distribution alone.
+        tasks: differ at most in road length, seed and driver, and on motorways in exploration.
+        to_array: makes the arrays of the simulation.
+        upcoming: similar tasks that will follow; if warm-ups are needed now, theirs are simulated together with these.
+        allow_statistical: whether to allow scenarios whose episodes equal SUMO's only in distribution.
 
     Raises:
-        InputError: the tasks differ in more, or `batch.possible.unsupported_reason` says why they cannot be run so.
+        InputError: the tasks differ in more, or `unjam.worlds.batch.support` says why they are not supported.
     """
     first = tasks[0]
-    if any(_shared_settings(each) != _shared_settings(first) for each in tasks):
+    if any(_shared_settings(task) != _shared_settings(first) for task in tasks):
         raise InputError("batch: the tasks differ in driver, reward or exploration")
-    earned = make_reward(first.reward or first.scenario.reward)
-    return [add_reward_terms(episode, earned) for episode in _run_at_once(tasks, to_array, upcoming, allow_statistical)]
+    reward = make_reward(first.reward or first.scenario.reward)
+    return [add_reward_terms(episode, reward) for episode in _run_at_once(tasks, to_array, upcoming, allow_statistical)]
 
 
 def _run_at_once(
     tasks: Sequence[EpisodeTask], to_array: ArrayFactory, upcoming: Sequence[EpisodeTask], allow_statistical: bool
 ) -> Sequence[Episode]:
-    """Return the episodes of tasks, without what was earned; arguments as of `run_batch`."""
+    """Return the episodes of tasks without rewards; arguments as of `run_batch`."""
     first = tasks[0]
     for task in tasks:
         check_can_drive(task.driver, task.scenario)
     if isinstance(first.scenario, OnRamp):
         check_batch_scenarios([task.scenario for task in tasks], allow_statistical)
-        if len(tasks) > 1 and any(_depends_on_entry_order(task.driver) for task in tasks):  # those of its own road
-            return [each for task in tasks for each in _run_at_once([task], to_array, (), allow_statistical)]
+        if len(tasks) > 1 and any(
+            _depends_on_entry_order(task.driver) for task in tasks
+        ):  # which must be that of one road
+            return [episode for task in tasks for episode in _run_at_once([task], to_array, (), allow_statistical)]
         explore = [task.explore for task in tasks]
         motorways = MotorwayBatch(first.scenario, [task.seed for task in tasks], explore=explore)
-        driver = _combined_driver(tasks, lambda owner: owner[motorways.cav_roads])
+        driver = _combined_driver(tasks, lambda indices: indices[motorways.cav_roads])
         motorways.measured_fields = driver.measured_fields
         episodes = finish_drive(DriveLoop(motorways, driver, float(any(explore))))
         for episode in episodes:
             check_has_cavs(episode, driver)
         return episodes
-    scenarios, seeds = [cast(LoopScenario, each.scenario) for each in tasks], [each.seed for each in tasks]
+    scenarios, seeds = [cast(LoopScenario, task.scenario) for task in tasks], [task.seed for task in tasks]
     world = RingBatch(scenarios, seeds, to_array, first.reward, allow_statistical=allow_statistical)
     if world.scenario.warmup > 0:
-        world.warm_up_states = WARM_UP_CACHE.get_states(
-            [_warm_up_key(task) for task in tasks], [_warm_up_key(task) for task in upcoming], _warm_up
-        )
-    driver = _combined_driver(tasks, lambda owner: to_array(np.tile(owner, world.cav_count // len(owner))))
+        keys, upcoming_keys = (list(map(_warm_up_key, each)) for each in (tasks, upcoming))
+        world.warm_up_states = WARM_UP_CACHE.get_states(keys, upcoming_keys, _warm_up)
+    driver = _combined_driver(tasks, lambda indices: to_array(np.tile(indices, world.cav_count // len(indices))))
     rings: RingResults = finish_drive(start_batch_drive(world, driver, to_array, first.explore))
     return rings.episodes
 
 
 @dataclass(frozen=True)
 class DriverPerRoad(MixedDriver):
-    """Drives each road of a batch by its own of several drivers."""
+    """Drives each road of a batch with its own one of several drivers."""
 
     driver_indices: Callable[[], Array]
-    """returns which driver each CAV's road has, of all CAVs that are there now"""
+    """returns the index of the driver of each CAV that is on a road now"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration that each CAV's driver wants, and the new memory."""
+        """Return the acceleration of each CAV's driver, and the new memory."""
         return super().act(state, memory | {DRIVER_INDEX_KEY: self.driver_indices()})
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return for each CAV that of its driver."""
+        """Return the time gap of each CAV's driver."""
         return super().time_gaps(state, memory | {DRIVER_INDEX_KEY: self.driver_indices()})
 
 
 def _depends_on_entry_order(driver: Driver) -> bool:
-    """Return whether who drives a CAV depends on how many entered before it."""
+    """Return whether the driver of a CAV depends on the number of CAVs that entered before it."""
     return isinstance(driver, MixedDriver) or any(map(_depends_on_entry_order, driver.inner_drivers.values()))
 
 
 def _combined_driver(tasks: Sequence[EpisodeTask], to_cavs: Callable[[Array], Array]) -> Driver:
-    """Return the driver of all tasks, or who drives each road by its own.
+    """Return the common driver of tasks, or one that drives each road with its own driver.
 
-    `of_cavs` returns what it is given of each road, shape (W,), of each CAV that is there.
+    `to_cavs` maps values of the roads, shape (W,), to those of the CAVs on them.
     """
     drivers = list[Driver]()
     for task in tasks:
@@ -155,8 +158,8 @@ def _combined_driver(tasks: Sequence[EpisodeTask], to_cavs: Callable[[Array], Ar
             drivers.append(task.driver)
     if len(drivers) == 1:
         return drivers[0]
-    owner = np.array([drivers.index(task.driver) for task in tasks])
-    return DriverPerRoad(tuple(drivers), lambda: to_cavs(owner))
+    indices = np.array([drivers.index(task.driver) for task in tasks])
+    return DriverPerRoad(tuple(drivers), lambda: to_cavs(indices))
 
 
 def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
@@ -164,39 +167,37 @@ def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
 
 
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
-    """Return rings after their warm-up, `MOST` at once."""
-    found: dict[_WarmUpKey, WarmUpState] = {}
-    for some in (keys[first : first + MAX_BATCH_ROADS] for first in range(0, len(keys), MAX_BATCH_ROADS)):
-        scenarios, seeds, (asked, *_) = zip(*some, strict=True)
+    """Return the states of rings after their warm-up, simulated in batches of `MAX_BATCH_ROADS`."""
+    states: dict[_WarmUpKey, WarmUpState] = {}
+    for batch in (keys[first : first + MAX_BATCH_ROADS] for first in range(0, len(keys), MAX_BATCH_ROADS)):
+        scenarios, seeds, (measured_fields, *_) = zip(*batch, strict=True)
         world = RingBatch(scenarios, seeds, keep_record=False, allow_statistical=True)
-        world.measured_fields = asked
-        found |= zip(some, world.run_warm_up(), strict=True)
-    return found
+        world.measured_fields = measured_fields
+        states |= zip(batch, world.run_warm_up(), strict=True)
+    return states
 
 
 def run_batches(
     tasks: Sequence[EpisodeTask], upcoming: Sequence[EpisodeTask] = (), allow_statistical: bool = False
 ) -> list[Episode]:
-    """Return the episodes of tasks on roads of any kinds, in their order; those that are alike at once.
+    """Return the episodes of tasks on roads of any kinds, in their order; similar tasks are simulated at once.
 
-    `is_approaching` are tasks that will follow, of any kinds; see `run_batch`, of `statistical` too.
+    `upcoming` are tasks of any kinds that will follow; see `run_batch`, also for `allow_statistical`.
     """
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
-        most = MAX_BATCH_MOTORWAYS if isinstance(task.scenario, OnRamp) else MAX_BATCH_ROADS
-        fits = (batch for batch in batches if len(batch) < most and _can_share_batch(task, next(iter(batch.values()))))
-        batch = next(fits, None)
+        size = MAX_BATCH_MOTORWAYS if isinstance(task.scenario, OnRamp) else MAX_BATCH_ROADS
+        suitable = (each for each in batches if len(each) < size and _can_share_batch(task, next(iter(each.values()))))
+        batch = next(suitable, None)
         if batch is None:
             batches.append(batch := {})
         batch[index] = task
-    found: dict[int, Episode] = {}
+    episodes: dict[int, Episode] = {}
     for batch in batches:
-        first = next(iter(batch.values()))
-        later = [task for task in upcoming if _can_share_batch(task, first)]
-        found |= zip(
-            batch, run_batch(list(batch.values()), upcoming=later, allow_statistical=allow_statistical), strict=True
-        )
-    return [found[index] for index in range(len(tasks))]
+        own = list(batch.values())
+        later = [task for task in upcoming if _can_share_batch(task, own[0])]
+        episodes |= zip(batch, run_batch(own, upcoming=later, allow_statistical=allow_statistical), strict=True)
+    return [episodes[index] for index in range(len(tasks))]
 
 
 def run_batched_if_supported(
@@ -205,29 +206,30 @@ def run_batched_if_supported(
     upcoming: Sequence[EpisodeTask] = (),
     allow_statistical: bool = False,
 ) -> list[Episode]:
-    """Return the episodes of tasks, in their order: in batches where that can be, else what `run` answers.
+    """Return the episodes of tasks in their order: from batches if these support them, else from `run_unsupported`.
 
-    `is_approaching` are tasks that will follow: see `run_batch`, of `statistical` too.
+    `upcoming` are tasks that will follow; see `run_batch`, also for `allow_statistical`.
     """
-    why_none = statistically_unsupported_reason if allow_statistical else unsupported_reason
-    batched = [not why_none(task.scenario) for task in tasks]
-    at_once = [task for task, possible in zip(tasks, batched, strict=True) if possible]
-    quick = iter(run_batches(at_once, upcoming, allow_statistical))
-    others = [task for task, possible in zip(tasks, batched, strict=True) if not possible]
-    slow = iter(run_unsupported(others) if others else ())
-    return [next(quick if possible else slow) for possible in batched]
+    reason_of = statistically_unsupported_reason if allow_statistical else unsupported_reason
+    is_supported = [not reason_of(task.scenario) for task in tasks]
+    supported, unsupported = (
+        [task for task, flag in zip(tasks, is_supported, strict=True) if flag is wanted] for wanted in (True, False)
+    )
+    batched = iter(run_batches(supported, upcoming, allow_statistical))
+    others = iter(run_unsupported(unsupported) if unsupported else ())
+    return [next(batched if flag else others) for flag in is_supported]
 
 
 def _shared_settings(task: EpisodeTask) -> tuple[object, ...]:
-    """Return in what tasks may not differ that are driven at once."""
-    alone = task.driver if task.driver.is_native or task.driver.network_inputs is not None else None
-    return alone, task.reward, task.explore != 0.0 if isinstance(task.scenario, OnRamp) else task.explore
+    """Return the settings that tasks must have in common to be simulated at once."""
+    is_indivisible = task.driver.is_native or task.driver.network_inputs is not None
+    explore = task.explore != 0.0 if isinstance(task.scenario, OnRamp) else task.explore
+    return task.driver if is_indivisible else None, task.reward, explore
 
 
 def _can_share_batch(first: EpisodeTask, second: EpisodeTask) -> bool:
-    together = isinstance(first.scenario, OnRamp) or first.driver == second.driver
     return (
-        together
+        (isinstance(first.scenario, OnRamp) or first.driver == second.driver)
         and _shared_settings(first) == _shared_settings(second)
         and differ_only_in_size(first.scenario, second.scenario)
     )

@@ -1,16 +1,13 @@
-"""How SUMO's own models follow and stop beneath commands: a quick IDM for people, a Krauss model for CAVs.
+"""SUMO's own car-following models, which limit commanded vehicles: a fast IDM for humans, a Krauss model for CAVs.
 
-Arrays have shape (vehicles, W). Sources: SUMO's MSCFModel_IDM (`_v`, `followSpeed`, `stopSpeed`),
-MSCFModel_Krauss, MSCFModel (`maximumSafeStopSpeedEuler`, `maximumSafeFollowSpeed`, `getMinimalArrivalTime`).
+Arrays have shape (vehicles, W). Sources: SUMO's MSCFModel_IDM (`_v`, `followSpeed`, `stopSpeed`), MSCFModel_Krauss,
+MSCFModel (`maximumSafeStopSpeedEuler`, `maximumSafeFollowSpeed`, `getMinimalArrivalTime`).
 """
-
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, square_root
-from unjam.physics.idm import IDMParameters, fast_power, idm_acceleration
+from unjam.physics.idm import IDMArrays, IDMParameters, fast_power, idm_acceleration
 from unjam.physics.kinematics import max_speed_to_stop, next_speed, stopping_distance
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, Scenario
 from unjam.worlds.batch.human_idm import EMERGENCY_BRAKING, SUMO_MIN_GAP, without_minimum_gap
@@ -18,140 +15,114 @@ from unjam.worlds.batch.leaders import look_ahead_distance
 from unjam.worlds.batch.noise import ArrayFactory
 
 COMMANDED_HUMAN_BRAKING = 4.5
-"""of commanded people's layer [m/s2]"""
+"""of SUMO's model beneath commanded human drivers [m/s2]"""
 HALTING_SPEED = 0.1
-"""speed below which SUMO says that a vehicle stands [m/s]"""
+"""speed below which SUMO counts a vehicle as standing [m/s]"""
 MIN_STOP_DISTANCE = 0.01
-"""way below which people's `stopSpeed` is zero [m]"""
+"""distance below which the `stopSpeed` of human drivers is zero [m]"""
 
 
-@dataclass(frozen=True)
 class CarFollowingModels:
-    """The models of the vehicles of a road: those at some places are CAVs, the others people."""
+    """The models of all vehicles of a road: CAVs and commanded human drivers."""
 
-    human_parameters: IDMParameters
-    """of commanded people"""
-    cav_indices: list[int]
-    """places of those that are driven by commands of a driver"""
-    braking: Array
-    """that SUMO gives each [m/s2], shape (vehicles, 1)"""
-    emergency_braking: Array
-    """hardest braking of each [m/s2], likewise"""
-    minimum_gap: Array
-    """gap that SUMO keeps for each [m], likewise"""
-    time_headway: Array
-    """time headway of each [s], likewise"""
-    cav_braking: float
-    """[m/s2]"""
-    speed_limit: float
-    """what the road allows [m/s]"""
-    step: float
-    """[s]"""
+    def __init__(self, scenario: Scenario, vehicle_count: int, cav_indices: list[int], to_array: ArrayFactory) -> None:
+        """Take the indices of the vehicles that a driver of CAVs commands."""
+        self._cav_indices, self._cav_braking = cav_indices, scenario.cav_max_braking
+        self.speed_limit, self._step = scenario.top_speed, scenario.simulation_step
+        """of the road [m/s]"""
+        self._humans = IDMParameters(
+            desired_speed=scenario.top_speed,
+            time_headway=1.0,
+            max_acceleration=SUMO_ACCELERATION,
+            comfortable_deceleration=COMMANDED_HUMAN_BRAKING,
+            exponent=scenario.humans.exponent,
+            minimum_gap=1e-9,
+        )
+        self._humans_before_stop = without_minimum_gap(self._humans)
+
+        def make_column(human: float, cav: float) -> Array:
+            column = np.full((vehicle_count, 1), human)
+            column[cav_indices] = cav
+            return to_array(column)
+
+        self.braking = make_column(COMMANDED_HUMAN_BRAKING, self._cav_braking)
+        """of SUMO's model [m/s2], shape (vehicles, 1)"""
+        self._emergency_braking = make_column(EMERGENCY_BRAKING, self._cav_braking)
+        self.minimum_gap = make_column(0.0, MIN_CAV_GAP)
+        """of SUMO's model [m], likewise"""
+        self._time_headway = make_column(1.0, scenario.simulation_step)
 
     def follow_speed(self, speed: Array, leader_speed: Array, gap: Array) -> Array:
-        """Return how fast each drives at most behind somebody a gap ahead [m/s]."""
-        found = self._idm_speed(speed, leader_speed, gap, self.human_parameters)
-        if own := self.cav_indices:
-            room = gap[own] - MIN_CAV_GAP + stopping_distance(leader_speed[own], self.cav_braking, self.step)
-            found[own] = self._krauss_speed(speed[own], room)
+        """Return the maximum speed behind a leader [m/s]."""
+        found = self._idm_speed(speed, leader_speed, gap, self._humans)
+        if own := self._cav_indices:
+            distance = gap[own] - MIN_CAV_GAP + stopping_distance(leader_speed[own], self._cav_braking, self._step)
+            found[own] = self._krauss_speed(speed[own], distance)
         return found
 
     def stop_speed(self, speed: Array, distance: Array) -> Array:
-        """Return how fast each drives at most that must stand within a way [m/s]."""
+        """Return the maximum speed of vehicles that must stop within a distance [m/s]."""
         xp = namespace(speed)
-        found = self._idm_speed(speed, 0.0, distance, without_minimum_gap(self.human_parameters))
-        creep = (speed < SUMO_MIN_GAP) & (found < SUMO_MIN_GAP)
-        if bool(creep.any()):  # the IDM would not start again before a line
-            reached = max_speed_to_stop(distance - SUMO_MIN_GAP, COMMANDED_HUMAN_BRAKING, self.step)
-            found = xp.where(creep, reached, found)
-        found = xp.minimum(found, distance / self.step) * (distance >= MIN_STOP_DISTANCE)
-        if own := self.cav_indices:
+        found = self._idm_speed(speed, 0.0, distance, self._humans_before_stop)
+        creeps = (speed < SUMO_MIN_GAP) & (found < SUMO_MIN_GAP)
+        if bool(creeps.any()):  # the IDM would not start again before a stop line
+            reachable = max_speed_to_stop(distance - SUMO_MIN_GAP, COMMANDED_HUMAN_BRAKING, self._step)
+            found = xp.where(creeps, reachable, found)
+        found = xp.minimum(found, distance / self._step) * (distance >= MIN_STOP_DISTANCE)
+        if own := self._cav_indices:
             found[own] = self._krauss_speed(speed[own], distance[own])
         return found
 
     def clip_speed(self, speed: Array, wanted_speed: Array) -> Array:
-        """Return speeds that engine and brakes allow [m/s]."""
+        """Return speeds within the limits of engine and brakes [m/s]."""
         xp = namespace(speed)
         return xp.maximum(xp.minimum(wanted_speed, self.max_speed(speed)), self.min_speed(speed))
 
     def min_speed(self, speed: Array) -> Array:
-        """Return the lowest speed after a step, but in an emergency [m/s]."""
-        return clamp_min(speed - self.braking * self.step, 0.0)
+        """Return the minimum speed after a step without emergency braking [m/s]."""
+        return clamp_min(speed - self.braking * self._step, 0.0)
 
     def max_speed(self, speed: Array) -> Array:
-        """Return the highest speed after a step [m/s]."""
-        return clamp_max(speed + SUMO_ACCELERATION * self.step, self.speed_limit)
+        """Return the maximum speed after a step [m/s]."""
+        return clamp_max(speed + SUMO_ACCELERATION * self._step, self.speed_limit)
 
     def finalize_speed(self, speed: Array, safe_speed: Array) -> Array:
-        """Return what nobody commands drives after a step, where so much is safe [m/s]."""
+        """Return the speed after a step of vehicles without commands, given their safe speed [m/s]."""
         xp = namespace(speed)
-        hard = clamp_min(speed - self.emergency_braking * self.step, 0.0)
-        slowest = xp.minimum(self.min_speed(speed), xp.maximum(safe_speed, hard))
-        return xp.maximum(slowest, xp.minimum(self.max_speed(speed), safe_speed))
+        emergency = clamp_min(speed - self._emergency_braking * self._step, 0.0)
+        lowest = xp.minimum(self.min_speed(speed), xp.maximum(safe_speed, emergency))
+        return xp.maximum(lowest, xp.minimum(self.max_speed(speed), safe_speed))
 
     def brake_gap(self, speed: Array) -> Array:
-        """Return the way in which each can stand, from the next step on [m]."""
-        return stopping_distance(speed, self.braking, self.step)
+        """Return the stopping distance from the next step on [m]."""
+        return stopping_distance(speed, self.braking, self._step)
 
     def look_ahead_distance(self, speed: Array) -> Array:
-        """Return how far each looks ahead: the way to stand after its headway, as fast as it may be [m]."""
-        return look_ahead_distance(self.max_speed(speed), self.time_headway, self.braking, self.step)
+        """Return how far drivers look ahead: far enough to stop after a headway at their maximum speed [m]."""
+        return look_ahead_distance(self.max_speed(speed), self._time_headway, self.braking, self._step)
 
     def arrival_time(self, distance: Array, speed: Array, arrival_speed: Array) -> Array:
-        """Return the soonest time in which a way is driven that ends with a speed at most [s]."""
+        """Return the minimum time for a distance that ends with at most `arrival_speed` [s]."""
         xp = namespace(speed)
-        faster = arrival_speed >= speed
-        acceleration = xp.where(faster, SUMO_ACCELERATION + 0.0 * speed, -self.braking + 0.0 * speed)
-        while_changing = (arrival_speed - speed) / acceleration
-        changing = while_changing * (arrival_speed + speed) * 0.5
-        steady = clamp_min(xp.maximum(speed, arrival_speed), HALTING_SPEED)
-        within = clamp_min(speed * speed + 2.0 * acceleration * distance, 0.0)
-        sooner = (square_root(within) - speed) / acceleration
-        return xp.where(distance >= changing, while_changing + (distance - changing) / steady, sooner)
+        accelerates = arrival_speed >= speed
+        acceleration = xp.where(accelerates, SUMO_ACCELERATION + 0.0 * speed, -self.braking + 0.0 * speed)
+        change_time = (arrival_speed - speed) / acceleration
+        change_distance = change_time * (arrival_speed + speed) * 0.5
+        steady_speed = clamp_min(xp.maximum(speed, arrival_speed), HALTING_SPEED)
+        squared_speed = clamp_min(speed * speed + 2.0 * acceleration * distance, 0.0)
+        time_while_changing = (square_root(squared_speed) - speed) / acceleration
+        time = change_time + (distance - change_distance) / steady_speed
+        return xp.where(distance >= change_distance, time, time_while_changing)
 
-    def _idm_speed(self, speed: Array, leader_speed: Array, gap: Array, parameters: Any) -> Array:
+    def _idm_speed(self, speed: Array, leader_speed: Array, gap: Array, parameters: IDMParameters | IDMArrays) -> Array:
         acceleration = idm_acceleration(speed, leader_speed, clamp_min(gap, SUMO_MIN_GAP), parameters, fast_power)
-        return next_speed(speed, acceleration, self.step)
+        return next_speed(speed, acceleration, self._step)
 
     def _krauss_speed(self, speed: Array, stop_distance: Array) -> Array:
-        within = max_speed_to_stop(stop_distance - SUMO_MIN_GAP, self.cav_braking, self.step)
-        return namespace(speed).minimum(within, self.max_speed(speed))
-
-
-def make_car_following_models(
-    scenario: Scenario, vehicle_count: int, cav_indices: list[int], to_array: ArrayFactory
-) -> CarFollowingModels:
-    """Return the models of a road on which those at the places `cavs` are driven by a driver."""
-    braking, emergency = (
-        np.full((vehicle_count, 1), COMMANDED_HUMAN_BRAKING),
-        np.full((vehicle_count, 1), EMERGENCY_BRAKING),
-    )
-    braking[cav_indices] = emergency[cav_indices] = scenario.cav_max_braking
-    keeps = np.zeros((vehicle_count, 1))
-    keeps[cav_indices] = MIN_CAV_GAP
-    headway = np.ones((vehicle_count, 1))
-    headway[cav_indices] = scenario.simulation_step
-    people = IDMParameters(
-        desired_speed=scenario.top_speed,
-        time_headway=1.0,
-        max_acceleration=SUMO_ACCELERATION,
-        comfortable_deceleration=COMMANDED_HUMAN_BRAKING,
-        exponent=scenario.humans.exponent,
-        minimum_gap=1e-9,
-    )
-    return CarFollowingModels(
-        human_parameters=people,
-        cav_indices=cav_indices,
-        braking=to_array(braking),
-        emergency_braking=to_array(emergency),
-        minimum_gap=to_array(keeps),
-        time_headway=to_array(headway),
-        cav_braking=scenario.cav_max_braking,
-        speed_limit=scenario.top_speed,
-        step=scenario.simulation_step,
-    )
+        safe = max_speed_to_stop(stop_distance - SUMO_MIN_GAP, self._cav_braking, self._step)
+        return namespace(speed).minimum(safe, self.max_speed(speed))
 
 
 def speed_after_distance(distance: Array, speed: Array) -> Array:
-    """Return how fast somebody is who speeds up over a way [m/s]."""
+    """Return the speed of vehicles that accelerate over a distance [m/s]."""
     return square_root(2.0 * SUMO_ACCELERATION * clamp_min(distance, 0.0) + speed * speed)

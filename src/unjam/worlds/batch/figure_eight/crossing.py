@@ -1,8 +1,8 @@
-"""Who goes first where a figure eight crosses itself, as SUMO's right of way has it, for W roads at once.
+"""SUMO's right of way where figure eights cross themselves, for W roads at once.
 
 Arrays have shape (vehicles, W). Sources: SUMO's MSVehicle (`planMoveInternal`, `checkLinkLeader`,
 `adaptToJunctionLeader`, `processLinkApproaches`, `isLeader`) and MSLink (`opened`, `blockedByFoe`,
-`computeFoeArrivalTimeBraking`, `getLeaderInfo`).
+`computeFoeArrivalTimeBraking`, `getLeaderInfo`). A foe is a vehicle on the other direction, as in SUMO.
 """
 
 from collections.abc import Sequence
@@ -21,77 +21,98 @@ from unjam.worlds.batch.leaders import FREE_GAP, Leader
 from unjam.worlds.batch.noise import ArrayFactory
 
 FOE_VISIBILITY_DISTANCE = 4.5
-"""way before the crossing from which those who must yield see who comes [m]"""
+"""distance before the crossing from which yielding vehicles see foes [m]"""
 MINOR_STOP_DISTANCE, MAJOR_STOP_DISTANCE = 0.1, 1.0
-"""way before the crossing at which vehicles stand that must wait [m]"""
+"""distance before the crossing at which waiting vehicles stop [m]"""
 FOE_TIME_MARGIN = 1.0
-"""time that must be left before who has the right of way arrives [s]"""
+"""minimum time between leaving the crossing and the arrival of a foe with the right of way [s]"""
 IMPATIENCE_TIME = 300.0
-"""time of waiting in which impatience grows by one [s]"""
+"""waiting time in which impatience grows by one [s]"""
 MAX_WAITING_ACCELERATION = 0.5 * SUMO_ACCELERATION
-"""acceleration up to which who stands waits [m/s2]"""
+"""acceleration up to which a slow vehicle counts as waiting [m/s2]"""
 CROSSED_LANE_WIDTH = 3.2
-"""of the lane that is crossed [m]"""
+"""[m]"""
 CONFLICT_AREA_START = CROSSING_LINK / 2.0 - CROSSED_LANE_WIDTH / 2.0
-"""way from the beginning of the crossing to the other lane [m]"""
+"""distance from the start of the crossing to the crossed lane [m]"""
 STOPPING_FOE_DELAY = 30.0
-"""later than it would be by so much who can stand before the crossing [s]"""
+"""additional arrival time of foes that can stop before the crossing [s]"""
 
 
-class Approach(NamedTuple):
-    """Those on their way to one side of the crossing, as SUMO plans their step."""
+class CrossingMemory(NamedTuple):
+    """The state that one step leaves to the next; shape (vehicles, W), or (vehicles,) of one road."""
+
+    waiting_time: Array
+    """[s]"""
+    entry_step: Array
+    """when each vehicle entered the crossing that it is on or was on last, in steps from now (at most 0)"""
+
+
+class _Motion(NamedTuple):
+    """The vehicles in a step, and their speed limits without the crossing."""
+
+    models: CarFollowingModels
+    speed: Array
+    leader: Leader
+    free_speed: Array
+    """maximum speed without other vehicles [m/s]"""
+    follow_speed: Array
+    """maximum speed behind the leader [m/s]"""
+    look_ahead: Array
+    """distance up to which vehicles look ahead [m]"""
+
+
+class _LastVehicle(NamedTuple):
+    """The last vehicle past the start of a crossing; shapes (W,)."""
+
+    front: Array
+    """of its front bumper past the start [m]"""
+    speed: Array
+    index: Array
+
+
+class _Approach(NamedTuple):
+    """The plans of vehicles that approach one side of the crossing."""
 
     distance: Array
     """to the crossing [m]; negative on it"""
     is_approaching: Array
-    """whether SUMO expects each there"""
+    """whether SUMO registers them"""
     approach_speed: Array
-    """that the road up to the crossing allows in this step [m/s]"""
+    """maximum speed in this step before the crossing [m/s]"""
     stop_speed: Array
-    """the same of who must wait [m/s]"""
+    """maximum speed of vehicles that must wait [m/s]"""
     go_speed: Array
-    """the same of who may go on [m/s]"""
+    """maximum speed of vehicles that may enter [m/s]"""
     arrival_time: Array
-    """when each arrives [s]"""
+    """at the crossing [s]"""
     leave_time: Array
-    """when each has left [s]"""
+    """from the crossing [s]"""
 
 
-class CrossingMemory(NamedTuple):
-    """What one step leaves to the next; shape (vehicles, W), or (vehicles,) of one road."""
-
-    waiting_time: Array
-    """how long each has stood [s]"""
-    entry_step: Array
-    """when each came onto the crossing it is on or was on last, steps from now"""
-
-
-def _last_vehicle(speed: Array, distance_past: Array) -> tuple[Array, Array, Array]:
-    """Return where the front of the last vehicle beyond a crossing is, its speed and its place, (W,) each."""
-    place = distance_past.argmin(0)
-    columns = np.arange(distance_past.shape[1])
-    return distance_past[place, columns], speed[place, columns], place
+def _last_vehicle(speed: Array, distance_past: Array) -> _LastVehicle:
+    index, columns = distance_past.argmin(0), np.arange(distance_past.shape[1])
+    return _LastVehicle(distance_past[index, columns], speed[index, columns], index)
 
 
 class Crossing:
-    """The right of way of W figures eight; it remembers who waits, and since when each is on the crossing."""
+    """The right of way of W figure eights, with its memory."""
 
     def __init__(self, scenario: Scenario, roads: Sequence[ClosedRoad], to_array: ArrayFactory) -> None:
-        """Take roads that cross themselves once: first the way that goes first, then the one that yields."""
+        """Take roads that cross themselves once, the direction with the right of way first."""
         self._figure_eights = make_figure_eights(roads, to_array)
         self._sumo_loop_length = self._figure_eights.loop_length
         self._crossings = to_array(np.transpose([road.crossings for road in roads], (1, 2, 0)))
         self._loop_length = to_array(np.array([road.loop_length for road in roads]))
         self._step, self._impatience = scenario.simulation_step, scenario.impatience
         self._to_array, self._columns = to_array, np.arange(len(roads))
-        none = to_array(np.zeros((len(roads[0].vehicle_ids), len(roads))))
-        self.memory = CrossingMemory(none, none)
+        zeros = to_array(np.zeros((len(roads[0].vehicle_ids), len(roads))))
+        self.memory = CrossingMemory(zeros, zeros)
 
     def is_on_crossing(self, position: Array) -> Array:
-        """Return who is on the crossing, where SUMO drives people itself."""
+        """Return which vehicles are on the crossing, where SUMO itself drives human-driven vehicles."""
         place = position % self._loop_length
-        (first, end), (second, last) = self._crossings
-        return ((first <= place) & (place < end)) | ((second <= place) & (place < last))
+        (major_start, major_end), (minor_start, minor_end) = self._crossings
+        return ((major_start <= place) & (place < major_end)) | ((minor_start <= place) & (place < minor_end))
 
     def next_speeds(
         self,
@@ -102,218 +123,187 @@ class Crossing:
         commanded_speed: Array,
         is_commanded: Array,
     ) -> Array:
-        """Return the speeds of a step, and remember it.
+        """Return the speeds after a step, and update the memory.
 
         Args:
-            layer: how SUMO's own models drive.
+            models: SUMO's car-following models.
             speed: [m/s].
             position: front bumpers along the road, wrapped or not [m].
-            ahead: the vehicle ahead of each.
-            wanted: speeds that are commanded [m/s].
-            commanded: whom; SUMO drives the others.
+            leader: the vehicle ahead of each.
+            commanded_speed: [m/s].
+            is_commanded: whether each vehicle is commanded; SUMO drives the others.
         """
         xp, step = namespace(speed), self._step
-        own = xp.where(is_commanded, models.clip_speed(speed, commanded_speed), models.max_speed(speed))
-        sight = models.look_ahead_distance(speed)
-        on, (major_side, minor_side, *_) = self._figure_eights.distances_past(position), self._figure_eights
-        seen = leader.gap <= self._visible_distance(sight, on)
-        follows = models.follow_speed(
-            speed, xp.where(seen, leader.speed, models.speed_limit), xp.where(seen, leader.gap, FREE_GAP)
-        )
-        across = [_last_vehicle(speed, each) for each in on]
-        safe = xp.minimum(own, follows)
-        for beyond, (foe, foe_speed, foe_place) in zip(on, across[::-1], strict=True):
-            safe = self._speed_on_crossing(models, speed, safe, beyond, foe, foe_speed, foe_place)
-        major, minor = (
-            self._approach(
-                models, side, stop, speed, self._sumo_loop_length - beyond, leader, own, follows, sight, *ways
-            )
-            for side, stop, beyond, ways in (
-                (major_side, MAJOR_STOP_DISTANCE, on[0], across),
-                (minor_side, MINOR_STOP_DISTANCE, on[1], across[::-1]),
-            )
-        )
+        free_speed = xp.where(is_commanded, models.clip_speed(speed, commanded_speed), models.max_speed(speed))
+        look_ahead = models.look_ahead_distance(speed)
+        distances_past, (major_side, minor_side, *_) = self._figure_eights.distances_past(position), self._figure_eights
+        is_visible = leader.gap <= self._visible_distance(look_ahead, distances_past)
+        leader_speed = xp.where(is_visible, leader.speed, models.speed_limit)
+        follow_speed = models.follow_speed(speed, leader_speed, xp.where(is_visible, leader.gap, FREE_GAP))
+        motion = _Motion(models, speed, leader, free_speed, follow_speed, look_ahead)
+        major_last, minor_last = (_last_vehicle(speed, each) for each in distances_past)
+        safe = xp.minimum(free_speed, follow_speed)
+        for distance_past, foe in zip(distances_past, (minor_last, major_last), strict=True):
+            safe = self._speed_on_crossing(motion, safe, distance_past, foe)
+        to_major, to_minor = (self._sumo_loop_length - each for each in distances_past)
+        major = self._approach(motion, major_side, MAJOR_STOP_DISTANCE, to_major, major_last, minor_last)
+        minor = self._approach(motion, minor_side, MINOR_STOP_DISTANCE, to_minor, minor_last, major_last)
         safe = xp.where(major.is_approaching, major.go_speed, safe)
         safe = xp.where(minor.is_approaching, minor.stop_speed, safe)
         first = minor.distance.argmin(0), self._columns
-        goes, can_brake = self._may_enter(models, speed, major, minor, first)
-        # Who would have to slow down to go on, and can still stand before the crossing, does that.
-        onward, now = minor.go_speed[first], speed[first]
-        slows = onward + SUMO_MIN_GAP < xp.minimum(minor.approach_speed, models.max_speed(speed))[first]
-        slows = slows & can_brake & (onward < now)
-        stands = xp.maximum(models.stop_speed(speed, minor.distance), models.min_speed(speed))[first]
-        onward = xp.where(slows, xp.minimum(onward, stands), onward)
-        safe[first] = xp.where(goes, onward, safe[first])
-        finished = models.finalize_speed(speed, safe)
-        finished = finished * (finished > STANDSTILL_ACCELERATION * step)
-        moved = xp.where(is_commanded, models.clip_speed(speed, xp.minimum(commanded_speed, safe)), finished)
-        self._update_memory(speed, moved, on)
+        may_enter, can_brake = self._may_enter(motion, major, minor, first)
+        # A vehicle that would have to slow down to enter, and can still stop before the crossing, stops.
+        go_speed = minor.go_speed[first]
+        slows_down = go_speed + SUMO_MIN_GAP < xp.minimum(minor.approach_speed, models.max_speed(speed))[first]
+        slows_down = slows_down & can_brake & (go_speed < speed[first])
+        stop_speed = xp.maximum(models.stop_speed(speed, minor.distance), models.min_speed(speed))[first]
+        go_speed = xp.where(slows_down, xp.minimum(go_speed, stop_speed), go_speed)
+        safe[first] = xp.where(may_enter, go_speed, safe[first])
+        uncommanded = models.finalize_speed(speed, safe)
+        uncommanded = uncommanded * (uncommanded > STANDSTILL_ACCELERATION * step)
+        commanded = models.clip_speed(speed, xp.minimum(commanded_speed, safe))
+        moved = xp.where(is_commanded, commanded, uncommanded)
+        self._update_memory(speed, moved, distances_past)
         return moved
 
     def record_step(self, speed: Array, next_speed: Array, position: Array) -> None:
-        """Remember a step in which vehicles moved so; arguments as of `moved`."""
+        """Update the memory after a recorded step; arguments as of `next_speeds`."""
         self._update_memory(speed, next_speed, self._figure_eights.distances_past(position))
 
     def _visible_distance(self, look_ahead: Array, distances_past: list[Array]) -> Array:
-        """Return how far ahead each sees others [m]: to the end of a lane beyond those it must look at."""
+        """Return the distance up to which leaders are visible: the end of the last lane that SUMO looks at [m]."""
         xp = namespace(look_ahead)
-        found = look_ahead + self._sumo_loop_length
-        for side, beyond in zip(self._figure_eights[:2], distances_past, strict=True):
-            way = self._sumo_loop_length - beyond
+        visible = look_ahead + self._sumo_loop_length
+        for side, distance_past in zip(self._figure_eights[:2], distances_past, strict=True):
+            distance = self._sumo_loop_length - distance_past
             after = CROSSING_LINK + side.lane_length
-            across = xp.where((way <= side.lane_length) | (way <= look_ahead), way + after, way)
-            found = xp.where(way <= side.approach_distance, across, found)
-            found = xp.where(beyond < CROSSING_LINK, after - beyond, found)
-        return xp.where(found <= look_ahead, look_ahead + self._sumo_loop_length, found)
+            looks_past = (distance <= side.lane_length) | (distance <= look_ahead)
+            to_end = xp.where(looks_past, distance + after, distance)
+            visible = xp.where(distance <= side.approach_distance, to_end, visible)
+            visible = xp.where(distance_past < CROSSING_LINK, after - distance_past, visible)
+        return xp.where(visible <= look_ahead, look_ahead + self._sumo_loop_length, visible)
 
     def _approach(
         self,
-        models: CarFollowingModels,
+        motion: _Motion,
         side: CrossingSide,
         stop_distance: float,
-        speed: Array,
         distance: Array,
-        leader: Leader,
-        free_speed: Array,
-        follow_speed: Array,
-        look_ahead: Array,
-        last_vehicle: tuple[Array, Array, Array],
-        foe: tuple[Array, Array, Array],
-    ) -> Approach:
-        """Return how all come to one side; `is_present` is the last vehicle on it, `foe` that on the other one."""
-        xp = namespace(speed)
-        coming, on_lane = distance <= side.approach_distance, distance <= side.lane_length
-        front = xp.where(on_lane, -distance, self._sumo_loop_length - distance)
-        last = front.argmin(0)
-        last_front, last_speed = front[last, self._columns], speed[last, self._columns]
-        # The car ahead counts on the lane on which its rear bumper is; who is still before the lane also sees
-        # the last car of it.
-        before_lane, before_crossing = leader.gap <= distance - side.lane_length, leader.gap <= distance
-        sees = ~on_lane & (last_front < VEHICLE_LENGTH)
-        to_last = models.follow_speed(speed, last_speed + 0.0 * speed, distance + last_front - VEHICLE_LENGTH)
-        before = xp.where(before_lane, xp.minimum(free_speed, follow_speed), free_speed)
-        nearest = xp.where(before_crossing, follow_speed, models.speed_limit)
-        nearest = xp.where(sees, xp.minimum(nearest, to_last), nearest)
+        last: _LastVehicle,
+        foe: _LastVehicle,
+    ) -> _Approach:
+        """Return the plans of all vehicles for one side, `last` being the last vehicle past its start."""
+        models, speed, leader, free_speed, follow_speed, look_ahead = motion
+        xp, speed_limit = namespace(speed), models.speed_limit
+        is_approaching, is_on_lane = distance <= side.approach_distance, distance <= side.lane_length
+        front = xp.where(is_on_lane, -distance, self._sumo_loop_length - distance)
+        rearmost = front.argmin(0)
+        lane_front, lane_speed = front[rearmost, self._columns], speed[rearmost, self._columns]
+        # The leader counts on the lane of its rear bumper; vehicles before the lane also see the last vehicle on it.
+        is_leader_before_lane, is_leader_before = leader.gap <= distance - side.lane_length, leader.gap <= distance
+        sees_lane = ~is_on_lane & (lane_front < VEHICLE_LENGTH)
+        behind_lane = models.follow_speed(speed, lane_speed + 0.0 * speed, distance + lane_front - VEHICLE_LENGTH)
+        before_lane = xp.where(is_leader_before_lane, xp.minimum(free_speed, follow_speed), free_speed)
+        nearest = xp.where(is_leader_before, follow_speed, speed_limit)
+        nearest = xp.where(sees_lane, xp.minimum(nearest, behind_lane), nearest)
         to_crossing = xp.minimum(free_speed, nearest)
-        passing = clamp_max(speed_after_distance(xp.minimum(distance, side.lane_length), before), models.speed_limit)
-        limiting = xp.where(on_lane, nearest, xp.where(sees, to_last, models.speed_limit))
-        passing = xp.minimum(passing, limiting)
-        there_front, there_speed, _ = last_vehicle
-        gap = distance + there_front - VEHICLE_LENGTH
-        looks = coming & (on_lane | (distance <= look_ahead))
-        occupied = looks & (there_front < CROSSING_LINK + VEHICLE_LENGTH)
-        leaving = clamp_max(speed_after_distance(CROSSING_LINK + 0.0 * distance, passing), models.speed_limit)
-        leaving = xp.where(
-            occupied, xp.minimum(leaving, models.follow_speed(leaving, there_speed + 0.0 * speed, gap)), leaving
-        )
-        beyond = xp.minimum(to_crossing, follow_speed)
-        to_there = models.follow_speed(speed, there_speed + 0.0 * speed, gap)
-        beyond = xp.where(occupied, xp.minimum(beyond, to_there), beyond)
-        kept = clamp_min(clamp_max(distance - models.brake_gap(speed), stop_distance), MINOR_STOP_DISTANCE)
-        waiting = xp.minimum(to_crossing, models.stop_speed(speed, clamp_min(distance - kept, 0.0)))
-        waiting = xp.where(occupied, xp.minimum(waiting, to_there), waiting)
-        foe_front, foe_speed, _ = foe
-        behind = self._speed_behind_foe(models, speed, distance, foe_front, foe_speed)
-        crossed = looks & (foe_front < CONFLICT_AREA_START + CROSSED_LANE_WIDTH + VEHICLE_LENGTH)
-        beyond = xp.where(crossed, xp.maximum(xp.minimum(beyond, behind), waiting), beyond)
-        leaving = xp.where(crossed, xp.minimum(leaving, behind), leaving)
-        arrival = models.arrival_time(distance, to_crossing, passing) - self._step
-        mean = clamp_min(0.5 * (passing + leaving), 1e-3)
-        left = arrival + (CROSSING_LINK + VEHICLE_LENGTH) / mean
-        return Approach(distance, coming, to_crossing, waiting, beyond, arrival, left)
+        passing = clamp_max(speed_after_distance(xp.minimum(distance, side.lane_length), before_lane), speed_limit)
+        passing = xp.minimum(passing, xp.where(is_on_lane, nearest, xp.where(sees_lane, behind_lane, speed_limit)))
+        last_speed, gap = last.speed + 0.0 * speed, distance + last.front - VEHICLE_LENGTH
+        looks = is_approaching & (is_on_lane | (distance <= look_ahead))
+        is_occupied = looks & (last.front < CROSSING_LINK + VEHICLE_LENGTH)
+        leaving = clamp_max(speed_after_distance(CROSSING_LINK + 0.0 * distance, passing), speed_limit)
+        leaving_behind = xp.minimum(leaving, models.follow_speed(leaving, last_speed, gap))
+        leaving = xp.where(is_occupied, leaving_behind, leaving)
+        behind_last = models.follow_speed(speed, last_speed, gap)
+        go_speed = xp.minimum(to_crossing, follow_speed)
+        go_speed = xp.where(is_occupied, xp.minimum(go_speed, behind_last), go_speed)
+        stop_gap = clamp_min(clamp_max(distance - models.brake_gap(speed), stop_distance), MINOR_STOP_DISTANCE)
+        stop_speed = xp.minimum(to_crossing, models.stop_speed(speed, clamp_min(distance - stop_gap, 0.0)))
+        stop_speed = xp.where(is_occupied, xp.minimum(stop_speed, behind_last), stop_speed)
+        behind_foe = self._speed_behind_foe(models, speed, distance, foe)
+        is_crossed = looks & (foe.front < CONFLICT_AREA_START + CROSSED_LANE_WIDTH + VEHICLE_LENGTH)
+        go_speed = xp.where(is_crossed, xp.maximum(xp.minimum(go_speed, behind_foe), stop_speed), go_speed)
+        leaving = xp.where(is_crossed, xp.minimum(leaving, behind_foe), leaving)
+        arrival_time = models.arrival_time(distance, to_crossing, passing) - self._step
+        mean_speed = clamp_min(0.5 * (passing + leaving), 1e-3)
+        leave_time = arrival_time + (CROSSING_LINK + VEHICLE_LENGTH) / mean_speed
+        return _Approach(distance, is_approaching, to_crossing, stop_speed, go_speed, arrival_time, leave_time)
 
-    def _speed_behind_foe(
-        self, models: CarFollowingModels, speed: Array, distance: Array, foe_front: Array, foe_speed: Array
-    ) -> Array:
-        """Return how fast each drives at most that must let somebody on the crossing pass [m/s]."""
-        xp = namespace(speed)
-        keeps = models.minimum_gap
-        rear = CONFLICT_AREA_START - (foe_front - VEHICLE_LENGTH)
+    def _speed_behind_foe(self, models: CarFollowingModels, speed: Array, distance: Array, foe: _LastVehicle) -> Array:
+        """Return the maximum speed of vehicles that must let a foe on the crossing pass [m/s]."""
+        xp, minimum_gap = namespace(speed), models.minimum_gap
+        rear = CONFLICT_AREA_START - (foe.front - VEHICLE_LENGTH)
         to_area = distance + CONFLICT_AREA_START
         gap = to_area - rear - CROSSED_LANE_WIDTH
-        free = gap - keeps >= 0.0
         safe = xp.where(
-            free,
-            models.follow_speed(speed, foe_speed + 0.0 * speed, gap),
+            gap - minimum_gap >= 0.0,
+            models.follow_speed(speed, foe.speed + 0.0 * speed, gap),
             models.stop_speed(speed, clamp_min(distance - MINOR_STOP_DISTANCE, 0.0)),
         )
-        stands = models.stop_speed(speed, clamp_min(to_area - keeps, 0.0))
-        until_past = (keeps + rear + CROSSED_LANE_WIDTH) / clamp_min(foe_speed, HALTING_SPEED)
-        until_past = clamp_min(until_past, 1e-3)
-        final = xp.maximum(speed, 2.0 * (to_area - keeps) / until_past - speed)
-        drives_up = speed + (final - speed) / until_past * self._step
-        return xp.where(to_area >= 0.0, xp.maximum(safe, xp.minimum(drives_up, stands)), safe)
+        stop_speed = models.stop_speed(speed, clamp_min(to_area - minimum_gap, 0.0))
+        pass_time = clamp_min((minimum_gap + rear + CROSSED_LANE_WIDTH) / clamp_min(foe.speed, HALTING_SPEED), 1e-3)
+        final = xp.maximum(speed, 2.0 * (to_area - minimum_gap) / pass_time - speed)
+        drives_up = speed + (final - speed) / pass_time * self._step
+        return xp.where(to_area >= 0.0, xp.maximum(safe, xp.minimum(drives_up, stop_speed)), safe)
 
-    def _speed_on_crossing(
-        self,
-        models: CarFollowingModels,
-        speed: Array,
-        safe_speed: Array,
-        distance_past: Array,
-        foe_front: Array,
-        foe_speed: Array,
-        foe_index: Array,
-    ) -> Array:
-        """Return how fast those drive who have just begun to cross: who came first goes first [m/s]."""
-        xp = namespace(speed)
-        early = (distance_past < CONFLICT_AREA_START + MINOR_STOP_DISTANCE) & (
-            foe_front < CONFLICT_AREA_START + CROSSED_LANE_WIDTH + VEHICLE_LENGTH
+    def _speed_on_crossing(self, motion: _Motion, safe_speed: Array, distance_past: Array, foe: _LastVehicle) -> Array:
+        """Return the maximum speed of vehicles that just entered the crossing: the earlier vehicle goes first [m/s]."""
+        xp, speed = namespace(motion.speed), motion.speed
+        has_conflict = (distance_past < CONFLICT_AREA_START + MINOR_STOP_DISTANCE) & (
+            foe.front < CONFLICT_AREA_START + CROSSED_LANE_WIDTH + VEHICLE_LENGTH
         )
-        if not bool(early.any()):
+        if not bool(has_conflict.any()):
             return safe_speed
-        entered = self.memory.entry_step
-        came = entered[foe_index, self._columns]
-        sooner = (entered > came) | ((entered == came) & (speed < foe_speed))
-        in_the_way = (foe_front > CONFLICT_AREA_START) & (distance_past < CONFLICT_AREA_START)
-        leads = early & (sooner | in_the_way | (foe_front > CROSSING_LINK))
-        behind = self._speed_behind_foe(models, speed, -distance_past, foe_front, foe_speed)
-        return xp.where(leads, xp.minimum(safe_speed, behind), safe_speed)
+        entry = self.memory.entry_step
+        foe_entry = entry[foe.index, self._columns]
+        is_foe_earlier = (entry > foe_entry) | ((entry == foe_entry) & (speed < foe.speed))
+        is_foe_in_area = (foe.front > CONFLICT_AREA_START) & (distance_past < CONFLICT_AREA_START)
+        yields = has_conflict & (is_foe_earlier | is_foe_in_area | (foe.front > CROSSING_LINK))
+        behind = self._speed_behind_foe(motion.models, speed, -distance_past, foe)
+        return xp.where(yields, xp.minimum(safe_speed, behind), safe_speed)
 
     def _may_enter(
-        self,
-        models: CarFollowingModels,
-        speed: Array,
-        major: Approach,
-        minor: Approach,
-        first_index: tuple[Array, Array],
+        self, motion: _Motion, major: _Approach, minor: _Approach, first: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Return where the first of those who yield may go, and whether it can still stand, (W,) each."""
-        xp, step = namespace(speed), self._step
-        way, arrival, leaving = (each[first_index] for each in (minor.distance, minor.arrival_time, minor.leave_time))
-        can_brake = (way > models.brake_gap(speed)[first_index]) | (models.min_speed(speed)[first_index] == 0.0)
-        patience = clamp_max(self._impatience + self.memory.waiting_time[first_index] / IMPATIENCE_TIME, 1.0)
-        impatience = xp.where(can_brake, patience, 1.0)
+        """Return whether the first yielding vehicle may enter, and whether it can still stop, (W,) each."""
+        (models, speed, *_), xp = motion, namespace(motion.speed)
+        distance, arrival, leave = (each[first] for each in (minor.distance, minor.arrival_time, minor.leave_time))
+        can_brake = (distance > models.brake_gap(speed)[first]) | (models.min_speed(speed)[first] == 0.0)
+        impatience = clamp_max(self._impatience + self.memory.waiting_time[first] / IMPATIENCE_TIME, 1.0)
+        impatience = xp.where(can_brake, impatience, 1.0)
         expected = major.arrival_time + impatience * self._foe_delay(models, major, arrival, impatience)
         expected = xp.where(arrival < major.arrival_time, expected, major.arrival_time)
-        passes = (major.leave_time < arrival) | (expected > leaving + FOE_TIME_MARGIN)
-        blocks = major.is_approaching & (major.approach_speed > STANDSTILL_ACCELERATION * step) & ~passes
-        return (way <= FOE_VISIBILITY_DISTANCE) & minor.is_approaching[first_index] & ~blocks.any(0), can_brake
+        has_room = (major.leave_time < arrival) | (expected > leave + FOE_TIME_MARGIN)
+        moves = major.approach_speed > STANDSTILL_ACCELERATION * self._step
+        is_blocked = (major.is_approaching & moves & ~has_room).any(0)
+        return (distance <= FOE_VISIBILITY_DISTANCE) & minor.is_approaching[first] & ~is_blocked, can_brake
 
-    def _foe_delay(self, models: CarFollowingModels, major: Approach, arrival_time: Array, impatience: Array) -> Array:
-        """Return how much later each would arrive who begins to brake as another one does [s]."""
+    def _foe_delay(self, models: CarFollowingModels, major: _Approach, arrival_time: Array, impatience: Array) -> Array:
+        """Return the delay of each foe that starts to brake when the other vehicle arrives [s]."""
         xp, step = namespace(arrival_time), self._step
-        begin = xp.ceil(arrival_time / step) * step
-        same = xp.floor(arrival_time / step) == xp.floor(major.arrival_time / step)
+        start = xp.ceil(arrival_time / step) * step
+        is_same_step = xp.floor(arrival_time / step) == xp.floor(major.arrival_time / step)
         braking = clamp_min(models.braking * impatience, 1e-6)
-        lasting = major.arrival_time - begin
-        change = lasting * braking
-        saved = lasting * change / 2.0
+        duration = major.arrival_time - start
+        speed_drop = duration * braking
+        lost_distance = duration * speed_drop / 2.0
         speed = major.distance / clamp_min(major.arrival_time + step, 1e-3)
-        stands = 0.5 * speed * speed / braking <= major.distance - speed * begin
-        left = speed - change
-        root = square_root(clamp_min(4.0 * left * left - 8.0 * braking * saved, 1e-12))
-        longer = (left - 0.5 * root) / braking
-        return xp.where(same, 0.0, xp.where(stands, STOPPING_FOE_DELAY, longer))
+        can_stop = 0.5 * speed * speed / braking <= major.distance - speed * start
+        final_speed = speed - speed_drop
+        root = square_root(clamp_min(4.0 * final_speed * final_speed - 8.0 * braking * lost_distance, 1e-12))
+        delay = (final_speed - 0.5 * root) / braking
+        return xp.where(is_same_step, 0.0, xp.where(can_stop, STOPPING_FOE_DELAY, delay))
 
     def _update_memory(self, speed: Array, next_speed: Array, distances_past: list[Array]) -> None:
-        """Note who waits, and who is on the crossing since when."""
         xp, step = namespace(speed), self._step
-        stands = (next_speed <= HALTING_SPEED) & (next_speed - speed <= MAX_WAITING_ACCELERATION * step)
-        waited, entered = (self.memory.waiting_time + step) * stands, self.memory.entry_step - 1.0
-        for beyond in distances_past:
-            entered = xp.where(self._sumo_loop_length - beyond < next_speed * step, 0.0, entered)
-        self.memory = CrossingMemory(waited, entered)
+        waits = (next_speed <= HALTING_SPEED) & (next_speed - speed <= MAX_WAITING_ACCELERATION * step)
+        waiting_time, entry_step = (self.memory.waiting_time + step) * waits, self.memory.entry_step - 1.0
+        for distance_past in distances_past:
+            has_entered = self._sumo_loop_length - distance_past < next_speed * step
+            entry_step = xp.where(has_entered, 0.0, entry_step)
+        self.memory = CrossingMemory(waiting_time, entry_step)
 
-    def restore_memory(self, memories: Sequence["CrossingMemory"]) -> None:
-        """Go on from what earlier steps left, road by road, shape (vehicles,) each."""
+    def restore_memory(self, memories: Sequence[CrossingMemory]) -> None:
+        """Continue from the memories of the roads, shape (vehicles,) each."""
         self.memory = CrossingMemory(*(self._to_array(np.stack(each, 1)) for each in zip(*memories, strict=True)))

@@ -1,8 +1,8 @@
-"""How SUMO's extended intelligent drivers follow and stop, as one formula on arrays.
+"""SUMO's extended intelligent driver model (EIDM) as formulas on arrays.
 
-They are Treiber and Kesting's improved IDM, with coolness when somebody cuts in, a bounded jerk, a slow
-start, and misjudged gaps and speeds. Arrays have shape (n,) of n vehicles, units are m/s, m and s. In a
-`step` of the simulation drivers think `EIDM_SUBSTEPS` times; SUMO's reaction time is one step: all act in each.
+It is the improved IDM of Treiber and Kesting, with coolness towards vehicles that cut in, a bounded jerk, slow starts,
+and errors in the estimation of gaps and speeds. Arrays have shape (n,) for n vehicles; units are m/s, m and s. Each
+`step` of the simulation has `EIDM_SUBSTEPS` steps of the model. All drivers act in each: SUMO's reaction time is one.
 Sources: SUMO's MSCFModel_EIDM (`_v`, `finalizeSpeed`, `slowToStartTerm`); Salles, Kaufmann and Reuss 2020.
 """
 
@@ -13,49 +13,52 @@ from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, square_
 from unjam.physics.idm import IDMArrays, desired_gap
 
 EIDM_SUBSTEPS = 2
-"""steps into which a driver divides one of half a second"""
+"""steps into which SUMO divides one of 0.5 s"""
 EIDM_EPSILON = 1e-3
 """SUMO's NUMERICAL_EPS"""
 EIDM_SLACK = 0.05
 """EIDM_POS_ACC_EPS [m, m/s2]"""
 LOW_SPEED_THRESHOLD = 3.0
-"""speed below which nobody misjudges, and all stop with care: EST_REAC_THRESHOLD [m/s]"""
+"""speed below which estimation errors do not change and drivers stop carefully: EST_REAC_THRESHOLD [m/s]"""
 CLUTCH_ENGAGE_SPEED = 0.5
 """speed below which drivers start slowly: ClutchEngageSpeed [m/s]"""
 START_UP_DURATION, START_UP_SHAPE, START_UP_SHIFT, MIN_START_UP_INTERVAL = 1.2, 2.0, 0.7, 4.0
-"""how long they start, the shape of it, and how long after one start there is no other [s]"""
+"""duration of a start [s], shape and shift of its profile, and minimum time between two starts [s]"""
 COOLNESS = 0.99
 MAX_JERK = 3.0
 """[m/s3]"""
 GAP_ERROR_STRENGTH, LEADER_SPEED_ERROR_STRENGTH, DRIVING_ERROR_STRENGTH = 0.1, 0.02, 0.04
 """strengths of the three errors"""
 ESTIMATION_ERROR_TIME, DRIVING_ERROR_TIME = 10.0, 3.0
-"""[s]"""
+"""correlation times of the errors [s]"""
 EIDM_EMERGENCY_BRAKING = 9.0
-"""hardest braking [m/s2]"""
+"""[m/s2]"""
 EIDM_HALTING_SPEED, LEADER_STANDING_SPEED = 0.1, 0.1
-"""speeds at which a vehicle halts, and a leader counts as standing [m/s]"""
+"""speeds below which a vehicle halts, and a leader counts as standing [m/s]"""
 
 
 class DriverErrors(NamedTuple):
-    """By how much drivers err, as processes that forget: standard normal, or half as strong for judgement."""
+    """Errors of drivers as Ornstein-Uhlenbeck processes; the standard deviation is 1 for driving, else 0.5."""
 
     gap: Array
     leader_speed: Array
     driving: Array
 
     def next_errors(self, speed: Array, noise: Array, step: float) -> "DriverErrors":
-        """Return those after a step that ended with a speed; `drawn` is standard normal, shape (3, n)."""
-        xp, found, acts = namespace(speed), [], speed > LOW_SPEED_THRESHOLD
-        lasting = (ESTIMATION_ERROR_TIME, 0.5), (ESTIMATION_ERROR_TIME, 0.5), (DRIVING_ERROR_TIME, 1.0)
-        for value, (time, strength), one in zip(self, lasting, noise, strict=True):
-            new = exp(-step / time) * value + sqrt(2.0 * step / time) * strength * one
-            found.append(xp.where(acts, new, value))
-        return DriverErrors(*found)
+        """Return the errors after a step, given the speed after it and standard normal noise of shape (3, n)."""
+        xp, changes = namespace(speed), speed > LOW_SPEED_THRESHOLD
+        estimation = ESTIMATION_ERROR_TIME, 0.5
+
+        def next_error(value: Array, process: tuple[float, float], normal: Array) -> Array:
+            time, strength = process
+            new = exp(-step / time) * value + sqrt(2.0 * step / time) * strength * normal
+            return xp.where(changes, new, value)
+
+        return DriverErrors(*map(next_error, self, (estimation, estimation, (DRIVING_ERROR_TIME, 1.0)), noise))
 
 
 class LeaderMotion(NamedTuple):
-    """Who is ahead of each driver who may stay cool about it."""
+    """The acceleration of each leader, about which the driver behind may stay cool."""
 
     acceleration: Array
     """[m/s2]"""
@@ -64,27 +67,27 @@ class LeaderMotion(NamedTuple):
 
 
 def eidm_acceleration(speed: Array, gap_ratio: Array, parameters: IDMArrays) -> Array:
-    """Return what the improved IDM wants, `ratio` being the wanted gap over that to the leader [m/s2]."""
-    xp, most, braking = namespace(speed), parameters.max_acceleration, parameters.comfortable_deceleration
-    share = speed / parameters.desired_speed
-    square = clamp_max(share, 1.0) ** 2
-    free = most * (1.0 - square * square)
-    near = most * (1.0 - gap_ratio * gap_ratio)
-    far = free * (1.0 - xp.exp(xp.log(clamp_max(gap_ratio, 1.0)) * (2.0 * most / clamp_min(free, 1e-6))))
-    found, close = xp.where(gap_ratio >= 1.0, near, far), gap_ratio >= 1.0
-    beyond = share > 1.0
-    if bool(beyond.any()):
-        slowing = -braking * (1.0 - xp.exp(-xp.log(clamp_min(share, 1.0)) * (4.0 * most / braking)))
-        found = xp.where(beyond, xp.where(close, slowing + near, slowing), found)
-    return found
+    """Return the acceleration of the improved IDM [m/s2]; `gap_ratio` is the desired gap over the actual one."""
+    xp, highest, braking = namespace(speed), parameters.max_acceleration, parameters.comfortable_deceleration
+    speed_ratio = speed / parameters.desired_speed
+    square = clamp_max(speed_ratio, 1.0) ** 2
+    free = highest * (1.0 - square * square)
+    near = highest * (1.0 - gap_ratio * gap_ratio)
+    far = free * (1.0 - xp.exp(xp.log(clamp_max(gap_ratio, 1.0)) * (2.0 * highest / clamp_min(free, 1e-6))))
+    is_near, is_too_fast = gap_ratio >= 1.0, speed_ratio > 1.0
+    acceleration = xp.where(is_near, near, far)
+    if bool(is_too_fast.any()):
+        slowing = -braking * (1.0 - xp.exp(-xp.log(clamp_min(speed_ratio, 1.0)) * (4.0 * highest / braking)))
+        acceleration = xp.where(is_too_fast, xp.where(is_near, slowing + near, slowing), acceleration)
+    return acceleration
 
 
 class DesiredSpeed(NamedTuple):
-    """What drivers want after a step behind somebody."""
+    """Desired speeds of drivers after a step behind their leaders."""
 
     speed: Array
     uncooled_acceleration: Array
-    """the acceleration for it if they were not cool: by it they choose which of several to heed [m/s2]"""
+    """the acceleration without coolness, by which drivers choose between several leaders or limits [m/s2]"""
 
 
 def eidm_follow_speed(
@@ -96,31 +99,32 @@ def eidm_follow_speed(
     step: float,
     leader_motion: LeaderMotion | None = None,
 ) -> DesiredSpeed:
-    """Return how fast drivers want to be after a step behind leaders whose bumpers are `gap` ahead."""
-    xp, most = namespace(speed), parameters.max_acceleration
-    least = parameters.minimum_gap
-    left = eidm_effective_gap(gap, parameters)
-    new, each = speed, step / EIDM_SUBSTEPS
-    misjudged, slower = xp.exp(GAP_ERROR_STRENGTH * errors.gap), LEADER_SPEED_ERROR_STRENGTH * errors.leader_speed
-    urgent = 0.0 * speed
+    """Return the desired speeds after a step at bumper-to-bumper gaps behind leaders."""
+    xp, minimum_gap, remaining = namespace(speed), parameters.minimum_gap, eidm_effective_gap(gap, parameters)
+    new, substep = speed, step / EIDM_SUBSTEPS
+    gap_factor = xp.exp(GAP_ERROR_STRENGTH * errors.gap)
+    speed_error = LEADER_SPEED_ERROR_STRENGTH * errors.leader_speed
+    uncooled = 0.0 * speed
     for _ in range(EIDM_SUBSTEPS):
-        leader, seen = clamp_min(leader_speed - left * slower, 0.0), left * misjudged
-        wanted = desired_gap(new, new - leader, parameters) + EIDM_SLACK
-        enough = seen * square_root(1.0 + 2.0 * EIDM_SLACK / most)
-        stops = (seen < least + (10.0 * step + 1.0) * EIDM_SLACK) & (new < LOW_SPEED_THRESHOLD)
-        wanted = xp.where(stops, xp.maximum(wanted, enough), wanted)
-        told = urgent = eidm_acceleration(new, wanted / seen, parameters)
+        seen_speed, seen_gap = clamp_min(leader_speed - remaining * speed_error, 0.0), remaining * gap_factor
+        wanted_gap = desired_gap(new, new - seen_speed, parameters) + EIDM_SLACK
+        stop_gap = seen_gap * square_root(1.0 + 2.0 * EIDM_SLACK / parameters.max_acceleration)
+        stops = (seen_gap < minimum_gap + (10.0 * step + 1.0) * EIDM_SLACK) & (new < LOW_SPEED_THRESHOLD)
+        wanted_gap = xp.where(stops, xp.maximum(wanted_gap, stop_gap), wanted_gap)
+        acceleration = uncooled = eidm_acceleration(new, wanted_gap / seen_gap, parameters)
         if leader_motion is not None:
-            told = _with_coolness(told, new, leader, seen, wanted, parameters, leader_motion)
-        new = clamp_min(new + told * each, 0.0)
-        left = clamp_min(left - clamp_min(new - leader_speed, 0.0) * each, EIDM_EPSILON)
-    return DesiredSpeed(new, urgent)
+            acceleration = _with_coolness(
+                acceleration, new, seen_speed, seen_gap, wanted_gap, parameters, leader_motion
+            )
+        new = clamp_min(new + acceleration * substep, 0.0)
+        remaining = clamp_min(remaining - clamp_min(new - leader_speed, 0.0) * substep, EIDM_EPSILON)
+    return DesiredSpeed(new, uncooled)
 
 
 def eidm_effective_gap(gap: Array, parameters: IDMArrays) -> Array:
-    """Return the gaps to leaders with which drivers reckon: a quarter of a metre less than they are."""
-    least = parameters.minimum_gap
-    return clamp_min(gap - least + clamp_min(least - 0.25, EIDM_EPSILON), EIDM_EPSILON)
+    """Return the gaps that drivers use: 0.25 m less than the actual ones."""
+    minimum_gap = parameters.minimum_gap
+    return clamp_min(gap - minimum_gap + clamp_min(minimum_gap - 0.25, EIDM_EPSILON), EIDM_EPSILON)
 
 
 def _with_coolness(
@@ -132,50 +136,53 @@ def _with_coolness(
     parameters: IDMArrays,
     leader_motion: LeaderMotion,
 ) -> Array:
-    """Return what is left of braking for which the leader, who goes on as it is, gives no reason."""
+    """Return the acceleration with less braking where a leader with constant acceleration does not require it."""
     xp, braking = namespace(speed), parameters.comfortable_deceleration
-    its = xp.minimum(leader_motion.acceleration, parameters.max_acceleration)
-    its = xp.where(gap > 1.5 * wanted_gap, its * 1.5 * wanted_gap / gap, its)
-    its = xp.where(leader_speed >= LEADER_STANDING_SPEED, its, EIDM_EPSILON)
+    leader_acceleration = xp.minimum(leader_motion.acceleration, parameters.max_acceleration)
+    scaled = leader_acceleration * 1.5 * wanted_gap / gap
+    leader_acceleration = xp.where(gap > 1.5 * wanted_gap, scaled, leader_acceleration)
+    leader_acceleration = xp.where(leader_speed >= LEADER_STANDING_SPEED, leader_acceleration, EIDM_EPSILON)
     leader_speed = clamp_min(leader_speed, LEADER_STANDING_SPEED)
-    nearing = speed - leader_speed
-    divisor = leader_speed * leader_speed - 2.0 * gap * its
-    both_stop = leader_speed * nearing <= -2.0 * gap * its
-    steady = its - clamp_min(nearing, 0.0) ** 2 / (2.0 * gap)
-    enough = xp.where(both_stop, speed * speed * its / xp.where(both_stop, divisor, 1.0), steady)
-    cooled = (1.0 - COOLNESS) * acceleration + COOLNESS * (
-        enough + braking * xp.tanh((acceleration - enough) / braking)
-    )
-    return xp.where(leader_motion.may_stay_cool & (acceleration < enough), cooled, acceleration)
+    closing_speed = speed - leader_speed
+    divisor = leader_speed * leader_speed - 2.0 * gap * leader_acceleration
+    both_stop = leader_speed * closing_speed <= -2.0 * gap * leader_acceleration
+    stopping = speed * speed * leader_acceleration / xp.where(both_stop, divisor, 1.0)
+    following = leader_acceleration - clamp_min(closing_speed, 0.0) ** 2 / (2.0 * gap)
+    required = xp.where(both_stop, stopping, following)
+    smooth = required + braking * xp.tanh((acceleration - required) / braking)
+    cooled = (1.0 - COOLNESS) * acceleration + COOLNESS * smooth
+    return xp.where(leader_motion.may_stay_cool & (acceleration < required), cooled, acceleration)
 
 
 def eidm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, errors: DriverErrors, step: float) -> Array:
-    """Return how fast drivers want to be after a step who must stand within a way."""
-    xp, most = namespace(speed), parameters.max_acceleration
-    keeps = EIDM_SLACK + 0.2 * clamp_min(most, 0.25)
-    own = parameters._replace(minimum_gap=keeps)
-    room = left = clamp_min(distance + keeps, EIDM_EPSILON)
-    new, each = speed, step / EIDM_SUBSTEPS
+    """Return the desired speeds after a step of drivers that must stop within a distance."""
+    xp, highest = namespace(speed), parameters.max_acceleration
+    minimum_gap = EIDM_SLACK + 0.2 * clamp_min(highest, 0.25)
+    own = parameters._replace(minimum_gap=minimum_gap)
+    start = remaining = clamp_min(distance + minimum_gap, EIDM_EPSILON)
+    new, substep = speed, step / EIDM_SUBSTEPS
     for number in range(EIDM_SUBSTEPS):
-        seen = left * xp.exp(GAP_ERROR_STRENGTH * errors.gap * clamp_max(new / LOW_SPEED_THRESHOLD, 1.0))
-        wanted = desired_gap(new, new, own) + EIDM_SLACK
-        enough = seen * square_root(1.0 + EIDM_SLACK / most)
-        wanted = xp.where(seen < keeps + 2.0 * EIDM_SLACK, xp.maximum(wanted, enough), wanted)
-        new = clamp_min(new + eidm_acceleration(new, wanted / seen, parameters) * each, 0.0)
-        left = clamp_min(left - new * each, EIDM_EPSILON)
-        reached = clamp_min((room - left) / step * EIDM_SUBSTEPS / (number + 1.0), 0.0)
-        new = xp.where(new < LOW_SPEED_THRESHOLD * step, reached, new)
+        weight = clamp_max(new / LOW_SPEED_THRESHOLD, 1.0)
+        seen_gap = remaining * xp.exp(GAP_ERROR_STRENGTH * errors.gap * weight)
+        wanted_gap = desired_gap(new, new, own) + EIDM_SLACK
+        stop_gap = seen_gap * square_root(1.0 + EIDM_SLACK / highest)
+        stops = seen_gap < minimum_gap + 2.0 * EIDM_SLACK
+        wanted_gap = xp.where(stops, xp.maximum(wanted_gap, stop_gap), wanted_gap)
+        new = clamp_min(new + eidm_acceleration(new, wanted_gap / seen_gap, parameters) * substep, 0.0)
+        remaining = clamp_min(remaining - new * substep, EIDM_EPSILON)
+        mean_speed = clamp_min((start - remaining) / step * EIDM_SUBSTEPS / (number + 1.0), 0.0)
+        new = xp.where(new < LOW_SPEED_THRESHOLD * step, mean_speed, new)
     return new
 
 
 def eidm_secure_gap(speed: Array, leader_speed: Array, parameters: IDMArrays) -> Array:
-    """Return the gap beyond the smallest one with which drivers change lanes (`getSecureGap`)."""
+    """Return the gap, beyond the minimum gap, that drivers require for a lane change (`getSecureGap`)."""
     divisor = square_root(parameters.comfortable_deceleration / parameters.max_acceleration + 1.0)
     return (desired_gap(speed, speed - leader_speed, parameters) - parameters.minimum_gap) / divisor
 
 
 class SpeedBounds(NamedTuple):
-    """Speeds after a step: the lowest and the highest that are allowed, and one that is wanted."""
+    """Minimum, desired and maximum speeds after a step."""
 
     lowest: Array
     desired: Array
@@ -191,17 +198,18 @@ def eidm_speed_bounds(
     errors: DriverErrors,
     step: float,
 ) -> SpeedBounds:
-    """Return what engine, brakes and safety leave, and what drivers want of it, who do not drive evenly."""
-    xp, most = namespace(speed), parameters.max_acceleration
-    hard = clamp_min(speed - EIDM_EMERGENCY_BRAKING * step, 0.0)
-    slowest = clamp_min(speed - parameters.comfortable_deceleration * step, 0.0)
-    lowest = xp.minimum(slowest, xp.maximum(safe_speed, hard))
-    highest = xp.maximum(lowest, xp.minimum(speed + most * step, safe_speed))
+    """Return the speeds that engine, brakes and safety allow, and the desired ones with driving errors."""
+    xp, max_acceleration = namespace(speed), parameters.max_acceleration
+    emergency = clamp_min(speed - EIDM_EMERGENCY_BRAKING * step, 0.0)
+    comfortable = clamp_min(speed - parameters.comfortable_deceleration * step, 0.0)
+    lowest = xp.minimum(comfortable, xp.maximum(safe_speed, emergency))
+    highest = xp.maximum(lowest, xp.minimum(speed + max_acceleration * step, safe_speed))
     critical = (desired_gap(speed, speed - leader_speed, parameters) + EIDM_SLACK) / effective_gap - 0.5
     critical = clamp_max(clamp_min(critical, -0.4), 0.0)
-    strength = xp.minimum(most, clamp_min(highest - 0.5 * most, 0.0)) * (2.75**2 * critical * critical + 1.0)
-    wanted = xp.maximum(lowest, highest + step * DRIVING_ERROR_STRENGTH * errors.driving * strength)
-    return SpeedBounds(lowest, wanted, highest)
+    strength = xp.minimum(max_acceleration, clamp_min(highest - 0.5 * max_acceleration, 0.0))
+    strength = strength * (2.75**2 * critical * critical + 1.0)
+    desired = xp.maximum(lowest, highest + step * DRIVING_ERROR_STRENGTH * errors.driving * strength)
+    return SpeedBounds(lowest, desired, highest)
 
 
 def finalize_eidm_speed(
@@ -214,30 +222,28 @@ def finalize_eidm_speed(
     end_time: float,
     step: float,
 ) -> tuple[Array, Array]:
-    """Return the speeds after a step that ends `now`, and when drivers last began to start [s].
+    """Return the speeds after a step with bounded jerk and slow starts, and the time of the last start [s].
 
-    `acceleration` is that of the step before, `wanted` what they want, `highest` what is safe; `max_acceleration` is the
-    highest acceleration of each.
+    `acceleration` is that of the previous step; the step ends at `end_time`; the others are as in `SpeedBounds`.
     """
-    xp, rolling = namespace(speed), speed > 2.0 * CLUTCH_ENGAGE_SPEED
-    change, before = desired - speed, acceleration * step
+    xp, is_rolling = namespace(speed), speed > 2.0 * CLUTCH_ENGAGE_SPEED
+    change, previous_change = desired - speed, acceleration * step
     jerk = MAX_JERK * step * step
-    faster = xp.minimum(change, before + xp.where(MAX_JERK * step + acceleration < 0.0, 2.0 * jerk, jerk))
-    slower = xp.minimum(highest - speed, xp.maximum(change, before - jerk))
-    up = (change > 0.0) & rolling & (start_time + START_UP_DURATION + EIDM_EPSILON < end_time)
-    down = (change <= 0.0) & rolling & (desired < highest - EIDM_EPSILON)
+    rise = xp.where(MAX_JERK * step + acceleration < 0.0, 2.0 * jerk, jerk)
+    faster = xp.minimum(change, previous_change + rise)
+    slower = xp.minimum(highest - speed, xp.maximum(change, previous_change - jerk))
+    up = (change > 0.0) & is_rolling & (start_time + START_UP_DURATION + EIDM_EPSILON < end_time)
+    down = (change <= 0.0) & is_rolling & (desired < highest - EIDM_EPSILON)
     change = xp.where(up, faster, xp.where(down, slower, change))
     change = xp.maximum(change, -speed)
-    starts = change > 0.0
-    part, done = change / EIDM_SUBSTEPS, 0.0 * change
+    accelerates = change > 0.0
+    may_start = accelerates & (speed < CLUTCH_ENGAGE_SPEED) & (acceleration < clamp_max(max_acceleration / 4.0, 0.2))
+    part, total = change / EIDM_SUBSTEPS, 0.0 * change
     for number in range(EIDM_SUBSTEPS):
         time = end_time - step * (EIDM_SUBSTEPS - number - 1.0) / EIDM_SUBSTEPS
-        rested = start_time + MIN_START_UP_INTERVAL - EIDM_EPSILON < time
-        begins = (
-            starts & (speed < CLUTCH_ENGAGE_SPEED) & rested & (acceleration < clamp_max(max_acceleration / 4.0, 0.2))
-        )
-        start_time = xp.where(begins, time, start_time)
-        since = time - start_time
-        slow = (xp.tanh((since * 2.0 / START_UP_DURATION - START_UP_SHIFT) * START_UP_SHAPE) + 1.0) / 2.0
-        done = done + part * xp.where(since < START_UP_DURATION + EIDM_EPSILON, slow, 1.0)
-    return speed + xp.where(starts, done, change), start_time
+        starts = may_start & (start_time + MIN_START_UP_INTERVAL - EIDM_EPSILON < time)
+        start_time = xp.where(starts, time, start_time)
+        elapsed = time - start_time
+        profile = (xp.tanh((elapsed * 2.0 / START_UP_DURATION - START_UP_SHIFT) * START_UP_SHAPE) + 1.0) / 2.0
+        total = total + part * xp.where(elapsed < START_UP_DURATION + EIDM_EPSILON, profile, 1.0)
+    return speed + xp.where(accelerates, total, change), start_time

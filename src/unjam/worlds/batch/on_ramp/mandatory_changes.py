@@ -1,20 +1,20 @@
-"""Who must leave the lane that ends, and what they ask of others: to make room, to go, or to change too.
+"""Mandatory lane changes from the ramp's lane, and requests to other vehicles to make room, to go, or to change, too.
 
 Source: SUMO's MSLCM_LC2013 (`_wantsChange`, `informLeader`, `informFollower`, `slowDownForBlocked`).
 """
 
 from unjam.physics.arrays import Array, clamp_min, namespace, scatter_minimum
 from unjam.worlds.batch.on_ramp.lane_change_context import LaneChangeContext, MotorwayGeometry, Neighbor
-from unjam.worlds.batch.on_ramp.vehicles import NO_ADVICE, NO_VEHICLE, MotorwayVehicles
+from unjam.worlds.batch.on_ramp.vehicles import NO_ADVICE, NO_VEHICLE, MotorwayVehicles, copy_array
 
 MERGE_LOOK_AHEAD_TIME, LEFT_LOOK_AHEAD_FACTOR = 10.0, 2.0
-"""how long somebody looks ahead for a change that must be made [s], and how much longer to the left"""
+"""look-ahead time of a mandatory change [s], and its factor for changes to the left"""
 URGENCY_FACTOR = 2.0
-"""how many times over the way that is left would be driven in the time that is left"""
+"""factor by which the remaining time is shorter than at the look-ahead speed"""
 HELP_SPEED_DIFFERENCE, MIN_FALL_BEHIND_BRAKING = 10.0 / 3.6, 7.0 / 3.6
-"""speed by which one overtakes to help [m/s], braking at least to fall behind [m/s2]"""
+"""speed difference with which vehicles overtake to help [m/s], minimum braking to fall behind a leader [m/s2]"""
 UNCONGESTED_SPEED = 60.0 / 3.6
-"""speed above which nobody passes on the right [m/s]"""
+"""speed above which vehicles do not pass on the right [m/s]"""
 SUMO_POSITION_TOLERANCE = 0.1
 """SUMO's POSITION_EPS [m]"""
 
@@ -22,44 +22,43 @@ SUMO_POSITION_TOLERANCE = 0.1
 def mandatory_lane_changes(
     vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry
 ) -> tuple[MotorwayVehicles, Array, Array]:
-    """Return the vehicles with advice, who must change now, and who is asked to make room."""
-    xp, place = namespace(vehicles.speed), vehicles.position
-    on_lane = (vehicles.lane == 0) & (context.target_lane != NO_VEHICLE)
-    ahead_sum = (vehicles.lane == 1) & (place >= geometry.merge_start)
-    lengths = xp.where(ahead_sum, vehicles.minimum_gap + geometry.vehicle_length, 0.0 * place)
-    so_far = lengths.cumsum(0)
-    first = namespace(place).searchsorted(vehicles.road, vehicles.road)
-    occupied = so_far - xp.where(first > 0, so_far[first - 1], 0.0 * place)
-    left = geometry.merge_end - place
+    """Return the vehicles with advice, whether each must change now, and whether it is asked to make room."""
+    xp, position, step = namespace(vehicles.speed), vehicles.position, context.step
+    is_on_lane = (vehicles.lane == 0) & (context.target_lane != NO_VEHICLE)
+    occupies = (vehicles.lane == 1) & (position >= geometry.merge_start)
+    lengths = xp.where(occupies, vehicles.minimum_gap + geometry.vehicle_length, 0.0 * position)
+    total = lengths.cumsum(0)
+    first = xp.searchsorted(vehicles.road, vehicles.road)
+    occupied = total - xp.where(first > 0, total[first - 1], 0.0 * position)
+    remaining = geometry.merge_end - position
     needed = vehicles.look_ahead_speed * (MERGE_LOOK_AHEAD_TIME * LEFT_LOOK_AHEAD_FACTOR) + 2.0 * (
         vehicles.minimum_gap + geometry.vehicle_length
     )
-    urgent = on_lane & (left - occupied < needed)
-    helps = vehicles.speed < 0.0
-    rows = xp.arange(len(place))[urgent]
+    is_urgent = is_on_lane & (remaining - occupied < needed)
+    is_asked = vehicles.speed < 0.0
+    rows = xp.arange(len(position))[is_urgent]
     if len(rows) == 0:
-        return vehicles, urgent, helps
-    own, told, leans = vehicles.own_advice, vehicles.cooperative_advice, vehicles.speed_bias
-    one = MergingVehicles(vehicles, context, geometry, rows, left[rows])
-    planned, mine, passes = one.plan_with_leader()
-    own[rows] = mine
-    blocked = one.is_leader_blocking & one.target_leader.is_present
-    leans[one.target_leader.row[blocked]] = 1.0
-    over = blocked & passes
-    scatter_minimum(told, one.target_leader.row[over], 0.0 * one.speed[over])
-    asked, speeds, more, wishes = one.request_from_follower(planned, ~over)
-    own[rows] = xp.minimum(own[rows], more)
-    step = context.step
-    scatter_minimum(told, one.target_follower.row[asked], (speeds - one.target_follower.speed)[asked] / step)
-    helps[one.target_follower.row[wishes]] = True
-    stuck = one.is_leader_blocking | one.is_follower_blocking
-    leans[rows[stuck]] = 1.0
-    vehicles = vehicles._replace(own_advice=own, cooperative_advice=told, speed_bias=leans)
-    return _yield_to_stuck(vehicles, context, geometry, rows[stuck]), urgent, helps
+        return vehicles, is_urgent, is_asked
+    own, cooperative, bias = map(copy_array, (vehicles.own_advice, vehicles.cooperative_advice, vehicles.speed_bias))
+    merging = _MergingVehicles(vehicles, context, geometry, rows, remaining[rows])
+    leader, follower = merging.leader, merging.follower
+    planned, own_advice, overtakes = merging.plan_with_leader()
+    is_blocked = merging.is_leader_blocking & leader.is_present
+    bias[leader.row[is_blocked]] = 1.0
+    overtakes_leader = is_blocked & overtakes
+    scatter_minimum(cooperative, leader.row[overtakes_leader], 0.0 * merging.speed[overtakes_leader])
+    is_request, speeds, more_advice, asks_for_change = merging.request_from_follower(planned, ~overtakes_leader)
+    own[rows] = xp.minimum(own_advice, more_advice)
+    scatter_minimum(cooperative, follower.row[is_request], (speeds - follower.speed)[is_request] / step)
+    is_asked[follower.row[asks_for_change]] = True
+    stuck_rows = rows[merging.is_leader_blocking | merging.is_follower_blocking]
+    bias[stuck_rows] = 1.0
+    vehicles = vehicles._replace(own_advice=own, cooperative_advice=cooperative, speed_bias=bias)
+    return _yield_to_stuck(vehicles, context, geometry, stuck_rows), is_urgent, is_asked
 
 
-class MergingVehicles:
-    """Those who must leave the ramp's lane, and what they ask of others."""
+class _MergingVehicles:
+    """Vehicles that must leave the ramp's lane, and their requests."""
 
     def __init__(
         self,
@@ -69,108 +68,100 @@ class MergingVehicles:
         rows: Array,
         remaining_distance: Array,
     ) -> None:
-        """Take their rows, and how much of the lane is left to each [m]."""
-        self.speed, self.remaining_distance, self._step = vehicles.speed[rows], remaining_distance, context.step
+        """Take their rows, and the remaining length of the lane [m]."""
+        self.speed, self._remaining_distance, self._step = vehicles.speed[rows], remaining_distance, context.step
         self._vehicle_length, self._minimum_gap = geometry.vehicle_length, vehicles.minimum_gap[rows]
-        self.target_leader, self.target_follower = (
-            Neighbor(*(each[rows] for each in other)) for other in (context.target_leader, context.target_follower)
+        self.leader, self.follower = (
+            Neighbor(*(each[rows] for each in neighbor))
+            for neighbor in (context.target_leader, context.target_follower)
         )
         self.is_leader_blocking, self.is_follower_blocking = (
-            context.is_leader_blocking[rows],
-            context.is_follower_blocking[rows],
+            each[rows] for each in (context.is_leader_blocking, context.is_follower_blocking)
         )
         self._drivers, self._follower_drivers = context.drivers.select(rows), context.follower_drivers.select(rows)
-        self._leader_drivers, self._leader_minimum_gap = (
-            context.drivers.select(self.target_leader.row),
-            vehicles.minimum_gap[self.target_leader.row],
-        )
-        self._braking, self._leader_acceleration = vehicles.braking[rows], vehicles.acceleration[self.target_leader.row]
-        self._remaining_time = clamp_min(
-            remaining_distance / clamp_min(vehicles.look_ahead_speed[rows], 1e-3) / URGENCY_FACTOR, context.step
-        )
+        self._leader_drivers = context.drivers.select(self.leader.row)
+        self._leader_acceleration = vehicles.acceleration[self.leader.row]
+        self._braking = vehicles.braking[rows]
+        look_ahead_speed = clamp_min(vehicles.look_ahead_speed[rows], 1e-3)
+        self._remaining_time = clamp_min(remaining_distance / look_ahead_speed / URGENCY_FACTOR, context.step)
 
     def plan_with_leader(self) -> tuple[Array, Array, Array]:
-        """Return the speeds that they plan, accelerations for that [m/s2], and who passes the leader."""
-        xp, speed, step, leader = namespace(self.speed), self.speed, self._step, self.target_leader
-        planned = xp.minimum(speed, self._drivers.stop_speed(speed, self.remaining_distance, step))
-        slower = leader.speed - step * clamp_min(-self._leader_acceleration, 1.0)
-        gap = leader.gap + step * (slower - planned)
-        follow = self._drivers.follow_speed(speed, gap + self._minimum_gap, slower, step)
+        """Return planned speeds, advised accelerations [m/s2], and whether each vehicle overtakes its leader."""
+        xp, speed, step, leader = namespace(self.speed), self.speed, self._step, self.leader
+        planned = xp.minimum(speed, self._drivers.stop_speed(speed, self._remaining_distance, step))
+        leader_speed = leader.speed - step * clamp_min(-self._leader_acceleration, 1.0)
+        gap = leader.gap + step * (leader_speed - planned)
+        follow = self._drivers.follow_speed(speed, gap + self._minimum_gap, leader_speed, step)
         follow = xp.maximum(clamp_min(speed - self._braking * step, 0.0), follow)
-        room = leader.gap + 2.0 * self._vehicle_length + self._leader_minimum_gap
-        room = clamp_min(room + self._leader_drivers.secure_gap(leader.speed, speed), 0.0)
-        faster = planned - leader.speed
-        lasts = xp.where(faster > 0.0, room / clamp_min(faster, 1e-6), self._remaining_time + 1.0)
-        within = self.remaining_distance - self._drivers.brake_gap(speed, step) >= room
-        passes = (faster >= 0.0) & (speed < UNCONGESTED_SPEED) & within & (lasts <= self._remaining_time)
-        braking = xp.minimum(self._braking, clamp_min((speed - follow) / self._remaining_time, MIN_FALL_BEHIND_BRAKING))
-        behind = xp.minimum(planned, clamp_min(speed - step * braking, 0.0))
-        blocked = self.is_leader_blocking & leader.is_present
-        falls = blocked & ~passes & (follow < speed)
-        told = xp.where(falls, behind, follow)
-        mine = xp.where(leader.is_present & ~(blocked & passes), (told - speed) / step, NO_ADVICE)
-        unblocked = leader.is_present & ~self.is_leader_blocking
-        planned = xp.where(falls, behind, xp.where(unblocked, xp.minimum(follow, planned), planned))
-        return planned, mine, passes
+        way = leader.gap + 2.0 * self._vehicle_length + self._leader_drivers.parameters.minimum_gap
+        way = clamp_min(way + self._leader_drivers.secure_gap(leader.speed, speed), 0.0)
+        surplus = planned - leader.speed
+        duration = xp.where(surplus > 0.0, way / clamp_min(surplus, 1e-6), self._remaining_time + 1.0)
+        has_room = self._remaining_distance - self._drivers.brake_gap(speed, step) >= way
+        overtakes = (surplus >= 0.0) & (speed < UNCONGESTED_SPEED) & has_room & (duration <= self._remaining_time)
+        braking = clamp_min((speed - follow) / self._remaining_time, MIN_FALL_BEHIND_BRAKING)
+        behind = xp.minimum(planned, clamp_min(speed - step * xp.minimum(self._braking, braking), 0.0))
+        is_blocked = self.is_leader_blocking & leader.is_present
+        falls_behind = is_blocked & ~overtakes & (follow < speed)
+        advice = (xp.where(falls_behind, behind, follow) - speed) / step
+        advice = xp.where(leader.is_present & ~(is_blocked & overtakes), advice, NO_ADVICE)
+        is_free = leader.is_present & ~self.is_leader_blocking
+        planned = xp.where(is_free, xp.minimum(follow, planned), planned)
+        return xp.where(falls_behind, behind, planned), advice, overtakes
 
     def request_from_follower(self, planned_speed: Array, may_request: Array) -> tuple[Array, Array, Array, Array]:
-        """Return who asks its follower for a speed, which, own accelerations, and who asks it to change."""
-        xp, speed, step, other = namespace(self.speed), self.speed, self._step, self.target_follower
-        there, drivers, seconds = may_request & other.is_present, self._follower_drivers, self._remaining_time
-        hard = drivers.parameters.comfortable_deceleration
-        slower, second = clamp_min(other.speed - step * hard, 0.0), clamp_min(other.speed - hard, 0.0)
-        faster, room = planned_speed - second, other.gap + planned_speed - second
-        needed = drivers.secure_gap(second, clamp_min(planned_speed, 0.0))
-        keeps = drivers.parameters.minimum_gap
+        """Return whether each follower is asked for a speed, the speed, own advice, and whether it is asked to change."""
+        xp, speed, step, follower = namespace(self.speed), self.speed, self._step, self.follower
+        may_ask, drivers, seconds = may_request & follower.is_present, self._follower_drivers, self._remaining_time
+        braking, minimum_gap = drivers.parameters.comfortable_deceleration, drivers.parameters.minimum_gap
+        slower, after_second = clamp_min(follower.speed - step * braking, 0.0), clamp_min(follower.speed - braking, 0.0)
+        surplus, room = planned_speed - after_second, follower.gap + planned_speed - after_second
+        needed = drivers.secure_gap(after_second, clamp_min(planned_speed, 0.0))
 
         def follower_speed(slack: Array) -> Array:
-            return drivers.follow_speed(other.speed, other.gap + keeps + step * slack, planned_speed, step)
+            gap = follower.gap + minimum_gap + step * slack
+            return drivers.follow_speed(follower.speed, gap, planned_speed, step)
 
-        follows = follower_speed(planned_speed - xp.maximum(slower, follower_speed(planned_speed)))
-        alone = planned_speed - other.speed >= HELP_SPEED_DIFFERENCE
-        enough = drivers.secure_gap(other.speed, planned_speed) - other.gap < (planned_speed - other.speed) * seconds
-        brakes = (room > 0.0) & (room >= needed)
-        in_time = (faster > 0.0) & (faster * seconds > needed - room + SUMO_POSITION_TOLERANCE)
-        slow = other.speed > speed
-        lets = xp.where(
-            slow,
-            xp.maximum(slower, speed + HELP_SPEED_DIFFERENCE),
-            xp.maximum(other.speed, speed + HELP_SPEED_DIFFERENCE),
-        )
-        asked = xp.where(brakes, xp.maximum(slower, follows), xp.where(in_time, slower, lets))
-        asked = xp.where(alone & enough, planned_speed - HELP_SPEED_DIFFERENCE, asked)
-        passed = ~(alone & enough) & ~brakes & ~in_time
-        overtaken = passed & ~(slow & ((other.speed - speed) / hard < seconds))
-        length = other.gap + 2.0 * self._vehicle_length + self._minimum_gap
-        length = clamp_min(length + self._drivers.secure_gap(planned_speed, lets), 0.0)
-        mine = xp.maximum(lets - length / seconds, speed - step * self._braking)
-        blocked = there & self.is_follower_blocking
-        own = xp.where(blocked & overtaken, (mine - speed) / step, NO_ADVICE)
-        stays = there & ~self.is_follower_blocking & self.is_leader_blocking
-        follows = follower_speed(planned_speed - follower_speed(planned_speed))
-        return blocked | stays, xp.where(blocked, asked, follows), own, blocked
+        behind = follower_speed(planned_speed - xp.maximum(slower, follower_speed(planned_speed)))
+        difference = planned_speed - follower.speed
+        missing = drivers.secure_gap(follower.speed, planned_speed) - follower.gap
+        opens_alone = (difference >= HELP_SPEED_DIFFERENCE) & (missing < difference * seconds)
+        can_brake = (room > 0.0) & (room >= needed)
+        is_in_time = (surplus > 0.0) & (surplus * seconds > needed - room + SUMO_POSITION_TOLERANCE)
+        is_faster = follower.speed > speed
+        passing = speed + HELP_SPEED_DIFFERENCE
+        passing = xp.where(is_faster, xp.maximum(slower, passing), xp.maximum(follower.speed, passing))
+        requested = xp.where(can_brake, xp.maximum(slower, behind), xp.where(is_in_time, slower, passing))
+        requested = xp.where(opens_alone, planned_speed - HELP_SPEED_DIFFERENCE, requested)
+        is_passed = ~opens_alone & ~can_brake & ~is_in_time
+        is_passed = is_passed & ~(is_faster & ((follower.speed - speed) / braking < seconds))
+        way = follower.gap + 2.0 * self._vehicle_length + self._minimum_gap
+        way = clamp_min(way + self._drivers.secure_gap(planned_speed, passing), 0.0)
+        own_speed = xp.maximum(passing - way / seconds, speed - step * self._braking)
+        is_blocked = may_ask & self.is_follower_blocking
+        own_advice = xp.where(is_blocked & is_passed, (own_speed - speed) / step, NO_ADVICE)
+        keeps_gap = may_ask & ~self.is_follower_blocking & self.is_leader_blocking
+        keeping = follower_speed(planned_speed - follower_speed(planned_speed))
+        return is_blocked | keeps_gap, xp.where(is_blocked, requested, keeping), own_advice, is_blocked
 
 
 def _yield_to_stuck(
     vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry, stuck_rows: Array
 ) -> MotorwayVehicles:
-    """Return the vehicles, those who crawl beside the ramp's lane letting in the next one that is stuck."""
+    """Return the vehicles with advice to those that crawl next to the ramp's lane: each lets one stuck vehicle in."""
     if len(stuck_rows) == 0:
         return vehicles
-    xp, place, speed = namespace(vehicles.position), vehicles.position, vehicles.speed
-    crawls = (vehicles.lane == 1) & (place >= geometry.merge_start) & (place < geometry.merge_end)
-    crawls = crawls & (speed < vehicles.braking)
+    xp, position, speed = namespace(vehicles.position), vehicles.position, vehicles.speed
+    is_adjacent = (vehicles.lane == 1) & (position >= geometry.merge_start) & (position < geometry.merge_end)
+    crawls = is_adjacent & (speed < vehicles.braking)
     if not bool(crawls.any()):
         return vehicles
-    next_one = xp.searchsorted(stuck_rows, xp.arange(len(place))) - 1
-    other = stuck_rows[clamp_min(next_one, 0)]
-    gap = place[other] - geometry.vehicle_length - place - vehicles.minimum_gap
-    lets = crawls & (next_one >= 0) & (vehicles.road[other] == vehicles.road) & (gap > SUMO_POSITION_TOLERANCE)
-    if not bool(lets.any()):
+    index = xp.searchsorted(stuck_rows, xp.arange(len(position))) - 1
+    stuck = stuck_rows[clamp_min(index, 0)]
+    gap = position[stuck] - geometry.vehicle_length - position - vehicles.minimum_gap
+    yields = crawls & (index >= 0) & (vehicles.road[stuck] == vehicles.road) & (gap > SUMO_POSITION_TOLERANCE)
+    if not bool(yields.any()):
         return vehicles
-    drivers, advice = context.drivers.select(lets), vehicles.adjacent_advice
-    wanted = drivers.follow_speed(
-        speed[lets], (gap + vehicles.minimum_gap)[lets] - SUMO_POSITION_TOLERANCE, speed[other][lets], context.step
-    )
-    advice[lets] = (wanted - speed[lets]) / context.step
-    return vehicles._replace(adjacent_advice=advice)
+    gap = (gap + vehicles.minimum_gap)[yields] - SUMO_POSITION_TOLERANCE
+    own_speed = context.drivers.select(yields).follow_speed(speed[yields], gap, speed[stuck][yields], context.step)
+    return vehicles.replace_rows(yields, adjacent_advice=(own_speed - speed[yields]) / context.step)

@@ -1,4 +1,4 @@
-"""What happened on W motorways of a batch: the record of each, as SUMO's roads with ends have it."""
+"""The record of W motorways of a batch, as that of SUMO's roads with ends."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -31,49 +31,45 @@ from unjam.worlds.record import SHARED_COLUMN_FRAMES, Episode, Trajectory, assig
 from unjam.worlds.world import DriverLog
 
 NO_END_STEP = int(np.iinfo(np.intp).max)
-"""the decision after which a road ends on which nobody has touched"""
+"""last control step of roads without a collision"""
+_DRIVER_KINDS = (HUMAN_DRIVER, CAV_DRIVER, CAV_AFTER_CUT_IN)
 
 
 class _Placements(NamedTuple):
-    """Where vehicles are; arrays of shape (n,)."""
+    """Positions of vehicles; arrays of shape (n,)."""
 
     step_index: NDArray[np.intp]
-    """after so many decisions"""
+    """number of control steps before"""
     road: NDArray[np.intp]
     entry: NDArray[np.intp]
-    """which of those who want to enter the road"""
+    """index among the entries of the road"""
     lane: NDArray[np.intp]
     position: Floats
     """[m]"""
     speed: Floats
     """[m/s]"""
     gap: Floats
-    """to the one ahead [m]; NaN where nobody is"""
-
-    def select(self, rows: NDArray[np.intp]) -> "_Placements":
-        """Return where some of them are."""
-        whole = (self.step_index[rows], self.road[rows], self.entry[rows], self.lane[rows])
-        return _Placements(*whole, self.position[rows], self.speed[rows], self.gap[rows])
+    """to the vehicle ahead [m]; NaN without one"""
 
 
 @dataclass
 class MotorwayLog:
-    """All decisions of W motorways; braking and headways in every simulation step."""
+    """All control steps of W motorways, with the braking and car following of every simulation step."""
 
     roads: Sequence[MotorwayRoad]
     entry_count: int
+    """maximum number of entries of a road"""
     simulation_step: float
-    """of the simulation [s]"""
+    """[s]"""
     control_step: float
     """[s]"""
     planned_duration: float
-    """how long they are driven [s]"""
+    """[s]"""
     end_steps: NDArray[np.intp] = field(init=False)
-    """decision after which vehicles touched on each, or NEVER"""
+    """control step after which vehicles touched on each road, or `NO_END_STEP`"""
 
     def __post_init__(self) -> None:
-        """Begin with nothing."""
-        roads, kinds = len(self.roads), 1 + max(HUMAN_DRIVER, CAV_DRIVER, CAV_AFTER_CUT_IN)
+        roads, kinds = len(self.roads), len(_DRIVER_KINDS)
         self.end_steps = np.full(roads, NO_END_STEP)
         self._placements = list[_Placements]()
         self._backlogs = list[NDArray[np.intp]]()
@@ -86,9 +82,9 @@ class MotorwayLog:
         self._leader, self._leader_since = np.full((2, roads, self.entry_count), -1)
         self._step_count, self._steady_following = 0, list[Floats]()
         self._is_recovering = np.zeros((roads, self.entry_count), bool)
-        """whether each vehicle, if it is a CAV, recovers from a change of leader"""
+        """whether each CAV recovers from a change of leader"""
         self._following_pairs = np.zeros((len(FollowingPair._fields), roads, self.entry_count))
-        """each of them and its leader in the last step, as `FollowingPair` has them"""
+        """each CAV and its leader in the last step, with the fields of `FollowingPair`"""
 
     def record_step(
         self,
@@ -98,39 +94,36 @@ class MotorwayLog:
         cav_rows: NDArray[np.intp],
         is_controlled: bool,
     ) -> None:
-        """Note how all braked in a step, and how CAVs, the rows `cavs`, follow those `ahead` of each."""
+        """Record the braking of all vehicles in a simulation step, and the car following of the CAVs."""
         self._step_count += 1
-        goes_on = self.end_steps == NO_END_STEP
-        self._arrivals += np.bincount(arrived_vehicles.road, minlength=len(self.roads)) * goes_on
+        is_running = self.end_steps == NO_END_STEP
+        self._arrivals += np.bincount(arrived_vehicles.road, minlength=len(self.roads)) * is_running
         road, entry = vehicles.road, vehicles.entry
         kind = np.full(len(road), HUMAN_DRIVER)
         if is_controlled:
             rows = cav_rows[cav_rows >= 0]
-            kind[rows] = CAV_DRIVER
-            leader = leader_rows[rows]
-            now, own = np.where(leader >= 0, entry[leader], -1), (road[rows], entry[rows])
-            changed = self._leader[own] != now
-            self._leader[own] = now
-            self._leader_since[own] = np.where(changed, self._step_count, self._leader_since[own])
-            lasts = (self._step_count - self._leader_since[own]) * self.simulation_step
-            kind[rows[lasts < CUT_IN_SECONDS]] = CAV_AFTER_CUT_IN
-            follows = (leader >= 0) & (lasts > STEADY_FOLLOWING_SECONDS) & goes_on[road[rows]]
+            own, leader = (road[rows], entry[rows]), leader_rows[rows]
+            leader_entry = np.where(leader >= 0, entry[leader], -1)
+            is_new = self._leader[own] != leader_entry
+            self._leader[own] = leader_entry
+            self._leader_since[own] = np.where(is_new, self._step_count, self._leader_since[own])
+            duration = (self._step_count - self._leader_since[own]) * self.simulation_step
+            kind[rows] = np.where(duration < CUT_IN_SECONDS, CAV_AFTER_CUT_IN, CAV_DRIVER)
+            is_steady = (leader >= 0) & (duration > STEADY_FOLLOWING_SECONDS) & is_running[road[rows]]
             gap = vehicles.position[leader] - self.roads[0].vehicle_length - vehicles.position[rows]
             pair = FollowingPair(vehicles.speed[rows], vehicles.speed[leader], gap)
-            recovers = is_recovering(
-                self._is_recovering[own], lasts, FollowingPair(*self._following_pairs[:, *own]), pair
-            )
-            self._is_recovering[own] = recovers = recovers & (leader >= 0)
-            self._following_pairs[:, *own] = pair
-            seen = road[rows], *pair, recovers
-            self._steady_following.append(np.stack([each[follows].astype(np.float64) for each in seen]))
-        np.add.at(self._observed_steps, (road, kind), goes_on[road])
-        hard = np.flatnonzero((vehicles.acceleration < 0.0) & goes_on[road])
-        braking = -vehicles.acceleration[hard].astype(np.float64)
-        np.maximum.at(self._max_braking, (road[hard], kind[hard]), braking)
-        for number, limit in enumerate(BRAKING_THRESHOLDS):
-            there = hard[braking > limit + BRAKING_TOLERANCE]
-            np.add.at(self._hard_braking_counts[..., number], (road[there], kind[there]), 1)
+            previous = FollowingPair(*self._following_pairs[:, *own])
+            recovers = is_recovering(self._is_recovering[own], duration, previous, pair) & (leader >= 0)
+            self._is_recovering[own], self._following_pairs[:, *own] = recovers, pair
+            columns = road[rows], *pair, recovers
+            self._steady_following.append(np.stack([each[is_steady].astype(np.float64) for each in columns]))
+        np.add.at(self._observed_steps, (road, kind), is_running[road])
+        brakes = np.flatnonzero((vehicles.acceleration < 0.0) & is_running[road])
+        braking = -vehicles.acceleration[brakes].astype(np.float64)
+        np.maximum.at(self._max_braking, (road[brakes], kind[brakes]), braking)
+        for number, threshold in enumerate(BRAKING_THRESHOLDS):
+            hard = brakes[braking > threshold + BRAKING_TOLERANCE]
+            np.add.at(self._hard_braking_counts[..., number], (road[hard], kind[hard]), 1)
 
     def record_control_step(
         self,
@@ -140,77 +133,71 @@ class MotorwayLog:
         cav_numbers: NDArray[np.intp],
         states: LocalState,
     ) -> None:
-        """Note who is where after a decision, and what CAVs perceive, whose names are `cavs`."""
-        moment = np.full(len(gaps), len(self._placements))
-        self._placements.append(_Placements(moment, *vehicles[:5], gaps))
+        """Record the positions of all vehicles after a control step, and what the CAVs observe."""
+        step_index = np.full(len(gaps), len(self._placements))
+        self._placements.append(_Placements(step_index, *vehicles[:5], gaps))
         self._backlogs.append(backlog)
         self._cav_numbers.append(cav_numbers)
         self._states.append(states)
 
     def record_accelerations(self, accelerations: Floats) -> None:
-        """Note what the CAVs of the moment before did in a decision [m/s2]."""
+        """Record the accelerations in a control step of the CAVs before it [m/s2]."""
         self._accelerations.append(accelerations)
 
     def make_episodes(
         self, driver_log: DriverLog, seeds: Sequence[Sequence[int]], numbers_per_road: int
     ) -> tuple[Episode, ...]:
-        """Return the record of each road; CAVs' names are `road * per_road + entry`."""
-        stays, wheres = self._trips(driver_log, numbers_per_road), self._placements_by_road()
-        settled = np.concatenate(self._steady_following, 1) if self._steady_following else np.zeros((5, 0))
-        waiting = np.stack(self._backlogs, 1).astype(np.float64)
-        return tuple(
-            self._make_episode(number, tuple(seed), wheres[number], stays[number], waiting[number], settled)
-            for number, seed in enumerate(seeds)
-        )
-
-    def _placements_by_road(self) -> list[_Placements]:
-        """Return where vehicles were at all moments until the end, road by road."""
+        """Return the record of each road; CAVs have the numbers `road * numbers_per_road + entry`."""
+        trips = self._trips(driver_log, numbers_per_road)
+        steady = np.concatenate(self._steady_following, 1) if self._steady_following else np.zeros((5, 0))
+        backlogs = np.stack(self._backlogs, 1).astype(np.float64)
         every = _Placements(*(np.concatenate(values) for values in zip(*self._placements, strict=True)))
         order = np.argsort(every.road, kind="stable")
         starts = np.searchsorted(every.road[order], np.arange(len(self.roads) + 1))
-        rows = [order[start:end] for start, end in pairwise(starts)]
-        rows = [each[every.step_index[each] <= end] for each, end in zip(rows, self.end_steps, strict=True)]
-        return [every.select(each) for each in rows]
+        episodes = []
+        for number, (start, end) in enumerate(pairwise(starts)):
+            rows = order[start:end]
+            rows = rows[every.step_index[rows] <= self.end_steps[number]]
+            placements = _Placements(*(values[rows] for values in every))
+            audit = self._audit(number, trips[number], steady[1:, steady[0] == number])
+            seed = tuple(seeds[number])
+            episodes.append(self._make_episode(number, seed, placements, trips[number], backlogs[number], audit))
+        return tuple(episodes)
 
     def _trips(self, driver_log: DriverLog, numbers_per_road: int) -> list[list[Trajectory]]:
-        """Return the stays of CAVs on each road of at least one decision, in order of entry."""
+        """Return the trips of the CAVs on each road that last at least one control step, in order of entry."""
         counts = [len(each) for each in self._cav_numbers]
-        time = np.repeat(np.arange(len(counts)), counts)
+        step_index = np.repeat(np.arange(len(counts)), counts)
         row = np.concatenate([np.arange(count) for count in counts])
-        names = np.concatenate(self._cav_numbers)
-        order = np.argsort(names, kind="stable")
-        cut = np.flatnonzero(np.diff(names[order])) + 1
+        numbers = np.concatenate(self._cav_numbers)
+        order = np.argsort(numbers, kind="stable")
+        groups = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1) if len(order) else []
         first, *others = self._states
         states = first.map(lambda *values: np.concatenate(values), *others)
-        # Nobody had decided anything at the last moment.
-        applied = np.concatenate([*self._accelerations, np.zeros(counts[-1])])
-        found: list[list[Trajectory]] = [[] for _ in self.roads]
-        entered = np.argsort([group[0] for group in np.split(order, cut)] if len(order) else [], kind="stable")
-        groups = np.split(order, cut) if len(order) else []
-        for number, which in enumerate(entered.tolist()):
-            rows = groups[which]
-            road, entry = divmod(int(names[rows[0]]), numbers_per_road)
+        accelerations = np.concatenate([*self._accelerations, np.zeros(counts[-1])])  # none after the last state
+        trips: list[list[Trajectory]] = [[] for _ in self.roads]
+        for entry_number, rows in enumerate(sorted(groups, key=lambda group: group[0])):
+            road, entry = divmod(int(numbers[rows[0]]), numbers_per_road)
             end = self.end_steps[road]
-            rows = rows[time[rows] <= end]
+            rows = rows[step_index[rows] <= end]
             if len(rows) < 2:
                 continue
-            steps = rows[:-1]
-            nothing = np.zeros(len(steps))
-            found[road].append(
+            zeros = np.zeros(len(rows) - 1)
+            trips[road].append(
                 make_trajectory(
                     vehicle=self.roads[road].entries[entry].name,
-                    entry_number=number,
-                    start_step=int(time[rows[0]]),
+                    entry_number=entry_number,
+                    start_step=int(step_index[rows[0]]),
                     rows=row[rows],
                     states=states.select(rows),
-                    applied_acceleration=applied[steps],
-                    filter_braking=nothing,
-                    shield_braking=nothing,
-                    terminated=bool(time[rows[-1]] == end),
+                    applied_acceleration=accelerations[rows[:-1]],
+                    filter_braking=zeros,
+                    shield_braking=zeros,
+                    terminated=bool(step_index[rows[-1]] == end),
                     driver_log=driver_log,
                 )
             )
-        return found
+        return trips
 
     def _make_episode(
         self,
@@ -219,39 +206,36 @@ class MotorwayLog:
         placements: _Placements,
         trips: list[Trajectory],
         backlog: Floats,
-        steady_following: Floats,
+        audit: Audit,
     ) -> Episode:
-        road, entry = self.roads[road_index], placements.entry
-        moments, crashed = len(backlog), self.end_steps[road_index] < len(backlog)
-        if crashed:
-            moments = int(self.end_steps[road_index]) + 1
-        came, first = np.unique(entry, return_index=True)
-        came = came[np.argsort(first, kind="stable")]
-        of_entry = np.full(self.entry_count, -1)
-        of_entry[came] = np.arange(len(came))
-        mine = of_entry[entry]
-        begins, ends = np.full(len(came), moments), np.zeros(len(came), np.intp)
-        np.minimum.at(begins, mine, placements.step_index)
-        np.maximum.at(ends, mine, placements.step_index)
-        cavs = dict.fromkeys(each.vehicle for each in trips)
-        entries = [road.entries[each] for each in came.tolist()]
-        groups = [(each.name in cavs, each.route) for each in entries]
-        columns = assign_columns(begins, ends, groups, max(1, moments // SHARED_COLUMN_FRAMES))
+        road, steps = self.roads[road_index], placements.step_index
+        moments = min(len(backlog), int(self.end_steps[road_index]) + 1)
+        has_crashed = self.end_steps[road_index] < len(backlog)
+        numbers, first_rows, inverse = np.unique(placements.entry, return_index=True, return_inverse=True)
+        order = np.argsort(first_rows, kind="stable")
+        vehicle = np.argsort(order)[inverse]  # by first appearance
+        first, last = np.full(len(order), moments), np.zeros(len(order), np.intp)
+        np.minimum.at(first, vehicle, steps)
+        np.maximum.at(last, vehicle, steps)
+        cav_ids = dict.fromkeys(each.vehicle for each in trips)
+        entries = [road.entries[number] for number in numbers[order].tolist()]
+        groups = [(each.name in cav_ids, each.route) for each in entries]
+        columns = assign_columns(first, last, groups, max(1, moments // SHARED_COLUMN_FRAMES))
         branches = dict(zip(columns.tolist(), [each.route for each in entries], strict=True))
 
         def as_table(values: Floats) -> Floats:
-            found = np.full((moments, int(columns.max(initial=-1)) + 1), np.nan)
-            found[placements.step_index, columns[mine]] = values
-            return found
+            table = np.full((moments, len(branches)), np.nan)
+            table[steps, columns[vehicle]] = values
+            return table
 
         return Episode(
             seed=seed,
-            status="collision" if crashed else "completed",
-            collisions=2 * int(crashed),
+            status="collision" if has_crashed else "completed",
+            collisions=2 * int(has_crashed),
             control_step=self.control_step,
             limit_speed=road.limit_speed,
             vehicle_ids=tuple(each.name for each in entries),
-            cav_ids=tuple(cavs),
+            cav_ids=tuple(cav_ids),
             vehicle_columns=tuple(columns.tolist()),
             branches=tuple(branches[column] for column in sorted(branches)),
             speeds=as_table(placements.speed),
@@ -265,22 +249,21 @@ class MotorwayLog:
             demand_peak=road.peak,
             free_flow_time=road.free_flow_time,
             trajectories=tuple(trips),
-            audit=self._audit(road_index, trips, steady_following[1:, steady_following[0] == road_index]),
+            audit=audit,
         )
 
     def _audit(self, road_index: int, trips: list[Trajectory], steady_following: Floats) -> Audit:
-        """Return the physics of every simulation step of a road."""
-        people, cavs, cut_in = (
+        """Return the audit of every simulation step of a road."""
+        humans, cavs, cut_ins = (
             BrakingStatistics(
                 float(self._max_braking[road_index, kind]),
                 tuple(map(int, self._hard_braking_counts[road_index, kind])),
                 int(self._observed_steps[road_index, kind]),
             )
-            for kind in (HUMAN_DRIVER, CAV_DRIVER, CAV_AFTER_CUT_IN)
+            for kind in _DRIVER_KINDS
         )
         jerks = [np.abs(np.diff(each.states.speed, 2)).max(initial=0.0) for each in trips]
-        jerk = max(jerks, default=0.0) / self.control_step**2
-        speed, leader, gap, recovering = steady_following[:, None]
-        found = following_statistics(speed, leader, gap, self.simulation_step, in_recovery=recovering)
-        found = replace(found, max_jerk=float(jerk))
-        return Audit(people, cavs, found, SHORT_TIME_GAP, has_lanes=True, cut_in_braking=cut_in)
+        speed, leader_speed, gap, in_recovery = steady_following[:, None]
+        following = following_statistics(speed, leader_speed, gap, self.simulation_step, in_recovery=in_recovery)
+        following = replace(following, max_jerk=float(max(jerks, default=0.0) / self.control_step**2))
+        return Audit(humans, cavs, following, SHORT_TIME_GAP, has_lanes=True, cut_in_braking=cut_ins)

@@ -1,6 +1,6 @@
-"""W motorways that a ramp joins as one world to drive in: CAVs hold their own ACCs back, as in SUMO.
+"""W motorways with a ramp as one world: CAVs reduce the set speeds of their own ACCs, as in SUMO.
 
-Rows of CAVs are in the order in which they entered, whatever their road.
+The rows of CAVs are in the order in which they entered, regardless of their road.
 """
 
 from collections.abc import Collection, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, batch_commanded_accelerations, commanded_time_gaps
-from unjam.drivers.local_state import ADJACENT_POSITIONS, MAX_OBSERVED_GAP, SECTIONS_AHEAD, LocalState
+from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import RoadSections, RoadsideMessages
 from unjam.physics.arrays import Floats
 from unjam.physics.kinematics import next_speed
@@ -19,36 +19,30 @@ from unjam.scenarios.road import MotorwayRoad
 from unjam.worlds.batch.leaders import CONTACT_GAP
 from unjam.worlds.batch.on_ramp.record import MotorwayLog
 from unjam.worlds.batch.on_ramp.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
-from unjam.worlds.batch.on_ramp.vehicles import (
-    NUMBERS_PER_ROAD,
-    MotorwayVehicles,
-    find_rows,
-    neighbors_on_lane,
-    vehicle_numbers,
-)
+from unjam.worlds.batch.on_ramp.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers
 from unjam.worlds.record import Episode
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 
 class ReplayOptions(NamedTuple):
-    """What is otherwise where the people of an episode come once more, all at the same times."""
+    """Options of a replay, in which the vehicles of an episode enter again at the same times."""
 
     seeds: Sequence[tuple[Sequence[int], Sequence[int]]]
-    """of what people misjudge, and of exploration, for each road"""
+    """of drivers' errors, and of exploration, for each road"""
     control_steps: int
-    """after which it ends"""
+    """after which the replay ends"""
     has_driver_errors: bool
-    """whether people misjudge anything"""
+    """whether human drivers make errors"""
     correction: LearnedCorrection | None
-    """what people do besides"""
+    """of the speeds of human drivers"""
 
 
 class MotorwayBatch:
-    """W on-ramps of the same kind, each with a seed of its own; alike SUMO's in distribution."""
+    """W on-ramps of one kind, each with its own seed; they equal SUMO's in distribution."""
 
     is_scalar = False
     measured_fields: Collection[str] = ()
-    """fields of a `LocalState` that the driver looks at"""
+    """optional fields of `LocalState` that the driver reads"""
     remaining_rows: Sequence[int] | None = None
 
     def __init__(
@@ -57,220 +51,201 @@ class MotorwayBatch:
         seeds: Sequence[Sequence[int]],
         dtype: type = np.float64,
         explore: Sequence[float] | None = None,
-        replay: "ReplayOptions | None" = None,
+        replay: ReplayOptions | None = None,
     ) -> None:
-        """Take empty roads, one for each seed; numbers have the precision `kind`.
+        """Take empty roads, one for each seed.
 
-        By `explore` exploration noise counts on each road; None: as it is drawn. `resume_arguments`: what is otherwise
-        than in the episodes of these seeds.
+        `dtype` is the precision of the simulation, `explore` the factor of exploration noise on each road (None: 1);
+        `replay` changes the episodes of these seeds.
         """
         self._exploration_scales = np.ones(len(seeds)) if explore is None else np.array(explore)
-        self.scenario, self._seeds = scenario, seeds
+        self.scenario, self._seeds, self._replay, self._dtype = scenario, seeds, replay, dtype
         drawn = [scenario.draw_from_seed(seed) for seed in seeds]
         self.roads = [cast(MotorwayRoad, road) for road, _ in drawn]
-        self._replay, own = replay, [(noise, seed) for _, (noise, seed, *_) in drawn]
+        generator_seeds = [others[:2] for _, others in drawn] if replay is None else replay.seeds
         self._human_generators, self._exploration_generators = (
-            [np.random.default_rng(seed) for seed in seeds]
-            for seeds in zip(*(own if replay is None else replay.seeds), strict=True)
+            [np.random.default_rng(seed) for seed in each] for each in zip(*generator_seeds, strict=True)
         )
-        self._dtype, step = dtype, self.scenario.simulation_step
-        numbers, learned = lambda values: values.astype(dtype), replay and replay.correction
-        taken = self.scenario.steps_per_control_step
-        self._traffic = BatchMotorways(self.roads, step, self._draw_errors, numbers, learned, taken)
-        entries = max(len(road.entries) for road in self.roads)
-        self._is_cav = np.zeros((len(drawn), entries), bool)
+        self._traffic = BatchMotorways(
+            self.roads,
+            scenario.simulation_step,
+            self._draw_errors,
+            lambda values: values.astype(dtype),
+            replay and replay.correction,
+            scenario.steps_per_control_step,
+        )
+        entry_count = max(len(road.entries) for road in self.roads)
+        self._is_cav = np.zeros((len(seeds), entry_count), bool)
         for number, road in enumerate(self.roads):
             self._is_cav[number, : len(road.entries)] = [entry.name in road.cav_ids for entry in road.entries]
-        ways, road = len(self.roads[0].lane_names), self.roads[0]
-        self._road_sections = RoadSections(ways, road.length, len(drawn))
-        self._messages = RoadsideMessages(road.roadside, self.scenario.control_step, self._human_generators[0])
-        self.limits, self.control_steps, self.entered_count = self.scenario.acceleration_limits, 0, 0
+        first = self.roads[0]
+        self._road_sections = RoadSections(len(first.lane_names), first.length, len(seeds))
+        self._messages = RoadsideMessages(first.roadside, scenario.control_step, self._human_generators[0])
+        self.limits, self.control_steps, self.entered_count = scenario.acceleration_limits, 0, 0
         self._cav_numbers: NDArray[np.intp] = np.zeros(0, np.intp)
         """road and entry of each CAV as one number, in order of entry"""
-        self._cav_entry_counts = np.zeros(len(drawn))
-        """CAVs that have entered each road"""
+        self._cav_entry_counts = np.zeros(len(seeds))
+        """number of CAVs that have entered each road"""
         self._is_controlled, self._has_time_gap_commands = False, False
         self._episode_noise: Floats | None = None
-        """what networks explore with all episode long, of each road"""
-        decision_step = self.scenario.control_step
-        planned = self.scenario.horizon * decision_step
-        self._log = MotorwayLog(self.roads, entries, step, decision_step, planned)
+        """per-episode exploration noise of each road"""
+        step, duration = scenario.control_step, scenario.horizon * scenario.control_step
+        self._log = MotorwayLog(self.roads, entry_count, scenario.simulation_step, step, duration)
 
     def _draw_errors(self, shape: tuple[int, ...]) -> Floats:
-        """Return the errors of all vehicles in this step: each road draws its own."""
+        """Return noise for the errors of all drivers in this step, which each road draws itself."""
         if self._replay is not None and not self._replay.has_driver_errors:
             return np.zeros(shape, self._dtype)
-        counts = np.bincount(self._traffic.vehicles.road, minlength=len(self.roads))
-        drawn = [
+        counts = np.bincount(self._traffic.vehicles.road, minlength=len(self.roads)).tolist()
+        draws = [
             generator.standard_normal((shape[0], count))
-            for generator, count in zip(self._human_generators, counts.tolist(), strict=True)
+            for generator, count in zip(self._human_generators, counts, strict=True)
         ]
-        return np.concatenate(drawn, 1).astype(self._dtype)
+        return np.concatenate(draws, 1).astype(self._dtype)
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Begin with empty roads; nothing was before."""
+        """Start with empty roads, without a history."""
         self._is_controlled = is_controlled
         self._update_cavs()
 
     @property
     def cav_count(self) -> int:
-        """CAVs on the roads now."""
+        """Number of CAVs on the roads now."""
         return len(self._cav_numbers)
 
     @property
     def cav_roads(self) -> NDArray[np.intp]:
-        """Which road each CAV is on, shape (CAVs,)."""
+        """The road of each CAV, shape (CAVs,)."""
         return self._cav_numbers // NUMBERS_PER_ROAD
 
     @property
     def has_ended(self) -> bool:
         """Whether the horizon is reached."""
-        horizon = self.scenario.horizon if self._replay is None else self._replay.control_steps
-        return self.control_steps >= horizon
+        return self.control_steps >= (self.scenario.horizon if self._replay is None else self._replay.control_steps)
 
     def local_state(self) -> LocalState:
-        """Return what the CAVs perceive now: arrays of shape (CAVs,)."""
+        """Return what the CAVs observe now: arrays of shape (CAVs,)."""
         return self._local_state
 
     def advance(self, command: Command | None) -> None:
-        """Simulate one decision, held over its steps; None: the CAVs stay human."""
-        scenario, before = self.scenario, self._local_state.speed
-        wanted = None
+        """Simulate one control step with the same command throughout; None: the CAVs stay human."""
+        scenario, traffic, before = self.scenario, self._traffic, self._local_state.speed
+        accelerations = None
         if self._is_controlled:
-            wanted = batch_commanded_accelerations(command, self.limits, self.cav_count, self.control_steps)
+            accelerations = batch_commanded_accelerations(command, self.limits, self.cav_count, self.control_steps)
             self._set_time_gaps(command)
         for _ in range(scenario.steps_per_control_step):
-            if wanted is not None:
-                self._apply_set_speeds(np.asarray(wanted, np.float64))
-            left = self._traffic.step()
-            vehicles = self._traffic.vehicles
-            ahead = neighbors_on_lane(self._traffic.neighbors.leaders, vehicles.lane)
-            self._log.record_step(vehicles, ahead, left, find_rows(self._cav_numbers, vehicles), self._is_controlled)
+            if accelerations is not None:
+                self._apply_set_speeds(np.asarray(accelerations, np.float64))
+            arrived = traffic.step()
+            vehicles = traffic.vehicles
+            leader_rows = neighbors_on_lane(traffic.neighbors.leaders, vehicles.lane)
+            cav_rows = find_rows(self._cav_numbers, vehicles)
+            self._log.record_step(vehicles, leader_rows, arrived, cav_rows, self._is_controlled)
         self.control_steps += 1
         self._update_cavs()
-        after, kept = before.copy(), slice(len(before)) if self.remaining_rows is None else self.remaining_rows
-        after[kept] = self._local_state.speed[: len(after[kept])]
+        after = before.copy()
+        remaining = slice(len(before)) if self.remaining_rows is None else self.remaining_rows
+        after[remaining] = self._local_state.speed[: len(after[remaining])]
         self._log.record_accelerations((after - before) / scenario.control_step)
 
     def _set_time_gaps(self, command: Command | None) -> None:
-        """Let CAVs' ACCs keep the time headways that a driver asks for; their own, where it asks no more."""
-        self._has_time_gap_commands = self._has_time_gap_commands or (
-            command is not None and command.time_gap is not None
-        )
-        if not self._has_time_gap_commands:
-            return
-        names = [str(number) for number in self._cav_numbers]
-        least = self.scenario.cruise.time_gap
-        headways = commanded_time_gaps(command, least, names, self.control_steps)
-        self._traffic.vehicles.time_headway[find_rows(self._cav_numbers, self._traffic.vehicles)] = headways
+        """Set the time gaps of the CAVs' ACCs from the first command of one on, by default that of the scenario."""
+        self._has_time_gap_commands |= command is not None and command.time_gap is not None
+        if self._has_time_gap_commands:
+            names = [str(number) for number in self._cav_numbers]
+            time_gaps = commanded_time_gaps(command, self.scenario.cruise.time_gap, names, self.control_steps)
+            rows = find_rows(self._cav_numbers, self._traffic.vehicles)
+            self._traffic.vehicles = self._traffic.vehicles.replace_rows(rows, time_headway=time_gaps)
 
     def _apply_set_speeds(self, accelerations: Floats) -> None:
-        """Give each CAV a set speed, or none where its ACC may drive as it likes or a lane closes."""
-        vehicles, cruise, step = self._traffic.vehicles, self.scenario.cruise, self.scenario.simulation_step
-        found = find_rows(self._cav_numbers, vehicles)
-        there = found >= 0
-        rows, accelerations = found[there], accelerations[there]
-        speed, stretch = vehicles.speed[rows].astype(np.float64), self._traffic.geometry
-        asked = cruise.set_speed(speed, next_speed(speed, accelerations, step), self.limits.highest, step)
-        beside = (vehicles.position[rows] >= stretch.merge_start) & (vehicles.position[rows] < stretch.merge_end)
-        vehicles.speed_cap[rows] = np.where(beside, NO_SPEED_CAP, np.minimum(asked, NO_SPEED_CAP))
+        """Set the set speed of each CAV's ACC; it has no cap next to the ramp's lane."""
+        vehicles, geometry, step = self._traffic.vehicles, self._traffic.geometry, self.scenario.simulation_step
+        rows = find_rows(self._cav_numbers, vehicles)
+        is_present = rows >= 0
+        rows, accelerations = rows[is_present], accelerations[is_present]
+        speed, position = vehicles.speed[rows].astype(np.float64), vehicles.position[rows]
+        commanded = next_speed(speed, accelerations, step)
+        set_speed = self.scenario.cruise.set_speed(speed, commanded, self.limits.highest, step)
+        is_merging = (position >= geometry.merge_start) & (position < geometry.merge_end)
+        cap = np.where(is_merging, NO_SPEED_CAP, np.minimum(set_speed, NO_SPEED_CAP))
+        self._traffic.vehicles = vehicles.replace_rows(rows, speed_cap=cap)
 
     def _update_cavs(self) -> None:
-        """Note who is where after a decision, and take control of the CAVs that have entered."""
-        vehicles = self._traffic.vehicles
-        there = find_rows(self._cav_numbers, vehicles) >= 0
-        keys = vehicle_numbers(vehicles)
-        chosen_ones = np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry])
-        new = chosen_ones[~np.isin(keys[chosen_ones], self._cav_numbers)]
-        new = new[np.argsort(keys[new], kind="stable")]
-        self.remaining_rows = np.flatnonzero(there).tolist() if len(new) or not there.all() else None
-        self._cav_numbers = np.concatenate([self._cav_numbers[there], keys[new]])
+        """Record the vehicles after a control step, and take control of the CAVs that have entered."""
+        traffic, vehicles = self._traffic, self._traffic.vehicles
+        remains, numbers = find_rows(self._cav_numbers, vehicles) >= 0, vehicle_numbers(vehicles)
+        cav_rows = np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry])
+        new = cav_rows[~np.isin(numbers[cav_rows], self._cav_numbers)]
+        new = new[np.argsort(numbers[new], kind="stable")]
+        self.remaining_rows = np.flatnonzero(remains).tolist() if len(new) or not remains.all() else None
+        self._cav_numbers = np.concatenate([self._cav_numbers[remains], numbers[new]])
         self.entered_count += len(new)
         if self._is_controlled and len(new):
-            enable_acc(vehicles, new, self.scenario.cruise)
+            vehicles = traffic.vehicles = enable_acc(vehicles, new, self.scenario.cruise)
         self._cav_entry_counts += np.bincount(vehicles.road[new], minlength=len(self.roads))
-        means = self._road_sections.mean_speeds(
-            vehicles.lane, vehicles.position, vehicles.speed, self._traffic.geometry.speed_limit, vehicles.road
-        )
-        self._messages.send(means)
-        self._local_state = self._exact_state(vehicles)
-        waiting = self._traffic.insertion_queue.backlog(self._traffic.time - self.scenario.simulation_step)
-        gaps = self._gaps(vehicles)
-        touched = vehicles.road[gaps < CONTACT_GAP]
-        self._log.end_steps[touched] = np.minimum(self._log.end_steps[touched], self.control_steps)
-        self._log.record_control_step(vehicles, gaps, waiting, self._cav_numbers, self._local_state)
-
-    def _gaps(self, vehicles: MotorwayVehicles) -> Floats:
-        """Return the gaps of all to those ahead on their ways [m]; NaN where nobody is."""
-        if not len(vehicles.road):
-            return np.zeros(0)
-        row = neighbors_on_lane(self._traffic.neighbors.leaders, vehicles.lane)
+        motion = vehicles.lane, vehicles.position, vehicles.speed
+        self._messages.send(self._road_sections.mean_speeds(*motion, traffic.geometry.speed_limit, vehicles.road))
+        self._local_state = self._exact_state()
+        row = neighbors_on_lane(traffic.neighbors.leaders, vehicles.lane)
         gaps = vehicles.position[row] - self.roads[0].vehicle_length - vehicles.position
-        return np.where(row >= 0, gaps, np.nan)
+        gaps = np.where(row >= 0, gaps, np.nan)
+        touching = vehicles.road[gaps < CONTACT_GAP]
+        self._log.end_steps[touching] = np.minimum(self._log.end_steps[touching], self.control_steps)
+        backlog = traffic.insertion_queue.backlog(traffic.time - self.scenario.simulation_step)
+        self._log.record_control_step(vehicles, gaps, backlog, self._cav_numbers, self._local_state)
 
-    def _exact_state(self, vehicles: MotorwayVehicles) -> LocalState:
-        """Return what exact sensors of the CAVs would read now."""
-        rows, road = find_rows(self._cav_numbers, vehicles), self.roads[0]
-        if not len(rows):
-            return _empty_state()
-        near = self._traffic.neighbors
-        way, place, speed = vehicles.lane[rows], vehicles.position[rows], vehicles.speed[rows]
+    def _exact_state(self) -> LocalState:
+        """Return the readings of exact sensors of the CAVs."""
+        traffic, vehicles, road = self._traffic, self._traffic.vehicles, self.roads[0]
+        rows, neighbors, geometry = find_rows(self._cav_numbers, vehicles), traffic.neighbors, traffic.geometry
+        lane, position, speed, roads = (
+            each[rows] for each in (vehicles.lane, vehicles.position, vehicles.speed, vehicles.road)
+        )
 
         def neighbor_state(neighbors: NDArray[np.intp], lane_offset: int, direction: float) -> tuple[Floats, Floats]:
             row = neighbors_on_lane(neighbors, vehicles.lane + lane_offset)[rows]
-            gap = direction * (vehicles.position[row] - place) - road.vehicle_length
-            there = (row >= 0) & (gap < MAX_OBSERVED_GAP)
-            return np.where(there, vehicles.speed[row], speed), np.where(there, gap, MAX_OBSERVED_GAP)
+            gap = direction * (vehicles.position[row] - position) - road.vehicle_length
+            is_near = (row >= 0) & (gap < MAX_OBSERVED_GAP)
+            return np.where(is_near, vehicles.speed[row], speed), np.where(is_near, gap, MAX_OBSERVED_GAP)
 
-        beside = [
-            neighbor_state(each, side, sign)
-            for side in (1, -1)
-            for each, sign in ((near.leaders, 1.0), (near.followers, -1.0))
-        ]
-        ramp = (way == 0) & (place < road.merge_position)
-        allowed = np.where(ramp, self._traffic.geometry.ramp_speed_limit, self._traffic.geometry.speed_limit)
-        lane_speeds, road_speeds = self._road_sections.speeds_ahead(
-            self._messages.latest, way, place, vehicles.road[rows]
+        own, left, right = (
+            (neighbor_state(neighbors.leaders, offset, 1.0), neighbor_state(neighbors.followers, offset, -1.0))
+            for offset in (0, 1, -1)
         )
-        share = self._cav_entry_counts / self._traffic.insertion_queue.entry_counts.clip(1)
-        found = LocalState(
+        is_on_ramp = (lane == 0) & (position < road.merge_position)
+        limit = np.where(is_on_ramp, geometry.ramp_speed_limit, geometry.speed_limit)
+        lane_speeds, road_speeds = self._road_sections.speeds_ahead(self._messages.latest, lane, position, roads)
+        penetration_rate = self._cav_entry_counts / traffic.insertion_queue.entry_counts.clip(1)
+        state = LocalState(
             speed,
-            *neighbor_state(near.leaders, 0, 1.0),
-            *neighbor_state(near.followers, 0, -1.0),
-            place - road.merge_position,
+            *own[0],
+            *own[1],
+            position - road.merge_position,
             np.full(len(rows), np.nan),
-            allowed_speed=allowed * vehicles.speed_factor[rows],
-            distance_to_merge=road.merge_position - place,
+            allowed_speed=limit * vehicles.speed_factor[rows],
+            distance_to_merge=road.merge_position - position,
             lane_speeds=lane_speeds,
             road_speeds=road_speeds,
-            adjacent_gaps=np.stack([gap for _, gap in beside], -1),
-            adjacent_speeds=np.stack([its for its, _ in beside], -1),
-            penetration_rate=share[vehicles.road[rows]],
+            adjacent_gaps=np.stack([gap for _, gap in left + right], -1),
+            adjacent_speeds=np.stack([adjacent_speed for adjacent_speed, _ in left + right], -1),
+            penetration_rate=penetration_rate[roads],
         )
-        return found.map(lambda values: values.astype(np.float64)).as_read_only()
+        return state.map(lambda values: values.astype(np.float64)).as_read_only()
 
     def noise(self, episode_noise_size: int = 0) -> Floats:
-        """Return standard normal noise for one look of a network, shape (CAVs,), or what lasts."""
-        roads = self.cav_roads
+        """Return standard normal noise for one action, shape (CAVs,), or of the episode, see `World.noise`."""
+        roads, generators = self.cav_roads, self._exploration_generators
         if episode_noise_size:
             if self._episode_noise is None:
-                each = [generator.standard_normal(episode_noise_size) for generator in self._exploration_generators]
-                self._episode_noise = np.stack(each)
+                self._episode_noise = np.stack([each.standard_normal(episode_noise_size) for each in generators])
             return self._exploration_scales[roads, None] * self._episode_noise[roads]
-        found = np.empty(len(roads))
+        noise = np.empty(len(roads))
         for road in np.unique(roads).tolist():
-            here = roads == road
-            found[here] = self._exploration_generators[road].standard_normal(int(here.sum()))
-        return self._exploration_scales[roads] * found
+            is_on_road = roads == road
+            noise[is_on_road] = generators[road].standard_normal(int(is_on_road.sum()))
+        return self._exploration_scales[roads] * noise
 
     def record(self, driver_log: DriverLog) -> tuple[Episode, ...]:
-        """Return what happened on each road since the start, without what was earned."""
+        """Return the record of each road since the start, without rewards."""
         return self._log.make_episodes(driver_log, self._seeds, NUMBERS_PER_ROAD)
-
-
-def _empty_state() -> LocalState:
-    """Return what is perceived where no CAV is on the road."""
-    one, many, four = np.zeros(0), np.zeros((0, SECTIONS_AHEAD)), np.zeros((0, len(ADJACENT_POSITIONS)))
-    own = LocalState(one, one, one, one, one, one, one)
-    told = {"allowed_speed": one, "distance_to_merge": one, "lane_speeds": many, "road_speeds": many}
-    return own._replace(**told, adjacent_gaps=four, adjacent_speeds=four, penetration_rate=one)

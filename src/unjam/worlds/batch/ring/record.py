@@ -1,4 +1,4 @@
-"""What happened in a batch of rings: sums of each, and the whole record where it was kept."""
+"""The record of a batch of rings: sums of each ring, and whole episodes if they are kept."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,42 +18,42 @@ from unjam.worlds.world import DriverLog
 
 @dataclass(frozen=True)
 class RingResults:
-    """What happened on W rings; arrays of shape (W,)."""
+    """Results of W rings; arrays of shape (W,)."""
 
     control_steps: Floats
-    """made until the end, or until a collision"""
+    """until the end or a collision"""
     has_crashed: Floats
-    """1 where there was a collision"""
+    """1 after a collision, else 0"""
     reward_terms: dict[str, Floats]
-    """terms of the reward, summed"""
+    """sums over the control steps"""
     mean_speed: Floats
-    """of all vehicles after each decision [m/s]"""
+    """of all vehicles after each control step [m/s]"""
     min_time_gap: Floats
-    """smallest of the CAVs in any step while they drive faster than 1 m/s [s]; infinite where never"""
+    """minimum of the CAVs above 1 m/s over all simulation steps [s]; infinite if they never drive that fast"""
     max_braking: Floats
-    """hardest of the CAVs in a step [m/s2]"""
+    """maximum of the CAVs over all simulation steps [m/s2]"""
     episodes: tuple[Episode, ...] = ()
-    """the whole record of each, without its reward; none where it was not kept"""
+    """records without rewards; empty if they are not kept"""
 
 
 @dataclass(frozen=True)
 class RingLog:
-    """All simulation steps of W rings, arrays as they were stepped."""
+    """All simulation steps of W rings, in arrays of the batch."""
 
     start_positions: Floats
-    """front bumpers as it began [m], shape (vehicles, W)"""
+    """front bumpers at the start [m], shape (vehicles, W)"""
     speeds: list[Array]
-    """with noise, that at the start being the first; (vehicles, W) each"""
+    """with noise, from the start on; (vehicles, W) each"""
     find_contacts: Callable[[Array, Array, Array], Array]
-    """which vehicles touch another one, of positions, gaps and the road's length [m]"""
+    """from positions, gaps and the road's length [m] to the vehicles that touch another one"""
     noise_free_speeds: list[Array] = field(default_factory=list)
-    """speeds before noise; likewise"""
+    """before noise, of each step; likewise"""
     requested_accelerations: list[Array] = field(default_factory=list)
-    """what drivers asked for in each decision; (CAVs * W,) each"""
+    """of the drivers in each control step; (CAVs * W,) each"""
     safe_accelerations: list[Array] = field(default_factory=list)
-    """what passed the filter in each step; likewise"""
+    """after the safety filter in each step; likewise"""
     commanded_speeds: list[Array] = field(default_factory=list)
-    """the speeds that this leads to; likewise"""
+    """speeds that result from them; likewise"""
 
     def make_episodes(
         self,
@@ -65,75 +65,57 @@ class RingLog:
         driver_log: DriverLog,
         penetration_rate: float | None,
     ) -> tuple[Episode, ...]:
-        """Return the record of each ring, which ends after so many decisions; the share is as it was told.
+        """Return the record of each ring until its last control step; arguments as in `Episode` and `RingResults`.
 
-        Who touched in one that has `crashed` may do so no more when it ends: a decision has many steps.
+        Vehicles that touched may be separate again at the end, because a control step has several simulation steps.
         """
-        rings, cavs = len(roads), len(roads[0].cav_ids)
-        decided = [tuple(map(as_numpy, decision)) for decision in driver_log.decisions]
-        last = None if driver_log.last_observation is None else as_numpy(driver_log.last_observation)
-        driver_log = replace(driver_log, decisions=decided, last_observation=last)
-        ways = {name: _stack_steps(getattr(self, name), -1, rings) for name in ("noise_free_speeds", "speeds")}
-        asked = {
-            name: _stack_steps(getattr(self, name), cavs, rings)
-            for name in ("requested_accelerations", "safe_accelerations", "commanded_speeds")
-        }
-        return tuple(
-            self._make_episode(
-                scenario, road, seed, number, int(count), bool(touched), driver_log, penetration_rate, {**ways, **asked}
-            )
-            for number, (scenario, road, seed, count, touched) in enumerate(
-                zip(scenarios, roads, seeds, control_steps, has_crashed, strict=True)
-            )
+        last = driver_log.last_observation
+        driver_log = replace(
+            driver_log,
+            decisions=[tuple(map(as_numpy, decision)) for decision in driver_log.decisions],
+            last_observation=None if last is None else as_numpy(last),
         )
+        vehicle_count, cav_count = len(self.start_positions), len(roads[0].cav_ids)
+        values = {name: self._stack(name, vehicle_count) for name in ("noise_free_speeds", "speeds")}
+        for name in ("requested_accelerations", "safe_accelerations", "commanded_speeds"):
+            values[name] = self._stack(name, cav_count)
+        episodes = []
+        for ring, (scenario, road, seed, count, crashed) in enumerate(
+            zip(scenarios, roads, seeds, control_steps.astype(int), has_crashed.astype(bool), strict=True)
+        ):
+            steps = count * scenario.steps_per_control_step
+            ends = {"requested_accelerations": count, "speeds": steps + 1}
+            own: dict[str, Any] = {name: each[: ends.get(name, steps), :, ring] for name, each in values.items()}
+            start = self.start_positions[:, ring]
+            log = ClosedRoadLog(
+                scenario, road, start, **own, has_crashed=bool(crashed), penetration_rate=penetration_rate
+            )
+            motion = log.speeds_and_positions()
+            position = motion[1][:, -1]
+            # The leader's position is not wrapped: a vehicle that touches its leader may be a little beyond it.
+            gaps = np.append(position[1:], position[0] + road.loop_length) - position - VEHICLE_LENGTH
+            touches = self.find_contacts(position, gaps, road.loop_length)
+            is_touched = np.roll(touches & (gaps < CONTACT_GAP), 1)  # on a crossing, `touches` contains both vehicles
+            fields = {
+                "seed": tuple(seed),
+                "status": "collision" if crashed else "completed",
+                "control_step": scenario.control_step,
+                "warmup": scenario.warmup,
+                "drawn_values": road.drawn_values,
+                "collisions": max(2 * int(crashed), int((touches | is_touched).sum())),
+                "limit_speed": road.limit_speed,
+            }
+            rows = np.arange(cav_count) * len(roads) + ring
+            episodes.append(log.episode(motion, fields, driver_log, rows))
+        return tuple(episodes)
 
-    def _make_episode(
-        self,
-        scenario: LoopScenario,
-        road: ClosedRoad,
-        seed: Sequence[int],
-        ring_index: int,
-        control_steps: int,
-        has_crashed: bool,
-        driver_log: DriverLog,
-        penetration_rate: float | None,
-        step_values: dict[str, Floats],
-    ) -> Episode:
-        made = control_steps * scenario.steps_per_control_step
-        ends = {"requested_accelerations": control_steps, "speeds": made + 1}
-        own: dict[str, Any] = {
-            name: values[: ends.get(name, made), :, ring_index] for name, values in step_values.items()
-        }
-        log = ClosedRoadLog(
-            scenario, road, self.start_positions[:, ring_index], **own, penetration_rate=penetration_rate
-        )
-        moments = log.speeds_and_positions()
-        before = moments[1][:, -1]
-        # Not wrapped: who touches the car ahead is a little before or beyond it.
-        ahead = np.append(before[1:], before[0] + road.loop_length)
-        gaps = ahead - before - VEHICLE_LENGTH
-        collided = self.find_contacts(before, gaps, road.loop_length)
-        hit = np.roll(collided & (gaps < CONTACT_GAP), 1)  # across a crossing both are told of
-        facts = {
-            "seed": tuple(seed),
-            "status": "collision" if has_crashed else "completed",
-            "control_step": scenario.control_step,
-            "warmup": scenario.warmup,
-            "drawn_values": road.drawn_values,
-            "collisions": max(2 * has_crashed, int((collided | hit).sum())),
-            "limit_speed": road.limit_speed,
-        }
-        rows = np.arange(len(road.cav_ids)) * self.start_positions.shape[1] + ring_index
-        return replace(log, has_crashed=has_crashed).episode(moments, facts, driver_log, rows)
+    def _stack(self, name: str, row_count: int) -> Floats:
+        """Return the values of all steps, shape (steps, row_count, W)."""
+        steps = getattr(self, name)
+        shape = len(steps), row_count, self.start_positions.shape[1]
+        return np.stack([as_numpy(each) for each in steps]).reshape(shape) if steps else np.zeros(shape)
 
 
 def as_numpy(values: Any) -> Floats:
     """Return an array or a tensor as a NumPy array in double precision."""
     return np.asarray(values.double().cpu() if hasattr(values, "cpu") else values, np.float64)
-
-
-def _stack_steps(values: list[Array], row_count: int, ring_count: int) -> Floats:
-    """Return arrays one after the other, shape (len(values), first, rings)."""
-    if not values:
-        return np.zeros((0, max(row_count, 0), ring_count))
-    return np.stack([as_numpy(each) for each in values]).reshape(len(values), row_count, ring_count)

@@ -1,4 +1,4 @@
-"""What the CAVs of many rings sense: each ring's misread what those of SUMO's episode of its seed do."""
+"""Sensor readings of the CAVs of many rings, with the same errors as in SUMO's episodes of the same seeds."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -14,7 +14,7 @@ from unjam.worlds.batch.ring.record import as_numpy
 
 
 class RingReadings:
-    """Readings of W rings: each has generators of its own, which are asked as SUMO's worlds ask theirs."""
+    """Readings of W rings; each ring has its own generators and calls them in the same order as SUMO's worlds."""
 
     def __init__(
         self,
@@ -23,17 +23,17 @@ class RingReadings:
         seeds: Sequence[Sequence[np.random.SeedSequence]],
         to_array: ArrayFactory,
     ) -> None:
-        """Take the names of a ring's CAVs, and the seeds of each ring, of `Scenario.draw_from_seed`."""
+        """Take the ids of a ring's CAVs, and the seeds of each ring, of `Scenario.draw_from_seed`."""
         sensors, braking = scenario.sensors, scenario.safety.leader_braking
         self._ring_readings = [
-            SensorReadings(sensors, braking, scenario.simulation_step, sensed)
-            for *_, sensed in (() if sensors.is_exact else seeds)
+            SensorReadings(sensors, braking, scenario.simulation_step, seed)
+            for *_, seed in (() if sensors.is_exact else seeds)
         ]
         self._cav_ids, self._to_array, self._shape = cav_ids, to_array, (len(cav_ids), len(seeds))
         self._cached_readings: tuple[int, LocalState] | None = None
 
     def read_for_drivers(self, step_index: int, true_state: LocalState) -> LocalState:
-        """Return what drivers perceive where `state` is true, the same however often a decision asks."""
+        """Return the drivers' readings of the true state, the same for all calls in a control step."""
         if not self._ring_readings:
             return true_state
         if self._cached_readings is None or self._cached_readings[0] != step_index:
@@ -47,10 +47,10 @@ class RingReadings:
         return self._cached_readings[1]
 
     def read_for_filters(self, true_state: FollowingState) -> FollowingState:
-        """Return what filters may rely on where `true` is so, once in each simulation step."""
+        """Return the safety filters' readings of the true state, for one call in each simulation step."""
         if not self._ring_readings:
             return true_state
-        cars = product(self._cav_ids, self._ring_readings)
+        cavs = product(self._cav_ids, self._ring_readings)
         rows = np.stack([as_numpy(values) for values in true_state], 1).tolist()
-        read = [ring.read_for_filter(name, FollowingState(*row)) for (name, ring), row in zip(cars, rows, strict=True)]
+        read = [ring.read_for_filter(name, FollowingState(*row)) for (name, ring), row in zip(cavs, rows, strict=True)]
         return FollowingState(*self._to_array(np.array(read).T))

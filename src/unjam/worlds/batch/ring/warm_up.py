@@ -1,4 +1,4 @@
-"""Rings after their all-human warm-up: it is the same whoever drives afterwards, so each has one."""
+"""States of rings after their all-human warm-up, which the driver of the CAVs does not influence."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
@@ -9,13 +9,13 @@ from unjam.worlds.batch.noise import NoiseState
 from unjam.worlds.record import Floats
 
 MAX_CACHED_CAVS = 2048
-"""CAVs whose rings are kept: some 60 kB each, most of them what the CAV saw in the last minute"""
+"""CAVs on cached rings: some 60 kB each, mostly the history of the CAV's last minute"""
 
 WarmUpKey = TypeVar("WarmUpKey", bound=Hashable)
 
 
 class WarmUpState(NamedTuple):
-    """One ring as its CAVs are handed over."""
+    """State of one ring at the moment when its CAVs are handed over."""
 
     speed: Floats
     """[m/s], shape (vehicles + 1,), the first again at the end"""
@@ -24,22 +24,21 @@ class WarmUpState(NamedTuple):
     gap: Floats
     """to the vehicle ahead [m], likewise"""
     has_crashed: bool
-    """whether people collided"""
+    """whether human drivers collided"""
     noise: NoiseState
     history: LocalState | None
-    """what the CAVs perceived in the last minute, shape (CAVs, moments); None where that is not remembered"""
-
+    """what the CAVs observed in the last minute, shape (CAVs, moments); None if it is not remembered"""
     crossing_memory: CrossingMemory | None = None
-    """on a figure eight who waits, and who is on the crossing since when; None elsewhere"""
+    """of a figure eight; None on rings"""
 
     @property
     def cav_count(self) -> int:
-        """How many CAVs' past is kept, one at least."""
+        """Number of CAVs with a history, at least one."""
         return 1 if self.history is None else len(self.history.speed)
 
 
 class WarmUpCache(dict[WarmUpKey, WarmUpState]):
-    """Rings that were warmed up already; the newest are kept."""
+    """The newest warm-up states."""
 
     def get_states(
         self,
@@ -47,19 +46,18 @@ class WarmUpCache(dict[WarmUpKey, WarmUpState]):
         upcoming: Sequence[WarmUpKey],
         warm_up: Callable[[Sequence[WarmUpKey]], Mapping[WarmUpKey, WarmUpState]],
     ) -> list[WarmUpState]:
-        """Return each wanted ring.
+        """Return the state of each key.
 
-        Where one must be warmed up, so are those of `is_approaching`: many at once take hardly longer than a few.
+        If one is missing, `warm_up` also simulates the missing ones of `upcoming`: many rings at once take hardly
+        longer than a few.
         """
-        missing = not all(ring in self for ring in keys)
-        new = [ring for ring in dict.fromkeys([*keys, *upcoming]) if missing and ring not in self]
-        known = {**self, **warm_up(new)} if missing else self
-        found = [known[ring] for ring in keys]
-        if missing:
-            left = sum(begun.cav_count for begun in known.values())
-            self.clear()
-            for ring, begun in known.items():
-                if left <= MAX_CACHED_CAVS:
-                    self[ring] = begun
-                left -= begun.cav_count
-        return found
+        if all(key in self for key in keys):
+            return [self[key] for key in keys]
+        known = {**self, **warm_up([key for key in dict.fromkeys([*keys, *upcoming]) if key not in self])}
+        remaining_cavs = sum(state.cav_count for state in known.values())
+        self.clear()
+        for key, state in known.items():
+            if remaining_cavs <= MAX_CACHED_CAVS:
+                self[key] = state
+            remaining_cavs -= state.cav_count
+        return [known[key] for key in keys]
