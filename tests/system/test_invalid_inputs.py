@@ -111,7 +111,7 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     "resuming with a preset": ("not allowed together with it", ["train --resume full --preset demo"]),
     "evaluating a folder that is not a run": ("not a run folder", ["evaluate full"]),
     "model of a folder that is not a run": ("not a run folder", ["model full"]),
-    "model of a run without one": ("has no learned model", ["model model-free"]),
+    "model of a run without one": ("has no model", ["model model-free"]),
     "report of a missing folder": ("report: 'nowhere' is not a folder", ["report nowhere"]),
     "report of an empty folder": ("has no evaluation.json", ["report full"]),
     "report of damaged results": ("damaged", ["report damaged"]),
@@ -120,8 +120,8 @@ INVALID: dict[str, tuple[str, list[str]]] = {
         "no CAV was on the road in 5 control steps",
         ["drive merge --driver pi --set penetration_rate=0 --set horizon=5"],
     ),
-    "share of CAVs on a road without one": (
-        "cav_share: unknown name",
+    "penetration rate on a closed road": (
+        "penetration_rate: unknown name",
         ["drive ring --driver pi --penetration-rate 0.1"],
     ),
     "configuration that is missing": ("there is no such file", ["drive none.sumocfg --driver pi"]),
@@ -184,7 +184,7 @@ INVALID: dict[str, tuple[str, list[str]]] = {
         "released: time_gap: 1",
         [f"drive ring --driver pi --reward released:time_gap=1{'0' * 400}"],
     ),
-    "seed too large to tune with": ("'--seed': 4294967296", ["tune ring --seed 4294967296"]),
+    "seed too large to tune with": ("less than or equal to 4294967295", ["tune ring --seed 4294967296"]),
     "text that is not UTF-8": ("allowed: text in UTF-8", ["drive ring --driver pi --out a\udcff"]),
     "weights that are complex": ("complex64", ["verify complex.unjam"]),
     "weights that are booleans": ("bool", ["verify boolean.unjam"]),

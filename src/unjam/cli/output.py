@@ -12,10 +12,10 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from unjam.cli.options import DEFAULT_WORKERS
 from unjam.errors import InputError, MissingPartError
@@ -76,13 +76,13 @@ def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
         columns[label].append(number)  # without a baseline there are no differences
 
     def build_table(columns: Sequence[int], separator: str) -> Table:
-        table = new_table(("metric", "unit"), [fill(escape(headings[number]), TEXT_COLUMN_WIDTH) for number in columns])
+        table = new_table(("metric", "unit"), [fill(headings[number], TEXT_COLUMN_WIDTH) for number in columns])
         for column in table.columns[2:]:
             column.no_wrap = True
         if separator != " ":
             table.columns[0].width, table.columns[1].width = NARROW_COLUMN_WIDTHS
         for row in rows:
-            table.add_row(row.label, row.unit, *(_cell_markup(row.cells[number], separator) for number in columns))
+            table.add_row(row.label, row.unit, *(_cell_text(row.cells[number], separator) for number in columns))
         return table
 
     def fits(columns: Sequence[int], separator: str) -> bool:
@@ -98,7 +98,7 @@ def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
         else:
             blocks[-1] = block
     for block in blocks:
-        console.print(build_table(block, separator), markup=True)
+        console.print(build_table(block, separator))
 
 
 def print_notes(notes: Sequence[str]) -> None:
@@ -107,10 +107,10 @@ def print_notes(notes: Sequence[str]) -> None:
         err_console.print(f"note: {note}", soft_wrap=True)
 
 
-def _cell_markup(cell: "TableCell", separator: str) -> str:
-    """Return a cell in rich's markup: its interval dim, verdicts wrapped."""
-    interval = f"[dim]{escape(cell.interval)}[/dim]" if cell.interval else ""
-    return separator.join(filter(None, (escape(fill(cell.mean, TEXT_COLUMN_WIDTH)), interval)))
+def _cell_text(cell: "TableCell", separator: str) -> Text:
+    """Return a cell: its interval dim, verdicts wrapped."""
+    mean = fill(cell.mean, TEXT_COLUMN_WIDTH)
+    return Text.assemble(mean, separator, (cell.interval, "dim")) if cell.interval else Text(mean)
 
 
 class ProgressReporter:
