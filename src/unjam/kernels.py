@@ -101,7 +101,7 @@ def _find_obstacle() -> str | None:
 
 
 def _openblas_core(numpy: Any) -> str | None:
-    """Return the processor whose kernels NumPy's own OpenBLAS has chosen; None: another BLAS."""
+    """Return the processor for which NumPy's own OpenBLAS has chosen kernels; None: another BLAS."""
     for library in (Path(numpy.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas64_*"):
         with suppress(OSError, AttributeError):
             core_name = ctypes.CDLL(str(library)).scipy_openblas_get_corename64_

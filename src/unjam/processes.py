@@ -11,8 +11,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
 
@@ -134,18 +134,16 @@ def kernel_protections() -> list[str]:
         child = os.fork()
         if child == 0:
             confine_process()
-            os._exit(_is_denied(Path(folder, "file").touch) + 2 * _is_denied(socket.socket))
+            denied = 0
+            for bit, action in ((1, Path(folder, "file").touch), (2, socket.socket)):
+                try:
+                    action()
+                except PermissionError:
+                    denied |= bit
+            os._exit(denied)
         code = max(0, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
     names = {1: "disk read-only (Landlock)", 2: "no network (seccomp)"}
     return [name for bit, name in names.items() if code & bit]
-
-
-def _is_denied(action: Callable[[], object]) -> bool:
-    try:
-        action()
-    except PermissionError:
-        return True
-    return False
 
 
 def has_display() -> bool:
@@ -163,34 +161,23 @@ def lock_folder(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another process has locked it, or one of its entries is a link.
     """
-    with protect_folder(folder), _hold_lock(folder):
-        yield
-
-
-@contextmanager
-def _hold_lock(folder: Path) -> Iterator[None]:
     path = folder / LOCK_FILE
-    descriptor = _open_locked(path)
-    while descriptor is not None and not _is_same_file(path, descriptor):  # its owner has just removed it
-        os.close(descriptor)
+    with protect_folder(folder), ExitStack() as stack:
         descriptor = _open_locked(path)
-    if descriptor is None:
+        while descriptor is not None and not _is_same_file(path, descriptor):  # its owner has just removed it
+            os.close(descriptor)
+            descriptor = _open_locked(path)
+        if descriptor is not None:
+            stack.callback(os.close, descriptor)
+            _check_other_machine(path, descriptor)
+            os.pwrite(descriptor, f"{platform.node()} {os.getpid()}\n".ljust(300).encode(), 0)
+            stop = threading.Event()
+            heart = threading.Thread(target=_send_heartbeats, args=(descriptor, stop), daemon=True)
+            heart.start()
+            stack.callback(remove, path)  # the last of these is called first
+            stack.callback(heart.join)
+            stack.callback(stop.set)
         yield
-        return
-    stop = threading.Event()
-    try:
-        _check_other_machine(path, descriptor)
-        os.pwrite(descriptor, f"{platform.node()} {os.getpid()}\n".ljust(300).encode(), 0)
-        heart = threading.Thread(target=_send_heartbeats, args=(descriptor, stop), daemon=True)
-        heart.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            heart.join()
-            remove(path)
-    finally:
-        os.close(descriptor)
 
 
 def _send_heartbeats(descriptor: int, stop: threading.Event) -> None:

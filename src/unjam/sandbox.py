@@ -9,6 +9,7 @@ import ctypes
 import os
 import platform
 import runpy
+import struct
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -29,20 +30,6 @@ IO_URING_SETUP = 425
 X32_SYSCALL_BIT = 0x40000000
 """marks other numbers of the same system calls (x32)"""
 EPERM = 1
-
-
-class _Rule(ctypes.Structure):
-    _pack_ = 1
-    _layout_ = "ms"
-    _fields_ = (("allowed", ctypes.c_uint64), ("folder", ctypes.c_int32))
-
-
-class _Instruction(ctypes.Structure):
-    _fields_ = (("code", ctypes.c_uint16), ("yes", ctypes.c_uint8), ("no", ctypes.c_uint8), ("k", ctypes.c_uint32))
-
-
-class _Program(ctypes.Structure):
-    _fields_ = (("length", ctypes.c_uint16), ("instructions", ctypes.POINTER(_Instruction)))
 
 
 def limit_resources(memory: int, seconds: int = 0) -> None:
@@ -84,7 +71,7 @@ def restrict_writing(*writable: Path) -> None:
     folders = filter(Path.is_dir, writable)
     for path, allowed in {**dict.fromkeys(folders, handled), Path(os.devnull): files}.items():
         folder = os.open(path, os.O_PATH | os.O_CLOEXEC)
-        libc.syscall(ADD_RULE, ruleset, 1, ctypes.byref(_Rule(allowed, folder)), 0)
+        libc.syscall(ADD_RULE, ruleset, 1, struct.pack("=Qi", allowed, folder), 0)
         os.close(folder)
     libc.syscall(RESTRICT_SELF, ruleset, 0)
     os.close(ruleset)
@@ -95,7 +82,7 @@ def _block_sockets(libc: ctypes.CDLL) -> None:
         return
     processor, socket = SOCKET_SYSCALLS[platform.machine()]
     load, equal, at_least, answer = 0x20, 0x15, 0x35, 0x06
-    instructions = (_Instruction * 8)(
+    instructions = (
         (load, 0, 0, 4),
         (equal, 0, 5, processor),
         (load, 0, 0, 0),
@@ -105,7 +92,9 @@ def _block_sockets(libc: ctypes.CDLL) -> None:
         (answer, 0, 0, 0x7FFF0000),  # allowed
         (answer, 0, 0, 0x00050000 | EPERM),
     )
-    libc.prctl(SET_SECCOMP, SECCOMP_FILTER_MODE, ctypes.byref(_Program(len(instructions), instructions)), 0, 0)
+    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *each) for each in instructions))
+    program = struct.pack("HP", len(instructions), ctypes.addressof(code))
+    libc.prctl(SET_SECCOMP, SECCOMP_FILTER_MODE, program, 0, 0)
 
 
 def run_sandboxed(memory: str, seconds: str, writable: str, program: str, *arguments: str) -> None:

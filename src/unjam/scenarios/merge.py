@@ -160,7 +160,7 @@ class Merge(Scenario):
 
 @lru_cache
 def _free_flow_speed(flow: float, length: float, humans: IDMParameters, step: float) -> float:
-    """Return the mean speed over `length` of human drivers that enter one after the other and never meet a jam [m/s]."""
+    """Return the mean speed over `length` of human drivers that enter one after the other in free flow [m/s]."""
     delay = round(3600.0 / flow / step)
     leader: list[tuple[float, float]] = []
     own: list[tuple[float, float]] = []

@@ -19,13 +19,11 @@ RING_EDGES = 4
 
 
 class EdgeSpan(NamedTuple):
-    """The position of an edge along a closed road."""
+    """The position of an edge along a closed road [m]."""
 
     name: str
     start: float
-    """[m]"""
     length: float
-    """[m]"""
 
     @property
     def end(self) -> float:
@@ -34,19 +32,18 @@ class EdgeSpan(NamedTuple):
 
 
 class LoopLayout(NamedTuple):
-    """One closed road, and the initial positions of its vehicles."""
+    """One closed road, and the initial positions of its vehicles [m]."""
 
     edges: Sequence[EdgeSpan]
     """in driving order"""
     length: float
-    """[m]"""
     positions: NDArray[np.float64]
-    """of the vehicles, from the last to the first of the queue [m]"""
+    """of the vehicles, from the last to the first of the queue"""
     network: RoadNetwork
     outline: NDArray[np.float64]
-    """rows (coordinate along the lap, x, y) [m]"""
+    """rows (coordinate along the lap, x, y)"""
     crossings: tuple[tuple[float, float], ...] = ()
-    """sections where the road crosses itself [m]"""
+    """sections where the road crosses itself"""
 
 
 @dataclass(frozen=True, config=STRICT)

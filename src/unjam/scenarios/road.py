@@ -21,13 +21,11 @@ def as_polyline(points: NDArray[np.float64]) -> Polyline:
 
 
 class Node(NamedTuple):
-    """A point where edges begin, end or meet."""
+    """A point (x, y) [m] where edges begin, end or meet."""
 
     name: str
     x: float
-    """[m]"""
     y: float
-    """[m]"""
     has_priority: bool = False
     """whether the priorities of the edges decide the right of way"""
     radius: float | None = None
@@ -35,29 +33,27 @@ class Node(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """A piece of road between two nodes."""
+    """A piece of road between two nodes; length [m], speed limit [m/s]."""
 
     name: str
     from_node: str
     to_node: str
     length: float
-    """[m]"""
     priority: int | None = None
     """the larger one has the right of way"""
     shape: Polyline = ()
     """empty: straight"""
     lanes: int = 1
     speed_limit: float | None = None
-    """[m/s]; None: that of the network"""
+    """None: that of the network"""
 
 
 class Connection(NamedTuple):
-    """Two edges, or two lanes, that follow each other; lanes count from 0 at the right."""
+    """Two edges, or two lanes, that follow each other; lanes count from 0 at the right, None: all of them."""
 
     from_edge: str
     to_edge: str
     from_lane: int | None = None
-    """None: all lanes, as the simulator connects them"""
     to_lane: int | None = None
 
 
@@ -76,12 +72,11 @@ class RoadNetwork:
 
 
 class Route(NamedTuple):
-    """Edges that a vehicle drives one after the other."""
+    """Edges that a vehicle drives one after the other, for a number of laps."""
 
     name: str
     edges: tuple[str, ...]
     laps: int = 1
-    """how often they are driven"""
 
 
 class Entry(NamedTuple):
@@ -145,18 +140,15 @@ class ClosedRoad(BuiltRoad):
 
 
 class VehicleType(NamedTuple):
-    """A human driver on a motorway, with the parameters of SUMO's car-following models."""
+    """A human driver on a motorway, with the parameters of one of SUMO's car-following models, in SI units."""
 
     model: str
-    """SUMO's name of the car-following model"""
     time_headway: float
-    """[s]"""
     acceleration: float
-    """[m/s2]"""
     deceleration: float
-    """comfortable [m/s2]"""
+    """comfortable"""
     minimum_gap: float
-    """to a standing leader [m]"""
+    """to a standing leader"""
     speed_factor: float
     """desired speed divided by the speed limit"""
 
@@ -165,10 +157,9 @@ class EdgeLane(NamedTuple):
     """A lane of an edge; the lanes of consecutive edges with the same `lane_index` form one lane of the road."""
 
     name: str
-    """the simulator's"""
     lane_index: int
     start: float
-    """its begin along the main road [m]"""
+    """along the main road [m]"""
     speed_limit: float
     """[m/s]"""
     is_merging: bool = False
@@ -189,7 +180,7 @@ class Origin(NamedTuple):
     branch: int
     """0: the main road; 1: the ramp"""
     position: float
-    """of its front bumper as it enters, negative upstream of the merge point [m]"""
+    """of its front bumper [m], negative upstream of the merge point"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,23 +36,7 @@ MAX_HORIZON = 10_000_000
 """control steps of the longest episode: twelve days of 0.1 s; more would fill the memory"""
 
 Actuation = Literal["shielded", "raw", "flow", "cruise"]
-"""How SUMO carries out a CAV's command.
-
-`shielded`: exactly, until it is unsafe; then SUMO brakes, and the override is counted.
-`raw`: exactly, always; a collision ends the episode.
-`flow`: as in Flow, SUMO's human model also limits the CAV, which can never accelerate more than that model.
-`cruise`: the CAV's own ACC follows and keeps its distance; commands can only reduce its set speed. It suits roads
-with several lanes, where SUMO makes room for vehicles that change lanes.
-"""
-
 HumanControl = Literal["native", "commanded"]
-"""What computes the motion of human drivers.
-
-`native`: SUMO's own IDM with the scenario's parameters; noise is added to its speeds.
-`commanded`: the same IDM and noise as a speed command in every step, as in Flow, on top of a quicker model of SUMO
-that keeps vehicles safe and obeys the right of way. SUMO's IDM with the paper's parameters alone is far more timid
-where roads cross.
-"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -154,8 +138,10 @@ class Scenario:
     action_limit: Positive = 1.0
     """largest acceleration that a CAV can command, in either direction [m/s2]"""
     actuation: Actuation = "shielded"
-    """how SUMO carries out a CAV's command: `shielded` exactly until it is unsafe, then SUMO brakes; `raw` exactly;
-    `flow` limited by the human IDM; `cruise` limited by the CAV's own ACC"""
+    """how SUMO carries out a CAV's command: `shielded` exactly until it is unsafe, then SUMO brakes, and the override
+    is counted; `raw` exactly, and a collision ends the episode; `flow`, as in Flow, limited by SUMO's human model;
+    `cruise` limited by the CAV's own ACC, which keeps its distance: commands only reduce its set speed. `cruise`
+    suits roads with several lanes, where SUMO makes room for vehicles that change lanes"""
     cruise: CruiseControl = field(default_factory=CruiseControl)
     """the CAV's own ACC, for `cruise`"""
     safety: SafetyFilter = field(default_factory=SafetyFilter)
@@ -169,11 +155,11 @@ class Scenario:
     humans: IDMParameters = field(default_factory=IDMParameters)
     """parameters of human drivers"""
     population: str = ""
-    """calibrated human drivers with individual parameters: a file of `unjam fit-drivers`, `unjam:ngsim` or
-    `unjam:astazero`; empty: all drive as `humans` says"""
+    """calibrated human drivers: a file of `unjam fit-drivers`, `unjam:ngsim` or `unjam:astazero`; empty: `humans`"""
     human_control: HumanControl = "native"
-    """what computes the motion of human drivers: `native` SUMO's own IDM; `commanded` the same IDM as a speed command
-    in every step, as in Flow"""
+    """what computes the motion of human drivers: `native` SUMO's own IDM plus noise on its speeds; `commanded`
+    the same IDM and noise as a speed command in every step, as in Flow, on top of a quicker model of SUMO that keeps
+    vehicles safe and obeys the right of way. SUMO's IDM with the paper's parameters is too timid where roads cross"""
     right_of_way: bool = True
     """whether vehicles obey the right of way where roads meet; if not, SUMO only prevents collisions"""
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.0
