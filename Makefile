@@ -1,4 +1,4 @@
-# make demo   sets everything up, trains a residual in a jam, and drives a motorway beside people alone: a minute
+# make demo   sets everything up, trains a residual in a jam, and compares drivers on a motorway with the human baseline: a minute
 #             or two after the installation
 # make test   fifteen tests of sixteen, in minutes; .ci/run adds the long ones, make test-all the slow ones, too
 # make check  lint, format, types; make docs builds the site; make bench measures speed
@@ -20,7 +20,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring-jammed --preset demo
-	$(BIN)/unjam drive on-ramp -d human -d unjam:on-ramp-tuned --cav-share 0.05 --held-out -n 4
+	$(BIN)/unjam drive on-ramp -d human -d unjam:on-ramp-tuned --penetration-rate 0.05 --test-seeds -n 4
 
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder

@@ -17,7 +17,7 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell
 
 ROOT = Path(__file__).parents[1]
-MADE_OF = ("results", "src/unjam", "docs/*.py", "constraints.txt")
+MADE_OF = ("results", "src", "docs/*.py", "constraints.txt")
 """what cells read and run, beside themselves"""
 KERNEL = AsyncKernelManager()
 
@@ -48,6 +48,4 @@ def _run(notebook: NotebookNode, cwd: str, **options: Any) -> ExecutionResult:
 
 
 cache.single_nb_execution = _run
-logging.getLogger("traitlets").setLevel(
-    logging.ERROR
-)  # it tells of each page, and of each client that is left
+logging.getLogger("traitlets").setLevel(logging.ERROR)  # it tells of each page, and of each client that is left

@@ -7,24 +7,23 @@ import pandas as pd
 from IPython.display import Image
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
+from studies import rows_of
 from tables import results_part
 
-from studies import rows_of
-from unjam_paper.comparison import interval_text
 from unjam_paper.road_model import compared_variants
-from unjam_paper.study import PlannedRun
+from unjam_paper.study import PlannedRun, interval_text
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
 COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
 
 
-def imagined(prefix: str, road: str = "ring") -> dict[str, str]:
-    """Return the labels of the variants that a study of imagined roads compares, large iterations first."""
+def road_model(prefix: str, road: str = "ring") -> dict[str, str]:
+    """Return the labels of the variants that a study of road models compares, large iterations first."""
     modelled, *others = compared_variants(prefix)
-    sizes = {name: PlannedRun(road, name, 0).config.learner.batch_steps for name in others}
+    sizes = {name: PlannedRun(road, name, 0).config.learner.steps_per_iteration for name in others}
     labels = {name: f"without, in iterations of {size:,}" for name, size in sizes.items()}
     ordered = sorted(labels, key=lambda name: -sizes[name])
-    return {modelled: "whole roads imagined besides", **{name: labels[name] for name in ordered}}
+    return {modelled: "with a model of the whole road", **{name: labels[name] for name in ordered}}
 
 
 def validations(variant: str, study: str = "table-2", road: str = "ring") -> tuple[np.ndarray, np.ndarray]:
@@ -40,10 +39,7 @@ def validations(variant: str, study: str = "table-2", road: str = "ring") -> tup
 
 
 def draw(
-    labels: dict[str, str] = LABELS,
-    study: str = "table-2",
-    lowest: float | None = None,
-    road: str = "ring",
+    labels: dict[str, str] = LABELS, study: str = "table-2", lowest: float | None = None, road: str = "ring"
 ) -> Image:
     """Draw validation against actual steps: mean and range of the runs; from `lowest` on, steps by powers."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
@@ -62,7 +58,7 @@ def draw(
         axes.xaxis.set_major_formatter("{x:,.0f}")
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_ylim(lowest, most + max(5.0, 0.05 * (most - lowest)))
-    axes.set_xlabel("actual simulator steps [thousands]")
+    axes.set_xlabel("environment steps [thousands]")
     axes.set_ylabel("return of an episode, validation")
     axes.legend(frameon=False)
     for side in ("top", "right"):
@@ -77,7 +73,7 @@ def judged() -> pd.DataFrame:
 
     The level is what runs without the virtual environment reach at best, on average.
     """
-    rows = {row["variant"]: row for row in rows_of("table-2", "ring") if row["learns"]}
+    rows = {row["variant"]: row for row in rows_of("table-2", "ring") if row["is_learned"]}
     level = float(validations("ours-without-model")[1].max(1).mean())
     table = []
     for variant, label in LABELS.items():
@@ -88,10 +84,10 @@ def judged() -> pd.DataFrame:
             {
                 "": label,
                 "trainings": len(curves),
-                "beyond the best tuned expert": interval_text(row["beyond_best_expert"], 0, "+"),
+                "difference to the best tuned expert": interval_text(row["gain_over_best_expert"], 0, "+"),
                 "each": ", ".join(f"{gain:+.0f}" for gain in row["gains"]),
                 f"reach {level:.0f}": f"{len(there)} of {len(curves)}",
-                "after actual steps": ", ".join(f"{count:,}" for count in sorted(there)),
+                "after environment steps": ", ".join(f"{count:,}" for count in sorted(there)),
             }
         )
     return pd.DataFrame(table)

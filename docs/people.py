@@ -7,24 +7,24 @@ import numpy as np
 import pandas as pd
 from tables import results_part
 
-from unjam.measures.statistics import estimate
 from unjam.measures.metric_table import estimate_cell
+from unjam.measures.statistics import estimate
 
 NETWORKS = {"knowledge": "IDM + residual", "vanilla": "network alone", "nearest row": "nearest row"}
 MODELS = {
     "paper's IDM": "paper's IDM",
     "paper's IDM, clipped": "the same, clipped",
-    "IDM, every moment": "IDM, calibrated on all moments alike",
-    "IDM": "IDM, calibrated on all trajectories alike",
-    "IDM, headway kept": "the same, part of the first headway kept",
+    "IDM, samples weighted equally": "IDM, calibrated, all samples weighted equally",
+    "IDM": "IDM, calibrated, all trajectories weighted equally",
+    "IDM, initial headway weighted": "the same, initial headway weighted",
     "vanilla": "network alone",
     "knowledge, paper's IDM": "paper's IDM + residual",
     "knowledge, paper's IDM clipped": "paper's IDM, clipped + residual",
     "knowledge, IDM": "calibrated IDM + residual",
     "IDM + multi-step": "calibrated IDM + multi-step residual",
-    "IDM, headway kept + multi-step": "part of the first headway kept + multi-step residual",
-    "IDM, own headway": "calibrated IDM, each driver's own headway",
-    "IDM, all own": "IDM, all parameters each driver's own",
+    "IDM, initial headway weighted + multi-step": "initial headway weighted + multi-step residual",
+    "IDM, personal time headway": "calibrated IDM, personal time headway",
+    "IDM, all parameters personal": "IDM, all parameters personal",
 }
 
 
@@ -41,9 +41,9 @@ def figure_6(**chosen: Any) -> pd.DataFrame:
     return rows.sort_values(["size", "network", "repeat"])
 
 
-def errors(driver: str, longer: bool = False, name: str = "error_of_driver") -> pd.DataFrame:
+def errors(driver: str, is_long: bool = False, name: str = "driver_error") -> pd.DataFrame:
     """Return the mean error and its standard deviation over the repeats, by size and network."""
-    rows = figure_6(driver=driver, split="trajectories", longer=longer)
+    rows = figure_6(driver=driver, split="trajectories", is_long=is_long)
     table = []
     for size, found in rows[rows["network"] != "nearest row"].groupby("size"):
         cells: dict[str, Any] = {"share of the data": f"{100 * size:g} %"}
@@ -55,7 +55,7 @@ def errors(driver: str, longer: bool = False, name: str = "error_of_driver") -> 
 
 def leaks() -> pd.DataFrame:
     """Return the error on the test rows by split: what rows that training has seen hide."""
-    rows = figure_6(driver="other", longer=False)
+    rows = figure_6(driver="other", is_long=False)
     rows = rows[rows["size"].isin([0.01, 0.1, 1.0])]
     words = {"trajectories": "by trajectory", "rows": "row by row", "released": "as the released code"}
     table = []
@@ -71,7 +71,7 @@ def leaks() -> pd.DataFrame:
 def field(data: str, test: str, models: Sequence[str] = tuple(MODELS)) -> pd.DataFrame:
     """Return errors on a test set: of a single seed with its interval, of several their mean and range."""
     rows = rows_of("field/field")
-    rows = rows[(rows["data"] == data) & (rows["test"] == test)]
+    rows = rows[(rows["data_set"] == data) & (rows["test"] == test)]
     table = []
     for model in models:
         found = rows[rows["model"] == model]
@@ -80,9 +80,9 @@ def field(data: str, test: str, models: Sequence[str] = tuple(MODELS)) -> pd.Dat
         table.append(
             {
                 "": MODELS[model],
-                "gap, driving on [m]": _cell(found, "gap"),
-                "speed, driving on [m/s]": f"{found['speed'].mean():.2f}",
-                "collided": f"{100 * found['collided'].mean():.0f} %",
+                "gap error in open loop [m]": _cell(found, "gap"),
+                "speed error in open loop [m/s]": f"{found['speed'].mean():.2f}",
+                "end in a collision": f"{100 * found['collision_share'].mean():.0f} %",
                 "one step [m/s²]": f"{found['one_step'].mean():.3f}",
             }
         )
@@ -99,17 +99,17 @@ def _cell(found: pd.DataFrame, name: str) -> str:
 def gap_error(model: str, data: str = "ngsim", test: str = "test") -> float:
     """Return the error of the gap, mean over seeds [m]."""
     rows = rows_of("field/field")
-    chosen = (rows["data"] == data) & (rows["test"] == test) & (rows["model"] == model)
+    chosen = (rows["data_set"] == data) & (rows["test"] == test) & (rows["model"] == model)
     return float(rows[chosen]["gap"].mean())
 
 
 def ring() -> pd.DataFrame:
     """Return what happens on the ring, by who the people are and who drives the CAV."""
     table = []
-    for (people, driver), found in rows_of("field/ring").groupby(["people", "driver"], sort=False):
+    for (people, driver), found in rows_of("field/ring").groupby(["humans", "driver"], sort=False):
         table.append(
             {
-                "people": people,
+                "human drivers": people,
                 "CAV": {"human": "none", "pi": "PI", "trained": "PI + residual"}[str(driver)],
                 "mean speed, steady [m/s]": _mean(found["mean_speed_steady"], 2),
                 "speed std across vehicles, steady [m/s]": _mean(found["speed_std_fleet_steady"], 2),
@@ -127,7 +127,7 @@ def _mean(values: pd.Series, digits: int) -> str:
 
 def claims() -> pd.DataFrame:
     """Return what the paper says of the knowledge network, and what was measured."""
-    rows = figure_6(driver="other", split="trajectories", longer=False)
+    rows = figure_6(driver="other", split="trajectories", is_long=False)
     return pd.DataFrame(
         [
             {"the paper": words, "here": verdict, "number": number}
@@ -148,9 +148,7 @@ def _loss(rows: pd.DataFrame) -> tuple[str, str, str]:
     for network, found in whole.groupby("network"):
         limit = 1.05 * float(found["noise"].iloc[0]) ** 2
         curves = [np.array(curve) for curve in found["training_loss"]]
-        passes = [
-            int(np.argmax(curve <= limit)) + 1 if (curve <= limit).any() else len(curve) for curve in curves
-        ]
+        passes = [int(np.argmax(curve <= limit)) + 1 if (curve <= limit).any() else len(curve) for curve in curves]
         reached[str(network)] = float(np.mean(passes))
     held = reached["knowledge"] < reached["vanilla"]
     with_idm, without = (f"{reached[name]:.0f}" for name in ("knowledge", "vanilla"))
@@ -159,14 +157,12 @@ def _loss(rows: pd.DataFrame) -> tuple[str, str, str]:
 
 
 def _sizes(rows: pd.DataFrame, words: str, how: str) -> tuple[str, str, str]:
-    found = rows[rows["network"] != "nearest row"].groupby(["size", "network"])["error_of_driver"].agg(how)
+    found = rows[rows["network"] != "nearest row"].groupby(["size", "network"])["driver_error"].agg(how)
     table = found.unstack()
     better = table["knowledge"] < table["vanilla"]
     names = [f"{100 * size:g} %" for size in table.index]
     held = [name for name, one in zip(names, better, strict=True) if one]
-    verdict = (
-        "held" if better.all() else "not held" if not better.any() else f"held at {', '.join(held)} alone"
-    )
+    verdict = "held" if better.all() else "not held" if not better.any() else f"held at {', '.join(held)} alone"
     number = "; ".join(
         f"{name}: {row['knowledge']:.4f} and {row['vanilla']:.4f}"
         for name, (_, row) in zip(names, table.iterrows(), strict=True)
@@ -176,7 +172,7 @@ def _sizes(rows: pd.DataFrame, words: str, how: str) -> tuple[str, str, str]:
 
 def _one_step() -> tuple[str, str, str]:
     rows = rows_of("field/field")
-    rows = rows[(rows["data"] == "ngsim") & (rows["test"] == "others")]
+    rows = rows[(rows["data_set"] == "ngsim") & (rows["test"] == "other drivers")]
     means = rows.groupby("model")["one_step"].mean()
     knowledge, alone = means["knowledge, paper's IDM clipped"], means["vanilla"]
     number = f"one step, NGSIM, 218 drivers: {knowledge:.3f} m/s² with IDM, {alone:.3f} without"
@@ -184,6 +180,6 @@ def _one_step() -> tuple[str, str, str]:
 
 
 def _driving_on() -> tuple[str, str, str]:
-    idm, knowledge = (gap_error(model, test="others") for model in ("IDM", "knowledge, IDM"))
+    idm, knowledge = (gap_error(model, test="other drivers") for model in ("IDM", "knowledge, IDM"))
     number = f"error of the gap, driving on: {knowledge:.2f} m with the residual, {idm:.2f} m without"
     return "the residual improves on IDM", "held" if knowledge < idm else "not held", number

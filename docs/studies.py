@@ -1,6 +1,7 @@
 """Tables of the studies that `unjam reproduce` made, from files under results/."""
 
 import shlex
+from dataclasses import asdict
 from typing import Any
 
 import pandas as pd
@@ -8,13 +9,14 @@ from tables import RESULTS, metrics_of, results_part
 from tables import rows_of as rows_of_file
 
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.statistics import estimate_over_trainings
 from unjam.measures.metric_table import with_no_break_spaces
-from unjam_paper import STUDIES
-from unjam_paper.comparison import COMPARISON_METRICS, estimate_entries, estimate_metrics, interval_text, number_text
-from unjam_paper.results_file import read_parts
+from unjam.measures.statistics import estimate_over_trainings
+from unjam_paper.comparison import COMPARISON_METRICS, estimate_metrics
 from unjam_paper.references import REFERENCE_DRIVERS, TUNED_REFERENCES
-from unjam_paper.study import STUDY_ROADS, VARIANTS
+from unjam_paper.results_file import read_parts
+from unjam_paper.studies import STUDIES
+from unjam_paper.study import STUDY_ROADS, interval_text, number_text
+from unjam_paper.variants import VARIANTS
 
 FREE = 15.0
 """mean speed of an episode on the merge in which no jam stayed [m/s]"""
@@ -33,8 +35,8 @@ def rows_of(study: str, road: str) -> list[dict[str, Any]]:
     """
     rows = results_part(f"{study}/table")
     for row in rows:
-        if "gains" in row and "smallest" not in row["beyond_best_expert"]:
-            row["beyond_best_expert"] = estimate_entries(estimate_over_trainings(row["gains"]))
+        if "gains" in row and "smallest" not in row["gain_over_best_expert"]:
+            row["gain_over_best_expert"] = asdict(estimate_over_trainings(row["gains"]))
             row["probability_of_improvement"] = {"mean": row["probability_of_improvement"]["mean"]}
     rows = [row for row in rows if row["road"] == road]
     known = any(row["name"].startswith("tuned ") for row in rows)
@@ -49,10 +51,10 @@ def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any
 
     Episodes of its trainings are not kept, so intervals are over the trainings' means alone.
     """
-    metric = next(row["beyond"]["metric"] for row in rows if row["learns"])
+    metric = next(row["gain_reference"]["metric"] for row in rows if row["is_learned"])
     names = {name: label for label, name in TUNED_REFERENCES[rows[0]["road"]].items()}
     driven = [
-        {"name": names[name], "learns": False, "trainings": 0, **estimate_metrics(found, COMPARISON_METRICS)}
+        {"name": names[name], "is_learned": False, "trainings": 0, **estimate_metrics(found, COMPARISON_METRICS)}
         for name, found in tuned.items()
         if name in names
     ]
@@ -62,11 +64,11 @@ def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any
     if more <= 0:
         return rows
     learned = [
-        {**row, "beyond_best_expert": estimate_entries(estimate_over_trainings([gain - more for gain in row["gains"]]))}
+        {**row, "gain_over_best_expert": asdict(estimate_over_trainings([gain - more for gain in row["gains"]]))}
         for row in rows
-        if row["learns"]
+        if row["is_learned"]
     ]
-    others = [{**row, "best_expert": False, "beyond_best_expert": None} for row in rows if not row["learns"]]
+    others = [{**row, "best_expert": False, "gain_over_best_expert": None} for row in rows if not row["is_learned"]]
     driven = [{**row, "best_expert": row is best} for row in driven]
     return [*others, *driven, *({**row, "probability_of_improvement": None} for row in learned)]
 
@@ -74,9 +76,9 @@ def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any
 def beyond_own_expert(rows: dict[str, dict[str, Any]], name: str, expert: str) -> dict[str, Any]:
     """Return what the trainings of a row earn beyond an expert of their table, over the trainings' means."""
     row = rows[name]
-    metric, best = row["beyond"]["metric"], row["beyond"]["expert"]
+    metric, best = row["gain_reference"]["metric"], row["gain_reference"]["expert"]
     more = rows[best][metric]["mean"] - rows[expert][metric]["mean"]
-    return estimate_entries(estimate_over_trainings([gain + more for gain in row["gains"]]))
+    return asdict(estimate_over_trainings([gain + more for gain in row["gains"]]))
 
 
 def paper_convention(study: str, road: str) -> pd.DataFrame:
@@ -100,27 +102,25 @@ COLUMNS = {
     "steady [m/s]": ("mean_speed_steady", 2),
     "of the limit, steady": ("speed_limit_ratio_steady", 3),
     "std across vehicles [m/s]": ("speed_std_fleet", 2),
-    "smallest headway [s]": ("min_time_gap", 2),
+    "min time gap [s]": ("min_time_gap", 2),
     "leave [veh/h]": ("outflow_veh_per_h", 0),
     "wait [veh]": ("insertion_backlog_veh", 0),
 }
 """what the honest tables show: a metric and its digits"""
 OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
-OF_THE_RING += ("smallest headway [s]",)
+OF_THE_RING += ("min time gap [s]",)
 OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
-OF_THE_ON_RAMP = ("return", "mean speed [m/s]", "leave [veh/h]", "smallest headway [s]")
+OF_THE_ON_RAMP = ("return", "mean speed [m/s]", "leave [veh/h]", "min time gap [s]")
 OF_THE_MERGE = ("return", "mean speed [m/s]", "steady [m/s]", "leave [veh/h]", "wait [veh]")
 
 
-def honest(
-    study: str, road: str, columns: tuple[str, ...] = OF_THE_RING, names: tuple[str, ...] = ()
-) -> pd.DataFrame:
+def honest(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING, names: tuple[str, ...] = ()) -> pd.DataFrame:
     """Return a table in the honest convention, of the drivers of these names or of all."""
     table = []
     for row in rows_of(study, road):
         if names and row["name"] not in names:
             continue
-        beyond, better = row.get("beyond_best_expert"), row.get("probability_of_improvement")
+        beyond, better = row.get("gain_over_best_expert"), row.get("probability_of_improvement")
         cells = {
             "": f"{row['name']}{' (best expert)' if row.get('best_expert') else ''}",
             "trainings": row["trainings"] or "",
@@ -128,20 +128,22 @@ def honest(
         for name in columns:
             key, digits = COLUMNS[name]
             cells[name] = number_text(row[key]["mean"], digits)
-        if "drivable" in row:
-            cells["drivable"] = _drivable(row["drivable"])
+        if "feasibility" in row:
+            cells["feasible"] = _feasibility(row["feasibility"])
         nothing = beyond is None or row.get("best_expert")
-        cells["beyond"] = "" if nothing else interval_text(beyond, 0, "+")
-        cells["better"] = "" if better is None else interval_text({"low": None, "high": None, **better}, 2)
+        cells["difference to best expert"] = "" if nothing else interval_text(beyond, 0, "+")
+        cells["probability of improvement"] = (
+            "" if better is None else interval_text({"low": None, "high": None, **better}, 2)
+        )
         table.append(cells)
     return pd.DataFrame(table)
 
 
-def _drivable(verdicts: str | list[str]) -> str:
-    """Return whether a driver is drivable, or how many trainings are; a dash for people alone."""
+def _feasibility(verdicts: str | list[str]) -> str:
+    """Return whether a driver is feasible, or how many trainings are; a dash for the human baseline."""
     if isinstance(verdicts, str):
         return {"": "–", FEASIBLE: "yes"}.get(verdicts, "no")
-    return f"{verdicts.count(DRIVABLE)} of {len(verdicts)}"
+    return f"{verdicts.count(FEASIBLE)} of {len(verdicts)}"
 
 
 def merge_capacity() -> pd.DataFrame:
@@ -151,7 +153,7 @@ def merge_capacity() -> pd.DataFrame:
     for part in read_parts(RESULTS / "research-notes.json"):
         if not part.startswith("merge-capacity-"):
             continue
-        standing, inflow = (int(number_text) for number_text in part.split("-")[-2:])
+        standing, inflow = (int(number) for number in part.split("-")[-2:])
         table = metrics_of(f"research-notes/{part}", names)
         table.insert(0, "highway [veh/h]", f"{inflow:,}")
         table.insert(0, "start", f"{standing} standing" if standing else "empty")
@@ -174,7 +176,7 @@ def commands() -> pd.DataFrame:
     """Return the command that repeats the training of a row with the first seed, by study and road."""
     table = {}
     for name, study in STUDIES.items():
-        for run in study.runs(1):
+        for run in study.make_runs(1):
             variant, road = VARIANTS[run.variant], STUDY_ROADS[run.road]
             words = ["unjam", "train", str(road["scenario"]), "--preset", variant.preset, "--seed", "0"]
             words += ["--steps", str(variant.steps)] if variant.steps else []

@@ -10,9 +10,9 @@ import pandas as pd
 from IPython.display import HTML
 
 from unjam.measures.feasibility import overall_feasibility
+from unjam.measures.metric_table import choose_baseline, estimate_cell, with_no_break_spaces
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, metric_estimate, paired_difference
-from unjam.measures.metric_table import choose_baseline, estimate_cell, with_no_break_spaces
 from unjam.reports.model import error_text
 from unjam_paper.results_file import read_part
 
@@ -51,7 +51,7 @@ def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.D
             cells[heading] = str(estimate_cell(found, about.digits, len(rows))) if found.count else "never"
         first = METRICS[metrics[0]]
         if "human" in by_driver and len(by_driver) > 1 and "cav_max_braking" in rows[0]:
-            cells["could a car drive so?"] = overall_feasibility(rows)
+            cells["feasible"] = overall_feasibility(rows)
         if baseline:
             beyond = paired_difference(rows, by_driver[baseline], metrics[0])
             shown = "" if driver == baseline else str(estimate_cell(beyond, first.digits, sign="+"))
@@ -111,7 +111,7 @@ def knowledge_gain(roads: Sequence[str], columns: dict[str, str]) -> pd.DataFram
     for road in roads:
         rows = knowledge_rows(road)
         for steps, found in rows[rows["steps"] > 0].groupby("steps"):
-            cells = {"road": road, "actual steps": f"{steps:,}"}
+            cells = {"road": road, "environment steps": f"{steps:,}"}
             for name, heading in columns.items():
                 errors = found.pivot(index="seed", columns="model", values=name)
                 less = 1.0 - errors["IDM + residual"] / errors["networks alone"]
@@ -127,7 +127,7 @@ def roads_known(road: str) -> pd.DataFrame:
     actual ones, where PI drives and where a CAV follows as people do; in brackets the range of the seeds.
     """
     rows = results_part("model/whole_roads")["rows"]
-    drivers = {"PI": "PI", "a CAV that follows as people do": "as people"}
+    drivers = {"PI": "PI", "CAV that follows as a human driver": "as a human driver"}
     metrics = {"speed": ("speed", "m/s", 2), "wave": ("spread", "m/s", 2)}
     return _known([row for row in rows if row["road"] == road], drivers, metrics)
 
@@ -135,7 +135,7 @@ def roads_known(road: str) -> pd.DataFrame:
 def on_ramps_known() -> pd.DataFrame:
     """Return how wrong imagined on-ramps are, as `roads_known`: travel time and flow beyond the actual."""
     rows = results_part("model/on_ramps")["rows"]
-    drivers = {"the expert of the data": "the expert", "people alone": "people alone"}
+    drivers = {"expert of the data": "the expert", "human baseline": "human baseline"}
     metrics = {"travel_time": ("travel time", "s", 1), "outflow_veh_per_h": ("flow", "veh/h", 0)}
     return _known(rows, drivers, metrics)
 
@@ -152,8 +152,8 @@ def _known(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.Da
     (actual,) = (row for row in rows if not row["known"])
     found, table = pd.DataFrame([row for row in rows if row["known"]]), []
     for (known, steps), of in found.groupby(["known", "steps"], sort=False):
-        cells = {"what is known": known, "actual steps": f"{steps:,}" if steps else "none"}
-        cells["a step is wrong by [m/s]"] = f"{of['ignorance'].mean():.4f}"
+        cells = {"what is known": known, "environment steps": f"{steps:,}" if steps else "none"}
+        cells["error of a step [m/s]"] = f"{of['step_error'].mean():.4f}"
         for who, words in drivers.items():
             for name, (heading, unit, digits) in metrics.items():
                 whole = [each for each in of[who] if 2 * each["collisions"] < len(each[name])]
@@ -206,7 +206,7 @@ def guesses() -> pd.DataFrame:
     for form, of in explained.items():
         row = {"what is remembered": form}
         for target in of[seen]:
-            for rings, where in ((seen, "seen"), (held_out, "held out")):
+            for rings, where in ((seen, "training"), (held_out, "unseen")):
                 share = of[rings][target]
                 row[f"{target}, {where}"] = f"{share['mean']:.2f} [{share['low']:.2f}, {share['high']:.2f}]"
         rows.append(row)
@@ -222,7 +222,7 @@ def notes_table() -> dict[str, pd.DataFrame]:
             number += f" [{row['low']:,g}, {row['high']:,g}]"
         tables.setdefault(row["topic"], []).append(
             {
-                "what was tried": row["tried"],
+                "experiment": row["experiment"],
                 "measured": row["metric"],
                 "number": number,
                 "based on": row["basis"],
@@ -286,14 +286,8 @@ def soak_origin() -> str:
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
     """Return a table in the style of the site: names in its index break after a comma, intervals nowhere."""
-    html = table.rename(
-        index=lambda name: name.replace(",", ", ") if isinstance(name, str) else name
-    ).to_html(
-        index=index,
-        border=0,
-        justify="left",
-        classes="docutils align-default",
-        float_format=f"{{:.{digits}f}}".format,
+    html = table.rename(index=lambda name: name.replace(",", ", ") if isinstance(name, str) else name).to_html(
+        index=index, border=0, justify="left", classes="docutils align-default", float_format=f"{{:.{digits}f}}".format
     )
     whole = re.sub(r"\[[^\[\]<>]*\]", lambda found: with_no_break_spaces(found[0]), html)
     return HTML(f'<div class="table-wrapper">{whole}</div>')

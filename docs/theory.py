@@ -1,5 +1,6 @@
 """Tables of what was measured of the paper's theorems, from results/theory.json."""
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -7,8 +8,8 @@ import pandas as pd
 from tables import results_part
 
 from unjam.measures.statistics import estimate_over_trainings
-from unjam_paper.comparison import estimate_entries, interval_text
-from unjam_paper.study import VARIANTS
+from unjam_paper.study import interval_text
+from unjam_paper.variants import VARIANTS
 
 
 def measured() -> dict[str, Any]:
@@ -22,7 +23,9 @@ def untrained() -> pd.DataFrame:
     for row in measured()["untrained"]:
         cells = table.setdefault(row["road"], {"": row["road"]})
         cells[row["policy"]] = (
-            interval_text(estimate_entries(estimate_over_trainings(row["returns"])), 0) if "returns" in row else f"{row['mean']:.0f}"
+            interval_text(asdict(estimate_over_trainings(row["returns"])), 0)
+            if "returns" in row
+            else f"{row['mean']:.0f}"
         )
     return pd.DataFrame(table.values())
 
@@ -31,13 +34,13 @@ def convergence() -> pd.DataFrame:
     """A2: which trainings come within 5 % of the best return known, when, and whether they are there last."""
     table = []
     for row in measured()["convergence"]:
-        arrivals = ["never" if steps is None else f"{steps:,}" for steps in row["arrivals"]]
+        arrivals = ["never" if steps is None else f"{steps:,}" for steps in row["convergence_steps"]]
         table.append(
             {
                 "": row["name"],
                 "trainings": row["trainings"],
-                "arrive after [actual steps]": ", ".join(arrivals),
-                "are there at the end": f"{row['stayed']} of {row['trainings']}",
+                "converge after [environment steps]": ", ".join(arrivals),
+                "converged at the end": f"{row['converged_at_end']} of {row['trainings']}",
                 "return at the end, in training": interval_text(row["last"], 0),
             }
         )

@@ -55,7 +55,7 @@ def small_study() -> Iterator[pytest.MonkeyPatch]:
 def reproduced(tmp_path_factory: pytest.TempPathFactory, small_study: pytest.MonkeyPatch) -> tuple[Path, list[str]]:
     """The folder of a study, with trainings in this process and without reports, and the messages."""
     small_study.setattr(reproduction, "run_all", run_here)
-    small_study.setattr("unjam.training.train.write_report", lambda folders, path: path.touch())
+    small_study.setattr("unjam.training.train.write_report_page", lambda folders, path: path.touch())
     folder, messages = tmp_path_factory.mktemp("studies"), []
     plan = make_plan(["small"], 2, StudyFolder(folder))
     assert len(plan.runs) == 4
