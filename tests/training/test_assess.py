@@ -1,4 +1,4 @@
-"""Is a question checked before anything is driven, and its answer written whole, from rows that it keeps?"""
+"""Assessments: checks of the request, stored rows and documents."""
 
 import json
 from collections.abc import Iterator
@@ -45,7 +45,7 @@ def answer(asked: AssessmentRequest, tmp_path_factory: pytest.TempPathFactory) -
         yield assess(asked, tmp_path_factory.mktemp("answer") / "out", workers)
 
 
-def test_a_question_has_all_penetration_rates_and_controllers_and_two_baselines(file: str) -> None:
+def test_request_has_all_penetration_rates_controllers_and_two_baselines(file: str) -> None:
     usual = make_request(file, [0.2, 0.0, 0.1], 400, 0.02)
     assert usual.penetration_rates == (0.1, 0.2)
     assert len(usual.options) == 2 * len(DEFAULT_CONTROLLERS)
@@ -57,14 +57,14 @@ def test_a_question_has_all_penetration_rates_and_controllers_and_two_baselines(
     assert driver.name == "pi"
 
 
-def test_acc_vehicles_are_the_baseline_of_controllers_that_drive_without_an_acc_too(file: str) -> None:
+def test_acc_baseline_uses_an_acc_even_if_controllers_do_not(file: str) -> None:
     road, driver = make_request(file, [0.1], 400, 0.02, None, ["pi"], HELD).make_setup(Option(0.1, ACC_DRIVER))
     assert (road.actuation, road.safety.active, driver.name) == ("cruise", False, "cruise")
     assert (road.cruise.acceleration, road.cruise.deceleration) == (None, None)
 
 
 @pytest.mark.parametrize("name", ["acceleration", "deceleration", "keep_right", "speed_gain"])
-def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(name: str, file: str) -> None:
+def test_acc_property_is_compared_with_unchanged_vehicles(name: str, file: str) -> None:
     plain = make_request(file, [0.1], 400, 0.02, None, ["pi"], {"cruise.time_gap": 1.5})
     assert not plain.has_acc_properties
     found = make_request(file, [0.1], 400, 0.02, None, ["pi"], {f"cruise.{name}": 3.0, "cruise.minimum_gap": 2.5})
@@ -83,7 +83,7 @@ def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(nam
         ({"episodes": 23}, "episodes: 23 is not allowed; allowed: >= 24 for 2 penetration rates and 3 control"),
         ({"minutes": 0.0}, "minutes: 0.0"),
         ({"precision": 1.0}, "precision: 1.0"),
-        ({"drivers": ["human"]}, "driver: 'human' is not allowed; allowed: the human baseline is driven anyway"),
+        ({"drivers": ["human"]}, "driver: 'human' is not allowed; allowed: the human baseline is always included"),
         ({"drivers": ["pacer"]}, "driver: 'pacer' is not allowed; allowed: one that needs no closed road"),
         ({"drivers": ["ghost"]}, "driver: 'ghost'"),
         ({"options": {"penetration_rate": 0.5}}, "penetration_rate: it is not allowed here"),
@@ -92,18 +92,18 @@ def test_a_property_that_is_set_for_cavs_is_compared_with_unchanged_vehicles(nam
         ({"options": {"ghost": 1}}, "ghost: unknown name"),
     ],
 )
-def test_what_is_wrong_is_told_at_once(changes: dict[str, Any], words: str, file: str) -> None:
+def test_wrong_request_is_refused(changes: dict[str, Any], words: str, file: str) -> None:
     with pytest.raises(InputError, match=words.replace("+", r"\+")):
         make_request(file, **{"penetration_rates": [0.1, 0.2], "episodes": 400, "precision": 0.02, **changes})
 
 
-def test_a_road_of_the_package_is_refused() -> None:
+def test_packaged_scenario_is_refused() -> None:
     with pytest.raises(InputError, match=r"scenario: 'ring' is not allowed; allowed: your own .sumocfg file"):
         make_request("ring", [0.1], 400, 0.02)
 
 
 @pytest.mark.long
-def test_all_rows_are_kept_those_that_chose_apart(asked: AssessmentRequest, answer: Assessment) -> None:
+def test_rows_of_selection_and_test_are_stored_separately(asked: AssessmentRequest, answer: Assessment) -> None:
     folder = answer.page.parent
     chose, judged = read_rows(folder / SELECTION_FOLDER), read_rows(folder)
     (found,) = answer.controller_results
@@ -116,7 +116,7 @@ def test_all_rows_are_kept_those_that_chose_apart(asked: AssessmentRequest, answ
     assert [*read_results(folder).plot_episodes] == ["human", f"{found.driver}, 50 %"]
 
 
-def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Assessment) -> None:
+def test_document_equals_the_file_and_has_all_results(answer: Assessment) -> None:
     written = json.loads((answer.page.parent / "assessment.json").read_text())
     assert written == answer.document
     (found,) = answer.controller_results
@@ -139,7 +139,7 @@ def test_the_document_is_that_of_the_folder_and_says_what_is_judged(answer: Asse
 
 
 @pytest.mark.long
-def test_the_answer_does_not_depend_on_the_number_of_workers(
+def test_result_does_not_depend_on_the_number_of_workers(
     asked: AssessmentRequest, answer: Assessment, tmp_path: Path
 ) -> None:
     with WorkerPool(1) as workers:
@@ -153,7 +153,7 @@ def test_the_answer_does_not_depend_on_the_number_of_workers(
     ['<vType id="own" sigma="0"/>', '<vType id="own" vClass="truck" accel="0.5" maxSpeed="18" sigma="0"/>'],
     ids=["drawn desired speeds", "weak engines"],
 )
-def test_where_only_the_properties_of_vehicles_could_gain_nothing_is_gained(vehicle: str, tmp_path: Path) -> None:
+def test_vehicle_properties_alone_give_no_gain(vehicle: str, tmp_path: Path) -> None:
     file, changes = network(tmp_path, vehicle + SPARSE), {"cav_classes": ["passenger", "truck"]}
     alone = make_request(file, [0.5], 12, 0.02, None, ["cruise"], changes)
     with WorkerPool(2) as workers:
@@ -163,7 +163,7 @@ def test_where_only_the_properties_of_vehicles_could_gain_nothing_is_gained(vehi
     assert found.acc_results[0].effect.travel_time.mean >= -0.1
 
 
-def test_seeds_without_a_cav_are_those_of_the_human_baseline(file: str, tmp_path: Path) -> None:
+def test_seeds_without_a_cav_use_the_human_baseline(file: str, tmp_path: Path) -> None:
     few = make_request(file, [0.06], 20, 0.02, None, ["acc"], HELD)
     with WorkerPool(2) as workers:
         assess(few, tmp_path / "out", workers)
@@ -174,7 +174,7 @@ def test_seeds_without_a_cav_are_those_of_the_human_baseline(file: str, tmp_path
     assert any(one["travel_time"] == other["travel_time"] for one, other in pairs)
 
 
-def test_a_folder_with_something_in_it_is_left_alone(asked: AssessmentRequest, tmp_path: Path) -> None:
+def test_nonempty_folder_is_not_changed(asked: AssessmentRequest, tmp_path: Path) -> None:
     (tmp_path / "precious.txt").write_text("keep me")
     with WorkerPool(1) as workers, pytest.raises(InputError, match="is not empty"):
         assess(asked, tmp_path, workers)

@@ -36,7 +36,7 @@ def cores() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("hold", [1, 10])
-def test_the_driver_that_is_timed_keeps_the_contract(hold: int) -> None:
+def test_benchmark_driver_is_valid(hold: int) -> None:
     driver = make_benchmark_driver(hold)
     check_driver(driver)
     assert driver.expert == PISaturation()
@@ -46,7 +46,7 @@ def test_the_driver_that_is_timed_keeps_the_contract(hold: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
-def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_not_use() -> None:
+def test_benchmark_has_rates_and_ratios_and_restores_cores() -> None:
     told: list[str] = []
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
     found = benchmark_episodes(1, told.append)
@@ -75,9 +75,7 @@ def test_measures_rates_and_their_ratios_and_gives_back_the_cores_that_it_did_no
     assert cores is None or os.sched_getaffinity(0) == cores
 
 
-def test_batches_of_growing_size_are_measured_with_people_who_have_networks_and_without(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_batches_are_measured_with_both_human_models(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_benchmark, "STEPS_PER_ROUND", 3)
     monkeypatch.setattr(batch_benchmark, "BATCH_SIZES", {"cpu": (2, 5)})
     told: list[str] = []
@@ -91,6 +89,6 @@ def test_batches_of_growing_size_are_measured_with_people_who_have_networks_and_
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU")
-def test_batches_on_a_graphics_card_that_is_not_there_are_refused() -> None:
+def test_missing_gpu_is_refused() -> None:
     with pytest.raises(MissingPartError, match="device: cuda is not available; allowed: cpu"):
         benchmark_batches("cuda")

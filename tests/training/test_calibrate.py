@@ -77,7 +77,7 @@ def done(asked: Corridor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
 
 
 @pytest.mark.long
-def test_a_calibrated_road_comes_nearer_to_its_detectors(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
+def test_calibration_improves_the_agreement(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     folder, found = done
     estimates = found.estimates()
     for name in ("geh", "flow_rmse", "speed_rmse", "score"):
@@ -93,9 +93,7 @@ def test_a_calibrated_road_comes_nearer_to_its_detectors(asked: Corridor, done: 
 
 
 @pytest.mark.long
-def test_what_is_written_is_a_network_that_measures_as_it_was_judged(
-    asked: Corridor, done: tuple[Path, CalibrationResult]
-) -> None:
+def test_written_network_has_the_reported_agreement(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     folder, found = done
     files = read_sumo_files(folder / CALIBRATED_NETWORK_FILE)
     own = asked.files.types["person"]
@@ -111,7 +109,7 @@ def test_what_is_written_is_a_network_that_measures_as_it_was_judged(
     assert episode.status == "completed"
 
 
-def test_a_calibration_that_was_stopped_goes_on_where_it_was(
+def test_interrupted_calibration_resumes(
     asked: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, before = done
@@ -133,12 +131,12 @@ def test_a_calibration_that_was_stopped_goes_on_where_it_was(
     assert (again.factors, again.calibrated) == (before.factors, before.calibrated)
 
 
-def test_the_folder_of_another_calibration_is_refused(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
+def test_folder_of_another_calibration_is_refused(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     with DetectorPool(1) as counting, pytest.raises(InputError, match="was made with other settings"):
         calibrate(asked, done[0], counting, SPACE, TRIALS, seeds_per_trial=2)
 
 
-def test_a_road_that_sumo_refuses_as_it_is_is_told(asked: Corridor, tmp_path: Path) -> None:
+def test_unusable_original_network_is_reported(asked: Corridor, tmp_path: Path) -> None:
     path = road(tmp_path / "broken")
     demand = path.with_name("demand.rou.xml")
     demand.write_text(demand.read_text().replace('route="along"', 'route="astray"'))
@@ -157,7 +155,7 @@ EACH = "".join(
 )
 
 
-def test_factors_multiply_what_each_passenger_type_says_or_sumo_has(tmp_path: Path) -> None:
+def test_factors_scale_passenger_types_or_sumo_defaults(tmp_path: Path) -> None:
     files = read_sumo_files(straight(tmp_path, TYPES + EACH))
     assert scale_vehicle_types(files, {"tau": 0.5, "speedFactor": 0.9, "accel": 1.0, "flow": 2.0}) == {
         "drawn": {"tau": "0.6", "speedFactor": "normc(0.9,0.09,0.45,1.35)"},
@@ -168,7 +166,7 @@ def test_factors_multiply_what_each_passenger_type_says_or_sumo_has(tmp_path: Pa
     assert scale_vehicle_types(files, {"tau": 1.0, "flow": 2.0}) == {}
 
 
-def test_an_attribute_that_is_no_number_is_told(tmp_path: Path) -> None:
+def test_attribute_that_is_not_a_number_is_refused(tmp_path: Path) -> None:
     files = read_sumo_files(straight(tmp_path, TYPES.replace("1.2", "long") + EACH))
     with pytest.raises(InputError, match="vType drawn: tau: 'long' is not allowed; allowed: a number"):
         scale_vehicle_types(files, {"tau": 0.5})
@@ -183,7 +181,7 @@ def test_an_attribute_that_is_no_number_is_told(tmp_path: Path) -> None:
         ("edge", "road,5,300,360,1,1", "detectors.csv: no interval lies between 0 s and 240 s"),
     ],
 )
-def test_a_detector_that_is_not_on_the_road_is_told(kind: str, row: str, words: str, tmp_path: Path) -> None:
+def test_detector_off_the_network_is_refused(kind: str, row: str, words: str, tmp_path: Path) -> None:
     file = tmp_path / "detectors.csv"
     file.write_text(f"{kind},{','.join(DETECTOR_COLUMNS)}\n{row}\n")
     with pytest.raises(InputError) as error:
@@ -191,7 +189,7 @@ def test_a_detector_that_is_not_on_the_road_is_told(kind: str, row: str, words: 
     assert words in str(error.value)
 
 
-def test_intervals_beside_the_time_that_is_driven_are_left_out(tmp_path: Path) -> None:
+def test_intervals_outside_the_simulated_time_are_excluded(tmp_path: Path) -> None:
     file = tmp_path / "detectors.csv"
     rows = [f"road_0,5,{begin},{begin + 60},1,1" for begin in range(0, 360, 60)]
     file.write_text("\n".join([f"lane,{','.join(DETECTOR_COLUMNS)}", *rows]))
@@ -203,7 +201,7 @@ def test_intervals_beside_the_time_that_is_driven_are_left_out(tmp_path: Path) -
     assert len(asked.loops) == 1
 
 
-def test_a_road_without_passenger_cars_is_refused(tmp_path: Path) -> None:
+def test_network_without_passenger_cars_is_refused(tmp_path: Path) -> None:
     lorries = '<vType id="lorry" vClass="truck"/><trip id="a" type="lorry" from="road" to="road" depart="0"/>'
     file = tmp_path / "detectors.csv"
     file.write_text(f"edge,{','.join(DETECTOR_COLUMNS)}\nroad,5,0,60,1,1\n")
@@ -211,7 +209,7 @@ def test_a_road_without_passenger_cars_is_refused(tmp_path: Path) -> None:
         load_corridor(str(straight(tmp_path, lorries)), file)
 
 
-def test_what_is_varied_are_factors_by_known_names() -> None:
+def test_factor_space_needs_known_names_and_positive_ranges() -> None:
     assert parse_factor_space([]) == FACTOR_RANGES
     assert parse_factor_space(["tau=1..2"]) == {"tau": NumericRange(1.0, 2.0)}
     for text, words in (
@@ -223,14 +221,14 @@ def test_what_is_varied_are_factors_by_known_names() -> None:
             parse_factor_space([text])
 
 
-def test_an_end_that_is_asked_for_counts_where_it_begins_behind_that_of_the_file(tmp_path: Path) -> None:
+def test_requested_times_may_lie_after_those_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "detectors.csv"
     file.write_text(f"edge,{','.join(DETECTOR_COLUMNS)}\nroad,5,{END + 60},{END + 120},1,1\n")
     found = load_corridor(str(road(tmp_path / "road")), file, END + 30, END + 150)
     assert (found.begin, found.end) == (END + 30, END + 120)
 
 
-def test_a_share_lies_between_none_and_all_and_errors_are_not_below_none(done: tuple[Path, CalibrationResult]) -> None:
+def test_intervals_of_agreement_are_clipped_at_their_bounds(done: tuple[Path, CalibrationResult]) -> None:
     rows = [replace(done[1].original[0], geh_below_5=share, geh=9.0 * share) for share in (1.0, 1.0, 0.9, 0.0)]
     found = replace(done[1], original=rows, calibrated=rows[::-1]).estimates()
     assert found["geh_below_5"]["original"].high == 1.0
@@ -238,7 +236,7 @@ def test_a_share_lies_between_none_and_all_and_errors_are_not_below_none(done: t
     assert found["geh"]["difference"].low < 0.0
 
 
-def test_a_process_that_was_lost_says_nothing_of_the_factors(
+def test_lost_process_is_not_a_verdict_on_the_factors(
     asked: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path
 ) -> None:
     class Lost(DetectorPool):

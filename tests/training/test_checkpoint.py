@@ -44,12 +44,12 @@ def is_content(found: Content | None, iteration: int) -> bool:
     return found[0] == state and found[1].keys() == tensors.keys() and same
 
 
-def test_gives_back_what_was_saved(tmp_path: Path) -> None:
+def test_saved_checkpoint_is_loaded(tmp_path: Path) -> None:
     save_all(tmp_path, 7)
     assert is_content(load_checkpoint(tmp_path), 7)
 
 
-def test_numbers_that_json_does_not_know_come_back(tmp_path: Path) -> None:
+def test_nonfinite_numbers_are_restored(tmp_path: Path) -> None:
     state = {"iteration": 1, "best_validation": float("-inf"), "expert_returns": [float("nan")]}
     save_checkpoint(tmp_path, state, {})
     found = load_checkpoint(tmp_path)
@@ -59,18 +59,18 @@ def test_numbers_that_json_does_not_know_come_back(tmp_path: Path) -> None:
     assert expert != expert
 
 
-def test_without_any_there_is_none(tmp_path: Path) -> None:
+def test_missing_checkpoint_is_none(tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path) is None
     assert load_checkpoint(tmp_path / "nowhere") is None
 
 
-def test_keeps_the_newest_two(tmp_path: Path) -> None:
+def test_newest_two_checkpoints_are_kept(tmp_path: Path) -> None:
     save_all(tmp_path, 1, 2, 9, 10, 11)
     assert sorted(place.name for place in tmp_path.iterdir()) == ["000010", "000011"]
     assert is_content(load_checkpoint(tmp_path), 11)
 
 
-def test_what_else_lies_in_the_folder_is_left_alone(tmp_path: Path) -> None:
+def test_other_files_are_not_changed(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "old").mkdir()
     save_all(tmp_path, 1, 2, 3)
@@ -79,7 +79,7 @@ def test_what_else_lies_in_the_folder_is_left_alone(tmp_path: Path) -> None:
     assert is_content(load_checkpoint(tmp_path), 3)
 
 
-def test_what_another_version_made_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoint_of_another_format_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_folder, "CHECKPOINT_FORMAT", 1)
     save_all(tmp_path, 1)
     monkeypatch.undo()
@@ -126,14 +126,14 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("name", [name for name in DAMAGE if "another iteration" not in name])
-def test_the_one_before_stands_in_for_a_damaged_one(tmp_path: Path, name: str) -> None:
+def test_previous_checkpoint_replaces_a_damaged_one(tmp_path: Path, name: str) -> None:
     save_all(tmp_path, 1, 2)
     DAMAGE[name](tmp_path / "000002")
     assert is_content(load_checkpoint(tmp_path), 1)
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_where_all_are_damaged_it_says_so(tmp_path: Path, name: str) -> None:
+def test_damaged_checkpoints_are_reported(tmp_path: Path, name: str) -> None:
     save_all(tmp_path, 1, 2)
     for place in ("000002",) if "another iteration" in name else ("000002", "000001"):
         DAMAGE[name](tmp_path / place)
@@ -152,7 +152,7 @@ def test_where_all_are_damaged_it_says_so(tmp_path: Path, name: str) -> None:
 @example(part=CHECKPOINT_STATE_FILE, place=0.0, bits=0x20)
 @example(part=CHECKPOINT_TENSORS_FILE, place=0.0, bits=1)
 @example(part=CHECKPOINT_TENSORS_FILE, place=0.999, bits=128)
-def test_a_changed_byte_anywhere_never_changes_what_is_loaded(part: str, place: float, bits: int) -> None:
+def test_changed_byte_never_changes_the_loaded_content(part: str, place: float, bits: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         save_all(folder, 1, 2)
@@ -168,7 +168,7 @@ def test_a_changed_byte_anywhere_never_changes_what_is_loaded(part: str, place: 
 
 @settings(max_examples=60)
 @given(part=st.sampled_from([CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE]), share=st.floats(0, 1, exclude_max=True))
-def test_a_file_cut_anywhere_is_noticed(part: str, share: float) -> None:
+def test_truncated_file_is_detected(part: str, share: float) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         save_all(folder, 1, 2)
@@ -178,14 +178,14 @@ def test_a_file_cut_anywhere_is_noticed(part: str, share: float) -> None:
         assert is_content(load_checkpoint(folder), 1)
 
 
-def test_a_damaged_one_is_written_anew(tmp_path: Path) -> None:
+def test_damaged_checkpoint_is_overwritten(tmp_path: Path) -> None:
     save_all(tmp_path, 1, 2)
     halve(tmp_path / "000002" / CHECKPOINT_TENSORS_FILE)
     save_all(tmp_path, 2)
     assert is_content(load_checkpoint(tmp_path), 2)
 
 
-def test_a_full_disk_leaves_the_ones_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_keeps_earlier_checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_all(tmp_path, 1, 2)
 
     def full(_: int) -> None:

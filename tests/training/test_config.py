@@ -23,12 +23,12 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_without_anything_it_is_the_defaults() -> None:
+def test_default_configuration() -> None:
     assert load_config() == RunConfig()
     assert load_config().scenario == "ring"
 
 
-def test_later_sources_go_before_earlier_ones(tmp_path: Path) -> None:
+def test_later_sources_override_earlier_ones(tmp_path: Path) -> None:
     file = written(tmp_path, "steps = 7\nseed = 7\n[trpo]\ngamma = 0.7\ngae_lambda = 0.7\n")
     made = load_config(file, "paper", {"seed": 8, "trpo.gamma": 0.8})
     assert made.seed == 8  # changes before file
@@ -41,7 +41,7 @@ def test_later_sources_go_before_earlier_ones(tmp_path: Path) -> None:
     assert made.preset == "paper"
 
 
-def test_a_change_of_one_key_leaves_the_rest_of_its_table() -> None:
+def test_change_of_one_key_keeps_the_rest_of_its_table() -> None:
     made = load_config(
         changes={"policy": {"action_duration": 3}, "policy.authority": 0.5, "scenario_options": {"vehicles": 20}}
     )
@@ -49,7 +49,7 @@ def test_a_change_of_one_key_leaves_the_rest_of_its_table() -> None:
     assert made.make_scenario().vehicles == 20  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_the_road_can_be_changed_key_by_key() -> None:
+def test_scenario_options_can_be_changed_key_by_key() -> None:
     made = load_config(
         changes={"scenario": "ring-warm", "scenario_options.length": [230, 240], "scenario_options.horizon": 50}
     )
@@ -64,7 +64,7 @@ def test_presets_are_not_changed_by_their_use() -> None:
     assert load_config(preset="paper") == before
 
 
-def test_merging_changes_neither_side() -> None:
+def test_merging_does_not_change_its_arguments() -> None:
     values, changes = {"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 6}}
     assert merge_changes(values, changes) == {"a": {"b": 5, "c": 2}, "d": {"e": 6}}
     assert (values, changes) == ({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 6}})
@@ -115,36 +115,39 @@ def test_merging_changes_neither_side() -> None:
         ),
         (
             {"policy.exploration": "antithetic", "model.kind": "road"},
-            "policy.exploration: antithetic is not allowed; allowed: per_step, per_episode, for these model rollouts",
+            "policy.exploration: antithetic is not allowed; allowed: per_step, per_episode, because these model",
         ),
         (
             {"policy.reward_after_exit": True},
-            "policy.reward_after_exit: true is not allowed; allowed: false where rows are imagined",
+            "policy.reward_after_exit: true is not allowed; allowed: false with a row model",
         ),
         (
             {"policy.history_features": True, "policy.inputs": ["local"]},
-            "policy.history_features: true is not allowed; allowed: false, where expert_memory is not observed",
+            "policy.history_features: true is not allowed; allowed: false without the input expert_memory",
         ),
         (
             {"scenario_options.simulation_step": 0.0333},
             "scenario ring.simulation_step: 0.0333 is not allowed; allowed: a whole number of milliseconds",
         ),
-        ({"scenario": "merge", "simulator": "batch"}, "simulator: batch is not allowed; allowed: sumo, for merge"),
+        (
+            {"scenario": "merge", "simulator": "batch"},
+            "simulator: batch is not allowed; allowed: sumo (merge is not a ring)",
+        ),
         (
             {"simulator": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},
-            "simulator: batch is not allowed; allowed: sumo, for figure-eight",
+            "simulator: batch is not allowed; allowed: sumo (figure-eight is not a ring)",
         ),
         (
             {"evaluation.patience": 5, "evaluation.validation_interval": 0},
-            "evaluation.patience: it is not allowed without validations",
+            "evaluation.patience: 5 is not allowed; allowed: 0 without validations",
         ),
         (
             {"model.kind": "road", "model.device": "cuda"},
-            "model.device: cuda is not allowed; allowed: cpu, for whole roads",
+            "model.device: cuda is not allowed; allowed: cpu, for road models",
         ),
     ],
 )
-def test_a_wrong_value_gets_one_line_that_begins_with_its_name(changes: dict[str, Any], words: str) -> None:
+def test_wrong_value_gives_one_line_with_its_name(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError) as caught:
         load_config(changes=changes)
     assert str(caught.value).startswith(words)
@@ -152,12 +155,12 @@ def test_a_wrong_value_gets_one_line_that_begins_with_its_name(changes: dict[str
 
 
 @pytest.mark.parametrize("seed", [TEST_SEED, VALIDATION_SEED])
-def test_a_seed_that_would_train_on_the_judging_episodes_is_refused(seed: int) -> None:
+def test_reserved_seed_is_refused(seed: int) -> None:
     with pytest.raises(InputError, match="seed"):
         load_config(changes={"seed": seed})
 
 
-def test_an_unknown_preset_lists_the_known() -> None:
+def test_unknown_preset_lists_known_presets() -> None:
     with pytest.raises(InputError, match="preset: 'papre' is not allowed; allowed: demo, rings, shared-rings"):
         load_config(preset="papre")
 
@@ -173,7 +176,7 @@ def test_an_unknown_preset_lists_the_known() -> None:
         (b"steps = 2020-01-01\n", "is not allowed"),
     ],
 )
-def test_a_wrong_file_gets_one_line(tmp_path: Path, content: bytes, words: str) -> None:
+def test_wrong_file_gives_one_line(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "wrong.toml"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words) as caught:
@@ -181,14 +184,14 @@ def test_a_wrong_file_gets_one_line(tmp_path: Path, content: bytes, words: str) 
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.toml: No such file"):
         read_toml(tmp_path / "none.toml")
     with pytest.raises(InputError, match=r"config file .*directory"):
         read_toml(tmp_path)
 
 
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+def test_pipe_is_refused_without_waiting(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.toml"
     os.mkfifo(pipe)
     with pytest.raises(InputError, match=r"pipe\.toml: not a file"):
@@ -196,14 +199,14 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("preset", ["", "demo", "rings", "shared-rings", "all-roads", "paper", "paper-exact"])
-def test_the_toml_of_a_configuration_makes_it_again(tmp_path: Path, preset: str) -> None:
+def test_configuration_survives_toml(tmp_path: Path, preset: str) -> None:
     made = load_config(
         preset=preset, changes={"scenario_options.humans": {"time_headway": 1.3}, "expert": 'a "b" c.py:d'}
     )
     assert load_config(written(tmp_path, to_toml(made))) == made
 
 
-def test_the_toml_of_a_road_given_in_python_makes_it_again(tmp_path: Path) -> None:
+def test_tuple_options_survive_toml(tmp_path: Path) -> None:
     made = load_config(changes={"scenario_options.length": (230, 240)})
     assert load_config(written(tmp_path, to_toml(made))) == made
 
@@ -228,7 +231,7 @@ TEXT = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])
         evaluation=st.builds(EvaluationSettings, baselines=st.lists(TEXT).map(tuple)),
     )
 )
-def test_any_configuration_survives_being_written(made: RunConfig, tmp_path_factory: Any) -> None:
+def test_any_configuration_survives_toml(made: RunConfig, tmp_path_factory: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "any.toml"
     path.write_bytes(to_toml(made).encode())
     assert load_config(path) == made
@@ -257,7 +260,7 @@ def test_every_key_is_written_out() -> None:
         assert f"\n{key} = " in f"\n{text}"
 
 
-def test_the_expert_is_made_as_named() -> None:
+def test_expert_is_made_by_name() -> None:
     assert load_config(changes={"expert": "none"}).make_expert() == Constant()
     assert load_config(changes={"expert": "pi:window=30"}).make_expert() == PISaturation(window=30)
     slow = load_config(changes={"scenario_options.steps_per_control_step": 5}).make_expert()
@@ -272,7 +275,7 @@ def test_the_expert_is_made_as_named() -> None:
         ({"scenario_options.length": [230, 230]}, "scenario_options.length: [230, 230]"),
     ],
 )
-def test_what_each_road_of_a_preset_says_otherwise_is_refused(changes: dict[str, Any], name: str) -> None:
+def test_conflict_with_all_tasks_of_a_preset_is_refused(changes: dict[str, Any], name: str) -> None:
     with pytest.raises(InputError, match=re.escape(f"{name} is not allowed; allowed: none with the preset rings")):
         load_config(None, "rings", changes)
     assert load_config(None, "rings", {"scenario_options.horizon": 200}).make_tasks()[0].scenario.horizon == 200

@@ -139,7 +139,7 @@ def crash(folder: Path, at: int, moment: Moment, kill: bool) -> Disk:
 
 @pytest.mark.long
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
-def test_wherever_it_ends_it_goes_on_to_the_same_files(every: int, tmp_path: Path) -> None:
+def test_run_resumes_to_the_same_files_after_any_failure(every: int, tmp_path: Path) -> None:
     wanted_in, trial = tmp_path / "wanted", 0
     total = crash(wanted_in, 0, "before", False).count
     wanted = content_of(wanted_in)
@@ -157,7 +157,7 @@ def test_wherever_it_ends_it_goes_on_to_the_same_files(every: int, tmp_path: Pat
 
 
 @pytest.mark.long
-def test_twice_in_a_row_too(tmp_path: Path) -> None:
+def test_run_resumes_after_two_failures(tmp_path: Path) -> None:
     crash(tmp_path / "wanted", 0, "before", False)
     wanted = content_of(tmp_path / "wanted")
     for first in range(1, 60, 11):

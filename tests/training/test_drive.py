@@ -36,20 +36,20 @@ def test_every_driver_has_a_row_for_every_seed(compared: DriveResult) -> None:
         assert {row["status"] for row in rows} == {"completed"}
 
 
-def test_a_row_measures_the_episode_of_its_seed(compared: DriveResult) -> None:
+def test_row_measures_the_episode_of_its_seed(compared: DriveResult) -> None:
     ring = Ring(**ROAD)
     for row in compared.rows["pi"]:
         (trajectory,) = run_episode(ring, PISaturation(), (row["seed"],)).trajectories
         assert row["return"] == trajectory.reward.sum()
 
 
-def test_held_out_seeds_are_those_that_judge_trainings() -> None:
+def test_test_seeds_are_those_of_training_evaluations() -> None:
     judged = drive("ring", "pi", episodes=2, scenario_options=ROAD, workers=1, test_seeds=True).rows["pi"]
     again = [run_episode(Ring(**ROAD), PISaturation(), seed).trajectories[0] for seed in make_test_seeds(2)]
     assert [row["return"] for row in judged] == [trajectory.reward.sum() for trajectory in again]
 
 
-def test_what_was_driven_is_written_with_a_report(compared: DriveResult) -> None:
+def test_results_are_written_with_a_report(compared: DriveResult) -> None:
     assert compared.folder is not None
     assert {path.name for path in compared.folder.iterdir()} == {
         "evaluation.json",
@@ -64,7 +64,7 @@ def test_what_was_driven_is_written_with_a_report(compared: DriveResult) -> None
     assert results.trained_label is None
 
 
-def test_the_mean_is_that_of_the_first_driver(compared: DriveResult) -> None:
+def test_mean_is_that_of_the_first_driver(compared: DriveResult) -> None:
     speeds = [row["mean_speed"] for row in compared.rows["pi"]]
     assert compared.mean["mean_speed"] == pytest.approx(np.mean(speeds))
     found = compared.summary("idm")["mean_speed"]
@@ -73,7 +73,7 @@ def test_the_mean_is_that_of_the_first_driver(compared: DriveResult) -> None:
     assert found.count == 3
 
 
-def test_the_document_of_several_drivers_is_a_list_of_such(compared: DriveResult) -> None:
+def test_document_of_several_drivers_is_a_list(compared: DriveResult) -> None:
     document = json.loads(to_json(compared.document()))
     assert document["scenario"] == "ring"
     assert [entry["driver"] for entry in document["drivers"]] == ["pi", "idm"]
@@ -88,7 +88,7 @@ def test_the_document_of_several_drivers_is_a_list_of_such(compared: DriveResult
         assert (entry["difference_to_baseline"] is None) == (entry["driver"] == expert)
 
 
-def test_the_document_of_one_driver_is_strict_json_with_null_for_nan() -> None:
+def test_document_is_strict_json_with_null_for_nan() -> None:
     result = drive("ring", "pi", episodes=1, scenario_options=ROAD, workers=1)
     document = json.loads(to_json(result.document()), parse_constant=lambda name: pytest.fail(name))
     assert document["driver"] == "pi"
@@ -112,12 +112,12 @@ def test_no_temporary_file_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not list(tmp_path.iterdir())
 
 
-def test_the_number_of_workers_changes_nothing(compared: DriveResult) -> None:
+def test_number_of_workers_does_not_change_the_result(compared: DriveResult) -> None:
     other = drive("ring", ["pi", "idm"], episodes=3, seed=4, scenario_options=ROAD, workers=2)
     assert to_json(other.rows) == to_json(compared.rows)
 
 
-def test_progress_is_told_by_driver_and_episode() -> None:
+def test_progress_has_driver_and_episode() -> None:
     told: list[tuple[Any, int]] = []
     drive(
         "ring",
@@ -131,7 +131,7 @@ def test_progress_is_told_by_driver_and_episode() -> None:
     assert (("idm", 0), 60) in told
 
 
-def test_a_reward_of_the_users_own(my_drivers: Path, tmp_path: Path) -> None:
+def test_user_reward_is_used(my_drivers: Path, tmp_path: Path) -> None:
     name = f"{my_drivers}:calm"
     result = drive("ring", "idm", 1, scenario_options=ROAD, reward=name, workers=1, out=tmp_path / "out")
     (trajectory,) = run_episode(Ring(**ROAD), IDM(), (0,), name).trajectories
@@ -139,7 +139,7 @@ def test_a_reward_of_the_users_own(my_drivers: Path, tmp_path: Path) -> None:
     assert read_results(tmp_path / "out").metadata["reward"] == name
 
 
-def test_a_driver_that_fails_has_rows_that_say_so_and_can_be_raised(my_drivers: Path, tmp_path: Path) -> None:
+def test_failed_driver_has_rows_and_can_be_raised(my_drivers: Path, tmp_path: Path) -> None:
     bad = f"{my_drivers}:broken"
     result = drive("ring", ["idm", bad], episodes=2, scenario_options=ROAD, workers=1, out=tmp_path / "out")
     assert [row["status"] for row in result.rows[bad]] == ["failed", "failed"]
@@ -150,7 +150,7 @@ def test_a_driver_that_fails_has_rows_that_say_so_and_can_be_raised(my_drivers: 
     assert "\n" not in str(caught.value)
 
 
-def test_where_all_went_well_nothing_is_raised(compared: DriveResult) -> None:
+def test_nothing_is_raised_without_failures(compared: DriveResult) -> None:
     raise_failures(compared)
 
 
@@ -178,7 +178,7 @@ def follow(state: LocalState) -> Any:
     return 0.5 * (state.leader_speed - state.speed)
 
 
-def test_functions_and_objects_of_the_program_drive_beside_the_others() -> None:
+def test_functions_and_objects_are_drivers() -> None:
     result = drive("ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, scenario_options=ROAD, workers=1)
     assert list(result.rows) == ["follow", "Follows", "Follows (2)", "Stays", "idm"]
     raise_failures(result)
@@ -190,12 +190,12 @@ def test_functions_and_objects_of_the_program_drive_beside_the_others() -> None:
     check_driver(Follows(0.2))
 
 
-def test_an_error_in_a_function_of_the_program_is_raised_as_it_is() -> None:
+def test_error_in_a_function_is_raised_unchanged() -> None:
     with pytest.raises(ZeroDivisionError):
         drive("ring", lambda state: 1 / 0, 1, scenario_options=ROAD, workers=1)
 
 
-def test_it_drives_while_an_environment_is_open_and_warns() -> None:
+def test_drive_works_with_an_open_environment_and_warns() -> None:
     with closing(RoadEnv(**ROAD)) as environment:
         environment.reset(seed=0)
         with pytest.warns(UserWarning, match="runs in a process of its own"):
@@ -203,7 +203,7 @@ def test_it_drives_while_an_environment_is_open_and_warns() -> None:
     assert beside.mean["return"] == drive("ring", follow, 1, scenario_options=ROAD, workers=1).mean["return"]
 
 
-def test_a_result_is_a_table_of_pandas_and_shows_itself_in_a_notebook(compared: DriveResult) -> None:
+def test_result_has_a_pandas_table_and_a_notebook_view(compared: DriveResult) -> None:
     table = compared.table()
     assert list(table.index) == list(METRICS)
     assert table["pi", "mean"].to_dict() == pytest.approx(compared.mean, nan_ok=True)
@@ -254,7 +254,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
     ],
     ids=str,
 )
-def test_wrong_arguments_are_told_before_anything_starts(
+def test_wrong_arguments_are_refused_before_the_start(
     tmp_path: Path, started: Callable[[], bool], wrong: dict[str, Any]
 ) -> None:
     arguments = {
@@ -273,7 +273,7 @@ def test_wrong_arguments_are_told_before_anything_starts(
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
-def test_what_is_already_there_is_left_alone(tmp_path: Path, started: Callable[[], bool], kind: str) -> None:
+def test_existing_files_are_not_changed(tmp_path: Path, started: Callable[[], bool], kind: str) -> None:
     mine = tmp_path / "out" / "mine.txt" if kind == "folder" else tmp_path / "out"
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("keep")
@@ -283,20 +283,20 @@ def test_what_is_already_there_is_left_alone(tmp_path: Path, started: Callable[[
     assert not started()
 
 
-def test_started_notices_a_worker(started: Callable[[], bool]) -> None:
+def test_fixture_detects_started_workers(started: Callable[[], bool]) -> None:
     assert not started()
     drive("ring", "idm", 1, scenario_options=ROAD, workers=1)
     assert started()
 
 
-def test_two_drivers_of_the_same_description_are_both_driven(my_drivers: Path) -> None:
+def test_drivers_with_equal_descriptions_are_both_run(my_drivers: Path) -> None:
     from unjam.controller import make_driver
 
     drivers = [make_driver(f"{my_drivers}:Keeper:gain={gain}", 0.1) for gain in (0.1, 0.2)]
     assert len(drive("ring", drivers, 1, scenario_options=ROAD, workers=1).rows) == 2
 
 
-def test_a_drive_of_which_every_episode_failed_leaves_no_folder(tmp_path: Path, my_drivers: Path) -> None:
+def test_failed_drive_leaves_no_folder(tmp_path: Path, my_drivers: Path) -> None:
     road = {"horizon": 20}
     result = drive("ring", f"{my_drivers}:broken", 1, scenario_options=road, workers=1, out=tmp_path / "drive")
     assert (result.folder, result.report) == (None, None)

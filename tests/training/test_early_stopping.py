@@ -46,12 +46,12 @@ def test_patience_counts_validations_since_the_best(validations: list[float | No
         ([1.0, 1.0, 1.0, 1.0], 0, False),
     ],
 )
-def test_converged_is_who_earns_no_more_than_before(returns: list[float], span: int, over: bool) -> None:
+def test_convergence_compares_two_windows(returns: list[float], span: int, over: bool) -> None:
     rows = [{"return_mean": value} for value in returns]
     assert has_converged(small_config(evaluation__convergence_window=span), rows) is over
 
 
-def test_the_policy_that_has_converged_is_the_controller(tmp_path: Path) -> None:
+def test_converged_policy_is_the_controller(tmp_path: Path) -> None:
     config = small_config(steps=20 * STEPS, evaluation__validation_interval=0, evaluation__convergence_window=1)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
@@ -60,7 +60,7 @@ def test_the_policy_that_has_converged_is_the_controller(tmp_path: Path) -> None
     assert controller_manifest(tmp_path / "run")["iteration"] == len(returns) < 20
 
 
-def test_the_validation_of_what_has_converged_is_in_its_progress_and_judges_a_trial(
+def test_validation_at_convergence_is_in_progress_and_counts_for_trials(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     returns = iter([5.0, 7.5])  # of the expert, and where it ends: before any validation was due
@@ -74,7 +74,7 @@ def test_the_validation_of_what_has_converged_is_in_its_progress_and_judges_a_tr
 
 
 @pytest.mark.long
-def test_training_ends_where_patience_is_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_training_ends_when_patience_is_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     returns = iter([5.0, 6.0, 5.5, 5.8, 9.0])
     monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
     config = small_config(steps=20 * STEPS, evaluation__patience=2)
@@ -85,9 +85,7 @@ def test_training_ends_where_patience_is_over(monkeypatch: pytest.MonkeyPatch, t
 
 
 @pytest.mark.long
-def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_callback_can_end_the_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     returns = iter([5.0, 4.0, 6.0])  # of the expert, after two iterations, and where it ends
     monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
     config = small_config(steps=20 * STEPS, evaluation__validation_interval=2)
@@ -98,7 +96,7 @@ def test_a_callback_that_returns_false_ends_the_training_as_its_steps_would(
 
 
 @pytest.mark.long
-def test_what_a_callback_ended_goes_on_as_if_it_never_had(tmp_path: Path) -> None:
+def test_training_ended_by_a_callback_resumes_unchanged(tmp_path: Path) -> None:
     config = small_config(steps=2 * STEPS, evaluation__validation_interval=2)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "stopped", config, lambda row: False)
@@ -107,7 +105,7 @@ def test_what_a_callback_ended_goes_on_as_if_it_never_had(tmp_path: Path) -> Non
     assert outcome(tmp_path / "stopped") == outcome(tmp_path / "one go")
 
 
-def test_tensorboard_has_every_number_at_its_actual_step(tmp_path: Path) -> None:
+def test_tensorboard_has_every_number_by_environment_step(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     write = tensorboard_writer(str(tmp_path))
     for step in (300, 600):
@@ -119,9 +117,7 @@ def test_tensorboard_has_every_number_at_its_actual_step(tmp_path: Path) -> None
     assert [(event.step, event.value) for event in board.Scalars("return_mean")] == [(300, 30.0), (600, 60.0)]
 
 
-def test_without_tensorboard_a_line_says_so_before_anything_is_trained(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_missing_tensorboard_is_reported_before_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("unjam.training.tensorboard.find_spec", lambda name: None)
     with pytest.raises(MissingPartError, match=r"pip install 'unjam\[train\]'"):
         tensorboard_writer(tmp_path)
@@ -129,9 +125,7 @@ def test_without_tensorboard_a_line_says_so_before_anything_is_trained(
 
 
 @pytest.mark.long
-def test_who_has_converged_or_given_up_stays_so_when_it_is_resumed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_early_stop_persists_when_resumed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     returns = iter([5.0, 6.0, 5.5, 5.8, 9.0, 9.5])
     monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])
     for name, settings in (
@@ -146,7 +140,7 @@ def test_who_has_converged_or_given_up_stays_so_when_it_is_resumed(
         assert (outcome(folder), len(read_progress(folder))) == before
 
 
-def test_a_validation_at_an_end_that_a_longer_run_would_not_make_counts_for_no_patience() -> None:
+def test_unscheduled_validation_does_not_count_for_patience() -> None:
     rows = [{"iteration": number, "return_expert": 10.0} for number in range(1, 5)]
     for row, found in zip(rows, (None, 12.0, 11.0, 11.5), strict=True):
         row["return_validation"] = found  # pyright: ignore[reportArgumentType]

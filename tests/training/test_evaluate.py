@@ -34,7 +34,7 @@ def found(pool: WorkerPool) -> Evaluation:
     return evaluate(RING, {"mine": PISaturation(), "other": IDM()}, SEEDS, pool)
 
 
-def test_every_driver_has_a_row_for_every_seed_in_their_order(found: Evaluation) -> None:
+def test_rows_follow_the_order_of_seeds(found: Evaluation) -> None:
     assert list(found.rows) == ["mine", "other"]
     for rows in found.rows.values():
         assert [tuple(row["seed"]) for row in rows] == SEEDS
@@ -42,7 +42,7 @@ def test_every_driver_has_a_row_for_every_seed_in_their_order(found: Evaluation)
         assert all(METRICS.keys() <= row.keys() for row in rows)
 
 
-def test_a_row_measures_the_episode_of_its_driver_and_seed(found: Evaluation) -> None:
+def test_row_measures_the_episode_of_its_driver_and_seed(found: Evaluation) -> None:
     drivers: dict[str, Driver] = {"mine": PISaturation(), "other": IDM()}
     for label, driver in drivers.items():
         for seed, row in zip(SEEDS, found.rows[label], strict=True):
@@ -51,7 +51,7 @@ def test_a_row_measures_the_episode_of_its_driver_and_seed(found: Evaluation) ->
             assert row["mean_speed"] == np.mean(episode.speeds[1:])
 
 
-def test_all_drivers_meet_the_same_traffic(found: Evaluation) -> None:
+def test_drivers_have_the_same_traffic(found: Evaluation) -> None:
     assert found.plot_episodes["mine"].drawn_values == found.plot_episodes["other"].drawn_values
     assert found.plot_episodes["mine"].seed == found.plot_episodes["other"].seed == SEEDS[0]
     assert not np.array_equal(found.plot_episodes["mine"].speeds, found.plot_episodes["other"].speeds)
@@ -68,7 +68,7 @@ def test_means_are_over_the_seeds(found: Evaluation) -> None:
     assert found.means()["mine"]["return"] == pytest.approx(expected)
 
 
-def test_another_reward_changes_the_return_alone(found: Evaluation, pool: WorkerPool) -> None:
+def test_another_reward_changes_only_the_return(found: Evaluation, pool: WorkerPool) -> None:
     other = evaluate(RING, {"mine": PISaturation()}, SEEDS, pool, reward="eq16")
     for row, before in zip(other.rows["mine"], found.rows["mine"], strict=True):
         assert row["return"] == pytest.approx(before["return_eq16"])
@@ -76,7 +76,7 @@ def test_another_reward_changes_the_return_alone(found: Evaluation, pool: Worker
         assert row["mean_speed"] == before["mean_speed"]
 
 
-def test_progress_names_driver_and_episode(pool: WorkerPool) -> None:
+def test_progress_names_driver_and_episode_of_evaluations(pool: WorkerPool) -> None:
     told: list[tuple[tuple[str, int], int]] = []
     evaluate(
         RING, {"a": IDM(), "b": IDM()}, SEEDS[:2], pool, progress=lambda episode, steps: told.append((episode, steps))
@@ -84,9 +84,7 @@ def test_progress_names_driver_and_episode(pool: WorkerPool) -> None:
     assert {episode for episode, steps in told if steps == 60} == {("a", 0), ("a", 1), ("b", 0), ("b", 1)}
 
 
-def test_a_driver_that_fails_has_rows_that_say_so_and_does_not_stop_the_others(
-    pool: WorkerPool, my_drivers: Path
-) -> None:
+def test_failed_driver_does_not_stop_the_others(pool: WorkerPool, my_drivers: Path) -> None:
     found = evaluate(RING, {"bad": FileDriver(my_drivers, "raises"), "good": IDM()}, SEEDS[:2], pool)
     assert [row["status"] for row in found.rows["bad"]] == ["failed", "failed"]
     assert [tuple(row["seed"]) for row in found.rows["bad"]] == SEEDS[:2]
@@ -98,7 +96,7 @@ def test_a_driver_that_fails_has_rows_that_say_so_and_does_not_stop_the_others(
 
 
 @pytest.mark.parametrize("kind", [InputError, MissingPartError, DiskError, EpisodeError, UnjamError])
-def test_a_failure_is_raised_as_the_error_that_it_was(kind: type[UnjamError]) -> None:
+def test_failure_is_raised_as_the_original_kind(kind: type[UnjamError]) -> None:
     rows = [
         {"status": "completed", "seed": (1,)},
         {"status": "failed", "seed": (2,), "reason": "no way", "error": kind.__name__},
@@ -110,11 +108,11 @@ def test_a_failure_is_raised_as_the_error_that_it_was(kind: type[UnjamError]) ->
     assert ("seed (2,)" in str(caught.value)) is (kind is not InputError)
 
 
-def test_where_nothing_failed_nothing_is_raised(found: Evaluation) -> None:
+def test_successful_rows_raise_nothing(found: Evaluation) -> None:
     raise_failure([row for rows in found.rows.values() for row in rows])
 
 
-def test_an_error_of_an_unknown_name_is_still_one_of_ours() -> None:
+def test_unknown_error_name_gives_an_unjam_error() -> None:
     with pytest.raises(UnjamError, match="no way"):
         raise_failure([{"status": "failed", "seed": (2,), "reason": "no way", "error": "Surprise"}])
 
@@ -124,7 +122,7 @@ def numbers_of(seed: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(np.random.SeedSequence(list(seed)).generate_state(4).tolist())
 
 
-def test_seeds_that_train_choose_and_judge_have_nothing_in_common() -> None:
+def test_seed_families_are_disjoint() -> None:
     judging = {numbers_of(seed) for seed in make_test_seeds(500)}
     choosing = {numbers_of((VALIDATION_SEED, index)) for index in range(500)}
     tuning = {numbers_of(seed) for seed in tuning_seeds(500)}
@@ -140,7 +138,7 @@ def test_seeds_that_train_choose_and_judge_have_nothing_in_common() -> None:
     assert TUNING_SEED < VALIDATION_SEED + 500  # a seed that only counted up from one would meet the other
 
 
-def test_more_held_out_episodes_contain_the_fewer() -> None:
+def test_more_test_seeds_contain_fewer() -> None:
     assert make_test_seeds(20)[:5] == make_test_seeds(5)
 
 
@@ -153,7 +151,7 @@ def strict(text: str) -> Any:
     return json.loads(text, parse_constant=refuse)
 
 
-def test_a_saved_evaluation_can_be_read_again(found: Evaluation, tmp_path: Path) -> None:
+def test_saved_evaluation_is_read_back(found: Evaluation, tmp_path: Path) -> None:
     save_evaluation(tmp_path / "new", found, {"scenario": "ring", "reward": "released", "limit": float("inf")})
     assert {path.name for path in (tmp_path / "new").iterdir()} == {
         "evaluation.json",
@@ -187,7 +185,7 @@ def test_the_table_has_the_rows(found: Evaluation, tmp_path: Path) -> None:
     )
 
 
-def test_an_evaluation_in_which_all_failed_can_be_saved(pool: WorkerPool, my_drivers: Path, tmp_path: Path) -> None:
+def test_evaluation_with_only_failures_can_be_saved(pool: WorkerPool, my_drivers: Path, tmp_path: Path) -> None:
     found = evaluate(RING, {"bad": FileDriver(my_drivers, "broken")}, SEEDS[:1], pool)
     save_evaluation(tmp_path, found, {})
     (row,) = strict((tmp_path / "evaluation.json").read_text())["rows"]
@@ -196,7 +194,7 @@ def test_an_evaluation_in_which_all_failed_can_be_saved(pool: WorkerPool, my_dri
     assert pd.read_parquet(tmp_path / "episodes.parquet")["status"].tolist() == ["failed"]
 
 
-def test_a_new_evaluation_takes_the_place_of_the_old(found: Evaluation, tmp_path: Path, pool: WorkerPool) -> None:
+def test_new_evaluation_replaces_the_old_one(found: Evaluation, tmp_path: Path, pool: WorkerPool) -> None:
     save_evaluation(tmp_path, found, {})
     save_evaluation(tmp_path, evaluate(RING, {"one": IDM()}, SEEDS[:1], pool), {})
     assert list(read_results(tmp_path).rows) == ["one"]

@@ -37,7 +37,7 @@ def run(pool: WorkerPool, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return learned(pool, tmp_path_factory.mktemp("runs") / "run")
 
 
-def test_compares_baselines_the_expert_and_what_was_trained(run: tuple[Path, RunConfig]) -> None:
+def test_comparison_has_baselines_expert_and_trained_controller(run: tuple[Path, RunConfig]) -> None:
     folder, config = run
     drivers = drivers_to_compare(config, folder, ["human", "pi:window=30"])
     assert next(iter(drivers)) == "human"
@@ -49,7 +49,7 @@ def test_compares_baselines_the_expert_and_what_was_trained(run: tuple[Path, Run
     assert trained.expert == PISaturation()
 
 
-def test_results_and_their_report_name_the_hash_of_the_controller_that_was_judged(
+def test_results_and_report_have_the_hash_of_the_controller(
     run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
 ) -> None:
     folder, config = run
@@ -61,26 +61,24 @@ def test_results_and_their_report_name_the_hash_of_the_controller_that_was_judge
         assert f"Controller {TRAINED_LABEL}: SHA-256 {sha256}" in render_report([found])
 
 
-def test_an_expert_among_the_baselines_is_compared_once(run: tuple[Path, RunConfig]) -> None:
+def test_expert_among_the_baselines_is_compared_once(run: tuple[Path, RunConfig]) -> None:
     folder, config = run
     assert list(drivers_to_compare(config, folder, ["pi", "human"])) == ["pi", "human", TRAINED_LABEL]
 
 
-def test_a_shipped_baseline_has_its_short_name(run: tuple[Path, RunConfig]) -> None:
+def test_packaged_baseline_has_its_short_name(run: tuple[Path, RunConfig]) -> None:
     folder, config = run
     name = "unjam:ring-jammed-tuned"
     assert list(drivers_to_compare(config, folder, ["human", name])) == ["human", name, "pi", TRAINED_LABEL]
 
 
-def test_baselines_of_one_file_with_other_parameters_are_all_compared(
-    run: tuple[Path, RunConfig], my_drivers: Path
-) -> None:
+def test_baselines_with_different_parameters_are_all_compared(run: tuple[Path, RunConfig], my_drivers: Path) -> None:
     folder, config = run
     names = [f"{my_drivers}:Keeper:gain={gain}" for gain in (0.1, 0.2)]
     assert len(drivers_to_compare(config, folder, names)) == 4
 
 
-def test_judges_on_the_held_out_seeds_and_saves_it(run: tuple[Path, RunConfig], pool: WorkerPool) -> None:
+def test_evaluation_uses_test_seeds_and_is_saved(run: tuple[Path, RunConfig], pool: WorkerPool) -> None:
     folder, config = run
     found = evaluate_run(folder, config, pool)
     assert list(found.rows) == ["human", "pi", TRAINED_LABEL]
@@ -95,9 +93,7 @@ def test_judges_on_the_held_out_seeds_and_saves_it(run: tuple[Path, RunConfig], 
     assert found.rows[TRAINED_LABEL][0]["return"] == trajectory.reward.sum()
 
 
-def test_baselines_and_episodes_can_be_others_than_the_configurations(
-    run: tuple[Path, RunConfig], pool: WorkerPool
-) -> None:
+def test_baselines_and_episodes_can_be_overridden(run: tuple[Path, RunConfig], pool: WorkerPool) -> None:
     folder, config = run
     found = evaluate_run(folder, config, pool, baselines=["idm"], episodes=1)
     assert list(found.rows) == ["idm", "pi", TRAINED_LABEL]
@@ -105,14 +101,14 @@ def test_baselines_and_episodes_can_be_others_than_the_configurations(
     assert list(evaluate_run(folder, config, pool, baselines=[], episodes=1).rows) == ["pi", TRAINED_LABEL]
 
 
-def test_without_an_expert_none_is_compared(pool: WorkerPool, tmp_path: Path) -> None:
+def test_no_expert_is_compared_without_one(pool: WorkerPool, tmp_path: Path) -> None:
     folder, config = learned(pool, tmp_path / "run", expert="none")
     found = evaluate_run(folder, config, pool, episodes=1)
     assert list(found.rows) == ["human", TRAINED_LABEL]
     assert read_results(folder).metadata["expert"] == "none"
 
 
-def test_a_trained_controller_is_the_expert_of_the_next(
+def test_trained_controller_can_be_the_next_expert(
     run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
 ) -> None:
     first, _ = run
@@ -126,7 +122,7 @@ def test_a_trained_controller_is_the_expert_of_the_next(
     assert found.rows["pi + residual"][0]["return"] == trajectory.reward.sum()
 
 
-def test_a_baseline_described_like_the_expert_is_not_lost(
+def test_baseline_with_the_description_of_the_expert_is_kept(
     run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
 ) -> None:
     first, _ = run
@@ -135,7 +131,7 @@ def test_a_baseline_described_like_the_expert_is_not_lost(
     assert len(drivers_to_compare(config, folder, [str(second)])) == 3
 
 
-def test_an_expert_and_a_reward_of_the_users_own(pool: WorkerPool, tmp_path: Path, my_drivers: Path) -> None:
+def test_user_expert_and_reward_are_used(pool: WorkerPool, tmp_path: Path, my_drivers: Path) -> None:
     changes = {"expert": f"{my_drivers}:gentle", "reward": f"{my_drivers}:calm"}
     folder, config = learned(pool, tmp_path / "run", **changes)
     found = evaluate_run(folder, config, pool, episodes=1)
@@ -148,7 +144,7 @@ def test_an_expert_and_a_reward_of_the_users_own(pool: WorkerPool, tmp_path: Pat
     assert found.rows[TRAINED_LABEL][0]["return"] == trajectory.reward.sum()
 
 
-def test_a_baseline_at_fault_is_told_and_the_rest_is_saved(
+def test_failed_baseline_is_reported_and_the_rest_is_saved(
     run: tuple[Path, RunConfig], pool: WorkerPool, my_drivers: Path
 ) -> None:
     folder, config = run
@@ -159,6 +155,6 @@ def test_a_baseline_at_fault_is_told_and_the_rest_is_saved(
     assert [row["status"] for row in rows[TRAINED_LABEL]] == ["completed"]
 
 
-def test_a_folder_without_a_controller_cannot_be_judged(tmp_path: Path, pool: WorkerPool) -> None:
+def test_folder_without_a_controller_is_refused(tmp_path: Path, pool: WorkerPool) -> None:
     with pytest.raises(InputError, match=r"controller\.unjam' does not exist"):
         evaluate_run(tmp_path, small_config(), pool)

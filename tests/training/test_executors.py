@@ -1,4 +1,4 @@
-"""Command lines at once: in processes of this machine, and on a Ray cluster of two."""
+"""Parallel command lines: in processes of this machine, and on a Ray cluster of two machines."""
 
 import hashlib
 import signal
@@ -29,19 +29,19 @@ def hash_of(folder: Path) -> str:
     return hashlib.sha256((folder / "run" / "controller.unjam").read_bytes()).hexdigest()
 
 
-def test_one_failure_does_not_stop_the_others(tmp_path: Path) -> None:
+def test_failed_command_does_not_stop_the_others(tmp_path: Path) -> None:
     commands = {
         "bad": CommandLine(["fly"], tmp_path / "bad.log"),
         "good": CommandLine(["--version"], tmp_path / "logs" / "good.log"),
     }
     told: list[str] = []
-    with pytest.raises(UnjamError, match="1 of 2 failed: bad; what the first of them said"):
+    with pytest.raises(UnjamError, match="1 of 2 failed: bad; first log: "):
         run_all(commands, 1, "local", told.append)
     assert "unjam 0" in commands["good"].log.read_text()
     assert sorted(line.split(": ")[1] for line in told) == ["bad failed", "good"]
 
 
-def test_what_was_begun_is_gone_on_with(tmp_path: Path) -> None:
+def test_started_training_is_resumed(tmp_path: Path) -> None:
     command = command_of(tmp_path)
     assert command.argv()[4:6] == ["train", "--config"]
     (tmp_path / "run").mkdir()
@@ -49,7 +49,7 @@ def test_what_was_begun_is_gone_on_with(tmp_path: Path) -> None:
     assert command.argv()[4:6] == ["train", "--resume"]
 
 
-def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_command_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = tmp_path / "script.py"
     script.write_text(
         "import os, pathlib, sys\n"
@@ -64,7 +64,7 @@ def test_what_a_signal_kills_is_started_again(tmp_path: Path, monkeypatch: pytes
         assert len(counted.read_text()) == min(times, executors.MAX_ATTEMPTS)
 
 
-def test_a_stop_ends_what_runs_and_starts_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_ends_running_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CommandLine, "argv", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"])
     processes, codes = LocalExecutor(), []
     thread = threading.Thread(target=lambda: codes.append(processes.run(CommandLine([], tmp_path / "log"))))
@@ -77,7 +77,7 @@ def test_a_stop_ends_what_runs_and_starts_nothing_again(tmp_path: Path, monkeypa
     assert (tmp_path / "log").read_text().count("$ ") == 1
 
 
-def test_without_ray_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ray_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingPartError, match=r"pip install 'unjam\[ray\]'"):
         run_all({"any": CommandLine(["--version"], tmp_path / "log")}, 1, "ray", print)
@@ -96,7 +96,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 @pytest.mark.slow
-def test_a_cluster_ends_with_the_bytes_of_this_machine(tmp_path: Path, cluster: Any) -> None:
+def test_cluster_gives_the_same_controllers_as_this_machine(tmp_path: Path, cluster: Any) -> None:
     cluster.add_node(num_cpus=1)
     names = ("one", "two")
     configs = [small_config(seed=seed, evaluation__baselines=[]) for seed in range(2)]
@@ -112,7 +112,7 @@ def test_a_cluster_ends_with_the_bytes_of_this_machine(tmp_path: Path, cluster: 
 
 
 @pytest.mark.slow
-def test_a_training_whose_machine_is_lost_goes_on_elsewhere(tmp_path: Path, cluster: Any) -> None:
+def test_training_on_a_lost_machine_resumes_elsewhere(tmp_path: Path, cluster: Any) -> None:
 
     lost = cluster.add_node(num_cpus=1)
     config = small_config(steps=6000, evaluation__validation_interval=0, evaluation__baselines=[])

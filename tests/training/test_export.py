@@ -42,7 +42,7 @@ def exported(run: Path) -> Path:
 
 
 @pytest.mark.long
-def test_it_is_the_runs_controller_that_is_exported(run: Path, exported: Path) -> None:
+def test_export_has_the_controller_of_the_run(run: Path, exported: Path) -> None:
     made, kept = load_controller(exported), load_controller(run)
     assert isinstance(made, FilteredDriver)
     made = made.driver
@@ -53,7 +53,7 @@ def test_it_is_the_runs_controller_that_is_exported(run: Path, exported: Path) -
     assert unpack_parts(exported).keys() == {MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART}
 
 
-def test_its_manifest_says_where_it_comes_from_and_how_good_it_is(run: Path, exported: Path) -> None:
+def test_manifest_has_origin_and_metrics(run: Path, exported: Path) -> None:
     said = manifest_of(exported)
     assert said["run"] == {"scenario": "ring", "agent": "trpo", "seed": 0}
     assert said["scenario"]["vehicles"] == 8
@@ -67,21 +67,21 @@ def test_its_manifest_says_where_it_comes_from_and_how_good_it_is(run: Path, exp
     assert {"reward", "trained", "pi"} == metrics.keys()
 
 
-def test_the_sample_is_what_a_cav_perceived_in_an_episode(exported: Path) -> None:
+def test_sample_has_the_local_states_of_an_episode(exported: Path) -> None:
     states, answers = read_sample(unpack_parts(exported)[SAMPLE_PART])
     assert len(answers) == 100  # the horizon of the run
     np.testing.assert_allclose(np.diff(states.speed), 0.1 * answers[:-1], atol=1e-6)
     assert set(states.loop_length) <= set(range(120, 131))
 
 
-def test_a_run_that_was_not_evaluated_yet_has_no_metrics(run: Path, tmp_path: Path) -> None:
+def test_export_of_an_unevaluated_run_has_no_metrics(run: Path, tmp_path: Path) -> None:
     for name in ("config.toml", "controller.unjam"):
         (tmp_path / name).write_bytes((run / name).read_bytes())
     assert manifest_of(export_controller(tmp_path, tmp_path / "it.unjam").file)["metrics"] is None
 
 
 @pytest.mark.slow
-def test_a_driver_by_itself_gets_step_and_bounds_of_its_road(tmp_path: Path) -> None:
+def test_exported_driver_has_step_and_bounds_of_the_scenario(tmp_path: Path) -> None:
     done = export_controller("pi:window=30", tmp_path / "pi.unjam", scenario="merge")
     assert load_controller(done.file) == PISaturation(window=30, time_step=1.0)
     said = manifest_of(done.file)
@@ -92,7 +92,7 @@ def test_a_driver_by_itself_gets_step_and_bounds_of_its_road(tmp_path: Path) -> 
 
 
 @pytest.mark.long
-def test_with_a_graph_it_is_in_the_file_and_beside_it(run: Path, tmp_path: Path) -> None:
+def test_graph_is_in_the_controller_and_in_its_own_file(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")
     done = export_controller(run, tmp_path / "ring.unjam", onnx=True)
@@ -110,11 +110,11 @@ def test_with_a_graph_it_is_in_the_file_and_beside_it(run: Path, tmp_path: Path)
         ("mine.py:gentle", "it.unjam", "", "mine.py is Python code"),
         ("none.unjam", "it.unjam", "", "does not exist"),
         (".", "it.unjam", "", "not a run folder"),
-        (".", "it.unjam", "ring", "none beside a run"),
+        (".", "it.unjam", "ring", "none for a run"),
     ],
 )
 @pytest.mark.usefixtures("my_drivers")
-def test_what_cannot_be_exported_is_refused(
+def test_impossible_export_is_refused(
     source: str, to: str, scenario: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -124,7 +124,7 @@ def test_what_cannot_be_exported_is_refused(
     assert not Path(to).exists()
 
 
-def test_a_file_that_does_not_verify_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_verification_keeps_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     to = tmp_path / "pi.unjam"
     export_controller("pi", to, scenario="ring")
     before = to.read_bytes()
@@ -139,7 +139,7 @@ def test_a_file_that_does_not_verify_leaves_the_one_before(tmp_path: Path, monke
     assert to.read_bytes() == before
 
 
-def test_a_car_that_obeys_late_gets_no_file_whose_filter_does_not_know_it(tmp_path: Path) -> None:
+def test_actuator_latency_with_a_filter_is_refused(tmp_path: Path) -> None:
     config = small_config(steps=100, model__model_ratio=0.0, scenario_options__actuator__lag=0.5)
     with empty_pictures():
         train(config, tmp_path / "late")
@@ -147,14 +147,14 @@ def test_a_car_that_obeys_late_gets_no_file_whose_filter_does_not_know_it(tmp_pa
         export_controller(tmp_path / "late", tmp_path / "late.unjam")
 
 
-def test_no_graph_is_drawn_of_a_driver_that_looks_at_what_its_road_does_not_tell(tmp_path: Path) -> None:
+def test_graph_needs_all_inputs_of_the_driver(tmp_path: Path) -> None:
     file = tmp_path / "it.unjam"
-    with pytest.raises(InputError, match="filtered is not allowed: ring does not tell allowed_speed"):
+    with pytest.raises(InputError, match="filtered is not allowed: ring does not provide allowed_speed"):
         export_controller("adaptive-acc", file, onnx=True, scenario="ring")
     assert not file.exists()
 
 
-def test_a_controllers_file_keeps_its_road_and_origin(tmp_path: Path) -> None:
+def test_exported_controller_file_keeps_its_origin(tmp_path: Path) -> None:
     shipped = manifest_of(packaged_file("figure-eight-tuned"))
     again = manifest_of(export_controller("unjam:figure-eight-tuned", tmp_path / "again.unjam").file)
     for name in ("scenario", "tuning", "expert", "versions"):

@@ -49,15 +49,13 @@ def refused(folder: Path, config: RunConfig) -> str:
         ({"scenario_options__vehicles": 9}, "scenario_options.vehicles: 9 is not allowed"),
     ],
 )
-def test_a_checkpoint_of_another_configuration_is_refused_and_nothing_changed(
-    changes: dict[str, Any], words: str, tmp_path: Path
-) -> None:
+def test_checkpoint_of_another_configuration_is_refused(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
     with_checkpoint(tmp_path, small_config())
     (tmp_path / "config.toml").write_text(to_toml(small_config(**changes)))
     assert words in refused(tmp_path, small_config(**changes))
 
 
-def test_more_steps_and_other_workers_are_the_same_training(tmp_path: Path) -> None:
+def test_steps_and_workers_do_not_change_the_fingerprint(tmp_path: Path) -> None:
     with_checkpoint(tmp_path, small_config())
     assert restore_newest_checkpoint(tmp_path, {tmp_path}, fingerprint(small_config(steps=9000, workers=2))) is not None
 
@@ -81,7 +79,7 @@ def of_network(folder: Path) -> RunConfig:
 @pytest.mark.parametrize(
     ("make", "file"), [(of_expert, "mine.py"), (of_reward, "mine.py"), (of_network, "demand.rou.xml")]
 )
-def test_what_a_training_is_made_of_cannot_change(make: Callable[[Path], RunConfig], file: str, tmp_path: Path) -> None:
+def test_changed_files_of_a_training_are_refused(make: Callable[[Path], RunConfig], file: str, tmp_path: Path) -> None:
     config, run = make(tmp_path), tmp_path / "run"
     with_checkpoint(run, config)
     assert restore_newest_checkpoint(run, {run}, fingerprint(config)) is not None
@@ -96,7 +94,7 @@ def test_what_a_training_is_made_of_cannot_change(make: Callable[[Path], RunConf
     check_run_files(run, config)  # what is damaged does not tell
 
 
-def test_other_packages_and_kernels_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_other_packages_and_kernels_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     now = fingerprint(small_config())
     check_fingerprint(now, now)
     assert not caplog.records
@@ -105,7 +103,7 @@ def test_other_packages_and_kernels_are_told(tmp_path: Path, caplog: pytest.LogC
     assert ["packages" in caplog.messages[0], "kernels" in caplog.messages[1]] == [True, True]
 
 
-def test_a_manifest_says_by_what_a_run_went_on(tmp_path: Path) -> None:
+def test_manifest_has_the_lineage_of_a_run(tmp_path: Path) -> None:
     create_run_folder(tmp_path, small_config())
     for iteration in (3, 7):
         append_lineage(tmp_path, iteration)
@@ -115,9 +113,7 @@ def test_a_manifest_says_by_what_a_run_went_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("ended", "content"), [(True, b"last"), (False, b"best")])
-def test_a_longer_run_goes_on_from_the_controller_that_it_would_have_had(
-    ended: bool, content: bytes, tmp_path: Path
-) -> None:
+def test_longer_run_resumes_with_the_best_scheduled_controller(ended: bool, content: bytes, tmp_path: Path) -> None:
     controllers = ControllerStore([tmp_path])
     controllers.save([b"best"], is_best=True)
     controllers.save([b"last"], is_best=False)

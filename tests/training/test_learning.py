@@ -40,7 +40,7 @@ TARGET = 100.0
 
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", QUICK)
-def test_a_network_alone_learns_to_drive_on_a_little_ring(agent: str, tmp_path: Path) -> None:
+def test_network_without_expert_learns_on_a_small_ring(agent: str, tmp_path: Path) -> None:
     config = load_config(changes={**LITTLE_RING, "agent": agent, **QUICK[agent]})
     rows: list[dict[str, Any]] = []
     with WorkerPool(1) as workers:

@@ -37,14 +37,14 @@ def facts(run: Path) -> dict[str, Any]:
     return measure_model(run, CONFIG)
 
 
-def test_only_decisions_that_no_network_learned_from_count(facts: dict[str, Any]) -> None:
+def test_facts_use_only_holdout_steps(facts: dict[str, Any]) -> None:
     held_out = [0, 5]
     assert facts["validation_steps"] == 100 * len(held_out)
     for found in facts["by_state"].values():
         assert sum(found["control_steps"]) == facts["validation_steps"]
 
 
-def test_errors_in_bins_make_up_the_error_of_all(facts: dict[str, Any]) -> None:
+def test_errors_in_bins_add_up_to_the_total(facts: dict[str, Any]) -> None:
     for found in facts["by_state"].values():
         assert found["values"] == sorted(found["values"])
         for name, error in facts["one_step"].items():
@@ -54,7 +54,7 @@ def test_errors_in_bins_make_up_the_error_of_all(facts: dict[str, Any]) -> None:
                 assert whole == pytest.approx(error[kind], rel=5e-3, abs=1e-12), (name, kind)
 
 
-def test_replays_go_over_half_of_a_stay(facts: dict[str, Any]) -> None:
+def test_replays_cover_half_of_a_trip(facts: dict[str, Any]) -> None:
     replay = facts["replay"]
     assert replay["times"][-1] == pytest.approx(5.0)
     assert list(replay["quantities"]) == NUMBERS
@@ -64,7 +64,7 @@ def test_replays_go_over_half_of_a_stay(facts: dict[str, Any]) -> None:
     assert 0 < replay["starts"] <= model_facts.MAX_REPLAYS
 
 
-def test_examples_begin_where_they_were_recorded(facts: dict[str, Any]) -> None:
+def test_examples_start_at_recorded_states(facts: dict[str, Any]) -> None:
     examples = facts["replay"]["examples"]
     assert len(examples) == model_facts.EXAMPLE_COUNT
     for example in examples:
@@ -74,7 +74,7 @@ def test_examples_begin_where_they_were_recorded(facts: dict[str, Any]) -> None:
             assert {len(line) for line in (found["recorded"], found["base"], *found["members"])} == {50}
 
 
-def test_the_bound_is_that_of_the_run(run: Path, facts: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bound_matches_progress(run: Path, facts: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     newest = read_progress(run)[-1]
     monkeypatch.setattr(model_facts, "ROLLOUT_LENGTHS", (newest["k_star"],))
     found = measure_model(run, CONFIG)["bound"]
@@ -83,7 +83,7 @@ def test_the_bound_is_that_of_the_run(run: Path, facts: dict[str, Any], monkeypa
     assert facts["k_star"] == newest["k_star"]
 
 
-def test_runs_of_before_that_do_not_know_the_error_have_no_bound(run: Path, tmp_path: Path) -> None:
+def test_runs_without_the_error_have_no_bound(run: Path, tmp_path: Path) -> None:
     lone = shutil.copytree(run, tmp_path / "lone")
     rows = read_progress(lone)
     del rows[-1]["model"]["eps_m_by_estimator"]["transitions"]
@@ -91,20 +91,20 @@ def test_runs_of_before_that_do_not_know_the_error_have_no_bound(run: Path, tmp_
     assert measure_model(lone, CONFIG)["bound"] is None
 
 
-def test_facts_are_small_and_the_same_each_time(run: Path, facts: dict[str, Any]) -> None:
+def test_facts_are_small_and_reproducible(run: Path, facts: dict[str, Any]) -> None:
     assert measure_model(run, CONFIG) == facts
     assert len(json.dumps(facts)) < 60_000
 
 
 @pytest.mark.parametrize("kept", [None, "{", "[]", '{"iteration": 1}'])
-def test_missing_damaged_and_old_facts_are_measured_anew(kept: str | None, run: Path, facts: dict[str, Any]) -> None:
+def test_missing_damaged_and_old_facts_are_measured_again(kept: str | None, run: Path, facts: dict[str, Any]) -> None:
     (run / MODEL_FILE).unlink(missing_ok=True)
     if kept is not None:
         (run / MODEL_FILE).write_text(kept)
     assert update_model_facts(run, CONFIG) == json.loads(json.dumps(facts))
 
 
-def test_newest_facts_are_read(run: Path) -> None:
+def test_current_facts_are_read(run: Path) -> None:
     (run / MODEL_FILE).write_text('{"iteration": 2, "base": "told"}')
     assert update_model_facts(run, CONFIG)["base"] == "told"
 
@@ -113,25 +113,25 @@ def without_virtual() -> RunConfig:
     return small_config(model__model_ratio=0.0)
 
 
-def test_a_run_without_a_virtual_environment_says_so(run: Path) -> None:
-    with pytest.raises(InputError, match="has no virtual environment"):
+def test_run_without_a_model_is_refused(run: Path) -> None:
+    with pytest.raises(InputError, match="has no model"):
         update_model_facts(run, without_virtual())
 
 
-def test_a_run_that_has_only_begun_says_so(run: Path, tmp_path: Path) -> None:
+def test_run_without_a_checkpoint_is_refused(run: Path, tmp_path: Path) -> None:
     shutil.copy(run / "config.toml", tmp_path)
     with pytest.raises(InputError, match="has no checkpoint yet"):
         update_model_facts(tmp_path, read_config(tmp_path))
 
 
 @given(st.lists(st.integers(1, 5000), min_size=1, max_size=50))
-def test_at_least_half_of_the_stays_are_long_enough_to_be_replayed(stays: list[int]) -> None:
+def test_half_of_the_trips_are_long_enough_for_replays(stays: list[int]) -> None:
     ahead = replay_length(stays)
     assert 1 <= ahead <= model_facts.MAX_REPLAY_STEPS
     assert np.mean([stay >= ahead for stay in stays]) >= 0.5
 
 
-def test_a_run_that_imagines_whole_roads_shows_waves(tmp_path: Path) -> None:
+def test_road_model_has_waves(tmp_path: Path) -> None:
     changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__base": "none"}
     config = small_config(**changes, model__members=2, steps=STEPS)
     with WorkerPool(1) as workers:
@@ -140,9 +140,9 @@ def test_a_run_that_imagines_whole_roads_shows_waves(tmp_path: Path) -> None:
     shapes = [np.shape(found["waves"]["recorded"][name]) for name in ("speeds", "positions")]
     assert shapes == [(10, 8)] * 2  # a moment a second, for ten seconds
     assert found["control_step"] == pytest.approx(1.0)
-    assert len(found["waves"]["recorded"]["cavs"]) == 1
+    assert len(found["waves"]["recorded"]["cav_columns"]) == 1
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in wave_figure(found).axes[:3]]
-    assert titles == ["recorded", "model", "nothing changes"]
+    assert titles == ["recorded", "model", "no change"]
     assert update_model_facts(tmp_path / "run", config) == found
     rows = dict(wave_rows(found))
     speeds = np.array(found["waves"]["model"]["speeds"])
@@ -165,7 +165,7 @@ RAMP: dict[str, Any] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("world", ["batch", "sumo"])
-def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str, tmp_path: Path) -> None:
+def test_on_ramp_model_has_waves_by_lane(world: str, tmp_path: Path) -> None:
     changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__members": 2, **RAMP}
     config = small_config(**{**changes, "simulator": world}, steps=STEPS)
     with WorkerPool(1) as workers:
@@ -188,9 +188,7 @@ def test_a_run_that_imagines_an_on_ramp_shows_its_waves_lane_by_lane(world: str,
 
 @pytest.mark.long
 @pytest.mark.parametrize("road", [{}, RAMP])
-def test_a_run_that_imagines_whole_roads_goes_on_as_if_it_had_not_been_stopped(
-    road: dict[str, Any], tmp_path: Path
-) -> None:
+def test_run_with_a_road_model_resumes_unchanged(road: dict[str, Any], tmp_path: Path) -> None:
     changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__members": 2, **road}
     ends = []
     for stops in ([2 * STEPS], [STEPS, 2 * STEPS]):

@@ -18,14 +18,14 @@ def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_each_preset_makes_a_configuration_and_an_expert(name: str) -> None:
+def test_presets_give_a_configuration_and_an_expert(name: str) -> None:
     made = load_config(preset=name)
     assert made.preset == name
     made.make_expert()
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_changes_what_it_names_and_nothing_else(name: str) -> None:
+def test_preset_changes_only_its_keys(name: str) -> None:
     defaults = flat(dataclasses.asdict(RunConfig()))
     made = flat(dataclasses.asdict(load_config(preset=name)))
     named = flat(preset_values(name, "ring"))
@@ -36,14 +36,14 @@ def test_a_preset_changes_what_it_names_and_nothing_else(name: str) -> None:
     assert {key for key in made if made[key] != defaults[key]} <= {*named, "preset"}
 
 
-def test_the_demo_of_a_first_visit_begins_with_a_wave_and_ends_within_a_minute() -> None:
+def test_demo_on_the_jammed_ring_is_short() -> None:
     made = load_config(preset="demo", changes={"scenario": "ring-jammed"})
     assert (made.scenario, made.simulator, made.steps) == ("ring-jammed", "batch", 288_000)
     assert made.evaluation.baselines[0] == "human"
     assert load_config(preset="demo").simulator == "sumo"
 
 
-def test_the_exact_preset_of_the_paper_has_none_of_our_additions() -> None:
+def test_paper_exact_preset_has_no_additions() -> None:
     paper, exact = load_config(preset="paper"), load_config(preset="paper-exact")
     assert (exact.steps, exact.trpo, exact.model.kappa) == (4_000_000, paper.trpo, paper.model.kappa)
     model = exact.model
@@ -60,7 +60,7 @@ def test_the_exact_preset_of_the_paper_has_none_of_our_additions() -> None:
     )
 
 
-def test_the_papers_preset_has_the_papers_numbers() -> None:
+def test_paper_preset_has_the_numbers_of_the_paper() -> None:
     made = load_config(preset="paper")
     assert (made.trpo.gamma, made.trpo.gae_lambda, made.trpo.target_kl) == (0.995, 0.97, 0.01)
     ppo, sac = made.ppo, made.sac

@@ -6,7 +6,7 @@ from unjam.errors import UnjamError
 from unjam.training.random_state import exclusive_random_state
 
 
-def test_a_training_leaves_generators_and_threads_of_its_process_as_they_were() -> None:
+def test_training_restores_generators_and_threads() -> None:
     torch.manual_seed(3)
     np.random.seed(3)
     threads, expected = torch.get_num_threads(), (torch.rand(2).tolist(), np.random.rand(2).tolist())
@@ -20,7 +20,7 @@ def test_a_training_leaves_generators_and_threads_of_its_process_as_they_were() 
     assert torch.get_num_threads() == threads
 
 
-def test_a_second_training_in_the_same_process_is_refused() -> None:
+def test_second_training_in_a_process_is_refused() -> None:
     refused = pytest.raises(UnjamError, match="another training runs in this process")
     for _ in range(2):
         with exclusive_random_state(), refused, exclusive_random_state():

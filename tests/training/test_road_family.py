@@ -8,12 +8,12 @@ from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
 SEEN, HELD_OUT = family_scenarios("all-roads", "training"), family_scenarios("all-roads", "combination", "axis")
 
 
-def test_no_road_that_is_held_out_is_seen() -> None:
+def test_unseen_roads_are_not_used_for_training() -> None:
     assert len(SEEN) + len(HELD_OUT) == len(FAMILY)
     assert not set(HELD_OUT.values()) & set(SEEN.values())
 
 
-def test_each_held_out_axis_lies_beyond_what_is_seen() -> None:
+def test_unseen_axes_lie_beyond_training_values() -> None:
     rings = [road for road in SEEN.values() if isinstance(road, Ring)]
     spacings = [size / road.vehicles for road in rings for size in road.length]
     dense = HELD_OUT["ring-22-dense"]
@@ -24,11 +24,11 @@ def test_each_held_out_axis_lies_beyond_what_is_seen() -> None:
 
 
 @pytest.mark.parametrize("group", ROAD_GROUPS)
-def test_every_group_has_roads_of_both_kinds(group: str) -> None:
+def test_every_group_has_training_and_unseen_roads(group: str) -> None:
     assert family_scenarios(group, "training")
     assert family_scenarios(group, "combination", "axis")
 
 
-def test_rings_are_shared_where_six_in_a_hundred_are_cavs() -> None:
+def test_shared_rings_have_at_least_six_percent_cavs() -> None:
     assert list(family_scenarios("shared-rings", "training")) == ["ring-33-growing-3-cavs", "ring-66-grown-4-cavs"]
     assert list(family_scenarios("shared-rings", "combination", "axis")) == ["ring-44-grown-5-cavs"]

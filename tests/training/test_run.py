@@ -132,14 +132,14 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory, learn: Learn) -> Pat
     return folder
 
 
-def test_progress_has_a_row_per_iteration_that_counts_actual_steps(uninterrupted: Path) -> None:
+def test_progress_counts_environment_steps_by_iteration(uninterrupted: Path) -> None:
     rows = progress(uninterrupted)
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
     assert [row["environment_steps"] for row in rows] == [300, 600, 900, 1200]
     assert all(row["model_steps"] >= row["environment_steps"] for row in rows if row["k_star"] >= 10)
 
 
-def test_a_row_of_progress_is_whole(uninterrupted: Path) -> None:
+def test_progress_row_is_complete(uninterrupted: Path) -> None:
     for row in read_progress(uninterrupted):
         numbers = [
             row[name] for name in ("return_mean", "return_expert", "return_validation", "mean_speed", "mean_abs_accel")
@@ -153,25 +153,25 @@ def test_a_row_of_progress_is_whole(uninterrupted: Path) -> None:
         assert 0.0 < row["mean_speed"] < 30.0
 
 
-def test_steps_are_rounded_up_to_whole_episodes_and_whole_iterations(tmp_path: Path, learn: Learn) -> None:
+def test_steps_are_rounded_up_to_whole_iterations(tmp_path: Path, learn: Learn) -> None:
     run = learn(tmp_path / "run", small_config(trpo__steps_per_iteration=101, steps=201))
     assert [row["environment_steps"] for row in progress(tmp_path / "run")] == [200, 400]
     assert run.training.environment_steps == 400
 
 
 @pytest.mark.long
-def test_the_same_configuration_repeats_to_the_last_bit(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_same_configuration_repeats_bit_for_bit(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "again", small_config(steps=4 * STEPS))
     assert outcome(tmp_path / "again") == outcome(uninterrupted)
 
 
-def test_another_seed_is_another_run(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_other_seed_gives_another_run(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "other", small_config(steps=STEPS, seed=1))
     assert progress(tmp_path / "other")[0]["return_mean"] != progress(uninterrupted)[0]["return_mean"]
 
 
 @pytest.mark.long
-def test_the_number_of_workers_changes_nothing(uninterrupted: Path, tmp_path: Path) -> None:
+def test_number_of_workers_does_not_change_the_result(uninterrupted: Path, tmp_path: Path) -> None:
     with WorkerPool(2) as two:
         learn_with(two, tmp_path / "two", small_config(steps=4 * STEPS, workers=2))
     assert outcome(tmp_path / "two") == outcome(uninterrupted)
@@ -179,9 +179,7 @@ def test_the_number_of_workers_changes_nothing(uninterrupted: Path, tmp_path: Pa
 
 @pytest.mark.long
 @pytest.mark.parametrize("iterations", [pytest.param(1, marks=pytest.mark.slow), 3])
-def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
-    uninterrupted: Path, tmp_path: Path, iterations: int, learn: Learn
-) -> None:
+def test_interrupted_run_ends_unchanged(uninterrupted: Path, tmp_path: Path, iterations: int, learn: Learn) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
     with pytest.raises(Stop):
         learn(folder, config, stop_after(iterations))
@@ -192,7 +190,7 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not_been(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ppo", "sac", "td3"])
-def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(tmp_path: Path, agent: str, learn: Learn) -> None:
+def test_interrupted_run_of_any_learner_ends_unchanged(tmp_path: Path, agent: str, learn: Learn) -> None:
     config = small_config(agent=agent, steps=4 * STEPS, policy__hidden=[8, 8])
     learn(tmp_path / "one go", config)
     for iterations in (1, 3):
@@ -203,7 +201,7 @@ def test_a_run_of_any_learner_ends_as_if_it_had_not_been_stopped(tmp_path: Path,
 
 
 @pytest.mark.long
-def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_learners_give_different_results(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
     for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss", "td3": "critic_loss"}.items():
         learn(tmp_path / agent, small_config(agent=agent))
         rows = progress(tmp_path / agent)
@@ -216,9 +214,7 @@ def test_each_learner_learns_its_own_way(uninterrupted: Path, tmp_path: Path, le
 
 
 @pytest.mark.slow
-def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(
-    uninterrupted: Path, tmp_path: Path, learn: Learn
-) -> None:
+def test_repeatedly_interrupted_run_ends_unchanged(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
     for iterations in (1, 2, 3):
         with pytest.raises(Stop):
@@ -228,25 +224,21 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(
 
 
 @pytest.mark.long
-def test_a_run_that_goes_on_with_a_larger_budget_ends_as_one_in_one_go(
-    uninterrupted: Path, tmp_path: Path, learn: Learn
-) -> None:
+def test_extended_run_equals_one_long_run(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
     folder = tmp_path / "run"
     learn(folder, small_config(steps=2 * STEPS))
     learn(folder, small_config(steps=4 * STEPS, workers=2), resume=True)
     assert outcome(folder) == outcome(uninterrupted)
 
 
-def test_a_run_does_not_go_back_to_fewer_steps_than_are_made(tmp_path: Path, learn: Learn) -> None:
+def test_fewer_steps_than_done_are_refused(tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "run", small_config(steps=2 * STEPS))
     with pytest.raises(InputError, match=f"steps: {STEPS} is not allowed; allowed: >= {2 * STEPS}, which"):
         resume_run_folder(tmp_path / "run", small_config(steps=STEPS))
 
 
 @pytest.mark.slow
-def test_validating_at_the_end_of_a_smaller_budget_does_not_change_what_is_learned(
-    tmp_path: Path, learn: Learn
-) -> None:
+def test_final_validation_does_not_change_learning(tmp_path: Path, learn: Learn) -> None:
     longer, folder = small_config(steps=4 * STEPS, evaluation__validation_interval=2), tmp_path / "run"
     learn(folder, replace(longer, steps=3 * STEPS))
     learn(folder, longer, resume=True)
@@ -257,9 +249,7 @@ def test_validating_at_the_end_of_a_smaller_budget_does_not_change_what_is_learn
 
 
 @pytest.mark.long
-def test_a_run_killed_before_its_first_checkpoint_starts_again(
-    uninterrupted: Path, tmp_path: Path, learn: Learn
-) -> None:
+def test_run_without_a_checkpoint_starts_again(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
     with pytest.raises(Stop):
         learn(folder, config, stop_after(1))
@@ -281,7 +271,7 @@ KILLED, *OTHERS = DAMAGE
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [KILLED, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
-def test_what_a_crash_left_behind_does_not_show_in_the_end(
+def test_leftovers_of_a_crash_do_not_change_the_result(
     uninterrupted: Path, tmp_path: Path, name: str, learn: Learn
 ) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
@@ -292,11 +282,11 @@ def test_what_a_crash_left_behind_does_not_show_in_the_end(
     assert outcome(folder) == outcome(uninterrupted)
 
 
-def test_two_checkpoints_are_kept(uninterrupted: Path) -> None:
+def test_run_keeps_two_checkpoints(uninterrupted: Path) -> None:
     assert sorted(place.name for place in (uninterrupted / "checkpoint").iterdir()) == ["000003", "000004"]
 
 
-def test_the_controller_is_the_best_on_the_validation_seeds(uninterrupted: Path) -> None:
+def test_controller_is_the_best_on_validation_seeds(uninterrupted: Path) -> None:
     rows = progress(uninterrupted)
     best = max(rows, key=lambda row: row["return_validation"])
     expected = best["iteration"] if best["return_validation"] > best["return_expert"] else 0
@@ -304,7 +294,7 @@ def test_the_controller_is_the_best_on_the_validation_seeds(uninterrupted: Path)
     assert controller_manifest(uninterrupted)["environment_steps"] == expected * STEPS
 
 
-def test_a_controller_from_before_a_stop_stays_where_nothing_later_beats_it(tmp_path: Path, learn: Learn) -> None:
+def test_earlier_controller_stays_if_it_is_the_best(tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path, small_config(steps=STEPS))
     before = (tmp_path / "controller.unjam").read_bytes()
     found = load_checkpoint(tmp_path / "checkpoint")
@@ -315,7 +305,7 @@ def test_a_controller_from_before_a_stop_stays_where_nothing_later_beats_it(tmp_
     assert len(progress(tmp_path)) == 2
 
 
-def test_the_expert_stays_the_controller_where_nothing_beats_it(tmp_path: Path, learn: Learn) -> None:
+def test_expert_stays_the_controller_if_it_is_the_best(tmp_path: Path, learn: Learn) -> None:
     # A residual of almost nothing, whose exploration alone moves the car.
     config = small_config(policy__authority=1e-30, policy__exploration_std=1e-12, steps=STEPS)
     learn(tmp_path / "run", config)
@@ -324,7 +314,7 @@ def test_the_expert_stays_the_controller_where_nothing_beats_it(tmp_path: Path, 
     assert controller_manifest(tmp_path / "run")["iteration"] == 0
 
 
-def test_before_the_first_iteration_the_controller_is_the_expert(tmp_path: Path, learn: Learn) -> None:
+def test_initial_controller_is_the_expert(tmp_path: Path, learn: Learn) -> None:
     with pytest.raises(Stop):
         learn(tmp_path / "run", small_config(evaluation__validation_interval=5), stop_after(1))
     loaded = load_controller(tmp_path / "run")
@@ -333,7 +323,7 @@ def test_before_the_first_iteration_the_controller_is_the_expert(tmp_path: Path,
     assert not loaded.network.layers[-1][0].any()
 
 
-def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, learn: Learn) -> None:
+def test_last_policy_is_the_controller_without_validations(tmp_path: Path, learn: Learn) -> None:
     run = learn(tmp_path / "run", small_config(evaluation__validation_interval=0))
     assert {row["return_validation"] for row in progress(tmp_path / "run")} == {None}
     loaded = load_controller(tmp_path / "run")
@@ -345,14 +335,14 @@ def test_without_validation_the_last_policy_is_the_controller(tmp_path: Path, le
 
 
 @pytest.mark.long
-def test_validates_now_and_then_and_at_the_end(tmp_path: Path, learn: Learn) -> None:
+def test_validations_are_scheduled_and_at_the_end(tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "run", small_config(evaluation__validation_interval=2, steps=3 * STEPS))
     validated = [row["return_validation"] is not None for row in progress(tmp_path / "run")]
     assert validated == [False, True, True]
 
 
 @pytest.mark.parametrize("spread", [True, False])
-def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
+def test_stratified_episodes_cover_all_lengths(
     tmp_path: Path, spread: bool, learn: Learn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = small_config(
@@ -369,7 +359,7 @@ def test_episodes_of_an_iteration_are_spread_over_the_lengths_where_asked(
     assert set(lengths) <= set(range(120, 131))
 
 
-def test_every_training_episode_has_a_seed_of_its_own_that_never_judges(
+def test_training_seeds_are_unique_and_not_reserved(
     tmp_path: Path, learn: Learn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     episodes = collected(monkeypatch)
@@ -392,13 +382,13 @@ def test_training_explores_and_validation_does_not(
 
 
 @pytest.mark.parametrize("name", ["broken", "short", "raises"])
-def test_an_expert_at_fault_is_told_at_once(tmp_path: Path, my_drivers: Path, learn: Learn, name: str) -> None:
+def test_invalid_expert_is_reported(tmp_path: Path, my_drivers: Path, learn: Learn, name: str) -> None:
     with pytest.raises(InputError) as caught:
         learn(tmp_path / "run", small_config(expert=f"{my_drivers}:{name}"))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run" / "checkpoint").exists()
 
 
-def test_a_reward_at_fault_is_told_at_once(tmp_path: Path, my_drivers: Path, learn: Learn) -> None:
+def test_invalid_reward_is_reported(tmp_path: Path, my_drivers: Path, learn: Learn) -> None:
     with pytest.raises(InputError, match="reward: step 0: term 'speed' is nan"):
         learn(tmp_path / "run", small_config(reward=f"{my_drivers}:wrong_reward"))

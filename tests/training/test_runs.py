@@ -42,7 +42,7 @@ def under(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_runs_are_listed_with_how_far_they_are(under: Path) -> None:
+def test_runs_are_listed_with_state_and_steps(under: Path) -> None:
     with lock_folder(under / "merge-001"):
         found = {run.name: run for run in unjam.list_runs(under)}
     assert {name: (run.state, run.steps) for name, run in found.items()} == {
@@ -57,12 +57,12 @@ def test_runs_are_listed_with_how_far_they_are(under: Path) -> None:
     assert [run.name for run in unjam.list_runs(under, "merge")] == ["merge-001"]
 
 
-def test_only_settings_that_differ_are_told(under: Path) -> None:
+def test_only_differing_settings_are_listed(under: Path) -> None:
     runs = [read_run(under / name) for name in ("ring-001", "deep/ring-002")]
     assert config_differences(runs) == {"seed": [0, 3], "scenario_options.cavs": [None, 2]}
 
 
-def test_a_run_is_removed_and_nothing_else(under: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_run_is_removed(under: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with lock_folder(under / "ring-001"), pytest.raises(InputError, match="written by another process"):
         remove_run(under / "ring-001")
     for other in (under / "notes", under):
@@ -72,7 +72,7 @@ def test_a_run_is_removed_and_nothing_else(under: Path, monkeypatch: pytest.Monk
     with pytest.raises(InputError, match="is a link"):
         remove_run(under / "link")
     monkeypatch.chdir(under / "ring-001")
-    with pytest.raises(InputError, match="where you are"):
+    with pytest.raises(InputError, match="has the working folder"):
         remove_run(Path("."))
     monkeypatch.chdir(under)
     remove_run(under / "ring-001")
@@ -80,12 +80,12 @@ def test_a_run_is_removed_and_nothing_else(under: Path, monkeypatch: pytest.Monk
     assert (under / "notes" / "config.toml").is_file()
 
 
-def test_a_folder_that_is_not_there_is_told() -> None:
-    with pytest.raises(InputError, match="allowed: one that holds run folders"):
+def test_missing_root_folder_is_refused() -> None:
+    with pytest.raises(InputError, match="allowed: a folder with run folders"):
         unjam.list_runs("nowhere")
 
 
-def test_a_damaged_run_is_listed_as_such_beside_the_others(under: Path) -> None:
+def test_damaged_run_is_listed_as_damaged(under: Path) -> None:
     file = under / "ring-001/evaluation.json"
     file.write_text(file.read_text()[:100])
     found = {run.name: run for run in unjam.list_runs(under)}

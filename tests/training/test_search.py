@@ -28,7 +28,7 @@ BASE = small_config(evaluation__validation_interval=1)
 SPACE = parse_search_space(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch_size=8,16", "trpo.critic_epochs=1..9"])
 
 
-def test_ranges_and_choices_are_read() -> None:
+def test_search_space_is_parsed() -> None:
     assert parse_search_space(["trpo.gamma=0.9..0.99", "a=1..8", "b=1e-3..1:log", "expert=pi,bcm", "c=true,1,2.5"]) == {
         "trpo.gamma": NumericRange(0.9, 0.99),
         "a": NumericRange(1, 8),
@@ -43,12 +43,12 @@ def test_ranges_and_choices_are_read() -> None:
 @pytest.mark.parametrize(
     "text", ["a", "=1..2", "a=", "a=2..1", "a=1..1", "a=0..1:log", "a=x..y", "a=1..2..3", "a=0..inf", "a=true..2"]
 )
-def test_what_is_no_range_is_refused_in_one_line(text: str) -> None:
+def test_invalid_range_is_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"^vary: .* is not allowed; allowed: [^\n]*$"):
         parse_search_space([text])
 
 
-def test_nothing_to_vary_is_refused() -> None:
+def test_empty_search_space_is_refused() -> None:
     with pytest.raises(InputError, match="at least one key is needed"):
         parse_search_space([])
 
@@ -59,23 +59,23 @@ def test_nothing_to_vary_is_refused() -> None:
         ({}, "trpo.nothing=1..2", "trpo.nothing: unknown name"),
         ({}, "trpo.gamma=0.9..1.5", "trpo.gamma: 1.5 is not allowed"),
         ({}, "expert=pi,nobody", "nobody"),
-        ({"evaluation__validation_interval": 0}, "trpo.gamma=0.9..0.99", "judged by validations"),
+        ({"evaluation__validation_interval": 0}, "trpo.gamma=0.9..0.99", "compared by validations"),
     ],
 )
-def test_what_cannot_work_is_told_before_anything_is_trained(changes: dict[str, Any], text: str, words: str) -> None:
+def test_impossible_search_is_refused(changes: dict[str, Any], text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         check_search_space(
             small_config(**{"evaluation__validation_interval": 1, **changes}), parse_search_space([text])
         )
 
 
-def test_a_trial_differs_from_the_base_in_its_values_alone() -> None:
+def test_trial_differs_from_the_base_only_in_its_values() -> None:
     changed = trial_config(BASE, {"trpo.gamma": 0.5, "scenario_options.vehicles": 7})
     assert (changed.trpo.gamma, changed.make_scenario().possible_cav_ids()) == (0.5, ("cav_0",))
     assert trial_config(changed, {"trpo.gamma": BASE.trpo.gamma, "scenario_options.vehicles": 8}) == BASE
 
 
-def test_a_training_is_worth_its_best_validation_beyond_its_expert(tmp_path: Path) -> None:
+def test_validation_gain_is_the_best_validation_minus_the_expert(tmp_path: Path) -> None:
     rows = [(None, 10.0), (12.0, 10.0), (17.0, 10.0), (11.0, 10.0)]
     lines = [
         to_json({"iteration": number, "return_validation": found, "return_expert": expert})
@@ -90,17 +90,17 @@ def test_a_training_is_worth_its_best_validation_beyond_its_expert(tmp_path: Pat
 @pytest.mark.parametrize(
     ("gain", "last", "words"),
     [
-        (7.0, 1.0, "trial 3: +7.0 beyond the expert, last checkpoint +1.0, validation seeds: agent=ppo"),
+        (7.0, 1.0, "trial 3: validation gain over expert +7.0, last checkpoint +1.0: agent=ppo"),
         (
             -2.0,
             -3.0,
-            "trial 3: -2.0 beyond the expert, last checkpoint -3.0, validation seeds "
-            "(the untrained network was kept): agent=ppo",
+            "trial 3: validation gain over expert -2.0, last checkpoint -3.0 (the controller is the untrained "
+            "network): agent=ppo",
         ),
         (None, None, "trial 3: failed: agent=ppo"),
     ],
 )
-def test_a_trial_says_what_its_last_checkpoint_earns(gain: float | None, last: float | None, words: str) -> None:
+def test_trial_text_has_the_gain_of_the_last_checkpoint(gain: float | None, last: float | None, words: str) -> None:
     assert describe_trial(SearchTrial(3, {"agent": "ppo"}, Path("trials/3"), gain, last)) == words
 
 
@@ -139,7 +139,7 @@ def trainings(monkeypatch: pytest.MonkeyPatch) -> Trainings:
     return made
 
 
-def test_the_best_comes_first_and_is_there_to_be_trained_with(tmp_path: Path, trainings: Trainings) -> None:
+def test_best_trial_comes_first_and_is_written(tmp_path: Path, trainings: Trainings) -> None:
     found = search(BASE, SPACE, 25, tmp_path / "search", 2)
     gains = [trial.gain for trial in found]
     assert len(found) == len(trainings.done) == 25
@@ -166,7 +166,7 @@ def test_values_are_within_their_ranges(tmp_path: Path, trainings: Trainings) ->
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_search_that_was_stopped_goes_on(tmp_path: Path, trainings: Trainings, workers: int) -> None:
+def test_interrupted_search_resumes(tmp_path: Path, trainings: Trainings, workers: int) -> None:
     trainings.stop_at = 4
     with pytest.raises(KeyboardInterrupt):
         search(BASE, SPACE, 8, tmp_path, workers)
@@ -179,29 +179,30 @@ def test_a_search_that_was_stopped_goes_on(tmp_path: Path, trainings: Trainings,
     assert len({trial.values["trpo.target_kl"] for trial in found}) == 8
 
 
-def test_a_search_goes_on_with_more_trials_but_not_with_others(tmp_path: Path, trainings: Trainings) -> None:
+def test_search_resumes_only_with_the_same_settings(tmp_path: Path, trainings: Trainings) -> None:
     search(BASE, SPACE, 2, tmp_path, 1)
     assert len(search(BASE, SPACE, 5, tmp_path, 1)) == 5
     assert len(trainings.done) == 5
-    with pytest.raises(InputError, match="is of other ranges"):
+    with pytest.raises(InputError, match="has other ranges"):
         search(BASE, parse_search_space(["trpo.target_kl=0.001..0.2"]), 6, tmp_path, 1)
-    with pytest.raises(InputError, match="is of another configuration"):
+    with pytest.raises(InputError, match="has another configuration"):
         search(small_config(seed=1), SPACE, 6, tmp_path, 1)
 
 
-def test_values_that_nobody_offered_are_not_tried(tmp_path: Path, trainings: Trainings) -> None:
+def test_stored_values_outside_the_space_are_refused(tmp_path: Path, trainings: Trainings) -> None:
     optuna, space = pytest.importorskip("optuna"), parse_search_space(["expert=pi,bcm"])
     (tmp_path / "config.toml").write_text(to_toml(BASE))
     backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL_FILE))
     study = optuna.create_study(study_name="search", storage=optuna.storages.JournalStorage(backend))
     study.ask({"expert": optuna.distributions.CategoricalDistribution(["code.py:of_others"])})
-    with pytest.raises(InputError, match=r"^out: expert: 'code\.py:of_others' in journal\.log was not offered"):
+    words = r"^out: expert: 'code\.py:of_others' in journal\.log is not in the search space"
+    with pytest.raises(InputError, match=words):
         search(BASE, space, 3, tmp_path, 1)
     assert trainings.done == []
 
 
 @pytest.mark.parametrize("state", ["WAITING", "COMPLETE"])
-def test_a_stored_trial_that_no_search_began_is_refused(state: str, tmp_path: Path, trainings: Trainings) -> None:
+def test_foreign_stored_trial_is_refused(state: str, tmp_path: Path, trainings: Trainings) -> None:
     optuna = pytest.importorskip("optuna")
     (tmp_path / "config.toml").write_text(to_toml(BASE))
     backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL_FILE))
@@ -218,7 +219,7 @@ def test_a_stored_trial_that_no_search_began_is_refused(state: str, tmp_path: Pa
     assert trainings.done == []
 
 
-def test_a_journal_that_a_crash_has_cut_short_goes_on_and_has_no_link(tmp_path: Path) -> None:
+def test_truncated_journal_is_continued_without_links(tmp_path: Path) -> None:
     journal = pytest.importorskip("unjam.training.journal").Journal
     path, entries = tmp_path / JOURNAL_FILE, [{"op_code": 0, "value": [float("nan")]}, {"op_code": 1}]
     journal(path).append_logs(entries)
@@ -231,22 +232,22 @@ def test_a_journal_that_a_crash_has_cut_short_goes_on_and_has_no_link(tmp_path: 
     assert [each.name for each in tmp_path.iterdir()] == [JOURNAL_FILE]
 
 
-def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_folder_with_other_files_is_not_changed(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").touch()
     with pytest.raises(InputError, match="is not empty; allowed: a new folder, or that of a search"):
         search(BASE, SPACE, 2, tmp_path, 1)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_a_search_of_which_all_fails_says_so(tmp_path: Path, trainings: Trainings) -> None:
+def test_failure_of_all_trials_is_reported(tmp_path: Path, trainings: Trainings) -> None:
     trainings.failing = True
     told: list[str] = []
-    with pytest.raises(UnjamError, match="all 3 trainings failed; what they said is in"):
+    with pytest.raises(UnjamError, match="all 3 trainings failed; their logs are in"):
         search(BASE, SPACE, 3, tmp_path, 2, on_message=told.append)
     assert all(line.endswith("failed") for line in told)
 
 
-def test_without_optuna_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_optuna_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(MissingPartError, match="pip install optuna"):
         search(BASE, SPACE, 2, tmp_path / "it", 1)
@@ -254,14 +255,14 @@ def test_without_optuna_one_line_says_how_to_get_it(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.slow
-def test_real_trainings_are_searched(tmp_path: Path) -> None:
+def test_search_runs_real_trainings(tmp_path: Path) -> None:
     found = search(BASE, SPACE, 2, tmp_path, 2)
     for trial in found:
         assert trial.gain == validation_gain(trial.folder)
         assert (trial.folder / "report.html").is_file()
 
 
-def test_among_several_experts_that_wins_whose_controller_earns_most(tmp_path: Path, trainings: Trainings) -> None:
+def test_search_over_experts_maximizes_the_return(tmp_path: Path, trainings: Trainings) -> None:
     space = parse_search_space(["expert=constant,pi", "trpo.target_kl=0.001..0.1:log"])
     best, *_ = search(BASE, space, 12, tmp_path / "search", 1)
     assert best.values["expert"] == "constant"

@@ -72,18 +72,18 @@ def run_judge(
     return compare_on_test_seeds(finalists, shares, split, drive, drive.budget, precision, quiet)
 
 
-def test_the_best_of_each_penetration_rate_is_chosen_on_tuning_seeds() -> None:
+def test_best_controller_of_each_penetration_rate_is_selected() -> None:
     drive = MadeUp({IDM: shifted(-2), PI: shifted(-4), IDM_MORE: shifted(-3), PI_MORE: shifted(-1)})
     found = select_controllers(OPTIONS, drive, drive.budget, quiet)
     assert found.finalists == [PI, IDM_MORE]
-    assert found.rejection_reasons[IDM].startswith("behind pi (tuning seeds: ")
+    assert found.rejection_reasons[IDM].startswith("behind pi (selection seeds: ")
     assert {seed[0] for _, seed in drive.driven} == {SELECTION_SEED}
     assert drive.seeds_of(HUMAN_BASELINE) == [
         (SELECTION_SEED, number) for number in range(len(found.rows[HUMAN_BASELINE]))
     ]
 
 
-def test_half_of_the_controllers_stop_after_each_round() -> None:
+def test_half_of_the_controllers_are_rejected_in_each_round() -> None:
     many = [Option(0.1, name) for name in ("a", "b", "c", "d", "e")]
     drive = MadeUp({option: shifted(-number) for number, option in enumerate(many)})
     found = select_controllers(many, drive, drive.budget, quiet)
@@ -92,25 +92,25 @@ def test_half_of_the_controllers_stop_after_each_round() -> None:
     assert counts == [MAX_SELECTION_SEEDS * rounds for rounds in (1, 1, 2, 3, 3, 3)]
 
 
-def test_a_single_controller_costs_no_tuning_seeds() -> None:
+def test_single_controller_needs_no_selection_seeds() -> None:
     drive = MadeUp({})
     assert select_controllers([PI, IDM_MORE], drive, drive.budget, quiet).finalists == [PI, IDM_MORE]
     assert not drive.driven
 
 
-def test_less_flow_is_a_loss_however_quick() -> None:
+def test_lower_flow_is_rejected_despite_shorter_travel_time() -> None:
     drive = MadeUp({IDM: shifted(-30, outflow_veh_per_h=1900.0), PI: shifted(-1)})
     found = select_controllers([IDM, PI], drive, drive.budget, quiet)
     assert found.finalists == [PI]
     assert found.rejection_reasons[IDM].startswith("flow is lower than that of the human baseline")
 
 
-def test_feasible_controllers_come_before_quick_ones() -> None:
+def test_feasible_controllers_rank_before_quick_ones() -> None:
     drive = MadeUp({IDM: shifted(-9, 20.0, min_time_gap=0.1), PI: shifted(0, 20.0)})
     assert select_controllers([IDM, PI], drive, drive.budget, quiet).finalists == [PI]
 
 
-def test_an_option_that_fails_is_set_aside_with_the_reason() -> None:
+def test_failed_option_is_rejected_with_the_reason() -> None:
     failed = {"status": "failed", "reason": "no CAV was on the road", "error": "InputError"}
     drive = MadeUp({IDM: lambda generator: failed, PI: shifted(-1)})
     found = select_controllers([IDM, PI], drive, drive.budget, quiet)
@@ -123,7 +123,7 @@ def test_an_option_that_fails_is_set_aside_with_the_reason() -> None:
 
 @pytest.mark.parametrize("drivers", [2, 5])
 @pytest.mark.parametrize("more", [0, 20, 200])
-def test_no_step_exceeds_its_part_of_the_budget(drivers: int, more: int) -> None:
+def test_budget_is_never_exceeded(drivers: int, more: int) -> None:
     episodes = min_episodes(2, drivers) + more
     options = [Option(share, f"driver {number}") for share in SHARES for number in range(drivers)]
     drive = MadeUp({option: shifted(0.0, 40.0) for option in options}, episodes)
@@ -135,7 +135,7 @@ def test_no_step_exceeds_its_part_of_the_budget(drivers: int, more: int) -> None
     assert len(rows[HUMAN_BASELINE]) >= MIN_TEST_SEEDS
 
 
-def test_the_human_baseline_is_driven_once_a_seed_for_all_penetration_rates() -> None:
+def test_human_baseline_runs_once_per_seed() -> None:
     drive = MadeUp({PI: shifted(-2.0), IDM_MORE: shifted(-3.0)})
     found = run_judge(drive, [PI, IDM_MORE])
     assert {seed[0] for _, seed in drive.driven} == {TEST_SEED}
@@ -144,7 +144,7 @@ def test_the_human_baseline_is_driven_once_a_seed_for_all_penetration_rates() ->
     assert [each.penetration_rate for each in found.acc_results] == [0.1, 0.2]
 
 
-def test_what_gains_beyond_acc_vehicles_is_driven_until_its_interval_is_narrow() -> None:
+def test_gain_over_acc_vehicles_runs_until_its_interval_is_narrow() -> None:
     drive = MadeUp({PI: shifted(-6.0, 6.0), BASELINE: shifted(-2.0, 0.1)}, 4000)
     (judged,) = run_judge(drive, [PI]).controller_results
     assert judged.reasons == []
@@ -153,7 +153,7 @@ def test_what_gains_beyond_acc_vehicles_is_driven_until_its_interval_is_narrow()
     assert judged.difference_to_acc.mean == pytest.approx(-4.0, abs=1.0)
 
 
-def test_the_same_gain_as_that_of_acc_vehicles_is_no_gain_of_the_controller() -> None:
+def test_gain_equal_to_acc_vehicles_is_not_recommended() -> None:
     drive = MadeUp({PI: shifted(-5.0, 0.01), BASELINE: shifted(-5.5, 0.01)})
     found = run_judge(drive, [PI])
     (judged,), (acc,) = found.controller_results, found.acc_results
@@ -172,7 +172,7 @@ def test_the_same_gain_as_that_of_acc_vehicles_is_no_gain_of_the_controller() ->
     ],
     ids=["slower", "less flow", "infeasible", "out of reach", "failed"],
 )
-def test_a_hopeless_controller_ends_early_and_leaves_the_budget_to_others(change: Change) -> None:
+def test_hopeless_controller_ends_early(change: Change) -> None:
     drive = MadeUp({PI: change, IDM_MORE: shifted(-6.0, 6.0), Option(0.2, ACC_DRIVER): shifted(0.0, 0.1)}, 800)
     found = run_judge(drive, [PI, IDM_MORE])
     hopeless, good = found.controller_results
@@ -182,22 +182,22 @@ def test_a_hopeless_controller_ends_early_and_leaves_the_budget_to_others(change
     assert len(drive.seeds_of(BASELINE)) <= 2 * MIN_VERDICT_SEEDS
 
 
-def test_a_small_budget_gets_an_answer_that_says_what_a_verdict_would_need() -> None:
+def test_small_budget_reports_the_missing_seeds() -> None:
     drive = MadeUp({PI: shifted(-1.0, 9.0)}, 12)
     (judged,) = run_judge(drive, [PI], 0.001).controller_results
     assert judged.difference_to_acc.count == 4
     assert judged.missing_seeds > 0
-    assert "no verdict yet: the interval is ±" in judged.summary
+    assert "no verdict yet: the confidence interval is ±" in judged.summary
 
 
-def test_acc_vehicles_alone_are_tested_without_any_controller() -> None:
+def test_acc_vehicles_are_tested_without_controllers() -> None:
     found = run_judge(MadeUp({BASELINE: shifted(-3.0)}), [])
     assert (found.controller_results, len(found.acc_results)) == ([], 1)
     assert found.acc_results[0].effect.travel_time.high < 0
     assert found.acc_results[0].property_effect is None
 
 
-def test_the_gain_of_properties_that_are_set_for_cavs_is_split_off() -> None:
+def test_property_effect_is_reported_separately() -> None:
     unchanged = Option(0.1, UNCHANGED_ACC_DRIVER)
     drive = MadeUp({BASELINE: shifted(-5.0), unchanged: shifted(-1.0)})
     (acc,) = run_judge(drive, [PI], split=True).acc_results
@@ -205,7 +205,7 @@ def test_the_gain_of_properties_that_are_set_for_cavs_is_split_off() -> None:
     assert acc.property_effect.mean == pytest.approx(-4.0, abs=0.5)
 
 
-def test_seeds_that_fit_into_the_time_follow_from_those_before() -> None:
+def test_affordable_seeds_follow_from_the_elapsed_time() -> None:
     now = [0.0]
     budget = EpisodeBudget(1000, minutes=1.0, workers=4, clock=lambda: now[0])
     assert budget.affordable_seeds(10) == 100
@@ -218,7 +218,7 @@ def test_seeds_that_fit_into_the_time_follow_from_those_before() -> None:
     assert budget.affordable_seeds(4) == 0
 
 
-def test_each_round_is_told_in_a_line_with_the_time_that_is_left() -> None:
+def test_each_round_has_a_line_with_the_remaining_time() -> None:
     lines: list[str] = []
     now = [0.0]
     budget = EpisodeBudget(40, clock=lambda: now[0])
@@ -232,5 +232,5 @@ def test_each_round_is_told_in_a_line_with_the_time_that_is_left() -> None:
 
     select_controllers([IDM, PI], timed, budget, lines.append)
     compare_on_test_seeds([PI], (0.1,), False, timed, budget, 0.001, lines.append)
-    assert lines[0] == "tuning seeds: 5; 1 of 2 options left; at most 4 min more"
-    assert lines[1].startswith("test seeds: 8; travel time known to ±")
+    assert lines[0] == "selection seeds: 5; 1 of 2 options remain; at most 4 min more"
+    assert lines[1].startswith("test seeds: 8; CI of travel time at most ±")

@@ -32,7 +32,7 @@ def mixture(**changes: Any) -> RunConfig:
     return small_config(**{"tasks": MIXTURE, **VIRTUAL, **changes})
 
 
-def test_steps_are_those_of_whole_iterations() -> None:
+def test_planned_steps_are_whole_iterations() -> None:
     assert planned_steps(load_config(changes={"steps": 10})) == 12_000
     assert planned_steps(load_config(changes={"steps": 24_000})) == 24_000
     assert (
@@ -43,7 +43,7 @@ def test_steps_are_those_of_whole_iterations() -> None:
     )
 
 
-def test_what_a_task_leaves_out_is_the_runs_own() -> None:
+def test_missing_task_entries_are_those_of_the_run() -> None:
     config = mixture(expert="pi:window=30", reward="eq16", tasks=[*MIXTURE, {"scenario": "ring-warm"}, {}])
     roads = config.task_configs()
     assert list(roads) == ["ring", "short", "ring-warm", "ring-2"]
@@ -55,14 +55,14 @@ def test_what_a_task_leaves_out_is_the_runs_own() -> None:
     assert [task.scenario.warmup for task in tasks] == [0, 0, 750, 0]
 
 
-def test_one_road_is_a_list_of_one() -> None:
+def test_single_road_is_one_task() -> None:
     config = small_config()
     assert config.task_configs() == {"": config}
     (task,) = config.make_tasks()
     assert (task.scenario, task.expert, task.name) == (config.make_scenario(), PISaturation(), "")
 
 
-def test_a_mixture_survives_being_written(tmp_path: Path) -> None:
+def test_mixture_survives_toml(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text(to_toml(mixture()))
     assert load_config(tmp_path / "config.toml") == mixture()
 
@@ -70,12 +70,12 @@ def test_a_mixture_survives_being_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("task", "words"),
     [
-        ({"expert": "follower-stopper"}, "tasks: on ring-2 the network would see something else than on ring"),
+        ({"expert": "follower-stopper"}, "tasks: the network would have other inputs on ring-2 than on ring"),
         ({"expert": "magic"}, "driver: 'magic'"),
         ({"reward": "magic"}, "reward: 'magic'"),
     ],
 )
-def test_roads_that_do_not_go_together_are_refused_in_one_line(task: dict[str, Any], words: str) -> None:
+def test_incompatible_tasks_are_refused(task: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError) as caught:
         check_config(mixture(tasks=[{}, task]))
     assert str(caught.value).startswith(words)
@@ -86,9 +86,7 @@ def test_roads_that_do_not_go_together_are_refused_in_one_line(task: dict[str, A
 @pytest.mark.parametrize(
     "agent", [pytest.param(name, marks=pytest.mark.slow) if name != "td3" else name for name in AGENT_NAMES]
 )
-def test_a_mixture_that_was_stopped_ends_as_if_it_had_not_been(
-    agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_mixture_ends_unchanged(agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, places = mixture(agent=agent), [tmp_path / "one go", tmp_path / "run"]
     episodes = collected(monkeypatch)
     with WorkerPool(1) as workers:
@@ -113,7 +111,7 @@ def outcome_of(folder: Path) -> tuple[Any, ...]:
     return outcome(folder)
 
 
-def test_progress_is_of_all_roads_and_of_each(tmp_path: Path) -> None:
+def test_progress_covers_the_run_and_each_task(tmp_path: Path) -> None:
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", mixture())
     for number, row in enumerate(progress(tmp_path / "run")):
@@ -126,7 +124,7 @@ def test_progress_is_of_all_roads_and_of_each(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("sees_road", [True, False])
-def test_the_critic_sees_which_road_it_is_and_what_that_has_drawn(tmp_path: Path, sees_road: bool) -> None:
+def test_privileged_critic_has_task_and_drawn_values(tmp_path: Path, sees_road: bool) -> None:
     with WorkerPool(1) as workers:
         trainer = Trainer(tmp_path, mixture(policy__privileged_critic=sees_road), workers)
         training = trainer.training
@@ -149,7 +147,7 @@ def test_the_critic_sees_which_road_it_is_and_what_that_has_drawn(tmp_path: Path
 
 @pytest.mark.long
 @pytest.mark.usefixtures("without_pictures")
-def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
+def test_each_task_is_evaluated_in_its_own_folder(tmp_path: Path) -> None:
     result = train(mixture(), tmp_path / "run")
     assert (result.rows, result.gain) == ({}, None)
     assert list(result.tasks) == ["ring", "short"]
@@ -174,7 +172,7 @@ def test_each_road_is_judged_in_a_folder_of_its_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("agent", "exploration"), [("trpo", "per_step"), ("trpo", "antithetic"), ("ppo", "antithetic")]
 )
-def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, tmp_path: Path) -> None:
+def test_batch_training_equals_training_in_sumo(agent: str, exploration: str, tmp_path: Path) -> None:
     mixture = {
         "tasks": [{"scenario_options": {"length": [120, 125]}}, {"scenario_options": {"vehicles": 7}, "name": "fewer"}]
     }
@@ -193,7 +191,7 @@ def test_a_training_in_the_batch_is_that_in_sumo(agent: str, exploration: str, t
             assert one[name] == pytest.approx(other[name], rel=1e-9, abs=2e-3 if learned else 0.0)
 
 
-def test_roads_that_cannot_be_batched_are_driven_in_sumo_beside_those_that_can(tmp_path: Path) -> None:
+def test_unsupported_tasks_run_in_sumo(tmp_path: Path) -> None:
     ring = {"length": [120, 130], "vehicles": 8}
     tasks = [
         {"scenario_options": ring},
@@ -219,9 +217,7 @@ def test_roads_that_cannot_be_batched_are_driven_in_sumo_beside_those_that_can(t
 
 
 @pytest.mark.long
-def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_regret_increases_the_episodes_of_a_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The short road can be driven far better than it is; a run that was stopped knows, too."""
 
     def validated(trainer: Trainer, drivers: Any) -> list[float]:
@@ -245,12 +241,12 @@ def test_more_is_driven_where_a_validation_shows_that_the_policy_falls_short(
 @pytest.mark.parametrize(
     "changes", [{"tasks": []}, {"evaluation__validation_interval": 0}], ids=["one road", "no validation"]
 )
-def test_sampling_by_regret_wants_several_roads_that_are_validated(changes: dict[str, Any]) -> None:
+def test_regret_sampling_needs_several_validated_tasks(changes: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="task_sampling: regret is not allowed; allowed: weights"):
         mixture(task_sampling="regret", **changes)
 
 
-def test_a_network_acts_within_the_narrowest_limits_of_its_roads(tmp_path: Path) -> None:
+def test_network_output_respects_the_narrowest_limits(tmp_path: Path) -> None:
     config = mixture(
         tasks=[
             {"scenario_options": {"action_limit": 2.0}},

@@ -61,26 +61,26 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return Trained(config, result, shown, judged)
 
 
-def test_a_run_leaves_all_that_it_made_in_its_folder(trained: Trained) -> None:
+def test_run_folder_is_complete(trained: Trained) -> None:
     folder = trained.result.folder
     assert {path.name for path in folder.iterdir()} == CONTENT
     assert trained.result.controller == folder / "controller.unjam"
     assert trained.result.report == folder / "report.html"
 
 
-def test_the_folder_says_how_it_was_made(trained: Trained) -> None:
+def test_run_folder_has_its_configuration_and_manifest(trained: Trained) -> None:
     assert read_config(trained.result.folder) == trained.config
     manifest = json.loads((trained.result.folder / "manifest.json").read_text())
     assert manifest["packages"]["torch"]
     assert manifest["started"]
 
 
-def test_what_is_shown_is_what_progress_holds(trained: Trained) -> None:
+def test_callback_gets_the_rows_of_progress(trained: Trained) -> None:
     assert trained.shown == read_progress(trained.result.folder)
     assert [row["environment_steps"] for row in trained.shown] == [STEPS, 2 * STEPS]
 
 
-def test_every_driver_is_judged_on_the_held_out_seeds(trained: Trained) -> None:
+def test_every_driver_is_evaluated_on_test_seeds(trained: Trained) -> None:
     rows = trained.result.rows
     assert list(rows) == ["human", "pi", "trained"]
     for found in rows.values():
@@ -89,19 +89,19 @@ def test_every_driver_is_judged_on_the_held_out_seeds(trained: Trained) -> None:
         assert {row["steps"] for row in found} == {100}
 
 
-def test_progress_of_the_judgement_is_told(trained: Trained) -> None:
+def test_evaluation_reports_progress(trained: Trained) -> None:
     ended = {episode for episode, steps in trained.judged if steps == 100}
     assert ended == {(driver, index) for driver in ("human", "pi", "trained") for index in (0, 1)}
 
 
-def test_the_controller_earns_what_the_evaluation_says(trained: Trained) -> None:
+def test_controller_has_the_reported_return(trained: Trained) -> None:
     scenario, driver = trained.config.make_scenario(), load_controller(trained.result.controller)
     for seed, row in zip(make_test_seeds(2), trained.result.rows["trained"], strict=True):
         (trajectory,) = run_episode(scenario, driver, seed).trajectories
         assert trajectory.reward.sum() == row["return"]
 
 
-def test_the_gain_is_the_mean_difference_to_the_expert_on_the_same_seeds(trained: Trained) -> None:
+def test_gain_is_the_paired_difference_to_the_expert(trained: Trained) -> None:
     rows = trained.result.rows
     differences = [ours["return"] - theirs["return"] for ours, theirs in zip(rows["trained"], rows["pi"], strict=True)]
     assert trained.result.gain is not None
@@ -110,7 +110,7 @@ def test_the_gain_is_the_mean_difference_to_the_expert_on_the_same_seeds(trained
     assert (trained.result.gain.smallest, trained.result.gain.largest) == (min(differences), max(differences))
 
 
-def test_the_evaluation_of_a_folder_is_that_of_the_result(trained: Trained) -> None:
+def test_stored_evaluation_equals_the_result(trained: Trained) -> None:
     results = read_results(trained.result.folder)
     about = results.metadata
     assert (about["scenario"], about["reward"], about["expert"]) == ("ring", "released", "pi")
@@ -124,7 +124,7 @@ def test_the_evaluation_of_a_folder_is_that_of_the_result(trained: Trained) -> N
     assert table["return"].tolist() == [row["return"] for rows in trained.result.rows.values() for row in rows]
 
 
-def test_the_shown_episode_is_the_first_of_each_driver(trained: Trained) -> None:
+def test_plot_episode_is_the_first_of_each_driver(trained: Trained) -> None:
     shown = read_results(trained.result.folder).plot_episodes
     assert list(shown) == ["human", "pi", "trained"]
     expected = run_episode(
@@ -134,7 +134,7 @@ def test_the_shown_episode_is_the_first_of_each_driver(trained: Trained) -> None
     assert shown["trained"].speeds.shape == (101, 8)
 
 
-def test_the_report_shows_the_run(trained: Trained) -> None:
+def test_report_has_the_run(trained: Trained) -> None:
     page = trained.result.report.read_text()
     assert page.lower().startswith("<!doctype html>")
     assert "trained" in page
@@ -142,7 +142,7 @@ def test_the_report_shows_the_run(trained: Trained) -> None:
 
 
 @pytest.mark.slow
-def test_a_finished_run_goes_on_with_a_larger_budget(trained: Trained, tmp_path: Path) -> None:
+def test_finished_run_resumes_with_a_larger_budget(trained: Trained, tmp_path: Path) -> None:
     folder, longer = tmp_path / "run", replace(trained.config, steps=3 * STEPS)
     shutil.copytree(trained.result.folder, folder)
     result = train(longer, folder, resume=True)
@@ -163,7 +163,7 @@ def same_rows(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> bool:
 
 
 @pytest.mark.slow
-def test_a_network_learns_without_an_expert(tmp_path: Path) -> None:
+def test_training_works_without_an_expert(tmp_path: Path) -> None:
     config = small_config(expert="none", evaluation__baselines=(), evaluation__validation_interval=0)
     result = train(config, tmp_path / "run")
     assert result.gain is None
@@ -177,21 +177,21 @@ def test_a_network_learns_without_an_expert(tmp_path: Path) -> None:
     assert result.report.is_file()
 
 
-def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
+def test_nonempty_run_folder_is_not_changed(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="is not empty; allowed: a new folder"):
         train(small_config(), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_a_file_in_the_place_of_the_folder_is_left_alone(tmp_path: Path) -> None:
+def test_file_instead_of_a_folder_is_not_changed(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(UnjamError):
         train(small_config(), tmp_path / "file")
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_the_gain_is_that_over_an_expert_with_parameters() -> None:
+def test_gain_uses_the_expert_with_its_parameters() -> None:
     config = small_config(expert="pi:window=30")
     expert = config.make_expert().describe()
     rows = {

@@ -41,7 +41,7 @@ SPACE = {"catch_up_speed": NumericRange(0.5, 3.0), "safe_gap_rule": Categorical(
 
 
 @pytest.mark.long
-def test_a_tuned_expert_is_written_and_no_worse_than_it_was(tmp_path: Path) -> None:
+def test_tuned_expert_is_written_and_not_worse(tmp_path: Path) -> None:
     with WorkerPool(1) as workers:
         lines: list[str] = []
         found = tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path, workers, on_message=lines.append)
@@ -59,7 +59,7 @@ def test_a_tuned_expert_is_written_and_no_worse_than_it_was(tmp_path: Path) -> N
 
 
 @pytest.mark.long
-def test_the_same_seed_tries_the_same_settings_whoever_drives(tmp_path: Path) -> None:
+def test_trials_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     tried = []
     for count in (1, 2):
         with WorkerPool(count) as workers:
@@ -69,7 +69,7 @@ def test_the_same_seed_tries_the_same_settings_whoever_drives(tmp_path: Path) ->
 
 
 @pytest.mark.long
-def test_a_tuning_that_was_stopped_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_tuning_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with WorkerPool(1) as workers:
         whole = tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path / "whole", workers)
         folder, lines, driven = tmp_path / "stopped", list[str](), list[int]()
@@ -101,7 +101,7 @@ def test_a_tuning_that_was_stopped_goes_on_where_it_was(tmp_path: Path, monkeypa
 
 
 @pytest.mark.long
-def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simulation: Simulation) -> None:
+def test_screened_scores_equal_those_of_sumo(tmp_path: Path, simulation: Simulation) -> None:
     steps = FINAL + 10 * TUNING_EPISODES * 60
     with WorkerPool(1) as workers:
         found = tune({"ring": SMALL}, "pi", SPACE, steps, tmp_path, workers, screen=True)
@@ -119,15 +119,13 @@ def test_screened_settings_are_judged_as_sumo_judges_them(tmp_path: Path, simula
     assert written["steps_per_iteration"] == found.batch_steps
 
 
-def test_roads_that_cannot_be_stepped_in_a_batch_are_not_screened(tmp_path: Path) -> None:
-    with WorkerPool(1) as workers, pytest.raises(InputError, match=r"screen: .*no ring"):
+def test_unsupported_roads_are_not_screened(tmp_path: Path) -> None:
+    with WorkerPool(1) as workers, pytest.raises(InputError, match=r"screen: .*not a ring"):
         tune({"merge": Merge()}, "pi", SPACE, 10**9, tmp_path, workers, screen=True)
 
 
 @pytest.mark.long
-def test_on_ramps_are_screened_in_batches_where_each_setting_has_roads_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_on_ramps_are_screened_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("unjam.training.tune.TUNING_EPISODES", 2)
     monkeypatch.setattr("unjam.training.tune.TUNING_FINALISTS", 1)
     road = replace(ON_RAMP, horizon=60, penetration_rate=0.5)
@@ -141,12 +139,12 @@ def test_on_ramps_are_screened_in_batches_where_each_setting_has_roads_of_its_ow
         assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-12)
 
 
-def test_too_few_steps_are_refused_before_anything_is_driven(tmp_path: Path) -> None:
+def test_too_few_steps_are_refused(tmp_path: Path) -> None:
     with WorkerPool(1) as workers, pytest.raises(InputError, match=f"steps: {FINAL} is not allowed; allowed: >= "):
         tune({"ring": SMALL}, "pi", SPACE, FINAL, tmp_path, workers)
 
 
-def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:
+def test_default_space_has_numbers_words_and_booleans() -> None:
     space = default_search_space("pi", 0.1)
     assert space["catch_up_speed"] == NumericRange(0.25, 4.0, log=True)
     assert space["safe_gap_rule"] == Categorical(("constant", "closing"))
@@ -161,7 +159,7 @@ def test_the_space_around_an_expert_has_its_numbers_words_and_truths() -> None:
             default_search_space(name, 0.1)
 
 
-def test_whole_ends_of_a_parameter_that_is_none_are_no_integers() -> None:
+def test_integer_limits_of_a_float_parameter_are_floats() -> None:
     asked = ["gathering_speed=1..3", "use_tuned=true,false"]
     space = expert_search_space(asked, default_search_space("pacer", 0.1))
     assert space == {"gathering_speed": NumericRange(1.0, 3.0), "use_tuned": Categorical((True, False))}
@@ -174,13 +172,13 @@ def test_whole_ends_of_a_parameter_that_is_none_are_no_integers() -> None:
     assert (first.is_integer, speed.is_integer) == (True, False)
 
 
-def test_finalists_meet_seeds_that_no_setting_was_tried_on() -> None:
+def test_finalists_use_new_seeds() -> None:
     assert not set(tuning_seeds(TUNING_EPISODES)) & set(tuning_seeds(2 * TUNING_EPISODES, TUNING_EPISODES))
     assert {first for first, _ in tuning_seeds(3)} == {TUNING_SEED}
 
 
 @pytest.mark.long
-def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tmp_path: Path) -> None:
+def test_several_roads_maximize_the_mean_gain(tmp_path: Path) -> None:
     roads = {"short": SMALL, "full": Ring(horizon=80, length=(200, 210))}
     each = TUNING_EPISODES_PER_ROAD * (60 + 80)
     steps = each * ((TUNING_FINALISTS + 1) * 2 + 3) + 2 * each
@@ -196,7 +194,7 @@ def test_on_several_roads_the_mean_gain_is_maximised_and_the_worst_road_named(tm
 
 
 @pytest.mark.long
-def test_of_roads_of_all_kinds_those_are_screened_that_a_batch_can_step(tmp_path: Path) -> None:
+def test_only_supported_roads_are_screened(tmp_path: Path) -> None:
     roads = {"ring": SMALL, "eight": FigureEight(horizon=80)}
     each = TUNING_EPISODES_PER_ROAD * (60 + 80)
     final = each * ((TUNING_FINALISTS + 1) * 2 + 3)
@@ -214,13 +212,13 @@ def test_of_roads_of_all_kinds_those_are_screened_that_a_batch_can_step(tmp_path
     assert [one.score for one in found.trials] == pytest.approx([one.score for one in driven.trials])
 
 
-def test_what_is_no_parameter_of_the_expert_is_not_varied(tmp_path: Path) -> None:
+def test_unknown_parameter_is_refused(tmp_path: Path) -> None:
     with WorkerPool(1) as workers, pytest.raises(InputError, match="vary: 'catch_up' is not allowed"):
         tune({"ring": SMALL}, "pi", {"catch_up": NumericRange(0.5, 3.0)}, STEPS, tmp_path, workers)
 
 
 @pytest.mark.long
-def test_a_reward_whose_file_has_changed_is_another_tuning(tmp_path: Path) -> None:
+def test_changed_reward_file_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     text = "import numpy as np\ndef calm(outcome): return {{'speed': {} * outcome.speeds.mean(-1)}}\n"
     file.write_text(text.format(1))
@@ -232,9 +230,7 @@ def test_a_reward_whose_file_has_changed_is_another_tuning(tmp_path: Path) -> No
             tune(*arguments)
 
 
-def test_finalists_are_different_settings_and_none_is_driven_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_finalists_are_different_and_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     driven: list[str] = []
     actual = tuning._run_drivers
 
