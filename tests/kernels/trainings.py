@@ -15,7 +15,7 @@ from tests.training.test_run import learn_with, small_config
 from unjam.worlds.worker_pool import WorkerPool
 
 DATA = ("model/data/", "replay/")
-"""hashed names of what was learned from, not what was learned"""
+"""prefixes of the training data, which are not hashed"""
 LEARNERS = {
     "trpo": {"model__model_ratio": 1.0, "model__epochs": 2, "model__members": 2},
     "ppo": {"model__model_ratio": 0.0},
@@ -39,10 +39,11 @@ def hashes(learners: list[str]) -> dict[str, str]:
             )
             run = learn_with(workers, Path(place) / learner, config)
             total = hashlib.sha256()
-            tensors = {hashed_name(name): tensor for name, tensor in run.training.state()[1].items()}
-            for name, tensor in sorted(tensors.items()):
-                if not name.startswith(DATA):
-                    total.update(name.encode() + tensor.numpy().tobytes())
+            tensors = run.training.state()[1].items()
+            for name, tensor in sorted(
+                (hashed_name(name), value) for name, value in tensors if not name.startswith(DATA)
+            ):
+                total.update(name.encode() + tensor.numpy().tobytes())
             found[learner] = total.hexdigest()[:16]
     return found
 

@@ -1,7 +1,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from unjam.drivers.residual import ResidualDriver
 from unjam.learners.algorithm_1 import Iteration, TaskEpisodes, algorithm_1, start_training
 from unjam.learners.experience import join_experience
 from unjam.learners.learner import Update
-from unjam.learners.model_rollouts import RowRollouts, rollout_experience
+from unjam.learners.model_rollouts import ExperienceFactory, RolloutPlan, RowRollouts, rollout_experience
 from unjam.learners.settings import AGENT_NAMES, PolicySettings, PPOSettings, SACSettings, TD3Settings, TRPOSettings
 from unjam.models.rollouts import RolloutBatch
 from unjam.models.settings import ModelSettings
@@ -179,19 +179,29 @@ def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(share
     ("begin", "episodes_begun"), [("newest", {2, 3}), ("all", {0, 1, 2, 3}), ("first", {0, 1, 2, 3})]
 )
 def test_rollouts_begin_in_the_episodes_asked_for_and_are_as_many(
-    shared: Simulation, begin: Any, episodes_begun: set[int]
+    shared: Simulation, begin: Any, episodes_begun: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    imagination = RowRollouts(replace(VIRTUAL, model_ratio=3.0, rollout_starts=begin), TASK, POLICY, 0)
+    rollouts = RowRollouts(replace(VIRTUAL, model_ratio=3.0, rollout_starts=begin), TASK, POLICY, 0)
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, 10)
     for iteration in (1, 2):
         episodes = [run_episode(RING, driver, (9, iteration, n), explore=True, simulation=shared) for n in (0, 1)]
-        imagination.learn(episodes, iteration)
-    rollouts = cast(RolloutBatch, imagination.roll_out_rows(network, 2))
-    assert imagination.k_star == 30
-    assert rollouts.rewards.numel() == 3 * 240 / 10
-    assert set(rollouts.start_indices[:, 0]) == episodes_begun
-    assert (set(rollouts.start_indices[:, 1]) == {0}) == (begin == "first")
+        rollouts.learn(episodes, iteration)
+    batches = list[RolloutBatch]()
+    simulate = rollouts.simulate
+
+    def recorded(plan: RolloutPlan) -> RolloutBatch:
+        batches.append(simulate(plan))
+        return batches[-1]
+
+    monkeypatch.setattr(rollouts, "simulate", recorded)
+    rows = rollouts.roll_out(network, 2, 0, 1, ExperienceFactory(lambda drawn: drawn, lambda _: pytest.fail()))
+    assert rows is not None
+    (batch,) = batches
+    assert rollouts.k_star == 30
+    assert batch.rewards.numel() == 3 * 240 / 10
+    assert set(batch.start_indices[:, 0]) == episodes_begun
+    assert (set(batch.start_indices[:, 1]) == {0}) == (begin == "first")
 
 
 def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:
@@ -213,7 +223,7 @@ def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() 
     buffer.real_ratio = 0.25
     found = buffer.sample(8).rewards.numpy().ravel()
     assert sorted(found) == pytest.approx([0.1] * 2 + [0.2] * 6)
-    buffer.drop_model_buffer()
+    buffer.model_buffer = None
     assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
 
 

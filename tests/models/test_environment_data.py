@@ -11,8 +11,9 @@ from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.errors import InputError
-from unjam.models.environment_data import EnvironmentData, is_holdout_episode, pack_data, unpack_data
+from unjam.models.environment_data import EnvironmentData, is_holdout_episode
 from unjam.scenarios import Ring
+from unjam.tree import pack, unpack
 from unjam.worlds.record import Episode, Trajectory
 
 RING = Ring()
@@ -127,7 +128,7 @@ def test_looks_are_where_a_residual_was_due_and_enough_follows() -> None:
 def test_unpacked_data_are_what_was_packed() -> None:
     driver = ResidualDriver(PISaturation(window=2.0), random_network(), 1.0, action_repeat=4)
     data = actual_data(ToyDynamics(), driver, 2, 30)
-    again = unpack_data(*pack_data(data))
+    again = unpack(EnvironmentData, *pack(data))
     assert fingerprint(tuple(again.recordings)) == fingerprint(tuple(data.recordings))
     assert (again.capacity, again.episode_count) == (data.capacity, data.episode_count)
     assert again.recordings[0].initial_memory.keys() == {"window", "total", "count", "command"}

@@ -99,7 +99,8 @@ def test_moments_are_what_was_recorded_and_what_came_next(episodes: list[Episode
 
 
 @pytest.mark.parametrize(
-    ("road", "why"), [(Merge(), "it is no ring"), (replace(RING, steps_per_control_step=2), "steps_per_decision is 2")]
+    ("road", "why"),
+    [(Merge(), "merge is not a ring"), (replace(RING, steps_per_control_step=2), "steps_per_control_step is 2")],
 )
 def test_other_roads_are_refused_in_one_line(road: Any, why: str) -> None:
     with pytest.raises(InputError, match=f"model.kind: road is not allowed; allowed: row, for .*{why}"):

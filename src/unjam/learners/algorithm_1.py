@@ -1,7 +1,7 @@
 """Algorithm 1 of the paper: knowledge-informed model-based residual reinforcement learning.
 
-The names are the paper's: pi_theta is the network of residuals, pi_H the expert, T the virtual environment,
-D_a actual experience and D_v virtual experience, k* the rollout length of Eq. 15.
+The symbols are the paper's: pi_theta is the network of residuals, pi_H the expert, T the learned model, D_a
+environment experience and D_v model experience, k* the rollout length of Eq. 15.
 """
 
 import time
@@ -37,17 +37,17 @@ from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats, Trajectory
 
 MAX_COMPARED_ROWS = 2000
-"""at most so many of the visited states tell how far an update has moved the policy"""
+"""maximum number of visited states at which the policy is compared before and after an update"""
 
 TaskEpisodes = Sequence[Sequence[Episode]]
 """the episodes of each task"""
 ValidationReturns = Sequence[float] | None
-"""return on the validation seeds of each task; None where it was not the time to validate"""
+"""return on the validation seeds of each task; None without a validation"""
 
 
 @dataclass
 class Training:
-    """What Algorithm 1 goes on from: networks, virtual environments with D_a, and how far it is."""
+    """The state of Algorithm 1."""
 
     tasks: Sequence[Task]
     policy: PolicySettings
@@ -56,43 +56,40 @@ class Training:
     learner: Learner
     """pi_theta and its value network"""
     model_rollouts: Sequence[ModelRollouts[Any]] = ()
-    """the virtual environment of each task, with its D_a; empty: model-free"""
+    """of each task, with its model and D_a; empty: model-free"""
     iteration: int = 0
-    """iterations done"""
+    """number of completed iterations"""
     environment_steps: int = 0
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return counters and tensors at the end of an iteration: all that is needed to go on."""
+        """Return all counters and tensors that are needed to resume after an iteration."""
         counters, tensors = self.learner.state()
         counters |= {"iteration": self.iteration, "environment_steps": self.environment_steps}
-        for imagination in self.model_rollouts:
-            counters[imagination.name], kept = imagination.state()
-            tensors |= {f"{imagination.name}/{name}": tensor for name, tensor in kept.items()}
+        for each in self.model_rollouts:
+            counters[each.name], model_tensors = each.state()
+            tensors |= {f"{each.name}/{name}": tensor for name, tensor in model_tensors.items()}
         return counters, {name: tensor.detach().clone() for name, tensor in tensors.items()}
 
     def restore(self, counters: dict[str, Any], tensors: Tensors) -> None:
-        """Go on, with the same configuration, from what `state` returned."""
+        """Resume, with the same configuration, from what `state` returned."""
         self.learner.restore(counters, tensors)
         self.iteration, self.environment_steps = counters["iteration"], counters["environment_steps"]
-        for imagination in self.model_rollouts:
-            imagination.restore(counters[imagination.name], tensors_with_prefix(f"{imagination.name}/", tensors))
+        for each in self.model_rollouts:
+            each.restore(counters[each.name], tensors_with_prefix(f"{each.name}/", tensors))
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """What one iteration did: Algorithm 1, once around."""
+    """The result of one iteration of Algorithm 1, numbered from 1; steps are totals of all iterations so far."""
 
     number: int
-    """from 1"""
     episodes: TaskEpisodes
     environment_steps: int
-    """of all iterations so far"""
     model_steps: int
-    """of all iterations so far"""
     model: Sequence[dict[str, Any]]
-    """what there is to say of the virtual environment of each task; empty without one"""
+    """facts about the model of each task; empty if model-free"""
     log: dict[str, float]
-    """what the learner says about its update"""
+    """of the learner's updates"""
     seconds: dict[str, float]
     """wall time of each part"""
 
@@ -100,22 +97,21 @@ class Iteration:
 def start_training(
     tasks: Sequence[Task], policy: PolicySettings, learner: LearnerSettings, model: ModelSettings, seed: int
 ) -> Training:
-    """Initialise pi_theta, the value network, T and an empty D_a (lines 1 and 2); pi_H is the tasks'."""
-    imaginations = []
-    if model.model_ratio > 0:
-        imaginations = [
-            model_rollouts_class(model, task)(model, task, policy, seed, index) for index, task in enumerate(tasks)
-        ]
+    """Initialize pi_theta, the value network, T and an empty D_a (lines 1 and 2); pi_H is the tasks'."""
+    rollouts = [
+        model_rollouts_class(model, task)(model, task, policy, seed, index)
+        for index, task in enumerate(tasks if model.model_ratio > 0 else ())
+    ]
     inputs = observation_size(policy.inputs, tasks[0].expert)
-    drawn = np.zeros((1, len(tasks[0].scenario.drawn_ranges)))
-    critic_inputs = privileged_inputs(tasks, policy, 0, drawn).shape[1] + policy.reward_after_exit
+    drawn_values = np.zeros((1, len(tasks[0].scenario.drawn_ranges)))
+    critic_inputs = privileged_inputs(tasks, policy, 0, drawn_values).shape[1] + policy.reward_after_exit
     limit = min(task.scenario.action_limit for task in tasks)
     spec = AgentSpec(inputs, critic_inputs, limit, policy, seed)
-    return Training(tasks, policy, seed, make_learner(learner, spec), imaginations)
+    return Training(tasks, policy, seed, make_learner(learner, spec), rollouts)
 
 
 def model_rollouts_class(model: ModelSettings, task: Task) -> type[ModelRollouts[Any]]:
-    """Return what kind of virtual environment a task has with such settings."""
+    """Return the kind of model rollouts for a task with these settings."""
     if model.kind == "row":
         return RowRollouts
     return MotorwayRollouts if isinstance(task.scenario, OnRamp) else RoadRollouts
@@ -128,145 +124,139 @@ def algorithm_1(
     validate: Callable[[Iteration], ValidationReturns],
     write: Callable[[Iteration, ValidationReturns], object],
 ) -> None:
-    """Learn until `budget` actual steps were made, or `write` says stop; an end loses at most an iteration.
+    """Continue `training` up to `max_environment_steps`, or until `write` returns true.
 
     Args:
-        training: where to begin; it goes on in place.
-        budget: actual steps, those of the iterations before included.
+        training: is changed; an abort loses at most one iteration.
+        max_environment_steps: including those of earlier iterations.
         collect: (pi_theta, iteration) -> the episodes of an iteration, driven with exploration.
-        validate: judges the policy as it is now, where it is time to, and keeps it if it is the best.
-        write: writes progress and a checkpoint: what an iteration did, what `validate` says, and the state
-            of `training`; what is true ends the training.
+        validate: evaluates the present policy if a validation is due, and stores it if it is the best.
+        write: writes progress and a checkpoint; a true result ends the training.
 
     Raises:
         UnjamError: an observation, a reward or a parameter is not finite; it names the first.
     """
-    learner, imaginations = training.learner, training.model_rollouts
+    learner, model_rollouts = training.learner, training.model_rollouts
     while training.environment_steps < max_environment_steps:
-        timed_parts = ("collect", "fit", "roll_out", "update") if imaginations else ("collect", "update")
+        timed_parts = ("collect", "fit", "roll_out", "update") if model_rollouts else ("collect", "update")
         seconds: dict[str, float] = dict.fromkeys(timed_parts, 0.0)
 
-        # Line 4: collect transitions from the actual environment using pi_theta and pi_H, ...
+        # Line 4: collect transitions from the environment using pi_theta and pi_H, ...
         with _measure_seconds(seconds, "collect"):
             network = learner.exploring_network(training.environment_steps)
             episodes = collect(network, training.iteration + 1)
         training.iteration += 1
-        training.environment_steps += sum(episode.control_steps for driven in episodes for episode in driven)
-        actual = environment_experience(training, episodes)
+        training.environment_steps += sum(episode.control_steps for each in episodes for episode in each)
+        environment_rows = environment_experience(training, episodes)
         if training.iteration == 1:
-            learner.set_value_scale(actual)
-        some = torch.as_tensor(actual.observations[:: -(-len(actual.rewards) // MAX_COMPARED_ROWS)])
-        before = learner.residual_distribution(some)
+            learner.set_value_scale(environment_rows)
+        stride = -(-len(environment_rows.rewards) // MAX_COMPARED_ROWS)
+        compared = torch.as_tensor(environment_rows.observations[::stride])
+        before = learner.residual_distribution(compared)
 
         # ... and add them to D_a. Line 5: train T on D_a. Line 6: eps_m gives the rollout length k*.
-        for imagination, driven in zip(imaginations, episodes, strict=False):  # none: model-free
+        for each, task_episodes in zip(model_rollouts, episodes, strict=False):  # none: model-free
             with _measure_seconds(seconds, "fit"):
-                imagination.learn(driven, training.iteration)
+                each.learn(task_episodes, training.iteration)
 
         plan = plan_updates(training)
-        for with_actual, part, parts in plan:
-            # Line 7: collect virtual transitions using T, pi_theta as it is now, and pi_H: D_v.
-            virtual = None
+        for with_environment, part, parts in plan:
+            # Line 7: collect model transitions using T, the present pi_theta, and pi_H: D_v.
+            model_rows = None
             if parts:
                 with _measure_seconds(seconds, "roll_out"):
-                    virtual = model_experience(training, part, parts)
-                if virtual is None and not with_actual:
+                    model_rows = model_experience(training, part, parts)
+                if model_rows is None and not with_environment:
                     continue
             # Line 8: update pi_theta and its value network with D_a and D_v.
-            seed_iteration(training.seed, training.iteration, part if parts and not with_actual else None)
-            given = actual if with_actual else None
+            seed_iteration(training.seed, training.iteration, None if with_environment else part)
+            rows = environment_rows if with_environment else None, model_rows
             with _measure_seconds(seconds, "update"):
                 try:
-                    learner.learn(Update(given, virtual, 1.0 / len(plan), training.environment_steps))
-                finally:  # torch, too, complains of a distribution with such a parameter
+                    learner.learn(Update(*rows, 1.0 / len(plan), training.environment_steps))
+                finally:  # torch also raises an error for a distribution with such a parameter
                     learner.check_parameters(training.iteration)
 
         log = learner.log()
-        eps_pi = policy_distance(before, learner.residual_distribution(some))
+        eps_pi = policy_distance(before, learner.residual_distribution(compared))
         log |= {"eps_pi_mean": float(eps_pi.mean()), "eps_pi_max": float(eps_pi.max())}
-        for imagination in imaginations:
-            imagination.facts["bound"] = imagination.bound(log["eps_pi_max"], learner.gamma)
+        for each in model_rollouts:
+            each.facts["bound"] = each.bound(log["eps_pi_max"], learner.gamma)
 
-        # Line 9: until the policy performs well in the actual environment; the best one is kept.
-        facts = [imagination.facts for imagination in imaginations]
-        virtual_steps = sum(imagination.model_steps for imagination in imaginations)
-        done = Iteration(training.iteration, episodes, training.environment_steps, virtual_steps, facts, log, seconds)
-        if write(done, validate(done)):
+        # Line 9: until the policy performs well in the environment; the best one is stored.
+        facts = [each.facts for each in model_rollouts]
+        steps = training.environment_steps, sum(each.model_steps for each in model_rollouts)
+        iteration = Iteration(training.iteration, episodes, *steps, facts, log, seconds)
+        if write(iteration, validate(iteration)):
             return
 
 
 def plan_updates(training: Training) -> list[tuple[bool, int, int]]:
-    """Return the updates of this iteration: (with actual rows, which part of the virtual rows, of how many).
+    """Return the updates of this iteration: (with environment rows, part of the model rows, number of parts).
 
-    All rows at once; or first the actual ones, then parts of virtual ones alone, each of the policy that the
-    part before has made. Of no parts are those that learn from actual rows alone.
+    All rows at once; or the environment rows, then parts of the model rows, each by the policy of the previous update.
+    Without parts there are no model rows.
     """
-    only_actual = (True, 0, 0)
+    without_model = (True, 0, 0)
     if not training.model_rollouts or not training.learner.is_learning(training.environment_steps):
-        return [only_actual]
+        return [without_model]
     settings = training.model_rollouts[0].settings
     if settings.update_mode == "union":
         return [(True, 0, 1)]
-    return [only_actual, *((False, part, settings.model_updates) for part in range(settings.model_updates))]
+    return [without_model, *((False, part, settings.model_updates) for part in range(settings.model_updates))]
 
 
 def environment_experience(training: Training, episodes: TaskEpisodes) -> Experience:
-    """Return what was driven as experience; raise `UnjamError` where some of it is not finite."""
-    joined = join_experience([task_experience(training, index, driven) for index, driven in enumerate(episodes)])
+    """Return the experience of the episodes of all tasks; raise `UnjamError` if some of it is not finite."""
+    rows = join_experience([task_experience(training, index, each) for index, each in enumerate(episodes)])
     for name in ("observations", "rewards"):
-        if not np.isfinite(getattr(joined, name)).all():
+        if not np.isfinite(getattr(rows, name)).all():
             raise UnjamError(f"learner: {name} of iteration {training.iteration} are not finite")
-    return joined
+    return rows
 
 
 def task_experience(training: Training, task_index: int, episodes: Sequence[Episode]) -> Experience:
-    """Return the experience of episodes of task `index`."""
-    policy, scenario = training.policy, training.tasks[task_index].scenario
+    """Return the experience of episodes of a task."""
+    policy, scenario, gamma = training.policy, training.tasks[task_index].scenario, training.learner.gamma
     pairs = [(episode, trajectory) for episode in episodes for trajectory in episode.trajectories]
     if not pairs:
-        raise InputError(f"no CAV was on the road in {len(episodes)} episodes: let more vehicles be CAVs")
-    drawn = np.array([scenario.scale_drawn_values(episode.drawn_values) for episode, _ in pairs])
-    extra, later = privileged_inputs(training.tasks, policy, task_index, drawn), None
+        raise InputError(f"no CAV was on the road in {len(episodes)} episodes: increase the share of CAVs")
+    drawn_values = np.array([scenario.scale_drawn_values(episode.drawn_values) for episode, _ in pairs])
+    critic_inputs, later = privileged_inputs(training.tasks, policy, task_index, drawn_values), None
     if policy.reward_after_exit:
-        came = [trajectory.start_step / scenario.horizon for _, trajectory in pairs]
-        extra = np.column_stack([extra, came])
-        gamma, horizon = training.learner.gamma, scenario.horizon
-        later = [return_after_exit(episode, trajectory, gamma, horizon) for episode, trajectory in pairs]
-    return make_experience([trajectory for _, trajectory in pairs], extra, later)
+        entry_times = [trajectory.start_step / scenario.horizon for _, trajectory in pairs]
+        critic_inputs = np.column_stack([critic_inputs, entry_times])
+        later = [return_after_exit(*pair, gamma, scenario.horizon) for pair in pairs]
+    return make_experience([trajectory for _, trajectory in pairs], critic_inputs, later)
 
 
 def return_after_exit(episode: Episode, trajectory: Trajectory, gamma: float, horizon: int) -> float | None:
-    """Return what was earned after a CAV had left, discounted to its last choice.
-
-    None where it never left, or where the episode was broken off before its `horizon`, as one is that is
-    imagined for a while: what would have been earned then nobody knows.
-    """
+    """Return rewards after a CAV left, discounted to its last action; None if it stayed or the episode is truncated."""
     end = trajectory.step_slice.stop
     goes_on = episode.status != "collision" and not np.isnan(episode.speeds[-1]).all()
     if end >= episode.control_steps or trajectory.terminated or (goes_on and episode.control_steps < horizon):
         return None
-    earned = np.add.reduceat(episode.reward[end:], np.arange(0, episode.control_steps - end, trajectory.action_repeat))
-    return float(earned @ gamma ** np.arange(1, len(earned) + 1))
+    rewards = np.add.reduceat(episode.reward[end:], np.arange(0, episode.control_steps - end, trajectory.action_repeat))
+    return float(rewards @ gamma ** np.arange(1, len(rewards) + 1))
 
 
 def model_experience(training: Training, part: int, parts: int) -> Experience | None:
-    """Return one of `parts` of what the policy as it is now does in the virtual environments, if anything."""
+    """Return one of `parts` of the experience of the present policy in the models of all tasks, if there is any."""
     network, found = training.learner.network(), []
-    for index, imagination in enumerate(training.model_rollouts):
-        how = ExperienceFactory(
+    for index, each in enumerate(training.model_rollouts):
+        factory = ExperienceFactory(
             partial(privileged_inputs, training.tasks, training.policy, index),
             partial(task_experience, training, index),
         )
-        found.append(imagination.roll_out(network, training.iteration, part, parts, how))
-    imagined = [each for each in found if each is not None]
-    return join_experience(imagined) if imagined else None
+        found.append(each.roll_out(network, training.iteration, part, parts, factory))
+    rows = [each for each in found if each is not None]
+    return join_experience(rows) if rows else None
 
 
 def privileged_inputs(tasks: Sequence[Task], policy: PolicySettings, task_index: int, drawn_values: Floats) -> Floats:
-    """Return what the critic alone sees in rows of task `index` whose episodes drew `drawn`, shape (rows, m).
+    """Return the inputs of the critic alone in rows of a task whose episodes drew `drawn_values`, shape (rows, m).
 
-    Of several tasks that is what each draws, zeros for the other tasks', and a number per task that says
-    which it is.
+    With several tasks these are the values that each of them draws, zeros for the others, and a one-hot task index.
     """
     if not policy.privileged_critic:
         return drawn_values[:, :0]
@@ -278,19 +268,15 @@ def privileged_inputs(tasks: Sequence[Task], policy: PolicySettings, task_index:
 
 
 def seed_iteration(run_seed: int, iteration: int, part: int | None = None) -> None:
-    """Seed every generator that an update uses, from the run's seed and the iteration alone.
-
-    So a run that goes on from a checkpoint draws what the uninterrupted one would have drawn. Where an
-    iteration has several updates, each of a `part` of virtual rows draws its own.
-    """
-    which = (1,) if part is None else (1, 1 + part)  # a zero at the end changes nothing
-    torch_seed, numpy_seed = np.random.SeedSequence([run_seed, iteration, *which]).generate_state(2)
+    """Seed all generators of an update by run, iteration and part: a resumed run draws the same random numbers."""
+    key = (1,) if part is None else (1, 1 + part)  # a trailing zero would change nothing
+    torch_seed, numpy_seed = np.random.SeedSequence([run_seed, iteration, *key]).generate_state(2)
     torch.manual_seed(int(torch_seed))
     np.random.seed(int(numpy_seed))
 
 
 @contextmanager
 def _measure_seconds(seconds: dict[str, float], part: str) -> Iterator[None]:
-    started = time.perf_counter()
+    start = time.perf_counter()
     yield
-    seconds[part] += time.perf_counter() - started
+    seconds[part] += time.perf_counter() - start

@@ -53,13 +53,9 @@ def make_experience(
     critic_inputs: Sequence[Sequence[float]] | Float64,
     returns_after_exit: Sequence[float | None] | None = None,
 ) -> Experience:
-    """Return the experience of trajectories.
+    """Return the experience of trajectories, each with the `critic_inputs` of the critic alone.
 
-    Args:
-        trajectories: with observations.
-        critic_inputs: of each, the inputs of the critic alone.
-        returns_after_exit: of each, the rewards after its end, discounted to its last action, so that it counts as
-            terminated; None: it is bootstrapped with the value of its last observation.
+    One with a return after its exit, discounted to its last action, counts as terminated; others are bootstrapped.
     """
     residuals, rewards = zip(*(trajectory.actions_and_rewards for trajectory in trajectories), strict=True)
     terminated = [trajectory.terminated for trajectory in trajectories]
@@ -91,10 +87,9 @@ def join_experience(parts: Sequence[Experience]) -> Experience:
 
 @torch.no_grad()
 def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
-    """Fill `buffer` with rows and compute their advantages.
+    """Fill `buffer` with rows and compute their advantages; to truncated trajectories gamma V of their end is added.
 
-    Values and log-probabilities are computed in one batch, so that the ratio before the first update is exactly 1. A
-    truncated trajectory is bootstrapped: gamma V of its last observation is added to its last reward.
+    Values and log-probabilities are computed in one batch, so that the ratio before the first update is exactly 1.
     """
     actions, observations = rows.actions[:, None], torch.as_tensor(rows.observations)
     values, log_probs, _ = policy.evaluate_actions(observations, torch.as_tensor(actions))
@@ -115,10 +110,9 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
 
 
 def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Float64) -> None:
-    """Add rows to the buffer, in place of the oldest ones if it is full.
+    """Add rows to the buffer, in place of the oldest ones if it is full; only collisions set `dones`.
 
-    A truncated trajectory is bootstrapped: only a collision sets `dones`. SB3 stores actions as shares of their bounds,
-    here of the `authority` [m/s2].
+    SB3 stores actions as shares of their bounds, here of the `authority` [m/s2].
     """
     done = np.zeros(len(rewards), np.float32)
     done[rows.last_rows] = rows.terminated
@@ -136,36 +130,31 @@ def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: floa
 class MixedReplayBuffer(ReplayBuffer):
     """SB3's replay buffer of environment rows; while it has model rows too, batches are mixed."""
 
-    _model_buffer: ReplayBuffer | None = None
+    model_buffer: ReplayBuffer | None = None
     real_ratio = 1.0
     """share of environment rows in a batch"""
 
     def new_model_buffer(self, rows: int) -> ReplayBuffer:
         """Return an empty buffer for a number of model rows, which replaces the previous one."""
         spaces = self.observation_space, self.action_space
-        self._model_buffer = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
-        return self._model_buffer
-
-    def drop_model_buffer(self) -> None:
-        """Sample environment rows alone from now on."""
-        self._model_buffer = None
+        self.model_buffer = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
+        return self.model_buffer
 
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
         """Return a random batch."""
-        if self._model_buffer is None:
+        if self.model_buffer is None:
             return super().sample(batch_size, env)
         real = round(self.real_ratio * batch_size)
         parts = [super().sample(real)] if real else []
         if real < batch_size:
-            parts.append(self._model_buffer.sample(batch_size - real))
+            parts.append(self.model_buffer.sample(batch_size - real))
         return ReplayBufferSamples(*(torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)))
 
 
 def shift_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
-    """Return the rewards minus `offset`, shape (rows,), so that the best policies stay the same.
+    """Return the rewards minus `offset`, shape (rows,), so that all values decrease by offset / (1 - gamma).
 
-    All values then decrease by offset / (1 - gamma). After a collision, where no reward follows, the last reward
-    decreases by the missing part.
+    At a collision, which no reward follows, the last reward decreases by the missing part.
     """
     rewards = rows.rewards - offset
     rewards[rows.last_rows] -= np.where(rows.terminated, offset * gamma / (1.0 - gamma), 0.0)
@@ -173,10 +162,7 @@ def shift_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
 
 
 def discounted_returns(rows: Experience, gamma: float) -> Float64:
-    """Return the discounted sum of the rewards from each row on, shape (rows,).
-
-    A truncated trajectory counts as if it continued with its mean reward.
-    """
+    """Return discounted rewards from each row on, (rows,); truncated trajectories continue with their mean reward."""
     returns = np.empty(len(rows.rewards))
     for first, last, terminated in zip(rows.starts, rows.last_rows, rows.terminated, strict=True):
         later = 0.0 if terminated else float(rows.rewards[first : last + 1].mean()) / (1.0 - gamma)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from math import ceil
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,13 +15,12 @@ from unjam.following.calibration import calibrate_human_drivers
 from unjam.learners.experience import Experience, join_experience
 from unjam.learners.learner import Tensors, tensors_with_prefix
 from unjam.learners.settings import PolicySettings
-from unjam.learners.waves import Waves
-from unjam.models.comparison import return_gap
+from unjam.models.comparison import Waves, return_gap
 from unjam.models.dynamics import ModelDynamics, check_device
-from unjam.models.ensemble import Ensemble, torch_generator
-from unjam.models.environment_data import EnvironmentData, is_holdout_episode, pack_data, unpack_data
+from unjam.models.ensemble import Ensemble, Seed, torch_generator
+from unjam.models.environment_data import EnvironmentData, is_holdout_episode
 from unjam.models.fitting import ModelFit, fit_row_model
-from unjam.models.road_model import RoadModel
+from unjam.models.road_model import EpisodeSamples, RoadModel
 from unjam.models.rollouts import RolloutBatch, draw_starts, prepare_starts, return_bound, roll_out, rollout_length
 from unjam.models.row_model import RowModel
 from unjam.models.settings import ModelSettings
@@ -35,7 +34,8 @@ FIT_SEED, STARTS_SEED, NOISE_SEED, EXPLORATION_SEED = 2, 3, 4, 5
 """purposes of the random numbers of an iteration, in their seeds"""
 _DATA_PREFIX, _SAMPLES_PREFIX = "data/", "samples/"
 """prefixes of tensors in checkpoints"""
-Seed = tuple[int, ...]
+EnsembleT = TypeVar("EnsembleT", bound=Ensemble)
+SamplesT = TypeVar("SamplesT", bound=EpisodeSamples)
 
 
 class ExperienceFactory(NamedTuple):
@@ -48,36 +48,28 @@ class ExperienceFactory(NamedTuple):
 
 
 class RolloutPlan(NamedTuple):
-    """The model rollouts of a part of an iteration."""
+    """Model rollouts from recorded states, `StartIndices`, or with the vehicles of episodes, a list of samples."""
 
     driver: ResidualDriver
     starts: Any
-    """rows (recording, step), or samples of episodes"""
     control_steps: int
     noise_seed: Seed
     exploration_seed: Seed
 
 
 class RolloutResult(NamedTuple):
-    """What model rollouts return."""
+    """Experience, if a CAV was on the road; total of control steps; return of each rollout; facts, as `crash_share`."""
 
     experience: Experience | None
-    """None: no CAV was on the road"""
     control_steps: int
-    """in all"""
     returns: Floats
-    """of each rollout"""
     facts: dict[str, Any]
-    """at least `crash_share`"""
 
 
 def full_policy(task: Task, policy: PolicySettings, network: Network) -> ResidualDriver:
     """Return the full policy on a task: its expert plus the residual of `network`."""
     repeat = policy.action_repeat(task.scenario.control_step)
     return ResidualDriver(task.expert, network, task.scenario.action_limit, policy.inputs, repeat)
-
-
-EnsembleT = TypeVar("EnsembleT", bound=Ensemble)
 
 
 class ModelRollouts(Generic[EnsembleT]):
@@ -88,12 +80,7 @@ class ModelRollouts(Generic[EnsembleT]):
     def __init__(
         self, settings: ModelSettings, task: Task, policy: PolicySettings, run_seed: int, task_index: int = 0
     ) -> None:
-        """Start with the base alone and without data.
-
-        Raises:
-            MissingPartError: the device of the settings is not available.
-            InputError: the model does not support the scenario or the settings.
-        """
+        """Start with the base alone and without data; `InputError` if scenario or settings are not supported."""
         check_device(settings.device, "model.device")
         self.settings = settings
         self.name = f"model-{task_index}" if task_index else "model"
@@ -113,7 +100,6 @@ class ModelRollouts(Generic[EnsembleT]):
         raise NotImplementedError
 
     def _fit_model(self, seed: Seed) -> ModelFit:
-        """Fit the model to D_a."""
         raise NotImplementedError
 
     def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
@@ -132,10 +118,11 @@ class ModelRollouts(Generic[EnsembleT]):
         starts = self._draw_starts(parts, seed, control_steps) if control_steps else ()
         if len(starts) == 0:
             return None
-        result = self._run(RolloutPlan(driver, starts, control_steps, *seeds), experience_factory)
+        plan = RolloutPlan(driver, starts, control_steps, *seeds)
+        result = self._run(plan, experience_factory)
         self.model_steps += result.control_steps
         if part == 0:
-            model, environment = self._compare_returns(result.returns, starts, control_steps)
+            model, environment = self._compare_returns(plan, result.returns)
             self.facts |= {"return_model": model, "return_environment": environment, **result.facts}
         return result.experience
 
@@ -144,7 +131,6 @@ class ModelRollouts(Generic[EnsembleT]):
         return self.k_star
 
     def _seed(self, *key: int) -> Seed:
-        """Return a seed of the run and the task."""
         return (self._run_seed, *key, *self._task_index)
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
@@ -153,13 +139,12 @@ class ModelRollouts(Generic[EnsembleT]):
         self.data.add(episodes, self.scenario)
         self._first_new_episode = first
         self._new_steps = sum(len(each.reward) for episode in episodes for each in episode.trajectories)
-        settings = self.settings
-        if settings.calibrate_base and first == 0:
+        if self.settings.calibrate_base and first == 0:
             states = (recording.states for recording in self.data.recordings)
             self.scenario = replace(self.scenario, humans=calibrate_human_drivers(states, self.scenario))
         fit = self._fit_model(self._seed(iteration, FIT_SEED))
-        eps_m = fit.errors[settings.error_estimator]
-        self.k_star = rollout_length(eps_m, settings)
+        eps_m = fit.errors[self.settings.error_estimator]
+        self.k_star = rollout_length(eps_m, self.settings)
         self.facts = {
             "k_star": self.k_star,
             "eps_m": eps_m,
@@ -176,12 +161,10 @@ class ModelRollouts(Generic[EnsembleT]):
         first_episode = self._first_new_episode if starts == "newest" else 0
         return draw_starts(self.data, count, 1, seed, first_episode, episode_starts_only=starts == "first")
 
-    def _compare_returns(
-        self, returns: Floats, starts: Any, control_steps: int
-    ) -> tuple[float, float] | tuple[None, None]:
+    def _compare_returns(self, plan: RolloutPlan, returns: Floats) -> tuple[float | None, float | None]:
         """Return the mean returns of model and environment from starts in episodes of the newest policy."""
-        is_new = [self.data.recordings[index].episode >= self._first_new_episode for index in starts[:, 0]]
-        gap = return_gap(returns[is_new], starts[is_new], self.data, control_steps)
+        is_new = [self.data.recordings[index].episode >= self._first_new_episode for index in plan.starts[:, 0]]
+        gap = return_gap(returns[is_new], plan.starts[is_new], self.data, plan.control_steps)
         return (gap.model_return, gap.environment_return) if gap else (None, None)
 
     def bound(self, eps_pi: float, gamma: float) -> float:
@@ -203,13 +186,13 @@ class ModelRollouts(Generic[EnsembleT]):
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all that a run needs to resume, as JSON and tensors."""
-        data, arrays = pack_data(self.data)
+        data, arrays = pack(self.data)
         tensors = _to_tensors(_DATA_PREFIX, arrays) | {name: t.cpu() for name, t in self.model.state_dict().items()}
         return {"model_steps": self.model_steps, "data": data, "humans": asdict(self.scenario.humans)}, tensors
 
     def restore(self, facts: dict[str, Any], tensors: Tensors) -> None:
         """Resume from what `state` returned."""
-        self.data = unpack_data(facts["data"], _to_arrays(_DATA_PREFIX, tensors))
+        self.data = unpack(EnvironmentData, facts["data"], _to_arrays(_DATA_PREFIX, tensors))
         self.model_steps = facts["model_steps"]
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["humans"]))
         self.model.load_state_dict({name: tensor for name, tensor in tensors.items() if "/" not in name})
@@ -223,25 +206,12 @@ def _to_arrays(prefix: str, tensors: Tensors) -> Arrays:
     return {name: tensor.numpy() for name, tensor in tensors_with_prefix(prefix, tensors).items()}
 
 
-class EpisodeSummary(Protocol):
-    """The samples of an environment episode."""
-
-    @property
-    def episode(self) -> int:
-        """Number of the episode."""
-        ...
-
-
-SamplesT = TypeVar("SamplesT", bound=EpisodeSummary)
-
-
 class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
     """The learned model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
 
     sample_type: type[SamplesT]
 
     def __init__(self, *args: Any) -> None:
-        """Start with the base alone and without data; arguments as of `ModelRollouts`."""
         super().__init__(*args)
         self.samples: list[SamplesT] = []
         """of the episodes in D_a, oldest first"""
@@ -256,7 +226,6 @@ class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
         raise NotImplementedError
 
     def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
-        """Yield the episodes of rollouts batch by batch."""
         raise NotImplementedError
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
@@ -277,14 +246,9 @@ class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
     @property
     def _holdout_samples(self) -> SamplesT:
         """The newest holdout episode, or the newest one if there is none."""
-        holdout, group = self.settings.holdout, self._episodes_per_group
-        held_out = [each for each in self.samples if is_holdout_episode(each.episode // group, holdout)]
+        holdout, group_size = self.settings.holdout, len(self._policy.exploration_signs)
+        held_out = [each for each in self.samples if is_holdout_episode(each.episode // group_size, holdout)]
         return (held_out or self.samples)[-1]
-
-    @property
-    def _episodes_per_group(self) -> int:
-        """Number of consecutive episodes with the same vehicles, which are held out together."""
-        return len(self._policy.exploration_signs)
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
@@ -322,11 +286,11 @@ class RowRollouts(ModelRollouts[RowModel]):
         return fit_row_model(self.model, transitions, self.settings, self.scenario, self._task.reward, seed)
 
     def simulate(self, plan: RolloutPlan) -> RolloutBatch:
-        """Return the rollouts of rows from `plan.starts`, rows (recording, step)."""
-        device, expert = self.settings.device, self._task.expert
+        """Return the rollouts of rows from `StartIndices`."""
+        device = self.settings.device
         noise, exploration = (torch_generator(seed, device) for seed in (plan.noise_seed, plan.exploration_seed))
         dynamics = ModelDynamics(self.model, self.scenario, self._task.reward, noise, self.settings.add_noise)
-        starts = prepare_starts(self.data, plan.starts, expert, device)
+        starts = prepare_starts(self.data, plan.starts, self._task.expert, device)
         return roll_out(plan.driver, dynamics, starts, plan.control_steps, exploration)
 
     def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
@@ -339,10 +303,7 @@ class RowRollouts(ModelRollouts[RowModel]):
 
 
 def rollout_experience(rollouts: RolloutBatch, critic_inputs: NDArray[np.floating]) -> Experience:
-    """Return rollouts of rows as experience; the truncation at k* is no termination.
-
-    `critic_inputs`, shape (n, m), are the inputs of the critic alone in each row.
-    """
+    """Return rollouts of rows as experience, with `critic_inputs`, (n, m); the truncation at k* is no termination."""
     lengths = rollouts.lengths.cpu().numpy()
     observations = rollouts.observations.cpu().numpy()
     extra = np.broadcast_to(critic_inputs[:, None], (*observations.shape[:2], critic_inputs.shape[1]))

@@ -7,9 +7,9 @@ from typing import Any, cast
 import numpy as np
 
 from unjam.drivers.driver import Driver
-from unjam.learners.model_rollouts import RolloutPlan, Seed, WholeRoadRollouts
-from unjam.learners.waves import Waves, road_trajectories
-from unjam.models.ensemble import torch_generator
+from unjam.learners.model_rollouts import RolloutPlan, WholeRoadRollouts
+from unjam.models.comparison import Waves, road_trajectories
+from unjam.models.ensemble import Seed, torch_generator
 from unjam.models.fitting import ModelFit
 from unjam.models.motorway_model import (
     MotorwaySamples,
@@ -39,7 +39,6 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
     sample_type = MotorwaySamples
 
     def __init__(self, *args: Any) -> None:
-        """Start with the base alone and without data; arguments and errors as of `ModelRollouts`."""
         super().__init__(*args)
         check_motorway_model(cast(OnRamp, self.scenario), self.settings)
 
@@ -47,7 +46,8 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
         return motorway_samples(episode, number, cast(OnRamp, self.scenario), self.model.base)
 
     def _fit_samples(self, seed: Seed) -> ModelFit:
-        return fit_motorway_model(self.model, self.samples, self.settings, seed, self._episodes_per_group)
+        group_size = len(self._policy.exploration_signs)
+        return fit_motorway_model(self.model, self.samples, self.settings, seed, group_size)
 
     @property
     def _max_control_steps(self) -> int:
@@ -71,14 +71,11 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
             scales = [signs[number % len(signs)] for number in numbers]
             yield self.simulate(plan.driver, samples, plan.control_steps, seeds, scales)
 
-    def _compare_returns(
-        self, returns: Floats, starts: Any, control_steps: int
-    ) -> tuple[float, float] | tuple[None, None]:
-        """Return the mean returns of model and environment in episodes of the newest policy, if they are complete."""
-        is_new = [samples.episode >= self._first_new_episode for samples in starts]
-        if control_steps < self.scenario.horizon or not any(is_new):
+    def _compare_returns(self, plan: RolloutPlan, returns: Floats) -> tuple[float | None, float | None]:
+        is_new = [samples.episode >= self._first_new_episode for samples in plan.starts]
+        if plan.control_steps < self.scenario.horizon or not any(is_new):
             return None, None
-        recorded = np.array([samples.episode_return for samples in starts])
+        recorded = np.array([samples.episode_return for samples in plan.starts])
         return float(returns[is_new].mean()), float(recorded[is_new].mean())
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
@@ -104,18 +101,10 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
         driver: Driver,
         samples: Sequence[MotorwaySamples],
         control_steps: int,
-        seeds: Sequence[tuple[Sequence[int], Sequence[int]]],
+        seeds: Sequence[tuple[Seed, Seed]],
         exploration_scales: Sequence[float],
     ) -> list[Episode]:
-        """Return episodes in which the vehicles of recorded episodes enter again.
-
-        Args:
-            driver: of all CAVs, with its exploration.
-            samples: of the recorded episodes.
-            control_steps: of each episode.
-            seeds: of drivers' errors, and of exploration, for each episode.
-            exploration_scales: factor of the exploration noise of each episode.
-        """
+        """Return recorded episodes with the same vehicles, and seeds of human drivers' errors and of exploration."""
         road = cast(OnRamp, self.scenario)
         correction = self._correction(self.model, seeds[0][0])
         replay = ReplayOptions(seeds, control_steps, self.settings.add_noise, correction)

@@ -1,19 +1,17 @@
 """Model rollouts on closed roads: all vehicles drive on from recorded states."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import EXPERT_KEY, RESIDUAL_AGE_KEY, RESIDUAL_KEY
-from unjam.learners.model_rollouts import RolloutPlan, Seed, WholeRoadRollouts
-from unjam.learners.waves import RoadTrajectories, Waves, road_trajectories
-from unjam.models.comparison import ReplayDriver
-from unjam.models.ensemble import torch_generator
-from unjam.models.environment_data import reconstruct_memory
+from unjam.learners.model_rollouts import RolloutPlan, WholeRoadRollouts
+from unjam.models.comparison import ReplayDriver, RoadTrajectories, Waves, road_trajectories
+from unjam.models.ensemble import Seed, torch_generator
+from unjam.models.environment_data import StartIndices, reconstruct_memory
 from unjam.models.fitting import ModelFit
 from unjam.models.road_model import (
     RoadSamples,
@@ -43,7 +41,6 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
     sample_type = RoadSamples
 
     def __init__(self, *args: Any) -> None:
-        """Start with the base alone and without data; arguments and errors as of `ModelRollouts`."""
         super().__init__(*args)
         check_road_model(self.scenario)
 
@@ -53,7 +50,7 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
     def _fit_samples(self, seed: Seed) -> ModelFit:
         return fit_road_model(self.model, self.samples, self.settings, self.scenario, seed)
 
-    def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> NDArray[np.int64]:
+    def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> StartIndices:
         cavs_per_road = len(self.scenario.possible_cav_ids())
         return super()._draw_starts(parts * cavs_per_road, seed, control_steps)
 
@@ -69,26 +66,19 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
         self,
         driver: Driver,
         memory: Memory,
-        start_indices: NDArray[np.int64],
+        start_indices: StartIndices,
         control_steps: int,
         human_model: HumanSpeedModel,
-        seed: Sequence[int],
+        seed: Seed,
     ) -> list[Episode]:
-        """Return the episodes that follow recorded states.
+        """Return the episodes that follow recorded states; `seed` is that of all noise, and of sensor errors.
 
-        Args:
-            driver: of all CAVs, with its exploration.
-            memory: of the driver, all rows of the first CAV, then of the second.
-            start_indices: rows (recording, step).
-            control_steps: of each episode.
-            human_model: of the human drivers.
-            seed: of all noise, and of sensor errors.
+        `driver` controls all CAVs and explores; its `memory` has all rows of the first CAV, then of the second.
         """
         road = cast(LoopScenario, self.scenario)
         by_episode = {each.episode: each for each in self.samples}
         samples = [by_episode[self.data.recordings[index].episode] for index, _ in start_indices]
-        rows = [at // each.interval for each, (_, at) in zip(samples, start_indices, strict=True)]
-        pairs = list(zip(samples, rows, strict=True))
+        pairs = [(each, at // each.interval) for each, (_, at) in zip(samples, start_indices, strict=True)]
         noise = float(self.model.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
         common = replace(road, horizon=control_steps, noise=noise if self.settings.add_noise else 0.0, population="")
         world = RingBatch(
@@ -112,10 +102,7 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
         return [add_reward_terms(episode, reward) for episode in results.episodes]
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
-        """Return a recorded holdout episode, and what model and base make of it from its start on.
-
-        CAVs repeat their recorded accelerations; the noise is drawn anew.
-        """
+        """Return a recorded holdout episode, and its CAVs' accelerations replayed in model and base with new noise."""
         samples, recordings = self._holdout_samples, self.data.recordings
         rows = [index for index, each in enumerate(recordings) if each.episode == samples.episode]
         driver = ReplayDriver(np.stack([recordings[row].applied_acceleration for row in rows], 1))
@@ -131,14 +118,10 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
             roads[label] = road_trajectories(episode, samples.interval)
         return Waves(samples.interval * self.scenario.control_step, samples.length, (), roads)
 
-    def _expert_memory(self, start_indices: NDArray[np.int64]) -> Memory:
-        """Return the expert's memory at the starts, rows (recording, step): all rows of the first CAV, then of the next."""
-        first_by_episode: dict[int, int] = {}
-        for index, recording in enumerate(self.data.recordings):
-            first_by_episode.setdefault(recording.episode, index)
-        first = np.array([first_by_episode[self.data.recordings[index].episode] for index, _ in start_indices])
-        starts = [
-            np.column_stack([first + cav, start_indices[:, 1]]) for cav in range(len(self.scenario.possible_cav_ids()))
-        ]
+    def _expert_memory(self, start_indices: StartIndices) -> Memory:
+        """Return the expert's memory: all rows of the first CAV, then of the second."""
+        cavs = len(self.scenario.possible_cav_ids())  # each episode has as many recordings
+        first = start_indices[:, 0] // cavs * cavs
+        starts = [np.column_stack([first + cav, start_indices[:, 1]]) for cav in range(cavs)]
         memories = [reconstruct_memory(self._task.expert, self.data.recordings, each) for each in starts]
         return map_leaves(lambda *values: np.concatenate(values), *memories)

@@ -1,4 +1,4 @@
-"""SAC, and what learners share that learn from earlier iterations too, by a pair of critics."""
+"""SAC, and what off-policy learners share: a replay buffer and a pair of critics."""
 
 import math
 from typing import Any, cast
@@ -16,23 +16,23 @@ from torch.distributions import Normal
 from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.learners.experience import Experience, MixedReplayBuffer, add_to_replay_buffer, shift_rewards
-from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, network_layers
+from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, network_layers, zero_layer
 from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings
 
 UNIFORM_STD = 0.85
-"""standard deviation of normal noise whose tanh is uniform in [-1, 1] to one per cent"""
+"""standard deviation of normal noise with a tanh that is uniform in [-1, 1] to one percent"""
 REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones")
 REPLAY_POSITION = ("pos", "full")
-"""where the next row goes, and whether the buffer is full"""
+"""index of the next row, and whether the buffer is full"""
 
 
 def uniform_network(inputs: int, authority: float) -> Network:
-    """Return a network whose residuals, exploring, are uniform over its authority [m/s2]."""
+    """Return a network that explores with residuals that are uniform over its authority [m/s2]."""
     return Network(((np.zeros((inputs, 2)), np.array([0.0, math.log(UNIFORM_STD)])),), authority)
 
 
 class ActorInputExtractor(BaseFeaturesExtractor):
-    """What the actor sees: the first numbers of an observation; the critic alone sees the others."""
+    """The inputs of the actor: the first columns of an observation; the others are for the critic alone."""
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return the first columns, shape (n, inputs)."""
@@ -40,76 +40,61 @@ class ActorInputExtractor(BaseFeaturesExtractor):
 
 
 class NormalizedReLU(nn.Module):
-    """Layer normalisation, then ReLU: keeps critics from promising much where there is no data.
-
-    Source: Ball et al. 2023, Efficient online reinforcement learning with offline data.
-    """
+    """Layer normalization and ReLU, which bound critics far from data (Ball et al. 2023, Efficient online RL)."""
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return the normalised units, of the shape of `features`."""
+        """Return the normalized features, of the same shape."""
         return torch.relu(nn.functional.layer_norm(features, features.shape[-1:]))
 
 
 class OffPolicyResidualMixin(BasePolicy):
-    """What the policies of off-policy learners share; stands before one of SB3's with a pair of critics."""
+    """What the policies of off-policy learners share, as a base class before one of SB3's with a pair of critics."""
 
     critic_kwargs: dict[str, Any]
     reward_offset: Tensor
-    """what rewards are shifted by"""
+    """subtracted from rewards"""
 
     def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
-        self.settings = settings
-        self.inputs = inputs
-        self.authority = settings.authority * action_limit
+        self.settings, self.inputs, self.authority = settings, inputs, settings.authority * action_limit
         super().__init__(
             *args, net_arch=list(settings.hidden), optimizer_class=Adam, optimizer_kwargs={"fused": True}, **kwargs
         )
         self.register_buffer("reward_offset", torch.zeros((), dtype=torch.float64))
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        """Return a pair of critics, which see all and normalise their hidden layers."""
+        """Return a pair of critics, which take all inputs and normalize their hidden layers."""
         self.critic_kwargs["activation_fn"] = NormalizedReLU
         return super().make_critic(features_extractor)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class SquashedResidualPolicy(OffPolicyResidualMixin, SACPolicy):
-    """SB3's policy of soft actor-critic with a residual that is zero at the start, with a little noise.
-
-    The last layer of the actor starts at zero but for the size of the noise, `exploration_std`; unless the
-    settings want the residual as torch draws it.
-    """
+    """SB3's policy of SAC for a residual that starts, with `zero_init`, at zero, with noise of `exploration_std`."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        """Return the actor, which sees the first `inputs` numbers."""
+        """Return the actor, which takes the first `inputs` inputs."""
         actor = super().make_actor(ActorInputExtractor(self.observation_space, self.inputs))
-        first_std = self.settings.exploration_std / self.settings.authority
-        known = ((actor.mu, 0.0), (actor.log_std, math.log(first_std)))
-        for layer, bias in known[0 if self.settings.zero_init else 1 :]:
-            linear = cast(nn.Linear, layer)
-            nn.init.zeros_(linear.weight)
-            nn.init.constant_(linear.bias, bias)
+        log_std = cast(nn.Linear, actor.log_std)
+        nn.init.zeros_(log_std.weight)
+        nn.init.constant_(log_std.bias, math.log(self.settings.exploration_std / self.settings.authority))
+        if self.settings.zero_init:
+            zero_layer(cast(nn.Linear, actor.mu))
         return actor
 
     def network(self) -> Network:
-        """Return the NumPy twin: the same residual to 1e-6, the same exploration noise."""
+        """Return the policy as a NumPy network: the same residual to 1e-6, the same exploration noise."""
         layers = network_layers(nn.Sequential(self.actor.latent_pi, self.actor.mu, self.actor.log_std))  # pyright: ignore[reportArgumentType]
         *hidden, (mean, mean_bias), (log_std, log_std_bias) = layers
-        last = np.hstack([mean, log_std]), np.hstack([mean_bias, log_std_bias])
-        return Network((*hidden, last), self.authority)
+        output = np.hstack([mean, log_std]), np.hstack([mean_bias, log_std_bias])
+        return Network((*hidden, output), self.authority)
 
 
 class OffPolicyLearner(Learner):
-    """What learners share that learn from earlier iterations too, out of a replay buffer."""
+    """A learner that also learns from earlier iterations, which are in a replay buffer."""
 
     def __init__(
-        self,
-        spec: AgentSpec,
-        settings: OffPolicySettings,
-        algorithm: type[Any],
-        policy: type[BasePolicy],
-        **kwargs: Any,
+        self, spec: AgentSpec, settings: OffPolicySettings, algorithm: type, policy: type[BasePolicy], **kwargs: Any
     ) -> None:
-        """Make SB3's algorithm with what its settings share and its own `arguments`."""
+        """Make SB3's algorithm; `kwargs` are its own beyond those that `settings` share."""
         super().__init__(
             spec,
             algorithm,
@@ -121,7 +106,7 @@ class OffPolicyLearner(Learner):
             batch_size=settings.batch_size,
             tau=settings.tau,
             gamma=settings.gamma,
-            replay_buffer_kwargs={"handle_timeout_termination": False},  # a cut is no end in our rows
+            replay_buffer_kwargs={"handle_timeout_termination": False},  # only collisions end rows
             **kwargs,
         )
         self.settings = settings
@@ -129,27 +114,26 @@ class OffPolicyLearner(Learner):
         self._due_gradient_steps = 0
 
     def exploring_network(self, environment_steps: int) -> Network:
-        """Return the policy's twin; before the first update, what the settings say."""
+        """Return the policy as a NumPy network; before the first update, the start policy of the settings."""
         if not self.is_learning(environment_steps) and self.settings.start_policy == "uniform":
             return uniform_network(self.spec.inputs, self.sb3.policy.authority)
         return self.network()
 
     def is_learning(self, environment_steps: int) -> bool:
-        """Whether the start is over: before it, nothing is learned."""
+        """Whether learning has started."""
         return environment_steps >= self.settings.learning_starts
 
     def set_value_scale(self, environment_rows: Experience) -> None:
-        """Shift rewards by the mean of actual rows."""
+        """Shift rewards by the mean of these rows."""
         if self.spec.policy.normalize_value:
             self.sb3.policy.reward_offset.fill_(environment_rows.rewards.mean())
 
     def learn(self, update: Update) -> None:
-        """Add actual rows to the replay buffer, and update actor and critics from it and virtual rows."""
+        """Add environment rows to the replay buffer, and update actor and critics with it and the model rows."""
         if update.environment_rows is not None:
-            # Those of the start are made up for at its end: before it drives, the policy has seen them.
-            self._due_gradient_steps = (
-                round(update.environment_steps * self.settings.gradient_steps_per_step) - self.sb3._n_updates
-            )
+            # Includes those that were due before learning started: the policy is trained before it drives.
+            due = round(update.environment_steps * self.settings.gradient_steps_per_step)
+            self._due_gradient_steps = due - self.sb3._n_updates
             self.add_rows(self.buffer, update.environment_rows)
         if update.model_rows is not None:
             self.add_rows(self.buffer.new_model_buffer(len(update.model_rows.rewards)), update.model_rows)
@@ -157,22 +141,22 @@ class OffPolicyLearner(Learner):
         if self.is_learning(update.environment_steps):
             steps = max(1, round(self._due_gradient_steps * update.share))
             self.sb3.train(gradient_steps=steps, batch_size=self.settings.batch_size)
-        self.buffer.drop_model_buffer()
+        self.buffer.model_buffer = None
 
     def add_rows(self, buffer: ReplayBuffer, rows: Experience) -> None:
-        """Add rows to a replay buffer, their rewards shifted and scaled."""
+        """Add rows to a replay buffer, with shifted and scaled rewards."""
         policy = self.sb3.policy
         rewards = shift_rewards(rows, policy.reward_offset.item(), self.gamma)
         add_to_replay_buffer(buffer, rows, policy.authority, rewards * self.settings.reward_scale)
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return all that it must keep to go on, the replay buffer too."""
+        """Return all that it needs to resume, including the replay buffer."""
         counters, tensors = super().state()
         counters |= {name: getattr(self.buffer, name) for name in REPLAY_POSITION}
         return counters, tensors | self._shared_tensors()
 
     def restore(self, counters: dict[str, Any], tensors: Tensors) -> None:
-        """Put a learner made from the same configuration into what `state` returned."""
+        """Resume from what `state` of a learner with the same configuration returned."""
         super().restore(counters, tensors)
         for name in REPLAY_POSITION:
             setattr(self.buffer, name, counters[name])
@@ -180,24 +164,18 @@ class OffPolicyLearner(Learner):
             tensor.detach().copy_(tensors[name])
 
     def _shared_tensors(self) -> Tensors:
-        """Return what SB3 does not name among its parameters, as tensors that share the learner's memory."""
+        """Return the state outside SB3's parameters, as tensors that share the learner's memory."""
         filled = self.buffer.size()
         return {f"replay/{name}": torch.from_numpy(getattr(self.buffer, name)[:filled]) for name in REPLAY_ARRAYS}
 
 
 class SAC(OffPolicyLearner):
-    """Soft actor-critic from whole episodes."""
+    """Soft actor-critic on whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: SACSettings) -> None:
-        temperature = settings.temperature
-        super().__init__(
-            spec,
-            settings,
-            stable_baselines3.SAC,
-            SquashedResidualPolicy,
-            ent_coef=f"auto_{temperature}" if settings.learn_temperature else temperature,
-            target_entropy=settings.target_entropy,
-        )
+        coefficient = f"auto_{settings.temperature}" if settings.learn_temperature else settings.temperature
+        entropy = {"ent_coef": coefficient, "target_entropy": settings.target_entropy}
+        super().__init__(spec, settings, stable_baselines3.SAC, SquashedResidualPolicy, **entropy)
 
     @torch.no_grad()
     def residual_distribution(self, observations: Tensor) -> Normal:
@@ -206,6 +184,6 @@ class SAC(OffPolicyLearner):
         return Normal(mean.squeeze(1), log_std.squeeze(1).exp())
 
     def _shared_tensors(self) -> Tensors:
-        """Return the filled part of the replay buffer and, where it is learned, the temperature."""
+        """Return the filled part of the replay buffer and, if it is learned, the temperature."""
         learned = {} if self.sb3.log_ent_coef is None else {"log_ent_coef": self.sb3.log_ent_coef}
         return super()._shared_tensors() | learned

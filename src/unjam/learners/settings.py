@@ -35,17 +35,16 @@ class PolicySettings:
     learn_exploration_std: bool = True
     """whether the standard deviation is learned (always by sac)"""
     exploration: Literal["per_step", "per_episode", "antithetic"] = "per_step"
-    """`per_step`: independent noise for each action of a CAV. `per_episode`: one perturbation of the weights of the last
-    layer, each with `exploration_std`, for all CAVs of an episode: what many do for minutes changes everyone's travel
-    time, while single commands vanish in the noise of human drivers (trpo and ppo; the standard deviation is not
-    learned; after Raffin et al. 2022, CoRL). `antithetic`: in pairs of episodes with the same vehicles, the second with
-    the opposite perturbation (after Salimans et al. 2017, arXiv:1703.03864)"""
+    """`per_step`: independent noise for each action of a CAV. `per_episode`: one perturbation of the weights of the
+    last layer, each with `exploration_std`, for all CAVs of an episode (trpo and ppo; the standard deviation is not
+    learned; after Raffin et al. 2022, CoRL): what many CAVs do for minutes changes all travel times, while single
+    commands vanish in the noise of human drivers. `antithetic`: in pairs of episodes with the same vehicles, the
+    second with the opposite perturbation (after Salimans et al. 2017, arXiv:1703.03864)"""
     reward_after_exit: bool = False
-    """give CAVs the rewards after they leave an open road, and the value network their entry time: with a shared reward,
-    a prevented jam pays off only later. Not with the row model, which does not know what follows"""
+    """give CAVs the rewards after they leave an open road, and the value network their entry time: with a shared
+    reward, a prevented jam pays off only later. Not with the row model, which does not know what follows"""
     action_duration: NonNegative = 1.0
-    """time for which a residual is held [s], rounded to control steps: over a second, noise adds up to a change of speed
-    instead of cancelling itself"""
+    """time for which a residual is held [s], rounded to control steps: over a second, noise changes the speed"""
     privileged_critic: bool = True
     """give the value network what the episode drew (the ring's length); else it takes a large gap for a longer and
     faster ring, and the policy learns to fall back"""
@@ -139,8 +138,8 @@ class SACSettings(OffPolicySettings):
 
     learner_class: ClassVar[str] = "unjam.learners.sac:SAC"
     temperature: Positive = 0.05
-    """weight of the policy's entropy, in units of scaled rewards; with the paper's 0.2 the noise alone costs a quarter of
-    the return on the ring, and what is learned from it fails on short rings"""
+    """weight of the policy's entropy, in units of scaled rewards; with the paper's 0.2 the noise alone costs a quarter
+    of the return on the ring, and what is learned from it fails on short rings"""
     learn_temperature: bool = False
     """whether the temperature is adapted, starting from `temperature`, so that the entropy becomes `target_entropy`"""
     target_entropy: Annotated[float, Field(lt=0.69)] = -1.0

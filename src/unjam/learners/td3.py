@@ -1,7 +1,4 @@
-"""TD3: a deterministic policy that explores with noise of a fixed size, and a pair of critics.
-
-Source: Fujimoto, van Hoof and Meger 2018, Addressing function approximation error in actor-critic methods.
-"""
+"""TD3 (Fujimoto, van Hoof and Meger 2018, Addressing function approximation error in actor-critic methods)."""
 
 from typing import cast
 
@@ -13,21 +10,19 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from unjam.drivers.network import Network
-from unjam.learners.learner import AgentSpec, network_layers
+from unjam.learners.learner import AgentSpec, network_layers, zero_layer
 from unjam.learners.sac import ActorInputExtractor, OffPolicyLearner, OffPolicyResidualMixin
 from unjam.learners.settings import TD3Settings
 
 
 class DeterministicResidualPolicy(OffPolicyResidualMixin, TD3Policy):
-    """SB3's policy of TD3 with a residual that is zero at the start, if wanted: the actor's last layer is."""
+    """SB3's policy of TD3 for a residual that starts at zero: with `zero_init`, the actor's last layer is zero."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        """Return the actor, which sees the first `inputs` numbers."""
+        """Return the actor, which takes the first `inputs` inputs."""
         actor = super().make_actor(ActorInputExtractor(self.observation_space, self.inputs))
-        last = cast(nn.Linear, actor.mu[-2])  # before the tanh
         if self.settings.zero_init:
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+            zero_layer(cast(nn.Linear, actor.mu[-2]))  # before the tanh
         return actor
 
     @property
@@ -36,23 +31,20 @@ class DeterministicResidualPolicy(OffPolicyResidualMixin, TD3Policy):
         return self.settings.exploration_std * self.authority / self.settings.authority
 
     def network(self) -> Network:
-        """Return the NumPy twin: the same residual to 1e-6, with the exploration noise beside it."""
+        """Return the policy as a NumPy network: the same residual to 1e-6, and the exploration noise."""
         return Network(network_layers(self.actor.mu), self.authority, self.exploration_std)
 
 
 class TD3(OffPolicyLearner):
-    """Twin delayed deep deterministic policy gradient from whole episodes."""
+    """Twin delayed deep deterministic policy gradient on whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: TD3Settings) -> None:
-        super().__init__(
-            spec,
-            settings,
-            stable_baselines3.TD3,
-            DeterministicResidualPolicy,
-            policy_delay=settings.policy_delay,
-            target_policy_noise=settings.target_noise,
-            target_noise_clip=settings.target_noise_clip,
-        )
+        kwargs = {
+            "policy_delay": settings.policy_delay,
+            "target_policy_noise": settings.target_noise,
+            "target_noise_clip": settings.target_noise_clip,
+        }
+        super().__init__(spec, settings, stable_baselines3.TD3, DeterministicResidualPolicy, **kwargs)
 
     @torch.no_grad()
     def residual_distribution(self, observations: Tensor) -> Normal:

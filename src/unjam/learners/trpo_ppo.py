@@ -1,4 +1,4 @@
-"""TRPO and PPO: learners from the rows of the newest policy alone, and the policy that they share."""
+"""TRPO and PPO, which learn from the rows of the newest policy alone, and their policy."""
 
 import math
 from typing import Any, cast
@@ -15,15 +15,12 @@ from torch.distributions import Normal
 from unjam.adam import Adam
 from unjam.drivers.network import Network, append_ones
 from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join_experience
-from unjam.learners.learner import AgentSpec, Learner, Update, network_layers
+from unjam.learners.learner import AgentSpec, Learner, Update, network_layers, zero_layer
 from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
-
-PLACEHOLDER_SIZE = 2
-"""stands for the size of rollout buffer and batch until an iteration says how many rows it has"""
 
 
 class BoundedTanh(nn.Module):
-    """`authority * tanh(x)`: keeps the mean of the residual within its bounds (paper, section 3.3.2)."""
+    """`authority * tanh(x)`: bounds the mean of the residual (paper, section 3.3.2)."""
 
     def __init__(self, authority: float) -> None:
         super().__init__()
@@ -35,7 +32,7 @@ class BoundedTanh(nn.Module):
 
 
 class ScaledValue(nn.Module):
-    """A value head in the units of the returns: `mean + std * linear(x)`, with fixed mean and std."""
+    """A value head in units of the returns: `mean + std * linear(x)`, with fixed mean and std."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -49,16 +46,13 @@ class ScaledValue(nn.Module):
 
 
 class ActorCriticExtractor(nn.Module):
-    """Hidden layers of both networks; the critic may see more than the actor.
-
-    SB3 hands both the same vector: what the actor sees, then what the critic alone sees.
-    """
+    """Hidden layers of both networks; SB3 gives both the inputs of the actor, then those of the critic alone."""
 
     def __init__(self, inputs: int, critic_inputs: int, hidden: tuple[int, ...]) -> None:
         super().__init__()
         self.inputs = inputs
         self.policy_net = nn.Sequential(*create_mlp(inputs, -1, list(hidden)))  # -1: no output layer
-        # TRPO tells the critic by `value` in its name.
+        # TRPO recognizes the critic by `value` in its name.
         self.value_net = nn.Sequential(*create_mlp(inputs + critic_inputs, -1, list(hidden)))
         self.latent_dim_pi = self.latent_dim_vf = hidden[-1]
 
@@ -76,16 +70,10 @@ class ActorCriticExtractor(nn.Module):
 
 
 class ResidualPolicy(ActorCriticPolicy):
-    """SB3's actor-critic policy with a bounded mean that is zero at the start.
-
-    The last layer of the actor starts at zero, so that the full policy starts as exactly the expert; unless
-    the settings want it as torch draws it.
-    """
+    """SB3's actor-critic policy with a bounded mean that starts, with `zero_init`, at zero: as the expert."""
 
     def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
-        self.settings = settings
-        self.inputs = inputs
-        self.authority = settings.authority * action_limit
+        self.settings, self.inputs, self.authority = settings, inputs, settings.authority * action_limit
         kwargs |= {"log_std_init": math.log(settings.exploration_std * action_limit), "use_sde": settings.episode_noise}
         super().__init__(*args, optimizer_class=Adam, **kwargs)
 
@@ -97,8 +85,7 @@ class ResidualPolicy(ActorCriticPolicy):
         super()._build(lr_schedule)
         last = nn.Linear(self.mlp_extractor.latent_dim_pi, 1)
         if self.settings.zero_init:
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+            zero_layer(last)
         self.action_net = nn.Sequential(last, BoundedTanh(self.authority))
         self.value_net = ScaledValue(self.mlp_extractor.latent_dim_vf)  # pyright: ignore[reportAttributeAccessIssue]
         nn.init.orthogonal_(self.value_net.linear.weight)
@@ -112,10 +99,10 @@ class ResidualPolicy(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # pyright: ignore[reportCallIssue]
 
     def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
-        """Return what SB3 does; noise that lasts is that of the bias, too.
+        """Return SB3's distribution; per-episode noise also perturbs the bias.
 
-        Without it, next to nothing is tried where all units are at rest, and to move there is so improbable
-        that no step of TRPO's line search passes.
+        Without it there would be hardly any exploration where all hidden units are zero, and actions there would be so
+        improbable that no step of TRPO's line search passes.
         """
         if not self.settings.episode_noise:
             return super()._get_action_dist_from_latent(latent_pi)
@@ -123,32 +110,30 @@ class ResidualPolicy(ActorCriticPolicy):
         return self.action_dist.proba_distribution(mean, self.log_std, append_ones(latent_pi))  # pyright: ignore[reportCallIssue]
 
     def set_learning_rates(self, actor: float, critic: float) -> None:
-        """Give actor and critic learning rates of their own, in a new optimiser."""
-        groups: dict[bool, list[nn.Parameter]] = {False: [], True: []}
-        for name, parameter in self.named_parameters():
-            groups["value" in name].append(parameter)
-        self.optimizer = Adam(
-            [{"params": groups[False], "lr": actor}, {"params": groups[True], "lr": critic}],
-            eps=1e-5,
-            fused=True,  # see `unjam.kernels`
-        )
+        """Give actor and critic separate learning rates, in a new optimizer."""
+        named = list(self.named_parameters())
+        groups = [
+            {"params": [parameter for name, parameter in named if ("value" in name) is is_critic], "lr": rate}
+            for is_critic, rate in ((False, actor), (True, critic))
+        ]
+        self.optimizer = Adam(groups, eps=1e-5, fused=True)  # fused: see `unjam.kernels`
 
     def scale_value(self, mean: float, std: float) -> None:
-        """Fix the units of the value head."""
+        """Set the scale of the value head."""
         self.value_net.scale.copy_(torch.tensor([mean, std]))  # pyright: ignore[reportCallIssue]
 
     def network(self) -> Network:
-        """Return the NumPy twin: the same residual to 1e-6, and the same exploration noise."""
+        """Return the policy as a NumPy network: the same residual to 1e-6, and the same exploration noise."""
         layers = network_layers(nn.Sequential(self.mlp_extractor.policy_net, self.action_net))  # pyright: ignore[reportArgumentType]
         std = float(torch.exp(self.log_std.detach()).flatten()[0].item())
         return Network(layers, self.authority, std, self.settings.episode_noise)
 
 
 class OnPolicyLearner(Learner):
-    """What learners share that learn from the rows of the current policy alone."""
+    """A learner that learns from the rows of the current policy alone."""
 
     def set_value_scale(self, environment_rows: Experience) -> None:
-        """Scale the value head by the returns of actual rows."""
+        """Scale the value head by the returns of these rows."""
         if self.spec.policy.normalize_value:
             returns = discounted_returns(environment_rows, self.gamma)
             self.sb3.policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
@@ -160,29 +145,29 @@ class OnPolicyLearner(Learner):
         return Normal(normal.mean.squeeze(1), normal.stddev.squeeze(1))
 
     def learn(self, update: Update) -> None:
-        """Update policy and value network with actual and virtual rows together."""
-        self.fill_buffer(
-            join_experience([part for part in (update.environment_rows, update.model_rows) if part is not None])
-        )
+        """Update policy and value network with environment and model rows together."""
+        parts = [part for part in (update.environment_rows, update.model_rows) if part is not None]
+        self.fill_buffer(join_experience(parts))
         self.sb3.train()
 
     def fill_buffer(self, rows: Experience) -> None:
-        """Put rows into the rollout buffer, in place of those before."""
+        """Fill the rollout buffer with rows."""
         fill_rollout_buffer(self.sb3.rollout_buffer, self.sb3.policy, rows)
 
 
 class TRPO(OnPolicyLearner):
-    """Trust region policy optimisation from whole episodes."""
+    """Trust region policy optimization on whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: TRPOSettings) -> None:
+        decay = settings.critic_weight_decay
         super().__init__(
             spec,
             sb3_contrib.TRPO,
             ResidualPolicy,
-            # SB3 drops its own eps when given arguments for the optimiser. Fused: see `unjam.kernels`.
-            {"optimizer_kwargs": {"eps": 1e-5, "weight_decay": settings.critic_weight_decay, "fused": True}},
+            # SB3 drops its own eps when it gets optimizer arguments. Fused: see `unjam.kernels`.
+            policy_kwargs={"optimizer_kwargs": {"eps": 1e-5, "weight_decay": decay, "fused": True}},
             learning_rate=settings.critic_learning_rate,
-            n_steps=settings.critic_batch_size,  # the buffer takes the size of the episodes
+            n_steps=settings.critic_batch_size,  # the buffer is resized to the episodes
             batch_size=settings.critic_batch_size,
             gamma=settings.gamma,
             gae_lambda=settings.gae_lambda,
@@ -194,34 +179,31 @@ class TRPO(OnPolicyLearner):
 
 
 class PPO(OnPolicyLearner):
-    """Proximal policy optimisation from whole episodes."""
+    """Proximal policy optimization on whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: PPOSettings) -> None:
         super().__init__(
             spec,
             SeparateRatesPPO,
             ResidualPolicy,
-            n_steps=PLACEHOLDER_SIZE,
-            batch_size=PLACEHOLDER_SIZE,
             n_epochs=settings.epochs,
             gamma=settings.gamma,
             gae_lambda=settings.gae_lambda,
             clip_range=settings.clip_range,
-            # SB3 clips the gradients of actor and critic together; they share no weight, and the critic's
-            # gradient, in the units of returns, would leave nothing of the actor's.
+            # SB3 clips the gradients of actor and critic together, and the critic's, in units of returns, are larger.
             max_grad_norm=math.inf,
         )
         self._minibatches = settings.minibatches
         self.sb3.policy.set_learning_rates(settings.actor_learning_rate, settings.critic_learning_rate)
 
     def fill_buffer(self, rows: Experience) -> None:
-        """Put rows into the rollout buffer, and say how many of them make a minibatch."""
+        """Fill the rollout buffer with rows, and set the size of minibatches."""
         super().fill_buffer(rows)
         self.sb3.batch_size = math.ceil(len(rows.rewards) / self._minibatches)
 
 
 class SeparateRatesPPO(stable_baselines3.PPO):
-    """SB3's PPO, with the rates of the policy's optimiser left as they are."""
+    """SB3's PPO with the separate learning rates of the policy's optimizer."""
 
     def _update_learning_rate(self, optimizers: Any) -> None:
         """Do nothing: SB3 would set one rate for actor and critic."""

@@ -1,4 +1,4 @@
-"""Comparison of model and environment: replayed accelerations, one-step errors, and returns of the same policy."""
+"""Comparison of model and environment: replayed accelerations, one-step errors, returns, and waves."""
 
 import itertools
 from dataclasses import dataclass
@@ -6,20 +6,19 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.models.dynamics import ModelDynamics, to_device
 from unjam.models.ensemble import torch_generator
-from unjam.models.environment_data import EnvironmentData, Transitions
+from unjam.models.environment_data import EnvironmentData, StartIndices, Transitions
 from unjam.models.fitting import OneStepErrors, residual_targets
 from unjam.models.rollouts import ModelWorld, RolloutStarts
 from unjam.models.row_model import STATE_FIELDS, RowModel, model_inputs
 from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import DriveLoop
-from unjam.worlds.record import Floats
+from unjam.worlds.record import Episode, Floats
 
 
 class OpenLoopErrors(NamedTuple):
@@ -34,7 +33,7 @@ class OpenLoopErrors(NamedTuple):
 
 
 def open_loop_errors(
-    model: RowModel, data: EnvironmentData, start_indices: NDArray[np.int64], control_steps: int, scenario: Scenario
+    model: RowModel, data: EnvironmentData, start_indices: StartIndices, control_steps: int, scenario: Scenario
 ) -> OpenLoopErrors:
     """Replay recorded accelerations in the model, and compare; arguments as of `replay_accelerations`."""
     recorded = recorded_states(data, start_indices, control_steps)
@@ -46,8 +45,8 @@ def open_loop_errors(
     return OpenLoopErrors(error, spread, change)
 
 
-def recorded_states(data: EnvironmentData, start_indices: NDArray[np.int64], control_steps: int) -> dict[str, Floats]:
-    """Return the recorded states from each start on, by name of `STATE_FIELDS` [m/s, m], shape (rows, H + 1)."""
+def recorded_states(data: EnvironmentData, start_indices: StartIndices, control_steps: int) -> dict[str, Floats]:
+    """Return the recorded states from each start on, by name of `STATE_FIELDS` [m/s, m], shape (n, H + 1)."""
     windows = [(data.recordings[index].states, slice(at, at + control_steps + 1)) for index, at in start_indices]
     return {name: np.stack([getattr(states, name)[at] for states, at in windows]) for name in STATE_FIELDS}
 
@@ -70,19 +69,11 @@ class ReplayDriver(Driver):
 
 @torch.no_grad()
 def replay_accelerations(
-    model: RowModel, data: EnvironmentData, start_indices: NDArray[np.int64], control_steps: int, scenario: Scenario
+    model: RowModel, data: EnvironmentData, start_indices: StartIndices, control_steps: int, scenario: Scenario
 ) -> dict[str, Floats]:
-    """Replay recorded accelerations in the model, without noise, each member separately.
+    """Replay H recorded accelerations in the model, without noise, each member separately; a new model is the base.
 
-    Args:
-        model: fitted, or new: then it is the base alone.
-        data: recordings.
-        start_indices: rows (recording, step), each with at least `control_steps` recorded steps after it.
-        control_steps: H.
-        scenario: the road.
-
-    Returns:
-        By name of `STATE_FIELDS` [m/s, m], shape (members, rows, H).
+    Returns states by name of `STATE_FIELDS` [m/s, m], shape (members, n, H).
     """
     device = model.input_mean.device
     indices = np.tile(start_indices, (model.members, 1))
@@ -121,9 +112,9 @@ class ReturnGap(NamedTuple):
 
 
 def return_gap(
-    model_returns: Floats, start_indices: NDArray[np.int64], data: EnvironmentData, control_steps: int
+    model_returns: Floats, start_indices: StartIndices, data: EnvironmentData, control_steps: int
 ) -> ReturnGap | None:
-    """Compare `model_returns`, (rows,), with the recorded returns from the same starts, rows (recording, step).
+    """Compare `model_returns`, (n,), with the recorded returns from the same starts.
 
     The comparison is fair if the same policy drove both, with exploration. Returns are undiscounted sums of rewards up
     to the last step or a crash. Rows with fewer than `control_steps` recorded steps are skipped; None if none is left.
@@ -136,3 +127,33 @@ def return_gap(
     environment = np.array([each.sum() for each in itertools.compress(rewards, is_complete)])
     error = (model - environment).std() / np.sqrt(len(environment))
     return ReturnGap(float(model.mean()), float(environment.mean()), float(error))
+
+
+class RoadTrajectories(NamedTuple):
+    """All vehicles on a road at M times, in N columns; arrays (M, N), SI units, NaN without a vehicle."""
+
+    speeds: Floats
+    positions: Floats
+    """front bumpers"""
+    lanes: Floats
+    """lane indices, or of shape (0, 0)"""
+    cav_columns: list[int]
+
+
+class Waves(NamedTuple):
+    """The same road in the environment and in the model."""
+
+    time_step: float
+    """[s]"""
+    loop_length: float
+    """of a closed road [m], or NaN"""
+    lane_names: tuple[str, ...]
+    roads: dict[str, RoadTrajectories]
+    """`recorded`; `model`, with what was learned; and the `base` alone"""
+
+
+def road_trajectories(episode: Episode, interval: int) -> RoadTrajectories:
+    """Return every `interval`-th state of an episode."""
+    tables = episode.speeds, episode.positions, episode.lane_indices
+    speeds, positions, lanes = (values[::interval] for values in tables)
+    return RoadTrajectories(speeds, positions, lanes, episode.cav_columns)

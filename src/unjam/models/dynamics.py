@@ -76,21 +76,15 @@ class NumPyDriverAdapter(Driver):
     """Calls a driver that does not take tensors with NumPy arrays; its memory stays in NumPy."""
 
     accepts_tensors: ClassVar[bool] = True
-
     driver: Driver
     device: torch.device
-    """device of the world"""
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the driver's initial memory."""
+        """Return the initial memory of the driver."""
         return self.driver.initial_memory(n)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Tensor, Memory]:
-        """Return the driver's acceleration as a tensor, and its memory.
-
-        Raises:
-            InputError: the acceleration is not finite or has a wrong shape.
-        """
+        """Return the driver's acceleration as a tensor, and its memory; `InputError` if it is not finite."""
         arrays = state.map(lambda values: values.double().cpu().numpy())
         acceleration, memory = self.driver.act(arrays, memory)
         return to_device(check_acceleration(acceleration, len(state.speed), "model rollout"), self.device), memory
@@ -121,11 +115,10 @@ class Dynamics(Protocol):
 
 
 class ModelDynamics:
-    """Base plus residual networks, Eq. 4, for state and reward.
+    """Base plus residual of a random member of the ensemble in each step, Eq. 4, for state and reward.
 
-    A random member of the ensemble predicts each row in each step. Noise is a random holdout error of the model, drawn
-    independently for each row and step: it has their standard deviations, correlations and tails. Noise alone never
-    causes a collision.
+    Noise is a random holdout error of the model, drawn independently for each row and step: it has their standard
+    deviations, correlations and tails. Noise alone never causes a collision.
     """
 
     def __init__(
@@ -137,10 +130,7 @@ class ModelDynamics:
         add_noise: bool = True,
         members: Tensor | None = None,
     ) -> None:
-        """Make the dynamics of `scenario` according to `model`, on the generator's device.
-
-        With `members`, each of those predicts an equal share of the rows, in order, in every step.
-        """
+        """Make the dynamics on the generator's device; each of `members`, if given, always predicts the same rows."""
         self._model, self._layers, self._fixed_members = model, model.layers(), members
         self._scenario, self._generator, self._add_noise = scenario, generator, add_noise
         self._reward = tensor_reward(reward or scenario.reward)

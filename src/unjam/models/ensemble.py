@@ -2,8 +2,8 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,23 +21,21 @@ MIN_CHANGE = 1e-4
 ROWS_PER_MEMBER = 64
 """consecutive rows that the same member of the ensemble predicts"""
 
+Seed = Sequence[int]
 Layers = list[tuple[Tensor, Tensor]]
 """(weight of shape (members, inputs, outputs), bias of shape (members, 1, outputs)) of each layer"""
 
 
-def torch_generator(seed: Sequence[int], device: torch.device | str) -> torch.Generator:
+def torch_generator(seed: Seed, device: torch.device | str) -> torch.Generator:
     """Return a random number generator on `device` that depends on `seed` alone."""
     state = np.random.SeedSequence(list(seed)).generate_state(1, np.uint64)[0]
     return torch.Generator(device).manual_seed(int(state >> np.uint64(1)))
 
 
 def predict(layers: Layers, inputs: Tensor, members: Tensor) -> Tensor:
-    """Return the residual of the base, SI units, shape (n, outputs).
+    """Return the residual of the base, (n, outputs), for `inputs`, (n, inputs), both in SI units.
 
-    Args:
-        layers: of `Ensemble.layers`.
-        inputs: SI units, shape (n, inputs).
-        members: the member for each block of rows; all blocks but the last have the same length.
+    Each of `members` predicts one block of rows; all blocks but the last have the same length.
     """
     n, blocks = len(inputs), len(members)
     size = -(-n // blocks)
@@ -59,10 +57,7 @@ def _apply_layers(layers: Layers, inputs: Tensor) -> Tensor:
 
 
 class Ensemble(nn.Module):
-    """Networks that each predict the residual of a base model; `state_dict` is all that they have learned.
-
-    With `fallback_to_base` their last layers start at zero, so that a new ensemble adds nothing to the base.
-    """
+    """Networks that each predict the residual of a base, at first zero with `fallback_to_base`."""
 
     input_mean: Tensor
     input_scale: Tensor
@@ -71,7 +66,7 @@ class Ensemble(nn.Module):
     output_mask: Tensor
     """1 where the networks predict better than the base, shape (outputs,)"""
 
-    def __init__(self, settings: ModelSettings, inputs: int, outputs: int, seed: Sequence[int]) -> None:
+    def __init__(self, settings: ModelSettings, inputs: int, outputs: int, seed: Seed) -> None:
         super().__init__()
         self.members = settings.members
         generator = torch_generator(seed, "cpu")
@@ -100,11 +95,10 @@ class Ensemble(nn.Module):
 
     @torch.no_grad()
     def set_normalization(self, inputs: Tensor, targets: Tensor) -> None:
-        """Normalize by mean and standard deviation of `inputs` and `targets`, (rows, ...) in SI units.
+        """Normalize by mean and standard deviation of `inputs` and `targets`, (rows, ...); predictions stay the same.
 
-        First and last layers are converted, so that predictions stay the same. An input that varies by less than
-        `MIN_CHANGE`, as the length of the ring in a single episode, counts as constant: its normalized value is zero.
-        Otherwise Adam would make long steps of rounding errors, and another value on the holdout would be far away.
+        An input that varies by less than `MIN_CHANGE`, as the length of the ring in a single episode, counts as zero:
+        else Adam would make long steps of rounding errors, and another value on the holdout would be far away.
         """
         varies = inputs.std(0) >= MIN_CHANGE
         mean = torch.where(varies, inputs.mean(0), inputs[0]).float()
@@ -140,21 +134,18 @@ class Ensemble(nn.Module):
         return predictions.double().cpu().numpy()
 
 
-@dataclass(frozen=True)
-class EnsembleFit:
-    """The result of fitting an ensemble."""
+class EnsembleFit(NamedTuple):
+    """The result of fitting an ensemble; SI units."""
 
     targets: Floats
-    """residuals of the base on the holdout, SI units, shape (rows, outputs)"""
+    """residuals of the base on the holdout, shape (rows, outputs)"""
     predictions: Floats
-    """of them, by each member; zero where the base alone is better, shape (members, rows, outputs)"""
+    """of the targets by each member; zero where the base is better, shape (members, rows, outputs)"""
     holdout_indices: NDArray[np.int64]
-    """indices of the holdout rows"""
     loss: float
     """mean squared training error of the last epoch, in units of the targets' variance"""
     epochs: int
     training_rows: int
-    """rows that each network was trained on"""
 
 
 def fit_ensemble(
@@ -165,25 +156,15 @@ def fit_ensemble(
     settings: ModelSettings,
     generator: np.random.Generator,
 ) -> EnsembleFit:
-    """Train an ensemble further, in place.
+    """Train `ensemble` further on `inputs`, (rows, inputs), and residuals of the base `targets`, (rows, outputs).
 
-    Every network is trained on a bootstrap sample of the rows and ends with the weights that were best on the holdout.
-    With `fallback_to_base`, outputs that are predicted no better than by zero there are masked.
-
-    Args:
-        ensemble: is changed.
-        inputs: SI units, shape (rows, inputs).
-        targets: residuals of the base, SI units, shape (rows, outputs).
-        is_holdout: rows that no network is trained on, shape (rows,).
-        settings: of the fit.
-        generator: of all random numbers.
-
-    Raises:
-        UnjamError: a loss is not finite.
+    Units are SI. Each network is trained on a bootstrap sample of the rows that are not `is_holdout`, and ends with the
+    weights that were best on the holdout. With `fallback_to_base`, outputs that are predicted no better than by zero
+    there are masked. Raises `UnjamError` if a loss is not finite.
     """
     training = generator.permutation(np.flatnonzero(~is_holdout))[: settings.max_fit_rows]
-    holdout_size = max(1, round(settings.max_fit_rows * settings.holdout))
-    holdout = generator.permutation(np.flatnonzero(is_holdout))[:holdout_size]
+    max_holdout_rows = max(1, round(settings.max_fit_rows * settings.holdout))
+    holdout = generator.permutation(np.flatnonzero(is_holdout))[:max_holdout_rows]
     ensemble.set_normalization(inputs[training], targets[training])
     bootstrap = training[generator.integers(len(training), size=(ensemble.members, len(training)))]
     normalized = ensemble.normalize_inputs(inputs), ((targets - ensemble.target_mean) / ensemble.target_scale).float()

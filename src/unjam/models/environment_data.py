@@ -14,57 +14,54 @@ from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
-from unjam.tree import Arrays, map_leaves, pack, unpack
+from unjam.tree import map_leaves
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.record import Episode, Floats, Trajectory
 from unjam.worlds.world import RecordedWorld
 
+StartIndices = NDArray[np.int64]
+"""n recorded states as rows (recording, control step), shape (n, 2)"""
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 """its multiples modulo 1 cover the unit interval evenly from the first one on, without a period"""
 
 
 @dataclass(frozen=True)
 class Recording(Trajectory):
-    """A stored trajectory and the episode that it comes from."""
+    """A stored trajectory, with the number of its episode and the scaled values that it drew, shape (m,)."""
 
     drawn_values: Floats = field(default_factory=lambda: np.zeros(0))
-    """scaled values that its episode drew, shape (m,)"""
     episode: int = 0
-    """number of its episode"""
 
 
 class Transitions(NamedTuple):
-    """Control steps of many trajectories in a row; R rows."""
+    """Control steps of many trajectories in a row; R rows, arrays of shape (R,)."""
 
     states: LocalState
-    """shape (R,)"""
     acceleration: Floats
-    """applied [m/s2], shape (R,)"""
+    """applied [m/s2]"""
     drawn_values: Floats
     """shape (R, m)"""
     next_states: LocalState
-    """shape (R,)"""
     reward: Floats
-    """shape (R,)"""
     crashed: NDArray[np.bool_]
-    """whether the step ended in a collision, shape (R,)"""
+    """whether the step ended in a collision"""
     is_holdout: NDArray[np.bool_]
-    """rows that no network is trained on, shape (R,)"""
+    """rows that no network is trained on"""
 
     def select(self, rows: NDArray[np.int64]) -> "Transitions":
         """Return the transitions with these indices."""
-        return Transitions(*(part.select(rows) if isinstance(part, LocalState) else part[rows] for part in self))
+        return Transitions._make(part.select(rows) if isinstance(part, LocalState) else part[rows] for part in self)
 
 
+@dataclass
 class EnvironmentData:
     """The newest trajectories: whole episodes with at least `capacity` control steps, once there are as many."""
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self.recordings: list[Recording] = []
-        """oldest first"""
-        self.episode_count = 0
-        """number of episodes that were ever added"""
+    capacity: int
+    recordings: list[Recording] = field(default_factory=list)
+    """oldest first"""
+    episode_count: int = 0
+    """number of episodes that were ever added"""
 
     def __len__(self) -> int:
         """Return the number of stored control steps."""
@@ -86,11 +83,7 @@ class EnvironmentData:
             self.recordings = newer
 
     def transitions(self, holdout: float) -> Transitions:
-        """Return all control steps; a share `holdout` of the episodes is held out.
-
-        Raises:
-            InputError: there are none yet.
-        """
+        """Return all control steps, with a share `holdout` of the episodes held out; `InputError` if there are none."""
         if not len(self):
             raise InputError("model: there are no environment steps to fit it to")
 
@@ -108,21 +101,14 @@ class EnvironmentData:
         )
 
     def holdout_masks(self, holdout: float) -> list[NDArray[np.bool_]]:
-        """Return for each recording which of its control steps no network is trained on.
-
-        An episode that is held out is held out in every fit. Where all or none of the episodes would be, the last part
-        of every trajectory is.
-        """
+        """Return holdout steps of each recording: always the same episodes; if these are all or none, last parts."""
         masks = [np.full(len(r.reward), is_holdout_episode(r.episode, holdout)) for r in self.recordings]
         if np.concatenate(masks).all() or not np.concatenate(masks).any():
             return [np.arange(len(mask)) >= max(1, (1 - holdout) * len(mask)) for mask in masks]
         return masks
 
-    def start_indices(self, min_control_steps: int = 1, first_episode: int = 0) -> NDArray[np.int64]:
-        """Return where a residual was due and `min_control_steps` steps follow, rows (recording, step).
-
-        Only of the episodes from number `first_episode` on.
-        """
+    def start_indices(self, min_control_steps: int = 1, first_episode: int = 0) -> StartIndices:
+        """Return where a residual was due and `min_control_steps` follow, in episodes from `first_episode` on."""
         due = {
             index: np.arange(0, len(recording.reward) - min_control_steps + 1, recording.action_repeat)
             for index, recording in enumerate(self.recordings)
@@ -131,8 +117,8 @@ class EnvironmentData:
         indices = np.repeat(np.array(list(due), np.int64), [len(steps) for steps in due.values()])
         return np.column_stack([indices, np.concatenate([[], *due.values()]).astype(np.int64)])
 
-    def states_at(self, start_indices: NDArray[np.int64]) -> LocalState:
-        """Return the states at rows (recording, step), arrays of shape (rows,)."""
+    def states_at(self, start_indices: StartIndices) -> LocalState:
+        """Return the states at `start_indices`, arrays of shape (n,)."""
         first = np.cumsum([0, *(len(recording.states.speed) for recording in self.recordings)])
         rows = first[start_indices[:, 0]] + start_indices[:, 1]
         return _concatenate_states([recording.states for recording in self.recordings]).select(rows)
@@ -147,15 +133,12 @@ def _concatenate_states(parts: Sequence[LocalState]) -> LocalState:
     return parts[0].map(lambda *values: np.concatenate(values), *parts[1:])
 
 
-def reconstruct_memory(expert: Driver, recordings: Sequence[Recording], start_indices: NDArray[np.int64]) -> Memory:
-    """Return the expert's memory before each of the control steps `start_indices`, rows (recording, step).
+def reconstruct_memory(expert: Driver, recordings: Sequence[Recording], start_indices: StartIndices) -> Memory:
+    """Return the expert's memory before each of `start_indices`, NumPy arrays with one row per start.
 
     The expert is driven over the recorded states once more, from its recorded initial memory. That is exact, since the
     memory of a driver depends on nothing else. With noisy sensors it is the memory that exact sensors would have left:
     sensor errors are not recorded.
-
-    Returns:
-        NumPy arrays with one row per start.
     """
     indices, rows = np.unique(start_indices[:, 0], return_inverse=True)
     used = [recordings[index] for index in indices]
@@ -179,17 +162,3 @@ def reconstruct_memory(expert: Driver, recordings: Sequence[Recording], start_in
     for step, decision in enumerate(DriveLoop(world, expert, memory=memory), start=1):
         store(step, decision.memory if decision else memory)
     return result
-
-
-def pack_data(data: EnvironmentData) -> tuple[dict[str, Any], Arrays]:
-    """Return environment data as JSON and arrays; `unpack_data` restores them exactly."""
-    recordings, arrays = pack(data.recordings)
-    return {"capacity": data.capacity, "episode_count": data.episode_count, "recordings": recordings}, arrays
-
-
-def unpack_data(facts: dict[str, Any], arrays: Arrays) -> EnvironmentData:
-    """Return the environment data that `pack_data` packed."""
-    data = EnvironmentData(facts["capacity"])
-    data.episode_count = facts["episode_count"]
-    data.recordings = unpack(list[Recording], facts["recordings"], arrays)
-    return data

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from unjam.models.ensemble import MIN_CHANGE, EnsembleFit, fit_ensemble
+from unjam.models.ensemble import MIN_CHANGE, EnsembleFit, Seed, fit_ensemble
 from unjam.models.environment_data import Transitions
 from unjam.models.row_model import (
     NOISE_SAMPLES,
@@ -54,14 +54,10 @@ class OneStepErrors(NamedTuple):
 
     def rmse_by_target(self) -> dict[str, OneStepRMSE]:
         """Return the root mean squared errors, by name of `TARGET_NAMES`."""
-        model = self.model
+        parts = (np.moveaxis(each, -1, 0) for each in (self.base, self.model, self.change))
         return {
-            name: OneStepRMSE(
-                root_mean_square(self.base[:, column]),
-                root_mean_square(model[..., column]),
-                float(self.change[:, column].std()),
-            )
-            for column, name in enumerate(TARGET_NAMES)
+            name: OneStepRMSE(root_mean_square(base), root_mean_square(model), float(change.std()))
+            for name, base, model, change in zip(TARGET_NAMES, *parts, strict=True)
         }
 
 
@@ -83,24 +79,15 @@ class ModelFit:
     learned_targets: tuple[str, ...]
     """targets that the networks predict better than the base; the others are left to the base"""
     training_rows: int
-    """rows that each network was trained on"""
+    """per network"""
     holdout_rows: int
     epochs: int
 
 
 def fit_row_model(
-    model: RowModel,
-    transitions: Transitions,
-    settings: ModelSettings,
-    scenario: Scenario,
-    reward: str,
-    seed: Sequence[int],
+    model: RowModel, transitions: Transitions, settings: ModelSettings, scenario: Scenario, reward: str, seed: Seed
 ) -> ModelFit:
-    """Fit `model` further, in place, to the residual of its base, see `fit_ensemble`; depends on the arguments alone.
-
-    Raises:
-        UnjamError: a loss is not finite.
-    """
+    """Fit `model` further, in place, see `fit_ensemble`; the result depends on the arguments alone."""
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     to_device: Any = {"device": model.input_mean.device}
     columns = model_inputs(transitions.states, transitions.acceleration, transitions.drawn_values)
@@ -126,10 +113,7 @@ def fit_row_model(
 
 
 def residual_targets(transitions: Transitions, base: str, scenario: Scenario, reward: str) -> Floats:
-    """Return the differences of state and reward to what `base` predicts, shape (rows, 6), SI units.
-
-    For the base `none` they are the changes of the state, and the reward.
-    """
+    """Return the residuals of `base`, (rows, 6), SI units; of `none`, the change of the state, and the reward."""
     states, next_states, acceleration = transitions.states, transitions.next_states, transitions.acceleration
     predicted = base_step(base, scenario, states, acceleration)
     reward_function = make_reward(reward or scenario.reward)
@@ -150,26 +134,15 @@ def unexplained_variance(one_step: Sequence[OneStepRMSE]) -> float:
 
 
 def transition_variation(errors: Floats, noise: float) -> float:
-    """Return the mean total variation between predicted and true transitions, Gaussians with the same noise.
-
-    Source: eps_m of the paper's theorem A3.
-
-    Args:
-        errors: of the predicted means of noisy quantities, shape (..., quantities).
-        noise: standard deviation of the noise of human drivers.
-    """
+    """Return eps_m of the paper's theorem A3: Gaussians of std `noise`, means with `errors`, (..., quantities)."""
     return _gaussian_variation(np.sqrt(np.square(errors).sum(-1)) / max(noise, MIN_CHANGE))
 
 
 def total_variation(predictions: Floats, noise: Floats) -> float:
-    """Return the mean total variation between Gaussians around a member's prediction and around the mean of all.
+    """Return the mean total variation, in [0, 1], between Gaussians around a member's prediction and around the mean.
 
-    Args:
-        predictions: of each member, shape (members, rows, quantities).
-        noise: standard deviation of the noise of both, shape (quantities,).
-
-    Returns:
-        In [0, 1]; NaN for a single member, whose error is unknown.
+    `predictions` has shape (members, rows, quantities), `noise`, the standard deviation of both, (quantities,). It is
+    NaN for a single member, whose error is unknown.
     """
     if len(predictions) == 1:
         return float("nan")
@@ -197,10 +170,7 @@ def recorded_noise(transitions: Transitions, scenario: Scenario) -> Floats | Non
 
 
 def _row_transition_variation(fit: EnsembleFit, transitions: Transitions, scenario: Scenario) -> float:
-    """Return `transition_variation` of leader and follower on the holdout.
-
-    If the noise is unknown, its variance is subtracted from the mean squared errors.
-    """
+    """Return `transition_variation` of leader and follower; unknown noise is subtracted from the errors' variance."""
     columns = [TARGET_NAMES.index("leader_speed"), TARGET_NAMES.index("follower_speed")]
     errors = (fit.targets - fit.predictions)[..., columns]
     noise, sigma = recorded_noise(transitions, scenario), scenario.noise_per_step * scenario.simulation_step

@@ -8,15 +8,23 @@ once as the base does, and the remaining difference in speed is the target.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from unjam.errors import InputError
+from unjam.models.ensemble import Seed
 from unjam.models.fitting import ModelFit
-from unjam.models.road_model import HumanRows, RoadModel, check_road_model, fit_human_model, residual_function
+from unjam.models.road_model import (
+    EpisodeSamples,
+    HumanRows,
+    RoadModel,
+    check_road_model,
+    fit_human_model,
+    residual_function,
+)
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Floats
 from unjam.scenarios.on_ramp import RAMP_SPEED_LIMIT, OnRamp
@@ -37,6 +45,7 @@ from unjam.worlds.batch.on_ramp.vehicles import (
 )
 from unjam.worlds.record import Episode
 
+Index = NDArray[np.intp]
 MAX_SAMPLE_INTERVAL = 60
 """maximum number of control steps between samples"""
 MIN_ERROR_REDUCTION = 0.3
@@ -48,11 +57,9 @@ PERCEPTION_ERROR_STD = 0.5
 
 
 @dataclass(frozen=True)
-class MotorwaySamples:
-    """Samples of an environment episode on an on-ramp."""
+class MotorwaySamples(EpisodeSamples):
+    """Human drivers on an on-ramp at some steps of an environment episode."""
 
-    episode: int
-    """number of the episode"""
     seed: tuple[int, ...]
     """of the episode: it determines the vehicles and their entry times"""
     episode_return: float
@@ -76,33 +83,18 @@ def check_motorway_model(scenario: OnRamp, settings: ModelSettings) -> None:
     raise InputError(f"model.{setting} is not allowed; allowed: {allowed}, on on-ramps")
 
 
-class _SampledVehicles(NamedTuple):
-    """Vehicles at some steps of an episode, in each from front to back; V in all, arrays of shape (V,)."""
-
-    sample: NDArray[np.intp]
-    """index of the step"""
-    column: NDArray[np.intp]
-    """of the tables of the record"""
-    vehicle: NDArray[np.intp]
-    """number in the record"""
-
-
 def motorway_samples(episode: Episode, number: int, scenario: OnRamp, base: str = "idm") -> MotorwaySamples:
-    """Return the samples of an environment episode with this number.
-
-    Raises:
-        InputError: the record skips steps, since many vehicles drove for a long time.
-    """
+    """Return the samples of an environment episode; `InputError` if its record skips steps, as long ones do."""
     if episode.snapshot_stride > 1:
         raise InputError("road: its record skips moments; allowed: a shorter horizon, with model.kind road")
     road = cast(MotorwayRoad, scenario.draw_from_seed(episode.seed)[0])
     interval = max(1, min(MAX_SAMPLE_INTERVAL, episode.control_steps // 4))
     steps = np.arange(interval, episode.control_steps, interval)
-    sampled = _sample_vehicles(episode, steps)
-    now, later = (steps[sampled.sample], sampled.column), (steps[sampled.sample] + 1, sampled.column)
-    before = _batch_vehicles(episode, road, scenario, now, sampled)
+    sample, column, vehicle = _sample_vehicles(episode, steps)
+    now, later = (steps[sample], column), (steps[sample] + 1, column)
+    before = _batch_vehicles(episode, road, scenario, now, sample, vehicle)
     generator = np.random.default_rng([*episode.seed, number])
-    errors = generator.standard_normal((3, len(sampled.sample)))
+    errors = generator.standard_normal((3, len(sample)))
     perception = {"gap_error": PERCEPTION_ERROR_STD * errors[0], "leader_error": PERCEPTION_ERROR_STD * errors[1]}
     noisy = before._replace(**perception, driving_error=errors[2])
     base_speed = _speeds_after_step(before, road, scenario, len(steps), np.zeros)
@@ -120,8 +112,8 @@ def motorway_samples(episode: Episode, number: int, scenario: OnRamp, base: str 
     return MotorwaySamples(number, tuple(episode.seed), float(episode.reward.sum()), rows, noise_variance)
 
 
-def _sample_vehicles(episode: Episode, steps: NDArray[np.intp]) -> _SampledVehicles:
-    """Return the vehicles on the road at `steps`; vehicles share columns of the record one after the other."""
+def _sample_vehicles(episode: Episode, steps: Index) -> tuple[Index, Index, Index]:
+    """Return index in `steps`, column (which vehicles share in turn) and number of each vehicle, from front to back."""
     is_present = ~np.isnan(episode.speeds)
     enters = is_present & ~np.vstack([np.zeros((1, is_present.shape[1]), bool), is_present[:-1]])
     number_in_column = np.cumsum(enters, 0) - 1
@@ -131,31 +123,25 @@ def _sample_vehicles(episode: Episode, steps: NDArray[np.intp]) -> _SampledVehic
     sample, column = np.nonzero(is_present[steps])
     rows = np.lexsort((-episode.positions[steps[sample], column], sample))
     sample, column = sample[rows], column[rows]
-    return _SampledVehicles(sample, column, order[first[column] + number_in_column[steps[sample], column]])
+    return sample, column, order[first[column] + number_in_column[steps[sample], column]]
 
 
 def _batch_vehicles(
-    episode: Episode,
-    road: MotorwayRoad,
-    scenario: OnRamp,
-    sample_index: tuple[NDArray[np.intp], NDArray[np.intp]],
-    sampled: _SampledVehicles,
+    episode: Episode, road: MotorwayRoad, scenario: OnRamp, at: tuple[Index, Index], sample: Index, vehicle: Index
 ) -> MotorwayVehicles:
-    """Return sampled vehicles as a batch has them, without errors or memory; each sample is a road."""
+    """Return vehicles as a batch has them, without errors or memory; `at` is their index in the record."""
     numbers = {entry.name: number for number, entry in enumerate(road.entries)}
     entries = np.array([numbers[name] for name in episode.vehicle_ids])
     types = [road.vehicle_types[road.entries[number].vehicle_type] for number in entries.tolist()]
-    *parameters, speed_factor, is_eidm = np.array([driver_columns(each) for each in types])[sampled.vehicle].T
-    lane = (len(road.lane_names) - 1 - episode.lane_indices[sample_index]).astype(np.intp)
-    position, speed = episode.positions[sample_index] + road.merge_position, episode.speeds[sample_index]
-    previous_speed = episode.speeds[sample_index[0] - 1, sample_index[1]]
-    acceleration = np.nan_to_num(speed - previous_speed) / episode.control_step
+    *parameters, speed_factor, is_eidm = np.array([driver_columns(each) for each in types])[vehicle].T
+    lane = (len(road.lane_names) - 1 - episode.lane_indices[at]).astype(np.intp)
+    position, speed = episode.positions[at] + road.merge_position, episode.speeds[at]
+    acceleration = np.nan_to_num(speed - episode.speeds[at[0] - 1, at[1]]) / episode.control_step
     limit = np.where((lane == 0) & (position < road.merge_position), RAMP_SPEED_LIMIT, road.limit_speed)
-    moving = sampled.sample, entries[sampled.vehicle], lane, position, speed, acceleration
+    moving = sample, entries[vehicle], lane, position, speed, acceleration
     vehicles = make_vehicles(*moving, *parameters, speed_factor, is_eidm, limit * speed_factor)
     is_cav = np.isin(np.array(episode.vehicle_ids), episode.cav_ids)
-    enable_acc(vehicles, is_cav[sampled.vehicle], scenario.cruise)
-    return vehicles
+    return enable_acc(vehicles, is_cav[vehicle], scenario.cruise)
 
 
 def _speeds_after_step(
@@ -178,8 +164,7 @@ def learned_correction(
 ) -> LearnedCorrection | None:
     """Return what the model adds to the speeds of the batch's human drivers in a control step of `steps` steps.
 
-    With the base `none` it replaces the car following of the batch, and perception errors by noise of the same
-    strength.
+    With the base `none` it replaces the batch's car following, and perception errors by noise of the same strength.
     """
     residual = residual_function(model, generator)
     if model.base != "none":
@@ -195,21 +180,14 @@ def learned_correction(
 
 
 def fit_motorway_model(
-    model: RoadModel,
-    samples: Sequence[MotorwaySamples],
-    settings: ModelSettings,
-    seed: Sequence[int],
-    episodes_per_group: int = 1,
+    model: RoadModel, samples: Sequence[MotorwaySamples], settings: ModelSettings, seed: Seed, group_size: int = 1
 ) -> ModelFit:
     """Fit `model` to what the base leaves, see `fit_human_model`; perception errors do not count as model error.
 
-    `episodes_per_group` consecutive episodes have the same vehicles, and are held out together.
-
-    Raises:
-        UnjamError: a loss is not finite.
+    `group_size` consecutive episodes have the same vehicles, and are held out together.
     """
     rows = HumanRows(*(np.concatenate(parts) for parts in zip(*(each.human_rows for each in samples), strict=True)))
-    rows = rows._replace(episode=rows.episode // episodes_per_group)
+    rows = rows._replace(episode=rows.episode // group_size)
     sigma = float(np.sqrt(np.mean([each.noise_variance for each in samples])))
     min_reduction = 0.0 if model.base == "none" else MIN_ERROR_REDUCTION
     return fit_human_model(model, rows, sigma, settings, seed, False, min_reduction)

@@ -1,9 +1,8 @@
 """The road model: samples of whole closed roads, and the human drivers on them as a base plus one learned ensemble.
 
 All human drivers differ from the base in the same way: one ensemble learns it from all of them. SUMO's drivers add
-noise after they have moved, so that their distance gives the intended speed, and the remaining error is the model's.
-Noise moves commanded drivers too: of it only the strength is known. The right of way is known, and steps in which it
-constrains a driver are not used for training.
+noise after they have moved, so that their distance gives the intended speed. Noise moves commanded drivers too: only its
+strength is known. Steps in which the known right of way constrains a driver are not used for training.
 """
 
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.errors import InputError
-from unjam.models.ensemble import MIN_CHANGE, Ensemble, fit_ensemble, predict, random_members
+from unjam.models.ensemble import MIN_CHANGE, Ensemble, Seed, fit_ensemble, predict, random_members
 from unjam.models.environment_data import is_holdout_episode
 from unjam.models.fitting import ModelFit, OneStepRMSE, root_mean_square, total_variation, transition_variation
 from unjam.models.row_model import BASE_DRIVERS
@@ -45,14 +44,16 @@ MAX_NOISE_STDS = 3.0
 
 
 @dataclass(frozen=True)
-class RoadSamples:
-    """All vehicles on a closed road at each step of an episode at which a residual was due.
-
-    M samples, N vehicles in the order of the road.
-    """
+class EpisodeSamples:
+    """What a model is fitted to of an environment episode with this number."""
 
     episode: int
-    """number of the episode"""
+
+
+@dataclass(frozen=True)
+class RoadSamples(EpisodeSamples):
+    """N vehicles of a closed road, in its order, at M steps at which a residual was due; arrays (M, N), SI units."""
+
     interval: int
     """control steps between samples"""
     size: int
@@ -62,15 +63,14 @@ class RoadSamples:
     is_human: Floats
     """1 for human drivers, 0 for CAVs, shape (N,)"""
     speeds: Floats
-    """[m/s], shape (M, N)"""
     positions: Floats
-    """front bumpers, not wrapped [m], shape (M, N)"""
+    """front bumpers, not wrapped"""
     intended_speeds: Floats
-    """distance divided by time in the next control step: the speed before noise [m/s], shape (M, N)"""
+    """distance divided by time in the next control step: the speed before noise"""
     next_speeds: Floats
-    """speeds after that step [m/s], shape (M, N)"""
+    """speeds after that step"""
     crossing_memory: CrossingMemory | None
-    """on a road that crosses itself: waiting times and entry steps, shape (M, N) each"""
+    """on a road that crosses itself: waiting times and entry steps"""
 
 
 def check_road_model(scenario: Scenario) -> None:
@@ -87,7 +87,7 @@ def with_size(scenario: LoopScenario, size: int) -> LoopScenario:
     return replace(scenario, **{scenario.size_parameter: (size, size)}, warmup=0)
 
 
-def _closed_road(scenario: LoopScenario, size: int) -> ClosedRoad:
+def _road_of_size(scenario: LoopScenario, size: int) -> ClosedRoad:
     return cast(ClosedRoad, with_size(scenario, size).draw_from_seed((0,))[0])
 
 
@@ -96,7 +96,7 @@ def road_samples(episode: Episode, number: int, scenario: LoopScenario) -> RoadS
     interval, size = episode.trajectories[0].action_repeat, round(episode.drawn_values[scenario.size_parameter])
     at, sampled_memory = np.arange(0, episode.control_steps, interval), None
     if episode.crossings:
-        memory = crossing_memories(scenario, _closed_road(scenario, size), episode.speeds, episode.positions)
+        memory = crossing_memories(scenario, _road_of_size(scenario, size), episode.speeds, episode.positions)
         sampled_memory = CrossingMemory(memory.waiting_time[at], memory.entry_step[at])
     return RoadSamples(
         episode=number,
@@ -113,27 +113,19 @@ def road_samples(episode: Episode, number: int, scenario: LoopScenario) -> RoadS
 
 
 class HumanRows(NamedTuple):
-    """Steps of human drivers in many episodes; R rows, each field of shape (R,)."""
+    """Steps of human drivers in many episodes; R rows, each field of shape (R,), SI units."""
 
     speed: Floats
-    """[m/s]"""
     leader_speed: Floats
-    """[m/s]"""
     gap: Floats
-    """[m]"""
     base_speed: Floats
-    """speed after the step according to the base [m/s]"""
+    """speed after the step according to the base"""
     intended_speed: Floats
-    """speed of the movement, before noise except for commanded drivers [m/s]"""
+    """speed of the movement, before noise except for commanded drivers"""
     next_speed: Floats
-    """speed after the step [m/s]"""
+    """speed after the step"""
     episode: Floats
     """number of the episode"""
-
-    @property
-    def inputs(self) -> Tensor:
-        """Inputs of the networks, shape (R, 4)."""
-        return _inputs(*self[:ROAD_MODEL_INPUTS])
 
 
 class RoadModel(Ensemble):
@@ -142,7 +134,7 @@ class RoadModel(Ensemble):
     noise: Tensor
     """standard deviation of the noise of a speed [m/s]"""
 
-    def __init__(self, settings: ModelSettings, seed: Sequence[int]) -> None:
+    def __init__(self, settings: ModelSettings, seed: Seed) -> None:
         super().__init__(settings, ROAD_MODEL_INPUTS, 1, seed)
         self.base = settings.base
         self.register_buffer("noise", torch.zeros((), dtype=torch.float64))
@@ -166,7 +158,7 @@ def base_human_model(base: str, scenario: Scenario) -> HumanSpeedModel:
 
 
 def _inputs(*columns: Array) -> Tensor:
-    """Return the inputs of the networks for vehicles of any shape, one row each."""
+    """Return the inputs of the networks, shape (R, 4), for vehicles of any shape."""
     flat = [values.ravel() for values in columns]
     return torch.from_numpy(np.stack(flat, 1)) if isinstance(flat[0], np.ndarray) else torch.stack(flat, 1)
 
@@ -198,14 +190,9 @@ def learned_human_model(model: RoadModel, scenario: Scenario, generator: torch.G
     return human_speed
 
 
-def _noise_std(scenario: Scenario) -> float:
-    """Return the standard deviation of the noise of human drivers' speeds in a step [m/s]."""
-    return scenario.noise_per_step * scenario.simulation_step
-
-
 def _has_right_of_way(samples: RoadSamples, scenario: Scenario, desired_speeds: Floats) -> NDArray[np.bool_]:
     """Return whether the right of way allows human drivers these speeds [m/s], shape (M, N)."""
-    road = _closed_road(cast(LoopScenario, scenario), samples.size)
+    road = _road_of_size(cast(LoopScenario, scenario), samples.size)
     is_human, memory = samples.is_human > 0.0, cast(CrossingMemory, samples.crossing_memory)
     desired_speeds = np.where(is_human, desired_speeds, samples.next_speeds).clip(0.0)
     cav_columns, moving = np.flatnonzero(~is_human).tolist(), (samples.speeds, samples.positions)
@@ -215,32 +202,30 @@ def _has_right_of_way(samples: RoadSamples, scenario: Scenario, desired_speeds: 
 def human_rows(samples: Sequence[RoadSamples], base: str, scenario: Scenario) -> HumanRows:
     """Return the steps of human drivers that no right of way constrains, a row each."""
     base_model, parts = base_human_model(base, scenario), []
+    max_noise = MAX_NOISE_STDS * scenario.noise_per_step * scenario.simulation_step
     for each in samples:
         gap = gap_on_loop(each.positions, np.roll(each.positions, -1, 1), each.length, VEHICLE_LENGTH)
         inputs = each.speeds, np.roll(each.speeds, -1, 1), gap
         base_speed, episode = base_model(*inputs), np.full(gap.shape, each.episode)
         is_used = np.broadcast_to(each.is_human > 0.0, gap.shape)
         if each.crossing_memory is not None:
-            is_used = is_used & _has_right_of_way(each, scenario, base_speed + MAX_NOISE_STDS * _noise_std(scenario))
+            is_used = is_used & _has_right_of_way(each, scenario, base_speed + max_noise)
         columns = (*inputs, base_speed, each.intended_speeds, each.next_speeds, episode)
         parts.append(np.stack([values[is_used] for values in columns]))
     return HumanRows(*np.concatenate(parts, 1))
 
 
 def fit_road_model(
-    model: RoadModel, samples: Sequence[RoadSamples], settings: ModelSettings, scenario: Scenario, seed: Sequence[int]
+    model: RoadModel, samples: Sequence[RoadSamples], settings: ModelSettings, scenario: Scenario, seed: Seed
 ) -> ModelFit:
-    """Fit `model` to the residual of the base of human drivers' speeds, and measure their noise, see `fit_human_model`.
-
-    Raises:
-        UnjamError: a loss is not finite.
-    """
-    rows, is_commanded = human_rows(samples, model.base, scenario), scenario.human_control == "commanded"
+    """Measure the noise of human drivers' speeds, unless they are commanded, and fit `model`, see `fit_human_model`."""
+    rows = human_rows(samples, model.base, scenario)
+    if scenario.human_control == "commanded":
+        noise = scenario.noise_per_step * scenario.simulation_step
+        return fit_human_model(model, rows, noise, settings, seed, is_noise_known=False)
     is_moving = rows.intended_speed > MIN_NOISE_SPEED
-    sigma = float((rows.next_speed - rows.intended_speed)[is_moving].std()) if is_moving.any() else 0.0
-    if is_commanded:
-        sigma = _noise_std(scenario)
-    return fit_human_model(model, rows, sigma, settings, seed, is_noise_known=not is_commanded)
+    noise = float((rows.next_speed - rows.intended_speed)[is_moving].std()) if is_moving.any() else 0.0
+    return fit_human_model(model, rows, noise, settings, seed, is_noise_known=True)
 
 
 def fit_human_model(
@@ -248,23 +233,15 @@ def fit_human_model(
     rows: HumanRows,
     sigma: float,
     settings: ModelSettings,
-    seed: Sequence[int],
+    seed: Seed,
     is_noise_known: bool,
     min_error_reduction: float = 0.0,
 ) -> ModelFit:
-    """Fit `model` further, in place, to the residual of the base of rows, see `fit_ensemble`.
+    """Fit `model` further, in place, to the residual of the base of the rows' intended speeds, see `fit_ensemble`.
 
-    The errors are those of `ModelFit` for the speed alone. If the noise of the rows is unknown, its variance is
-    subtracted from the mean squared errors.
-
-    Args:
-        model: is changed.
-        rows: steps of human drivers.
-        sigma: standard deviation of their noise [m/s].
-        settings: of the fit.
-        seed: of all random numbers.
-        is_noise_known: whether the intended speeds are without noise.
-        min_error_reduction: share by which networks must reduce the base's mean squared error to be used.
+    The errors are those of `ModelFit` for the speed alone. `sigma` is the standard deviation of the rows' noise [m/s];
+    unless the intended speeds are without noise (`is_noise_known`), its variance is subtracted from the mean squared
+    errors. Networks are used if they reduce the base's mean squared error by the share `min_error_reduction`.
     """
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     is_holdout = is_holdout_episode(rows.episode, settings.holdout)
@@ -272,7 +249,7 @@ def fit_human_model(
         is_holdout = np.arange(len(is_holdout)) >= (1.0 - settings.holdout) * len(is_holdout)
     model.noise.fill_(sigma)
     targets = torch.from_numpy((rows.intended_speed - rows.base_speed)[:, None])
-    fit = fit_ensemble(model, rows.inputs, targets, is_holdout, settings, generator)
+    fit = fit_ensemble(model, _inputs(*rows[:ROAD_MODEL_INPUTS]), targets, is_holdout, settings, generator)
     base_error, model_error = root_mean_square(fit.targets), root_mean_square(fit.targets - fit.predictions)
     is_base_enough = base_error < MIN_CHANGE or model_error**2 > (1.0 - min_error_reduction) * base_error**2
     if settings.fallback_to_base and is_base_enough:

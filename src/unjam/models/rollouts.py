@@ -1,14 +1,12 @@
 """Model rollouts of rows: how long they may be (Eq. 15), and how the full policy is driven in them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import floor, isfinite
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
+from torch import Generator, Tensor
 
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Driver, Memory
@@ -16,7 +14,8 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.residual import EXPERT_KEY, RESIDUAL_AGE_KEY, RESIDUAL_KEY, ResidualDriver
 from unjam.errors import UnjamError
 from unjam.models.dynamics import CLIPPED_QUANTITIES, Dynamics, tensor_driver, tensor_memory, to_device
-from unjam.models.environment_data import EnvironmentData, reconstruct_memory
+from unjam.models.ensemble import Seed
+from unjam.models.environment_data import EnvironmentData, StartIndices, reconstruct_memory
 from unjam.models.settings import ModelSettings
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import DriverLog, ProgressCallback
@@ -32,12 +31,9 @@ def rollout_length(eps_m: float, settings: ModelSettings) -> int:
 def return_bound(eps_pi: float, eps_m: float, k: int, gamma: float, max_reward: float) -> float:
     """Return C, the bound on model return minus environment return (paper, below Eq. 13).
 
-    Args:
-        eps_pi: total variation between the policy and the one that collected the data.
-        eps_m: total variation between the next states of model and environment.
-        k: rollout length [control steps].
-        gamma: discount per control step.
-        max_reward: R_max, the largest |reward| of a control step.
+    `eps_pi` is the total variation between the policy and the one that collected the data, `eps_m` that between next
+    states of model and environment; `k` the rollout length, `gamma` the discount and R_max the largest |reward| of
+    control steps.
     """
     horizon = 1.0 / (1.0 - gamma)
     policy_term = gamma ** (k + 1) * eps_pi * horizon**2 + gamma**k * eps_pi * horizon
@@ -53,8 +49,7 @@ class RolloutStarts(NamedTuple):
     """of the expert, as its `tensor_driver` takes it"""
     drawn_values: Tensor
     """scaled values that the episodes drew, shape (n, m)"""
-    indices: NDArray[np.int64]
-    """rows (recording, step), shape (n, 2)"""
+    indices: StartIndices
 
 
 @dataclass(frozen=True)
@@ -73,8 +68,7 @@ class RolloutBatch:
     """whether the row crashed; otherwise it was truncated, shape (n,)"""
     drawn_values: Tensor
     """scaled values that the episodes drew, shape (n, m)"""
-    start_indices: NDArray[np.int64]
-    """rows (recording, step), shape (n, 2)"""
+    start_indices: StartIndices
     control_steps: int
     """total number of valid control steps"""
     clipped_share: dict[str, float]
@@ -85,16 +79,12 @@ def draw_starts(
     data: EnvironmentData,
     rows: int,
     min_control_steps: int,
-    seed: Sequence[int],
+    seed: Seed,
     first_episode: int = 0,
     *,
     episode_starts_only: bool = False,
-) -> NDArray[np.int64]:
-    """Return random steps at which a residual was due, rows (recording, step), shape (rows, 2).
-
-    At least `min_control_steps` recorded steps follow each, in episodes from `first_episode` on; with
-    `episode_starts_only` they are first steps of recordings. Shape (0, 2) if there are none.
-    """
+) -> StartIndices:
+    """Return `rows` random `start_indices`, or none; with `episode_starts_only`, only first steps of recordings."""
     indices = data.start_indices(min_control_steps, first_episode)
     if episode_starts_only:
         indices = indices[indices[:, 1] == 0]
@@ -104,7 +94,7 @@ def draw_starts(
 
 
 def prepare_starts(
-    data: EnvironmentData, start_indices: NDArray[np.int64], expert: Driver, device: torch.device | str
+    data: EnvironmentData, start_indices: StartIndices, expert: Driver, device: torch.device | str
 ) -> RolloutStarts:
     """Return the starts of rollouts at `start_indices`, with the expert's memory there."""
     drawn = np.stack([data.recordings[index].drawn_values for index in start_indices[:, 0]])
@@ -118,22 +108,13 @@ def prepare_starts(
 
 
 class ModelWorld:
-    """The row model as a world to drive in: n rows from recorded states for a number of control steps.
-
-    Rows that have crashed are driven on, but no longer counted.
-    """
+    """n rows of the model as a world to drive in, from recorded states; after a crash a row no longer counts."""
 
     is_scalar, entered_count, remaining_rows = False, 0, None
 
     def __init__(
-        self,
-        dynamics: Dynamics,
-        starts: RolloutStarts,
-        control_steps: int,
-        limits: Limits,
-        generator: torch.Generator | None,
+        self, dynamics: Dynamics, starts: RolloutStarts, control_steps: int, limits: Limits, generator: Generator | None
     ) -> None:
-        """Place the rows at `starts`; `generator` draws the exploration noise."""
         self.limits, self.cav_count = limits, len(starts.state.speed)
         self.states = [starts.state]
         """at each step, the last being the present one"""
@@ -180,11 +161,7 @@ class ModelWorld:
         return self._episode_noise
 
     def record(self, driver_log: DriverLog) -> RolloutBatch:
-        """Return the rollouts, action by action.
-
-        Raises:
-            UnjamError: some value is not finite.
-        """
+        """Return the rollouts, action by action; `UnjamError` if some value is not finite."""
         repeat, empty = driver_log.action_repeat, self.states[0].speed.new_zeros((self.cav_count, 0))
         steps = range(0, len(self._rewards), repeat)
         actions = [driver_log.decisions[step][1] for step in steps]
@@ -212,24 +189,12 @@ class ModelWorld:
 
 @torch.no_grad()
 def roll_out(
-    driver: ResidualDriver,
-    dynamics: Dynamics,
-    starts: RolloutStarts,
-    control_steps: int,
-    generator: torch.Generator | None,
+    driver: ResidualDriver, dynamics: Dynamics, starts: RolloutStarts, control_steps: int, generator: Generator | None
 ) -> RolloutBatch:
-    """Drive the full policy, expert plus residual, in the model; the expert decides in each control step.
+    """Drive the full policy in the model for `control_steps`, rounded down to whole actions of the network.
 
-    Args:
-        driver: expert, network, and action repeat.
-        dynamics: of the rows.
-        starts: of the rollouts.
-        control_steps: k*, rounded down to whole actions of the network.
-        generator: of the exploration noise; None: no exploration.
-
-    Raises:
-        UnjamError: the model returned a value that is not finite.
-        InputError: a driver of the user did.
+    `generator` draws the exploration noise; None: no exploration. Raises `UnjamError` if the model, or `InputError`
+    if a driver of the user, returns a value that is not finite.
     """
     speed, repeat = starts.state.speed, driver.action_repeat
     driver = replace(driver, expert=tensor_driver(driver.expert, speed.device))

@@ -1,16 +1,16 @@
 """The row model: a base model of a CAV, its leader and its follower, and an ensemble for its residual; Eq. 4."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from math import nan
 
 import torch
 from torch import Tensor
 
-from unjam.drivers.car_following import _MIN_GAP, ACC, IDM, OVM
+from unjam.drivers.car_following import ACC, IDM, MIN_IDM_GAP, OVM
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
-from unjam.models.ensemble import Ensemble
+from unjam.models.ensemble import Ensemble, Seed
 from unjam.models.settings import BaseName, ModelSettings
 from unjam.physics.arrays import Array, as_column, clamp_min, namespace, stack_columns
 from unjam.physics.idm import idm_acceleration
@@ -38,10 +38,7 @@ BASE_DRIVERS: dict[str, Callable[[Scenario], Driver] | None] = {
 
 
 def model_inputs(state: LocalState, acceleration: Array, drawn_values: Array) -> Array:
-    """Return the inputs of the networks, SI units, shape (n, 6 + m).
-
-    They are `STATE_FIELDS`, the applied acceleration, and the scaled values that the episode drew.
-    """
+    """Return the inputs of the networks: `STATE_FIELDS`, acceleration and m drawn values, SI units, (n, 6 + m)."""
     xp = namespace(acceleration)
     columns = [getattr(state, name) for name in STATE_FIELDS]
     return xp.concatenate([xp.stack([*columns, acceleration], 1), drawn_values], 1)
@@ -60,17 +57,11 @@ def missing_neighbors(state: LocalState) -> tuple[Array, Array]:
 
 
 def base_step(base: str, scenario: Scenario, state: LocalState, acceleration: Array) -> LocalState:
-    """Return the state after one control step according to the base; Eq. 2 of the paper.
+    """Return the state after one control step under `acceleration` [m/s2] according to the base; Eq. 2 of the paper.
 
-    The CAV moves by its acceleration and the follower by the base's car-following model. The leader keeps its speed,
-    since its own leader is not observed. All take `scenario.steps_per_control_step` Euler steps, as in SUMO. Missing
-    neighbors stay missing. The base `none` predicts no change.
-
-    Args:
-        base: a name in `BASE_DRIVERS`.
-        scenario: its time steps and IDM parameters are used.
-        state: n rows.
-        acceleration: the command, within the action limit [m/s2], shape (n,).
+    The follower moves by the base's car-following model. The leader keeps its speed, since its own leader is not
+    observed. All take `scenario.steps_per_control_step` Euler steps, as in SUMO. Missing neighbors stay missing. The
+    base `none` predicts no change.
     """
     make_driver = BASE_DRIVERS[base]
     if make_driver is None:
@@ -96,17 +87,7 @@ def base_step(base: str, scenario: Scenario, state: LocalState, acceleration: Ar
 
 
 def base_reward(base: str, reward: Reward, next_state: LocalState, acceleration: Array, crashed: Array) -> Array:
-    """Return the part of the reward of a control step that the next state determines, shape (n,).
-
-    The mean speed of all vehicles is approximated by that of the CAV and its neighbors. It is 0 for the base `none`.
-
-    Args:
-        base: a name in `BASE_DRIVERS`.
-        reward: of the road.
-        next_state: n rows.
-        acceleration: the command [m/s2], shape (n,).
-        crashed: whether the step ended in a collision, shape (n,).
-    """
+    """Return the reward in the next state, (n,), with the mean speed of CAV and neighbors for all; 0 for `none`."""
     if BASE_DRIVERS[base] is None:
         return acceleration * 0.0
     xp = namespace(acceleration)
@@ -126,7 +107,7 @@ class TypicalDriver(Driver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return its acceleration; the memory is not used."""
-        gap = clamp_min(state.leader_gap, _MIN_GAP)
+        gap = clamp_min(state.leader_gap, MIN_IDM_GAP)
         inputs = (state.speed, state.leader_speed, gap)
         acceleration = idm_acceleration(*inputs, self.scenario.humans)
         return apply_population(self.scenario.driver_population, acceleration, *inputs), memory
@@ -141,9 +122,8 @@ class RowModel(Ensemble):
     """smallest and largest residual of the reward"""
 
     def __init__(
-        self, settings: ModelSettings, drawn_count: int, seed: Sequence[int], device: torch.device | str = "cpu"
+        self, settings: ModelSettings, drawn_count: int, seed: Seed, device: torch.device | str = "cpu"
     ) -> None:
-        """Make the model of a road whose episodes draw `drawn_count` values."""
         super().__init__(settings, len(STATE_FIELDS) + 1 + drawn_count, len(TARGET_NAMES), seed)
         self.base: BaseName = settings.base
         self.register_buffer("noise", torch.zeros((NOISE_SAMPLES, len(TARGET_NAMES))))

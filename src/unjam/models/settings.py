@@ -29,8 +29,7 @@ class ModelSettings:
     hidden: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (64, 64)
     """units of the hidden layers of each network"""
     fallback_to_base: bool = True
-    """start the networks at zero, and use the base alone for outputs that they predict worse on the holdout; the
-    paper starts them at random and always adds them"""
+    """start networks at zero, use the base where it is better on the holdout; the paper adds random ones in any case"""
     buffer_size: PositiveInt = 100_000
     """newest environment steps that are stored, rounded up to whole episodes"""
     max_fit_rows: IntAboveOne = 10_000
