@@ -9,7 +9,7 @@ EPISODE_SECONDS, ROAD_SIMULATION_STEP = 900.0, 0.5
 """length of an episode, and simulation step [s]"""
 
 
-def xml_document(root: str, elements: Sequence[str]) -> str:
+def element_document(root: str, elements: Sequence[str]) -> str:
     """Return an XML document with these elements below its root."""
     return f"<{root}>{''.join(elements)}</{root}>"
 
@@ -40,12 +40,12 @@ def write_network(
     """Write a network and its traffic with options of netconvert, and return the SUMO configuration."""
     parts = {"node": ("nod", nodes), "edge": ("edg", edges), "connection": ("con", connections)}
     inputs = {
-        (f"--{name}-files", f"road.{suffix}.xml"): xml_document(f"{name}s", elements)
+        (f"--{name}-files", f"road.{suffix}.xml"): element_document(f"{name}s", elements)
         for name, (suffix, elements) in parts.items()
         if elements
     }
     run_netconvert(inputs, ["--no-turnarounds=true", *options], folder)
-    (folder / "road.rou.xml").write_text(xml_document("routes", traffic))
+    (folder / "road.rou.xml").write_text(element_document("routes", traffic))
     return write_configuration(folder, {})
 
 
@@ -55,5 +55,5 @@ def write_configuration(folder: Path, options: Mapping[str, str]) -> Path:
     values = {**files, "end": EPISODE_SECONDS, "step-length": ROAD_SIMULATION_STEP, **options}
     path = folder / "road.sumocfg"
     lines = [xml_element(name, value=value) for name, value in values.items()]
-    path.write_text(xml_document("configuration", lines))
+    path.write_text(element_document("configuration", lines))
     return path

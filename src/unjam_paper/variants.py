@@ -87,17 +87,17 @@ FIRST_150_SECONDS = {
 }
 """found by a search on the first half of the episodes of the jammed ring; `best` was found on whole episodes"""
 EXACT_TRPO = {**NO_EXPERT, **NO_EARLY_STOPPING}
-PPO, SAC = {"agent": "ppo"}, {"agent": "sac"}
+PPO_AGENT, SAC_AGENT = {"agent": "ppo"}, {"agent": "sac"}
 VARIANTS: dict[str, Variant] = {
     "trpo": Variant("TRPO", "paper", NO_EXPERT),
-    "ppo": Variant("PPO", "paper", {**PPO, **NO_EXPERT}),
-    "sac": Variant("SAC", "paper", {**SAC, **NO_EXPERT}),
+    "ppo": Variant("PPO", "paper", {**PPO_AGENT, **NO_EXPERT}),
+    "sac": Variant("SAC", "paper", {**SAC_AGENT, **NO_EXPERT}),
     "mb-trpo": Variant("MB-TRPO", "paper", {"expert": "none", "model.base": "none"}),
     "no-initial-policy": Variant("no initial policy", "paper", {"expert": "none"}),
     "without-model": Variant("residual without model", "paper", {"model.model_ratio": 0.0}),
     "proposed": Variant("proposed", "paper", {}),
-    "proposed-ppo": Variant("proposed with PPO", "paper", PPO),
-    "proposed-sac": Variant("proposed with SAC", "paper", SAC),
+    "proposed-ppo": Variant("proposed with PPO", "paper", PPO_AGENT),
+    "proposed-sac": Variant("proposed with SAC", "paper", SAC_AGENT),
     "trpo-eq16": Variant("TRPO, Eq. 16 as meant", "paper", {**NO_EXPERT, "reward": "eq16"}),
     "trpo-as-printed": Variant("TRPO, Eq. 16 as printed", "paper", {**NO_EXPERT, "reward": "eq16-as-printed"}),
     "proposed-eq16": Variant("proposed, Eq. 16 as meant", "paper", {"reward": "eq16"}),
@@ -122,9 +122,9 @@ VARIANTS: dict[str, Variant] = {
     "rings": Variant("residual", "rings", TWO_EPISODES_PER_ROAD, None),
     "shared-rings": Variant("residual", "shared-rings", TWO_EPISODES_PER_ROAD, None),
     "rings-trpo": Variant("TRPO", "rings", FROM_SCRATCH, 1_200_000),
-    "rings-ppo": Variant("PPO", "rings", {**PPO, **FROM_SCRATCH}, 1_200_000),
+    "rings-ppo": Variant("PPO", "rings", {**PPO_AGENT, **FROM_SCRATCH}, 1_200_000),
     "all-roads": Variant("residual", "all-roads", TWO_EPISODES_PER_ROAD, None),
     "all-roads-trpo": Variant("TRPO", "all-roads", FROM_SCRATCH, MILLION_STEPS),
-    "all-roads-ppo": Variant("PPO", "all-roads", {**PPO, **FROM_SCRATCH}, MILLION_STEPS),
+    "all-roads-ppo": Variant("PPO", "all-roads", {**PPO_AGENT, **FROM_SCRATCH}, MILLION_STEPS),
 }
 """variants by name"""

@@ -23,7 +23,7 @@ from unjam.measures.feasibility import FEASIBLE, overall_feasibility
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import paired_difference
 from unjam.scenarios import FigureEight, Ring
-from unjam.training.presets import BEST_BY_SCENARIO
+from unjam.training.presets import preset_scenarios, preset_values
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -40,7 +40,7 @@ def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
 
 
 def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
-    best = {f"{scenario}-best" for scenario in BEST_BY_SCENARIO.keys() - {"merge"}}  # where nothing is drivable
+    best = {f"{scenario}-best" for scenario in {*preset_scenarios("best")} - {"merge"}}  # where nothing is drivable
     assert {name for name in packaged_names() if not name.endswith("-tuned")} == {"best", *best}
 
 
@@ -87,7 +87,7 @@ def test_the_on_ramps_adds_to_its_expert_where_a_ramp_joins_and_drives_nowhere_e
 
 @pytest.mark.slow
 def test_the_figure_eights_is_faster_than_its_expert_over_the_radii() -> None:
-    expert, trained = BEST_BY_SCENARIO["figure-eight"]["expert"], "unjam:figure-eight-best"
+    expert, trained = preset_values("best", "figure-eight")["expert"], "unjam:figure-eight-best"
     found = unjam.drive("figure-eight", [expert, trained], episodes=8, scenario_options={"radius": [32, 35]}, workers=2)
     assert paired_difference(found.rows[trained], found.rows[expert], "mean_speed").low > 0.0
 

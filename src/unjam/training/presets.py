@@ -70,13 +70,3 @@ def _family_task(name: str, scenario: Scenario) -> dict[str, Any]:
     limits = [scenario.limit_speed(size) for size in scenario.drawn_ranges[scenario.size_parameter]]
     speed = round(5.0 * len(limits) / sum(limits), 4)
     return {**task, "reward": f"released:speed={speed},acceleration={BRAKING_COST}"}
-
-
-# Names that unjam_paper still imports; it will define them itself.
-RINGS_EXPERT, SHARED_RINGS_EXPERT = "unjam:rings-tuned", "unjam:shared-rings-tuned"
-ON_RAMP_JAM_AHEAD = (
-    "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,"
-    "max_deceleration=1.106,time_constant=1.681"
-)
-MERGE_JAM_ABSORBER = "jam-absorber:gap_gain=0,extra_acceleration=0.9,speed_gain=0.8"
-BEST_BY_SCENARIO = {scenario: preset_values("best", scenario) for scenario in _packaged_presets()["best"]["on"]}
