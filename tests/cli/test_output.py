@@ -102,7 +102,8 @@ def test_a_finished_training_is_exported_if_it_gained(messages: StringIO) -> Non
         (
             ["human", "pi"],
             {"cavs": 2, "actuation": "raw"},
-            "unjam train ring --expert pi --preset demo --reward eq16 --set scenario_options.cavs=2 --set scenario_options.actuation=raw",
+            "unjam train ring --expert pi --preset demo --reward eq16 --set scenario_options.cavs=2 "
+            "--set scenario_options.actuation=raw",
         ),
         (["unjam:best", "human"], {}, "unjam watch ring -d unjam:best --video ring.gif"),
     ],
