@@ -138,7 +138,7 @@ def _write_all_roads(study_folder: StudyFolder, seeds: int, folder: Path, worker
 def _drive_missing(
     scenario: Scenario, experts: Sequence[str], results: dict[str, Any], run_episodes: EpisodeRunner
 ) -> None:
-    """Run the drivers of a road that have no results yet, or whose packaged file has changed, and add their results."""
+    """Run the drivers of a road without results, or with a changed packaged file, and add their results."""
     new = [driver for driver in experts if results["expert_files"].get(driver) != controller_digest(driver)]
     if new:
         others = experts if results["best"] in new else (results["best"], *new)

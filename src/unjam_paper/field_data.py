@@ -317,7 +317,7 @@ def _draw_seed_errors(axes: Axes, rows: Table, name: str, color: str, offset: fl
             face = "white" if row["collision_share"] else color
             axes.plot(row[name], height, marker="o", ms=4.5, color=color, mfc=face, label=label)
             label = None  # once is enough for the legend
-        beyond = [row[name] for row in found if row[name] > limit]
-        if beyond:
-            mean = f"{sum(beyond) / len(beyond):.1f} →"
+        outside = [row[name] for row in found if row[name] > limit]
+        if outside:
+            mean = f"{sum(outside) / len(outside):.1f} →"
             axes.annotate(mean, (limit, place + offset), ha="right", va="bottom", fontsize=8, color=color)

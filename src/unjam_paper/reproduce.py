@@ -110,7 +110,7 @@ def run_plan(
     """Run what is missing, `workers` trainings at once, write the studies, and return their folders.
 
     The results file NAME.json is written next to the folder of each study. A stopped study is continued: trainings from
-    their last checkpoint. With `ray` trainings run on a cluster whose machines share the folder.
+    their last checkpoint. With `ray` trainings run on a cluster with a shared folder.
 
     Raises:
         UnjamError: a training failed; the others are finished.

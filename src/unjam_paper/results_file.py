@@ -1,8 +1,9 @@
-"""Write and read the results file of a study: one JSON object with its manifest and an entry for each part.
+"""Read and write the results file of a study: one JSON object with its manifest and an entry for each part.
 
-Tables of rows with the same keys are stored column by column, `{"columns": {NAME: [VALUES]}}`; a number or a
-text that is the same in all rows is stored once, `{NAME: VALUE}`. That takes a third of the space. Pictures
-and controllers lie beside the file, as NAME-PICTURE.png and NAME-controllers.zip.
+Tables of rows with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; a number or a text that is the
+same in all rows is stored once, `{NAME: VALUE}`. This takes a third of the space. Figures and controllers are separate
+files: NAME-FIGURE.png and NAME-controllers.zip. Commands, scripts and controller names in manifests are those of the
+commit that made the results, and may have the names before version 0.1 (CONTRIBUTING.md).
 """
 
 import json

@@ -38,7 +38,7 @@ def road_model_study(road: str, prefix: str) -> Study:
 
 
 def compared_variants(prefix: str) -> tuple[str, ...]:
-    """Return the variant with the model whose name begins with `prefix`, and those without it by `STEP_MULTIPLES`."""
+    """Return the variant of a prefix with the model, and those without it by `STEP_MULTIPLES`."""
     return (f"{prefix}-road-model", *MODEL_FREE_VARIANTS.get(prefix, (f"{prefix}-few", f"{prefix}-double", "best")))
 
 

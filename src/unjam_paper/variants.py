@@ -31,7 +31,7 @@ class Variant:
     steps: int | None = STEP_BUDGET
     """None: the steps of the preset"""
     paper_variant: str = ""
-    """the variant whose numbers the paper reports, if it has another name here"""
+    """the variant with the numbers of the paper, if it has another name here"""
 
 
 def reduced_step_variants(
