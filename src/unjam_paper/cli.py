@@ -32,11 +32,9 @@ def reproduce_command(
 
     Examples:
 
-      unjam reproduce table-2 --seeds 5
-
-      unjam reproduce all --dry-run
-
-      unjam reproduce table-1 --executor ray --workers 64 --out /shared/unjam
+    - unjam reproduce table-2 --seeds 5
+    - unjam reproduce all --dry-run
+    - unjam reproduce table-1 --executor ray --workers 64 --out /shared/unjam
     """
     from unjam_paper.reproduce import make_plan, run_plan
     from unjam_paper.study import StudyFolder

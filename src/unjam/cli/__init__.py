@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 
 from unjam import __version__
 from unjam.child_processes import isolate_children
-from unjam.cli import calibrate, catalog, diagnostics, drive, results, sign, train, tune
+from unjam.cli import catalog, controllers, diagnostics, drive, train, tune
 from unjam.cli.options import with_trust_option
 from unjam.cli.runs import runs_app
 from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, invalid_value, missing_package_error
@@ -68,19 +68,19 @@ COMMANDS = {
     "drivers": catalog.drivers_command,
     "drive": drive.drive_command,
     "assess": drive.assess_command,
-    "calibrate": calibrate.calibrate_command,
+    "calibrate": tune.calibrate_command,
     "train": train.train_command,
-    "evaluate": results.evaluate_command,
-    "model": results.model_command,
+    "evaluate": controllers.evaluate_command,
+    "model": controllers.model_command,
     "fit-drivers": catalog.fit_drivers_command,
-    "report": results.report_command,
+    "report": controllers.report_command,
     "tune": tune.tune_command,
     "search": train.search_command,
-    "export": results.export_command,
-    "certify": results.certify_command,
-    "keys": sign.keys_command,
-    "sign": sign.sign_command,
-    "verify": results.verify_command,
+    "export": controllers.export_command,
+    "certify": controllers.certify_command,
+    "keys": controllers.keys_command,
+    "sign": controllers.sign_command,
+    "verify": controllers.verify_command,
     "watch": drive.watch_command,
     "bench": diagnostics.bench_command,
     "doctor": diagnostics.doctor_command,

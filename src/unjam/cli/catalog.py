@@ -28,11 +28,9 @@ def scenarios_command(
 
     Examples:
 
-      unjam scenarios
-
-      unjam scenarios ring
-
-      unjam scenarios figure-eight --picture eight.png
+    - unjam scenarios
+    - unjam scenarios ring
+    - unjam scenarios figure-eight --picture eight.png
     """
     from unjam.scenarios import SCENARIOS, example_scenario, scenario_recipe
 
@@ -109,7 +107,7 @@ def drivers_command(json: JsonOption = False) -> None:
 
     Example:
 
-      unjam drivers
+    - unjam drivers
     """
     from unjam.controller import PACKAGED_PREFIX, packaged_names
     from unjam.drivers.registry import DRIVERS
@@ -228,11 +226,9 @@ def fit_drivers_command(
 
     Examples:
 
-      unjam fit-drivers data.parquet
-
-      unjam fit-drivers trajectories.csv --format ngsim --out people.json --residual
-
-      unjam drive ring-jammed -d human -d pi --humans drivers.json
+    - unjam fit-drivers data.parquet
+    - unjam fit-drivers trajectories.csv --format ngsim --out people.json --residual
+    - unjam drive ring-jammed -d human -d pi --humans drivers.json
     """
     from unjam.following.fit_drivers import fit_drivers_from_files
     from unjam.scenarios.population import write_population

@@ -33,7 +33,7 @@ def doctor_command(json: JsonOption = False) -> None:
 
     Example:
 
-      unjam doctor
+    - unjam doctor
     """
     checks = check_health()
     missing = [check for check in checks if not check.is_ok and check.is_required]
@@ -164,9 +164,8 @@ def bench_command(
 
     Examples:
 
-      unjam bench
-
-      unjam bench --device cuda
+    - unjam bench
+    - unjam bench --device cuda
     """
     if device:
         _bench_batches(device, json)

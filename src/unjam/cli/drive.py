@@ -56,19 +56,13 @@ def drive_command(
 
     Examples:
 
-      unjam drive ring --driver human
-
-      unjam drive ring-warm --driver pi --length 230
-
-      unjam drive ring-jammed -d human -d pi -d pi:time_constant=0 --episodes 10
-
-      unjam drive ring --driver my_driver.py:gentle --json
-
-      unjam drive my.sumocfg --penetration-rate 0.1
-
-      unjam drive ring-jammed -d human -d pi --humans drivers.json
-
-      unjam drive ring -d pi -d runs/ring-001 --test-seeds --episodes 20
+    - unjam drive ring --driver human
+    - unjam drive ring-warm --driver pi --length 230
+    - unjam drive ring-jammed -d human -d pi -d pi:time_constant=0 --episodes 10
+    - unjam drive ring --driver my_driver.py:gentle --json
+    - unjam drive my.sumocfg --penetration-rate 0.1
+    - unjam drive ring-jammed -d human -d pi --humans drivers.json
+    - unjam drive ring -d pi -d runs/ring-001 --test-seeds --episodes 20
     """
     from unjam.controller import DEFAULT_DRIVER
     from unjam.measures.effect import effects_by_driver
@@ -121,9 +115,8 @@ def watch_command(
 
     Examples:
 
-      unjam watch ring --driver pi
-
-      unjam watch ring-jammed --driver runs/ring-001 --video wave.mp4
+    - unjam watch ring --driver pi
+    - unjam watch ring-jammed --driver runs/ring-001 --video wave.mp4
     """
     from unjam.controller import make_driver
     from unjam.controller.domain import controller_notes
@@ -213,11 +206,9 @@ def assess_command(
 
     Examples:
 
-      unjam assess my.sumocfg
-
-      unjam assess my.sumocfg --penetration-rates 0.05,0.2 -d acc -d pi --minutes 30
-
-      unjam assess my.sumocfg -d runs/my-001 --penetration-rates 0.1 --begin 28800 --end 32400 --json
+    - unjam assess my.sumocfg
+    - unjam assess my.sumocfg --penetration-rates 0.05,0.2 -d acc -d pi --minutes 30
+    - unjam assess my.sumocfg -d runs/my-001 --penetration-rates 0.1 --begin 28800 --end 32400 --json
     """
     from unjam.training.assess import DEFAULT_CONTROLLERS, assess, make_request
     from unjam.training.run_folder import lock_new_folder

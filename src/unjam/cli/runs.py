@@ -31,15 +31,11 @@ def list_runs_command(
 
     Examples:
 
-      unjam runs
-
-      unjam runs --folder studies --scenario ring --json
-
-      unjam runs compare ring-001 ring-002
-
-      unjam runs progress ring-001 > progress.csv
-
-      unjam runs remove ring-001
+    - unjam runs
+    - unjam runs --folder studies --scenario ring --json
+    - unjam runs compare ring-001 ring-002
+    - unjam runs progress ring-001 > progress.csv
+    - unjam runs remove ring-001
     """
     if context.invoked_subcommand is not None:
         if folder != DEFAULT_RUNS_FOLDER or scenario or json:
@@ -80,7 +76,7 @@ def compare_command(
 
     Example:
 
-      unjam runs compare ring-001 ring-002
+    - unjam runs compare ring-001 ring-002
     """
     from unjam.training.runs import config_differences
 
@@ -115,7 +111,7 @@ def progress_command(
 
     Example:
 
-      unjam runs progress ring-001 > progress.csv
+    - unjam runs progress ring-001 > progress.csv
     """
     import pandas as pd
 
@@ -141,7 +137,7 @@ def remove_command(
 
     Example:
 
-      unjam runs remove ring-001 ring-002 --yes
+    - unjam runs remove ring-001 ring-002 --yes
     """
     from unjam.training.runs import remove_run
 

@@ -44,21 +44,14 @@ def train_command(
 
     Examples:
 
-      unjam train ring --preset demo
-
-      unjam train ring --agent sac --steps 120000
-
-      unjam train --config mixture.toml              (several roads together: its tables of tasks)
-
-      unjam train ring-jammed --expert follower-stopper --steps 500000 --seed 3
-
-      unjam train ring --expert my_driver.py:gentle --reward my_reward.py:calm
-
-      unjam train ring --expert runs/ring-001        (a trained controller as the expert)
-
-      unjam train ring --humans drivers.json --set model.base=population
-
-      unjam train --resume runs/ring-001 --steps 2000000
+    - unjam train ring --preset demo
+    - unjam train ring --agent sac --steps 120000
+    - unjam train --config mixture.toml              (several roads together: its tables of tasks)
+    - unjam train ring-jammed --expert follower-stopper --steps 500000 --seed 3
+    - unjam train ring --expert my_driver.py:gentle --reward my_reward.py:calm
+    - unjam train ring --expert runs/ring-001        (a trained controller as the expert)
+    - unjam train ring --humans drivers.json --set model.base=population
+    - unjam train --resume runs/ring-001 --steps 2000000
     """
     from unjam.training.config import load_config
     from unjam.training.run_folder import check_config, read_config
@@ -194,11 +187,9 @@ def search_command(
 
     Examples:
 
-      unjam search ring --steps 60000 --vary trpo.target_kl=0.003..0.1:log --vary policy.action_duration=0.1..2.0
-
-      unjam search merge --agent ppo --vary expert=acc,bcm,lacc --trials 30 --workers 8 --out runs/search
-
-      unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/search
+    - unjam search ring --steps 60000 --vary trpo.target_kl=0.003..0.1:log --vary policy.action_duration=0.1..2.0
+    - unjam search merge --agent ppo --vary expert=acc,bcm,lacc --trials 30 --workers 8 --out runs/search
+    - unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/search
     """
     from unjam.training.config import load_config
     from unjam.training.search import BEST_CONFIG_FILE, check_search_space, describe_trial, search

@@ -169,8 +169,8 @@ def _driver_notes(result: Results, label: str) -> list[str]:
     ratio = metric_estimate(rows, "speed_limit_ratio_steady").mean
     if ratio > MAX_LIMIT_RATIO:
         notes.append(
-            f"With {label} the mean speed is {100 * ratio:.0f}\u00a0% of the limit, which is the equilibrium speed of human "
-            "drivers: the CAV keeps a smaller gap than they would."
+            f"With {label} the mean speed is {100 * ratio:.0f}\u00a0% of the limit, which is the equilibrium speed of "
+            "human drivers: the CAV keeps a smaller gap than they would."
         )
     share = metric_estimate(rows, "shield_override_share").mean
     if share > 0.01:

@@ -1,6 +1,7 @@
-"""Trained controllers: `unjam evaluate`, `model`, `report`, `export`, `certify` and `verify`."""
+"""Controllers: `unjam evaluate`, `model`, `report`, `export`, `certify`, `verify`, `keys` and `sign`."""
 
 import logging
+import os
 import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,11 +30,9 @@ def evaluate_command(
 
     Examples:
 
-      unjam evaluate runs/ring-001
-
-      unjam evaluate runs/ring-001 --episodes 50 --json
-
-      unjam evaluate runs/ring-001 --humans drivers.json --out runs/other-drivers
+    - unjam evaluate runs/ring-001
+    - unjam evaluate runs/ring-001 --episodes 50 --json
+    - unjam evaluate runs/ring-001 --humans drivers.json --out runs/other-drivers
     """
     from unjam.drivers.registry import DRIVERS
     from unjam.reports.results import read_results
@@ -85,9 +84,8 @@ def model_command(
 
     Examples:
 
-      unjam model runs/ring-001
-
-      unjam model runs/ring-001 --json
+    - unjam model runs/ring-001
+    - unjam model runs/ring-001 --json
     """
     from matplotlib import get_cachedir
 
@@ -134,9 +132,8 @@ def report_command(
 
     Examples:
 
-      unjam report runs/ring-001
-
-      unjam report runs/ring-001 runs/ring-002 --out compared.html
+    - unjam report runs/ring-001
+    - unjam report runs/ring-001 runs/ring-002 --out compared.html
     """
     from matplotlib import get_cachedir
 
@@ -181,11 +178,9 @@ def export_command(
 
     Examples:
 
-      unjam export runs/ring-001 --out ring.unjam
-
-      unjam export runs/ring-001 --out ring.unjam --onnx
-
-      unjam export pi:window=30 --scenario merge --out pi.unjam
+    - unjam export runs/ring-001 --out ring.unjam
+    - unjam export runs/ring-001 --out ring.unjam --onnx
+    - unjam export pi:window=30 --scenario merge --out pi.unjam
     """
     from unjam.training.export import export_controller
 
@@ -219,7 +214,7 @@ def certify_command(
 
     Example:
 
-      unjam certify ring.unjam
+    - unjam certify ring.unjam
     """
     from unjam.controller.certificate import make_certificate
     from unjam.controller.file import add_certificate, check_unsigned, controller_file, read_controller
@@ -262,11 +257,9 @@ def verify_command(
 
     Examples:
 
-      unjam verify ring.unjam
-
-      unjam verify ring.unjam --signer maker.pub     (signed with this key, or exit code 2)
-
-      unjam verify runs/mine --trust-code            (its expert is a Python file that you trust)
+    - unjam verify ring.unjam
+    - unjam verify ring.unjam --signer maker.pub     (signed with this key, or exit code 2)
+    - unjam verify runs/mine --trust-code            (its expert is a Python file that you trust)
     """
     from rich.markup import escape
 
@@ -286,3 +279,60 @@ def verify_command(
             status = f"[{colors[check.status]}]{check.status}[/]"
             console.print(f"{status} {check.part}: {escape(check.detail)}", markup=True)
     require_complete(checks)
+
+
+def keys_command(
+    name: Annotated[Path, typer.Argument(help="Path of both files without their suffix.")], json: JsonOption = False
+) -> None:
+    """Make a key pair to sign controllers with: NAME.key, which you keep secret, and NAME.pub for others.
+
+    Existing files are never overwritten. Anyone with NAME.key can sign in your name: it has no password, and only
+    you can read it.
+
+    Example:
+
+    - unjam keys maker
+    """
+    from unjam.controller.signature import make_keys
+
+    keys = make_keys(name)
+    if json:
+        print_json({"private": str(keys.private), "public": str(keys.public), "fingerprint": keys.fingerprint})
+        return
+    console.print(f"{keys.private}: keep it secret", soft_wrap=True)
+    console.print(f"{keys.public}: for verification by others; fingerprint {keys.fingerprint}", soft_wrap=True)
+
+
+def sign_command(
+    file: Annotated[Path, typer.Argument(help="A .unjam file; the signature is added to it.")],
+    key: Annotated[Path, typer.Option(help="Private key (.key) of `unjam keys`.")],
+    overwrite: Annotated[bool, typer.Option("--replace", help="Replace the signature of another key.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Sign a controller, so that others can verify its maker, and that nothing in it has changed since.
+
+    The signature becomes a part of the file, which every reader checks. Sign last: a signed file cannot be
+    certified.
+
+    Examples:
+
+    - unjam sign ring.unjam --key maker.key
+    - unjam verify ring.unjam --signer maker.pub
+    """
+    from unjam.controller.file import add_signature, read_controller
+    from unjam.controller.signature import fingerprint_of, read_private_key
+
+    if os.path.isdir(file):
+        raise invalid_value("file", str(file), "a .unjam file")
+    private, controller = read_private_key(key), read_controller(file)
+    fingerprint, previous = fingerprint_of(private.public_key()), controller.signed_by
+    if previous not in (None, fingerprint) and not overwrite:
+        allowed = f"a file without the signature of another key (it is signed by {previous}); or --replace"
+        raise invalid_value("file", str(file), allowed)
+    add_signature(file, controller, private)
+    if json:
+        print_json({"file": str(file), "fingerprint": fingerprint, "previous_fingerprint": previous})
+        return
+    console.print(f"{file}: signed by {fingerprint}", soft_wrap=True)
+    if os.name == "posix" and key.stat().st_mode & 0o077:
+        err_console.print(f"note: other users of this machine can read {key}: chmod 600", soft_wrap=True)
