@@ -217,7 +217,7 @@ UNSAFE_BUT = {
     "unjam_paper/assess_examples.py: (folder / 'road.rou.xml').write_text('\\n'.join(lines))": PRIVATE,
     "unjam_paper/assess_examples.py: shutil.copy(network_file(road.network), folder / 'road.net.xml')": PRIVATE,
     "sumo_files/reader_program.py: open(copy, 'w', encoding='utf-8')": PRIVATE,
-    "reports/video.py: imageio_ffmpeg.write_frames(str(film), (FRAME_SIZE, FRAME_SIZE), fps=rate, "
+    "reports/video.py: imageio_ffmpeg.write_frames(str(video), (FRAME_SIZE, FRAME_SIZE), fps=rate, "
     "ffmpeg_log_level='error')": PRIVATE,
     "training/tensorboard.py: SummaryWriter(str(place), filename_suffix=f'.{secrets.token_hex(8)}')": (
         "nobody can guess the name of its file, and its folder was made without following links"
@@ -231,7 +231,7 @@ UNSAFE_BUT = {
     "reports/figures.py: figure.savefig(content, format='svg', dpi=DPI, metadata={'Date': None})": BUFFER,
     "reports/figures.py: figure.savefig(content, format='png', dpi=dpi)": BUFFER,
     "reports/figures.py: opaque.quantize(256, Image.Quantize.MAXCOVERAGE).save(content, 'PNG')": BUFFER,
-    "reports/video.py: next(frames).save(film, kind, save_all=True, append_images=frames, "
+    "reports/video.py: next(frames).save(content, kind, save_all=True, append_images=frames, "
     "duration=durations, loop=0)": BUFFER,
 }
 """calls that change no file that a stranger's link could stand for, and why not"""
@@ -331,7 +331,7 @@ CHANGES_THE_PROCESS = {
     "worlds/worker": "in a worker",
     "worlds/sumo/sandboxed": "in a process that runs SUMO",
     "cli/__init__": "in the command line",
-    "cli/results": "in the command line",
+    "cli/controllers": "in the command line",
 }
 """modules that make such calls, and when"""
 
