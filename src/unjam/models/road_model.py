@@ -1,8 +1,8 @@
 """The road model: samples of whole closed roads, and the human drivers on them as a base plus one learned ensemble.
 
 All human drivers differ from the base in the same way: one ensemble learns it from all of them. SUMO's drivers add
-noise after they have moved, so that their distance gives the intended speed. Noise moves commanded drivers too: only its
-strength is known. Steps in which the known right of way constrains a driver are not used for training.
+noise after they have moved, so that their distance gives the intended speed. Noise moves commanded drivers too: only
+its strength is known. Steps in which the known right of way constrains a driver are not used for training.
 """
 
 from collections.abc import Sequence
