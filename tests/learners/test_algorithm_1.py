@@ -24,7 +24,7 @@ every_learner = pytest.mark.parametrize("agent", AGENT_NAMES)
 
 
 @every_learner
-def test_the_same_seed_gives_the_same_parameters_to_the_last_bit(agent: str) -> None:
+def test_same_seed_gives_bit_identical_parameters(agent: str) -> None:
     one, other = (Toy(agent=agent).learn(3) for _ in range(2))
     assert same(one.parameters(), other.parameters())
     assert [entry.log for entry in one.iterations] == [entry.log for entry in other.iterations]
@@ -32,7 +32,7 @@ def test_the_same_seed_gives_the_same_parameters_to_the_last_bit(agent: str) -> 
 
 
 @every_learner
-def test_what_others_draw_in_between_changes_nothing(agent: str) -> None:
+def test_other_random_numbers_do_not_change_training(agent: str) -> None:
     task, disturbed = Toy(agent=agent), Toy(agent=agent)
     for iterations in (1, 2, 3):
         task.learn(iterations)
@@ -44,7 +44,7 @@ def test_what_others_draw_in_between_changes_nothing(agent: str) -> None:
 
 @every_learner
 @pytest.mark.parametrize("hold", [1, 5])
-def test_counts_decisions_and_not_looks(agent: str, hold: int) -> None:
+def test_environment_steps_count_control_steps_and_not_actions(agent: str, hold: int) -> None:
     task = Toy(agent=agent, hold=hold, episodes=3)
     task.run(2 * 3 * DECISIONS)
     assert [entry.environment_steps for entry in task.iterations] == [300, 600]
@@ -52,7 +52,7 @@ def test_counts_decisions_and_not_looks(agent: str, hold: int) -> None:
 
 
 @every_learner
-def test_ends_with_the_first_iteration_that_reaches_the_budget(agent: str) -> None:
+def test_training_ends_with_the_iteration_that_reaches_the_budget(agent: str) -> None:
     task = Toy(agent=agent, episodes=3)
     task.run(301)
     assert task.training.environment_steps == 600
@@ -63,7 +63,7 @@ def test_ends_with_the_first_iteration_that_reaches_the_budget(agent: str) -> No
 
 
 @every_learner
-def test_each_iteration_is_driven_by_what_the_one_before_learned(agent: str) -> None:
+def test_each_iteration_drives_the_newest_policy(agent: str) -> None:
     task = Toy(agent=agent).learn(2)
     rows = np.random.default_rng(0).uniform(size=(5, INPUTS))
     found = [network(rows) for network in (*task.networks, task.learner.network())]
@@ -73,7 +73,7 @@ def test_each_iteration_is_driven_by_what_the_one_before_learned(agent: str) -> 
 
 
 @every_learner
-def test_an_iteration_tells_what_progress_needs(agent: str) -> None:
+def test_iteration_has_the_values_of_progress(agent: str) -> None:
     (iteration,) = Toy(agent=agent).learn(1).iterations
     assert iteration.log
     assert all(type(value) is float and np.isfinite(value) for value in iteration.log.values())
@@ -85,7 +85,7 @@ def test_an_iteration_tells_what_progress_needs(agent: str) -> None:
 
 @every_learner
 @pytest.mark.parametrize("sees_road", [True, False])
-def test_only_the_critic_sees_the_road_that_was_drawn(agent: str, sees_road: bool) -> None:
+def test_only_the_critic_gets_the_drawn_values(agent: str, sees_road: bool) -> None:
     policy = PolicySettings(hidden=(8,), privileged_critic=sees_road)
     task = Toy(policy, agent=agent, episodes=2)
     rows = environment_experience(task.training, task.collect(task.learner.network(), 1))
@@ -96,7 +96,7 @@ def test_only_the_critic_sees_the_road_that_was_drawn(agent: str, sees_road: boo
     assert task.learner.network().input_size == INPUTS
 
 
-def test_what_is_earned_afterwards_is_discounted_look_by_look_to_the_last_one() -> None:
+def test_return_after_exit_is_discounted_by_action_to_the_last_one() -> None:
     reward = np.arange(1.0, 12.0)
     task = Toy(hold=2)
     (episode,) = task.collect(task.learner.network(), 1)[0][:1]
@@ -115,7 +115,7 @@ def test_what_is_earned_afterwards_is_discounted_look_by_look_to_the_last_one() 
     assert (alone.terminated.tolist(), more.terminated.tolist()) == ([False], [True])
 
 
-def test_each_iteration_of_each_run_draws_its_own_numbers() -> None:
+def test_each_iteration_of_each_run_has_its_own_random_numbers() -> None:
     drawn = {}
     for run, iteration in [(0, 1), (0, 2), (1, 1), (1, 2)]:
         seed_iteration(run, iteration)
@@ -130,7 +130,7 @@ def test_each_iteration_of_each_run_draws_its_own_numbers() -> None:
 
 @every_learner
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
-def test_a_reward_that_is_not_finite_is_named_before_anything_is_learned(agent: str) -> None:
+def test_non_finite_reward_is_named_before_the_update(agent: str) -> None:
     task = Toy(agent=agent, target=lambda observations: np.full(len(observations), 1e200))
     before = task.parameters()
     with pytest.raises(UnjamError, match="learner: rewards of iteration 1 are not finite"):
@@ -140,7 +140,7 @@ def test_a_reward_that_is_not_finite_is_named_before_anything_is_learned(agent: 
 
 
 @every_learner
-def test_a_parameter_that_is_not_finite_is_named_in_the_same_iteration(agent: str) -> None:
+def test_non_finite_parameter_is_named_in_the_same_iteration(agent: str) -> None:
     task = Toy(agent=agent)
     critic = (p for name, p in task.learner.sb3.policy.named_parameters() if "value" in name or "critic" in name)
     with torch.no_grad():
@@ -152,7 +152,7 @@ def test_a_parameter_that_is_not_finite_is_named_in_the_same_iteration(agent: st
 
 
 @pytest.mark.parametrize("agent", ["trpo", "ppo"])
-def test_exploration_that_has_ended_is_told_in_one_line(agent: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vanished_exploration_raises_error(agent: str, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Toy(agent=agent)
     spread = dict(task.learner.sb3.policy.named_parameters())["log_std"]
     monkeypatch.setattr(task.learner, "learn", lambda update: spread.data.fill_(-200.0))
@@ -192,7 +192,7 @@ TO_LEARN: dict[str, LearnerSettings] = {
 @pytest.mark.parametrize(
     "agent", [pytest.param(name, marks=pytest.mark.slow) if name == "ppo" else name for name in AGENT_NAMES]
 )
-def test_learns_to_be_at_the_target(agent: str, target: Target, hold: int) -> None:
+def test_learner_reaches_the_target(agent: str, target: Target, hold: int) -> None:
     policy = PolicySettings(hidden=(16,), exploration_std=0.2)
     episodes = 8 if hold == 1 else 20
     task = Toy(policy, TO_LEARN[agent], agent, target=target, hold=hold, episodes=episodes)

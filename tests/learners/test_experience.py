@@ -108,7 +108,7 @@ def advantages_written_out(
     gamma=st.floats(0.5, 0.999),
     gae_lambda=st.floats(0.0, 1.0),
 )
-def test_advantages_and_returns_are_those_of_each_trajectory_alone(
+def test_advantages_and_returns_are_computed_per_trajectory(
     shapes: list[tuple[int, bool]], hold: int, gamma: float, gae_lambda: float
 ) -> None:
     policy = random_policy()
@@ -123,7 +123,7 @@ def test_advantages_and_returns_are_those_of_each_trajectory_alone(
     np.testing.assert_allclose(buffer.returns[:, 0], returns, rtol=1e-4, atol=1e-4)
 
 
-def test_only_a_trajectory_that_was_cut_is_worth_something_after_its_end() -> None:
+def test_only_truncated_trajectories_are_bootstrapped() -> None:
     policy = random_policy()
     cut, ended = make_trajectory(0, 6), make_trajectory(0, 6, terminated=True)
     last = {
@@ -136,7 +136,7 @@ def test_only_a_trajectory_that_was_cut_is_worth_something_after_its_end() -> No
     assert last["ended"] == pytest.approx(looks_written_out(ended)[-1], rel=1e-5)
 
 
-def test_a_trajectory_does_not_change_its_neighbours() -> None:
+def test_trajectories_do_not_influence_each_other() -> None:
     policy = random_policy()
     first, second = make_trajectory(0, 7), make_trajectory(1, 5)
     both = fill(policy, [first, second]).advantages[:, 0]
@@ -149,7 +149,7 @@ def test_episodes_start_where_trajectories_start() -> None:
     assert buffer.episode_starts[:, 0].tolist() == [1, 0, 0, 0, 1, 1, 0, 0]
 
 
-def test_rows_are_the_looks_in_order() -> None:
+def test_rows_are_actions_in_order() -> None:
     first, second = make_trajectory(0, 7, hold=3), make_trajectory(1, 4, hold=3)
     buffer = fill(random_policy(), [first, second])
     observations = np.concatenate([first.observations[:3], second.observations[:2]])
@@ -158,7 +158,7 @@ def test_rows_are_the_looks_in_order() -> None:
     np.testing.assert_array_equal(buffer.actions[:, 0, 0], np.array(chosen, np.float32))
 
 
-def test_what_is_earned_while_a_residual_is_held_is_summed() -> None:
+def test_rewards_of_a_held_residual_are_summed() -> None:
     trajectory = make_trajectory(0, 8, hold=3, terminated=True)
     buffer = fill(random_policy(), [trajectory])
     np.testing.assert_allclose(buffer.rewards[:, 0], looks_written_out(trajectory), rtol=1e-6)
@@ -166,13 +166,13 @@ def test_what_is_earned_while_a_residual_is_held_is_summed() -> None:
     assert buffer.rewards.sum() == pytest.approx(trajectory.reward.sum(), rel=1e-6)
 
 
-def test_what_the_critic_alone_sees_follows_its_trajectory() -> None:
+def test_critic_inputs_follow_their_trajectory() -> None:
     trajectories = [make_trajectory(0, 3), make_trajectory(1, 2)]
     buffer = fill(random_policy(critic_inputs=1), trajectories, [(-1.0,), (0.5,)])
     assert buffer.observations[:, 0, INPUTS].tolist() == [-1.0, -1.0, -1.0, 0.5, 0.5]
 
 
-def test_the_value_after_the_end_is_that_of_the_trajectorys_own_road() -> None:
+def test_bootstrap_value_uses_the_critic_inputs_of_the_trajectory() -> None:
     policy = random_policy(critic_inputs=1)
     trajectory = make_trajectory(0, 5)
     buffer = fill(policy, [trajectory], [(0.7,)], gae_lambda=1.0)
@@ -180,7 +180,7 @@ def test_the_value_after_the_end_is_that_of_the_trajectorys_own_road() -> None:
     assert buffer.returns[-1, 0] == pytest.approx(expected, rel=1e-5)
 
 
-def test_parts_that_are_joined_are_the_rows_of_all_their_trajectories() -> None:
+def test_joined_experience_has_the_rows_of_all_parts() -> None:
     trajectories = [make_trajectory(seed, 3 + seed, hold=2, terminated=seed == 1) for seed in range(4)]
     extra = [(float(seed),) for seed in range(4)]
     parts = [make_experience(trajectories[:1], extra[:1]), make_experience(trajectories[1:], extra[1:])]
@@ -190,7 +190,7 @@ def test_parts_that_are_joined_are_the_rows_of_all_their_trajectories() -> None:
         assert getattr(joined, field.name).dtype == getattr(expected, field.name).dtype
 
 
-def test_after_each_row_comes_the_next_of_its_trajectory_or_where_that_ended() -> None:
+def test_next_observations_stay_within_their_trajectory() -> None:
     trajectories = [make_trajectory(0, 5, hold=2), make_trajectory(1, 1), make_trajectory(2, 3)]
     rows = make_experience(trajectories, [()] * 3)
     expected = np.concatenate([trajectory.observations[1:] for trajectory in trajectories])
@@ -198,7 +198,7 @@ def test_after_each_row_comes_the_next_of_its_trajectory_or_where_that_ended() -
     assert rows.last_rows.tolist() == [2, 3, 6]
 
 
-def test_refuses_another_number_of_trajectories_than_of_their_roads() -> None:
+def test_number_of_critic_inputs_must_match_trajectories() -> None:
     with pytest.raises(ValueError, match="shorter"):
         fill(random_policy(critic_inputs=1), [make_trajectory(0, 3), make_trajectory(1, 3)], [(0.0,)])
 
@@ -215,7 +215,7 @@ def test_the_ratio_before_the_first_update_is_exactly_one() -> None:
     assert (torch.exp(log_probs - before) == 1.0).all()
 
 
-def test_the_ratio_is_one_in_the_shuffled_order_of_the_update_too() -> None:
+def test_the_ratio_is_one_in_the_shuffled_order_of_the_update() -> None:
     policy = random_policy()
     buffer = fill(policy, [make_trajectory(seed, 997, hold=3) for seed in range(3)])
     (rows,) = buffer.get(batch_size=None)
@@ -226,7 +226,7 @@ def test_the_ratio_is_one_in_the_shuffled_order_of_the_update_too() -> None:
     assert not torch.equal(rows.old_log_prob, torch.as_tensor(buffer.log_probs[:, 0]))
 
 
-def test_a_buffer_takes_the_size_of_each_iteration() -> None:
+def test_rollout_buffer_is_resized_for_each_iteration() -> None:
     policy = random_policy()
     buffer = fill(policy, [make_trajectory(0, 50)])
     fill_rollout_buffer(buffer, policy, make_experience([make_trajectory(1, 20)], [()]))
@@ -242,7 +242,7 @@ def test_a_buffer_takes_the_size_of_each_iteration() -> None:
     hold=st.integers(1, 4),
     gamma=st.floats(0.1, 0.99),
 )
-def test_discounted_returns_are_the_sums_written_out(shapes: list[tuple[int, bool]], hold: int, gamma: float) -> None:
+def test_discounted_returns_equal_explicit_sums(shapes: list[tuple[int, bool]], hold: int, gamma: float) -> None:
     trajectories = [
         make_trajectory(seed, decisions, hold, terminated) for seed, (decisions, terminated) in enumerate(shapes)
     ]
@@ -261,7 +261,7 @@ def test_discounted_returns_are_the_sums_written_out(shapes: list[tuple[int, boo
     )
 
 
-def test_a_cut_trajectory_that_always_earns_the_same_is_worth_the_same_everywhere() -> None:
+def test_truncated_trajectory_with_constant_reward_has_constant_returns() -> None:
     trajectory = make_trajectory(0, 30)
     trajectory.reward_terms["one"][:], trajectory.reward_terms["other"][:] = 1.5, 0.5
     np.testing.assert_allclose(discounted_returns(make_experience([trajectory], [()]), 0.95), 2.0 / 0.05)
@@ -272,7 +272,7 @@ def replay_buffer(size: int) -> ReplayBuffer:
     return ReplayBuffer(size, *spaces, device="cpu", handle_timeout_termination=False)
 
 
-def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> None:
+def test_replay_buffer_equals_that_of_sb3_row_by_row() -> None:
     ours, theirs = replay_buffer(20), replay_buffer(20)
     for iteration in range(4):
         trajectories = [
@@ -294,7 +294,7 @@ def test_the_replay_buffer_holds_what_sb3_would_have_put_there_row_by_row() -> N
     assert ours.full
 
 
-def test_more_rows_than_a_replay_buffer_takes_leave_the_newest() -> None:
+def test_full_replay_buffer_has_the_newest_rows() -> None:
     buffer = replay_buffer(5)
     rows = make_experience([make_trajectory(0, 13)], [(0.0,)])
     add_to_replay_buffer(buffer, rows, 2.0, rows.rewards)
@@ -307,7 +307,7 @@ def test_more_rows_than_a_replay_buffer_takes_leave_the_newest() -> None:
     offset=st.floats(-20.0, 20.0),
     after=st.floats(-50.0, 50.0),
 )
-def test_shifted_rewards_shift_all_that_follows_by_the_same(
+def test_shifted_rewards_shift_all_values_equally(
     shapes: list[tuple[int, bool]], gamma: float, offset: float, after: float
 ) -> None:
     rows = make_experience(

@@ -34,7 +34,7 @@ WRAPPED = SACSettings(
     ],
 )
 @pytest.mark.parametrize("before", [1, 3])
-def test_a_restored_learner_goes_on_to_the_last_bit(
+def test_restored_learner_continues_bit_identically(
     agent: str, settings: LearnerSettings, learned: bool, before: int
 ) -> None:
     policy = PolicySettings(hidden=(8, 8), learn_exploration_std=learned)
@@ -59,7 +59,7 @@ def test_a_restored_learner_goes_on_to_the_last_bit(
 
 
 @every_learner
-def test_a_restored_learner_has_the_state_that_was_kept(agent: str) -> None:
+def test_restored_learner_has_the_stored_state(agent: str) -> None:
     kept = Toy(agent=agent).learn(2).training.state()
     other = Toy(agent=agent, seed=5)
     assert not same(other.parameters(), kept[1])
@@ -70,7 +70,7 @@ def test_a_restored_learner_has_the_state_that_was_kept(agent: str) -> None:
     assert same(tensors, kept[1])
 
 
-def test_the_state_holds_the_momenta_of_the_critic() -> None:
+def test_state_includes_the_momenta_of_the_critic() -> None:
     _, tensors = Toy().learn(1).training.state()
     momenta = [tensor for name, tensor in tensors.items() if name.endswith("/exp_avg")]
     assert len(momenta) == 4  # weight and bias of one hidden layer and of the head
@@ -78,7 +78,7 @@ def test_the_state_holds_the_momenta_of_the_critic() -> None:
 
 
 @pytest.mark.parametrize("learned", [True, False])
-def test_the_state_of_sac_holds_all_that_it_learns_from(learned: bool) -> None:
+def test_state_of_sac_includes_all_that_it_learns_from(learned: bool) -> None:
     settings = SACSettings(learning_starts=0, gradient_steps_per_step=0.01, batch_size=16, learn_temperature=learned)
     _, tensors = Toy(settings=settings, agent="sac").learn(1).training.state()
     parts = {name.partition("/")[0] for name in tensors}
@@ -88,13 +88,13 @@ def test_the_state_of_sac_holds_all_that_it_learns_from(learned: bool) -> None:
     assert len(tensors["replay/rewards"]) == 800  # and not the 200,000 that there is room for
 
 
-def test_a_full_replay_buffer_is_kept_whole() -> None:
+def test_full_replay_buffer_is_stored_completely() -> None:
     _, tensors = Toy(settings=WRAPPED, agent="sac").learn(2).training.state()
     assert len(tensors["replay/rewards"]) == 900
 
 
 @every_learner
-def test_a_kept_state_does_not_change_when_the_learner_goes_on(agent: str) -> None:
+def test_stored_state_does_not_change_with_further_learning(agent: str) -> None:
     task = Toy(agent=agent).learn(1)
     _, tensors = task.training.state()
     before = {name: tensor.clone() for name, tensor in tensors.items()}
@@ -104,7 +104,7 @@ def test_a_kept_state_does_not_change_when_the_learner_goes_on(agent: str) -> No
 
 
 @every_learner
-def test_a_learner_that_goes_on_does_not_change_the_state_it_came_from(agent: str) -> None:
+def test_restored_learner_does_not_change_its_source_state(agent: str) -> None:
     counters, tensors = Toy(agent=agent).learn(1).training.state()
     before = {name: tensor.clone() for name, tensor in tensors.items()}
     task = Toy(agent=agent)
@@ -131,7 +131,7 @@ def of(mean: float, std: float) -> Normal:
 
 @pytest.mark.long
 @given(means, stds, means, stds)
-def test_is_half_the_integral_of_the_difference_of_the_densities(m: float, s: float, n: float, t: float) -> None:
+def test_policy_distance_is_half_the_integral_of_the_density_difference(m: float, s: float, n: float, t: float) -> None:
     def difference(x: float) -> float:
         return float(abs(norm.pdf(x, m, s) - norm.pdf(x, n, t)))
 
@@ -142,12 +142,12 @@ def test_is_half_the_integral_of_the_difference_of_the_densities(m: float, s: fl
 
 
 @given(means, stds)
-def test_is_zero_for_the_same_policy_and_one_for_policies_far_apart(mean: float, std: float) -> None:
+def test_policy_distance_is_zero_for_equal_and_one_for_distant_policies(mean: float, std: float) -> None:
     assert float(policy_distance(of(mean, std), of(mean, std))) == 0.0
     assert float(policy_distance(of(mean, std), of(mean + 100 * std, std))) > 0.999
 
 
 @given(means, stds, means, stds)
-def test_is_the_same_both_ways(m: float, s: float, n: float, t: float) -> None:
+def test_policy_distance_is_symmetric(m: float, s: float, n: float, t: float) -> None:
     there, back = policy_distance(of(m, s), of(n, t)), policy_distance(of(n, t), of(m, s))
     torch.testing.assert_close(there, back, atol=1e-6, rtol=0)

@@ -83,7 +83,7 @@ def shared() -> Iterator[Simulation]:
 
 @pytest.mark.long
 @every_learner
-def test_virtual_rows_change_what_is_learned_and_cost_no_actual_step(agent: str, shared: Simulation) -> None:
+def test_model_rows_change_learning_without_environment_steps(agent: str, shared: Simulation) -> None:
     alone, imagined = (Trained(shared, agent, virtual).learn(2) for virtual in (None, VIRTUAL))
     assert [entry.environment_steps for entry in imagined.told] == [entry.environment_steps for entry in alone.told]
     assert imagined.episodes_run == alone.episodes_run == 4
@@ -98,9 +98,7 @@ def policy_of(trained: Trained) -> dict[str, torch.Tensor]:
 
 @every_learner
 @pytest.mark.parametrize("update", ["union", "sequential"])
-def test_a_learner_that_was_stopped_goes_on_with_the_same_model_and_data(
-    agent: str, update: str, shared: Simulation
-) -> None:
+def test_resumed_learner_has_the_same_model_and_data(agent: str, update: str, shared: Simulation) -> None:
     virtual = replace(VIRTUAL, update_mode=update, model_updates=2)
     expected = Trained(shared, agent, virtual).learn(3)
     stopped = Trained(shared, agent, virtual).learn(1)
@@ -160,7 +158,7 @@ def test_rows_of_a_rollout_end_where_it_crashed() -> None:
     assert rows.observations[:, -1].tolist() == [-1, -1, -1, 1, 1]
 
 
-def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(shared: Simulation) -> None:
+def test_truncated_rollouts_are_bootstrapped(shared: Simulation) -> None:
     learner = Trained(shared, "trpo", None).learner
     rollouts = rollouts_of(np.array([[1.0, 2.0], [3.0, 4.0]]), [2, 2], [False, True])
     rows = rollout_experience(rollouts, rollouts.drawn_values.numpy())
@@ -178,7 +176,7 @@ def test_the_advantage_at_the_cut_goes_on_with_the_value_of_where_it_ended(share
 @pytest.mark.parametrize(
     ("begin", "episodes_begun"), [("newest", {2, 3}), ("all", {0, 1, 2, 3}), ("first", {0, 1, 2, 3})]
 )
-def test_rollouts_begin_in_the_episodes_asked_for_and_are_as_many(
+def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
     shared: Simulation, begin: Any, episodes_begun: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rollouts = RowRollouts(replace(VIRTUAL, model_ratio=3.0, rollout_starts=begin), TASK, POLICY, 0)
@@ -204,13 +202,13 @@ def test_rollouts_begin_in_the_episodes_asked_for_and_are_as_many(
     assert (set(batch.start_indices[:, 1]) == {0}) == (begin == "first")
 
 
-def test_a_model_that_is_not_trusted_adds_nothing(shared: Simulation) -> None:
+def test_k_star_of_zero_gives_no_model_rows(shared: Simulation) -> None:
     trained = Trained(shared, "trpo", replace(VIRTUAL, kappa=1e-6)).learn(2)
     assert [(entry.model[0]["k_star"], entry.model_steps) for entry in trained.told] == [(0, 0), (0, 0)]
     assert same(policy_of(trained), policy_of(Trained(shared, "trpo", None).learn(2)))
 
 
-def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() -> None:
+def test_real_ratio_mixes_environment_and_model_rows() -> None:
     sac: Any = start_training([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
     buffer = sac.buffer
     actual, virtual = (
@@ -227,7 +225,7 @@ def test_without_the_ratio_actual_rows_alone_fill_a_batch_and_with_it_both_do() 
     assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
 
 
-def test_what_is_told_of_the_virtual_environment_is_whole(shared: Simulation) -> None:
+def test_facts_of_the_model_are_complete(shared: Simulation) -> None:
     told = Trained(shared, "trpo", VIRTUAL).learn(1).told[0]
     (virtual,) = told.model
     assert {"k_star", "eps_m", "eps_m_by_estimator", "one_step", "bound", "return_model", "return_environment"} <= set(
@@ -238,7 +236,7 @@ def test_what_is_told_of_the_virtual_environment_is_whole(shared: Simulation) ->
     assert virtual["bound"] > abs(virtual["return_model"] - virtual["return_environment"])
 
 
-def test_what_is_known_of_people_survives_a_stop(shared: Simulation) -> None:
+def test_state_and_restore_keep_calibrated_humans(shared: Simulation) -> None:
     one, other = (RowRollouts(VIRTUAL, TASK, POLICY, 0) for _ in range(2))
     people = IDMParameters(time_headway=1.3, max_acceleration=0.8)
     one.scenario = replace(RING, humans=people)

@@ -66,7 +66,7 @@ def again(errs: bool, beyond: float = 0.0, seed: int = 9) -> Episode:
 
 
 @pytest.mark.long
-def test_the_same_people_come_at_the_same_times_and_err_anew(actual: list[Episode]) -> None:
+def test_rollouts_have_the_same_vehicles_with_new_driver_errors(actual: list[Episode]) -> None:
     one, other = again(True), again(True, seed=10)
     for episode in (one, other):
         assert set(episode.vehicle_ids[:40]) == set(actual[0].vehicle_ids[:40])
@@ -78,14 +78,14 @@ def test_the_same_people_come_at_the_same_times_and_err_anew(actual: list[Episod
 
 
 @pytest.mark.long
-def test_what_is_learned_moves_people_by_so_much_in_a_decision() -> None:
+def test_correction_changes_speeds_per_control_step() -> None:
     calm, pushed = again(False), again(False, beyond=-0.05)
     assert np.nanmean(pushed.speeds[40:]) < np.nanmean(calm.speeds[40:]) - 0.2
     assert np.nanmean(again(False, beyond=1e-9).speeds) == pytest.approx(np.nanmean(calm.speeds), rel=1e-6)
 
 
 @pytest.mark.usefixtures("often")
-def test_a_step_of_the_base_is_what_people_did_but_for_what_they_misjudge(actual: list[Episode]) -> None:
+def test_base_step_differs_from_the_record_by_perception_errors(actual: list[Episode]) -> None:
     kept = motorway_samples(actual[0], 0, ROAD)
     wrong = kept.human_rows.next_speed - kept.human_rows.base_speed
     assert len(wrong) > 200
@@ -95,7 +95,7 @@ def test_a_step_of_the_base_is_what_people_did_but_for_what_they_misjudge(actual
 
 
 @pytest.mark.usefixtures("often")
-def test_people_who_err_in_nothing_are_foreseen_but_for_what_they_remember() -> None:
+def test_base_predicts_drivers_without_errors_except_for_their_memory() -> None:
     kept = motorway_samples(replace(again(False), seed=(0,), trajectories=()), 0, ROAD)
     wrong = np.abs(kept.human_rows.next_speed - kept.human_rows.base_speed)
     # What they remember of lane changes, and when they last began to start, is not in the record.
@@ -105,7 +105,7 @@ def test_people_who_err_in_nothing_are_foreseen_but_for_what_they_remember() -> 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("often")
-def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual: list[Episode]) -> None:
+def test_rollouts_have_the_set_ratio_in_antithetic_pairs(actual: list[Episode]) -> None:
     task = Task(ROAD, EXPERT)
     imagination = MotorwayRollouts(replace(VIRTUAL, model_ratio=2.0), task, POLICY, 0)
     imagination.learn(actual, 1)
@@ -133,7 +133,7 @@ def test_it_imagines_as_many_episodes_as_are_asked_for_in_mirrored_pairs(actual:
 
 
 @pytest.mark.usefixtures("often")
-def test_for_a_while_there_are_more_of_them_and_none_where_no_cav_comes(actual: list[Episode]) -> None:
+def test_shorter_rollouts_are_more_and_none_without_cavs(actual: list[Episode]) -> None:
     imagination = MotorwayRollouts(replace(VIRTUAL, k_max=80), Task(ROAD, EXPERT), POLICY, 0)
     imagination.learn(actual[:2], 1)
     network = replace(network_of(0.05, POLICY), episode_noise=True)
@@ -143,9 +143,7 @@ def test_for_a_while_there_are_more_of_them_and_none_where_no_cav_comes(actual: 
     assert imagination.roll_out(network, 2, 0, 64, HOW) is None
 
 
-def test_twins_meet_the_same_people_and_are_held_out_together(
-    actual: list[Episode], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_antithetic_pairs_are_held_out_together(actual: list[Episode], monkeypatch: pytest.MonkeyPatch) -> None:
     seen = list[NDArray[np.int64]]()
     monkeypatch.setattr(motorway_model, "fit_human_model", lambda model, rows, *_, **__: seen.append(rows.episode))
     kept = [motorway_samples(actual[0], number, ROAD, "idm") for number in (6, 7, 8)]
@@ -154,7 +152,7 @@ def test_twins_meet_the_same_people_and_are_held_out_together(
         assert set(seen[-1].tolist()) == numbers
 
 
-def test_who_knows_nothing_of_following_takes_people_to_go_on_as_fast_as_they_are() -> None:
+def test_base_none_predicts_constant_speed() -> None:
     model = RoadModel(replace(VIRTUAL, base="none"), (0,))
     model.noise.fill_(0.3)
     speed, known = np.linspace(5.0, 25.0, 4000), np.linspace(25.0, 5.0, 4000)
@@ -171,7 +169,7 @@ def test_who_knows_nothing_of_following_takes_people_to_go_on_as_fast_as_they_ar
 
 @pytest.mark.long
 @pytest.mark.usefixtures("often")
-def test_networks_count_beside_wrong_people_and_not_beside_those_who_are_known(actual: list[Episode]) -> None:
+def test_networks_are_used_only_if_the_base_is_wrong(actual: list[Episode]) -> None:
     others = {"time_headways": (1.6, 1.6), "accelerations": (0.73, 0.73), "decelerations": (1.67, 1.67)}
     for people, learned in (({}, []), (others, ["speed"])):
         imagination = MotorwayRollouts(replace(VIRTUAL, epochs=60), Task(ROAD, EXPERT), POLICY, 0)
@@ -182,7 +180,7 @@ def test_networks_count_beside_wrong_people_and_not_beside_those_who_are_known(a
 
 @pytest.mark.long
 @pytest.mark.usefixtures("often")
-def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
+def test_networks_without_base_learn_car_following(actual: list[Episode]) -> None:
     settings = replace(VIRTUAL, base="none", epochs=60)
     imagination = MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
     imagination.learn(actual, 1)
@@ -200,13 +198,13 @@ def test_networks_alone_learn_how_people_follow(actual: list[Episode]) -> None:
         (replace(VIRTUAL, calibrate_base=True), "model.calibrate_base: true is not allowed"),
     ],
 )
-def test_what_cannot_be_imagined_is_refused(settings: ModelSettings, words: str) -> None:
+def test_unsupported_settings_are_refused(settings: ModelSettings, words: str) -> None:
     with pytest.raises(InputError, match=words):
         MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
 
 
 @pytest.mark.long
-def test_the_base_expects_of_people_in_sumo_what_it_expects_of_those_in_the_batch(
+def test_base_predicts_drivers_in_sumo_as_well_as_in_the_batch(
     actual: list[Episode], in_sumo: list[Episode], often: None
 ) -> None:
     squares, counts, noises = list[float](), list[int](), list[float]()
@@ -221,6 +219,6 @@ def test_the_base_expects_of_people_in_sumo_what_it_expects_of_those_in_the_batc
     assert squares[1] < 1.3 * squares[0]
 
 
-def test_a_record_that_skips_moments_is_refused(in_sumo: list[Episode]) -> None:
+def test_record_that_skips_steps_is_refused(in_sumo: list[Episode]) -> None:
     with pytest.raises(InputError, match="skips moments"):
         motorway_samples(replace(in_sumo[0], snapshot_stride=2), 0, ROAD)

@@ -71,7 +71,7 @@ def imagined(road: LoopScenario, network: Network) -> tuple[RoadRollouts, list[E
 @pytest.mark.parametrize(
     "road", [RING, replace(RING, warmup=300), EIGHT], ids=["a ring", "a ring with a wave", "a figure eight"]
 )
-def test_without_noise_it_is_what_happened(road: LoopScenario) -> None:
+def test_rollouts_without_noise_equal_the_recording(road: LoopScenario) -> None:
     imagination, episodes = imagined(replace(road, noise=0.0), network_of(0.0))
     people = base_human_model("idm", road)
     memory = ReplayDriver(np.zeros((0, 2))).initial_memory(2)
@@ -85,7 +85,7 @@ def test_without_noise_it_is_what_happened(road: LoopScenario) -> None:
         np.testing.assert_allclose(found.gaps, actual.gaps[during], atol=1e-5)
 
 
-def test_the_policy_goes_on_with_what_it_remembered() -> None:
+def test_rollouts_continue_with_the_recorded_memory() -> None:
     network = network_of(0.0)
     imagination, episodes = imagined(replace(RING, noise=0.0), network)
     imagination.k_star = DECISIONS
@@ -102,7 +102,7 @@ def test_the_policy_goes_on_with_what_it_remembered() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("road", [RING, WRONG, EIGHT], ids=["exact sensors", "wrong sensors", "a figure eight"])
-def test_with_noise_returns_are_those_of_the_road(road: LoopScenario) -> None:
+def test_rollouts_with_noise_have_the_returns_of_the_road(road: LoopScenario) -> None:
     imagination, _ = imagined(road, network_of(0.05))
     found = imagination.roll_out(network_of(0.05), 1, 0, 1, as_drawn(road))
     assert found is not None
@@ -114,21 +114,21 @@ def test_with_noise_returns_are_those_of_the_road(road: LoopScenario) -> None:
     assert imagination.model_steps == 4 * 400
 
 
-def test_each_imagined_road_misreads_in_its_own_way() -> None:
+def test_each_rollout_has_its_own_sensor_errors() -> None:
     imagination, _ = imagined(replace(WRONG, noise=0.0), network_of(0.0))
     twice, people = np.array([[0, 0], [0, 0]]), base_human_model("idm", RING)
     one, other = imagination.simulate(IDM(), {}, twice, DECISIONS, people, (1,))
     assert np.abs(one.speeds - other.speeds).max() > 0.01
 
 
-def test_a_model_that_is_not_trusted_imagines_nothing() -> None:
+def test_too_short_k_star_gives_no_rollouts() -> None:
     imagination, _ = imagined(RING, network_of(0.0))
     imagination.k_star = 9
     assert imagination.roll_out(network_of(0.0), 1, 0, 1, as_drawn(RING)) is None
 
 
 @pytest.mark.parametrize("road", [RING, EIGHT], ids=["a ring", "a figure eight"])
-def test_it_survives_a_stop(road: LoopScenario) -> None:
+def test_state_and_restore_keep_samples_and_noise(road: LoopScenario) -> None:
     one, _ = imagined(road, network_of(0.05))
     other = RoadRollouts(VIRTUAL, Task(road, PISaturation()), POLICY, 0)
     facts, tensors = one.state()

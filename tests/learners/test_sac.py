@@ -20,7 +20,7 @@ def values_of(policy: SquashedResidualPolicy, rows: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("std", "authority"), [(0.1, 1.0), (0.3, 0.5)])
-def test_a_fresh_policy_adds_nothing_but_a_little_noise(std: float, authority: float) -> None:
+def test_new_policy_has_zero_mean_and_exploration_noise(std: float, authority: float) -> None:
     policy = fresh(PolicySettings(exploration_std=std, authority=authority), action_limit=2.0)
     network, rows = policy.network(), random_rows(20_000, 5)
     assert (residual_of(policy, rows) == 0.0).all()
@@ -32,7 +32,7 @@ def test_a_fresh_policy_adds_nothing_but_a_little_noise(std: float, authority: f
 
 
 @of_any_size
-def test_the_numpy_twin_gives_the_residual_and_the_noise_of_the_torch_policy(
+def test_numpy_network_equals_the_torch_policy_with_noise(
     seed: int, inputs: int, hidden: list[int], authority: float, rows: int
 ) -> None:
     policy = fresh(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
@@ -50,7 +50,7 @@ def test_the_numpy_twin_gives_the_residual_and_the_noise_of_the_torch_policy(
 
 
 @pytest.mark.parametrize(("log_std", "clipped"), [(5.0, 2.0), (-30.0, -20.0)])
-def test_the_twins_noise_has_the_bounds_of_the_policys(log_std: float, clipped: float) -> None:
+def test_numpy_network_bounds_noise_as_the_policy(log_std: float, clipped: float) -> None:
     policy = fresh()
     with torch.no_grad():
         policy.actor.get_parameter("log_std.bias").fill_(log_std)
@@ -58,7 +58,7 @@ def test_the_twins_noise_has_the_bounds_of_the_policys(log_std: float, clipped: 
     np.testing.assert_allclose(found, np.tanh(math.exp(clipped) * 1e-2), rtol=1e-6)
 
 
-def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
+def test_numpy_network_keeps_its_weights_while_the_policy_learns() -> None:
     policy = fresh()
     network, rows = policy.network(), random_rows(10, 5).astype(float)
     shake(policy.actor, 2)
@@ -66,7 +66,7 @@ def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
     assert np.abs(policy.network()(rows)).max() > 1e-3
 
 
-def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> None:
+def test_privileged_inputs_change_the_value_and_not_the_residual() -> None:
     policy = fresh(critic_inputs=2)
     shake(policy, 4)
     rows = random_rows(50, 7)
@@ -76,7 +76,7 @@ def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> No
     assert np.abs(values_of(policy, other) - values_of(policy, rows)).min() > 1e-5
 
 
-def test_the_target_starts_as_the_critic() -> None:
+def test_target_starts_as_a_copy_of_the_critic() -> None:
     policy = fresh(critic_inputs=1)
     rows = torch.as_tensor(random_rows(5, 6))
     for found, target in zip(
@@ -85,7 +85,7 @@ def test_the_target_starts_as_the_critic() -> None:
         assert torch.equal(found, target)
 
 
-def test_critics_promise_no_more_far_from_all_data() -> None:
+def test_critics_are_bounded_far_from_data() -> None:
     policy = fresh(critic_inputs=1)
     rows = random_rows(200, 6)
     near, far = values_of(policy, rows), values_of(policy, 1000.0 * rows)
@@ -93,7 +93,7 @@ def test_critics_promise_no_more_far_from_all_data() -> None:
     assert np.ptp(far) > 0.01
 
 
-def test_uniform_residuals_cover_their_authority_evenly() -> None:
+def test_uniform_network_covers_its_authority() -> None:
     network = uniform_network(3, authority=2.0)
     noise = np.random.default_rng(0).normal(size=200_000)
     found = np.sort(network.explore(np.ones((len(noise), 3)), noise))
@@ -103,7 +103,7 @@ def test_uniform_residuals_cover_their_authority_evenly() -> None:
 
 
 @pytest.mark.parametrize("start", ["expert", "uniform"])
-def test_sac_learns_nothing_before_its_start_is_driven(start: Any) -> None:
+def test_sac_does_not_learn_before_learning_starts(start: Any) -> None:
     settings = SACSettings(start_policy=start, learning_starts=1700, gradient_steps_per_step=0.02, batch_size=8)
     task = Toy(PolicySettings(hidden=(16,), exploration_std=0.1), settings, "sac").learn(4)
     updates = [entry.log.get("n_updates", 0.0) for entry in task.iterations]
@@ -137,7 +137,7 @@ def test_rewards_of_sac_are_shifted_by_the_mean_of_the_first_iteration_and_scale
 
 
 @pytest.mark.parametrize("learned", [True, False])
-def test_the_temperature_of_sac_changes_only_where_it_is_learned(learned: bool) -> None:
+def test_temperature_of_sac_changes_only_if_learned(learned: bool) -> None:
     settings = SACSettings(
         learning_starts=0, gradient_steps_per_step=0.02, batch_size=8, temperature=0.3, learn_temperature=learned
     )
@@ -164,6 +164,6 @@ def test_settings_reach_sac() -> None:
     assert {optimiser.param_groups[0]["lr"] for optimiser in optimisers} == {0.02}
 
 
-def test_a_policy_may_begin_as_its_weights_are_drawn() -> None:
+def test_policy_without_zero_init_has_random_residuals() -> None:
     policy = fresh(PolicySettings(zero_init=False))
     assert residual_of(policy, random_rows(200, 5, 0)).std() > 0.001

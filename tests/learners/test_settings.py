@@ -52,7 +52,7 @@ from unjam.parameters import build_dataclass
         (SACSettings, "buffer_size", 0),
     ],
 )
-def test_a_wrong_value_is_refused_in_one_line_that_names_it(kind: type, key: str, value: Any) -> None:
+def test_invalid_values_are_refused_by_name(kind: type, key: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         build_dataclass(kind, {key: value}, "settings")
     line = str(caught.value)
@@ -70,18 +70,18 @@ def test_an_unknown_name_is_refused(kind: type) -> None:
 @pytest.mark.parametrize(
     ("key", "value"), [("gae_lambda", 0.0), ("gae_lambda", 1.0), ("critic_weight_decay", 0.0), ("gamma", 0.999)]
 )
-def test_values_at_the_edge_of_what_is_allowed_are_taken(key: str, value: float) -> None:
+def test_boundary_values_are_allowed(key: str, value: float) -> None:
     assert getattr(build_dataclass(TRPOSettings, {key: value}, ""), key) == value
 
 
 @pytest.mark.parametrize("made", [PolicySettings(), TRPOSettings(), PPOSettings(), SACSettings()])
-def test_settings_do_not_change_once_made(made: Any) -> None:
+def test_settings_are_immutable(made: Any) -> None:
     name = next(iter(vars(made)))
     with pytest.raises(FrozenInstanceError):
         setattr(made, name, getattr(made, name))
 
 
-def test_lists_of_a_toml_file_become_tuples() -> None:
+def test_lists_become_tuples() -> None:
     made = build_dataclass(PolicySettings, {"hidden": [32, 16], "inputs": ["local", "loop_length"]}, "")
     assert made == PolicySettings(hidden=(32, 16), inputs=("local", "loop_length"))
 
@@ -90,7 +90,5 @@ def test_lists_of_a_toml_file_become_tuples() -> None:
     ("hold", "control_step", "decisions"),
     [(1.0, 0.1, 10), (1.0, 1.0, 1), (1.0, 0.2, 5), (0.0, 0.1, 1), (0.5, 1.0, 1), (0.3, 0.1, 3)],
 )
-def test_a_residual_is_held_for_so_many_seconds_whatever_a_decision_takes(
-    hold: float, control_step: float, decisions: int
-) -> None:
+def test_action_repeat_depends_on_the_control_step(hold: float, control_step: float, decisions: int) -> None:
     assert PolicySettings(action_duration=hold).action_repeat(control_step) == decisions

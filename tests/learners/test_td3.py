@@ -14,7 +14,7 @@ fresh = partial(make_policy, DeterministicResidualPolicy)
 
 
 @pytest.mark.parametrize(("std", "authority"), [(0.1, 1.0), (0.3, 0.5)])
-def test_a_fresh_policy_adds_nothing_but_noise_of_the_asked_size(std: float, authority: float) -> None:
+def test_new_policy_has_zero_mean_and_noise_of_the_set_size(std: float, authority: float) -> None:
     policy = fresh(PolicySettings(exploration_std=std, authority=authority), action_limit=2.0)
     network, rows = policy.network(), random_rows(200, 5)
     assert (residual_of(policy, rows) == 0.0).all()
@@ -24,7 +24,7 @@ def test_a_fresh_policy_adds_nothing_but_noise_of_the_asked_size(std: float, aut
 
 
 @of_any_size
-def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
+def test_numpy_network_equals_the_torch_policy(
     seed: int, inputs: int, hidden: list[int], authority: float, rows: int
 ) -> None:
     policy = fresh(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
@@ -34,7 +34,7 @@ def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
     np.testing.assert_allclose(found, residual_of(policy, seen), rtol=0, atol=1e-6)
 
 
-def test_targets_start_as_what_they_follow() -> None:
+def test_target_networks_start_as_copies() -> None:
     policy, rows = fresh(critic_inputs=1), torch.as_tensor(random_rows(5, 6))
     action = torch.ones(5, 1)
     assert torch.equal(policy.actor(rows), policy.actor_target(rows))
@@ -42,7 +42,7 @@ def test_targets_start_as_what_they_follow() -> None:
         assert torch.equal(found, target)
 
 
-def test_td3_learns_nothing_before_its_start_is_driven_and_keeps_its_noise() -> None:
+def test_td3_does_not_learn_before_learning_starts_and_keeps_its_noise() -> None:
     settings = TD3Settings(learning_starts=1700, gradient_steps_per_step=0.02, batch_size=8)
     toy = Toy(PolicySettings(hidden=(16,), exploration_std=0.1), settings, "td3").learn(4)
     updates = [entry.log.get("n_updates", 0.0) for entry in toy.iterations]
@@ -51,14 +51,14 @@ def test_td3_learns_nothing_before_its_start_is_driven_and_keeps_its_noise() -> 
     assert (toy.networks[2](np.ones((3, INPUTS))) == 0.0).all()
 
 
-def test_the_policy_is_updated_once_for_so_many_updates_of_its_critics() -> None:
+def test_policy_delay_is_the_number_of_critic_updates_per_policy_update() -> None:
     settings = TD3Settings(learning_starts=0, gradient_steps_per_step=0.01, batch_size=8, policy_delay=4)
     tensors = Toy(settings=settings, agent="td3").learn(1).parameters()
     steps = {part: int(tensors[f"{part}.optimizer/0/step"]) for part in ("actor", "critic")}
     assert steps == {"actor": 2, "critic": 8}
 
 
-def test_eps_pi_is_that_of_the_exploration_noise_about_the_residual() -> None:
+def test_residual_distribution_is_exploration_noise_around_the_residual() -> None:
     toy = Toy(agent="td3").learn(2)
     seen = torch.as_tensor(random_rows(20, INPUTS + 1))
     noise = toy.learner.residual_distribution(seen)
@@ -78,6 +78,6 @@ def test_settings_reach_td3() -> None:
     assert {optimiser.param_groups[0]["lr"] for optimiser in optimisers} == {0.02}
 
 
-def test_a_policy_may_begin_as_its_weights_are_drawn() -> None:
+def test_policy_without_zero_init_has_random_residuals() -> None:
     policy = fresh(PolicySettings(zero_init=False))
     assert residual_of(policy, random_rows(200, 5, 0)).std() > 0.001

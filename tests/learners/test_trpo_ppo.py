@@ -34,20 +34,20 @@ def value_of(policy: ResidualPolicy, rows: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_residual_of_a_fresh_policy_is_exactly_zero(seed: int) -> None:
+def test_residual_of_a_new_policy_is_exactly_zero(seed: int) -> None:
     policy, rows = fresh(seed=seed), random_rows(200, 5, seed)
     assert (mean_of(policy, rows) == 0.0).all()
     assert (policy.network()(rows.astype(float)) == 0.0).all()
 
 
-def test_a_policy_may_begin_as_its_weights_are_drawn() -> None:
+def test_policy_without_zero_init_has_random_residuals() -> None:
     rows = random_rows(200, 5, 0)
     assert mean_of(fresh(PolicySettings(zero_init=False)), rows).std() > 0.01
 
 
 @pytest.mark.parametrize("hold", [1, 10])
 @pytest.mark.parametrize("cavs", [1, 3])
-def test_a_fresh_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simulation: Simulation) -> None:
+def test_new_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simulation: Simulation) -> None:
     ring = Ring(length=(230, 230), horizon=200, warmup=100, cavs=cavs)
     expert, parts = PISaturation(), PolicySettings().inputs
     network = fresh(inputs=observation_size(parts, expert)).network()
@@ -63,7 +63,7 @@ def test_a_fresh_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simul
 
 
 @of_any_size
-def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
+def test_numpy_network_equals_the_torch_policy(
     seed: int, inputs: int, hidden: list[int], authority: float, rows: int
 ) -> None:
     policy = fresh(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
@@ -73,7 +73,7 @@ def test_the_numpy_twin_gives_the_residual_of_the_torch_policy(
     np.testing.assert_allclose(found, mean_of(policy, seen), rtol=0, atol=1e-6)
 
 
-def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
+def test_numpy_network_keeps_its_weights_while_the_policy_learns() -> None:
     policy = fresh()
     shake(policy, 1)
     network, rows = policy.network(), random_rows(10, 5).astype(float)
@@ -83,7 +83,7 @@ def test_the_twin_keeps_its_weights_when_the_policy_learns_on() -> None:
     assert np.abs(policy.network()(rows) - before).max() > 1e-3
 
 
-def test_actor_and_critic_learn_at_rates_of_their_own() -> None:
+def test_actor_and_critic_have_separate_learning_rates() -> None:
     policy = fresh(critic_inputs=2)
     policy.set_learning_rates(actor=0.1, critic=0.2)
     rates = {id(parameter): group["lr"] for group in policy.optimizer.param_groups for parameter in group["params"]}
@@ -104,7 +104,7 @@ def test_the_mean_reaches_its_authority_and_never_exceeds_it(authority: float, a
         assert (found < 0).any()
 
 
-def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> None:
+def test_privileged_inputs_change_the_value_and_not_the_residual() -> None:
     policy = fresh(critic_inputs=2)
     shake(policy, 4)
     rows = random_rows(50, 7)
@@ -114,7 +114,7 @@ def test_what_the_critic_alone_sees_moves_the_value_and_not_the_residual() -> No
     assert np.abs(value_of(policy, other) - value_of(policy, rows)).min() > 1e-4
 
 
-def test_the_critic_also_sees_what_the_actor_sees() -> None:
+def test_critic_uses_the_inputs_of_the_actor() -> None:
     policy = fresh(critic_inputs=2)
     shake(policy, 5)
     rows = random_rows(50, 7)
@@ -124,7 +124,7 @@ def test_the_critic_also_sees_what_the_actor_sees() -> None:
 
 
 @pytest.mark.parametrize("learned", [True, False])
-def test_explores_at_the_start_with_the_standard_deviation_that_was_set(learned: bool) -> None:
+def test_initial_exploration_has_the_set_standard_deviation(learned: bool) -> None:
     settings = PolicySettings(exploration_std=0.25, learn_exploration_std=learned)
     policy = fresh(settings, action_limit=2.0)
     assert policy.network().exploration_std == pytest.approx(0.5, rel=1e-6)
@@ -133,7 +133,7 @@ def test_explores_at_the_start_with_the_standard_deviation_that_was_set(learned:
     assert float(drawn.std()) == pytest.approx(0.5, rel=0.02)
 
 
-def test_noise_that_lasts_is_as_wide_in_the_network_as_the_policy_reckons() -> None:
+def test_episode_noise_of_the_network_has_the_deviation_of_the_policy() -> None:
     policy = fresh(PolicySettings(exploration_std=0.1, exploration="per_episode"), action_limit=2.0)
     shake(policy, 3)
     network, rows = policy.network(), random_rows(6, 5)
@@ -147,7 +147,7 @@ def test_noise_that_lasts_is_as_wide_in_the_network_as_the_policy_reckons() -> N
     assert "log_std" not in dict(policy.named_parameters())
 
 
-def test_noise_that_lasts_tries_something_where_all_units_are_at_rest() -> None:
+def test_episode_noise_explores_with_zero_hidden_units() -> None:
     policy = fresh(PolicySettings(exploration_std=0.1, exploration="per_episode"), action_limit=2.0)
     with torch.no_grad():
         at_rest = cast(Normal, policy.get_distribution(torch.zeros(1, 5)).distribution)
@@ -158,7 +158,7 @@ def test_noise_that_lasts_tries_something_where_all_units_are_at_rest() -> None:
 
 
 @pytest.mark.parametrize("learned", [True, False])
-def test_exploration_is_among_the_parameters_only_where_it_is_learned(learned: bool) -> None:
+def test_log_std_is_a_parameter_only_if_learned(learned: bool) -> None:
     policy = fresh(PolicySettings(learn_exploration_std=learned))
     assert ("log_std" in dict(policy.named_parameters())) is learned
     optimised = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
@@ -166,13 +166,13 @@ def test_exploration_is_among_the_parameters_only_where_it_is_learned(learned: b
     assert "log_std" in policy.state_dict()
 
 
-def test_the_optimiser_holds_every_parameter_of_the_finished_policy() -> None:
+def test_optimizer_has_every_parameter_of_the_policy() -> None:
     policy = fresh(critic_inputs=1)
     optimised = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
     assert optimised == {id(parameter) for parameter in policy.parameters()}
 
 
-def test_the_value_is_in_the_units_that_it_is_given() -> None:
+def test_value_has_the_set_scale() -> None:
     policy, rows = fresh(), random_rows(20, 5)
     before = value_of(policy, rows)
     policy.scale_value(150.0, 20.0)
@@ -180,7 +180,7 @@ def test_the_value_is_in_the_units_that_it_is_given() -> None:
     assert np.ptp(before) > 1e-3
 
 
-def test_units_of_the_value_are_kept_with_the_weights_and_never_learned() -> None:
+def test_value_scale_is_stored_with_the_weights_and_not_learned() -> None:
     policy, other = fresh(seed=1), fresh(seed=2)
     policy.scale_value(150.0, 20.0)
     other.load_state_dict(policy.state_dict())
@@ -189,7 +189,7 @@ def test_units_of_the_value_are_kept_with_the_weights_and_never_learned() -> Non
     assert not [name for name, _ in policy.named_parameters() if "scale" in name]
 
 
-def test_spaces_hold_both_networks_inputs_and_the_bounds_of_the_mean() -> None:
+def test_spaces_have_the_inputs_of_both_networks_and_the_bounds_of_the_mean() -> None:
     observations, actions = policy_spaces(5, 2, 0.7)
     assert observations.shape == (7,)
     assert actions.shape == (1,)
@@ -210,7 +210,7 @@ def test_each_update_stays_within_the_trust_region() -> None:
 
 
 @pytest.mark.parametrize("learned", [True, False])
-def test_exploration_changes_only_where_it_is_learned(learned: bool) -> None:
+def test_exploration_std_changes_only_if_learned(learned: bool) -> None:
     policy = PolicySettings(hidden=(8,), exploration_std=0.2, learn_exploration_std=learned)
     task = Toy(policy).learn(3)
     found = task.learner.network().exploration_std
@@ -224,7 +224,7 @@ def same_mean(one: Network, other: Network) -> bool:
 
 
 @pytest.mark.parametrize("normalise", [True, False])
-def test_units_of_the_value_come_from_the_first_iteration(normalise: bool) -> None:
+def test_value_scale_comes_from_the_first_iteration(normalise: bool) -> None:
     policy = PolicySettings(hidden=(8,), normalize_value=normalise)
     task = Toy(policy).learn(3)
     trajectories = [episode.trajectories[0] for episode in task.iterations[0].episodes[0]]
@@ -233,7 +233,7 @@ def test_units_of_the_value_come_from_the_first_iteration(normalise: bool) -> No
     assert task.parameters()["policy/value_net.scale"].tolist() == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_units_of_a_value_that_never_changes_stay_usable() -> None:
+def test_value_scale_of_constant_returns_is_positive() -> None:
     policy = PolicySettings(hidden=(8,), exploration_std=1e-9)
     task = Toy(policy, target=lambda rows: np.zeros(len(rows))).learn(2)
     assert task.parameters()["policy/value_net.scale"][1] > 0.0
@@ -252,7 +252,7 @@ def test_settings_reach_the_learner() -> None:
     assert (group["lr"], group["weight_decay"], group["eps"]) == (0.02, 0.3, 1e-5)
 
 
-def test_the_decay_of_the_value_network_leaves_the_actor_alone() -> None:
+def test_weight_decay_of_the_critic_does_not_change_the_actor() -> None:
     def actor(value_l2: float) -> dict[str, Any]:
         found = (
             Toy(settings=TRPOSettings(critic_weight_decay=value_l2, critic_learning_rate=0.01)).learn(1).parameters()
@@ -280,14 +280,14 @@ def test_settings_reach_ppo() -> None:
 
 
 @pytest.mark.parametrize(("minibatches", "steps_per_epoch"), [(1, 1), (3, 3)])
-def test_each_epoch_of_ppo_takes_all_rows_in_so_many_parts(minibatches: int, steps_per_epoch: int) -> None:
+def test_each_epoch_of_ppo_has_the_set_number_of_minibatches(minibatches: int, steps_per_epoch: int) -> None:
     settings = PPOSettings(epochs=5, minibatches=minibatches)
     parameters = Toy(settings=settings, agent="ppo", episodes=3).learn(2).parameters()
     steps = {int(tensor) for name, tensor in parameters.items() if name.endswith("/step")}
     assert steps == {2 * 5 * steps_per_epoch}
 
 
-def test_actor_and_critic_of_ppo_learn_at_their_own_rates() -> None:
+def test_actor_and_critic_of_ppo_learn_at_separate_rates() -> None:
     def moved(actor_rate: float, critic_rate: float) -> dict[bool, float]:
         settings = PPOSettings(epochs=5, actor_learning_rate=actor_rate, critic_learning_rate=critic_rate)
         task = Toy(settings=settings, agent="ppo")

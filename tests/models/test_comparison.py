@@ -31,7 +31,7 @@ def known_ahead(world: ToyDynamics) -> EnvironmentData:
     return actual_data(world, DRIVER, 30, 60)
 
 
-def test_a_model_that_is_the_truth_is_never_off() -> None:
+def test_exact_model_has_no_open_loop_error() -> None:
     data = known_ahead(ToyDynamics(leader=0.0))
     found = open_loop_errors(alone(), data, data.start_indices(40), 40, RING)
     for name in STATE_FIELDS:
@@ -41,7 +41,7 @@ def test_a_model_that_is_the_truth_is_never_off() -> None:
     assert found.change["leader_gap"][-1] > 1.0
 
 
-def test_errors_are_those_of_the_base_written_out() -> None:
+def test_open_loop_errors_of_the_base_equal_explicit_sums() -> None:
     """The base believes that the leader keeps its speed."""
     data = known_ahead(ToyDynamics())
     choices = data.start_indices(30)
@@ -57,7 +57,7 @@ def test_errors_are_those_of_the_base_written_out() -> None:
         assert found.change["leader_gap"][step - 1] == pytest.approx(np.sqrt(np.mean(np.square(moved))))
 
 
-def test_learning_brings_virtual_and_actual_together() -> None:
+def test_fit_reduces_open_loop_errors() -> None:
     data = known_ahead(ToyDynamics())
     choices, model = data.start_indices(30), alone()
     before = open_loop_errors(model, data, choices, 30, RING)
@@ -69,7 +69,7 @@ def test_learning_brings_virtual_and_actual_together() -> None:
     assert after.error["speed"].max() < 1e-3
 
 
-def test_each_member_drives_alone_from_what_was_recorded() -> None:
+def test_each_member_replays_separately_from_recorded_states() -> None:
     data = known_ahead(ToyDynamics())
     model = alone()
     fit_row_model(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
@@ -87,7 +87,7 @@ def test_each_member_drives_alone_from_what_was_recorded() -> None:
     )
 
 
-def test_errors_one_step_ahead_are_those_of_the_fit() -> None:
+def test_one_step_errors_equal_those_of_the_fit() -> None:
     data, model = known_ahead(ToyDynamics()), alone()
     actual = data.transitions(0.2)
     found = fit_row_model(model, actual, SETTINGS, RING, "", (2,))
@@ -97,7 +97,7 @@ def test_errors_one_step_ahead_are_those_of_the_fit() -> None:
         assert error == pytest.approx(found.one_step[name], rel=1e-6, abs=1e-9), name
 
 
-def test_a_new_model_is_as_wrong_as_its_base() -> None:
+def test_new_model_has_the_errors_of_its_base() -> None:
     errors = one_step_errors(alone(), known_ahead(ToyDynamics()).transitions(0.2), RING, "")
     for member in errors.model:
         np.testing.assert_array_equal(member, errors.base)
@@ -111,7 +111,7 @@ def gap_of(driver: ResidualDriver, world: ToyDynamics, data: EnvironmentData) ->
     return found
 
 
-def test_in_the_true_world_there_is_no_gap_between_returns() -> None:
+def test_exact_dynamics_have_no_return_gap() -> None:
     world = ToyDynamics()
     data = actual_data(world, DRIVER, 6, 60, explore=False)
     quiet = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
@@ -124,7 +124,7 @@ def test_in_the_true_world_there_is_no_gap_between_returns() -> None:
     assert found.standard_error < 1e-3
 
 
-def test_a_world_that_pays_more_has_a_gap() -> None:
+def test_higher_model_reward_gives_a_return_gap() -> None:
     data = actual_data(ToyDynamics(), DRIVER, 6, 60)
     found = gap_of(DRIVER, ToyDynamics(bonus=5.0), data)
     assert found.model_return - found.environment_return > 5 * found.standard_error

@@ -47,7 +47,7 @@ def world(of: RowModel, noise: bool = False, ring: Ring = RING, seed: int = 3) -
 
 
 @pytest.mark.parametrize("ring", [RING, replace(RING, simulation_step=0.2, steps_per_control_step=5)])
-def test_adds_what_the_networks_say_to_the_base(ring: Ring) -> None:
+def test_step_adds_residual_to_the_base(ring: Ring) -> None:
     residual = {"speed": 0.1, "leader_speed": 0.2, "leader_gap": 0.3, "follower_gap": 0.5, "reward": 0.7}
     state, applied, drawn = some_state(20), torch.linspace(-1, 1, 20), torch.zeros(20, 1)
     state = state._replace(leader_gap=state.leader_gap + 20, follower_gap=state.follower_gap + 20)
@@ -61,14 +61,14 @@ def test_adds_what_the_networks_say_to_the_base(ring: Ring) -> None:
     assert not step.clipped.any()
 
 
-def test_drives_round_the_loop() -> None:
+def test_route_position_wraps_around_the_loop() -> None:
     state = some_state(1)._replace(speed=torch.tensor([10.0]), route_position=torch.tensor([229.5]))
     step = world(model(residual={})).step(state, torch.zeros(1), torch.zeros(1, 1))
     assert_close(step.state.route_position, torch.tensor([0.5]))
     assert_close(step.state.loop_length, torch.tensor([230.0]))
 
 
-def test_what_a_map_and_a_service_say_stays_known() -> None:
+def test_step_keeps_penetration_rate_and_distance_to_crossing() -> None:
     told = {"penetration_rate": torch.tensor([0.1, 0.1]), "distance_to_crossing": torch.tensor([20.0, 0.5])}
     state = some_state(2)._replace(speed=torch.tensor([10.0, 10.0]), **told)
     step = world(model(residual={})).step(state, torch.zeros(2), torch.zeros(2, 1))
@@ -79,7 +79,7 @@ def test_what_a_map_and_a_service_say_stays_known() -> None:
 
 
 @given(st.integers(0, 10**6))
-def test_rows_at_once_step_as_single_rows(seed: int) -> None:
+def test_step_of_many_rows_equals_single_rows(seed: int) -> None:
     together = world(model())
     state, drawn = some_state(5, seed), torch.rand((5, 1), generator=torch_generator((seed,), "cpu"))
     applied = torch.linspace(-1, 1, 5)
@@ -94,7 +94,7 @@ def test_rows_at_once_step_as_single_rows(seed: int) -> None:
 
 
 @given(st.integers(0, 10**6), st.sampled_from([0.0, 1.0, 100.0]))
-def test_what_it_leads_to_is_physically_possible(seed: int, scale: float) -> None:
+def test_next_states_are_physically_possible(seed: int, scale: float) -> None:
     generator = torch_generator((seed,), "cpu")
     wild = model(residual={name: scale * float(torch.randn(1, generator=generator)) for name in TARGET_NAMES})
     state = some_state(30, seed)
@@ -121,7 +121,7 @@ def test_what_it_leads_to_is_physically_possible(seed: int, scale: float) -> Non
         ({}, [False, False, False]),
     ],
 )
-def test_each_kind_of_bound_is_told(residual: dict[str, float], bounded: list[bool]) -> None:
+def test_clipped_reports_each_quantity(residual: dict[str, float], bounded: list[bool]) -> None:
     state = some_state(4)._replace(leader_gap=torch.full((4,), 30.0), follower_gap=torch.full((4,), 30.0))
     step = world(model(residual=residual)).step(state, torch.zeros(4), torch.zeros(4, 1))
     assert CLIPPED_QUANTITIES == ("speed", "gap", "reward")
@@ -130,7 +130,7 @@ def test_each_kind_of_bound_is_told(residual: dict[str, float], bounded: list[bo
 
 
 @pytest.mark.parametrize("gap", ["leader_gap", "follower_gap"])
-def test_a_gap_that_is_used_up_is_a_crash_that_earns_nothing(gap: str) -> None:
+def test_zero_gap_is_a_crash_without_residual_reward(gap: str) -> None:
     state = some_state(3)._replace(leader_gap=torch.full((3,), 30.0), follower_gap=torch.full((3,), 30.0))
     state = state._replace(**{gap: torch.tensor([30.0, 1.0, 30.0])})
     step = world(model(residual={gap: -4.0, "reward": 0.5})).step(state, torch.ones(3), torch.zeros(3, 1))
@@ -140,7 +140,7 @@ def test_a_gap_that_is_used_up_is_a_crash_that_earns_nothing(gap: str) -> None:
     assert (step.reward[[0, 2]] != 0.0).all()
 
 
-def test_on_an_open_road_nobody_beyond_the_largest_gap_is_seen() -> None:
+def test_leader_beyond_the_largest_gap_is_missing_on_an_open_road() -> None:
     state = some_state(2)._replace(loop_length=torch.full((2,), torch.nan), leader_gap=torch.full((2,), 99.0))
     step = world(model(residual={"leader_gap": 5.0})).step(state, torch.zeros(2), torch.zeros(2, 1))
     assert (step.state.leader_gap == MAX_OBSERVED_GAP).all()
@@ -173,7 +173,7 @@ def test_noise_has_the_distribution_of_the_errors() -> None:
 
 
 @pytest.mark.parametrize("gap", ["leader_gap", "follower_gap"])
-def test_noise_alone_never_makes_a_crash(gap: str) -> None:
+def test_noise_alone_never_causes_a_crash(gap: str) -> None:
     """A jump that does not fit into the gap does not happen; one that fits does."""
     jumpy = model(residual={})
     jumpy.noise[:, TARGET_NAMES.index(gap)] = -20.0
@@ -191,7 +191,7 @@ def test_noise_alone_never_makes_a_crash(gap: str) -> None:
     assert found.reward[1] == still.reward[1]
 
 
-def test_every_member_answers_for_some_rows_and_each_row_gets_all_in_time() -> None:
+def test_each_member_predicts_some_rows_and_each_row_gets_all_members() -> None:
     several = model(members=3, residual={})
     with torch.no_grad():
         several.biases[-1][:, 0, STATE_FIELDS.index("leader_gap")] = torch.tensor([1.0, 2.0, 3.0])
@@ -214,7 +214,7 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     assert not torch.equal(one.reward, other.reward)
 
 
-def test_a_users_reward_is_asked_through_numpy(my_drivers: Path) -> None:
+def test_user_reward_is_called_with_numpy_arrays(my_drivers: Path) -> None:
     outcome = Outcome(
         torch.tensor([[1.0, 3.0, torch.nan], [2.0, 2.0, 5.0]]),
         torch.tensor([[1.0], [-0.5]]),
@@ -228,7 +228,7 @@ def test_a_users_reward_is_asked_through_numpy(my_drivers: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_virtual_environment_knows_no_simulator() -> None:
+def test_models_do_not_import_a_simulator() -> None:
     folder = Path(unjam.models.__path__[0])
     names = [f"unjam.models.{path.stem}" for path in folder.glob("*.py") if path.stem != "__init__"]
     assert "unjam.models.rollouts" in names

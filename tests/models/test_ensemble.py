@@ -27,7 +27,7 @@ def some_inputs(rows: int) -> torch.Tensor:
     return model_inputs(state, torch.linspace(-1, 1, rows), torch.full((rows, 1), 0.4))
 
 
-def test_sees_the_state_the_acceleration_and_what_was_drawn() -> None:
+def test_model_inputs_are_state_acceleration_and_drawn_values() -> None:
     state = LocalState(*(torch.tensor([float(value)]) for value in range(7)))
     found = model_inputs(state, torch.tensor([0.5]), torch.tensor([[0.25]]))
     assert STATE_FIELDS == ("speed", "leader_speed", "follower_speed", "leader_gap", "follower_gap")
@@ -41,14 +41,14 @@ def test_a_new_model_adds_nothing_to_its_base() -> None:
     assert_close(found, torch.zeros(9, len(TARGET_NAMES)))
 
 
-def test_networks_begin_different_and_the_same_for_a_seed() -> None:
+def test_initial_networks_differ_and_depend_on_the_seed_alone() -> None:
     one, again, other = (RowModel(SETTINGS, 1, (seed,)) for seed in (1, 1, 2))
     assert torch.equal(one.weights[0], again.weights[0])
     assert not torch.equal(one.weights[0], other.weights[0])
     assert not torch.equal(one.weights[0][0], one.weights[0][1])
 
 
-def test_new_units_leave_the_answers_as_they_were() -> None:
+def test_normalization_keeps_predictions() -> None:
     model, inputs = shaken(), some_inputs(50)
     members = torch.tensor([2, 0])
     before = predict(model.layers(), inputs, members)
@@ -60,7 +60,7 @@ def test_new_units_leave_the_answers_as_they_were() -> None:
     assert_close(model.target_mean, targets.mean(0).float() * 0.1)
 
 
-def test_each_block_of_rows_asks_its_member() -> None:
+def test_each_block_of_rows_uses_its_member() -> None:
     model, inputs = shaken(), some_inputs(10)
     found = predict(model.layers(), inputs, torch.tensor([2, 0, 1]))  # blocks of four rows, but for the last
     every = model(inputs.expand(3, -1, -1)).detach()
@@ -68,14 +68,14 @@ def test_each_block_of_rows_asks_its_member() -> None:
         assert_close(found[rows], every[member, rows])
 
 
-def test_rows_at_once_are_answered_as_single_rows() -> None:
+def test_prediction_of_many_rows_equals_single_rows() -> None:
     layers, inputs = shaken().layers(), some_inputs(7)
     together = predict(layers, inputs, torch.tensor([1]))
     for row in range(7):
         assert_close(predict(layers, inputs[row : row + 1], torch.tensor([1]))[0], together[row])
 
 
-def test_what_is_not_learned_is_left_to_the_base() -> None:
+def test_masked_outputs_are_zero() -> None:
     model, inputs = shaken(), some_inputs(5)
     before = predict(model.layers(), inputs, torch.tensor([0]))
     model.output_mask[1] = 0.0
@@ -84,7 +84,7 @@ def test_what_is_not_learned_is_left_to_the_base() -> None:
     assert_close(found[:, 2:], before[:, 2:])
 
 
-def test_all_members_are_asked_equally_often() -> None:
+def test_members_are_drawn_uniformly() -> None:
     found = random_members(5, 10_000 * ROWS_PER_MEMBER, torch_generator((1,), "cpu"))
     assert len(found) == 10_000
     shares = torch.bincount(found, minlength=5) / len(found)
@@ -92,7 +92,7 @@ def test_all_members_are_asked_equally_often() -> None:
     assert len(random_members(5, 1, torch_generator((1,), "cpu"))) == 1
 
 
-def test_state_dict_is_all_of_it() -> None:
+def test_state_dict_restores_the_model() -> None:
     model = shaken(1)
     model.set_normalization(some_inputs(20).double(), torch.rand((20, 6), dtype=torch.float64))
     other = RowModel(SETTINGS, 1, (9,))

@@ -50,7 +50,7 @@ def filled(*decisions: int, rows: int = 10**6, hold: int = 1) -> EnvironmentData
     return data
 
 
-def test_rows_are_the_decisions_in_order() -> None:
+def test_transitions_are_control_steps_in_order() -> None:
     data = EnvironmentData(100)
     two_cavs = episode(trajectory(0, 3), trajectory(1, 2, terminated=True), length=270.0)
     data.add([two_cavs, episode(trajectory(2, 4), length=220.0)], RING)
@@ -65,7 +65,7 @@ def test_rows_are_the_decisions_in_order() -> None:
     np.testing.assert_array_equal(np.flatnonzero(found.crashed), [4])
 
 
-def test_failed_episodes_leave_nothing() -> None:
+def test_failed_episodes_are_not_stored() -> None:
     data = EnvironmentData(100)
     data.add([Episode(seed=(1,), status="failed"), episode(trajectory(0, 3))], RING)
     assert len(data) == 3
@@ -73,7 +73,7 @@ def test_failed_episodes_leave_nothing() -> None:
 
 
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=12), st.integers(1, 60))
-def test_keeps_the_newest_episodes_whole(decisions: list[int], rows: int) -> None:
+def test_newest_episodes_are_stored_completely(decisions: list[int], rows: int) -> None:
     data = filled(*decisions, rows=rows)
     kept = [recording.episode for recording in data.recordings]
     assert kept == list(range(len(decisions)))[-len(kept) :]
@@ -83,7 +83,7 @@ def test_keeps_the_newest_episodes_whole(decisions: list[int], rows: int) -> Non
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.5])
-def test_a_share_of_the_episodes_is_held_out_from_the_first_on(share: float) -> None:
+def test_holdout_share_holds_from_the_first_episode_on(share: float) -> None:
     held = np.array([is_holdout_episode(number, share) for number in range(1000)])
     assert held[0]
     for first in range(0, 900, 90):
@@ -92,7 +92,7 @@ def test_a_share_of_the_episodes_is_held_out_from_the_first_on(share: float) -> 
         assert all(held[part::parts].any() for part in range(parts))
 
 
-def test_a_held_out_episode_stays_whole_and_held_out() -> None:
+def test_holdout_episode_stays_complete_and_held_out() -> None:
     data = filled(*[10] * 8, rows=60)
     for _ in range(2):
         found = data.transitions(0.2)
@@ -103,19 +103,19 @@ def test_a_held_out_episode_stays_whole_and_held_out() -> None:
 
 
 @pytest.mark.parametrize("decisions", [(10,), (10, 1)])
-def test_of_a_single_episode_the_end_is_held_out(decisions: tuple[int, ...]) -> None:
+def test_end_of_a_single_episode_is_held_out(decisions: tuple[int, ...]) -> None:
     data = filled(*decisions)
     data.recordings = [replace(recording, episode=0) for recording in data.recordings]
     found = data.transitions(0.2)
     np.testing.assert_array_equal(found.states.speed[found.is_holdout], [8, 9])
 
 
-def test_without_data_there_is_nothing_to_learn_from() -> None:
+def test_transitions_without_data_raise_error() -> None:
     with pytest.raises(InputError, match="no environment steps"):
         EnvironmentData(10).transitions(0.2)
 
 
-def test_looks_are_where_a_residual_was_due_and_enough_follows() -> None:
+def test_start_indices_are_due_actions_with_enough_steps_left() -> None:
     data = filled(7, 3, hold=3)
     assert data.start_indices().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0]]
     assert data.start_indices(3).tolist() == [[0, 0], [0, 3], [1, 0]]
@@ -125,7 +125,7 @@ def test_looks_are_where_a_residual_was_due_and_enough_follows() -> None:
     np.testing.assert_allclose(found.leader_gap, np.array([1000, 3, 3]) + 0.2)
 
 
-def test_unpacked_data_are_what_was_packed() -> None:
+def test_pack_and_unpack_restore_data() -> None:
     driver = ResidualDriver(PISaturation(window=2.0), random_network(), 1.0, action_repeat=4)
     data = actual_data(ToyDynamics(), driver, 2, 30)
     again = unpack(EnvironmentData, *pack(data))
@@ -134,7 +134,7 @@ def test_unpacked_data_are_what_was_packed() -> None:
     assert again.recordings[0].initial_memory.keys() == {"window", "total", "count", "command"}
 
 
-def test_chosen_rows_are_those_of_each_column() -> None:
+def test_select_takes_rows_of_each_column() -> None:
     actual = actual_data(ToyDynamics(), ResidualDriver(IDM(), random_network(), 1.0), 2, 30).transitions(0.2)
     rows = np.array([7, 3, 41])
     found = actual.select(rows)

@@ -46,7 +46,7 @@ def experts(my_drivers: Path) -> list[Driver]:
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 @pytest.mark.parametrize("warmup", [0, 40])
-def test_remembers_what_the_driver_really_did(
+def test_memory_equals_that_of_the_actual_drive(
     number: int, warmup: int, my_drivers: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two episodes with two CAVs each, driven with exploration; every choice of all four trajectories."""
@@ -68,7 +68,7 @@ def test_remembers_what_the_driver_really_did(
             np.testing.assert_allclose(flat[key][row], values[place % 2], atol=1e-10)
 
 
-def test_remembers_nothing_of_what_came_later_or_elsewhere() -> None:
+def test_memory_has_no_later_or_foreign_states() -> None:
     """A window goes back to the start of its own trajectory, and no further."""
     expert = PISaturation(window=100.0)
     data = EnvironmentData(1000)
@@ -85,14 +85,14 @@ def test_remembers_nothing_of_what_came_later_or_elsewhere() -> None:
         assert not found["window"][row, decision:].any()
 
 
-def test_a_driver_without_memory_needs_none() -> None:
+def test_driver_without_memory_has_empty_memory() -> None:
     data = EnvironmentData(1000)
     driver = ResidualDriver(IDM(), random_network(), 1.0)
     data.add([run_episode(RING, driver, (1,))], RING)
     assert reconstruct_memory(IDM(), data.recordings, data.start_indices()[:5]) == {}
 
 
-def test_built_in_drivers_take_tensors_as_they_are(my_drivers: Path) -> None:
+def test_built_in_drivers_take_tensors_without_adapter(my_drivers: Path) -> None:
     pi = PISaturation()
     assert tensor_driver(pi, "cpu") is pi
     assert isinstance(tensor_driver(FileDriver(my_drivers, "Keeper"), "cpu"), NumPyDriverAdapter)
@@ -101,7 +101,7 @@ def test_built_in_drivers_take_tensors_as_they_are(my_drivers: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
-def test_on_tensors_it_drives_as_on_arrays(number: int, my_drivers: Path) -> None:
+def test_tensor_driver_equals_array_driver(number: int, my_drivers: Path) -> None:
     expert = experts(my_drivers)[number]
     on_world = tensor_driver(expert, "cpu")
     generator = np.random.default_rng(1)
@@ -121,7 +121,7 @@ def test_on_tensors_it_drives_as_on_arrays(number: int, my_drivers: Path) -> Non
             np.testing.assert_allclose(features.numpy(), expected_features, atol=1e-4)
 
 
-def test_an_acceleration_that_is_not_finite_is_told(my_drivers: Path) -> None:
+def test_non_finite_acceleration_raises_error(my_drivers: Path) -> None:
     state = state_of_ones(COMMON_FIELDS, torch.ones, 3)
     with pytest.raises(InputError, match="model rollout: acceleration is nan; allowed: finite"):
         tensor_driver(FileDriver(my_drivers, "broken"), "cpu").act(state, {})

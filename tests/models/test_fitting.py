@@ -42,7 +42,7 @@ def known(actual: Transitions) -> tuple[RowModel, ModelFit]:
     return fitted(actual)
 
 
-def test_what_the_base_knows_is_not_left_to_learn(actual: Transitions) -> None:
+def test_targets_are_zero_where_the_base_is_exact(actual: Transitions) -> None:
     targets = residual_targets(actual, "idm", RING, "")
     worst = dict(zip(TARGET_NAMES, np.abs(targets).max(0), strict=True))
     assert worst["speed"] == worst["follower_speed"] == worst["follower_gap"] == pytest.approx(0, abs=1e-12)
@@ -63,7 +63,7 @@ def test_finds_a_known_residual(known: tuple[RowModel, ModelFit], actual: Transi
     assert np.abs(answer.numpy() - expected).mean() < 0.01
 
 
-def test_rows_are_counted(known: tuple[RowModel, ModelFit], actual: Transitions) -> None:
+def test_fit_counts_rows(known: tuple[RowModel, ModelFit], actual: Transitions) -> None:
     _, found = known
     assert found.training_rows == int((~actual.is_holdout).sum())
     assert found.holdout_rows == int(actual.is_holdout.sum())
@@ -71,14 +71,14 @@ def test_rows_are_counted(known: tuple[RowModel, ModelFit], actual: Transitions)
     assert (limited.training_rows, limited.holdout_rows, limited.epochs) == (100, 20, 2)
 
 
-def test_a_better_base_leaves_less_unexplained(known: tuple[RowModel, ModelFit], actual: Transitions) -> None:
+def test_better_base_has_less_unexplained_variance(known: tuple[RowModel, ModelFit], actual: Transitions) -> None:
     _, nothing_known = fitted(actual, replace(SETTINGS, base="none"))
     assert known[1].errors["unexplained_variance"] < nothing_known.errors["unexplained_variance"]
     assert known[1].one_step["leader_gap"].base < nothing_known.one_step["leader_gap"].base
     assert set(nothing_known.learned_targets) == set(TARGET_NAMES)
 
 
-def test_the_base_is_used_where_nothing_can_be_learned(actual: Transitions) -> None:
+def test_base_is_used_for_unpredictable_targets(actual: Transitions) -> None:
     noise = np.random.default_rng(0).normal(size=len(actual.acceleration))
     following = actual.next_states._replace(follower_speed=actual.next_states.follower_speed + noise)
     known = actual.reward - residual_targets(actual, "idm", RING, "")[:, -1]
@@ -91,7 +91,7 @@ def test_the_base_is_used_where_nothing_can_be_learned(actual: Transitions) -> N
     assert (answers[:, TARGET_NAMES.index("follower_speed")] == 0.0).all()
 
 
-def test_a_number_that_never_varied_misleads_nobody_where_it_does(actual: Transitions) -> None:
+def test_constant_training_input_does_not_mislead_on_the_holdout(actual: Transitions) -> None:
     """As the length of the ring, of which the first episodes may have a single one."""
     other = actual.drawn_values + np.where(actual.is_holdout, 0.5, 0.1 / 3.0)[:, None]
     _, found = fitted(actual._replace(drawn_values=other))
@@ -99,7 +99,7 @@ def test_a_number_that_never_varied_misleads_nobody_where_it_does(actual: Transi
         assert found.one_step[name].model < 0.5 * found.one_step[name].base, name
 
 
-def test_noise_is_what_the_holdout_was_off_by(actual: Transitions) -> None:
+def test_noise_has_the_distribution_of_holdout_errors(actual: Transitions) -> None:
     generator = np.random.default_rng(1)
     error = generator.normal(size=len(actual.acceleration))
     following = actual.next_states._replace(
@@ -115,9 +115,7 @@ def test_noise_is_what_the_holdout_was_off_by(actual: Transitions) -> None:
     assert np.abs(noise["speed"]).max() < 1e-9
 
 
-def test_the_learned_part_of_the_reward_has_the_range_of_the_data(
-    known: tuple[RowModel, ModelFit], actual: Transitions
-) -> None:
+def test_reward_range_is_that_of_the_data(known: tuple[RowModel, ModelFit], actual: Transitions) -> None:
     residual = 0.1 * actual.states.leader_gap / 20.0
     np.testing.assert_allclose(known[0].reward_range.numpy(), [residual.min(), residual.max()], rtol=1e-5)
 
@@ -133,14 +131,14 @@ def test_the_same_seed_gives_the_same_bits(known: tuple[RowModel, ModelFit], act
     assert fit_row_model(other, actual, SETTINGS, RING, "", (3,)).errors != found.errors
 
 
-def test_a_second_fit_goes_on_from_the_first(actual: Transitions) -> None:
+def test_second_fit_continues_the_first(actual: Transitions) -> None:
     short = replace(SETTINGS, epochs=1)
     model, first = fitted(actual, short)
     last = [fit_row_model(model, actual, short, RING, "", (5, again)) for again in range(3)][-1]
     assert last.one_step["leader_speed"].model < 0.9 * first.one_step["leader_speed"].model
 
 
-def test_bad_steps_are_taken_back(actual: Transitions, known: tuple[RowModel, ModelFit]) -> None:
+def test_worse_weights_are_discarded(actual: Transitions, known: tuple[RowModel, ModelFit]) -> None:
     model = RowModel(SETTINGS, 1, (1,))
     model.load_state_dict(known[0].state_dict())
     wild = replace(SETTINGS, learning_rate=1.0, epochs=2)
@@ -149,14 +147,14 @@ def test_bad_steps_are_taken_back(actual: Transitions, known: tuple[RowModel, Mo
     assert found.errors["training_loss"] > known[1].errors["training_loss"]
 
 
-def test_a_loss_that_is_not_finite_is_told(actual: Transitions) -> None:
+def test_non_finite_loss_raises_error(actual: Transitions) -> None:
     broken = actual.next_states.leader_gap.copy()
     broken[:] = np.inf
     with pytest.raises(UnjamError, match="loss of its fit is not finite in epoch 1"):
         fitted(actual._replace(next_states=actual.next_states._replace(leader_gap=broken)))
 
 
-def test_every_estimator_is_there(known: tuple[RowModel, ModelFit]) -> None:
+def test_fit_returns_all_error_estimators(known: tuple[RowModel, ModelFit]) -> None:
     errors = known[1].errors
     assert set(errors) == {"unexplained_variance", "transitions", "total_variation", "training_loss"}
     assert 0 < errors["transitions"] < 1
@@ -165,7 +163,7 @@ def test_every_estimator_is_there(known: tuple[RowModel, ModelFit]) -> None:
     assert 0 < errors["training_loss"] < 0.1
 
 
-def test_networks_that_may_not_fall_back_are_always_added(actual: Transitions) -> None:
+def test_networks_without_fallback_are_always_added(actual: Transitions) -> None:
     wild = replace(SETTINGS, members=1, fallback_to_base=False, epochs=1, max_fit_rows=20)
     _, found = fitted(actual, wild)
     assert set(found.learned_targets) == set(TARGET_NAMES)
@@ -175,7 +173,7 @@ def test_networks_that_may_not_fall_back_are_always_added(actual: Transitions) -
 
 
 @pytest.mark.parametrize("base", ["none", "idm"])
-def test_what_there_is_to_learn_of_a_row_hangs_on_that_row_alone(actual: Transitions, base: str) -> None:
+def test_targets_of_a_row_depend_on_that_row_alone(actual: Transitions, base: str) -> None:
     rows = np.random.default_rng(0).permutation(np.flatnonzero(actual.is_holdout))[:37]
     found = residual_targets(actual.select(rows), base, RING, "")
     np.testing.assert_array_equal(found, residual_targets(actual, base, RING, "")[rows])

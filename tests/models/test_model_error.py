@@ -23,14 +23,14 @@ from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask
 
 
-def test_errors_one_step_ahead_are_root_mean_squares() -> None:
+def test_one_step_errors_are_root_mean_squares() -> None:
     wanted, predicted = np.array([3.0, -4.0]), np.array([[3.0, -4.0], [3.0, -2.0]])
     columns = (np.repeat(each[..., None], 6, -1) for each in (wanted, predicted, np.array([1.0, 3.0])))
     found = OneStepErrors(*columns).rmse_by_target()
     assert found == dict.fromkeys(TARGET_NAMES, OneStepRMSE(math.sqrt(12.5), 1.0, 1.0))
 
 
-def test_unexplained_is_the_mean_share_of_the_variance() -> None:
+def test_unexplained_variance_is_the_mean_ratio_of_error_to_variance() -> None:
     steps = [OneStepRMSE(9.0, 0.1, 1.0), OneStepRMSE(9.0, 0.5, 1.0), OneStepRMSE(0.0, 0.0, 0.0)]
     assert unexplained_variance(steps) == pytest.approx((0.01 + 0.25 + 0.0) / 3)
 
@@ -43,30 +43,30 @@ def overlap(distance: float) -> float:
 
 
 @pytest.mark.parametrize("distance", [0.1, 1.0, 3.0])
-def test_total_variation_is_that_of_two_gaussians(distance: float) -> None:
+def test_total_variation_equals_that_of_two_gaussians(distance: float) -> None:
     members = np.array([0.0, math.sqrt(2.0)]) * distance * 0.5  # sample standard deviation: distance / 2
     predicted = members[:, None, None] + np.zeros((2, 4, 1))
     assert total_variation(predicted, np.array([0.5])) == pytest.approx(overlap(distance), abs=1e-6)
 
 
-def test_a_tenth_of_the_noise_makes_a_rollout_of_fifty() -> None:
+def test_error_of_a_tenth_of_the_noise_gives_rollouts_of_50_steps() -> None:
     predicted = np.array([0.0, math.sqrt(2.0)])[:, None, None] * 0.01 + np.zeros((2, 4, 1))
     assert 2.0 / total_variation(predicted, np.array([0.1])) == pytest.approx(50, abs=0.5)
 
 
-def test_numbers_add_up_and_one_that_all_agree_on_counts_nothing() -> None:
+def test_total_variation_adds_quantities_and_ignores_agreement() -> None:
     spread = np.array([0.0, math.sqrt(2.0)])[:, None, None]
     two = np.concatenate([spread * 0.3, spread * 0.4, spread * 0.0], 2) + np.zeros((2, 4, 1))
     one = spread * 0.5 + np.zeros((2, 4, 1))
     assert total_variation(two, np.array([1.0, 1.0, 0.0])) == pytest.approx(total_variation(one, np.array([1.0])))
 
 
-def test_of_a_single_member_nobody_can_tell() -> None:
+def test_total_variation_of_a_single_member_is_nan() -> None:
     assert math.isnan(total_variation(np.zeros((1, 4, 2)), np.ones(2)))
 
 
 @pytest.mark.parametrize("distance", [0.1, 1.0, 3.0])
-def test_against_transitions_is_that_of_two_gaussians(distance: float) -> None:
+def test_transition_variation_equals_that_of_two_gaussians(distance: float) -> None:
     wrong = np.full((3, 4, 2), distance * 0.5 / math.sqrt(2.0))
     assert transition_variation(wrong, 0.5) == pytest.approx(overlap(distance), abs=1e-6)
 
@@ -77,7 +77,7 @@ def transitions_of(scenario: Scenario, episodes: list[Episode]) -> Transitions:
     return data.transitions(0.2)
 
 
-def test_the_way_that_people_made_tells_their_noise() -> None:
+def test_recorded_noise_follows_from_the_driven_distance() -> None:
     ring = Ring(vehicles=6, length=(120, 120), horizon=400, noise=0.3)
     episodes = run_batch([EpisodeTask(ring, PISaturation(), (seed,)) for seed in range(6)])
     actual = transitions_of(ring, episodes)
@@ -91,7 +91,7 @@ def test_the_way_that_people_made_tells_their_noise() -> None:
     np.testing.assert_allclose((meant + noise[:, 1])[moves], actual.next_states.follower_speed[moves], atol=1e-9)
 
 
-def test_where_noise_moves_people_too_its_variance_is_taken_off_the_error() -> None:
+def test_variance_of_unknown_noise_is_subtracted_from_the_error() -> None:
     eight = FigureEight(horizon=300)
     actual = transitions_of(eight, [run_episode(eight, PISaturation(), (seed,)) for seed in range(4)])
     assert recorded_noise(actual, eight) is None

@@ -46,7 +46,7 @@ def fitted(episodes: list[Episode], road: LoopScenario = RING, **changes: Any) -
     return model, fit_road_model(model, kept, settings, road, (1,))
 
 
-def test_where_people_are_known_only_their_noise_is_left(episodes: list[Episode]) -> None:
+def test_exact_base_leaves_only_noise(episodes: list[Episode]) -> None:
     model, found = fitted(episodes)
     assert found.learned_targets == ()
     assert found.errors["unexplained_variance"] < 1e-9
@@ -57,7 +57,7 @@ def test_where_people_are_known_only_their_noise_is_left(episodes: list[Episode]
 
 @pytest.mark.long
 @pytest.mark.parametrize("base", ["none", "ovm"])
-def test_what_a_base_does_not_know_the_networks_learn(episodes: list[Episode], base: str) -> None:
+def test_networks_learn_what_the_base_lacks(episodes: list[Episode], base: str) -> None:
     _, found = fitted(episodes, base=base, epochs=20)
     step = found.one_step["speed"]
     assert found.learned_targets == ("speed",)
@@ -66,7 +66,7 @@ def test_what_a_base_does_not_know_the_networks_learn(episodes: list[Episode], b
 
 
 @pytest.mark.long
-def test_on_a_figure_eight_the_right_of_way_is_known_and_noise_no_ignorance(eights: list[Episode]) -> None:
+def test_right_of_way_and_noise_are_no_model_error_on_a_figure_eight(eights: list[Episode]) -> None:
     model, found = fitted(eights, EIGHT)
     sigma = EIGHT.noise_per_step * EIGHT.simulation_step
     assert found.one_step["speed"].base == pytest.approx(sigma, rel=0.05)
@@ -75,7 +75,7 @@ def test_on_a_figure_eight_the_right_of_way_is_known_and_noise_no_ignorance(eigh
 
 
 @pytest.mark.long
-def test_on_a_figure_eight_the_networks_learn_what_a_base_does_not_know(eights: list[Episode]) -> None:
+def test_networks_learn_what_the_base_lacks_on_a_figure_eight(eights: list[Episode]) -> None:
     _, found = fitted(eights, EIGHT, base="none", epochs=20)
     sigma, step = EIGHT.noise_per_step * EIGHT.simulation_step, found.one_step["speed"]
     assert found.learned_targets == ("speed",)
@@ -83,11 +83,11 @@ def test_on_a_figure_eight_the_networks_learn_what_a_base_does_not_know(eights: 
     assert step.model == pytest.approx(sigma, rel=0.2)
 
 
-def test_too_few_episodes_are_held_out_in_part(episodes: list[Episode]) -> None:
+def test_part_of_too_few_episodes_is_held_out(episodes: list[Episode]) -> None:
     assert fitted(episodes[:1])[1].holdout_rows > 0
 
 
-def test_moments_are_what_was_recorded_and_what_came_next(episodes: list[Episode]) -> None:
+def test_samples_are_recorded_states_and_next_states(episodes: list[Episode]) -> None:
     episode = episodes[3]
     kept = road_samples(episode, 7, RING)
     assert (kept.episode, kept.interval, kept.is_human.sum()) == (7, 1, 7)
@@ -102,12 +102,12 @@ def test_moments_are_what_was_recorded_and_what_came_next(episodes: list[Episode
     ("road", "why"),
     [(Merge(), "merge is not a ring"), (replace(RING, steps_per_control_step=2), "steps_per_control_step is 2")],
 )
-def test_other_roads_are_refused_in_one_line(road: Any, why: str) -> None:
+def test_unsupported_roads_are_refused(road: Any, why: str) -> None:
     with pytest.raises(InputError, match=f"model.kind: road is not allowed; allowed: row, for .*{why}"):
         check_road_model(road)
 
 
-def test_people_with_networks_drive_on_tensors_as_on_arrays(episodes: list[Episode]) -> None:
+def test_learned_human_model_on_tensors_equals_arrays(episodes: list[Episode]) -> None:
     model, _ = fitted(episodes, base="none", epochs=5)
     seen = [np.array([[3.0, 9.0], [0.0, 25.0]]), np.array([[4.0, 2.0], [1.0, 20.0]])]
     seen.append(np.array([[5.0, 12.0], [2.0, 30.0]]))

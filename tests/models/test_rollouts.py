@@ -49,7 +49,9 @@ def test_rollout_length_at_known_errors(eps_m: float, expected: int) -> None:
 
 
 @given(st.floats(0, 1), st.floats(0, 1), st.integers(0, 500), st.floats(0.5, 0.999), st.floats(0, 10))
-def test_bound_is_the_sum_of_its_three_parts(eps_pi: float, eps_m: float, k: int, gamma: float, largest: float) -> None:
+def test_return_bound_is_the_sum_of_its_three_terms(
+    eps_pi: float, eps_m: float, k: int, gamma: float, largest: float
+) -> None:
     power = 1.0
     for _ in range(k):
         power *= gamma
@@ -73,7 +75,7 @@ def value(observations: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 @pytest.mark.parametrize("hold", [1, 4])
-def test_with_the_true_dynamics_virtual_is_actual(number: int, hold: int, my_drivers: Path) -> None:
+def test_rollouts_with_true_dynamics_equal_recordings(number: int, hold: int, my_drivers: Path) -> None:
     """From any actual row: the same observations, residuals, rewards, and value targets."""
     world, gamma, decisions = ToyDynamics(), 0.97, 41
     driver = residual_driver(experts(my_drivers)[number], hold)
@@ -145,7 +147,7 @@ class Bounded(ToyDynamics):
         return super().step(state, acceleration, drawn_values)._replace(clipped=told)
 
 
-def test_bounds_count_until_the_crash() -> None:
+def test_clipped_share_counts_steps_before_the_crash() -> None:
     driver, data = crash_course()
     starts = prepare_starts(data, data.start_indices()[:50], driver.expert, "cpu")
     found = roll_out(driver, Bounded(), starts, 300, None)
@@ -183,7 +185,7 @@ def test_the_same_seed_gives_the_same_bits(noisy: tuple[ResidualDriver, Environm
     assert not torch.equal(one.rewards, other.rewards)
 
 
-def test_rollouts_are_whole_looks(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+def test_rollouts_have_whole_actions(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
     found = run(noisy, 1)
     assert found.observations.shape == (200, 5, 8)
     assert found.actions.shape == found.rewards.shape == (200, 4)
@@ -193,7 +195,9 @@ def test_rollouts_are_whole_looks(noisy: tuple[ResidualDriver, EnvironmentData, 
     assert found.observations.dtype == torch.float32
 
 
-def test_explores_with_the_networks_own_deviation(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+def test_exploration_noise_has_the_standard_deviation_of_the_network(
+    noisy: tuple[ResidualDriver, EnvironmentData, RowModel],
+) -> None:
     driver = noisy[0]
     found = run(noisy, 1)
     mean = driver.network(found.observations[:, :-1].reshape(-1, 8)).view(200, 4)
@@ -202,7 +206,7 @@ def test_explores_with_the_networks_own_deviation(noisy: tuple[ResidualDriver, E
     assert noise.std().item() == pytest.approx(1.0, abs=0.1)
 
 
-def test_no_decisions_are_the_start_alone(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+def test_rollout_without_steps_has_only_the_start(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
     driver, data, _ = noisy
     starts = prepare_starts(data, data.start_indices()[:7], driver.expert, "cpu")
     found = roll_out(driver, ToyDynamics(), starts, 4, None)
@@ -211,7 +215,7 @@ def test_no_decisions_are_the_start_alone(noisy: tuple[ResidualDriver, Environme
     assert (found.control_steps, found.lengths.tolist(), found.terminated.any().item()) == (0, [0] * 7, False)
 
 
-def test_starts_are_looks_with_enough_ahead() -> None:
+def test_starts_are_actions_with_enough_steps_left() -> None:
     data = actual_data(ToyDynamics(), residual_driver(IDM(), 4), 3, 50)
     found = draw_starts(data, 500, 20, (1,))
     assert found.shape == (500, 2)
@@ -221,14 +225,14 @@ def test_starts_are_looks_with_enough_ahead() -> None:
     assert draw_starts(data, 500, 51, (1,)).shape == (0, 2)
 
 
-def test_what_is_not_finite_is_told() -> None:
+def test_non_finite_values_raise_error() -> None:
     driver, data = residual_driver(IDM()), actual_data(ToyDynamics(), residual_driver(IDM()), 1, 10)
     starts = prepare_starts(data, data.start_indices(), driver.expert, "cpu")
     with pytest.raises(UnjamError, match="model rollout: rewards are not finite"):
         roll_out(driver, ToyDynamics(bonus=inf), starts, 3, None)
 
 
-def test_the_action_limit_holds_for_expert_and_sum() -> None:
+def test_action_limit_clips_expert_and_sum() -> None:
     driver, data = crash_course(limit=0.25)
     commands: list[torch.Tensor] = []
 
@@ -244,7 +248,7 @@ def test_the_action_limit_holds_for_expert_and_sum() -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-def test_drives_on_a_gpu_as_on_the_processor(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
+def test_rollouts_on_gpu_equal_cpu(noisy: tuple[ResidualDriver, EnvironmentData, RowModel]) -> None:
     driver, data, model = noisy
     found = []
     for device in ("cpu", "cuda"):

@@ -40,7 +40,7 @@ def literal_step(row: dict[str, float], applied: float, ring: Ring) -> dict[str,
 
 
 @given(st.integers(0, 10**6), st.sampled_from([Ring(), MERGE_LIKE]))
-def test_moves_as_equations_5_and_6_and_euler_steps_say(seed: int, ring: Ring) -> None:
+def test_base_step_follows_equations_5_and_6_with_euler_steps(seed: int, ring: Ring) -> None:
     generator = np.random.default_rng(seed)
     state, applied = random_state(generator, 3), generator.uniform(-1, 1, 3)
     found = base_step("idm", ring, state, applied)
@@ -56,7 +56,7 @@ def test_moves_as_equations_5_and_6_and_euler_steps_say(seed: int, ring: Ring) -
 
 @pytest.mark.parametrize("base", BASE_DRIVERS)
 @pytest.mark.parametrize("ring", [Ring(), MERGE_LIKE])
-def test_tensors_move_as_arrays_do(base: str, ring: Ring) -> None:
+def test_base_step_of_tensors_equals_arrays(base: str, ring: Ring) -> None:
     generator = np.random.default_rng(1)
     state, applied = with_nobody(random_state(generator, 8)), generator.uniform(-1, 1, 8)
     expected = base_step(base, ring, state, applied)
@@ -76,7 +76,7 @@ def with_nobody(state: LocalState) -> LocalState:
     return LocalState(state.speed, leader, gaps, follower, behind, nowhere, nowhere)
 
 
-def test_where_nobody_is_nobody_comes() -> None:
+def test_missing_neighbors_stay_missing() -> None:
     state = with_nobody(random_state(np.random.default_rng(2), 4))
     found = base_step("idm", MERGE_LIKE, state, np.array([1.0, -1.0, 0.5, 0.0]))
     assert found.leader_gap[0] == MAX_OBSERVED_GAP
@@ -88,13 +88,13 @@ def test_where_nobody_is_nobody_comes() -> None:
     assert behind.tolist() == [False, True, False, False]
 
 
-def test_a_far_leader_on_a_closed_road_is_a_leader() -> None:
+def test_distant_leader_on_a_closed_road_is_not_missing() -> None:
     state = random_state(np.random.default_rng(3), 1)._replace(leader_gap=np.array([150.0]))
     assert base_step("idm", Ring(), state, np.array([0.0])).leader_gap[0] != 150.0
     assert not missing_neighbors(state)[0].any()
 
 
-def test_no_knowledge_expects_no_change() -> None:
+def test_base_none_predicts_no_change() -> None:
     state = random_state(np.random.default_rng(4), 2)
     assert base_step("none", Ring(), state, np.ones(2)) is state
     nothing = base_reward("none", make_reward("released"), state, np.ones(2), np.zeros(2, bool))
@@ -110,7 +110,7 @@ def expected_reward(name: str, speeds: list[float], headway: float, applied: flo
 
 @pytest.mark.parametrize("kind", [np.array, torch.tensor])
 @pytest.mark.parametrize("name", ["released", "eq16"])
-def test_the_reward_takes_the_mean_speed_of_those_that_are_there(name: str, kind: Any) -> None:
+def test_reward_uses_the_mean_speed_of_present_vehicles(name: str, kind: Any) -> None:
     state = with_nobody(random_state(np.random.default_rng(5), 3))
     applied = np.array([0.5, -1.0, 0.0])
     on_kind = state.map(lambda values: kind(values))
@@ -122,7 +122,7 @@ def test_the_reward_takes_the_mean_speed_of_those_that_are_there(name: str, kind
         assert float(found[row]) == pytest.approx(expected_reward(name, speeds, headway, applied[row]))
 
 
-def test_the_typical_person_of_a_population_follows_with_its_residual(tmp_path: Path) -> None:
+def test_typical_driver_of_a_population_includes_its_residual(tmp_path: Path) -> None:
     quarter = Network(((np.zeros((3, 1)), np.array([np.arctanh(0.5)])),), 0.5)
     typical = IDMParameters(time_headway=1.3)
     states = random_state(np.random.default_rng(0), 6)

@@ -8,7 +8,7 @@ from unjam.models.settings import BaseName, ModelSettings
 from unjam.parameters import build_dataclass
 
 
-def test_every_base_can_be_chosen() -> None:
+def test_every_base_is_allowed() -> None:
     assert set(get_args(BaseName)) == set(BASE_DRIVERS)
 
 
@@ -28,6 +28,6 @@ def test_every_base_can_be_chosen() -> None:
         ({"members": 1, "error_estimator": "total_variation"}, "model.members: 1 is not allowed with total_variation"),
     ],
 )
-def test_what_is_wrong_is_named(values: dict, words: str) -> None:
+def test_invalid_settings_are_named(values: dict, words: str) -> None:
     with pytest.raises(InputError, match=words):
         build_dataclass(ModelSettings, values, "model")
