@@ -208,11 +208,11 @@ READS = {"shutil.which", "shutil.disk_usage", "shutil.get_terminal_size"}
 PRIVATE = "in a private temporary folder, with a random name, that its user alone may enter"
 BUFFER = "into memory, or to the standard output"
 UNSAFE_BUT = {
-    "worlds/sumo/simulation.py: traffic.write_text(files.traffic_xml)": PRIVATE,
+    "worlds/sumo/simulation.py: self._traffic_file.write_text(inputs.traffic_xml)": PRIVATE,
     "worlds/sumo/networks.py: (folder / name).write_text(content)": PRIVATE,
     "unjam_paper/do_no_harm.py: files.mkdir()": PRIVATE,
-    "unjam_paper/road_files.py: (folder / 'road.rou.xml').write_text(element_document('routes', traffic))": PRIVATE,
-    "unjam_paper/road_files.py: path.write_text(element_document('configuration', lines))": PRIVATE,
+    "unjam_paper/road_files.py: (folder / 'road.rou.xml').write_text(xml_document('routes', traffic))": PRIVATE,
+    "unjam_paper/road_files.py: path.write_text(xml_document('configuration', lines))": PRIVATE,
     "unjam_paper/assess_examples.py: (folder / 'road').mkdir()": PRIVATE,
     "unjam_paper/assess_examples.py: (folder / 'road.rou.xml').write_text('\\n'.join(lines))": PRIVATE,
     "unjam_paper/assess_examples.py: shutil.copy(network_file(road.network), folder / 'road.net.xml')": PRIVATE,
@@ -220,7 +220,7 @@ UNSAFE_BUT = {
     "reports/video.py: imageio_ffmpeg.write_frames(str(video), (FRAME_SIZE, FRAME_SIZE), fps=rate, "
     "ffmpeg_log_level='error')": PRIVATE,
     "training/tensorboard.py: SummaryWriter(str(place), filename_suffix=f'.{secrets.token_hex(8)}')": (
-        "nobody can guess the name of its file, and its folder was made without following links"
+        "the name of its file cannot be guessed, and its folder was made without following links"
     ),
     "training/train.py: self._controllers.save(contents, is_best)": "through `unjam.files`",
     "cli/__init__.py: os.open(os.devnull, os.O_WRONLY)": "no file",
