@@ -73,8 +73,8 @@ def test_contact_is_a_time_to_collision_of_zero() -> None:
 def test_absent_vehicles_do_not_count() -> None:
     there = following_statistics(column(5.0, np.nan), column(4.0, np.nan), column(10.0, np.nan), 0.1)
     assert (there.min_time_gap, there.min_time_to_collision, there.max_jerk) == (2.0, 10.0, 0.0)
-    nobody = np.zeros((4, 0))
-    assert following_statistics(nobody, nobody, nobody, 0.1) == Audit().following
+    empty = np.zeros((4, 0))
+    assert following_statistics(empty, empty, empty, 0.1) == Audit().following
 
 
 def test_an_override_near_a_crossing_counts_as_yielding() -> None:
@@ -91,6 +91,6 @@ def test_braking_counted_step_by_step_equals_that_of_all_steps_together(steps: l
         log = BrakingLog(0.5)
         for step in steps:
             log.add(np.array([change for change, _ in step]), np.array([kind for _, kind in step], np.uint8))
-    for kind in range(3):
-        changes = [change for step in steps for change, whose in step if whose == kind]
-        assert log.statistics(kind) == braking_statistics(np.array(changes) / 0.5)
+    for driver_kind in range(3):
+        changes = [change for step in steps for change, kind in step if kind == driver_kind]
+        assert log.statistics(driver_kind) == braking_statistics(np.array(changes) / 0.5)

@@ -51,8 +51,8 @@ def test_there_is_no_exploration_by_default() -> None:
 
 def test_per_episode_noise_is_the_same_in_all_control_steps_and_can_have_the_opposite_sign() -> None:
     lasting = replace(RESIDUAL, network=replace(random_network(), episode_noise=True), action_limit=100.0)
-    told = [drive_world(MockWorld(decisions=4), lasting, explore)[0] for explore in (0.0, 1.0, -1.0)]
-    (calm, one, other), again = told, drive_world(MockWorld(decisions=4), lasting, 1.0)[0]
+    reported = [drive_world(MockWorld(decisions=4), lasting, explore)[0] for explore in (0.0, 1.0, -1.0)]
+    (calm, one, other), again = reported, drive_world(MockWorld(decisions=4), lasting, 1.0)[0]
     np.testing.assert_array_equal(one, again)
     np.testing.assert_allclose(one[0] - calm[0], calm[0] - other[0], atol=1e-12)
     assert np.abs(one[0] - calm[0]).min() > 0.01
@@ -79,9 +79,9 @@ def test_a_native_driver_makes_no_decisions() -> None:
 
 
 def test_progress_is_reported_every_ten_control_steps() -> None:
-    told: list[int] = []
-    drive_world(MockWorld(decisions=25), PI, on_progress=told.append)
-    assert told == [10, 20]
+    reported: list[int] = []
+    drive_world(MockWorld(decisions=25), PI, on_progress=reported.append)
+    assert reported == [10, 20]
 
 
 def test_a_drive_can_continue_with_a_given_memory() -> None:

@@ -344,13 +344,13 @@ def test_an_unknown_reward_is_refused_before_anything_runs() -> None:
 
 
 def test_progress_is_reported_during_warm_up_and_episode(simulation: Simulation) -> None:
-    told: list[int] = []
+    reported: list[int] = []
     ring = replace(RING, warmup=1200, horizon=2600)
-    run_episode(ring, IDM(), (0,), simulation=simulation, on_progress=told.append)
-    assert told == sorted(told)
-    assert told.count(0) >= 2
-    assert 2000 < told[-1] <= 2600
-    assert len(set(told)) >= 4
+    run_episode(ring, IDM(), (0,), simulation=simulation, on_progress=reported.append)
+    assert reported == sorted(reported)
+    assert reported.count(0) >= 2
+    assert 2000 < reported[-1] <= 2600
+    assert len(set(reported)) >= 4
 
 
 def test_a_trajectory_has_the_experts_memory_of_the_warm_up(simulation: Simulation) -> None:

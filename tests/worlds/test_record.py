@@ -96,10 +96,10 @@ def test_the_reward_of_a_held_residual_is_the_sum_over_its_control_steps(simulat
     trajectory: Trajectory = run_episode(RING, driver, (0,), simulation=simulation).trajectories[0]
     reward = trajectory.reward_terms["speed"] + trajectory.reward_terms["acceleration"]
     np.testing.assert_array_equal(trajectory.reward, reward)
-    residuals, earned = trajectory.actions_and_rewards
-    assert len(residuals) == len(earned) == 9  # 8 whole holds and one of 4 decisions
+    residuals, rewards = trajectory.actions_and_rewards
+    assert len(residuals) == len(rewards) == 9  # 8 complete action repeats and one of 4 control steps
     for look in range(9):
         held = slice(7 * look, 7 * (look + 1))
         np.testing.assert_array_equal(trajectory.residual[held], residuals[look])
-        assert earned[look] == pytest.approx(reward[held].sum(), abs=1e-12)
+        assert rewards[look] == pytest.approx(reward[held].sum(), abs=1e-12)
     assert len(trajectory.observations) == 10

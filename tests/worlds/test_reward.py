@@ -23,7 +23,7 @@ from unjam.worlds.reward import (
 
 @st.composite
 def outcomes(draw: st.DrawFn) -> Outcome:
-    """What some decisions led to; a few vehicles and CAVs are not on the road, or nobody at all."""
+    """Outcomes of some control steps; some or all vehicles and CAVs may be absent."""
     rows, vehicles = draw(st.integers(1, 5)), draw(st.integers(1, 6))
     cavs = draw(st.integers(1, vehicles))
     speeds = draw(hnp.arrays(np.float64, (rows, vehicles), elements=st.floats(0, 70)))

@@ -117,7 +117,7 @@ def is_running(process: int) -> bool:
 
 
 def has_ended(process: int) -> bool:
-    """Whether a process that has lost its parent has ended, also while nobody has asked after it yet."""
+    """Whether a process without its parent has ended, even if no process has waited for it yet."""
     state = Path(f"/proc/{process}/stat")
     return not is_running(process) or (state.exists() and state.read_text().rpartition(") ")[2][0] == "Z")
 
@@ -180,14 +180,14 @@ def test_a_worker_continues_with_the_next_task(workers: WorkerPool) -> None:
 
 
 def test_progress_is_reported_for_each_task() -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     with WorkerPool(2) as workers:
         workers.run(
             [EpisodeTask(LONG, IDM(), (0,)), EpisodeTask(SHORT, IDM(), (1,))],
-            lambda task, steps: told.append((task, steps)),
+            lambda task, steps: reported.append((task, steps)),
         )
-    assert {(0, 15_000), (1, 60)} <= set(told)
-    assert any(task == 0 and 0 < steps < 15_000 for task, steps in told)
+    assert {(0, 15_000), (1, 60)} <= set(reported)
+    assert any(task == 0 and 0 < steps < 15_000 for task, steps in reported)
 
 
 @pytest.mark.long

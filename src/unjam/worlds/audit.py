@@ -1,5 +1,6 @@
 """Audit of the physics of all vehicles in every simulation step: braking, time gaps, jerk."""
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -40,7 +41,6 @@ class BrakingStatistics:
     samples: int = 0
 
     def __add__(self, other: "BrakingStatistics") -> "BrakingStatistics":
-        """Return the statistics of the vehicles of both."""
         exceedances = tuple(sum(both) for both in zip(self.exceedances, other.exceedances, strict=True))
         return BrakingStatistics(max(self.max_braking, other.max_braking), exceedances, self.samples + other.samples)
 
@@ -94,43 +94,34 @@ class BrakingLog:
     """Counts the braking of several kinds of drivers, step by step, with constant memory."""
 
     def __init__(self, step: float) -> None:
-        """Start without samples; `step` is the duration of a simulation step [s]."""
-        self._step, self._statistics = step, dict[int, BrakingStatistics]()
-        self._speed_changes: list[Floats] = []
-        self._driver_kinds: list[NDArray[np.uint8]] = []
+        self._step, self._statistics = step, defaultdict[int, BrakingStatistics](BrakingStatistics)
+        self._block: list[tuple[Floats, NDArray[np.uint8]]] = []
 
     def add(self, speed_changes: Floats, driver_kinds: NDArray[np.uint8]) -> None:
         """Add the speed changes of n vehicles in one step [m/s], and their driver kinds: shape (n,)."""
-        self._speed_changes.append(speed_changes)
-        self._driver_kinds.append(driver_kinds)
-        if len(self._speed_changes) == BRAKING_BLOCK_STEPS:
+        self._block.append((speed_changes, driver_kinds))
+        if len(self._block) == BRAKING_BLOCK_STEPS:
             self._count_block()
 
     def statistics(self, driver_kind: int) -> BrakingStatistics:
         """Return the braking statistics of a driver kind so far."""
         self._count_block()
-        return self._statistics.get(driver_kind, BrakingStatistics())
+        return self._statistics[driver_kind]
 
     def _count_block(self) -> None:
-        if not self._speed_changes:
-            return
-        accelerations, kinds = np.concatenate(self._speed_changes) / self._step, np.concatenate(self._driver_kinds)
-        for kind in np.unique(kinds).tolist():
-            block = braking_statistics(accelerations[kinds == kind])
-            self._statistics[kind] = self._statistics.get(kind, BrakingStatistics()) + block
-        self._speed_changes.clear()
-        self._driver_kinds.clear()
+        if self._block:
+            speed_changes, kinds = (np.concatenate(each) for each in zip(*self._block, strict=True))
+            for kind in np.unique(kinds).tolist():
+                self._statistics[kind] += braking_statistics(speed_changes[kinds == kind] / self._step)
+            self._block.clear()
 
 
 class FollowingPair(NamedTuple):
-    """A CAV and its leader in a simulation step: numbers, or arrays with an element for each of n CAVs."""
+    """Speeds [m/s] and net gap [m] of a CAV and its leader in a simulation step: floats, or arrays of n CAVs."""
 
     speed: Any
-    """of the CAV [m/s]"""
     leader_speed: Any
-    """[m/s]"""
     gap: Any
-    """net gap [m]"""
 
 
 def is_recovering(was_recovering: Any, time_behind_leader: Any, previous: FollowingPair, current: FollowingPair) -> Any:
@@ -142,11 +133,8 @@ def is_recovering(was_recovering: Any, time_behind_leader: Any, previous: Follow
     Source: UN Regulation No. 157, 5.2.3.3, which lets a vehicle that cannot respect the minimum time gap
     because of other road users restore it at the next opportunity without harsh braking.
 
-    Args:
-        was_recovering: whether the CAV was recovering in the previous step.
-        time_behind_leader: time since it has this leader [s]; zero in the first step, whatever was before.
-        previous: the CAV and this leader in the previous step.
-        current: both in this step.
+    `was_recovering` and `previous` describe the previous step, behind the same leader. In the first step behind this
+    leader, `time_behind_leader` [s] is zero, and they do not matter.
     """
     is_short = (current.speed > MIN_TIME_GAP_SPEED) & (current.gap < SHORT_TIME_GAP * current.speed)
     opens = (current.leader_speed > current.speed) | (current.gap * previous.speed > previous.gap * current.speed)
@@ -164,17 +152,10 @@ def following_statistics(
     is_yielding: Any = (),
     in_recovery: Any = False,
 ) -> FollowingStatistics:
-    """Return statistics of car following; arrays of shape (moments, CAVs), one `step` apart, NaN without a CAV.
+    """Return statistics of speeds [m/s] and gaps [m]: shape (moments, CAVs), one `step` [s] apart, NaN without a CAV.
 
-    Args:
-        speed: of the CAVs [m/s].
-        leader_speed: [m/s].
-        gap: net gap [m].
-        step: time between two moments [s].
-        is_overridden: which commands SUMO changed, any shape.
-        is_yielding: which commands were given near a crossing, the same shape.
-        in_recovery: moments of `is_recovering`, which do not count for time gaps.
-
+    `is_overridden` are the commands that SUMO changed, `is_yielding` those given near a crossing, of any same shape.
+    Moments that are `in_recovery`, see `is_recovering`, do not count for time gaps.
     Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
     """
     with np.errstate(invalid="ignore", divide="ignore"):

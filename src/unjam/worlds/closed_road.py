@@ -11,7 +11,7 @@ from unjam.physics.kinematics import gap_on_loop, next_position
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import OVERRIDE_TOLERANCE, Audit, braking_statistics, following_statistics
-from unjam.worlds.record import Episode, Floats, make_trajectory
+from unjam.worlds.record import Episode, Floats, Trajectory, make_trajectory
 from unjam.worlds.world import DriverLog
 
 MAX_RECALL_SECONDS = 60.0
@@ -23,7 +23,7 @@ NOISE_BLOCK_STEPS = 100
 
 
 class NeighborIndices(NamedTuple):
-    """Indices of some vehicles and of their neighbors, in road order: integers, or arrays of them."""
+    """Indices of some vehicles and their neighbors, in road order: integers, or arrays of them."""
 
     own: Any
     leader: Any
@@ -45,13 +45,9 @@ def loop_state(
 ) -> LocalState:
     """Return the local state of the vehicles `neighbors.own` on a closed road; floats for integer indices.
 
-    Args:
-        speeds: in road order [m/s]: an array of shape (vehicles,) or (vehicles, moments), or a list.
-        positions: of front bumpers, not wrapped [m], likewise.
-        neighbors: indices of the vehicles and their neighbors.
-        loop_length: of the road [m].
-        crossings: ranges where the road crosses itself [m].
-        penetration_rate: as a service reports it; None: no service does.
+    Speeds [m/s] and positions of front bumpers, not wrapped [m], are in road order: arrays of shape (vehicles,) or
+    (vehicles, moments), or lists. `crossings` are ranges where the road crosses itself [m]. `penetration_rate` is
+    that reported by a service; None: there is no such service.
     """
     own, leader, follower = neighbors
     speed, position = speeds[own], positions[own]
@@ -74,12 +70,10 @@ def loop_state(
 
 
 def poses_along(outline: Floats, positions: Floats, loop_length: float) -> Floats:
-    """Return rows (x, y, heading) of vehicles with front bumpers at `positions` along a closed road.
+    """Return rows (x, y, heading) of vehicles on a closed road, shape (..., 3): [m], and [rad] against the x axis.
 
-    The outline has rows (coordinate along the road, x, y) [m]. Positions are not wrapped [m], any shape.
-
-    Returns:
-        Shape (..., 3): [m], and [rad] against the x axis; a vehicle is a chord between its bumpers.
+    The outline has rows (coordinate along the road, x, y) [m]. Positions of front bumpers are not wrapped [m], any
+    shape. A vehicle is a chord between its bumpers.
     """
     (x, y), (rear_x, rear_y) = (
         [np.interp(along % loop_length, outline[:, 0], outline[:, axis]) for axis in (1, 2)]
@@ -136,13 +130,9 @@ class ClosedRoadLog:
         driver_log: DriverLog,
         rows: Any,
     ) -> Episode:
-        """Return the record of the episode.
+        """Return the record, with further `common_fields` and the decisions of the driver.
 
-        Args:
-            speeds_and_positions: of this log.
-            common_fields: further fields of the record.
-            driver_log: the driver's decisions.
-            rows: rows of the CAVs in these decisions, shape (C,); None: decisions are floats.
+        `rows` are those of the CAVs in these decisions, shape (C,); None: decisions are floats.
         """
         road, stride = self.road, self.scenario.steps_per_control_step
         speeds, positions = (values[:, ::stride] for values in speeds_and_positions)
@@ -150,24 +140,15 @@ class ClosedRoadLog:
         gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
         states = self._local_states(speeds, positions)
         applied, filter_braking = self._applied_and_filtered()
-        shield_braking = (
-            self._added_braking().reshape(control_steps, -1, len(road.cav_ids)).max(1).clip(0.0, None)
-        )  # the maximum in each control step
-        trajectories = tuple(
-            make_trajectory(
-                vehicle=name,
-                entry_number=number if rows is None else int(rows[number]),
-                start_step=0,
-                rows=None if rows is None else np.full(control_steps + 1, rows[number]),
-                states=states.map(lambda values: np.ascontiguousarray(values[number])),  # noqa: B023
-                applied_acceleration=np.ascontiguousarray(applied[:, number]),
-                filter_braking=np.ascontiguousarray(filter_braking[:, number]),
-                shield_braking=np.ascontiguousarray(shield_braking[:, number]),
-                terminated=self.has_crashed,
-                driver_log=driver_log,
-            )
-            for number, name in enumerate(road.cav_ids)
-        )
+        shield_braking = self._added_braking().reshape(control_steps, -1, len(road.cav_ids)).max(1).clip(0.0, None)
+        trajectories = list[Trajectory]()
+        for number, name in enumerate(road.cav_ids):
+            entry = number if rows is None else int(rows[number])
+            entry_rows = None if rows is None else np.full(control_steps + 1, entry)
+            state = states.map(lambda values: np.ascontiguousarray(values[number]))  # noqa: B023
+            commands = (np.ascontiguousarray(each[:, number]) for each in (applied, filter_braking, shield_braking))
+            trip = name, entry, 0, entry_rows, state
+            trajectories.append(make_trajectory(*trip, *commands, terminated=self.has_crashed, driver_log=driver_log))
         return Episode(
             **common_fields,
             vehicle_ids=road.vehicle_ids,
@@ -179,7 +160,7 @@ class ClosedRoadLog:
             loop_length=road.loop_length,
             crossings=road.crossings,
             outline=road.center_line,
-            trajectories=trajectories,
+            trajectories=tuple(trajectories),
             audit=self._audit(*speeds_and_positions),
         )
 
@@ -189,10 +170,7 @@ class ClosedRoadLog:
         states = self._local_states(speeds, positions).map(lambda values: values.T)
         followed = states.speed, states.leader_speed, states.leader_gap
         accelerations, is_cav = np.diff(speeds, axis=1) / step, np.zeros(len(speeds), bool)
-        if not len(self.requested_accelerations):
-            following = following_statistics(*followed, step)
-            return Audit(braking_statistics(accelerations), following=following, required_time_gap=time_gap)
-        is_cav[self.cav_indices] = True
+        is_cav[self.cav_indices] = len(self.requested_accelerations) > 0
         near_crossing = np.zeros(1, bool)
         for start, end in self.road.crossings:
             distance_to_end = (end - states.route_position[:-1]) % self.road.loop_length

@@ -28,11 +28,14 @@ class DriveLoop:
     ) -> None:
         """Start the world; no control step is made yet.
 
-        A learned policy adds its exploration noise times `explore`. Without a `memory`, the driver remembers only the
+        Exploration noise of a policy is multiplied by `explore`. Without a `memory`, the driver only remembers the
         world's history. `on_progress` is called now and then with the number of control steps made.
         """
         self.world, self.driver, self._on_progress = world, driver, on_progress
-        self._draw_noise = _noise_function(world, driver, explore)
+        size = driver.episode_noise_size
+        draw = partial(world.noise, size) if size else world.noise
+        scaled = draw if explore == 1.0 else lambda: explore * draw()
+        self._draw_noise: NoiseSampler | None = scaled if explore else None
         history = world.start(not driver.is_native, on_progress)
         self.memory = driver.initial_memory(world.cav_count) if memory is None else memory
         if history is not None:
@@ -77,15 +80,6 @@ class DriveLoop:
         rows = self.world.cav_count
         for row in range(rows - self.world.entered_count + len(self.initial_memories), rows):
             self.initial_memories.append(map_leaves(lambda values: np.array(values[row], np.float64), self.memory))  # noqa: B023
-
-
-def _noise_function(world: World[Any], driver: Driver, explore: float) -> NoiseSampler | None:
-    """Return the function that draws exploration noise, times `explore`, for each action of the driver's network."""
-    size = driver.episode_noise_size
-    draw = partial(world.noise, size) if size else world.noise
-    if explore in (0.0, 1.0):
-        return draw if explore else None
-    return lambda: explore * draw()
 
 
 def drive_world(

@@ -51,8 +51,8 @@ def run_episode(
 ) -> Episode:
     """Run one episode and return its record.
 
-    The result depends only on scenario, driver, seed, reward, `explore` and `stop_at_contact`: not on the process,
-    on earlier episodes in it, or on the clock.
+    The result depends only on scenario, driver, seed, reward, `explore` and `stop_at_contact`, not on the process,
+    earlier episodes in it, or the clock.
 
     Args:
         scenario: road, traffic and horizon.
@@ -85,9 +85,8 @@ def run_episode(
     if not simulation.episode_lock.acquire(blocking=False):
         raise UnjamError("simulation: an episode is running in it; allowed: one at a time")
     try:
-        traffic = make_traffic(
-            scenario, seed, simulation, driver.accepts_floats, record_details, driver.measured_fields
-        )
+        details = driver.accepts_floats, record_details, driver.measured_fields
+        traffic = make_traffic(scenario, seed, simulation, *details)
         traffic.stop_at_contact = stop_at_contact
         episode = drive_world(traffic, driver, explore, on_progress=on_progress)
         episode = replace(episode, warnings=simulation.finish())

@@ -16,17 +16,10 @@ MAX_REWARD_CELLS = 4_000_000
 def episode_reward_terms(
     reward: Reward, speeds: Floats, trajectories: Sequence[Trajectory], has_crashed: bool, backlog: Floats
 ) -> dict[str, Floats]:
-    """Return the terms of a reward in a whole episode, each of shape (T,).
+    """Return the terms of a reward in a whole episode, each of shape (T,); raise `InputError` if one is invalid.
 
-    Args:
-        reward: the reward function.
-        speeds: of all vehicles, shape (T + 1, N).
-        trajectories: of the CAVs.
-        has_crashed: whether a collision ended the last control step.
-        backlog: insertion backlog, shape (T + 1,), or (0,) if there is none.
-
-    Raises:
-        InputError: a term is not finite, or does not have one value for each control step.
+    Speeds are those of all vehicles, shape (T + 1, N), trajectories those of CAVs. `has_crashed`: a collision ended the
+    last control step. The insertion backlog has shape (T + 1,), or (0,) if there is none.
     """
     steps, rows = len(speeds) - 1, max(1, MAX_REWARD_CELLS // max(1, speeds.shape[1]))
     parts = [slice(start, min(start + rows, steps)) for start in range(0, max(steps, 1), rows)]
@@ -42,7 +35,6 @@ def episode_reward_terms(
 def _step_outcomes(
     speeds: Floats, trajectories: Sequence[Trajectory], has_crashed: bool, backlog: Floats, step_range: slice
 ) -> Outcome:
-    """Return the outcome of some control steps; `has_crashed`: the last of them ended with a collision."""
     first, end = step_range.start, step_range.stop
     size = end - first
     cavs = [each for each in trajectories if each.step_slice.start < end and first < each.step_slice.stop]

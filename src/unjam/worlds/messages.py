@@ -16,8 +16,7 @@ ARRAY_KINDS = "biuf"
 def write_message(pipe: IO[bytes], content: dict[str, Any], arrays: Arrays | None = None) -> None:
     """Write one message: `content` as JSON, and named arrays of numbers.
 
-    An array is written directly from its memory, and then removed from `arrays`. So hours of traffic, to which
-    nothing else refers, are in memory once, both here and at the reader.
+    Arrays are removed from `arrays` once they are written, so that hours of traffic are in memory only once.
     """
     unwritten = {} if arrays is None else arrays
     for name, array in unwritten.items():
@@ -47,8 +46,7 @@ def read_message(pipe: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
 
 
 def _array_bytes(array: np.ndarray) -> memoryview:
-    """Return the memory of an array; writing to it changes the array."""
-    return array.reshape(-1).view(np.uint8).data
+    return array.reshape(-1).view(np.uint8).data  # shares its memory
 
 
 def _read_exactly(pipe: IO[bytes], length: int) -> bytes:

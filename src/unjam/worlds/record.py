@@ -29,15 +29,13 @@ class Trajectory:
     states: LocalState
     """states that the CAV observed, shape (T + 1,): the last entry is the state at the end"""
     observations: Floats
-    """network observation at each action and at the end, shape (actions + 1, inputs); an action is held for
-    `action_repeat` control steps; (1, 0) without a network"""
+    """network observation at each action and at the end, shape (actions + 1, inputs); (1, 0) without a network"""
     expert_acceleration: Floats
     """the expert's acceleration within the action limit [m/s2]"""
     residual: Floats
     """the network's residual with its exploration noise, not clipped [m/s2]; zero without a network"""
     applied_acceleration: Floats
-    """the commanded acceleration within the action limit, or harder braking that the safety filter demanded; mean over
-    the control step [m/s2]"""
+    """the commanded acceleration, or harder braking by the safety filter; mean over the control step [m/s2]"""
     filter_braking: Floats
     """largest reduction of the driver's acceleration by the safety filter [m/s2]; zero if it did not intervene"""
     shield_braking: Floats
@@ -53,7 +51,7 @@ class Trajectory:
 
     @property
     def step_slice(self) -> slice:
-        """Its control steps among those of the episode."""
+        """The control steps of the episode."""
         return slice(self.start_step, self.start_step + len(self.applied_acceleration))
 
     @cached_property
@@ -80,13 +78,10 @@ def make_trajectory(
     terminated: bool,
     driver_log: DriverLog,
 ) -> Trajectory:
-    """Return the trajectory of a trip with the driver's decisions; arguments not listed are as in `Trajectory`.
+    """Return the trajectory of a trip with the driver's decisions; arguments are as in `Trajectory`, or as follows.
 
-    Args:
-        entry_number: number of CAVs that entered before this one.
-        rows: its row among the CAVs at each moment, shape (T + 1,); None: decisions are floats.
-        applied_acceleration: its commands; the actual accelerations of human drivers.
-        driver_log: all decisions of the driver.
+    `entry_number` is the number of earlier CAVs, `rows` the row among the CAVs at each moment, shape (T + 1,), or None
+    if decisions are floats. `applied_acceleration` is the actual acceleration of human drivers.
     """
     trip, commands = (vehicle, start_step, states), (applied_acceleration, filter_braking, shield_braking)
     if not driver_log.decisions:
@@ -94,7 +89,6 @@ def make_trajectory(
         return Trajectory(*trip, np.zeros((1, 0)), expert, residual, *commands, {}, 1, terminated)
 
     def select(values: Sequence[Any], steps: Sequence[int]) -> Floats:
-        """Return this CAV's values at some control steps."""
         return np.array([values[step] if rows is None else values[step][rows[step - start_step]] for step in steps])
 
     experts, residuals, observations = zip(*driver_log.decisions, strict=True)
@@ -145,8 +139,7 @@ class Episode:
     vehicle_ids: tuple[str, ...] = ()
     cav_ids: tuple[str, ...] = ()
     vehicle_columns: tuple[int, ...] = ()
-    """column of each vehicle if vehicles of different times share the N columns: with an empty moment between two, and
-    CAVs only with CAVs; empty: each vehicle has its own, in order"""
+    """column of each vehicle if vehicles of different times share columns, CAVs only with CAVs; empty: own columns"""
     snapshot_stride: int = 1
     """number of control steps between two snapshots of positions: more than 1 if many vehicles drive for long"""
     collisions: int = 0
@@ -182,11 +175,9 @@ class Episode:
     lane_lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) if not recorded"""
     poses: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T // snapshot_stride + 1, N, 3); no rows if
-    not recorded"""
+    """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T // snapshot_stride + 1 or 0, N, 3)"""
     lane_indices: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """index in `lane_names` of each vehicle's lane, shape (T // snapshot_stride + 1, N), NaN in no such lane; (0, 0) if
-    not recorded"""
+    """index in `lane_names` or NaN of each vehicle, shape (T // snapshot_stride + 1, N); (0, 0) if not recorded"""
     lane_names: tuple[str, ...] = ()
     """of a road with lanes, from left to right in driving direction"""
     reward_terms: dict[str, Floats] = field(default_factory=dict)

@@ -72,24 +72,17 @@ def released_reward(outcome: Outcome) -> dict[str, Array]:
 
 def eq16_reward(outcome: Outcome) -> dict[str, Array]:
     """Reward Eq. 16 of the paper with the sign of its first term corrected: it rewards speeds near v_des."""
-    mean = _nan_mean(outcome.speeds)
     return {
-        "speed": MOBILITY_WEIGHT * clamp_min(DESIRED_SPEED - abs(DESIRED_SPEED - mean), 0.0),
-        **_eq16_costs(outcome),
+        "speed": MOBILITY_WEIGHT * clamp_min(DESIRED_SPEED - abs(DESIRED_SPEED - _nan_mean(outcome.speeds)), 0.0),
+        "time_gap": TIME_GAP_WEIGHT * time_gap_penalty(outcome),
+        "acceleration": -ACCELERATION_WEIGHT * _nan_sum(abs(outcome.accelerations)),
     }
 
 
 def printed_eq16_reward(outcome: Outcome) -> dict[str, Array]:
     """Reward Eq. 16 as printed: its first term rewards low speeds. It is here to show this."""
-    mean = _nan_mean(outcome.speeds)
-    return {"speed": MOBILITY_WEIGHT * clamp_min(DESIRED_SPEED - mean, 0.0), **_eq16_costs(outcome)}
-
-
-def _eq16_costs(outcome: Outcome) -> dict[str, Array]:
-    return {
-        "time_gap": TIME_GAP_WEIGHT * time_gap_penalty(outcome),
-        "acceleration": -ACCELERATION_WEIGHT * _nan_sum(abs(outcome.accelerations)),
-    }
+    speed = MOBILITY_WEIGHT * clamp_min(DESIRED_SPEED - _nan_mean(outcome.speeds), 0.0)
+    return {**eq16_reward(outcome), "speed": speed}
 
 
 def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
@@ -173,23 +166,26 @@ def make_reward(text: str) -> Reward:
 
     `released:acceleration=2,time_gap=0.5` is the reward `released` with double weight of its term `acceleration`, plus
     half of the term `time_gap` of `REWARD_TERMS`. `path.py:name` is a function that takes an `Outcome` and returns
-    its terms by name, or one array.
-
-    Raises:
-        InputError: unknown name or term, a weight that is not a number, or the file does not have this function.
+    its terms by name, or one array. Raise `InputError` for unknown names and terms, and weights that are not numbers.
     """
     name, weights = split_parameters(text)
     for term, weight in weights.items():
         is_number = isinstance(weight, int | float) and not isinstance(weight, bool)
         if not is_number or not abs(weight) <= float_info.max:  # refuses NaN, too
             raise invalid_value(f"reward {name}: {term}", weight, "a number")
-    if is_file_reference(name):
-        reward = _user_reward(name)
-    elif name in REWARDS:
-        reward = REWARDS[name]
-    else:
+    if not is_file_reference(name) and name not in REWARDS:
         raise unknown_name("reward", name, [*REWARDS, "path.py:name"])
-    return _weighted_reward(reward, weights) if weights else reward
+    reward = REWARDS.get(name) or _user_reward(name)
+
+    def weighted_reward(outcome: Outcome) -> dict[str, Array]:
+        terms = dict(reward(outcome))
+        for name, weight in weights.items():
+            if name not in terms and name not in REWARD_TERMS:
+                raise invalid_value("reward: term", name, ", ".join(dict.fromkeys([*terms, *REWARD_TERMS])))
+            terms[name] = weight * (terms[name] if name in terms else REWARD_TERMS[name](outcome))
+        return terms
+
+    return weighted_reward if weights else reward
 
 
 def _user_reward(name: str) -> Reward:
@@ -201,17 +197,3 @@ def _user_reward(name: str) -> Reward:
         return terms if isinstance(terms, dict) else {"reward": terms}
 
     return user_reward
-
-
-def _weighted_reward(reward: Reward, weights: dict[str, float]) -> Reward:
-    """Return a reward with weights of its terms; terms that it does not have come from `REWARD_TERMS`."""
-
-    def weighted_reward(outcome: Outcome) -> dict[str, Array]:
-        terms = dict(reward(outcome))
-        for name, weight in weights.items():
-            if name not in terms and name not in REWARD_TERMS:
-                raise invalid_value("reward: term", name, ", ".join(dict.fromkeys([*terms, *REWARD_TERMS])))
-            terms[name] = weight * (terms[name] if name in terms else REWARD_TERMS[name](outcome))
-        return terms
-
-    return weighted_reward

@@ -47,16 +47,6 @@ def _answer_request(
     request: dict[str, Any], arrays: Arrays, open_simulation: Callable[[], Simulation], output: BinaryIO
 ) -> None:
     """Run an episode and send its record. The record of hours of traffic does not stay in memory here."""
-    try:
-        content, record_arrays = pack(_run_request(request, arrays, open_simulation(), output))
-    except Exception as error:  # every requested episode has a row, also one that failed
-        unjam_error = as_unjam_error(error)
-        failed = failed_episode(tuple(request["seed"]), str(unjam_error), type(unjam_error).__name__)
-        content, record_arrays = pack(failed)
-    write_message(output, {"episode": content}, record_arrays)
-
-
-def _run_request(request: dict[str, Any], arrays: Arrays, simulation: Simulation, output: BinaryIO) -> Any:
     last = time.monotonic()
 
     def send_progress(control_steps: int) -> None:
@@ -68,14 +58,21 @@ def _run_request(request: dict[str, Any], arrays: Arrays, simulation: Simulation
             except BrokenPipeError:
                 sys.exit()  # the parent has ended
 
-    if "files" in request:  # what the parent has read of the files; changed files are read again
-        take_answer(request["scenario"]["file"], request["files"])
-    scenario = scenario_from_recipe(request["scenario"])
-    if isinstance(scenario, UserNetwork):
-        enter_sandbox()
-    driver = driver_from_recipe(request["driver"], arrays)
-    options = {name: request[name] for name in ("seed", "reward", "explore", "record_details", "stop_at_contact")}
-    return run_episode(scenario, driver, **options, simulation=simulation, on_progress=send_progress)
+    try:
+        if "files" in request:  # what the parent has read of the files; changed files are read again
+            take_answer(request["scenario"]["file"], request["files"])
+        scenario = scenario_from_recipe(request["scenario"])
+        if isinstance(scenario, UserNetwork):
+            enter_sandbox()
+        driver = driver_from_recipe(request["driver"], arrays)
+        options = {name: request[name] for name in ("seed", "reward", "explore", "record_details", "stop_at_contact")}
+        options |= {"simulation": open_simulation(), "on_progress": send_progress}
+        content, record_arrays = pack(run_episode(scenario, driver, **options))
+    except Exception as error:  # every requested episode has a row, also one that failed
+        unjam_error = as_unjam_error(error)
+        failed = failed_episode(tuple(request["seed"]), str(unjam_error), type(unjam_error).__name__)
+        content, record_arrays = pack(failed)
+    write_message(output, {"episode": content}, record_arrays)
 
 
 if __name__ == "__main__":

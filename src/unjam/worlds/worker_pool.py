@@ -6,8 +6,9 @@ import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 from unjam.child_processes import child_environment, python_command
 from unjam.drivers.driver import Driver
@@ -51,17 +52,15 @@ class EpisodeTask:
         return content, arrays
 
 
-class WorkerPool:
+class WorkerPool(AbstractContextManager["WorkerPool"]):
     """A fixed number of worker processes, started when first needed, and replaced when they die or hang.
 
-    The episodes depend only on the tasks: not on the number of workers, on the worker that ran a task, or on how
-    often a worker was replaced.
+    The episodes depend only on the tasks, not on the number of workers, their order, or how often they were replaced.
     """
 
     def __init__(
         self, count: int = 1, timeout: float = WORKER_TIMEOUT, max_attempts: int = MAX_EPISODE_ATTEMPTS
     ) -> None:
-        """Prepare `count` workers; no process is started yet."""
         self.count, self._max_attempts, self._is_first = count, max_attempts, True
         remove_stale_private_folders()
         self._temporary_folder = PrivateFolder()  # of all workers, so that a killed one leaves no files
@@ -74,8 +73,7 @@ class WorkerPool:
     def run(self, tasks: Sequence[EpisodeTask], on_progress: Callable[[int, int], None] | None = None) -> list[Episode]:
         """Run all tasks and return their episodes, in the order of the tasks; a failed one contains the reason.
 
-        `on_progress` is called with a task's index and its control steps so far, from several threads. Errors as in
-        `run_and_map`.
+        `on_progress` is called with a task's index and its control steps so far, from several threads.
         """
         return self.run_and_map(tasks, lambda index, episode: episode, on_progress)
 
@@ -87,10 +85,8 @@ class WorkerPool:
     ) -> list[ResultT]:
         """Run all tasks and return `transform(index, episode)` of each: many whole episodes would need much memory.
 
-        `transform` is called when an episode ends, from several threads.
-
-        Raises:
-            SumoInputError: SUMO refuses the files of the very first task, and would also refuse those of others.
+        `transform` is called when an episode ends, from several threads. If SUMO refuses the files of the very first
+        task, and so would refuse those of others, raise `SumoInputError`.
         """
         is_first, self._is_first = self._is_first, False
 
@@ -117,8 +113,7 @@ class WorkerPool:
         try:
             for _ in range(self._max_attempts):
                 try:
-                    worker.set_sandboxed(isinstance(task.scenario, UserNetwork))
-                    episode = worker.run(task.message(), lambda steps: on_progress and on_progress(index, steps))
+                    episode = worker.run(task, lambda steps: on_progress and on_progress(index, steps))
                     if on_progress is not None:
                         on_progress(index, episode.control_steps)
                     return episode
@@ -135,9 +130,6 @@ class WorkerPool:
             worker.stop()
         self._thread_pool.shutdown(wait=True, cancel_futures=True)
         self._temporary_folder.cleanup()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -175,14 +167,11 @@ class _Worker:
         threading.Thread(target=_forward_messages, args=(process, self._messages), daemon=True).start()
         return process
 
-    def set_sandboxed(self, is_sandboxed: bool) -> None:
-        """Store whether the next episode sandboxes the process; a process cannot leave its sandbox."""
-        if self._is_sandboxed and not is_sandboxed:
-            self._kill()
-        self._is_sandboxed = is_sandboxed
-
-    def run(self, task: Message, on_progress: Callable[[int], object]) -> Episode:
+    def run(self, task: EpisodeTask, on_progress: Callable[[int], object]) -> Episode:
         """Return the episode of a task; raise `_WorkerLostError` if the process dies or does not answer."""
+        was_sandboxed, self._is_sandboxed = self._is_sandboxed, isinstance(task.scenario, UserNetwork)
+        if was_sandboxed and not self._is_sandboxed:  # a process cannot leave its sandbox
+            self._kill()
         with self._start_lock:
             if self._is_stopped:
                 raise _WorkerLostError("stopped")
@@ -190,12 +179,9 @@ class _Worker:
         # The process reads and loads a user's network before its first message.
         timeout = self._timeout + (MAX_READER_TIME if self._is_sandboxed else 0.0)
         try:
-            self._send(process, self._with_files(task))
-            while True:
-                message = self._messages.get(timeout=timeout)
+            self._send(process, *task.message())
+            while (message := self._messages.get(timeout=timeout)) is not None:
                 timeout = self._timeout
-                if message is None:
-                    raise _WorkerLostError(self._exit_reason(process))
                 content, arrays = message
                 if "episode" in content:
                     return unpack(Episode, content["episode"], arrays)
@@ -204,24 +190,19 @@ class _Worker:
             self._kill()
             raise _WorkerLostError(f"no message for {timeout:g} s") from None
         except BrokenPipeError:
-            raise _WorkerLostError(self._exit_reason(process)) from None
+            pass
+        raise _WorkerLostError(self._exit_reason(process))
 
-    def _with_files(self, task: Message) -> Message:
-        """Add the content of the user's files to a task, the first time that the process needs it."""
-        content, arrays = task
-        file = content["scenario"].get("file")
-        answer = answer_of(file) if file and file not in self._sent_files else None
-        if answer is None:
-            return task
-        self._sent_files.add(file)
-        return {**content, "files": answer}, arrays
-
-    def _send(self, process: subprocess.Popen[bytes], task: Message) -> None:
+    def _send(self, process: subprocess.Popen[bytes], content: dict[str, Any], arrays: Arrays) -> None:
+        """Send a task, with the content of the user's files the first time that the process needs it."""
         assert process.stdin is not None
+        file = content["scenario"].get("file")
+        if file and file not in self._sent_files and (answer := answer_of(file)):
+            self._sent_files.add(file)
+            content = {**content, "files": answer}
         timer = threading.Timer(self._timeout, process.kill)  # a full pipe without a reader blocks forever
         timer.start()
         try:
-            content, arrays = task
             write_message(process.stdin, content, dict(arrays))
         finally:
             timer.cancel()

@@ -47,9 +47,7 @@ class World(Protocol[RecordT]):
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Start, and hand the CAVs to the driver unless they stay human (`is_controlled` false).
 
-        Returns:
-            The states of the CAVs before the start, for drivers with a memory: arrays of shape (CAVs, moments),
-            oldest first; None if there is no history.
+        Return their earlier states for drivers with a memory, shape (CAVs, moments), oldest first; None without any.
         """
         ...
 
@@ -73,18 +71,13 @@ class World(Protocol[RecordT]):
         ...
 
     def advance(self, command: Command | None) -> None:
-        """Carry out one control step of every CAV; None: the CAVs stay human.
-
-        Raises:
-            InputError: a command is not finite, or the number of commands differs from the number of CAVs.
-        """
+        """Carry out one control step of every CAV; None: they stay human. Raise `InputError` for invalid commands."""
         ...
 
     def noise(self, episode_noise_size: int = 0) -> Array:
         """Return standard normal noise for one action of a network: shape (CAVs,), or a float.
 
-        With `episode_noise_size`, return that many numbers for each CAV, shape (CAVs, size). They are the same for
-        all CAVs of a road and for the whole episode.
+        With `episode_noise_size`, shape (CAVs, size): the same numbers for all CAVs of a road and the whole episode.
         """
         ...
 
@@ -143,14 +136,11 @@ class RecordedWorld(_OfflineWorld):
 
 
 class CarFollowingRecord(NamedTuple):
-    """The motion of n car-following pairs in T steps; arrays of shape (T + 1, n)."""
+    """Speeds [m/s] and gaps [m] of n CAVs and their leaders in T steps; arrays of shape (T + 1, n)."""
 
     speed: Floats
-    """of the CAVs [m/s]"""
     leader_speed: Floats
-    """[m/s]"""
     gap: Floats
-    """[m]"""
 
 
 class CarFollowingWorld(_OfflineWorld):

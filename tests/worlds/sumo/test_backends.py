@@ -46,7 +46,7 @@ def command(tmp_path: Path) -> Iterator[list[str]]:
 
 
 def speeds_of(sumo: Any, command: list[str], meanwhile: Callable[[], object] = lambda: None) -> list[Any]:
-    """The speeds in a user's simulation, half of whose steps are made before something else runs."""
+    """The speeds in a user's simulation; `meanwhile` runs after half of its steps."""
     sumo.start(command)
     found = []
     for step in range(STEPS):

@@ -21,7 +21,7 @@ STEP = 0.1
 
 
 class Playback(Driver):
-    """Asks for what it was told to ask for, one row of accelerations after the other."""
+    """Commands given accelerations, one row after the other."""
 
     def __init__(self, rows: Floats) -> None:
         self.rows = rows
@@ -35,7 +35,7 @@ class Playback(Driver):
 
 
 class Watcher(Playback):
-    """Stands still and keeps what it was told of the warm-up and what it perceived."""
+    """Stands still and stores the history of the warm-up and its states."""
 
     def __init__(self) -> None:
         super().__init__(np.full(10_000, -1.0))

@@ -1,4 +1,4 @@
-"""Detectors on a road in SUMO: the same whoever counts, and other simulations go on after one that failed."""
+"""Induction loops in SUMO: passages are the same for any number of processes, also after failed simulations."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ STEADY = (
 
 
 def road(folder: Path, vehicles: str = STEADY) -> UserNetwork:
-    """A road with one lane, people alone."""
+    """Human-only traffic on a road with one lane."""
     folder.mkdir(exist_ok=True)
     return load_user_network(str(straight(folder, vehicles)), {"penetration_rate": 1e-12})
 
@@ -59,8 +59,8 @@ def test_a_lane_change_on_a_loop_has_no_speed_as_with_sumos_own_detectors(tmp_pa
     with Simulation() as simulation:
         load_with_loops(simulation, ramp, (1,), loops)
         passed = passages(simulation, loops, 250)
-        told = simulation._sumo.inductionloop
-        own = [told.getIntervalMeanSpeed(loop_name(number)) for number in range(len(loops))]
+        loops_of_sumo = simulation._sumo.inductionloop
+        own = [loops_of_sumo.getIntervalMeanSpeed(loop_name(number)) for number in range(len(loops))]
     speeds = [np.array([one.speed for one in passed if one.loop == number]) for number in range(len(loops))]
     assert [np.nanmean(each) for each in speeds] == pytest.approx(own, rel=1e-9)
     assert sum(int(np.isnan(each).sum()) for each in speeds) == 3

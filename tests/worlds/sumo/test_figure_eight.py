@@ -96,7 +96,7 @@ class ByRow(Driver):
 
 
 def test_vehicles_from_the_right_yield(simulation: Simulation) -> None:
-    """Somebody stands before the crossing on the yielding way, nobody ever does on the other."""
+    """Vehicles stand before the crossing on the yielding approach, and never on the other one."""
     episode = run_episode(FigureEight(radius=(32, 32)), Human(), (0,), simulation=simulation)
     road = FigureEight(radius=(32, 32)).draw(np.random.default_rng(0))
     place = episode.positions % road.loop_length

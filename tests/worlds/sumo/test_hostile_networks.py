@@ -71,7 +71,7 @@ CONTENT = "as it was"
 
 @pytest.fixture
 def hostile(tmp_path: Path) -> Path:
-    """A road whose every file wants to write onto `canary`, and whose configuration opens a port."""
+    """A road: every file of it writes to `canary`, and its configuration opens a port."""
     path, canary = straight(tmp_path, COLUMN), tmp_path / "canary"
     canary.write_text(CONTENT)
     demand = tmp_path / "demand.rou.xml"

@@ -41,7 +41,7 @@ def test_each_human_driver_on_the_ring_has_its_own_parameters(tmp_path: Path, hu
     assert episode.has_run
     acceleration = np.diff(episode.speeds, axis=0)[200:] / episode.control_step
     speeds, gaps = episode.speeds[200:-1], episode.gaps[200:-1]
-    # Who drives what is drawn: it is told from how they drive.
+    # The assignment of drivers is random: it is identified from their driving.
     wanted = [idm_acceleration(speeds, np.roll(speeds, -1, 1), gaps, one) for one in DRIVERS]
     errors = np.abs(np.array(wanted) - acceleration).max(1)
     assert errors.min(0).max() < 1e-6

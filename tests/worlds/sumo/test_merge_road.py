@@ -1,4 +1,4 @@
-"""The merge on the actual simulator: how its people drive, and what is counted of it."""
+"""The merge in SUMO: its human drivers, and what is counted."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -40,7 +40,7 @@ def idm(speed: float, leader_speed: float, gap: float) -> float:
 
 
 class Commands:
-    """What was asked for in each step, beside what the IDM says, on and off the junction."""
+    """Commands in each step and speeds of the IDM, on and off the junction."""
 
     def __init__(
         self, traffic: MergingTraffic, simulation: Simulation, monkeypatch: pytest.MonkeyPatch, steps: int
@@ -48,11 +48,11 @@ class Commands:
         asked: dict[str, float] = {}
         command = simulation.command_speeds
         self.off: list[tuple[float, float, float]] = []
-        """of people off the junction: before, what was asked for, what the IDM says"""
+        """of human drivers off the junction: previous speed, command, IDM"""
         self.done: list[float] = []
         """by how much each of them then drove faster than it was asked to"""
         self.on: list[float] = []
-        """what people on the junction were asked for"""
+        """commands to human drivers on the junction"""
 
         def listen(names: Any, speeds: Any) -> None:
             names, speeds = list(names), list(speeds)

@@ -1,4 +1,4 @@
-"""Who is where on a merging road, against a second and plain implementation, and against SUMO."""
+"""Order and neighbors on a merging road, compared with a second, plain implementation and with SUMO."""
 
 from dataclasses import dataclass
 
@@ -42,13 +42,13 @@ def leader_of(vehicle: Vehicle, others: list[Vehicle]) -> Vehicle | None:
 
 
 def follower_of(vehicle: Vehicle, others: list[Vehicle]) -> Vehicle | None:
-    """Of those whose leader it is, the nearest."""
+    """The nearest of the vehicles that follow it."""
     behind = [other for other in others if leader_of(other, others) is vehicle]
     return max(behind, key=lambda other: other.position, default=None)
 
 
 def drive(vehicles: list[Vehicle], wanted: list[float], step: float) -> None:
-    """Move all by wanted speeds, foremost first, but nobody past its leader."""
+    """Move all by desired speeds, from front to back, but none past its leader."""
     for vehicle, speed in zip(sorted(vehicles, key=lambda each: -each.position), wanted, strict=False):
         leader = leader_of(vehicle, vehicles)
         room = np.inf if leader is None else max(leader.position - vehicle.position - 0.01, 0.0)

@@ -1,4 +1,4 @@
-"""Is what is said of a motorway what SUMO does there, and who may command what where?"""
+"""Traffic on a motorway compared with SUMO, and commands to CAVs."""
 
 from dataclasses import replace
 
@@ -137,15 +137,15 @@ def test_an_acc_keeps_the_commanded_time_gap_while_it_is_commanded(simulation: S
             if decision > 100:
                 seen = traffic.local_state()
                 found += (seen.leader_gap / seen.speed.clip(0.1))[seen.leader_gap < MAX_OBSERVED_GAP].tolist()
-        told = traffic.cav_ids
+        before = traffic.cav_ids
         traffic.advance(Command(np.full(traffic.cav_count, 100.0), np.full(traffic.cav_count, asked)))
-        kept = [name for name in told if name in traffic.cav_ids]
-        assert {libsumo.vehicle.getTau(name) for name in kept} == {max(asked, own)}
+        remaining = [name for name in before if name in traffic.cav_ids]
+        assert {libsumo.vehicle.getTau(name) for name in remaining} == {max(asked, own)}
         traffic.advance(Command(np.full(traffic.cav_count, 100.0), np.full(traffic.cav_count, np.nan)))
-        assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cav_ids} == {own}
+        assert {libsumo.vehicle.getTau(name) for name in remaining if name in traffic.cav_ids} == {own}
         traffic.advance(Command(np.full(traffic.cav_count, 100.0), np.full(traffic.cav_count, asked)))
         traffic.advance(Command(np.full(traffic.cav_count, 100.0)))  # nothing asked is as NaN for all
-        assert {libsumo.vehicle.getTau(name) for name in kept if name in traffic.cav_ids} == {own}
+        assert {libsumo.vehicle.getTau(name) for name in remaining if name in traffic.cav_ids} == {own}
         return float(np.quantile(found, 0.1))
 
     assert shortest(2.0) > shortest(0.5) + 0.3
@@ -263,7 +263,7 @@ def test_branches_and_demand_peak_are_recorded(capped: Episode) -> None:
 
 @pytest.mark.long
 def test_a_cav_with_a_cap_still_brakes_as_hard_as_its_own_acc(simulation: Simulation) -> None:
-    """SUMO keeps who is told a speed to comfortable braking: told on, this one ran into a jam's tail."""
+    """SUMO limits vehicles with a commanded speed to comfortable braking: they would run into the tail of a jam."""
     road = OnRamp(penetration_rate=0.3, horizon=800)
     episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), simulation=simulation)
     assert (episode.status, episode.collisions) == ("completed", 0)

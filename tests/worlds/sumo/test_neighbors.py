@@ -32,7 +32,7 @@ def vehicles_on_a_loop(draw: st.DrawFn) -> tuple[list[float], list[float], float
 
 
 def search(place: int, positions: list[float], loop: float) -> tuple[int, float, int, float]:
-    """Who is ahead of a vehicle and how far, and who is behind, by asking all others."""
+    """Leader and follower of a vehicle with their gaps, by a search among all others."""
     others = [other for other in range(len(positions)) if other != place]
     ahead = {other: (positions[other] - positions[place]) % loop for other in others}
     behind = {other: (positions[place] - positions[other]) % loop for other in others}
@@ -95,7 +95,7 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
     names, seen = traffic.road.vehicle_ids, []
     for push in pushes:
         traffic.advance(Command(push))
-        leaders = [libsumo.vehicle.getLeader(name, 600.0) or ("nobody", np.nan) for name in names]
+        leaders = [libsumo.vehicle.getLeader(name, 600.0) or ("", np.nan) for name in names]
         # SUMO takes the gap that a vehicle likes to keep off what it calls the gap.
         kept = [libsumo.vehicle.getMinGap(name) for name in names]
         seen.append([(leader, gap + keep) for (leader, gap), keep in zip(leaders, kept, strict=True)])

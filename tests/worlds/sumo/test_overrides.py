@@ -1,4 +1,4 @@
-"""Who is counted as overridden, and who is not: a car that may not creep, or that cannot drive faster."""
+"""Commands that do not count as overridden: creeping, and speeds that the vehicle cannot reach."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Does the filter alone keep CAVs safe on the actual simulator, whose own safety is switched off?"""
+"""Does the filter alone keep CAVs safe in SUMO without SUMO's safety check?"""
 
 from dataclasses import replace
 

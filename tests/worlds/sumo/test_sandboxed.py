@@ -1,4 +1,4 @@
-"""Programs that drive on networks of their own: SUMO is confined, the driver is not."""
+"""Programs that drive on users' networks: SUMO is sandboxed, the driver is not."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -43,9 +43,9 @@ def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, simulation: S
 
 
 def test_a_sandboxed_simulation_returns_the_same_results(road: Scenario, simulation: Simulation) -> None:
-    asked = [(name, of) for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
-    told = {"load", "step", "close", "command_speeds", "replace_speeds", "command_humans"}
-    told |= {"take_control", "change_type", "end_with_trips", "is_in_contact", "teleport_count", "finish"}
+    methods = [(name, of) for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
+    others = {"load", "step", "close", "command_speeds", "replace_speeds", "command_humans"}
+    others |= {"take_control", "change_type", "end_with_trips", "is_in_contact", "teleport_count", "finish"}
     answers = []
     with SandboxedSimulation() as apart:
         for each in (simulation, apart):
@@ -55,7 +55,7 @@ def test_a_sandboxed_simulation_returns_the_same_results(road: Scenario, simulat
             arguments |= dict.fromkeys(("lanes", "now", "has_refused"), ())
             arguments |= dict.fromkeys(("type_of", "route_of"), ("1",))
             answers.append(
-                {name: getattr(each, name)(*arguments.get(name, (names,))) for name, _ in asked if name not in told}
+                {name: getattr(each, name)(*arguments.get(name, (names,))) for name, _ in methods if name not in others}
             )
     for name, answer in answers[0].items():
         assert type(answers[1][name]) is type(answer), name
@@ -81,9 +81,9 @@ def test_a_drivers_function_runs_in_its_own_process(road: Scenario, tmp_path: Pa
 def test_the_kernel_refuses_that_sumo_writes(option: str, road: Scenario, tmp_path: Path) -> None:
     canary, files = tmp_path / "canary", sumo_inputs(road, road.draw_from_seed((0,))[0])
     canary.write_text("as it was")
-    told = (*files.options, option.format(canary))
+    options = (*files.options, option.format(canary))
     with SandboxedSimulation() as simulation, pytest.raises(EpisodeError, match="SUMO cannot start") as caught:
-        simulation.load(files._replace(options=told), road.simulation_step, 0)
+        simulation.load(files._replace(options=options), road.simulation_step, 0)
     assert "\n" not in str(caught.value)
     assert canary.read_text() == "as it was"
 
@@ -93,9 +93,9 @@ def test_the_kernel_refuses_that_sumo_writes(option: str, road: Scenario, tmp_pa
 def test_sumo_over_traci_writes_nothing_either(option: str, road: Scenario, tmp_path: Path) -> None:
     canary, files = tmp_path / "canary", sumo_inputs(road, road.draw_from_seed((0,))[0])
     canary.write_text("as it was")
-    told = (*files.options, option.format(canary))
+    options = (*files.options, option.format(canary))
     with Simulation("traci") as simulation, pytest.raises(EpisodeError, match="SUMO cannot start"):
-        simulation.load(files._replace(options=told), road.simulation_step, 0)
+        simulation.load(files._replace(options=options), road.simulation_step, 0)
     assert canary.read_text() == "as it was"
     canary.write_text("this process may still write")
 

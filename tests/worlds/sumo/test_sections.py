@@ -112,7 +112,7 @@ def jammed(tmp_path: Path) -> Any:
     return make_scenario(str(straight(tmp_path, JAM)), changes)
 
 
-def told(scenario: Any, simulation: Simulation) -> tuple[UserNetworkTraffic, Any]:
+def roadside_state(scenario: Any, simulation: Simulation) -> tuple[UserNetworkTraffic, Any]:
     traffic = make_traffic(scenario, (1,), simulation, measured_fields=JamAhead().measured_fields)
     assert isinstance(traffic, UserNetworkTraffic)
     traffic.start(is_controlled=True)
@@ -120,16 +120,16 @@ def told(scenario: Any, simulation: Simulation) -> tuple[UserNetworkTraffic, Any
 
 
 def test_a_cav_observes_the_speed_of_its_lane_ahead(jammed: Any, simulation: Simulation) -> None:
-    _, state = told(jammed, simulation)
+    _, state = roadside_state(jammed, simulation)
     own, van, other = simulation.speeds(["0", "1", "2"])
     expected = [own, 20.0, 20.0, 20.0, (van + other) / 2, *[20.0] * 6]
     assert state.lane_speeds[0].tolist() == pytest.approx(expected)
     assert (state.allowed_speed[0], state.penetration_rate[0]) == (20.0, pytest.approx(1 / 3))
-    assert state.leader_gap[0] == 100.0, "nobody is near: only the message tells of the jam"
+    assert state.leader_gap[0] == 100.0, "there is no leader: only the message reports the jam"
 
 
 def test_a_set_speed_cap_does_not_change_the_observed_allowed_speed(jammed: Any, simulation: Simulation) -> None:
-    traffic, _ = told(jammed, simulation)
+    traffic, _ = roadside_state(jammed, simulation)
     simulation.set_max_speed("0", 6.0)
     assert traffic._local_states(["0"]).allowed_speed.tolist() == [20.0]
 
@@ -181,7 +181,7 @@ def test_an_episode_that_starts_in_a_jam_has_no_cap(jammed: Any, simulation: Sim
 
 
 def test_roadside_messages_have_the_configured_latency(jammed: Any, simulation: Simulation) -> None:
-    traffic, first = told(replace(jammed, roadside=RoadsideSettings(latency=2.0)), simulation)
+    traffic, first = roadside_state(replace(jammed, roadside=RoadsideSettings(latency=2.0)), simulation)
     for _ in range(10):
         traffic.advance(Command(np.zeros(1)))
     assert traffic.local_state().lane_speeds.tolist() == first.lane_speeds.tolist()

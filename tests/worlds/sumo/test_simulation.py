@@ -185,7 +185,7 @@ FLOW = '<flow id="f" route="along" end="9" number="3"/>'
 
 
 def broken(folder: Path, network: str, vehicles: str) -> Path:
-    """A road whose network is whole, or without any edge."""
+    """A road with a complete network, or without any edge."""
     path = straight(folder, vehicles)
     if network == "hollow":
         (folder / "road.net.xml").write_text('<net version="1.20"></net>')

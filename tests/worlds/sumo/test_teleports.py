@@ -23,7 +23,7 @@ from unjam.worlds.world import DriverLog
 
 @pytest.fixture(scope="module")
 def blocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A van stops at the end of an edge, and others fill the next one; nobody waits for longer than 5 s."""
+    """A van stops at the end of an edge, and others fill the next one; vehicles are teleported after 5 s."""
     folder = tmp_path_factory.mktemp("blocked")
     places = {"a": 0, "b": 200, "c": 240, "d": 540}
     nodes = "".join(f'<node id="{name}" x="{x}" y="0"/>' for name, x in places.items())
@@ -76,7 +76,7 @@ def test_teleported_vehicles_count_in_the_backlog_until_they_arrive(
     assert episode.teleports >= 4
     assert (~np.isnan(episode.speeds[1:])).sum() == count
     assert episode.arrivals == len(episode.vehicle_ids) == 15
-    assert episode.backlog.max() >= 2, "whom SUMO finds no room for waits"
+    assert episode.backlog.max() >= 2, "vehicles that SUMO cannot reinsert wait"
     assert episode.backlog[-1] == 0
     assert measure(episode)["teleports"] == episode.teleports
 
@@ -88,12 +88,12 @@ def test_a_reinserted_cav_is_driven_again(blocked: Path, simulation: Simulation)
     assert again
     starts = [each.start_step for each in episode.trajectories]
     assert starts == sorted(starts), "in order of entry, as drivers' memories are"
-    told = list[bool]()
+    is_commanded = list[bool]()
     for name in again:
         first, *_, last = (each for each in episode.trajectories if each.vehicle == name)
         assert first.start_step + len(first.applied_acceleration) < last.start_step
-        told += np.isclose(np.diff(last.states.speed), 0.15).tolist()
-    assert sum(told) > 100, "with 0.3 m/s2 for half a second, where nobody is in its way"
+        is_commanded += np.isclose(np.diff(last.states.speed), 0.15).tolist()
+    assert sum(is_commanded) > 100, "with 0.3 m/s2 for half a second, without a leader"
 
 
 def test_teleports_are_reported(blocked: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The user's own network on the actual simulator, on networks that nobody here made."""
+"""Users' networks in SUMO, on networks from other sources."""
 
 import warnings
 from pathlib import Path
@@ -101,18 +101,18 @@ def test_penetration_rate_and_cav_types_select_the_cavs(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_calibrated_drivers_drive_the_cars_and_the_same_vehicles_are_cavs(tmp_path: Path) -> None:
-    file, people = game(tmp_path, "ramp"), tmp_path / "drivers.json"
+    file, population = game(tmp_path, "ramp"), tmp_path / "drivers.json"
     near, far = IDMParameters(time_headway=0.8), IDMParameters(time_headway=3.0, minimum_gap=6.0)
-    write_population(people, Population(near, (near, far), (-9.0, 3.0)))
+    write_population(population, Population(near, (near, far), (-9.0, 3.0)))
     plain = run_episode(scenario_of(file, horizon=400), Human(), (0,))
-    calibrated = scenario_of(file, horizon=400, population=str(people))
+    calibrated = scenario_of(file, horizon=400, population=str(population))
     assert "2 calibrated drivers" in calibrated.human_description
     driven = run_episode(calibrated, Human(), (0,))
     assert set(plain.cav_ids) & set(driven.cav_ids)
     assert not set(driven.cav_ids) & (set(plain.vehicle_ids) - set(plain.cav_ids))
     assert np.nanmean(driven.speeds) != np.nanmean(plain.speeds)
     with Simulation() as simulation:
-        traffic = own(simulation, file, population=str(people), horizon=100)
+        traffic = own(simulation, file, population=str(population), horizon=100)
         seen: dict[str, set[tuple[float, float]]] = {}
         for _ in range(100):
             traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
@@ -125,12 +125,12 @@ def test_calibrated_drivers_drive_the_cars_and_the_same_vehicles_are_cavs(tmp_pa
 
 def test_a_population_with_a_residual_is_refused_on_a_users_network(tmp_path: Path) -> None:
     residual = Network(((np.zeros((3, 1)), np.zeros(1)),), 0.5)
-    one, people = IDMParameters(), tmp_path / "drivers.json"
-    write_population(people, Population(one, (one,), (-9.0, 3.0), residual))
+    one, population = IDMParameters(), tmp_path / "drivers.json"
+    write_population(population, Population(one, (one,), (-9.0, 3.0), residual))
     with pytest.raises(InputError, match="residual network is not allowed on a user network"):
-        scenario_of(game(tmp_path, "ramp"), population=str(people))
+        scenario_of(game(tmp_path, "ramp"), population=str(population))
     with pytest.raises(InputError, match="human_control: native is not allowed for a population with a residual"):
-        make_scenario("ring", {"population": str(people), "human_control": "native"})
+        make_scenario("ring", {"population": str(population), "human_control": "native"})
 
 
 def test_all_vehicles_or_none_may_be_cavs(file: Path, simulation: Simulation) -> None:
@@ -195,7 +195,7 @@ def test_neighbors_on_one_lane_agree_with_the_positions(tmp_path: Path, simulati
     for _ in range(300):
         traffic.advance(Command(generator.uniform(-0.6, 0.5, len(traffic.cav_ids))))
         state = traffic.local_state()
-        order = sorted(traffic.cav_ids)  # nobody overtakes on one lane
+        order = sorted(traffic.cav_ids)  # no overtaking on one lane
         place = {name: libsumo.vehicle.getLanePosition(name) for name in order}
         speed = {name: libsumo.vehicle.getSpeed(name) for name in order}
         for row, name in enumerate(traffic.cav_ids):
@@ -283,8 +283,8 @@ def test_collisions_of_human_driven_vehicles_count_once_each_and_do_not_end_the_
     tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
-    told = iter([["f.0", "f.1"], ["f.0", "f.1"], ["f.1", "f.2"]])
-    monkeypatch.setattr(simulation, "colliding_vehicles", lambda: next(told, []))
+    collisions = iter([["f.0", "f.1"], ["f.0", "f.1"], ["f.1", "f.2"]])
+    monkeypatch.setattr(simulation, "colliding_vehicles", lambda: next(collisions, []))
     episode = run_episode(scenario_of(file, penetration_rate=0.2, horizon=300), IDM(), (0,), simulation=simulation)
     row = measure(episode)
     assert not {"f.0", "f.1", "f.2"} & set(episode.cav_ids)
@@ -432,6 +432,6 @@ def test_a_fast_cav_stops_behind_a_standing_vehicle_beyond_sensor_range(tmp_path
     )
     episode = run_episode(road, Constant(acceleration=1.0), (0,), simulation=simulation)
     fastest = max(each.states.speed.max() for each in episode.trajectories)
-    assert fastest > 36.0, "from there nobody stops within 100 m"
+    assert fastest > 36.0, "at this speed the braking distance exceeds 100 m"
     assert episode.status == "completed"
     assert episode.audit.cav_braking.max_braking <= 6.0 + 1e-6

@@ -38,7 +38,7 @@ def trips_of_plain_sumo(file: Path) -> tuple[int, int, float]:
 
 
 def trips_of(episode: Episode) -> tuple[int, int, float]:
-    """The same of an episode; who is on the road at the last moment has not driven on from there."""
+    """The same of an episode; vehicles on the road at the end have not driven on."""
     seconds = float((~np.isnan(episode.speeds[:-1])).sum() * episode.control_step)
     return len(episode.vehicle_ids), episode.arrivals, seconds
 
@@ -94,8 +94,8 @@ def test_a_collision_of_a_cav_ends_the_episode_even_if_sumo_counts_none(
     assert episode.status == "collision"
     assert episode.collisions == 2
     assert episode.control_steps < 300
-    people = run_episode(make_scenario(str(file), changes), Human(), (0,), simulation=simulation)
-    assert (people.status, people.collisions) == ("completed", 0)
+    human = run_episode(make_scenario(str(file), changes), Human(), (0,), simulation=simulation)
+    assert (human.status, human.collisions) == ("completed", 0)
 
 
 @pytest.mark.parametrize("most", [0, 1, 100])

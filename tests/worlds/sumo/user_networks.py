@@ -1,4 +1,4 @@
-"""Networks that nobody here made, and a plain one, for tests of the user's own network."""
+"""Networks from other sources, and a plain one, for tests of users' networks."""
 
 import os
 import shutil

@@ -30,13 +30,8 @@ def make_traffic(
 ) -> Traffic:
     """Put the vehicles of a seed on the road; nothing moves yet.
 
-    Args:
-        scenario: road and traffic.
-        seed: of all random numbers.
-        simulation: an open one.
-        is_scalar: use floats instead of arrays with one row for a single CAV on a closed road.
-        record_details: record fuel and, on roads with ends, positions (x, y).
-        measured_fields: optional fields of `LocalState` that the driver uses, for example roadside information.
+    With `is_scalar`, the state and command of a single CAV on a closed road are floats. With `record_details`, fuel is
+    recorded and, on roads with ends, positions (x, y). Optional fields of `LocalState` are measured if requested.
     """
     road, seeds = scenario.draw_from_seed(seed)
     traffic = TRAFFIC_CLASSES[type(road)](scenario, road, SeedTree(tuple(seed), seeds), simulation, record_details)

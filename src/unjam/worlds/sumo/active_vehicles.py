@@ -9,7 +9,6 @@ class ActiveVehicles:
     """The vehicles on a road with ends, and counts of arrivals, teleports and collisions."""
 
     def __init__(self) -> None:
-        """Start with an empty road."""
         self.is_cav: dict[str, bool] = {}
         """whether each vehicle on the road is a CAV, in order of entry"""
         self.teleported: dict[str, bool] = {}

@@ -50,7 +50,6 @@ class Libsumo:
         self._log_path: str | None = None
         """the error log of the running simulation, by which it is identified; None: it does not run"""
         self._step_count, self._begin_time = 0, 0.0
-        """steps since the start, and SUMO's time at the start [s]"""
         self.has_refused = False
         """whether a step has failed since the start"""
         self._is_claimed = _libsumo_lock.acquire(blocking=False)
@@ -82,15 +81,14 @@ class Libsumo:
     def start(self, command: Sequence[str], log_path: Path) -> None:
         """Start SUMO, which writes its errors to a log."""
         self._log_path = str(log_path)
-        self.functions.start([*command])
-        self._reset_step_count()
+        self._start(self.functions.start, command)
 
     def load(self, options: Sequence[str]) -> None:
         """Start the simulation again with other options."""
-        self.functions.load([*options])
-        self._reset_step_count()
+        self._start(self.functions.load, options)
 
-    def _reset_step_count(self) -> None:
+    def _start(self, start: Callable[[list[str]], object], options: Sequence[str]) -> None:
+        start([*options])
         self._begin_time, self._step_count, self.has_refused = self._get_time(), 0, False
 
     def step(self) -> None:
@@ -127,7 +125,6 @@ class Traci:
     is_lost = has_refused = False
 
     def __init__(self) -> None:
-        """Import traci; nothing is started yet."""
         self._traci = import_backend("traci")
         self.functions: Any = None
         """the connection; None without one"""

@@ -36,7 +36,6 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def __init__(
         self, scenario: Scenario, road: ClosedRoad, seed: SeedTree, simulation: Simulation, record_details: bool
     ) -> None:
-        """Put the vehicles on the road; nothing moves yet."""
         super().__init__(scenario, road, seed, simulation, record_details)
         vehicles = len(road.vehicle_ids)
         self.cav_ids, self.entered_count = road.cav_ids, len(road.cav_ids)
@@ -58,7 +57,6 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._reset_log()
 
     def _set_human_vehicles(self, ids: Sequence[str]) -> None:
-        """Set the human-driven vehicles, which have noise, from the next step on."""
         self._human_ids = ids
         self._human_mask = [name in ids for name in self.road.vehicle_ids]
         self._human_indices = [index for index, is_human in enumerate(self._human_mask) if is_human]
@@ -229,24 +227,20 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         Shape (vehicles, moments), including the start. Positions are SUMO's Euler steps with the recorded speeds,
         checked against SUMO's own odometer.
         """
-        return self._validated_series(self._make_log())
-
-    def record(self, driver_log: DriverLog) -> Episode:
-        """Return the record since the start."""
-        log, rows = self._make_log(), None if self.is_scalar else np.arange(len(self.cav_ids))
-        fields = {**self._common_fields(), "collisions": len(self._collided_vehicles)}
-        return log.episode(self._validated_series(log), fields, driver_log, rows)
-
-    def _validated_series(self, log: closed_road.ClosedRoadLog) -> tuple[Floats, Floats]:
-        speeds, positions = log.speeds_and_positions()
+        speeds, positions = self._make_log().speeds_and_positions()
         self._check_odometer(self.road.vehicle_ids, self.road.start_positions, positions[:, -1])
         return speeds, positions
 
+    def record(self, driver_log: DriverLog) -> Episode:
+        """Return the record since the start."""
+        fields = {**self._common_fields(), "collisions": len(self._collided_vehicles)}
+        rows = None if self.is_scalar else np.arange(len(self.cav_ids))
+        return self._make_log().episode(self.speeds_and_positions(), fields, driver_log, rows)
+
     def last_applied_acceleration(self) -> Floats:
         """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
-        cavs = len(self.cav_ids)
-        last = np.array(self._series["safe_accelerations"][-cavs * self.scenario.steps_per_control_step :])
-        return last.reshape(-1, cavs).mean(0)
+        count = self.cav_count * self.scenario.steps_per_control_step
+        return np.array(self._series["safe_accelerations"][-count:]).reshape(-1, self.cav_count).mean(0)
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""

@@ -15,11 +15,10 @@ ACCELERATION_LIMIT_BITS = 2 | 4
 
 
 class VehicleLimits(NamedTuple):
-    """Acceleration limits of a vehicle [m/s2]."""
+    """Maximum acceleration, comfortable deceleration and maximum deceleration of a vehicle [m/s2]."""
 
     acceleration: float
     deceleration: float
-    """comfortable"""
     emergency_deceleration: float
 
 
@@ -71,14 +70,10 @@ class VehicleControl:
         type_template: str = "cav",
         parameters: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Make vehicles CAVs, which obey `command_speeds`.
+        """Make vehicles CAVs, which obey `command_speeds`, with or without right of way.
 
-        Args:
-            ids: names of the vehicles.
-            actuation: how they carry out commands.
-            right_of_way: whether they obey it.
-            type_template: their new type; `{}` stands for the old one.
-            parameters: further parameters of the vehicles, by SUMO's names.
+        Their new type is `type_template`, in which `{}` stands for the old one. `parameters` are further parameters of
+        the vehicles, by SUMO's names.
         """
         mode = SPEED_MODES[actuation] if right_of_way else SPEED_MODES[actuation] & SAFE_SPEED_BIT
         for name in ids:

@@ -3,8 +3,8 @@
 import queue
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from typing import Self
+from contextlib import AbstractContextManager, suppress
+from typing import Any
 
 from unjam.errors import EpisodeError, LostWorkerError
 from unjam.scenarios.user_network import UserNetwork
@@ -16,14 +16,13 @@ MAX_DETECTOR_ATTEMPTS = 3
 """processes that may be lost in the same simulation"""
 
 
-class DetectorPool:
+class DetectorPool(AbstractContextManager["DetectorPool"]):
     """A fixed number of sandboxed SUMO processes, started when first needed.
 
     The passages depend only on scenario, seed and loops, not on the number of processes.
     """
 
     def __init__(self, count: int = 1) -> None:
-        """Prepare `count` processes; none is started yet."""
         self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-detectors")
         self._idle_simulations: queue.SimpleQueue[SandboxedSimulation | None] = queue.SimpleQueue()
         self._open_simulations: set[SandboxedSimulation] = set()
@@ -33,12 +32,7 @@ class DetectorPool:
     def run(
         self, scenario: UserNetwork, seeds: Sequence[tuple[int, ...]], loops: Sequence[InductionLoop]
     ) -> list[list[DetectorPassage]]:
-        """Return the passages of each seed, in the order of the seeds.
-
-        Raises:
-            EpisodeError: SUMO cannot run the scenario.
-            LostWorkerError: its process was lost repeatedly.
-        """
+        """Return the passages of each seed; raise `EpisodeError` if SUMO cannot run one or is lost repeatedly."""
         futures = [self._thread_pool.submit(self._run_with_retries, scenario, seed, loops) for seed in seeds]
         try:
             return [future.result() for future in futures]
@@ -47,13 +41,11 @@ class DetectorPool:
                 future.cancel()
             raise
 
-    def _run_with_retries(
-        self, scenario: UserNetwork, seed: tuple[int, ...], loops: Sequence[InductionLoop]
-    ) -> list[DetectorPassage]:
+    def _run_with_retries(self, *arguments: Any) -> list[DetectorPassage]:
         for _ in range(MAX_DETECTOR_ATTEMPTS - 1):
             with suppress(LostWorkerError):
-                return self._run_one(scenario, seed, loops)
-        return self._run_one(scenario, seed, loops)
+                return self._run_one(*arguments)
+        return self._run_one(*arguments)
 
     def _run_one(
         self, scenario: UserNetwork, seed: tuple[int, ...], loops: Sequence[InductionLoop]
@@ -83,9 +75,6 @@ class DetectorPool:
         self._thread_pool.shutdown()
         for simulation in list(self._open_simulations):
             simulation.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

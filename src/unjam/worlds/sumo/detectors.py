@@ -11,11 +11,10 @@ from unjam.worlds.sumo.simulation import Simulation
 
 
 class InductionLoop(NamedTuple):
-    """An induction loop in the road."""
+    """An induction loop at a position along a lane [m]."""
 
     lane: str
     position: float
-    """along the lane [m]"""
 
 
 class DetectorPassage(NamedTuple):

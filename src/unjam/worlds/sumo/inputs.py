@@ -80,7 +80,6 @@ def _user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInput
 
 
 def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
-    """Return the XML of the types, routes and vehicles of an episode."""
     individual = road.human_parameters if scenario.human_control == "native" else {}
     if isinstance(road, MotorwayRoad):
         lines = _motorway_types_xml(scenario, road)
@@ -145,15 +144,11 @@ def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:
 def _type_variant_xml(
     name: str, attributes: XMLAttributes, car_following: XMLAttributes, parameters: dict[str, str]
 ) -> str:
-    """Return the XML of one of the user's vehicle types with another car-following model."""
-    others = {
-        key: value
-        for key, value in attributes.items()
-        if key not in CAR_FOLLOWING_ATTRIBUTES and is_harmless_attribute(key)
-    }
+    keys = filter(is_harmless_attribute, attributes.keys() - CAR_FOLLOWING_ATTRIBUTES)
+    others = {key: attributes[key] for key in sorted(keys)}
     element = xml_element("vType", **{**others, "speedFactor": 1.0, "speedDev": 0.0, **car_following, "id": name})
     nested = "".join(
-        xml_element("param", key=key, value=value) for key, value in parameters.items() if is_harmless_parameter(key)
+        xml_element("param", key=key, value=parameters[key]) for key in parameters if is_harmless_parameter(key)
     )
     return f"{element.removesuffix('/>')}>{nested}</vType>"
 
@@ -170,16 +165,9 @@ def vehicle_class_by_type(road: UserNetworkRoad) -> dict[str, str]:
 
 def _vehicle_type_xml(name: str, scenario: Scenario, attributes: XMLAttributes) -> str:
     """Return the XML of a vehicle type without SUMO's default randomness."""
-    common = {
-        "id": name,
-        "length": VEHICLE_LENGTH,
-        "speedFactor": 1.0,
-        "speedDev": 0.0,  # without it SUMO draws factors between 0.8 and 1.2
-        "sigma": 0.0,
-        "impatience": scenario.impatience,
-        "emissionClass": scenario.emission_class,
-    }
-    return xml_element("vType", **{**common, **attributes})
+    common = {"id": name, "length": VEHICLE_LENGTH, "sigma": 0.0, "impatience": scenario.impatience}
+    common |= {"speedFactor": 1.0, "speedDev": 0.0}  # otherwise SUMO draws factors between 0.8 and 1.2
+    return xml_element("vType", **{**common, "emissionClass": scenario.emission_class, **attributes})
 
 
 def _human_attributes(scenario: Scenario, humans: IDMParameters) -> dict[str, Any]:
@@ -194,7 +182,6 @@ def _human_attributes(scenario: Scenario, humans: IDMParameters) -> dict[str, An
 
 
 def _idm_attributes(parameters: IDMParameters) -> XMLAttributes:
-    """Return the attributes of SUMO's IDM."""
     return {
         "carFollowModel": "IDM",
         "accel": parameters.max_acceleration,

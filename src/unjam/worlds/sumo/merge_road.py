@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.car_following import MIN_IDM_GAP
-from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import FollowingState
 from unjam.errors import EpisodeError
 from unjam.physics.idm import idm_acceleration, stack_idm_parameters
@@ -21,7 +21,7 @@ from unjam.scenarios.population import apply_population
 from unjam.scenarios.road import MergeRoad, Origin
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.open_road import OpenTraffic
+from unjam.worlds.sumo.open_road import OpenTraffic, neighbor_state
 from unjam.worlds.sumo.traffic import NO_SPEED_COMMAND
 from unjam.worlds.world import DriverLog, ProgressCallback
 
@@ -34,87 +34,72 @@ class MergingStreams:
     """The vehicles on a merging road, in the order described above."""
 
     def __init__(self) -> None:
-        """Start with an empty road."""
         self.names: list[str] = []
         self.positions: Floats = np.zeros(0)
         """of front bumpers, zero at the merge point, negative before it [m]"""
         self.speeds: Floats = np.zeros(0)
         """[m/s]"""
-        self._merged_count, self._main_road_count = 0, 0
-        """number of vehicles past the merge point, and on the main road before it"""
+        self._branches = np.zeros(0, np.intp)
+        """0: the main road; 1: the ramp"""
 
     def enter(self, name: str, origin: Origin, speed: float) -> None:
-        """Add a vehicle behind the last one of its branch."""
-        if origin.position >= 0:
-            self._merged_count += 1
-            row = self._merged_count - 1
-        elif origin.branch == 0:
-            self._main_road_count += 1
-            row = self._merged_count + self._main_road_count - 1
-        else:
-            row = len(self.names)
-        self.names.insert(row, name)
-        self.positions = np.insert(self.positions, row, origin.position)
-        self.speeds = np.insert(self.speeds, row, speed)
+        """Add a vehicle at the position of its entry."""
+        self.names.append(name)
+        self.positions, self.speeds = np.append(self.positions, origin.position), np.append(self.speeds, speed)
+        self._branches = np.append(self._branches, origin.branch)
+        self._sort()
 
     def leave(self, names: Collection[str]) -> None:
         """Remove the first vehicles from the road."""
         count = len(names)
         if set(names) != set(self.names[:count]):
             raise EpisodeError(f"{', '.join(sorted(names))} left the road from behind another vehicle")
-        self._merged_count -= count
         del self.names[:count]
-        self.positions, self.speeds = self.positions[count:], self.speeds[count:]
+        self._select(slice(count, None))
 
     def move(self, speeds: Sequence[float], step: float) -> None:
         """Move all vehicles by one step; `speeds` are those after it [m/s]."""
         self.speeds = np.array(speeds, np.float64)
         self.positions = next_position(self.positions, self.speeds, step)
-        while self._main_road_count and self.positions[self._merged_count] >= 0:  # its row stays the same
-            self._merged_count, self._main_road_count = self._merged_count + 1, self._main_road_count - 1
-        while (first := self._merged_count + self._main_road_count) < len(self.names) and self.positions[first] >= 0:
-            row = int((self.positions[: self._merged_count] >= self.positions[first]).sum())
-            self.names.insert(row, self.names.pop(first))
-            order = np.arange(len(self.names))
-            order[row : first + 1] = [first, *range(row, first)]
-            self.positions, self.speeds = self.positions[order], self.speeds[order]
-            self._merged_count += 1
+        self._sort()
+
+    def _groups(self) -> NDArray[np.intp]:
+        """Return 0 for vehicles past the merge point, 1 on the main road before it, 2 on the ramp."""
+        return np.where(self.positions >= 0, 0, 1 + self._branches)
+
+    def _sort(self) -> None:
+        order = np.lexsort((-self.positions, self._groups()))
+        if (order != np.arange(len(order))).any():
+            self.names = [self.names[row] for row in order.tolist()]
+            self._select(order)
+
+    def _select(self, rows: Any) -> None:
+        self.positions, self.speeds, self._branches = self.positions[rows], self.speeds[rows], self._branches[rows]
 
     def leaders(self) -> NDArray[np.intp]:
         """Return the row of each vehicle's leader; -1 without a leader."""
         leaders = np.arange(len(self.names)) - 1
-        first_on_ramp = self._merged_count + self._main_road_count
+        merged, first_on_ramp = np.searchsorted(self._groups(), (1, 2))
         if first_on_ramp < len(leaders):
-            leaders[first_on_ramp] = self._merged_count - 1
+            leaders[first_on_ramp] = merged - 1
         return leaders
 
     def gaps(self, leaders: NDArray[np.intp]) -> Floats:
         """Return each vehicle's gap to its leader [m]; `ABSENT_LEADER_GAP` without a leader."""
-        return np.where(leaders < 0, ABSENT_LEADER_GAP, self.positions[leaders] - self.positions - VEHICLE_LENGTH)
+        return np.where(leaders < 0, ABSENT_LEADER_GAP, self._leader_gaps(np.arange(len(leaders)), leaders))
+
+    def _leader_gaps(self, rows: NDArray[np.intp], leaders: NDArray[np.intp]) -> Floats:
+        return self.positions[leaders] - self.positions[rows] - VEHICLE_LENGTH
 
     def is_on_junction(self, approach_lengths: tuple[float, float]) -> NDArray[np.bool_]:
         """Return which vehicles are on the junction, of these lengths before the merge point on both branches [m]."""
-        lengths = np.zeros(len(self.names))
-        lengths[self._merged_count : self._merged_count + self._main_road_count] = approach_lengths[0]
-        lengths[self._merged_count + self._main_road_count :] = approach_lengths[1]
-        return (self.positions < 0) & (self.positions >= -lengths)
+        return (self.positions < 0) & (self.positions >= -np.array(approach_lengths)[self._branches])
 
     def states(self) -> LocalState:
         """Return the local states of all vehicles; neighbors beyond `MAX_OBSERVED_GAP` count as missing."""
         leaders = self.leaders()
-        followers, gaps = self._followers(leaders), self.gaps(leaders)
-        follower_gaps = np.where(
-            followers < 0, ABSENT_LEADER_GAP, self.positions - self.positions[followers] - VEHICLE_LENGTH
-        )
-        return LocalState(
-            speed=self.speeds,
-            leader_speed=np.where(gaps < MAX_OBSERVED_GAP, self.speeds[leaders], self.speeds),
-            leader_gap=gaps.clip(max=MAX_OBSERVED_GAP),
-            follower_speed=np.where(follower_gaps < MAX_OBSERVED_GAP, self.speeds[followers], self.speeds),
-            follower_gap=follower_gaps.clip(max=MAX_OBSERVED_GAP),
-            route_position=self.positions,
-            loop_length=np.full(len(self.names), np.nan),
-        )
+        rows, followers = np.arange(len(leaders)), self._followers(leaders)
+        return neighbor_state(rows, leaders, followers, self.positions, self.speeds, self._leader_gaps)
 
     def _followers(self, leaders: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the row of each vehicle's follower, the nearer one of two; -1 without a follower."""

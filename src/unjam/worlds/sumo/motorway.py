@@ -14,6 +14,7 @@ from unjam.scenarios.road import MotorwayRoad
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
+from unjam.worlds.sumo.open_road import neighbor_state
 from unjam.worlds.world import ProgressCallback
 
 
@@ -66,7 +67,6 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         return list(map(TrackedLeader, leader_names, *(each.tolist() for each in values)))
 
     def _leader_gaps(self, rows: Any, leaders: Any) -> Floats:
-        """Return the gaps of vehicles to their leaders [m]."""
         return self._position[leaders] - self.road.vehicle_length - self._position[rows]
 
     def _snapshot(self, names: Sequence[str]) -> dict[str, Any]:
@@ -79,22 +79,13 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         road, sections = self.road, self._road_sections
         self._messages.send(sections.mean_speeds(self._lane, self._position, self._speed, road.limit_speed))
         rows = np.array([self._row_of_name[name] for name in names], np.intp)
-        speed, position, lane = self._speed[rows], self._position[rows], self._lane[rows]
-        leader, follower = self._leader[rows], self._follower[rows]
-        leader_gap, follower_gap = self._leader_gaps(rows, leader), self._leader_gaps(follower, rows)
-        has_leader = (leader >= 0) & (leader_gap < MAX_OBSERVED_GAP)
-        has_follower = (follower >= 0) & (follower_gap < MAX_OBSERVED_GAP)
+        leaders, followers, position = self._leader[rows], self._follower[rows], self._position[rows]
+        state = neighbor_state(rows, leaders, followers, self._position, self._speed, self._leader_gaps)
         factors = np.array([self._speed_factors[name] for name in names])
-        lane_speeds, road_speeds = sections.speeds_ahead(self._messages.latest, lane, position)
+        lane_speeds, road_speeds = sections.speeds_ahead(self._messages.latest, self._lane[rows], position)
         adjacent_gaps, adjacent_speeds = self._adjacent_vehicles(rows)
-        return LocalState(
-            speed=speed,
-            leader_speed=np.where(has_leader, self._speed[leader], speed),
-            leader_gap=np.where(has_leader, leader_gap, MAX_OBSERVED_GAP),
-            follower_speed=np.where(has_follower, self._speed[follower], speed),
-            follower_gap=np.where(has_follower, follower_gap, MAX_OBSERVED_GAP),
+        return state._replace(
             route_position=position - road.merge_position,
-            loop_length=np.full(len(rows), np.nan),
             allowed_speed=self._edge_lane_speed_limits[[self._edge_lanes[row] for row in rows]] * factors,
             distance_to_merge=road.merge_position - position,
             lane_speeds=lane_speeds,

@@ -15,16 +15,8 @@ from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, commanded_time_gaps
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.audit import (
-    CAV_AFTER_CUT_IN,
-    CUT_IN_SECONDS,
-    SHORT_TIME_GAP,
-    STEADY_FOLLOWING_SECONDS,
-    Audit,
-    FollowingPair,
-    following_statistics,
-    is_recovering,
-)
+from unjam.worlds import audit
+from unjam.worlds.audit import CAV_AFTER_CUT_IN, Audit, FollowingPair, is_recovering
 from unjam.worlds.record import Floats, Trajectory
 from unjam.worlds.sumo.open_log import OpenRoadLog
 from unjam.worlds.sumo.open_road import OpenTraffic
@@ -33,16 +25,12 @@ from unjam.worlds.world import ProgressCallback
 
 
 class TrackedLeader(NamedTuple):
-    """The leader of a CAV."""
+    """The leader of a CAV, empty without a leader within range; own and leader speed [m/s], gap [m]."""
 
     leader: str
-    """its name; empty: no leader within range"""
     speed: float
-    """the CAV's own [m/s]"""
     leader_speed: float
-    """[m/s]"""
     gap: float
-    """[m]"""
 
 
 class MultiLaneLog(OpenRoadLog):
@@ -55,7 +43,6 @@ class MultiLaneLog(OpenRoadLog):
         speeds: Floats,
         tracked_leaders: Callable[[Sequence[str]], list[TrackedLeader]],
     ) -> None:
-        """Start with the vehicles on the road now, and the function that returns the leaders of CAVs."""
         super().__init__(scenario, names, speeds)
         self._tracked_leaders = tracked_leaders
         self._leaders: dict[str, tuple[str, int]] = {}
@@ -76,26 +63,26 @@ class MultiLaneLog(OpenRoadLog):
             if known is None or known[0] != leader:
                 known = self._leaders[name] = leader, self._step_count
             time_behind_leader = (self._step_count - known[1]) * self._scenario.simulation_step
-            if time_behind_leader < CUT_IN_SECONDS:
+            if time_behind_leader < audit.CUT_IN_SECONDS:
                 kinds[rows[name]] = CAV_AFTER_CUT_IN
             current = FollowingPair(*pair)
             was_recovering, previous = self._recovery_states.get(name, (False, current))
             recovers = bool(leader) and is_recovering(was_recovering, time_behind_leader, previous, current)
             self._recovery_states[name] = recovers, current
-            if leader and time_behind_leader > STEADY_FOLLOWING_SECONDS:
+            if leader and time_behind_leader > audit.STEADY_FOLLOWING_SECONDS:
                 self._steady_following.extend((*current, recovers))
         return kinds
 
-    def audit(self, trajectories: Sequence[Trajectory]) -> Audit:
+    def make_audit(self, trajectories: Sequence[Trajectory]) -> Audit:
         """Return the audit of every simulation step; overrides and jerk of every control step."""
         speed, leader_speed, gap, recovers = np.array(self._steady_following, np.float64).reshape(-1, 4).T[:, None]
-        steady = following_statistics(speed, leader_speed, gap, self._scenario.simulation_step, in_recovery=recovers)
-        audit = super().audit(trajectories)
-        commands = {name: getattr(audit.following, name) for name in ("max_jerk", "override_share", "yield_share")}
+        step, common = self._scenario.simulation_step, super().make_audit(trajectories)
+        steady = audit.following_statistics(speed, leader_speed, gap, step, in_recovery=recovers)
+        commands = {name: getattr(common.following, name) for name in ("max_jerk", "override_share", "yield_share")}
         return replace(
-            audit,
+            common,
             following=replace(steady, **commands),
-            required_time_gap=SHORT_TIME_GAP,
+            required_time_gap=audit.SHORT_TIME_GAP,
             has_lanes=True,
             cut_in_braking=self._braking.statistics(CAV_AFTER_CUT_IN),
         )
@@ -128,7 +115,6 @@ class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
         super().advance(command)
 
     def _tracked_leaders(self, names: Sequence[str]) -> list[TrackedLeader]:
-        """Return the current leaders of CAVs."""
         raise NotImplementedError
 
     def _acc_limits(self, names: Sequence[str]) -> tuple[Floats, Floats] | None:

@@ -22,7 +22,7 @@ import platformdirs
 from unjam.errors import DISK_ERRNOS, DiskError, EpisodeError, MissingPartError, disk_error, invalid_value
 from unjam.files import atomic_write, is_leftover, make_folder, remove
 from unjam.processes import PrivateFolder
-from unjam.scenarios.road import BuiltRoad, Connection, Edge, Node, Road, RoadNetwork, UserNetworkRoad
+from unjam.scenarios.road import BuiltRoad, Edge, Road, RoadNetwork, UserNetworkRoad
 from unjam.sumo_files import file_stamp, read_lanes
 from unjam.worlds.record import Floats
 
@@ -48,18 +48,13 @@ class NetworkLane(NamedTuple):
     speed_limit: float
     """[m/s]"""
     successors: tuple[str, ...]
-    """lanes of the next edges"""
     has_stop_line: bool = False
     """whether vehicles may have to wait at its end: at a signal, a stop sign, or to yield"""
 
 
 @cache
 def sumo_program(name: str) -> str:
-    """Return the path of one of SUMO's programs: the installed package's, else the one on the PATH.
-
-    Raises:
-        MissingPartError: there is neither.
-    """
+    """Return the path of a SUMO program: the package's, or the one on the PATH; raise `MissingPartError` if missing."""
     with suppress(ImportError, AttributeError):
         import sumo
 
@@ -97,18 +92,22 @@ def last_error_message(log_path: Path) -> str:
 def network_file(network: RoadNetwork) -> Path:
     """Return SUMO's network file, made with netconvert unless the cache has an intact one with this content.
 
-    Raises:
-        MissingPartError: netconvert is missing.
-        DiskError: the cache cannot be written.
+    Raise `MissingPartError` if netconvert is missing, `DiskError` if the cache cannot be written.
     """
-    edges = (_edge_attributes(edge, network.speed_limit) for edge in network.edges)
+    nodes = [
+        {"id": name, "x": f"{x:.6f}", "y": f"{y:.6f}", "type": "priority" if has_priority else None, "radius": radius}
+        for name, x, y, has_priority, radius in network.nodes
+    ]
     files = {
-        ("--node-files", "road.nod.xml"): xml_document("nodes", "node", map(_node_attributes, network.nodes)),
-        ("--edge-files", "road.edg.xml"): xml_document("edges", "edge", edges),
+        ("--node-files", "road.nod.xml"): xml_document("nodes", "node", nodes),
+        ("--edge-files", "road.edg.xml"): xml_document(
+            "edges", "edge", (_edge_attributes(edge, network.speed_limit) for edge in network.edges)
+        ),
     }
     if network.connections:
-        attributes = map(_connection_attributes, network.connections)
-        files["--connection-files", "road.con.xml"] = xml_document("connections", "connection", attributes)
+        names = "from", "to", "fromLane", "toLane"
+        connections = [dict[str, Any](zip(names, each, strict=True)) for each in network.connections]
+        files["--connection-files", "road.con.xml"] = xml_document("connections", "connection", connections)
     options = ["--no-turnarounds", "true", *([] if network.has_internal_links else ["--no-internal-links", "true"])]
     content = "\n".join([sumo_version(), *options, *files.values()])
     name = hashlib.sha256(content.encode()).hexdigest()[:24]
@@ -164,16 +163,6 @@ def _read_geometry(path: Path, stamp: tuple[int, int]) -> NetworkGeometry:
     return NetworkGeometry(np.array(rows, np.float64).reshape(-1, 2), lengths, dict(counts))
 
 
-def _node_attributes(node: Node) -> XMLAttributes:
-    kind = "priority" if node.has_priority else None
-    return {"id": node.name, "x": f"{node.x:.6f}", "y": f"{node.y:.6f}", "type": kind, "radius": node.radius}
-
-
-def _connection_attributes(connection: Connection) -> XMLAttributes:
-    ends = {"from": connection.from_edge, "to": connection.to_edge}
-    return {**ends, "fromLane": connection.from_lane, "toLane": connection.to_lane}
-
-
 def _edge_attributes(edge: Edge, speed: float) -> XMLAttributes:
     ends = {"id": edge.name, "from": edge.from_node, "to": edge.to_node}
     shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in edge.shape) or None
@@ -195,8 +184,7 @@ def xml_element(tag: str, /, **attributes: Any) -> str:
 def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
     """Return the network that netconvert makes in a folder, from the content of files by (option, name).
 
-    Raises:
-        EpisodeError: netconvert refuses them; with its own message.
+    Raise `EpisodeError` with netconvert's message if it refuses them.
     """
     network = folder / "road.net.xml"
     for (_, name), content in files.items():
@@ -216,8 +204,7 @@ def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder
 def cache_folder() -> Path:
     """Return the folder for networks: `$UNJAM_CACHE`, or the user's cache folder.
 
-    Raises:
-        InputError: SUMO would read its name as a list, or as a variable.
+    Raise `InputError` if SUMO would read its name as a list, or as a variable.
     """
     folder = os.environ.get("UNJAM_CACHE") or platformdirs.user_cache_dir("unjam")
     if any(character in folder for character in ",;$%"):

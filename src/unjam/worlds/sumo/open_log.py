@@ -1,24 +1,65 @@
 """The log of an episode on a road with ends, and the fields of the record made from it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.local_state import LocalState
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.audit import (
-    CAV_DRIVER,
-    HUMAN_DRIVER,
-    OVERRIDE_TOLERANCE,
-    Audit,
-    BrakingLog,
-    FollowingStatistics,
-    following_statistics,
-)
-from unjam.worlds.record import Floats, Trajectory
+from unjam.worlds import audit
+from unjam.worlds.record import Floats, Trajectory, make_trajectory
 from unjam.worlds.sumo.traffic_log import TrafficLog
-from unjam.worlds.sumo.trip_log import TripLog
+from unjam.worlds.world import DriverLog
+
+TRIPS_PER_PROGRESS = 500
+"""trips that are processed between two reports of progress"""
+
+
+class TripLog:
+    """The CAVs on the road at each moment, their states, and their commands in the control step that follows."""
+
+    def __init__(self) -> None:
+        self.cav_ids: list[Sequence[str]] = []
+        self.states: list[LocalState] = []
+        self.applied_accelerations: list[list[float]] = []
+        self.filter_brakings: list[list[float]] = []
+        """reductions by the safety filter"""
+        self.shield_brakings: list[list[float]] = []
+        """braking that SUMO added; these three lists [m/s2] have one entry per control step"""
+
+    def trajectories(
+        self, driver_log: DriverLog, has_crashed: bool, on_progress: Callable[[], object]
+    ) -> tuple[Trajectory, ...]:
+        """Return the trips of at least one control step, in order of entry, after an episode that may have crashed."""
+        trips = list[tuple[str, list[tuple[int, int]]]]()
+        """vehicle, and its moments and rows; a teleported vehicle that is reinserted starts another trip"""
+        latest = dict[str, list[tuple[int, int]]]()
+        for time, names in enumerate(self.cav_ids):
+            for row, name in enumerate(names):
+                if name not in latest or latest[name][-1][0] < time - 1:
+                    latest[name] = list[tuple[int, int]]()
+                    trips.append((name, latest[name]))
+                latest[name].append((time, row))
+        states, trajectories = list(zip(*self.states, strict=True)), list[Trajectory]()
+        commands = self.applied_accelerations, self.filter_brakings, self.shield_brakings
+        for number, (name, entries) in enumerate(trips):
+            if number % TRIPS_PER_PROGRESS == 0:
+                on_progress()
+            if len(entries) > 1:
+                start, rows = entries[0][0], np.array([row for _, row in entries])
+                state = LocalState(*(_trip_values(values, entries) for values in states))
+                values = (_trip_values(each, entries[:-1]) for each in commands)
+                terminated = has_crashed and entries[-1][0] == len(self.applied_accelerations)
+                trip = name, number, start, rows, state
+                trajectories.append(make_trajectory(*trip, *values, terminated=terminated, driver_log=driver_log))
+        return tuple(trajectories)
+
+
+def _trip_values(values: Sequence[Any], entries: Sequence[tuple[int, int]]) -> Any:
+    """Return a CAV's values of one quantity at its moments and rows; None if the road does not provide it."""
+    return None if values[0] is None else np.array([values[time][row] for time, row in entries])
 
 
 class OpenRoadLog:
@@ -31,7 +72,7 @@ class OpenRoadLog:
         """of each moment"""
         self.fuel: list[float] = []
         """total fuel rate of the vehicles [mg/s]"""
-        self._scenario, self._braking = scenario, BrakingLog(scenario.simulation_step)
+        self._scenario, self._braking = scenario, audit.BrakingLog(scenario.simulation_step)
         self._names, self._speeds = list(names), speeds
         self._cav_ids: Sequence[str] = ()
         self._kinds = np.zeros(len(names), np.uint8)
@@ -49,7 +90,6 @@ class OpenRoadLog:
         self._speeds = speeds
 
     def _driver_kinds(self) -> NDArray[np.uint8]:
-        """Return the driver kinds of the vehicles in the last step."""
         return self._kinds
 
     def episode_fields(
@@ -74,22 +114,19 @@ class OpenRoadLog:
             "backlog": np.array(self.backlog, np.float64),
             "teleported": len(set(teleported).intersection(vehicles)),
             "trajectories": trajectories,
-            "audit": self.audit(trajectories),
+            "audit": self.make_audit(trajectories),
         }
 
-    def audit(self, trajectories: Sequence[Trajectory]) -> Audit:
+    def make_audit(self, trajectories: Sequence[Trajectory]) -> audit.Audit:
         """Return the braking in every simulation step, and the CAVs' car following in every control step."""
-        human, cav = self._braking.statistics(HUMAN_DRIVER), self._braking.statistics(CAV_DRIVER)
-        return Audit(human, cav, self._following_statistics(trajectories), self._scenario.safety.time_gap)
-
-    def _following_statistics(self, trajectories: Sequence[Trajectory]) -> FollowingStatistics:
-        """Return the CAVs' car following and overrides in every control step."""
         moments = max((len(each.states.speed) for each in trajectories), default=0)
         speed, leader, gap = np.full((3, moments, len(trajectories)), np.nan)
         for column, each in enumerate(trajectories):
             rows = slice(len(each.states.speed))
             speed[rows, column] = each.states.speed
             leader[rows, column], gap[rows, column] = each.states.leader_speed, each.states.leader_gap
-        step = self._scenario.control_step
-        added = np.concatenate([each.shield_braking for each in trajectories]) if trajectories else np.zeros(0)
-        return following_statistics(speed, leader, gap, step, added > OVERRIDE_TOLERANCE, np.zeros_like(added))
+        added = np.concatenate([np.zeros(0), *(each.shield_braking for each in trajectories)])
+        is_overridden, step = added > audit.OVERRIDE_TOLERANCE, self._scenario.control_step
+        following = audit.following_statistics(speed, leader, gap, step, is_overridden, np.zeros_like(added))
+        human, cav = map(self._braking.statistics, (audit.HUMAN_DRIVER, audit.CAV_DRIVER))
+        return audit.Audit(human, cav, following, self._scenario.safety.time_gap)

@@ -1,6 +1,6 @@
 """Traffic on roads with ends: vehicles enter and leave, and each trip of a CAV is a trajectory."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.safety import FollowingState
 from unjam.physics.kinematics import next_speed
 from unjam.worlds.record import Episode, Floats
@@ -18,6 +18,25 @@ from unjam.worlds.sumo.networks import network_geometry, network_path
 from unjam.worlds.sumo.open_log import OpenRoadLog
 from unjam.worlds.sumo.traffic import OpenRoadT, RoadScene, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
+
+
+def neighbor_state(
+    rows: NDArray[np.intp],
+    leaders: NDArray[np.intp],
+    followers: NDArray[np.intp],
+    positions: Floats,
+    speeds: Floats,
+    leader_gaps: Callable[[NDArray[np.intp], NDArray[np.intp]], Floats],
+) -> LocalState:
+    """Return the local states of some rows of vehicles; a missing neighbor is -1, or beyond `MAX_OBSERVED_GAP`.
+
+    `leader_gaps` returns the gaps from rows of vehicles to the rows of their leaders [m].
+    """
+    values = [speeds[rows]]
+    for neighbors, gaps in ((leaders, leader_gaps(rows, leaders)), (followers, leader_gaps(followers, rows))):
+        is_near = (neighbors >= 0) & (gaps < MAX_OBSERVED_GAP)
+        values += [np.where(is_near, speeds[neighbors], speeds[rows]), np.where(is_near, gaps, MAX_OBSERVED_GAP)]
+    return LocalState(*values, route_position=positions[rows], loop_length=np.full(len(rows), np.nan))
 
 
 class OpenTraffic(Traffic[OpenRoadT]):

@@ -12,10 +12,11 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, Self, get_type_hints
+from typing import Any, get_type_hints
 
 from unjam.child_processes import child_environment, python_command
 from unjam.errors import LostWorkerError, as_unjam_error, error_from_name
@@ -70,11 +71,10 @@ _process_starter_lock = Lock()
 """prevents a second such thread, whose processes would end with its executor"""
 
 
-class SandboxedSimulation:
+class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
     """A `Simulation` in a sandboxed process, which carries out all calls."""
 
     def __init__(self) -> None:
-        """Start the process."""
         remove_stale_private_folders()
         self._folder = PrivateFolder()
         with _process_starter_lock:
@@ -132,16 +132,12 @@ class SandboxedSimulation:
         self._process.communicate()
         self._folder.cleanup()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
 
 @cache
 def _return_type(name: str) -> Any:
-    """Return the type of the result of a method of `Simulation`."""
     method = getattr(Simulation, name, None)
     return get_type_hints(method).get("return", Any) if method else Any
 

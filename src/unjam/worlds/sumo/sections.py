@@ -26,7 +26,6 @@ class LaneSections:
     """All lanes, divided into sections of `ROAD_SECTION_LENGTH`, the last of each shorter; without junctions."""
 
     def __init__(self, simulation: Simulation) -> None:
-        """Read the lanes from the simulator."""
         self._lanes = {lane.name: lane for lane in simulation.lanes()}
         counts = [max(1, ceil(lane.length / ROAD_SECTION_LENGTH)) for lane in self._lanes.values()]
         self._section_ranges = dict(zip(self._lanes, pairwise([0, *accumulate(counts)]), strict=True))
@@ -47,7 +46,6 @@ class LaneSections:
         """whether congestion is reported of each section"""
 
     def __contains__(self, lane: str) -> bool:
-        """Whether a lane is outside of junctions."""
         return lane in self._lanes
 
     def measure(self, lane_positions: Sequence[tuple[str, float]], speeds: Floats) -> tuple[Floats, Floats]:

@@ -2,13 +2,13 @@
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from itertools import starmap
 from pathlib import Path
 from tempfile import gettempdir
 from threading import Lock
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ _consume = deque(maxlen=0).extend
 """exhausts an iterator in C: a loop would take as long as the calls"""
 
 
-class Simulation(VehicleControl):
+class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
     """One SUMO simulation, loaded again for each episode.
 
     libsumo holds one simulation per process and silently replaces the first by a second. So this class
@@ -42,12 +42,9 @@ class Simulation(VehicleControl):
     def __init__(
         self, backend: Backend = "libsumo", gui_options: Sequence[str] = (), owns_stdout: bool = False
     ) -> None:
-        """Open a simulation; nothing runs before `load`.
+        """Open a simulation; nothing runs before `load`. Raise `InUseError` if libsumo already runs one here.
 
         `gui_options` are for SUMO's window. `owns_stdout`: this process prints nothing else while SUMO starts.
-
-        Raises:
-            InUseError: libsumo already runs a simulation in this process.
         """
         if "," in (folder := gettempdir()):  # separates the names of SUMO's files
             raise invalid_value("TMPDIR", folder, "a folder without , in its name")
@@ -73,7 +70,6 @@ class Simulation(VehicleControl):
             self._bind()
 
     def _bind(self) -> None:
-        """Look up the functions that are called often."""
         self._sumo: Any = self._library.functions
         call = partial(sumo_function, self._sumo)
         self._get_speed = call("vehicle", "getSpeed")
@@ -116,10 +112,8 @@ class Simulation(VehicleControl):
     def load(self, inputs: SumoInputs, step: float, seed: int) -> None:
         """Start an episode: load network and traffic, and insert the first vehicles.
 
-        Raises:
-            SumoInputError: SUMO refuses the files; the message contains its reason.
-            LostWorkerError: other code of this process has changed the simulation.
-            EpisodeError: it cannot start for another reason.
+        Raise `SumoInputError` with SUMO's reason if it refuses the files, `LostWorkerError` if other code of this
+        process has changed the simulation, and `EpisodeError` for other reasons.
         """
         self.check()
         self._traffic_file.write_text(inputs.traffic_xml)
@@ -129,9 +123,12 @@ class Simulation(VehicleControl):
         }
         paths.setdefault(inputs.traffic_option, []).append(str(self._traffic_file))
         options = [f"{option}={','.join(each)}" for option, each in paths.items() if each]
-        options += [*inputs.options, *self._simulation_options(step, seed)]
-        if inputs.records_trips:
-            options += trip_options(self._trip_file)
+        options += [*inputs.options, "--step-length", str(step), "--seed", str(seed)]
+        options += ["--no-step-log", "true", "--duration-log.disable", "true"]
+        # Warnings only go to the log, which keeps one example and the number of each kind.
+        options += ["--no-warnings", "true", "--error-log", str(self._error_log)]
+        options += ["--aggregate-warnings", MAX_EXAMPLES_OPTION]
+        options += trip_options(self._trip_file) if inputs.records_trips else []
         try:
             with capture_stderr(self._stdout_log) if self._stdout_log else nullcontext():
                 if self._library.is_running:
@@ -160,15 +157,6 @@ class Simulation(VehicleControl):
             write_harmless_copy(path, copy)
             self._harmless_copies[path] = stamps, copy
         return str(copy)
-
-    def _simulation_options(self, step: float, seed: int) -> list[str]:
-        return [
-            *("--step-length", str(step), "--seed", str(seed)),
-            *("--no-step-log", "true", "--duration-log.disable", "true"),
-            # Warnings only go to the log, which keeps one example and the number of each kind.
-            *("--no-warnings", "true", "--error-log", str(self._error_log)),
-            *("--aggregate-warnings", MAX_EXAMPLES_OPTION),
-        ]
 
     def speeds(self, ids: Sequence[str]) -> list[float]:
         """Return the vehicles' speeds [m/s]."""
@@ -284,9 +272,6 @@ class Simulation(VehicleControl):
         """End the episode and return SUMO's warnings: its log is only complete after its end."""
         self._library.end()
         return read_warnings(self._error_log)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -38,16 +38,14 @@ class SeedTree(NamedTuple):
 
 
 class RoadScene(NamedTuple):
-    """One moment of a road with n vehicles, for pictures."""
+    """One moment of a road with n vehicles and their speeds [m/s], for pictures."""
 
     lane_lines: Floats
     """rows (x, y) [m]; a row of NaN between two lines"""
     poses: Floats
     """rows (x, y, heading) of the front bumpers: [m], and [rad] against the x axis, shape (n, 3)"""
     speeds: Floats
-    """[m/s], shape (n,)"""
     is_cav: NDArray[np.bool_]
-    """shape (n,)"""
 
 
 RoadT = TypeVar("RoadT", bound=Road)
@@ -149,11 +147,7 @@ class Traffic(World[Episode], Generic[RoadT]):
         return self._cav_actuation.apply(name, acceleration, sensed)
 
     def noise(self, episode_noise_size: int = 0) -> Array:
-        """Return standard normal noise for one control step: an array (CAVs,), or a float.
-
-        With `episode_noise_size`, that many numbers, the same for all CAVs and the whole episode; of a single CAV
-        shape (size,).
-        """
+        """Return standard normal noise for one control step, as `World.noise`; of a scalar CAV shape (size,)."""
         if not episode_noise_size:
             return self._exploration_generator.standard_normal(len(self.cav_ids))
         if self._episode_noise is None:

@@ -23,7 +23,6 @@ class TrafficLog:
     """The vehicles on the road at each moment with their speeds, and snapshots at some moments."""
 
     def __init__(self) -> None:
-        """Start without a moment."""
         self.names: list[str] = []
         """vehicles at the last moment"""
         self.snapshot_stride = 1
@@ -37,7 +36,6 @@ class TrafficLog:
         self._snapshot_vehicle_count = 0
 
     def __len__(self) -> int:
-        """Return the number of moments."""
         return len(self._numbers_by_moment)
 
     @property

@@ -1,7 +1,7 @@
 """SUMO's trip records (`tripinfo-output`), which take no measurable time during a simulation."""
 
 from pathlib import Path
-from xml.parsers import expat
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -11,8 +11,6 @@ NOT_ARRIVED = -1.0
 """SUMO's arrival time of a vehicle that has not arrived"""
 TRIP_TIME_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival"
 """attributes of a trip that are read [s]"""
-TRIP_CHUNK_BYTES = 1 << 20
-"""bytes that are read at once"""
 
 
 def trip_options(path: Path) -> list[str]:
@@ -28,20 +26,15 @@ def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -
     `warmup_end` [s], and trips of vehicles that were to depart later are left out.
     """
     ids, kinds, times = list[str](), list[str](), list[list[float]]()
-
-    def start_element(tag: str, attributes: dict[str, str]) -> None:
-        if tag != "tripinfo" or NOT_ARRIVED < float(attributes["arrival"]) <= warmup_end:
-            return
-        if float(attributes["depart"]) >= 0.0 or float(attributes["departDelay"]) > 0.0:
-            ids.append(attributes["id"])
-            kinds.append(_vehicle_class(attributes["vType"], vehicle_classes))
-            times.append([float(attributes[name]) for name in TRIP_TIME_ATTRIBUTES])
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = start_element
-    with path.open("rb") as file:
-        while chunk := file.read(TRIP_CHUNK_BYTES):
-            parser.Parse(chunk)
+    for _, element in ElementTree.iterparse(path):
+        trip = element.attrib
+        if element.tag != "tripinfo" or NOT_ARRIVED < float(trip["arrival"]) <= warmup_end:
+            continue
+        if float(trip["depart"]) >= 0.0 or float(trip["departDelay"]) > 0.0:
+            ids.append(trip["id"])
+            kinds.append(_vehicle_class(trip["vType"], vehicle_classes))
+            times.append([float(trip[name]) for name in TRIP_TIME_ATTRIBUTES])
+        element.clear()
     depart_delay, duration, time_loss, arrival = np.array(times, np.float64).reshape(-1, len(TRIP_TIME_ATTRIBUTES)).T
     return Trips(tuple(ids), tuple(kinds), depart_delay, duration, time_loss, arrival != NOT_ARRIVED)
 
