@@ -47,9 +47,9 @@ def test_benchmark_driver_is_valid(hold: int) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_benchmark_has_rates_and_ratios_and_restores_cores() -> None:
-    told: list[str] = []
+    messages: list[str] = []
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
-    found = benchmark_episodes(1, told.append)
+    found = benchmark_episodes(1, messages.append)
     assert found["rounds"] == 1
     assert min(found[name] for name in RATES) > 0
     assert found["relative_to_sumo"] == pytest.approx(found["episode_steps_per_s"] / found["sumo_steps_per_s"])
@@ -71,21 +71,21 @@ def test_benchmark_has_rates_and_ratios_and_restores_cores() -> None:
     costs = [entry["us_per_vehicle_step"] for entry in found["scaling"]]
     assert [entry["vehicles"] for entry in found["scaling"]] == [22, 66]
     assert found["cost_growth"] == max(costs) / costs[0]
-    assert told == ["round 1 of 1", "larger roads"]
+    assert messages == ["round 1 of 1", "larger roads"]
     assert cores is None or os.sched_getaffinity(0) == cores
 
 
 def test_batches_are_measured_with_both_human_models(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_benchmark, "STEPS_PER_ROUND", 3)
     monkeypatch.setattr(batch_benchmark, "BATCH_SIZES", {"cpu": (2, 5)})
-    told: list[str] = []
-    found = benchmark_batches("cpu", told.append)
+    messages: list[str] = []
+    found = benchmark_batches("cpu", messages.append)
     assert found["device"] == "one core"
     assert list(found["batches"]) == ["human drivers by IDM", "human drivers by IDM and networks"]
     for rates in found["batches"].values():
         assert [entry["rings"] for entry in rates] == [2, 5]
         assert all(entry["vehicle_steps_per_s"] == pytest.approx(22 * entry["steps_per_s"]) for entry in rates)
-    assert len(told) == 4
+    assert len(messages) == 4
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU")

@@ -1,4 +1,4 @@
-"""Does calibration find people and flows with which detectors measure what they did?"""
+"""Calibration: human drivers and flows with which detectors measure what they did."""
 
 import json
 from dataclasses import replace
@@ -26,14 +26,14 @@ from unjam.worlds.sumo.detectors import DetectorPassage
 INTERVAL = 60
 END = 240
 TRUE_SPEED, TRUE_FLOW, FLOW_NOW = 0.8, 600.0, 800.0
-PEOPLE = '<vType id="person" carFollowModel="IDM" minGap="2" tau="{}" speedFactor="{}" speedDev="0.05"/>'
+HUMAN_TYPE = '<vType id="person" carFollowModel="IDM" minGap="2" tau="{}" speedFactor="{}" speedDev="0.05"/>'
 FLOW = '<flow id="f" type="person" route="along" begin="0" end="240" vehsPerHour="{}" departSpeed="max"/>'
 
 
 def road(folder: Path, tau: float = 1.0, speed: float = 1.0, flow: float = FLOW_NOW) -> Path:
-    """A road with one lane whose people drive so."""
+    """A road with one lane and human drivers with these parameters."""
     folder.mkdir(exist_ok=True)
-    return straight(folder, PEOPLE.format(tau, speed) + FLOW.format(flow), 800.0, END)
+    return straight(folder, HUMAN_TYPE.format(tau, speed) + FLOW.format(flow), 800.0, END)
 
 
 def measured(path: Path, file: Path, places: tuple[float, ...] = (200.0, 700.0)) -> Path:
@@ -57,7 +57,7 @@ def measured(path: Path, file: Path, places: tuple[float, ...] = (200.0, 700.0))
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory: pytest.TempPathFactory) -> Corridor:
-    """A road whose people are quicker and more than those that were measured."""
+    """A road with faster human drivers and a larger flow than measured."""
     folder = tmp_path_factory.mktemp("roads")
     detectors = measured(road(folder / "true", 1.5, TRUE_SPEED, TRUE_FLOW), folder / "detectors.csv")
     return load_corridor(str(road(folder / "mine")), detectors)
@@ -89,7 +89,7 @@ def test_calibration_improves_the_agreement(asked: Corridor, done: tuple[Path, C
     assert written["manifest"]["starts"]
     assert written["trials"][0]["factors"] == {"speedFactor": 1.0, "flow": 1.0}
     assert len(written["trials"]) == TRIALS
-    assert read_sumo_files(asked.files.path) == asked.files  # nobody's files have changed
+    assert read_sumo_files(asked.files.path) == asked.files  # the files have not changed
 
 
 @pytest.mark.long

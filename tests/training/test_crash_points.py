@@ -110,7 +110,7 @@ def no_manifest(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(folder: Path) -> None:
-    """What a training does to its folder: begun, or gone on with where it was begun before."""
+    """The file operations of a training that is started, or resumed if it was started before."""
     if (folder / "config.toml").is_file():
         resume_run_folder(folder, small_config())
     else:

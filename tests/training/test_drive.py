@@ -118,17 +118,17 @@ def test_number_of_workers_does_not_change_the_result(compared: DriveResult) -> 
 
 
 def test_progress_has_driver_and_episode() -> None:
-    told: list[tuple[Any, int]] = []
+    messages: list[tuple[Any, int]] = []
     drive(
         "ring",
         ["pi", "idm"],
         1,
         scenario_options=ROAD,
         workers=1,
-        progress=lambda key, steps: told.append((key, steps)),
+        progress=lambda key, steps: messages.append((key, steps)),
     )
-    assert (("pi", 0), 60) in told
-    assert (("idm", 0), 60) in told
+    assert (("pi", 0), 60) in messages
+    assert (("idm", 0), 60) in messages
 
 
 def test_user_reward_is_used(my_drivers: Path, tmp_path: Path) -> None:
@@ -218,7 +218,7 @@ def test_result_has_a_pandas_table_and_a_notebook_view(compared: DriveResult) ->
 
 @pytest.fixture
 def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
-    """Tells whether a worker process was started."""
+    """Detects whether a worker process was started."""
     from unjam.worlds import worker_pool
 
     begun: list[object] = []

@@ -110,10 +110,10 @@ def test_tensorboard_has_every_number_by_environment_step(tmp_path: Path) -> Non
     write = tensorboard_writer(str(tmp_path))
     for step in (300, 600):
         row: dict[str, Any] = {"iteration": step // 300, "environment_steps": step, "return_mean": step / 10}
-        write({**row, "return_validation": None, "learner": {"kl": 0.5}, "seconds": {"actual": 1}})
+        write({**row, "return_validation": None, "learner": {"kl": 0.5}, "seconds": {"collect": 1}})
     board = events.EventAccumulator(str(tmp_path / TENSORBOARD_FOLDER))
     board.Reload()
-    assert set(board.Tags()["scalars"]) == {"return_mean", "learner/kl", "seconds/actual"}
+    assert set(board.Tags()["scalars"]) == {"return_mean", "learner/kl", "seconds/collect"}
     assert [(event.step, event.value) for event in board.Scalars("return_mean")] == [(300, 30.0), (600, 60.0)]
 
 

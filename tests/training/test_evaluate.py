@@ -77,11 +77,15 @@ def test_another_reward_changes_only_the_return(found: Evaluation, pool: WorkerP
 
 
 def test_progress_names_driver_and_episode_of_evaluations(pool: WorkerPool) -> None:
-    told: list[tuple[tuple[str, int], int]] = []
+    messages: list[tuple[tuple[str, int], int]] = []
     evaluate(
-        RING, {"a": IDM(), "b": IDM()}, SEEDS[:2], pool, progress=lambda episode, steps: told.append((episode, steps))
+        RING,
+        {"a": IDM(), "b": IDM()},
+        SEEDS[:2],
+        pool,
+        progress=lambda episode, steps: messages.append((episode, steps)),
     )
-    assert {episode for episode, steps in told if steps == 60} == {("a", 0), ("a", 1), ("b", 0), ("b", 1)}
+    assert {episode for episode, steps in messages if steps == 60} == {("a", 0), ("a", 1), ("b", 0), ("b", 1)}
 
 
 def test_failed_driver_does_not_stop_the_others(pool: WorkerPool, my_drivers: Path) -> None:

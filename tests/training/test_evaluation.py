@@ -26,7 +26,7 @@ def pool() -> Iterator[WorkerPool]:
 
 
 def learned(pool: WorkerPool, folder: Path, **changes: object) -> tuple[Path, RunConfig]:
-    """A run of one iteration that is not judged yet."""
+    """A run of one iteration that is not evaluated yet."""
     config = small_config(**{"steps": STEPS, "evaluation__validation_interval": 0, **changes})
     learn_with(pool, folder, config)
     return folder, config

@@ -34,11 +34,11 @@ def test_failed_command_does_not_stop_the_others(tmp_path: Path) -> None:
         "bad": CommandLine(["fly"], tmp_path / "bad.log"),
         "good": CommandLine(["--version"], tmp_path / "logs" / "good.log"),
     }
-    told: list[str] = []
+    messages: list[str] = []
     with pytest.raises(UnjamError, match="1 of 2 failed: bad; first log: "):
-        run_all(commands, 1, "local", told.append)
+        run_all(commands, 1, "local", messages.append)
     assert "unjam 0" in commands["good"].log.read_text()
-    assert sorted(line.split(": ")[1] for line in told) == ["bad failed", "good"]
+    assert sorted(line.split(": ")[1] for line in messages) == ["bad failed", "good"]
 
 
 def test_started_training_is_resumed(tmp_path: Path) -> None:

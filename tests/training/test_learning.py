@@ -1,4 +1,4 @@
-"""Each learner reaches a return that driving by chance does not, actual and virtual rows together."""
+"""Each learner exceeds the return of random driving with environment and model rows."""
 
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ QUICK: dict[str, dict[str, Any]] = {
     },
 }
 STANDING = 60.0
-"""more than what a network that has learned nothing earns: it never starts, and stops those ahead"""
+"""above the return of an untrained network, which never starts and stops the vehicles behind it"""
 TARGET = 100.0
 """measured with other seeds: 166 (trpo), 195 (ppo), 173 (sac), 300 (td3)"""
 

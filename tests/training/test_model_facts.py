@@ -25,7 +25,7 @@ NUMBERS = ["speed", "leader_speed", "follower_speed", "leader_gap", "follower_ga
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two iterations of three episodes, 100 decisions each; episodes 0, 2 and 5 are held out."""
+    """A run of two iterations of three episodes, 100 control steps each; episodes 0, 2 and 5 are the holdout."""
     folder = tmp_path_factory.mktemp("runs") / "with-model"
     with WorkerPool(1) as workers:
         learn_with(workers, folder, CONFIG)
@@ -125,10 +125,10 @@ def test_run_without_a_checkpoint_is_refused(run: Path, tmp_path: Path) -> None:
 
 
 @given(st.lists(st.integers(1, 5000), min_size=1, max_size=50))
-def test_half_of_the_trips_are_long_enough_for_replays(stays: list[int]) -> None:
-    ahead = replay_length(stays)
+def test_half_of_the_trips_are_long_enough_for_replays(trips: list[int]) -> None:
+    ahead = replay_length(trips)
     assert 1 <= ahead <= model_facts.MAX_REPLAY_STEPS
-    assert np.mean([stay >= ahead for stay in stays]) >= 0.5
+    assert np.mean([trip >= ahead for trip in trips]) >= 0.5
 
 
 def test_road_model_has_waves(tmp_path: Path) -> None:
@@ -175,10 +175,10 @@ def test_on_ramp_model_has_waves_by_lane(world: str, tmp_path: Path) -> None:
     roads = {label: np.array(road["speeds"], float) for label, road in found["waves"].items()}
     assert list(roads) == ["recorded", "model", "base"]
     came = {label: (~np.isnan(speeds)).sum() for label, speeds in roads.items()}
-    assert came["model"] == came["base"] > 0  # the same people at the same times
+    assert came["model"] == came["base"] > 0  # the same vehicles at the same times
     alike = 0.0 if world == "batch" else 0.1  # SUMO lets some enter a second sooner or later than the batch
     assert came["recorded"] == pytest.approx(came["base"], rel=alike)
-    assert not np.array_equal(roads["recorded"], roads["base"], equal_nan=True)  # who misjudge anew
+    assert not np.array_equal(roads["recorded"], roads["base"], equal_nan=True)  # their errors are drawn again
     drawn = wave_figure(found)
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in drawn.axes]
     assert [title for title in titles if title] == ["recorded", "model", "IDM alone"]

@@ -1,22 +1,22 @@
-"""Is what is held out never seen, and can each road be driven?"""
+"""The road family: training and unseen roads."""
 
 import pytest
 
 from unjam.scenarios.ring import Ring
 from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
 
-SEEN, HELD_OUT = family_scenarios("all-roads", "training"), family_scenarios("all-roads", "combination", "axis")
+TRAINING, UNSEEN = family_scenarios("all-roads", "training"), family_scenarios("all-roads", "combination", "axis")
 
 
 def test_unseen_roads_are_not_used_for_training() -> None:
-    assert len(SEEN) + len(HELD_OUT) == len(FAMILY)
-    assert not set(HELD_OUT.values()) & set(SEEN.values())
+    assert len(TRAINING) + len(UNSEEN) == len(FAMILY)
+    assert not set(UNSEEN.values()) & set(TRAINING.values())
 
 
 def test_unseen_axes_lie_beyond_training_values() -> None:
-    rings = [road for road in SEEN.values() if isinstance(road, Ring)]
+    rings = [road for road in TRAINING.values() if isinstance(road, Ring)]
     spacings = [size / road.vehicles for road in rings for size in road.length]
-    dense = HELD_OUT["ring-22-dense"]
+    dense = UNSEEN["ring-22-dense"]
     assert isinstance(dense, Ring)
     assert dense.length[1] / dense.vehicles < min(spacings)
     assert all(road.vehicles < 88 for road in rings)

@@ -33,7 +33,7 @@ from unjam.worlds.worker_pool import WorkerPool
 torch.set_num_threads(1)  # as a training does
 
 STEPS = 300
-"""actual steps of an iteration of a small run: three episodes"""
+"""environment steps of an iteration of a small run: three episodes"""
 
 
 def small_config(**changes: Any) -> RunConfig:
@@ -306,7 +306,7 @@ def test_earlier_controller_stays_if_it_is_the_best(tmp_path: Path, learn: Learn
 
 
 def test_expert_stays_the_controller_if_it_is_the_best(tmp_path: Path, learn: Learn) -> None:
-    # A residual of almost nothing, whose exploration alone moves the car.
+    # The residual is almost zero: only its exploration has an effect.
     config = small_config(policy__authority=1e-30, policy__exploration_std=1e-12, steps=STEPS)
     learn(tmp_path / "run", config)
     (row,) = progress(tmp_path / "run")

@@ -15,7 +15,7 @@ from unjam.training.runs import config_differences, read_run, remove_run
 
 
 def made(folder: Path, config: RunConfig, done: int, gain: float | None = None) -> Path:
-    """A run folder that has come so far, judged with such a gain."""
+    """A run folder with so many steps, evaluated with such a gain."""
     create_run_folder(folder, config)
     append_line(folder / "progress.jsonl", to_json({"iteration": 1, "environment_steps": done}))
     if gain is not None:

@@ -241,10 +241,10 @@ def test_folder_with_other_files_is_not_changed(tmp_path: Path) -> None:
 
 def test_failure_of_all_trials_is_reported(tmp_path: Path, trainings: Trainings) -> None:
     trainings.failing = True
-    told: list[str] = []
+    messages: list[str] = []
     with pytest.raises(UnjamError, match="all 3 trainings failed; their logs are in"):
-        search(BASE, SPACE, 3, tmp_path, 2, on_message=told.append)
-    assert all(line.endswith("failed") for line in told)
+        search(BASE, SPACE, 3, tmp_path, 2, on_message=messages.append)
+    assert all(line.endswith("failed") for line in messages)
 
 
 def test_missing_optuna_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,11 +25,11 @@ torch.set_num_threads(1)  # as a training does
 EIGHT = {"radius": [30, 31], "vehicles": 8}
 SHORT = {"scenario_options": {"length": [90, 100], "vehicles": 6}, "name": "short"}
 MIXTURE: list[dict[str, Any]] = [{"weight": 2.0}, SHORT]
-VIRTUAL = {"model__members": 2, "model__epochs": 2, "model__hidden": [8]}
+MODEL = {"model__members": 2, "model__epochs": 2, "model__hidden": [8]}
 
 
 def mixture(**changes: Any) -> RunConfig:
-    return small_config(**{"tasks": MIXTURE, **VIRTUAL, **changes})
+    return small_config(**{"tasks": MIXTURE, **MODEL, **changes})
 
 
 def test_planned_steps_are_whole_iterations() -> None:
@@ -103,7 +103,7 @@ def test_interrupted_mixture_ends_unchanged(agent: str, tmp_path: Path, monkeypa
         assert found[0] == found[1]
     found = [outcome_of(place) for place in places]
     assert found[0] == found[1]
-    assert {"virtual", "virtual-1"} <= found[0][0].keys()
+    assert {"model", "model-1"} <= found[0][0].keys()
 
 
 def outcome_of(folder: Path) -> tuple[Any, ...]:
@@ -130,18 +130,18 @@ def test_privileged_critic_has_task_and_drawn_values(tmp_path: Path, sees_road: 
         training = trainer.training
         episodes = trainer.collect(training.learner.network(), 1)
         rows = environment_experience(training, episodes)
-    beside = rows.observations[:, training.learner.spec.inputs :]
+    privileged = rows.observations[:, training.learner.spec.inputs :]
     assert training.learner.sb3.observation_space.shape == rows.observations.shape[1:]
     if not sees_road:
-        assert beside.shape[1] == 0
+        assert privileged.shape[1] == 0
         return
     scaled = [
         task.scenario.scale_drawn_values(driven[-1].drawn_values)[0]
         for task, driven in zip(training.tasks, episodes, strict=True)
     ]
-    np.testing.assert_allclose(beside[0, 1:], [0.0, 1.0, 0.0])
-    np.testing.assert_allclose(beside[-1], [0.0, scaled[1], 0.0, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(beside[19, :2], [scaled[0], 0.0], rtol=1e-6)
+    np.testing.assert_allclose(privileged[0, 1:], [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(privileged[-1], [0.0, scaled[1], 0.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(privileged[19, :2], [scaled[0], 0.0], rtol=1e-6)
     assert (rows.last_observations[:2, -2:] == [1.0, 0.0]).all()
 
 

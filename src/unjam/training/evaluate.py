@@ -105,11 +105,12 @@ def evaluate_on_roads(
     results = dict(zip(remote, measured, strict=True))
     results |= _run_in_process(tasks, results.keys(), measure_task, on_progress)
     rows: RowsByDriver = {label: [] for label in drivers}
+    plot_episodes: dict[str, Episode] = {}
     for index, (label, _) in enumerate(pairs):
-        rows[label].append(results[index][0])
-    plot_episodes = {
-        label: results[index][1] for index, (label, _) in enumerate(pairs) if results[index][1] is not None
-    }
+        row, episode = results[index]
+        rows[label].append(row)
+        if episode is not None:
+            plot_episodes[label] = episode
     return Evaluation(rows, plot_episodes)
 
 
