@@ -17,35 +17,28 @@ from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import CarFollowingRecord, CarFollowingWorld
 
-ISO_MEAN_SECONDS = 2.0
-"""averaging time of accelerations in ISO 15622 [s]"""
-LEADER_STOP_SECONDS = 20.0
-"""simulated time after the start of a leader's emergency stop [s]"""
+ISO_MEAN_SECONDS, LEADER_STOP_SECONDS = 2.0, 20.0
+"""averaging time of accelerations in ISO 15622; simulated time after the start of a leader's emergency stop [s]"""
 ATTACK_SECONDS, ATTACK_STEP_SECONDS = 40.0, 1.0
 """duration of an adversarial maneuver of a leader, and of each of its accelerations [s]"""
 ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12
 """cross-entropy method: maneuvers in a generation, generations, and elites that determine the next generation"""
-MIN_MOVING_SPEED = 1.0
-"""speed above which time gaps and string stability are evaluated [m/s]"""
-STRING_SPEED_RATIOS = (0.5, 0.9)
-"""speeds for string stability, as shares of the highest visited speed"""
 MAX_LEADER_ACCELERATION = 3.0
-"""maximum acceleration of an adversarial leader [m/s2]"""
-OSCILLATION_AMPLITUDE = 0.05
-"""amplitude of a leader's speed, as a share of its mean: small, so that the response is nearly linear"""
+"""of an adversarial leader [m/s2]"""
+MIN_MOVING_SPEED, STRING_SPEED_RATIOS = 1.0, (0.5, 0.9)
+"""speed above which time gaps and string stability are evaluated [m/s]; speeds for string stability, as shares of the
+highest visited speed"""
+OSCILLATION_FREQUENCIES, OSCILLATION_AMPLITUDE = np.geomspace(0.04, 3.0, 20), 0.05
+"""[rad/s]; amplitude of a leader's speed, as a share of its mean: small, so that the response is nearly linear"""
 SETTLING_SECONDS, MEASURED_PERIODS, MIN_MEASURED_SECONDS = 100.0, 2, 200.0
 """settling time [s]; number of measured periods, and minimum measured time [s]"""
-OSCILLATION_FREQUENCIES = np.geomspace(0.04, 3.0, 20)
-"""[rad/s]"""
-MAX_FOLLOWERS = 60
-"""maximum number of human drivers behind a CAV"""
-GAIN_TOLERANCE = 5e-3
-"""gains up to one plus this count as one"""
+MAX_FOLLOWERS, GAIN_TOLERANCE = 60, 5e-3
+"""maximum number of human drivers behind a CAV; gains up to one plus the tolerance count as one"""
 
 
 @dataclass(frozen=True)
 class WorstCases:
-    """Results of simulations that try to cause contact with the leader, with the safety filter."""
+    """Results of simulations that try to cause contact with the leader, with the safety filter [m, s, m/s2]."""
 
     leader_stops: int
     """number of visited states from which the leader stopped with its maximum braking"""
@@ -53,31 +46,27 @@ class WorstCases:
     """simulated steps of single vehicles"""
     contacts: int
     min_gap: float
-    """[m]"""
     min_time_gap: float
-    """above 1 m/s, behind a leader that brakes with at most `SafetyFilter.time_gap_braking` [s]"""
+    """above 1 m/s, behind a leader that brakes with at most `SafetyFilter.time_gap_braking`"""
     max_braking: float
-    """[m/s2]"""
     attack: tuple[float, ...]
-    """the leader's accelerations with the smallest gap, one per second [m/s2]"""
+    """the leader's accelerations with the smallest gap, one per second"""
 
 
 @dataclass(frozen=True)
 class StringStability:
-    """Response to speed oscillations of the leader around one speed."""
+    """Response to speed oscillations of the leader around one speed [m/s] at several frequencies [rad/s]."""
 
     speed: float
-    """[m/s]"""
     frequencies: tuple[float, ...]
-    """[rad/s]"""
     gains: tuple[float, ...]
     """amplitude of the CAV divided by that of the leader, at each frequency"""
     human_gains: tuple[float, ...]
     """the same for a human driver, by the linearized IDM"""
     peak_frequency: float
-    """frequency of the CAV's largest gain [rad/s]"""
+    """frequency of the CAV's largest gain"""
     amplified_band: tuple[float, ...]
-    """smallest and largest frequency with a gain of the CAV above one; empty if there is none [rad/s]"""
+    """smallest and largest frequency with a gain of the CAV above one; empty if there is none"""
     max_stable_followers: int
     """maximum number of human drivers behind the CAV without amplification at any frequency"""
 
@@ -129,9 +118,7 @@ def make_certificate(controller: Controller) -> dict[str, Any]:
     driver = controller.driver
     if not isinstance(driver, FilteredDriver) or not driver.safety.active or SAMPLE_PART not in controller.parts:
         allowed = "output of `unjam export` for a road with a filter"
-        raise InputError(
-            f"certify: a controller without its safety filter and sample is not allowed; allowed: {allowed}"
-        )
+        raise InputError(f"certify: a controller without safety filter and sample is not allowed; allowed: {allowed}")
     if "scenario" not in controller.manifest:
         allowed = "one that was exported with --scenario"
         raise InputError(f"certify: a controller without a scenario is not allowed; allowed: {allowed}")
@@ -214,8 +201,7 @@ def _search_attacks(
 ) -> tuple[CarFollowingRecord, Floats, int]:
     """Search maneuvers of a leader with the smallest gap, by the cross-entropy method.
 
-    Returns:
-        The generation with the smallest gap, its worst maneuver, and the simulated steps of single vehicles.
+    Return the generation with the smallest gap, its worst maneuver, and the simulated steps of single vehicles.
     """
     pieces, repeats = round(ATTACK_SECONDS / ATTACK_STEP_SECONDS), max(1, round(ATTACK_STEP_SECONDS / driver.time_step))
     low, high = -driver.safety.leader_braking, MAX_LEADER_ACCELERATION

@@ -36,14 +36,10 @@ SIGNATURE_PART = "signature.json"
 ARCHIVE_PARTS = (MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART, SIGNATURE_PART)
 """all parts of an archive, in the order of signed ones; exported controllers have a sample and may have a graph,
 certified ones a certificate, signed ones a signature"""
-MAX_PART_BYTES = 64 * 2**20
-"""maximum size of one part"""
-MAX_JSON_BYTES = {MANIFEST_PART: 2**20, CERTIFICATE_PART: 2**20, SIGNATURE_PART: 10_000}
-"""maximum size of parts in JSON, which take many times their size in memory"""
+MAX_PART_BYTES, MAX_JSON_BYTES = 64 * 2**20, {MANIFEST_PART: 2**20, CERTIFICATE_PART: 2**20, SIGNATURE_PART: 10_000}
+"""maximum sizes: of one part, and of parts in JSON, which take many times their size in memory"""
 MAX_SAMPLE_STEPS = 1000
 """maximum number of control steps in a recorded sample"""
-ZIP_SYSTEM_UNIX = 3
-"""code of the creating system in an archive"""
 ACTION_NAME = "acceleration"
 """name of the recorded answers in a sample and of the output of a graph"""
 
@@ -82,11 +78,7 @@ def _pack_with_hashes(manifest: dict[str, Any], parts: dict[str, bytes]) -> byte
 
 
 def add_certificate(file: Path, controller: Controller, certificate: dict[str, Any]) -> None:
-    """Write the file of a controller again, with its certificate.
-
-    Raises:
-        InputError: it is signed, and the signature would not fit any more.
-    """
+    """Write the file of a controller again, with its certificate; raise `InputError` if it is signed."""
     check_unsigned(controller)
     parts = {**controller.parts, CERTIFICATE_PART: to_json(certificate, indent=1).encode()}
     del parts[MANIFEST_PART]
@@ -115,9 +107,8 @@ def _ordered_parts(parts: dict[str, bytes]) -> dict[str, bytes]:
 def load_controller(path: Path | str) -> Driver:
     """Return the driver of a `.unjam` file, or of a run folder with one.
 
-    Raises:
-        InputError: it does not exist, is damaged, is not a controller, or is a file outside of a run folder that
-            refers to Python code.
+    Raise `InputError` if it does not exist, is damaged or not a controller, or if a file outside of a run folder refers
+    to Python code.
     """
     return read_controller(path).driver
 
@@ -203,7 +194,7 @@ def pack_parts(parts: dict[str, bytes]) -> bytes:
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
         for name, part in parts.items():
             entry = zipfile.ZipInfo(name)  # with a fixed date
-            entry.create_system = ZIP_SYSTEM_UNIX  # on any system
+            entry.create_system = 3  # Unix, on any system
             archive.writestr(entry, part)
     return content.getvalue()
 
@@ -211,9 +202,8 @@ def pack_parts(parts: dict[str, bytes]) -> bytes:
 def unpack_parts(file: Path) -> dict[str, bytes]:
     """Return the parts of an archive, in memory: nothing is written.
 
-    Raises:
-        InputError: it has an unknown, duplicate, compressed, encrypted or too large part, or a link.
-        zipfile.BadZipFile, OSError, EOFError, RuntimeError: it is not an archive, or damaged.
+    Raise `InputError` for an unknown, duplicate, compressed, encrypted or too large part or a link, and
+    `zipfile.BadZipFile`, `OSError`, `EOFError` or `RuntimeError` if it is not an archive, or damaged.
     """
     size, largest = file.stat().st_size, len(ARCHIVE_PARTS) * MAX_PART_BYTES
     if size > largest:
@@ -254,9 +244,8 @@ def sample_bytes(driver: Driver, states: LocalState, action_limit: float) -> byt
 def read_sample(part: bytes) -> tuple[LocalState, Floats]:
     """Return the states of a sample and the recorded accelerations [m/s2], all of shape (T,).
 
-    Raises:
-        InputError: an array is missing, unknown, or of another shape or type, an acceleration is not finite, or
-            there is no control step, or more than `MAX_SAMPLE_STEPS`.
+    Raise `InputError` for a missing, unknown or wrong array, an acceleration that is not finite, no control step, or
+    more than `MAX_SAMPLE_STEPS`.
     """
     arrays: dict[str, Any] = load(part)
     required, known = {*COMMON_FIELDS, ACTION_NAME}, {*LocalState._fields, ACTION_NAME}

@@ -17,17 +17,15 @@ from unjam.physics.arrays import Floats
 from unjam.tree import leaves
 
 ONNX_OPSET = 20
-"""version of the ONNX operators"""
 ONNX_IR_VERSIONS = range(10, 14)
-"""versions of the ONNX format for graphs of this opset"""
+"""version of the ONNX operators, and versions of the ONNX format for graphs of this opset"""
 ALLOWED_OPERATORS: dict[str, dict[str, str]] = {
     **{
         name: {}
         for name in (
-            *("Abs", "Add", "And", "Clip", "Cos", "Div", "Equal", "Expand", "Floor", "Greater"),
-            *("GreaterOrEqual", "Identity", "IsNaN", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mul"),
-            *("Neg", "Not", "Or", "Pow", "Reciprocal", "Relu", "Sin", "Slice", "Sqrt", "Squeeze", "Sub"),
-            *("Tanh", "Unsqueeze", "Where"),
+            *("Abs", "Add", "And", "Clip", "Cos", "Div", "Equal", "Expand", "Floor", "Greater", "GreaterOrEqual"),
+            *("Identity", "IsNaN", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mul", "Neg", "Not", "Or", "Pow"),
+            *("Reciprocal", "Relu", "Sin", "Slice", "Sqrt", "Squeeze", "Sub", "Tanh", "Unsqueeze", "Where"),
         )
     },
     "Cast": {"to": "i"},
@@ -51,8 +49,8 @@ ALLOWED_FIELDS = {
     "GraphProto": {"name", "node", "initializer", "input", "output", "value_info"},
     "NodeProto": {"name", "op_type", "domain", "input", "output", "attribute"},
     "AttributeProto": {"name", "type", "i", "f", "s", "t", "ints"},
-    "TensorProto": {"name", "dims", "data_type", "raw_data", "double_data", "float_data", "int64_data"}
-    | {"int32_data"},
+    "TensorProto": {"name", "dims", "data_type", "raw_data", "double_data", "float_data"}
+    | {"int32_data", "int64_data"},
     "ValueInfoProto": {"name", "type"},
     "TypeProto": {"tensor_type"},
     "Tensor": {"elem_type", "shape"},

@@ -16,9 +16,6 @@ from unjam.drivers.speed_history import CircularWindow
 from unjam.errors import InputError
 from unjam.tree import leaves, replace_leaves
 
-EXAMPLE_ROWS = 2
-"""CAVs in the example from which the graph is exported; it takes any number of them"""
-
 
 class ControllerModule(nn.Module):
     """A driver and the bounds of its action as a pure function of tensors, in the order of the graph."""
@@ -61,18 +58,16 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
     """Return the ONNX graph of a driver with its acceleration clipped to `action_limit` [m/s2], in float64.
 
     Inputs are the fields of `LocalState` and `memory.NAME` for each entry of the memory; outputs are `acceleration`
-    and `next.NAME`. The first axis of each is the row of the CAV.
-
-    Raises:
-        InputError: the driver does not consist of formulas for torch.
-        MissingPartError: onnxscript is not installed.
+    and `next.NAME`. The first axis of each is the row of the CAV. Raise `InputError` if the driver does not consist of
+    formulas for torch, `MissingPartError` if onnxscript is not installed.
     """
     if not driver.accepts_tensors or driver.is_native:
         raise InputError(f"onnx: {driver.describe()} is not allowed; allowed: drivers that run on tensors")
     exact = {torch.ops.aten.scalar_tensor.default: _float64_constant()}
     inputs, outputs = graph_names(driver)
-    state = state_of_ones(driver.input_fields, partial(torch.ones, dtype=torch.float64), EXAMPLE_ROWS)
-    memory = driver.initial_memory(EXAMPLE_ROWS)
+    example_rows = 2  # the exported graph takes any number of rows
+    state = state_of_ones(driver.input_fields, partial(torch.ones, dtype=torch.float64), example_rows)
+    memory = driver.initial_memory(example_rows)
     arrays = [value for value in state if value is not None]
     arrays += [torch.as_tensor(value, dtype=torch.float64) for _, value in leaves(memory)]
     if driver.time_gaps(state, memory) is not None:

@@ -30,10 +30,8 @@ except ImportError:
     _MISSING_PACKAGE = "cryptography is not installed; signatures need it"
     raise MissingPartError(f"{_MISSING_PACKAGE}: pip install cryptography") from None
 
-PRIVATE_SUFFIX, PUBLIC_SUFFIX = ".key", ".pub"
 PRIVATE_KEY_DESCRIPTION = "an Ed25519 private key in PEM without a password, as `unjam keys` writes it"
 PUBLIC_KEY_DESCRIPTION = "an Ed25519 public key in PEM, as `unjam keys` writes it"
-PRIVATE_FILE_MODE, PUBLIC_FILE_MODE = 0o600, 0o644
 MAX_KEY_BYTES = 10_000
 """maximum size of a key file"""
 FIELD_PRIME = 2**255 - 19
@@ -60,13 +58,11 @@ class KeyPair:
 def make_keys(name: Path) -> KeyPair:
     """Write a new pair of keys into the same folder: `NAME.key`, readable by its owner only, and `NAME.pub`.
 
-    Raises:
-        InputError: a file with one of both names exists.
-        DiskError: they cannot be written; then neither exists.
+    Raise `InputError` if one of both files exists, `DiskError` if they cannot be written; then neither exists.
     """
     if not name.name:
         raise invalid_value("name", str(name), "the common start of the names of two new files")
-    private, public = (name.with_name(name.name + ending) for ending in (PRIVATE_SUFFIX, PUBLIC_SUFFIX))
+    private, public = (name.with_name(name.name + ending) for ending in (".key", ".pub"))
     check_parent_folder(private)
     for file in (private, public):
         if os.path.lexists(file):
@@ -74,10 +70,10 @@ def make_keys(name: Path) -> KeyPair:
     key = Ed25519PrivateKey.generate()
     public_key = key.public_key()
     secret = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    write_new_file(private, secret, PRIVATE_FILE_MODE)
+    write_new_file(private, secret, mode=0o600)
     try:
         content = public_key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
-        write_new_file(public, content, PUBLIC_FILE_MODE)
+        write_new_file(public, content, mode=0o644)
     except BaseException:
         remove(private)
         raise
@@ -136,9 +132,7 @@ def signature_of(parts: dict[str, bytes], key: Ed25519PrivateKey) -> bytes:
 def signer_of(name: str, parts: dict[str, bytes], part: bytes) -> str:
     """Return the fingerprint of the key that signed `parts` of the controller `name`, by its signature `part`.
 
-    Raises:
-        InputError: it is not a signature, it does not fit, or it is of a weak key or malleable: a second
-            encoding of another signature.
+    Raise `InputError` if it is not a signature, does not fit, is of a weak key, or is a second encoding of another one.
     """
     format_error = InputError(f"controller {name}: its signature is not one that unjam writes")
     forged = forged_error(name)

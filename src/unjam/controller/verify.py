@@ -13,22 +13,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from unjam.controller import file as archive
 from unjam.controller.certificate import make_certificate
 from unjam.controller.domain import road_description, step_mismatch
-from unjam.controller.file import (
-    CERTIFICATE_PART,
-    GRAPH_PART,
-    MANIFEST_PART,
-    SAMPLE_PART,
-    SIGNATURE_PART,
-    WEIGHTS_PART,
-    Controller,
-    Floats,
-    read_controller,
-    read_sample,
-    replay_states,
-    sha256_of,
-)
+from unjam.controller.file import Controller, Floats, read_controller, read_sample, replay_states, sha256_of
 from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.manifest import PROVENANCE_ENTRIES, driver_interface, first_difference, short_text
 from unjam.drivers.check import random_state
@@ -92,8 +80,8 @@ def check_parts(controller: Controller, signer: Path | str | None = None) -> lis
     """
     with reject_damaged("verify"):
         signature = _check_signer(controller.signed_by, signer)
-        tested = {GRAPH_PART, CERTIFICATE_PART} & controller.parts.keys()
-        if tested and SAMPLE_PART not in controller.parts:
+        tested = {archive.GRAPH_PART, archive.CERTIFICATE_PART} & controller.parts.keys()
+        if tested and archive.SAMPLE_PART not in controller.parts:
             raise InputError(f"controller: has {min(tested)}, but no recorded sample to test it on")
         return [
             _describe_archive(controller),
@@ -111,7 +99,11 @@ def check_parts(controller: Controller, signer: Path | str | None = None) -> lis
 
 def _describe_archive(controller: Controller) -> PartCheck:
     """Describe the parts of the archive; their hashes were compared while it was read."""
-    parts = {name: part for name, part in controller.parts.items() if name not in (MANIFEST_PART, SIGNATURE_PART)}
+    parts = {
+        name: part
+        for name, part in controller.parts.items()
+        if name not in (archive.MANIFEST_PART, archive.SIGNATURE_PART)
+    }
     sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items())
     return PartCheck("parts", "checked", f"{sizes}: each has the SHA-256 that the manifest names")
 
@@ -153,7 +145,7 @@ def _describe_code(controller: Controller) -> PartCheck:
 
 def _describe_weights(controller: Controller) -> PartCheck:
     """Describe the weights; their shapes and values were checked while the driver was built."""
-    part, arrays = controller.parts[WEIGHTS_PART], controller.driver.weights()
+    part, arrays = controller.parts[archive.WEIGHTS_PART], controller.driver.weights()
     if not arrays:
         return PartCheck("weights", "absent", f"the driver has no network; SHA-256 {sha256_of(part)}")
     detail = f"{len(arrays)} arrays, finite, of the required shapes, none superfluous; SHA-256 {sha256_of(part)}"
@@ -184,10 +176,10 @@ def _describe_provenance(controller: Controller) -> list[PartCheck]:
 
 def _check_sample(controller: Controller) -> PartCheck:
     """Compare the driver with the recorded sample."""
-    if SAMPLE_PART not in controller.parts:
+    if archive.SAMPLE_PART not in controller.parts:
         reason = "run folders and `unjam tune` record none, `unjam export` does"
         return PartCheck("sample", "absent", f"no recorded accelerations to repeat; {reason}")
-    states, recorded = read_sample(controller.parts[SAMPLE_PART])
+    states, recorded = read_sample(controller.parts[archive.SAMPLE_PART])
     answers = replay_states(controller.driver, states, _action_limit(controller))
     error = _max_error("its driver", answers, recorded, REPLAY_TOLERANCE)
     detail = f"the driver repeats them within {error:.1e} m/s2 (allowed {REPLAY_TOLERANCE:g})"
@@ -196,10 +188,10 @@ def _check_sample(controller: Controller) -> PartCheck:
 
 def _check_graph(controller: Controller) -> PartCheck:
     """Compare the graph with the recorded sample, and with the driver on states that no maker can choose."""
-    if GRAPH_PART not in controller.parts:
+    if archive.GRAPH_PART not in controller.parts:
         return PartCheck("graph", "absent", "no ONNX graph; `unjam export --onnx` adds one")
-    part, driver = controller.parts[GRAPH_PART], controller.driver
-    states, recorded = read_sample(controller.parts[SAMPLE_PART])
+    part, driver = controller.parts[archive.GRAPH_PART], controller.driver
+    states, recorded = read_sample(controller.parts[archive.SAMPLE_PART])
     try:
         check_graph(part, driver)
         sample_error = _max_error("its graph", run_graph(part, driver, states), recorded, GRAPH_TOLERANCE)
@@ -226,9 +218,9 @@ def _random_states(part: bytes, states: LocalState) -> LocalState:
 
 def _check_certificate(controller: Controller) -> PartCheck:
     """Repeat the simulations of the certificate, and compare it number by number."""
-    if CERTIFICATE_PART not in controller.parts:
+    if archive.CERTIFICATE_PART not in controller.parts:
         return PartCheck("certificate", "absent", "no worst cases were simulated; `unjam certify` does it")
-    stated = parse_json(controller.parts[CERTIFICATE_PART])  # before the simulations, in case it is damaged
+    stated = parse_json(controller.parts[archive.CERTIFICATE_PART])  # before the simulations, in case it is damaged
     actual = _json_roundtrip(make_certificate(controller))
     _require_same("certificate", first_difference(stated, actual, CERTIFICATE_TOLERANCE))
     worst = actual["worst_cases"]

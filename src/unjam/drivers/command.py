@@ -12,21 +12,18 @@ from unjam.physics.arrays import Array, clip, namespace
 
 
 class Command(NamedTuple):
-    """Commands for n CAVs until the next control step; arrays of shape (n,), or plain numbers for one."""
+    """Commands for n CAVs until the next control step [m/s2, s]; arrays of shape (n,), or plain numbers for one."""
 
     acceleration: Array
-    """[m/s2]"""
     time_gap: Array | None = None
-    """time gap for the CAVs' own ACCs, on roads with ACCs [s], shape (n,); NaN, or None for all: that of the ACC"""
+    """time gap for the CAVs' own ACCs, on roads with ACCs; NaN, or None for all: that of the ACC"""
 
 
 class Limits(NamedTuple):
-    """Accelerations that a CAV may command on a road."""
+    """Accelerations that a CAV may command on a road [m/s2]."""
 
     lowest: float
-    """[m/s2]"""
     highest: float
-    """[m/s2]"""
 
     def clip(self, acceleration: Array) -> Array:
         """Return accelerations within the limits, of the same shape; NaN stays NaN."""
@@ -52,8 +49,7 @@ def answer_as_array(answer: Any, rows: int, context: str, quantity: str = "accel
 def batch_commanded_accelerations(command: Command | None, limits: Limits, rows: int, step: int) -> Array:
     """Return the commands of the vehicles on many roads, within the limits, shape (rows,) [m/s2].
 
-    Raises:
-        InputError: they are not finite numbers, one for each row.
+    Raise `InputError` unless they are finite numbers, one for each row.
     """
     found: Any = () if command is None else command.acceleration
     if np.shape(found) != (rows,) or not bool(namespace(found).isfinite(found).all()):
@@ -64,10 +60,8 @@ def batch_commanded_accelerations(command: Command | None, limits: Limits, rows:
 def commanded_accelerations(command: Command | None, limits: Limits, names: Sequence[str], step: int) -> list[float]:
     """Return the commands of the vehicles `names`, within the limits, as plain floats [m/s2].
 
-    An acceleration is a number, or one for each vehicle; None is right for no vehicle. Messages name `step`.
-
-    Raises:
-        InputError: an acceleration is not finite, or their number is not that of the vehicles.
+    An acceleration is a number, or one for each vehicle; None is right for no vehicle. Raise `InputError` with `step`
+    in its message if an acceleration is not finite, or their number is not that of the vehicles.
     """
     found: Array = () if command is None else command.acceleration
     rows = len(names)
@@ -84,8 +78,7 @@ def commanded_accelerations(command: Command | None, limits: Limits, names: Sequ
 def commanded_time_gaps(command: Command | None, min_time_gap: float, names: Sequence[str], step: int) -> list[float]:
     """Return the time gaps that the vehicles `names` must keep [s], at least `min_time_gap`, that of their ACCs.
 
-    Raises:
-        InputError: one is infinite, or their number is not that of the vehicles.
+    Raise `InputError` if one is infinite, or their number is not that of the vehicles.
     """
     if command is None or command.time_gap is None:
         return [min_time_gap] * len(names)

@@ -64,13 +64,10 @@ class Feature:
 
 
 def local_observation(state: LocalState) -> Array:
-    """Return the observation of the paper: five numbers a row, divided by fixed physical scales.
+    """Return the observation of the paper, divided by fixed scales: shape (n, 5), no unit; a tuple for plain numbers.
 
     Own speed; relative speed and gap to the leader; relative speed and gap to the follower.
     Relative speeds are the other's minus the own; gaps are bumper to bumper.
-
-    Returns:
-        Shape (n, 5), no unit; a tuple of five for plain numbers.
     """
     return stack_columns(
         (
@@ -84,11 +81,7 @@ def local_observation(state: LocalState) -> Array:
 
 
 def lap_position(state: LocalState) -> Array:
-    """Return cosine and sine of the position on a closed road, 0 to 2 pi from its start.
-
-    Returns:
-        Shape (n, 2), no unit; a tuple of two for plain numbers.
-    """
+    """Return cosine and sine of `lap_angle`: shape (n, 2), no unit; a tuple for plain numbers."""
     xp, angle = namespace(state.speed), lap_angle(state)
     return stack_columns((xp.cos(angle), xp.sin(angle)))
 
@@ -195,21 +188,10 @@ FEATURES: dict[str, Feature] = {
 """all features of networks; `local` has the five numbers of the paper"""
 
 
-def _is_feature(name: str) -> bool:
-    return name in FEATURES or is_file_reference(name)
-
-
 def _check_feature_name(name: str) -> str:
-    if not _is_feature(name):
+    if name not in FEATURES and not is_file_reference(name):
         raise ValueError(f"{', '.join(map(repr, FEATURES))} or 'path.py:name'")
     return name
-
-
-def check_features(names: Sequence[str]) -> None:
-    """Raise `InputError` unless each name is that of a feature, or of a user's own function."""
-    for name in names:
-        if not _is_feature(name):
-            raise unknown_name("features", name, [*FEATURES, "path.py:name"])
 
 
 FeatureName = Annotated[str, AfterValidator(_check_feature_name)]
@@ -217,7 +199,9 @@ FeatureName = Annotated[str, AfterValidator(_check_feature_name)]
 
 
 def feature(name: str) -> Feature:
-    """Return a feature by name; raise `InputError` if a user's file has no such function."""
+    """Return a feature by name; raise `InputError` if there is none, or a user's file has no such function."""
+    if name not in FEATURES and not is_file_reference(name):
+        raise unknown_name("features", name, [*FEATURES, "path.py:name"])
     return FEATURES[name] if name in FEATURES else _user_feature(name)
 
 
@@ -280,11 +264,7 @@ def observation_size(names: Sequence[str], expert: Driver) -> int:
 
 
 def check_user_files(names: Sequence[str], files: Sequence[Recipe]) -> None:
-    """Reload the user's own features if they were loaded from other code than `files` lists.
-
-    Raises:
-        InputError: the code is not what `files` lists.
-    """
+    """Reload the user's own features if their code was not that in `files`; raise `InputError` if it still is not."""
     if any(file not in files for file in user_files(names)):
         _user_code.cache_clear()
         _user_feature.cache_clear()

@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Driver, Memory, Recipe
+from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION
 from unjam.drivers.wrappers import COMPOSITE_CONFIG, CompositeDriver
@@ -16,7 +16,7 @@ from unjam.tree import map_leaves
 MAX_GATHERING_TIME = 30.0
 """time in which all vehicles gather if their queue fits on the road [s]"""
 PRIMARY_KEY, FALLBACK_KEY = "primary", "fallback"
-"""names of both drivers in the memory"""
+"""names of both drivers in the memory, as of their fields"""
 ELAPSED_KEY, GATHERED_KEY, GAVE_UP_KEY = "elapsed", "has_gathered", "gave_up"
 """names in the memory: elapsed time [s]; whether all had gathered; whether the fallback drives"""
 
@@ -35,18 +35,9 @@ class QueueFallback(CompositeDriver):
     time_step: Positive
     """control step [s]"""
 
+    kind: ClassVar[str] = "queue-fallback"
     accepts_tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
     needs_loop: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleMethodOverride]
-
-    @property
-    def inner_drivers(self) -> dict[str, Driver]:
-        """Both."""
-        return {PRIMARY_KEY: self.primary, FALLBACK_KEY: self.fallback}
-
-    @property
-    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether both take plain numbers."""
-        return self.primary.accepts_floats and self.fallback.accepts_floats
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memories of both, without elapsed time, queue and switch."""
@@ -83,8 +74,3 @@ class QueueFallback(CompositeDriver):
     def describe(self) -> str:
         """Return both."""
         return f"{self.primary.describe()} while the queue holds, else {self.fallback.describe()}"
-
-    def recipe(self) -> Recipe:
-        """Return the recipes of both, and the control step."""
-        drivers = {name: driver.recipe() for name, driver in self.inner_drivers.items()}
-        return {"kind": "queue-fallback", "drivers": drivers, "time_step": self.time_step}

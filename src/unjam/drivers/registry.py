@@ -22,7 +22,7 @@ from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.road_type_switch import RoadTypeSwitch
 from unjam.drivers.user_driver import FileDriver, FileReference, is_file_reference
-from unjam.drivers.wrappers import INNER_KEY, DriverWrapper, FilteredDriver, HistoryDriver, ImpairedDriver, MixedDriver
+from unjam.drivers.wrappers import INNER_KEY, FilteredDriver, HistoryDriver, ImpairedDriver, MixedDriver
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, build_dataclass, split_parameters
 from unjam.tree import Arrays
@@ -31,6 +31,7 @@ _DRIVER_CLASSES = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
     *(Pacer, JamAbsorber, Cruise, JamAhead, GapMaker, AdaptiveACC, Constant),
 )
+_COMPOSITE_CLASSES = ImpairedDriver, FilteredDriver, HistoryDriver, RoadTypeSwitch, QueueFallback
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _DRIVER_CLASSES}
 
 InnerDriverBuilder = Callable[[Any, str], Driver]
@@ -46,8 +47,7 @@ def driver_names() -> str:
 def driver_from_name(text: str, time_step: float) -> Driver:
     """Return the driver for `name`, `name:key=value,...` or `path.py:name`; `time_step` is the control step [s].
 
-    Raises:
-        InputError: unknown name or parameter, or a value out of range.
+    Raise `InputError` for an unknown name or parameter, or a value out of range.
     """
     name, parameters = split_parameters(text)
     if is_file_reference(name):
@@ -79,8 +79,7 @@ class _ResidualRecipe:
 def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
     """Return the recipe of a driver and the weights of its networks; `driver_from_recipe` is the inverse.
 
-    Raises:
-        InputError: no other process could build such a driver.
+    Raise `InputError` if no other process could build such a driver.
     """
     recipe = driver.recipe()
     if any(part["kind"] == "named" and not part["name"] for part in _iterate_recipes(recipe)):
@@ -130,20 +129,14 @@ def _build_residual(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBui
     return ResidualDriver(expert, network, found.action_limit, found.inputs, found.action_repeat)
 
 
-def _build_wrapper(
-    driver_class: type[DriverWrapper], recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder
-) -> Driver:
-    settings = {key: value for key, value in recipe.items() if key != "kind"}
-    inner = build_inner(recipe.get("driver"), INNER_KEY)
-    return build_dataclass(driver_class, {**settings, "driver": inner}, "driver recipe")
-
-
-def _build_switch(
+def _build_composite(
     driver_class: type[Driver], recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder
 ) -> Driver:
-    settings = {key: value for key, value in recipe.items() if key not in ("kind", "drivers")}
-    inner = {name: build_inner(part, name) for name, part in recipe["drivers"].items()}
-    return build_dataclass(driver_class, {**settings, **inner}, "driver recipe")
+    values = {key: value for key, value in recipe.items() if key not in ("kind", "drivers")}
+    values |= {name: build_inner(part, name) for name, part in recipe.get("drivers", {}).items()}
+    if "driver" in recipe:
+        values["driver"] = build_inner(recipe["driver"], INNER_KEY)
+    return build_dataclass(driver_class, values, "driver recipe")
 
 
 RECIPE_BUILDERS: dict[str, Callable[[Recipe, Arrays, InnerDriverBuilder], Driver]] = {
@@ -155,9 +148,7 @@ RECIPE_BUILDERS: dict[str, Callable[[Recipe, Arrays, InnerDriverBuilder], Driver
     "mixed": lambda recipe, weights, build_inner: MixedDriver(
         tuple(build_inner(part, str(number)) for number, part in enumerate(recipe["drivers"]))
     ),
-    **{kind.kind: partial(_build_wrapper, kind) for kind in (ImpairedDriver, FilteredDriver, HistoryDriver)},
-    "road-type-switch": partial(_build_switch, RoadTypeSwitch),
-    "queue-fallback": partial(_build_switch, QueueFallback),
+    **{kind.kind: partial(_build_composite, kind) for kind in _COMPOSITE_CLASSES},
 }
 """functions that build a driver, by the kind of its recipe"""
 
@@ -165,25 +156,18 @@ RECIPE_BUILDERS: dict[str, Callable[[Recipe, Arrays, InnerDriverBuilder], Driver
 def user_code_recipes(recipe: Any) -> list[Recipe]:
     """Return the parts of `recipe` that refer to the user's own files, which are Python code.
 
-    Raises:
-        InputError: a network reads a feature from a file that is not listed with its hash.
+    Raise `InputError` if a network reads a feature from a file that is not listed with its hash.
     """
     parts = list(_iterate_recipes(recipe))
-    for part in parts:
-        if part["kind"] == "residual":
-            _check_user_features_listed(part)
-    return [part for part in parts if part["kind"] == "file"]
-
-
-def _check_user_features_listed(recipe: Recipe) -> None:
-    found = build_dataclass(_ResidualRecipe, recipe, "driver recipe")
-    listed = [(file.get("path"), file.get("name")) for file in found.files if file.get("kind") == "file"]
-    for name in found.inputs:
-        if name not in FEATURES:
+    for residual in (part for part in parts if part["kind"] == "residual"):
+        found = build_dataclass(_ResidualRecipe, residual, "driver recipe")
+        listed = [(file.get("path"), file.get("name")) for file in found.files if file.get("kind") == "file"]
+        for name in found.inputs:
             reference = FileReference.parse(name)
-            if (str(reference.path), reference.name) not in listed:
+            if name not in FEATURES and (str(reference.path), reference.name) not in listed:
                 allowed = "features whose files the recipe lists with their hashes"
                 raise invalid_value("driver recipe: input", name, allowed)
+    return [part for part in parts if part["kind"] == "file"]
 
 
 def _iterate_recipes(recipe: Any) -> Iterator[Recipe]:

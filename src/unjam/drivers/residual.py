@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from unjam.drivers.observation import (
     observation_inputs,
     user_files,
 )
-from unjam.drivers.wrappers import CompositeDriver
+from unjam.drivers.wrappers import DriverWrapper
 from unjam.physics.arrays import Array, namespace
 from unjam.tree import Arrays
 
@@ -27,11 +27,13 @@ EXPERT_KEY, RESIDUAL_KEY, RESIDUAL_AGE_KEY = "expert", "residual", "age"
 
 
 @dataclass(frozen=True)
-class ResidualDriver(CompositeDriver):
+class ResidualDriver(DriverWrapper):
     """Adds the output of a network to an expert, within the action limit: Eq. 8 of the paper.
 
     Any driver can be the expert, including another `ResidualDriver`.
     """
+
+    inner_key: ClassVar[str] = EXPERT_KEY
 
     expert: Driver
     network: Network
@@ -48,7 +50,7 @@ class ResidualDriver(CompositeDriver):
         return Limits.symmetric(self.action_limit)
 
     @cached_property
-    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Whether expert and features take plain numbers."""
         return self.expert.accepts_floats and all(feature(name).accepts_floats for name in self.inputs)
 
@@ -71,11 +73,6 @@ class ResidualDriver(CompositeDriver):
     def measured_fields(self) -> frozenset[str]:
         """Those of the expert and of the features; for the user's own features all fields."""
         return super().measured_fields | feature_fields(self.inputs)
-
-    @property
-    def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Those of the expert."""
-        return self.expert.memory_inputs
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the expert and, with an action repeat, the residual and its age."""
@@ -112,19 +109,6 @@ class ResidualDriver(CompositeDriver):
         """Return the deterministic acceleration, clip(expert + residual), and the new memory."""
         decision = self.decide(state, memory)
         return decision.command.acceleration, decision.memory
-
-    def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return those of the expert."""
-        return self.expert.time_gaps(state, memory[EXPERT_KEY])
-
-    def memory_features(self, memory: Memory) -> Array | None:
-        """Return those of the expert."""
-        return self.expert.memory_features(memory[EXPERT_KEY])
-
-    @property
-    def inner_drivers(self) -> dict[str, Driver]:
-        """Its expert."""
-        return {EXPERT_KEY: self.expert}
 
     @property
     def network_inputs(self) -> tuple[ScaledInput, ...]:

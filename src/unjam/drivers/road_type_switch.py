@@ -1,11 +1,10 @@
 """A driver for all roads: one control law per road type, selected by the fields that the road provides."""
 
-from functools import cached_property
 from typing import ClassVar
 
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.driver import Driver, Memory, Recipe
+from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.wrappers import COMPOSITE_CONFIG, CompositeDriver
 from unjam.physics.arrays import Array, namespace
@@ -23,6 +22,7 @@ class RoadTypeSwitch(CompositeDriver):
     All CAVs of an episode are on one road. The memories for other road types keep their initial values.
     """
 
+    kind: ClassVar[str] = "road-type-switch"
     accepts_tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
     needs_loop: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
     policy_inputs: ClassVar[tuple[str, ...]] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -38,12 +38,6 @@ class RoadTypeSwitch(CompositeDriver):
     """on open roads without roadside information"""
     shared_loop: Driver | None = None
     """on closed roads without a crossing and with at least `MIN_SHARED_PENETRATION_RATE`; None: `loop`"""
-
-    @cached_property
-    def inner_drivers(self) -> dict[str, Driver]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """All of them, by road type."""
-        drivers = {name: getattr(self, name) for name in ROAD_TYPES}
-        return {name: driver for name, driver in drivers.items() if driver is not None}
 
     @property
     def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -65,11 +59,6 @@ class RoadTypeSwitch(CompositeDriver):
     def describe(self) -> str:
         """Return all of them with their road types."""
         return ", ".join(f"{name}: {driver.describe()}" for name, driver in self.inner_drivers.items())
-
-    def recipe(self) -> Recipe:
-        """Return the recipes of all of them."""
-        drivers = {name: driver.recipe() for name, driver in self.inner_drivers.items()}
-        return {"kind": "road-type-switch", "drivers": drivers}
 
     def _road_type(self, state: LocalState) -> str:
         if state.lane_speeds is not None:

@@ -18,12 +18,11 @@ from unjam.physics.kinematics import max_speed_to_stop, stopping_distance
 
 
 class ActuatorState(NamedTuple):
-    """Current acceleration and pending commands of a vehicle; arrays of shape (n,), or plain numbers."""
+    """Current acceleration and pending commands of a vehicle [m/s2]; arrays of shape (n,), or plain numbers."""
 
     acceleration: Array
-    """current [m/s2]"""
     pending: tuple[Array, ...] = ()
-    """commands that have not arrived yet, the next one first [m/s2]"""
+    """commands that have not arrived yet, the next one first"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -48,10 +47,7 @@ class Actuator:
         return ActuatorState(0.0 * like, (0.0 * like,) * round(self.delay / step))
 
     def apply_command(self, command: Array, speed: Array, state: ActuatorState, step: float) -> ActuatorState:
-        """Return the state after a command: its acceleration holds for this step.
-
-        Brakes cannot reverse a vehicle: at standstill its acceleration is zero.
-        """
+        """Return the state after a command, with the acceleration for this step; brakes cannot reverse a vehicle."""
         arriving, *pending = *state.pending, command
         decay = self._lag_decay(step)
         acceleration = state.acceleration * decay + arriving * (1.0 - decay)
@@ -72,14 +68,12 @@ class Actuator:
 
 
 class FollowingState(NamedTuple):
-    """State of a vehicle behind its leader: arrays of shape (n,), or plain numbers."""
+    """State of a vehicle behind its leader [m/s, m]: arrays of shape (n,), or plain numbers."""
 
     speed: Array
-    """[m/s]"""
     leader_speed: Array
-    """[m/s]"""
     gap: Array
-    """own front bumper to the leader's rear bumper; infinite without a leader [m]"""
+    """own front bumper to the leader's rear bumper; infinite without a leader"""
 
 
 MAX_LEADER_GAP = 1e6

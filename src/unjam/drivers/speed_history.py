@@ -88,14 +88,10 @@ def _buffered_window(window: Array, count: Array) -> BufferedWindow:
 
 
 def empty_window(n: int, window: float, time_step: float) -> SpeedWindow:
-    """Return the memory of `n` vehicles before the first speed, for a window of `window` seconds.
+    """Return the memory of `n` vehicles before the first speed; raise `InputError` if the window has too many steps.
 
-    Returns:
-        `window` (n, steps): the last speeds, the newest in place of the oldest, zeros before the first;
-        `total` (n,): their sum; `count` (n,): number of speeds since the start.
-
-    Raises:
-        InputError: the window has too many steps.
+    `window` (n, steps): the speeds of the last `window` seconds, the newest in place of the oldest, zeros before the
+    first; `total` (n,): their sum; `count` (n,): number of speeds since the start.
     """
     if window / time_step > MAX_WINDOW_STEPS:
         raise invalid_value("window", window, f"at most {MAX_WINDOW_STEPS:,} steps of {time_step:g} s")

@@ -58,8 +58,7 @@ class FileReference:
     def read_code(self) -> UserCode:
         """Return the current code of the file.
 
-        Raises:
-            InputError: the file is missing, unreadable or not Python, or imports a compiled module of its folder.
+        Raise `InputError` if it is missing, unreadable or not Python, or imports a compiled module of its folder.
         """
         if not os.path.isfile(self.path):
             raise InputError(f"driver file: {str(self.path)!r} is not a file")
@@ -73,8 +72,7 @@ class FileReference:
     def load_object(self, code: UserCode | None = None) -> Any:
         """Run the file, from `code` if given, and return the object with the name.
 
-        Raises:
-            InputError: as `read_code`; the file fails when run, or has no such name.
+        Raise `InputError` as `read_code`, and if the file fails when run, or has no such name.
         """
         code = code or self.read_code()
         check_code_unchanged(code)
@@ -97,11 +95,7 @@ class FileReference:
         return found
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return the result of the user's function.
-
-        Raises:
-            InputError: it fails; with the last executed line of the file.
-        """
+        """Return the result of the user's function; raise `InputError` with its last executed line if it fails."""
         try:
             return function(*arguments)
         except (Exception, SystemExit) as error:
@@ -135,11 +129,8 @@ class UserDriver(Driver):
         return self.call_user_code(recall, memory, history) if recall else memory
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the user's acceleration and memory; raise `InputError` if the user's code fails.
-
-        It is not called while no CAV is on the road: the minimum of an empty array is an error in NumPy.
-        """
-        if np.size(state.speed) == 0:
+        """Return the user's acceleration and memory; raise `InputError` if the user's code fails."""
+        if np.size(state.speed) == 0:  # the user's code may need a row: the minimum of an empty array is an error
             return np.zeros(0), memory
         found = self.call_user_code(self.implementation.act, state, memory)
         if not (isinstance(found, tuple) and len(found) == 2):

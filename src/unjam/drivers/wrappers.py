@@ -1,6 +1,6 @@
 """Drivers that contain other drivers: mixtures, impaired sensing, the safety filter, history features."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property
 from math import exp
 from typing import ClassVar
@@ -19,7 +19,7 @@ from unjam.errors import InputError
 from unjam.parameters import STRICT, NonNegative, Positive
 from unjam.physics.arrays import Array, clamp_min, join_columns, namespace, square_root, stack_columns
 
-COMPOSITE_CONFIG = ConfigDict(**STRICT, arbitrary_types_allowed=True)
+COMPOSITE_CONFIG: ConfigDict = {**STRICT, "arbitrary_types_allowed": True}
 """configuration of parameter dataclasses with drivers among their fields"""
 DRIVER_INDEX_KEY = "driver_index"
 """name in the memory of a mixture: the driver of a CAV"""
@@ -36,7 +36,21 @@ MEAN_KEYS = ("mean_speed", "mean_square", "mean_gap")
 
 
 class CompositeDriver(Driver):
-    """A driver that contains other drivers."""
+    """A driver that contains other drivers in fields of a dataclass; the field `driver` has the memory name `inner`."""
+
+    kind: ClassVar[str] = ""
+    """kind of its recipe"""
+
+    @cached_property
+    def inner_drivers(self) -> dict[str, Driver]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The drivers in its fields, in order."""
+        drivers = ((field.name, getattr(self, field.name)) for field in fields(self))  # pyright: ignore[reportArgumentType]
+        return {INNER_KEY if name == "driver" else name: each for name, each in drivers if isinstance(each, Driver)}
+
+    @property
+    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether all inner drivers take plain numbers."""
+        return all(inner.accepts_floats for inner in self.inner_drivers.values())
 
     @property
     def accepts_tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -53,41 +67,34 @@ class CompositeDriver(Driver):
         """Features that the networks of inner drivers read."""
         return tuple(name for inner in self.inner_drivers.values() for name in inner.policy_inputs)
 
+    def recipe(self) -> Recipe:
+        """Return the recipes of its inner drivers, and its settings."""
+        inner = {name: driver.recipe() for name, driver in self.inner_drivers.items()}
+        recipe = {"kind": self.kind, **({"driver": inner[INNER_KEY]} if INNER_KEY in inner else {"drivers": inner})}
+        for field in fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, field.name)
+            if value is not None and not isinstance(value, Driver):
+                recipe[field.name] = asdict(value) if is_dataclass(value) else value  # pyright: ignore[reportArgumentType]
+        return recipe
+
 
 class DriverWrapper(CompositeDriver):
     """A driver around one inner driver."""
 
-    kind: ClassVar[str] = ""
-    """kind of its recipe"""
-    driver: Driver
-
-    @property
-    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether the inner driver takes plain numbers."""
-        return self.driver.accepts_floats
-
-    @property
-    def inner_drivers(self) -> dict[str, Driver]:
-        """The inner driver."""
-        return {INNER_KEY: self.driver}
+    inner_key: ClassVar[str] = INNER_KEY
 
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Those of the inner driver."""
-        return self.driver.memory_inputs
+        return self.inner_drivers[self.inner_key].memory_inputs
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return those of the inner driver."""
-        return self.driver.time_gaps(state, memory[INNER_KEY])
+        return self.inner_drivers[self.inner_key].time_gaps(state, memory[self.inner_key])
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return those of the inner driver."""
-        return self.driver.memory_features(memory[INNER_KEY])
-
-    def recipe(self) -> Recipe:
-        """Return its settings, and the recipe of the inner driver."""
-        settings = {field.name: getattr(self, field.name) for field in fields(self)}  # pyright: ignore[reportArgumentType]
-        return {"kind": self.kind, **settings, "driver": self.driver.recipe()}
+        return self.inner_drivers[self.inner_key].memory_features(memory[self.inner_key])
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,8 @@ class MixedDriver(CompositeDriver):
     After the last driver it starts again with the first; CAVs that enter an open road count in order of entry.
     """
 
+    accepts_floats: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
+
     drivers: tuple[Driver, ...]
 
     def __post_init__(self) -> None:
@@ -104,7 +113,7 @@ class MixedDriver(CompositeDriver):
         if any(driver.is_native for driver in self.drivers):
             raise InputError("driver: 'human' is not allowed among several; 'idm' drives like a human driver")
 
-    @property
+    @cached_property
     def inner_drivers(self) -> dict[str, Driver]:
         """All of them, by number."""
         return {str(number): driver for number, driver in enumerate(self.drivers)}
@@ -229,10 +238,6 @@ class FilteredDriver(DriverWrapper):
     def describe(self) -> str:
         """Return the inner driver, and that it is filtered."""
         return f"{self.driver.describe()}, filtered"
-
-    def recipe(self) -> Recipe:
-        """Return the settings of the filter, and the recipe of the inner driver."""
-        return super().recipe() | {"safety": asdict(self.safety)}
 
 
 @checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)

@@ -14,14 +14,7 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.observation import (
-    FeatureInputs,
-    FeatureName,
-    check_features,
-    compute_observation,
-    feature_fields,
-    observation_size,
-)
+from unjam.drivers.observation import FeatureInputs, FeatureName, compute_observation, feature_fields, observation_size
 from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.processes import has_display
@@ -87,12 +80,11 @@ class ExternalDriver(Driver):
 
 @dataclass(frozen=True)
 class RoadStepResult:
-    """The result of one control step."""
+    """The result of one control step, with the CAVs that are on the road now."""
 
     cav_ids: list[str]
-    """CAVs that are on the road now"""
     observations: Observations
-    """of these CAVs, shape (CAVs, numbers)"""
+    """shape (CAVs, numbers)"""
     departed: dict[str, Observations]
     """last observations of the CAVs that left the road in this step"""
     reward: float
@@ -123,7 +115,6 @@ class RoadStepper:
         check_can_drive(driver, self.scenario)
         if isinstance(features, str) or not features:
             raise invalid_value("features", features, "a list of features, like ('local', 'expert_acceleration')")
-        check_features(features)
         check_policy_inputs(self._driver.features, self.scenario, "features")
         self._backend: Backend = backend
         self._simulation: Simulation | None = None
