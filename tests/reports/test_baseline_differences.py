@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 
 from unjam.measures.metrics import METRICS
-from unjam.reports.summary import METRIC_DIRECTIONS, ReportColumn, baseline_differences, episodes_as_csv
+from unjam.reports.summary import COMPARED_METRICS, ReportColumn, baseline_differences, episodes_as_csv
 
 
 def column(name: str, values: list[float], human: ReportColumn | None = None, **more: Any) -> ReportColumn:
@@ -24,7 +24,7 @@ def test_lower_fuel_is_better_and_lower_speed_is_worse() -> None:
     assert found["names"] == ["pi"]
     assert cells["fuel"] == {"text": "-10.0 [-12.5, -7.5]", "mark": "better", "count": 3}
     assert cells["mean speed"]["mark"] == "worse"
-    assert list(cells) == [METRICS[name].label for name in METRIC_DIRECTIONS if METRICS[name].label in cells]
+    assert list(cells) == [METRICS[name].label for name in COMPARED_METRICS if METRICS[name].label in cells]
 
 
 def test_insignificant_differences_have_no_mark_and_unknown_metrics_no_row() -> None:

@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from unjam.cli.options import JsonOption, SeedOption, parse_settings
 from unjam.cli.output import ProgressReporter, console, err_console, new_table, print_json
@@ -20,8 +20,8 @@ PICTURE_SECONDS = 60.0
 
 
 def scenarios_command(
-    name: Annotated[str | None, typer.Argument(help="Scenario to describe in detail.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="Draw its road with the first vehicles: a .png file.")] = None,
+    name: Annotated[str | None, Argument(help="Scenario to describe in detail.")] = None,
+    picture: Annotated[Path | None, Option(help="Draw its road with the first vehicles: a .png file.")] = None,
     json: JsonOption = False,
 ) -> None:
     """List the scenarios, or describe one: road, observation, reward, speed limit and all parameters.
@@ -191,30 +191,22 @@ def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
 
 def fit_drivers_command(
     data: Annotated[
-        list[Path], typer.Argument(help="Recorded trajectories: .parquet or .csv; several files are one data set.")
+        list[Path], Argument(help="Recorded trajectories: .parquet or .csv; several files are one data set.")
     ],
-    out: Annotated[Path, typer.Option(help="File for the population.")] = Path("drivers.json"),
+    out: Annotated[Path, Option(help="File for the population.")] = Path("drivers.json"),
     format: Annotated[
         str,
-        typer.Option(
-            help="table, ngsim, ngsim-reconstructed, highd, openacc, fcd.", show_default="derived from the columns"
-        ),
+        Option(help="table, ngsim, ngsim-reconstructed, highd, openacc, fcd.", show_default="derived from the columns"),
     ] = "",
-    driver: Annotated[
-        str, typer.Option(help="Columns of a table that together identify the driver: period,follower.")
-    ] = "",
-    select: Annotated[
-        list[str] | None, typer.Option(help="Only trajectories with column=value, like kind=human.")
-    ] = None,
+    driver: Annotated[str, Option(help="Columns of a table that together identify the driver: period,follower.")] = "",
+    select: Annotated[list[str] | None, Option(help="Only trajectories with column=value, like kind=human.")] = None,
     residual: Annotated[
-        bool, typer.Option(help="Also learn what all drivers do in addition to their own IDM; takes minutes.")
+        bool, Option(help="Also learn what all drivers do in addition to their own IDM; takes minutes.")
     ] = False,
     drop_bad_rows: Annotated[
-        bool, typer.Option("--drop-bad-rows", help="Cut bad rows out of their trajectories instead of refusing.")
+        bool, Option("--drop-bad-rows", help="Cut bad rows out of their trajectories instead of refusing.")
     ] = False,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Settings such as calibration.generations=200.")
-    ] = None,
+    settings: Annotated[list[str] | None, Option("--set", help="Settings such as calibration.generations=200.")] = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
 ) -> None:

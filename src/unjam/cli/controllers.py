@@ -7,19 +7,19 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
-from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, scenario_changes
-from unjam.cli.output import console, err_console, new_table, print_json, print_metrics, print_notes, report_steps
+from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, network_changes
+from unjam.cli.output import ProgressReporter, console, err_console, new_table, print_json, print_metrics, print_notes
 from unjam.errors import InputError, invalid_value, resume_hint
 from unjam.processes import check_not_locked, continue_in_limited_child, lock_folder
 
 
 def evaluate_command(
-    run: Annotated[Path, typer.Argument(help="Folder of a training run.")],
-    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Test episodes per driver.")] = 20,
+    run: Annotated[Path, Argument(help="Folder of a training run.")],
+    episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Test episodes per driver.")] = 20,
     humans: HumansOption = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="the run's own")] = None,
+    out: Annotated[Path | None, Option(help="Folder for the results.", show_default="the run's own")] = None,
     workers: WorkersOption = DEFAULT_WORKERS,
     json: JsonOption = False,
 ) -> None:
@@ -44,7 +44,7 @@ def evaluate_command(
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
     config = read_config(run)
     check_run_files(run, config)
-    config = replace(config, scenario_options={**config.scenario_options, **scenario_changes(humans=humans)})
+    config = replace(config, scenario_options={**config.scenario_options, **network_changes(humans=humans)})
     if config.tasks:
         raise InputError(f"run: {str(run)!r} has several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
@@ -55,8 +55,8 @@ def evaluate_command(
     total = evaluation_steps(config, run, list(DRIVERS), episodes)
     target = out or run
     with lock_folder(target) if out is None else lock_new_folder(out):
-        with report_steps("evaluating", total) as steps, WorkerPool(workers) as pool:
-            evaluation = evaluate_run(run, config, pool, list(DRIVERS), episodes, steps, out)
+        with ProgressReporter("evaluating", "steps", total) as progress, WorkerPool(workers) as pool:
+            evaluation = evaluate_run(run, config, pool, list(DRIVERS), episodes, progress.update, out)
         page = write_report_page([target], target / "report.html")
     results = read_results(target)
     if json:
@@ -72,8 +72,7 @@ def evaluate_command(
 
 
 def model_command(
-    run: Annotated[Path, typer.Argument(help="Folder of a training run with a learned model.")],
-    json: JsonOption = False,
+    run: Annotated[Path, Argument(help="Folder of a training run with a learned model.")], json: JsonOption = False
 ) -> None:
     """Show the errors of a run's learned model relative to the environment.
 
@@ -121,10 +120,10 @@ def model_command(
 
 
 def report_command(
-    folders: Annotated[list[Path], typer.Argument(help="Folders of results: of training runs, or of drive.")],
+    folders: Annotated[list[Path], Argument(help="Folders of results: of training runs, or of drive.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="The page.", show_default="report.html in the folder, or comparison.html here"),
+        Option("--out", help="The page.", show_default="report.html in the folder, or comparison.html here"),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -161,13 +160,13 @@ def _check_page_path(path: Path) -> None:
 
 
 def export_command(
-    source: Annotated[str, typer.Argument(help="Folder of a training run; or any driver, as in drive --driver.")],
-    out: Annotated[Path, typer.Option("--out", help="The file to write; ends in .unjam.")],
+    source: Annotated[str, Argument(help="Folder of a training run; or any driver, as in drive --driver.")],
+    out: Annotated[Path, Option("--out", help="The file to write; ends in .unjam.")],
     onnx: Annotated[
-        bool, typer.Option("--onnx", help="Add the ONNX graph of the whole controller, also as a separate file.")
+        bool, Option("--onnx", help="Add the ONNX graph of the whole controller, also as a separate file.")
     ] = False,
     scenario: Annotated[
-        str, typer.Option(help="Scenario that defines control step and limits of a plain driver.", show_default="ring")
+        str, Option(help="Scenario that defines control step and limits of a plain driver.", show_default="ring")
     ] = "",
     json: JsonOption = False,
 ) -> None:
@@ -200,9 +199,9 @@ def export_command(
 
 
 def certify_command(
-    file: Annotated[Path, typer.Argument(help="An exported .unjam file; the certificate is added to it.")],
+    file: Annotated[Path, Argument(help="An exported .unjam file; the certificate is added to it.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="The page to write.", show_default="next to the file, ending in .html")
+        Path | None, Option("--out", help="The page to write.", show_default="next to the file, ending in .html")
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -243,9 +242,9 @@ def certify_command(
 
 
 def verify_command(
-    file: Annotated[Path, typer.Argument(help="A .unjam file, or the folder of a training run.")],
+    file: Annotated[Path, Argument(help="A .unjam file, or the folder of a training run.")],
     signer: Annotated[
-        Path | None, typer.Option(help="Public key (.pub) of the required signer.", show_default="any, or no signature")
+        Path | None, Option(help="Public key (.pub) of the required signer.", show_default="any, or no signature")
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -282,7 +281,7 @@ def verify_command(
 
 
 def keys_command(
-    name: Annotated[Path, typer.Argument(help="Path of both files without their suffix.")], json: JsonOption = False
+    name: Annotated[Path, Argument(help="Path of both files without their suffix.")], json: JsonOption = False
 ) -> None:
     """Make a key pair to sign controllers with: NAME.key, which you keep secret, and NAME.pub for others.
 
@@ -304,9 +303,9 @@ def keys_command(
 
 
 def sign_command(
-    file: Annotated[Path, typer.Argument(help="A .unjam file; the signature is added to it.")],
-    key: Annotated[Path, typer.Option(help="Private key (.key) of `unjam keys`.")],
-    overwrite: Annotated[bool, typer.Option("--replace", help="Replace the signature of another key.")] = False,
+    file: Annotated[Path, Argument(help="A .unjam file; the signature is added to it.")],
+    key: Annotated[Path, Option(help="Private key (.key) of `unjam keys`.")],
+    overwrite: Annotated[bool, Option("--replace", help="Replace the signature of another key.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Sign a controller, so that others can verify its maker, and that nothing in it has changed since.

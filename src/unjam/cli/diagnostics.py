@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 import typer
 from rich.markup import escape
+from typer import Option
 
 from unjam.cli.options import JsonOption
 from unjam.cli.output import console, err_console, new_table, print_json
@@ -151,10 +152,10 @@ def _run_test_episode() -> str:
 
 
 def bench_command(
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds; each measures all parts in turn.")] = 7,
+    rounds: Annotated[int, Option(min=1, help="Rounds; each measures all parts in turn.")] = 7,
     device: Annotated[
         Literal["cpu", "cuda"] | None,
-        typer.Option(help="Measure batches of rings of increasing size on this device instead."),
+        Option(help="Measure batches of rings of increasing size on this device instead."),
     ] = None,
     json: JsonOption = False,
 ) -> None:

@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from unjam.cli import options as opt
 from unjam.cli.output import (
+    ProgressReporter,
     console,
     err_console,
     print_json,
     print_metrics,
     print_notes,
-    report_steps,
     suggest_after_drive,
 )
 from unjam.errors import InputError, MissingPartError, invalid_value
@@ -31,7 +31,7 @@ def drive_command(
     scenario: opt.ScenarioArgument,
     driver: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--driver",
             "-d",
             help="Driver of the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, or a .unjam "
@@ -39,17 +39,17 @@ def drive_command(
             show_default="human and unjam:best; on your own network CAVs then have ACCs, as in assess",
         ),
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Number of episodes.")] = 5,
+    episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Number of episodes.")] = 5,
     seed: opt.SeedOption = 0,
     test_seeds: Annotated[
-        bool, typer.Option("--test-seeds", help="Use the test seeds of trainings instead of --seed.")
+        bool, Option("--test-seeds", help="Use the test seeds of trainings instead of --seed.")
     ] = False,
     changes: dict[str, Any],
     reward: opt.RewardOption = "",
     settings: opt.ScenarioSettingsOption = None,
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     out: opt.OutOption = None,
-    report: Annotated[bool, typer.Option(help="Write the results and a report.html into a folder.")] = True,
+    report: Annotated[bool, Option(help="Write the results and a report.html into a folder.")] = True,
     json: opt.JsonOption = False,
 ) -> None:
     """Run episodes with one or several drivers: a table of metrics and a report.
@@ -78,8 +78,8 @@ def drive_command(
         changes = (ACC_SETTINGS if scenario.endswith(".sumocfg") else {}) | changes
     total = make_scenario(scenario, changes).horizon * episodes * len(driver)
     folder = opt.new_folder(out, f"drive-{Path(scenario).stem}") if report else None
-    with report_steps(f"driving {Path(scenario).name}", total) as steps:
-        result = drive(scenario, driver, episodes, seed, changes, reward, workers, folder, steps, test_seeds)
+    with ProgressReporter(f"driving {Path(scenario).name}", "steps", total) as progress:
+        result = drive(scenario, driver, episodes, seed, changes, reward, workers, folder, progress.update, test_seeds)
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
@@ -100,13 +100,11 @@ def watch_command(
     *,
     scenario: opt.ScenarioArgument,
     drivers: Annotated[
-        list[str], typer.Option("--driver", "-d", help="One driver, as in drive; a run folder: its trained controller.")
+        list[str], Option("--driver", "-d", help="One driver, as in drive; a run folder: its trained controller.")
     ],
     seed: opt.SeedOption = 0,
-    video: Annotated[
-        Path | None, typer.Option(help="Write a video (.gif, .webp, .mp4) instead; needs no display.")
-    ] = None,
-    pace: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Speed relative to real time.")] = 10.0,
+    video: Annotated[Path | None, Option(help="Write a video (.gif, .webp, .mp4) instead; needs no display.")] = None,
+    pace: Annotated[float, Option(min=0.1, max=1000.0, help="Speed relative to real time.")] = 10.0,
     changes: dict[str, Any],
     settings: opt.ScenarioSettingsOption = None,
     json: opt.JsonOption = False,
@@ -174,10 +172,10 @@ def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int],
 @opt.with_options(changes=opt.network_changes)
 def assess_command(
     *,
-    scenario: Annotated[str, typer.Argument(help="Your own .sumocfg file.", metavar="FILE")],
+    scenario: Annotated[str, Argument(help="Your own .sumocfg file.", metavar="FILE")],
     driver: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--driver",
             "-d",
             help="Controller of the CAVs, as in drive; of several, the best is selected.",
@@ -185,12 +183,12 @@ def assess_command(
         ),
     ] = None,
     penetration_rates: Annotated[
-        str, typer.Option(help="Penetration rates among the vehicles of --cav-classes.")
+        str, Option(help="Penetration rates among the vehicles of --cav-classes.")
     ] = "0.02,0.05,0.1,0.2",
-    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 400,
-    minutes: Annotated[float | None, typer.Option(help="Maximum time; checked between batches of episodes.")] = None,
+    episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 400,
+    minutes: Annotated[float | None, Option(help="Maximum time; checked between batches of episodes.")] = None,
     precision: Annotated[
-        float, typer.Option(help="Sufficient half-width of the confidence interval of travel time, relative to it.")
+        float, Option(help="Sufficient half-width of the confidence interval of travel time, relative to it.")
     ] = 0.02,
     settings: opt.ScenarioSettingsOption = None,
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
@@ -217,9 +215,9 @@ def assess_command(
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
     request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)
     folder = opt.new_folder(out, f"assess-{Path(scenario).stem}")
-    reporter = report_steps("assessing, at most", request.network.horizon * episodes)
-    with lock_new_folder(folder), reporter as steps, WorkerPool(workers) as pool:
-        assessment = assess(request, folder, pool, steps, (lambda line: None) if json else err_console.print)
+    progress = ProgressReporter("assessing, at most", "steps", request.network.horizon * episodes)
+    with lock_new_folder(folder), progress, WorkerPool(workers) as pool:
+        assessment = assess(request, folder, pool, progress.update, (lambda line: None) if json else err_console.print)
     if json:
         print_json({**assessment.document, "folder": str(folder), "report": str(assessment.page)})
         return

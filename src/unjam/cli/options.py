@@ -9,7 +9,7 @@ from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import typer
+from typer import Argument, Option
 
 from unjam.errors import InputError, invalid_value
 from unjam.files import PACKAGED_PREFIX
@@ -19,55 +19,44 @@ from unjam.training.executors import Executor
 from unjam.trust import TRUST_CODE_OPTION, trusting_code
 
 ScenarioArgument = Annotated[
-    str, typer.Argument(help="Name of a scenario (`unjam scenarios` lists them), or your own .sumocfg file.")
+    str, Argument(help="Name of a scenario (`unjam scenarios` lists them), or your own .sumocfg file.")
 ]
 RewardOption = Annotated[
-    str, typer.Option("--reward", help="Name of a reward, or your own: path.py:name.", show_default="the scenario's")
+    str, Option("--reward", help="Name of a reward, or your own: path.py:name.", show_default="the scenario's")
 ]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed.")]
-OptunaSeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="First seed.")]
-ScenarioSettingsOption = Annotated[
-    list[str] | None, typer.Option("--set", help="Any parameter of the scenario: key=value.")
-]
+SeedOption = Annotated[int, Option("--seed", min=0, help="First seed.")]
+OptunaSeedOption = Annotated[int, Option("--seed", min=0, max=2**32 - 1, help="First seed.")]
+ScenarioSettingsOption = Annotated[list[str] | None, Option("--set", help="Any parameter of the scenario: key=value.")]
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=1, help="Worker processes; the result does not depend on their number.")
+    int, Option("--workers", min=1, help="Worker processes; the result does not depend on their number.")
 ]
-TrainingWorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Trainings at the same time.")]
-ExecutorOption = Annotated[Executor, typer.Option(help="local, or ray: a cluster that shares the folder.")]
+TrainingWorkersOption = Annotated[int, Option("--workers", min=1, help="Trainings at the same time.")]
+ExecutorOption = Annotated[Executor, Option(help="local, or ray: a cluster that shares the folder.")]
 OutOption = Annotated[
-    Path | None, typer.Option("--out", help="Folder for the results.", show_default="a new one under runs/")
+    Path | None, Option("--out", help="Folder for the results.", show_default="a new one under runs/")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print only one JSON document.")]
+JsonOption = Annotated[bool, Option("--json", help="Print only one JSON document.")]
 HumansOption = Annotated[
-    str | None,
-    typer.Option("--humans", help="Human drivers: a file of `unjam fit-drivers`, unjam:ngsim or unjam:astazero."),
+    str | None, Option("--humans", help="Human drivers: a file of `unjam fit-drivers`, unjam:ngsim or unjam:astazero.")
 ]
-CavClassesOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Vehicle classes that can be CAVs on your own network: passenger,truck.", show_default="passenger cars"
-    ),
-]
-BeginOption = Annotated[float | None, typer.Option(help="Start time on your own network [s].")]
-EndOption = Annotated[float | None, typer.Option(help="End time on your own network [s].")]
 
 DEFAULT_WORKERS = os.cpu_count() or 1
 
 
-def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of whole groups.
+def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Give a command, or a group, the options of whole groups.
 
     A group is a function with options as its parameters. They replace the command's parameter that has the
     group's name; the command gets the return value of the function as its argument.
     """
     members = {name: inspect.signature(group).parameters for name, group in groups.items()}
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(command)
-        def wrapper(**arguments: Any) -> None:
+        def wrapper(**arguments: Any) -> Any:
             for name, group in groups.items():
                 arguments[name] = group(**{option: arguments.pop(option) for option in members[name]})
-            command(**arguments)
+            return command(**arguments)
 
         options = inspect.signature(command).parameters.items()
         return _with_parameters(
@@ -79,7 +68,7 @@ def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]]
 
 def with_trust_option(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command the option that lets it run Python code that foreign folders name."""
-    option = Annotated[bool, typer.Option(TRUST_CODE_OPTION, help="Run Python code that a folder names.")]
+    option = Annotated[bool, Option(TRUST_CODE_OPTION, help="Run Python code that a folder names.")]
     added = inspect.Parameter("trust_code", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
 
     @wraps(command)
@@ -97,24 +86,31 @@ def _with_parameters(command: Callable[..., None], parameters: Iterable[inspect.
     return command
 
 
-def scenario_changes(
-    length: Annotated[
-        str | None, typer.Option(help="Length of the ring [m]: a number, or a range like 220-270.")
+def network_changes(
+    cav_classes: Annotated[
+        str | None, Option(help="Vehicle classes of CAVs on your own network: bus,truck.", show_default="passenger")
     ] = None,
-    radius: Annotated[
-        str | None, typer.Option(help="Radius of the figure eight [m]: a number, or a range like 32-35.")
-    ] = None,
-    vehicles: Annotated[int | None, typer.Option(help="Number of vehicles.")] = None,
-    cavs: Annotated[int | None, typer.Option(help="Number of CAVs among them.")] = None,
-    warmup: Annotated[int | None, typer.Option(help="Human-only simulation steps before the CAVs take over.")] = None,
-    penetration_rate: Annotated[float | None, typer.Option(help="Share of CAVs, on open roads.")] = None,
-    cav_types: Annotated[
-        str | None, typer.Option(help="Vehicle types that are CAVs on your own network: car,truck.")
-    ] = None,
-    cav_classes: CavClassesOption = None,
-    begin: BeginOption = None,
-    end: EndOption = None,
+    begin: Annotated[float | None, Option(help="Start time on your own network [s].")] = None,
+    end: Annotated[float | None, Option(help="End time on your own network [s].")] = None,
     humans: HumansOption = None,
+) -> dict[str, Any]:
+    """Return the changes to a user network: eligible vehicles, time, human drivers."""
+    file = humans if humans is None or humans.startswith(PACKAGED_PREFIX) else str(Path(humans).absolute())
+    classes = cav_classes.split(",") if cav_classes else None
+    return _without_none({"cav_classes": classes, "begin": begin, "end": end, "population": file})
+
+
+@with_options(network=network_changes)
+def scenario_changes(
+    *,
+    length: Annotated[str | None, Option(help="Length of the ring [m]: a number, or a range like 220-270.")] = None,
+    radius: Annotated[str | None, Option(help="Radius of the figure eight [m]: 32, or a range like 32-35.")] = None,
+    vehicles: Annotated[int | None, Option(help="Number of vehicles.")] = None,
+    cavs: Annotated[int | None, Option(help="Number of CAVs among them.")] = None,
+    warmup: Annotated[int | None, Option(help="Human-only simulation steps before the CAVs take over.")] = None,
+    penetration_rate: Annotated[float | None, Option(help="Share of CAVs, on open roads.")] = None,
+    cav_types: Annotated[str | None, Option(help="Vehicle types of CAVs on your own network: car,truck.")] = None,
+    network: dict[str, Any],
 ) -> dict[str, Any]:
     """Return the changes to a scenario that its options request."""
     changes = {
@@ -126,16 +122,7 @@ def scenario_changes(
         "penetration_rate": penetration_rate,
         "cav_types": cav_types.split(",") if cav_types else None,
     }
-    return _without_none(changes) | network_changes(cav_classes, begin, end, humans)
-
-
-def network_changes(
-    cav_classes: CavClassesOption = None, begin: BeginOption = None, end: EndOption = None, humans: HumansOption = None
-) -> dict[str, Any]:
-    """Return the changes to a user network: eligible vehicles, time, human drivers."""
-    file = humans if humans is None or humans.startswith(PACKAGED_PREFIX) else str(Path(humans).absolute())
-    classes = cav_classes.split(",") if cav_classes else None
-    return _without_none({"cav_classes": classes, "begin": begin, "end": end, "population": file})
+    return _without_none(changes) | network
 
 
 def _without_none(values: dict[str, Any]) -> dict[str, Any]:
@@ -154,22 +141,19 @@ class TrainingOptions(NamedTuple):
 
 
 def training_options(
-    scenario: Annotated[
-        str | None, typer.Argument(help="Name of the scenario.", show_default="the configuration's")
-    ] = None,
+    scenario: Annotated[str | None, Argument(help="Name of the scenario.", show_default="the configuration's")] = None,
     preset: Annotated[
-        str,
-        typer.Option(help="Base configuration: demo, quick, best, rings, shared-rings, all-roads, paper, paper-exact."),
+        str, Option(help="Base configuration: demo, quick, best, rings, shared-rings, all-roads, paper, paper-exact.")
     ] = "",
-    config: Annotated[Path | None, typer.Option(help="TOML file with any configuration keys.")] = None,
+    config: Annotated[Path | None, Option(help="TOML file with any configuration keys.")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Any configuration key: key=value, trpo.gamma=0.995.")
+        list[str] | None, Option("--set", help="Any configuration key: key=value, trpo.gamma=0.995.")
     ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps to train for.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the whole run.")] = None,
-    agent: Annotated[str | None, typer.Option(help=f"Learner: {', '.join(AGENT_NAMES)}.")] = None,
+    steps: Annotated[int | None, Option(min=1, help="Environment steps to train for.")] = None,
+    seed: Annotated[int | None, Option(min=0, help="Seed of the whole run.")] = None,
+    agent: Annotated[str | None, Option(help=f"Learner: {', '.join(AGENT_NAMES)}.")] = None,
     expert: Annotated[
-        str | None, typer.Option(help="Driver that the residual is added to, as in drive --driver; none: no expert.")
+        str | None, Option(help="Driver that the residual is added to, as in drive --driver; none: no expert.")
     ] = None,
     reward: RewardOption = "",
 ) -> TrainingOptions:

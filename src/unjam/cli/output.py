@@ -5,7 +5,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
@@ -122,7 +122,8 @@ class ProgressReporter:
         self._is_plain = not err_console.is_terminal
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         self._bar = Progress(*columns, console=err_console, transient=True, disable=self._is_plain)
-        self._task = self._bar.add_task(label, total=total)
+        self._task, self._total = self._bar.add_task(label, total=total), total or 0
+        self._done: dict[Any, int] = {}
         self._last_line = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -140,18 +141,10 @@ class ProgressReporter:
             self._last_line = time.monotonic()
             err_console.print(f"{self._label}: {done:,} of {total:,}{self._unit}")
 
-
-@contextmanager
-def report_steps(label: str, total: int) -> Iterator[Callable[[Any, int], None]]:
-    """Show the progress of parallel episodes: call the result with an episode and its number of steps so far."""
-    done: dict[Any, int] = {}
-    with ProgressReporter(label, "steps") as reporter:
-
-        def update(episode: Any, steps: int) -> None:
-            done[episode] = steps
-            reporter(sum(done.values()), total)
-
-        yield update
+    def update(self, episode: Any, steps: int) -> None:
+        """Show the progress of parallel episodes: one has made so many steps, of the `total` of all."""
+        self._done[episode] = steps
+        self(sum(self._done.values()), self._total)
 
 
 def print_next_command(reason: str, *arguments: object) -> None:

@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from unjam.cli.options import JsonOption
 from unjam.cli.output import console, err_console, new_table, print_json, print_next_command
 from unjam.errors import InputError
 
-RunsFolderOption = Annotated[Path, typer.Option("--folder", help="The folder that contains the runs.")]
-RunNamesArgument = Annotated[
-    list[str], typer.Argument(help="Names of runs, as listed, or their folders.", metavar="NAME...")
-]
+RunsFolderOption = Annotated[Path, Option("--folder", help="The folder that contains the runs.")]
+RunNamesArgument = Annotated[list[str], Argument(help="Names of runs, as listed, or their folders.", metavar="NAME...")]
 DEFAULT_RUNS_FOLDER = Path("runs")
 
 runs_app = typer.Typer(name="runs", rich_markup_mode="markdown")
@@ -24,7 +23,7 @@ runs_app = typer.Typer(name="runs", rich_markup_mode="markdown")
 def list_runs_command(
     context: typer.Context,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
-    scenario: Annotated[str, typer.Option(help="Only runs on this scenario.")] = "",
+    scenario: Annotated[str, Option(help="Only runs on this scenario.")] = "",
     json: JsonOption = False,
 ) -> None:
     """List the training runs in a folder: their progress, and their return relative to the expert.
@@ -103,7 +102,7 @@ def compare_command(
 
 @runs_app.command("progress")
 def progress_command(
-    name: Annotated[str, typer.Argument(help="Name of a run, as listed, or its folder.")],
+    name: Annotated[str, Argument(help="Name of a run, as listed, or its folder.")],
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     json: JsonOption = False,
 ) -> None:
@@ -128,7 +127,7 @@ def progress_command(
 def remove_command(
     names: RunNamesArgument,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    yes: Annotated[bool, Option("--yes", "-y", help="Do not ask.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Remove runs permanently, with their folders; asks for confirmation.

@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 from unjam.cli import options as opt
 from unjam.cli import output
@@ -33,10 +33,10 @@ def train_command(
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     out: opt.OutOption = None,
     resume: Annotated[
-        Path | None, typer.Option(help="Continue this run: after a stop, or with more --steps after its end.")
+        Path | None, Option(help="Continue this run: after a stop, or with more --steps after its end.")
     ] = None,
     tensorboard: Annotated[
-        bool, typer.Option("--tensorboard", help="Write curves for: tensorboard --logdir FOLDER.")
+        bool, Option("--tensorboard", help="Write curves for: tensorboard --logdir FOLDER.")
     ] = False,
     json: opt.JsonOption = False,
 ) -> None:
@@ -128,8 +128,6 @@ class _TrainingProgress(output.ProgressReporter):
         super().__init__(f"training into {folder}", "steps", config.steps)
         self._config, self._folder = config, folder
         self._validation_text, self._worst_road = "-", ""
-        self._evaluated_steps: dict[tuple[str, int], int] = {}
-        self._evaluation_total = 0
 
     def show_iteration(self, row: dict[str, Any]) -> None:
         """Show a row of progress."""
@@ -147,15 +145,14 @@ class _TrainingProgress(output.ProgressReporter):
         """Show the progress of the evaluation after the training."""
         from unjam.training.evaluate import evaluation_steps
 
-        if not self._evaluated_steps:
+        if not self._done:
             roads = self._config.task_configs().items()
-            self._evaluation_total = sum(evaluation_steps(road, self._folder / name) for name, road in roads)
+            self._total = sum(evaluation_steps(road, self._folder / name) for name, road in roads)
             self._label = EVALUATION_LABEL
-            self._bar.reset(self._task, description=EVALUATION_LABEL, total=self._evaluation_total)
+            self._bar.reset(self._task, description=EVALUATION_LABEL, total=self._total)
             if self._is_plain:
                 err_console.print(EVALUATION_LABEL)
-        self._evaluated_steps[episode] = steps
-        self(sum(self._evaluated_steps.values()), self._evaluation_total)
+        self.update(episode, steps)
 
 
 def _worst_road_text(roads: dict[str, dict[str, Any]]) -> str:
@@ -171,9 +168,9 @@ def _worst_road_text(roads: dict[str, dict[str, Any]]) -> str:
 def search_command(
     *,
     vary: Annotated[
-        list[str] | None, typer.Option(help="Settings to vary: key=low..high, key=low..high:log, or key=a,b,c.")
+        list[str] | None, Option(help="Settings to vary: key=low..high, key=low..high:log, or key=a,b,c.")
     ] = None,
-    trials: Annotated[int, typer.Option(min=1, help="Total number of trainings.")] = 20,
+    trials: Annotated[int, Option(min=1, help="Total number of trainings.")] = 20,
     options: opt.TrainingOptions,
     workers: opt.TrainingWorkersOption = opt.DEFAULT_WORKERS,
     executor: opt.ExecutorOption = "local",

@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from unjam.cli import options as opt
 from unjam.cli.output import console, err_console, new_table, print_json, print_next_command, setting_options
@@ -24,11 +24,11 @@ CALIBRATION_COLUMNS = {
 def tune_command(
     *,
     scenario: opt.ScenarioArgument,
-    expert: Annotated[str, typer.Option("--expert", help="Name of the expert, as in unjam drivers.")] = "pi",
-    steps: Annotated[int, typer.Option(min=1, help="Budget of steps, as that of a training.")] = 2_000_000,
+    expert: Annotated[str, Option("--expert", help="Name of the expert, as in unjam drivers.")] = "pi",
+    steps: Annotated[int, Option(min=1, help="Budget of steps, as that of a training.")] = 2_000_000,
     vary: Annotated[
         list[str] | None,
-        typer.Option(help="Parameters to vary, as in search.", show_default="all, a quarter to four times each"),
+        Option(help="Parameters to vary, as in search.", show_default="all, a quarter to four times each"),
     ] = None,
     changes: dict[str, Any],
     settings: opt.ScenarioSettingsOption = None,
@@ -36,7 +36,7 @@ def tune_command(
     seed: opt.OptunaSeedOption = 0,
     screen: Annotated[
         bool | None,
-        typer.Option(
+        Option(
             help="Evaluate trials in the batch simulator, exact or statistical, and only finalists in SUMO.",
             show_default="where the batch simulator supports the road",
         ),
@@ -96,18 +96,18 @@ def tune_command(
 
 
 def calibrate_command(
-    scenario: Annotated[str, typer.Argument(help="Your own .sumocfg file.")],
+    scenario: Annotated[str, Argument(help="Your own .sumocfg file.")],
     *,
     detectors: Annotated[
-        Path, typer.Option(help="CSV file: edge or lane, position, begin, end, flow_veh_per_h, speed; SI units.")
+        Path, Option(help="CSV file: edge or lane, position, begin, end, flow_veh_per_h, speed; SI units.")
     ],
-    trials: Annotated[int, typer.Option(min=2, help="Number of settings, including the unchanged network.")] = 60,
-    seeds: Annotated[int, typer.Option(min=1, help="Simulations of each.")] = 3,
+    trials: Annotated[int, Option(min=2, help="Number of settings, including the unchanged network.")] = 60,
+    seeds: Annotated[int, Option(min=1, help="Simulations of each.")] = 3,
     vary: Annotated[
-        list[str] | None, typer.Option(help="Factors to vary: tau=0.5..2:log.", show_default="all, around 1")
+        list[str] | None, Option(help="Factors to vary: tau=0.5..2:log.", show_default="all, around 1")
     ] = None,
-    begin: Annotated[float | None, typer.Option(min=0, help="Start time [s].")] = None,
-    end: Annotated[float | None, typer.Option(min=0, help="End time [s].")] = None,
+    begin: Annotated[float | None, Option(min=0, help="Start time [s].")] = None,
+    end: Annotated[float | None, Option(min=0, help="End time [s].")] = None,
     seed: opt.OptunaSeedOption = 0,
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     out: opt.OutOption = None,

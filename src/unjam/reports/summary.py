@@ -19,18 +19,15 @@ CLOSE_TIME_GAP = 1.0
 """time gap below which the report has a note [s]; the paper's h_max"""
 MAX_LIMIT_RATIO = 1.01
 """ratio of mean speed to the limit above which the report has a note"""
-LOWER_IS_BETTER, HIGHER_IS_BETTER = "less", "more"
-METRIC_DIRECTIONS = {
-    **dict.fromkeys(("mean_speed", "mean_speed_steady", "outflow_veh_per_h"), HIGHER_IS_BETTER),
-    **dict.fromkeys(("travel_time", "delay", "insertion_backlog_veh"), LOWER_IS_BETTER),
-    **dict.fromkeys(("fuel_ml_per_km", "share_standing"), LOWER_IS_BETTER),
-    **dict.fromkeys(("speed_std_fleet", "speed_std_fleet_steady", "time_to_dissolve"), LOWER_IS_BETTER),
-    "min_ttc": HIGHER_IS_BETTER,
-    **dict.fromkeys(("human_max_braking", "human_braking_beyond_3_5"), LOWER_IS_BETTER),
-    **dict.fromkeys(("human_braking_beyond_4_5", "human_braking_beyond_9", "collisions"), LOWER_IS_BETTER),
-}
-"""metrics with the same meaning in the human baseline and with CAVs, in the order of the table, and which direction
-is better"""
+COMPARED_METRICS = (
+    *("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "travel_time", "delay", "insertion_backlog_veh"),
+    *("fuel_ml_per_km", "share_standing", "speed_std_fleet", "speed_std_fleet_steady", "time_to_dissolve", "min_ttc"),
+    *("human_max_braking", "human_braking_beyond_3_5", "human_braking_beyond_4_5", "human_braking_beyond_9"),
+    "collisions",
+)
+"""metrics with the same meaning in the human baseline and with CAVs, in the order of the table"""
+HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
+"""lower values of the other `COMPARED_METRICS` are better"""
 
 
 @dataclass(frozen=True)
@@ -221,12 +218,12 @@ def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
     if not compared:
         return {}
     rows = []
-    for name, direction in METRIC_DIRECTIONS.items():
+    for name in COMPARED_METRICS:
         metric, cells = METRICS[name], []
         for column, human in compared:
             gain, pairs = paired_difference(column.rows, human, name), len(pair_rows(column.rows, human))
             is_marked = (gain.low > 0 or gain.high < 0) and gain.count == pairs
-            is_better = (gain.mean > 0) == (direction is HIGHER_IS_BETTER)
+            is_better = (gain.mean > 0) == (name in HIGHER_IS_BETTER)
             mark = ("better" if is_better else "worse") if is_marked else ""
             cells.append(
                 {"text": str(estimate_cell(gain, metric.digits, pairs, "+")), "mark": mark, "count": gain.count}
