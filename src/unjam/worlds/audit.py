@@ -14,8 +14,7 @@ BRAKING_THRESHOLDS = (3.5, 4.5, 9.0)
 BRAKING_TOLERANCE = 1e-6
 """of a braking threshold [m/s2]"""
 OVERRIDE_TOLERANCE = 1e-4
-"""change of a command that does not count as an override [m/s2]: SUMO rounds gaps to micrometers near the minimum gap,
-and stops vehicles that would creep there"""
+"""change of a command that is no override [m/s2]: a few micrometers near the minimum gap, where SUMO stops creeping"""
 MIN_TIME_GAP_SPEED = 1.0
 """speed above which time gaps matter for safety [m/s]"""
 SHORT_TIME_GAP = 1.0

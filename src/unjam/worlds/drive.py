@@ -12,7 +12,6 @@ from unjam.tree import map_leaves
 from unjam.worlds.world import DriverLog, ProgressCallback, RecordT, World
 
 PROGRESS_CONTROL_STEPS = 10
-"""control steps between two reports of progress"""
 
 
 class DriveLoop:

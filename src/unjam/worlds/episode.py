@@ -31,7 +31,6 @@ class Task:
     expert: Driver
     """the driver before training, to which the residual is added"""
     reward: str = ""
-    """name, or `path.py:name`; empty: the scenario's own"""
     weight: float = 1.0
     """share of the environment steps, relative to the weights of the other tasks"""
     name: str = ""

@@ -25,7 +25,6 @@ class Trajectory:
 
     vehicle: str
     start_step: int
-    """control step of the episode at which the trip started"""
     states: LocalState
     """states that the CAV observed, shape (T + 1,): the last entry is the state at the end"""
     observations: Floats
@@ -43,11 +42,9 @@ class Trajectory:
     initial_memory: dict[str, Any]
     """the expert's memory before the first control step, without the axis of rows; empty without a network"""
     action_repeat: int
-    """control steps for which one residual was held"""
     terminated: bool
     """whether a collision ended the trip; otherwise the horizon or the end of the road did"""
     reward_terms: dict[str, Floats] = field(default_factory=dict)
-    """terms of the reward by name"""
 
     @property
     def step_slice(self) -> slice:
@@ -109,7 +106,6 @@ class SumoWarning:
     kind: str
     """the message with placeholders for names and numbers"""
     example: str
-    """the first message of this kind"""
     count: int
 
 
@@ -121,15 +117,11 @@ class Episode:
     status: str
     """`completed`; `failed`; `collision`, or `teleports` beyond SUMO's max-num-teleports, ended it early"""
     reason: str = ""
-    """why it failed or ended early"""
     error: str = ""
-    """name of the error if it failed"""
     control_step: float = 0.1
     """duration of a control step [s]"""
     warmup: int = 0
-    """simulation steps before the first control step"""
     drawn_values: dict[str, float] = field(default_factory=dict)
-    """values that were drawn from the seed, by name"""
     loop_length: float = float("nan")
     """length of a closed road [m]; NaN of a road with ends"""
     crossings: tuple[tuple[float, float], ...] = ()
@@ -159,7 +151,6 @@ class Episode:
     branches: tuple[str, ...] = ()
     """origin of the vehicles of each column, on a road with several entrances"""
     arrivals: int = 0
-    """vehicles that left at the end of their route"""
     teleports: int = 0
     """number of teleports by SUMO, after long standing or a collision; a teleported vehicle waits to be reinserted"""
     demand_peak: tuple[float, float] = (0.0, 0.0)
@@ -221,7 +212,6 @@ def assign_columns(
     """
     columns, used = np.zeros(len(groups), np.intp), 0
     heaps: dict[Hashable, list[tuple[int, int]]] = {}
-    """of each group: last moment and column of its trips so far"""
     for trip in np.argsort(first_moments, kind="stable").tolist():
         heap = heaps.setdefault(groups[trip], [])
         if heap and heap[0][0] + min_spacing < first_moments[trip]:

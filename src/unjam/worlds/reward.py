@@ -22,8 +22,7 @@ MERGE_FREE_FLOW_VEHICLES = 30.0
 CRASH_CLOSURE_STEPS = 2_400
 """control steps for which a crash closes a road in the travel-time reward: a whole on-ramp episode"""
 MIN_CRASH_BACKLOG = 200
-"""minimum number of vehicles that a crash stops, as others were still to come: on an on-ramp with 3,700 veh/h and the
-154 s of human-only traffic, about 160 vehicles are on the road"""
+"""minimum number of vehicles that a crash stops, as more would enter: about 160 (3,700 veh/h for 154 s) drive there"""
 STANDSTILL_SPEED = 1e-3
 """lower limit of the speed in time gaps [m/s]"""
 
@@ -32,14 +31,12 @@ class Outcome(NamedTuple):
     """The outcome of control steps, one per row. NumPy arrays or torch tensors, SI units."""
 
     speeds: Array
-    """speeds after the step of all vehicles (in a learned model: of the modeled ones) [m/s], shape (rows, vehicles);
-    NaN if a vehicle is not on the road"""
+    """speeds of all (in a model: modeled) vehicles after the step [m/s], shape (rows, vehicles); NaN if absent"""
     accelerations: Array
-    """commands of the CAVs within the action limit [m/s2], shape (rows, CAVs); NaN if one is not on the road"""
+    """commands of the CAVs within the action limit [m/s2], shape (rows, CAVs); NaN if absent"""
     time_gaps: Array
     """time gaps of the CAVs after the step [s], shape (rows, CAVs); NaN likewise"""
     has_crashed: Array
-    """whether there was a collision, shape (rows,)"""
     backlog: Array
     """insertion backlog [vehicles], shape (rows,)"""
 

@@ -12,11 +12,7 @@ VEHICLE_GROUPS = {
     "trucks": ("truck", "trailer", "delivery"),
     "buses": ("bus", "coach"),
 }
-"""SUMO's vehicle classes whose travel times are reported separately, by the name of the group"""
-
-
-def _empty_array() -> Floats:
-    return np.zeros(0)
+"""SUMO's vehicle classes by group; travel times are reported for each group"""
 
 
 @dataclass(frozen=True)
@@ -29,15 +25,13 @@ class Trips:
 
     vehicle_ids: tuple[str, ...] = ()
     vehicle_classes: tuple[str, ...] = ()
-    """SUMO's vehicle class of each vehicle"""
-    depart_delay: Floats = field(default_factory=_empty_array)
+    depart_delay: Floats = field(default_factory=lambda: np.zeros(0))
     """time that each vehicle waited for its insertion, `departDelay` [s]"""
-    duration: Floats = field(default_factory=_empty_array)
+    duration: Floats = field(default_factory=lambda: np.zeros(0))
     """time since insertion [s]; 0 of a vehicle that was not inserted"""
-    time_loss: Floats = field(default_factory=_empty_array)
+    time_loss: Floats = field(default_factory=lambda: np.zeros(0))
     """time lost by driving below the desired speed, `timeLoss` [s]"""
     has_arrived: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
-    """whether the vehicle has reached the end of its route"""
 
     @property
     def delay(self) -> Floats:

@@ -5,7 +5,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -96,14 +96,9 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
                 raise SumoInputError(episode.reason)
             return transform(index, episode)
 
-        futures = list[Future[ResultT]]()
         try:
-            for index, task in enumerate(tasks):  # an interrupt may occur during this loop
-                futures.append(self._thread_pool.submit(run_one, index, task))
-            return [future.result() for future in futures]
-        except BaseException:
-            for future in futures:
-                future.cancel()
+            return list(self._thread_pool.map(run_one, range(len(tasks)), tasks))
+        except BaseException:  # may be an interrupt
             self.close()
             raise
 
@@ -147,7 +142,6 @@ class _Worker:
         self._process: subprocess.Popen[bytes] | None = None
         self._is_stopped = self._is_sandboxed = False
         self._sent_files = set[str]()
-        """the user's configurations whose content the process already has"""
         self._start_lock = threading.Lock()
 
     def _start(self) -> subprocess.Popen[bytes]:

@@ -27,11 +27,9 @@ class DriverLog:
     decisions: list[tuple[Array, Array, Array]] = field(default_factory=list)
     """the expert's acceleration, the residual, and the network's observation; empty without a network"""
     last_observation: Array | None = None
-    """the network's observation at the end"""
     initial_memories: list[Arrays] = field(default_factory=list)
     """the expert's memory before the first control step of each CAV, in order of entry"""
     action_repeat: int = 1
-    """control steps for which one residual was held"""
 
 
 class World(Protocol[RecordT]):

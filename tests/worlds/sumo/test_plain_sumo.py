@@ -19,8 +19,8 @@ from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.networks import sumo_program
+from unjam.worlds.sumo.outputs import read_trips, trip_options
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.tripinfo import read_trips, trip_options
 from unjam.worlds.trips import Trips
 
 TYPES = """<vType id="car" sigma="0.6"/><vType id="truck" vClass="truck" accel="0.8" maxSpeed="22"/>

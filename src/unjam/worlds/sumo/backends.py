@@ -28,7 +28,6 @@ BACKEND_MODULES = {"libsumo": "libsumo", "traci": "traci.main", "gui": "traci.ma
 MAX_START_SECONDS = 600.0
 """time limit for SUMO to accept a connection [s]: it reads the network first"""
 CONNECT_RETRY_SECONDS = 0.02
-"""time between two attempts to connect [s]"""
 _libsumo_lock = threading.Lock()
 """held by the one simulation that runs on libsumo in this process; nothing waits for it"""
 
@@ -127,7 +126,6 @@ class Traci:
     def __init__(self) -> None:
         self._traci = import_backend("traci")
         self.functions: Any = None
-        """the connection; None without one"""
 
     @property
     def is_running(self) -> bool:

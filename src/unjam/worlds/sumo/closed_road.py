@@ -41,7 +41,6 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self.cav_ids, self.entered_count = road.cav_ids, len(road.cav_ids)
         self._collided_vehicles: set[str] = set()
         self._cav_indices = [road.vehicle_ids.index(name) for name in road.cav_ids]
-        """in road order"""
         self._neighbors = closed_road.loop_neighbors(np.array(self._cav_indices), vehicles)
         self._scalar_neighbors = closed_road.loop_neighbors(self._cav_indices[0], vehicles)
         self._commands_humans = scenario.human_control == "commanded"

@@ -4,7 +4,6 @@ import queue
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
-from typing import Any
 
 from unjam.errors import EpisodeError, LostWorkerError
 from unjam.scenarios.user_network import UserNetwork
@@ -33,19 +32,14 @@ class DetectorPool(AbstractContextManager["DetectorPool"]):
         self, scenario: UserNetwork, seeds: Sequence[tuple[int, ...]], loops: Sequence[InductionLoop]
     ) -> list[list[DetectorPassage]]:
         """Return the passages of each seed; raise `EpisodeError` if SUMO cannot run one or is lost repeatedly."""
-        futures = [self._thread_pool.submit(self._run_with_retries, scenario, seed, loops) for seed in seeds]
-        try:
-            return [future.result() for future in futures]
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise
 
-    def _run_with_retries(self, *arguments: Any) -> list[DetectorPassage]:
-        for _ in range(MAX_DETECTOR_ATTEMPTS - 1):
-            with suppress(LostWorkerError):
-                return self._run_one(*arguments)
-        return self._run_one(*arguments)
+        def run_one(seed: tuple[int, ...]) -> list[DetectorPassage]:
+            for _ in range(MAX_DETECTOR_ATTEMPTS - 1):
+                with suppress(LostWorkerError):
+                    return self._run_one(scenario, seed, loops)
+            return self._run_one(scenario, seed, loops)
+
+        return list(self._thread_pool.map(run_one, seeds))
 
     def _run_one(
         self, scenario: UserNetwork, seed: tuple[int, ...], loops: Sequence[InductionLoop]

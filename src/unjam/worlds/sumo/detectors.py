@@ -21,7 +21,6 @@ class DetectorPassage(NamedTuple):
     """A vehicle that drove over a loop."""
 
     loop: int
-    """number of the loop"""
     vehicle: str
     time: float
     """at which its front bumper reached the loop [s]"""

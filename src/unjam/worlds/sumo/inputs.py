@@ -33,13 +33,11 @@ class SumoInputs(NamedTuple):
     """What SUMO reads for an episode."""
 
     options: tuple[str, ...]
-    """options of the simulation"""
     existing_files: dict[str, tuple[Path, ...]]
     """the network and other existing files, by the option that names them"""
     traffic_xml: str
     """XML of vehicle types, and of routes and vehicles unless they are the user's"""
     traffic_option: str
-    """the option that names the file with `traffic_xml`"""
     copied_files: Mapping[Path, tuple[Path, ...]] = MappingProxyType({})
     """files that SUMO must only read as a harmless copy, and the files from which the copy is made"""
     records_trips: bool = False
@@ -123,8 +121,8 @@ def _motorway_types_xml(scenario: Scenario, road: MotorwayRoad) -> list[str]:
 def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:
     """Return the XML of a CAV type for each type that may become one, equal except for the car-following model.
 
-    Each calibrated driver has such a type for each type of passenger cars. SUMO draws a new speed factor for
-    a vehicle whose type changes. From these types it draws none, and the vehicle gets its own back.
+    Each calibrated driver has such a type for each type of passenger cars. When the type of a vehicle changes, SUMO
+    draws a new speed factor. From these types it draws none, and the vehicle gets its own back.
     """
     cav = {"sigma": 0.0, "delta": IDMParameters().exponent, **_cav_attributes(scenario)}
     if scenario.actuation != "cruise":

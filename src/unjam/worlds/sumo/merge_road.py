@@ -23,11 +23,10 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.open_road import OpenTraffic, neighbor_state
 from unjam.worlds.sumo.traffic import NO_SPEED_COMMAND
-from unjam.worlds.world import DriverLog, ProgressCallback
+from unjam.worlds.world import DriverLog
 
 MERGE_BRANCHES = ("highway", "ramp")
 ABSENT_LEADER_GAP = 1e9
-"""gap to a missing leader [m]"""
 
 
 class MergingStreams:
@@ -113,10 +112,8 @@ class MergingStreams:
 class MergingTraffic(OpenTraffic[MergeRoad]):
     """The SUMO environment of a merge."""
 
-    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Run the warm-up, then hand the CAVs to the driver, without a history."""
+    def _prepare(self) -> None:
         self._streams = MergingStreams()
-        super().start(is_controlled, on_progress)
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
         streams, simulation = self._streams, self._simulation
@@ -130,7 +127,7 @@ class MergingTraffic(OpenTraffic[MergeRoad]):
     def _command_humans(self) -> None:
         """Command speeds of the IDM with noise, except on the junction, where SUMO drives.
 
-        This includes CAVs, whose own commands in the same step replace these.
+        This includes CAVs: their own commands in the same step replace these.
         """
         scenario, streams = self.scenario, self._streams
         leaders, speeds = streams.leaders(), streams.speeds

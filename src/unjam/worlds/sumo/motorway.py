@@ -15,7 +15,6 @@ from unjam.worlds.record import Floats
 from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
 from unjam.worlds.sumo.open_road import neighbor_state
-from unjam.worlds.world import ProgressCallback
 
 
 class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
@@ -23,8 +22,8 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
 
     _cav_type_template = CAV_TYPE_TEMPLATE
 
-    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Run the warm-up, then hand the CAVs to the driver, without a history."""
+    def _prepare(self) -> None:
+        super()._prepare()
         road, types = self.road, self.road.vehicle_types
         self._edge_lane_indices, self._edge_lane_starts, self._edge_lane_speed_limits = (
             np.array(each) for each in zip(*(lane[1:4] for lane in road.edge_lanes), strict=True)
@@ -34,8 +33,6 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         self._road_sections = RoadSections(int(self._edge_lane_indices.max()) + 1, road.length)
         self._messages = RoadsideMessages(road.roadside, self.scenario.control_step, self._noise_generator)
         self._entered_is_cav: list[bool] = []
-        """whether each vehicle that has entered is a CAV"""
-        super().start(is_controlled, on_progress)
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
         """Find leaders and followers from the vehicles on SUMO's lanes, which form lanes of the whole road."""

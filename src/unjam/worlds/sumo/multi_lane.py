@@ -21,7 +21,6 @@ from unjam.worlds.record import Floats, Trajectory
 from unjam.worlds.sumo.open_log import OpenRoadLog
 from unjam.worlds.sumo.open_road import OpenTraffic
 from unjam.worlds.sumo.traffic import OpenRoadT
-from unjam.worlds.world import ProgressCallback
 
 
 class TrackedLeader(NamedTuple):
@@ -50,8 +49,7 @@ class MultiLaneLog(OpenRoadLog):
         self._recovery_states: dict[str, tuple[bool, FollowingPair]] = {}
         """whether each CAV recovers from a change of its leader, and the pair in the last step"""
         self._steady_following = array("d")
-        """of CAVs behind the same leader for `STEADY_FOLLOWING_SECONDS`, in each simulation step: speed, leader speed,
-        gap, and whether they still recover"""
+        """of CAVs long behind the same leader, in each simulation step: speed, leader speed, gap, and recovery"""
         self._step_count = 0
 
     def _driver_kinds(self) -> NDArray[np.uint8]:
@@ -91,13 +89,11 @@ class MultiLaneLog(OpenRoadLog):
 class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
     """Common part of the roads with lanes."""
 
-    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Run the warm-up, then hand the CAVs to the driver, without a history."""
+    def _prepare(self) -> None:
         self._uncapped_max_speeds: dict[str, float] = {}
         """maximum speed without the cap, of CAVs that have a set-speed cap [m/s]"""
         self._time_gaps: dict[str, float] = {}
-        """current time gap of CAVs whose ACC got a time gap command [s]"""
-        super().start(is_controlled, on_progress)
+        """current time gap of CAVs with a time gap command to their ACC [s]"""
 
     def _make_log(self) -> OpenRoadLog:
         return MultiLaneLog(self.scenario, *self._names_and_speeds(), self._tracked_leaders)

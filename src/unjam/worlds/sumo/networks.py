@@ -31,7 +31,6 @@ STALE_FILE_SECONDS = 3600.0
 MESSAGE_TOTAL_MARKER = "total messages of type:"
 """in the lines at the end of a log that count its messages"""
 XMLAttributes = dict[str, Any]
-"""attributes of an XML element"""
 UNCONTROLLED_LINK_STATES = "MZ-"
 """states of connections without waiting vehicles: right of way, zipper merge, dead end"""
 _intact_networks: dict[Path, tuple[int, int]] = {}
@@ -144,7 +143,6 @@ class NetworkGeometry(NamedTuple):
     edge_lengths: dict[str, float]
     """[m]"""
     lane_counts: dict[str, int]
-    """number of lanes of each edge"""
 
 
 def network_geometry(path: Path) -> NetworkGeometry:

@@ -14,7 +14,6 @@ from unjam.worlds.sumo.traffic_log import TrafficLog
 from unjam.worlds.world import DriverLog
 
 TRIPS_PER_PROGRESS = 500
-"""trips that are processed between two reports of progress"""
 
 
 class TripLog:
@@ -69,7 +68,6 @@ class OpenRoadLog:
         """Start with the vehicles on the road now, and their speeds [m/s]."""
         self.traffic, self.trips = TrafficLog(), TripLog()
         self.backlog: list[int] = []
-        """of each moment"""
         self.fuel: list[float] = []
         """total fuel rate of the vehicles [mg/s]"""
         self._scenario, self._braking = scenario, audit.BrakingLog(scenario.simulation_step)

@@ -12,10 +12,10 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.safety import FollowingState
 from unjam.physics.kinematics import next_speed
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.active_vehicles import ActiveVehicles
 from unjam.worlds.sumo.inputs import lane_change_parameters
 from unjam.worlds.sumo.networks import network_geometry, network_path
 from unjam.worlds.sumo.open_log import OpenRoadLog
+from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.traffic import OpenRoadT, RoadScene, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
 
@@ -39,6 +39,52 @@ def neighbor_state(
     return LocalState(*values, route_position=positions[rows], loop_length=np.full(len(rows), np.nan))
 
 
+class ActiveVehicles:
+    """The vehicles on a road with ends, and counts of arrivals, teleports and collisions."""
+
+    def __init__(self) -> None:
+        self.is_cav: dict[str, bool] = {}
+        """whether each vehicle on the road is a CAV, in order of entry"""
+        self.teleported: dict[str, bool] = {}
+        """the same for vehicles that SUMO has teleported and not yet reinserted"""
+        self.collided = set[str]()
+        self.arrivals = self.teleports = 0
+
+    def reset_counts(self) -> None:
+        """Forget arrivals, teleports and collisions so far."""
+        self.arrivals = self.teleports = 0
+        self.collided.clear()
+
+    def update(self, simulation: Simulation, is_cav: Callable[[str], bool]) -> tuple[list[str], Sequence[str]]:
+        """Update after a simulation step, and return the names of vehicles that left and of those that entered.
+
+        `is_cav` decides whether a vehicle that has just entered is a CAV.
+        """
+        entered, arrived = simulation.departed_vehicles(), simulation.arrived_vehicles()
+        teleporting = simulation.teleporting_vehicles()
+        self.arrivals += len(arrived)
+        self.teleports += len(teleporting)
+        self.teleported |= {name: self.is_cav[name] for name in teleporting if name in self.is_cav}
+        left = [*arrived, *teleporting]
+        for name in left:
+            self.is_cav.pop(name, None)
+        for name in arrived:  # SUMO may teleport a vehicle to the end of its route
+            self.teleported.pop(name, None)
+        for name in entered:
+            self.is_cav[name] = is_cav(name)
+        for name in filter(self.teleported.__contains__, simulation.reinserted_vehicles()):
+            self.is_cav[name] = self.teleported.pop(name)
+        return left, entered
+
+    def add_collision(self, colliding: Sequence[str], simulation: Simulation) -> None:
+        """Count a collision in the last step; vehicles that SUMO removes for it are teleports, not arrivals."""
+        self.collided.update(colliding)
+        removed = set(colliding).intersection(simulation.arrived_vehicles())
+        removed -= set(simulation.teleporting_vehicles())  # one that is teleported to its end has arrived
+        self.arrivals -= len(removed)
+        self.teleports += len(removed)
+
+
 class OpenTraffic(Traffic[OpenRoadT]):
     """Common part of the roads with ends.
 
@@ -52,6 +98,9 @@ class OpenTraffic(Traffic[OpenRoadT]):
     """vehicle type of a CAV; `{}` stands for its own type"""
 
     # What the kinds of roads do in their own way:
+
+    def _prepare(self) -> None:
+        """Create the attributes of this kind of road, before the warm-up."""
 
     def _is_cav(self, name: str) -> bool:
         """Return whether a vehicle that has just entered is a CAV."""
@@ -117,6 +166,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
         """Run the warm-up, then hand the CAVs to the driver, without a history."""
+        self._prepare()
         self._vehicles = ActiveVehicles()
         self._controlled_cavs = set[str]()
         self.cav_ids = []

@@ -68,7 +68,7 @@ def _process_starter(process: int) -> ThreadPoolExecutor:
 
 
 _process_starter_lock = Lock()
-"""prevents a second such thread, whose processes would end with its executor"""
+"""prevents a second such thread: its processes would end with its executor"""
 
 
 class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
@@ -89,7 +89,6 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         )
         self._process = start.result()
         self.episode_lock = Lock()
-        """held by the running episode"""
 
     @property
     def is_lost(self) -> bool:

@@ -43,7 +43,6 @@ class LaneSections:
         remaining = np.array([lane.length - ROAD_SECTION_LENGTH * number for lane, number in sections])
         distance = np.array([distances.get(lane.name, inf) for lane, _ in sections])
         self.is_monitored = (remaining >= MIN_MONITORED_LENGTH) & (remaining + distance > MAX_QUEUE_LENGTH)
-        """whether congestion is reported of each section"""
 
     def __contains__(self, lane: str) -> bool:
         return lane in self._lanes

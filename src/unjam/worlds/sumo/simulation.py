@@ -21,8 +21,7 @@ from unjam.worlds.sumo.backends import Backend, Libsumo, NeighborStates, Traci, 
 from unjam.worlds.sumo.control import VehicleControl
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.networks import UNCONTROLLED_LINK_STATES, NetworkLane, last_error_message, sumo_program
-from unjam.worlds.sumo.tripinfo import read_trips, trip_options
-from unjam.worlds.sumo.warnings_log import MAX_EXAMPLES_OPTION, read_warnings
+from unjam.worlds.sumo.outputs import MAX_EXAMPLES_OPTION, read_trips, read_warnings, trip_options
 from unjam.worlds.trips import Trips
 
 MIN_CONTACT_OVERLAP = 0.01
@@ -54,7 +53,6 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
         self.check: Callable[[], None] = self._library.check
         """raises `LostWorkerError` if other code of this process has changed the simulation"""
         self.step: Callable[[], None] = self._library.step
-        """simulates one time step"""
         self._folder = PrivateFolder()
         folder = Path(self._folder.name)
         self._error_log, self._trip_file, self._traffic_file = (
@@ -65,7 +63,6 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
         self._harmless_copies: dict[Path, tuple[list[tuple[int, int]], Path]] = {}
         """of users' files, with the stamps of the files from which they are made"""
         self.episode_lock = Lock()
-        """held by the running episode"""
         if backend == "libsumo":
             self._bind()
 
@@ -99,7 +96,6 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
         self.vehicles_on_loop: Callable[[str], Sequence[Any]] = call("inductionloop", "getVehicleData")
         """vehicles on a loop in the last step: (name, length, entry time, exit time or -1, type)"""
         self.pending_vehicles: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
-        """the insertion backlog"""
 
     def now(self) -> float:
         """Return SUMO's time [s]."""

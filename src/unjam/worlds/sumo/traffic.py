@@ -76,11 +76,9 @@ class Traffic(World[Episode], Generic[RoadT]):
         self.stop_at_contact = True
         """whether contact of a CAV ends an episode on a user's network; on built-in roads it always does"""
         self.is_finished = False
-        """whether no vehicle is on the road or will enter"""
         self.stop_reason = ""
         """why SUMO's own rules end the episode early; empty: they do not"""
         self.control_steps = 0
-        """since the start of the log"""
         self.entered_count = 0
         self.record_details = record_details
         """whether fuel and, on roads with ends, positions (x, y) are recorded"""

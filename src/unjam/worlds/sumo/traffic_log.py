@@ -24,11 +24,8 @@ class TrafficLog:
 
     def __init__(self) -> None:
         self.names: list[str] = []
-        """vehicles at the last moment"""
         self.snapshot_stride = 1
-        """moments between two snapshots"""
         self._vehicle_numbers: dict[str, int] = {}
-        """in order of entry"""
         self._current_numbers: NDArray[np.int32] = np.zeros(0, np.int32)
         self._numbers_by_moment: list[NDArray[np.int32]] = []
         self._speeds: list[Floats] = []

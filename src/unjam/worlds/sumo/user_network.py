@@ -22,7 +22,7 @@ from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, CAV_TYPE_TEMPLATE
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
 from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.sections import RoadsideService
-from unjam.worlds.world import DriverLog, ProgressCallback
+from unjam.worlds.world import DriverLog
 
 SAFETY_FILTER_RANGE = 400.0
 """range in which a safety filter detects leaders [m]: enough at 60 m/s"""
@@ -33,27 +33,21 @@ FUEL_INTERVAL_SECONDS = 1.0
 class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
     """The SUMO environment of a user's network."""
 
-    def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Run the warm-up, then hand the CAVs to the driver, without a history."""
+    def _prepare(self) -> None:
+        super()._prepare()
         self._cav_type_template = "{}" if self.scenario.actuation == "flow" else CAV_TYPE_TEMPLATE
         self._route_counts: Counter[tuple[str, ...]] = Counter()
         self._edge_numbers: dict[str, int] = {}
-        """number of each edge that a vehicle has used"""
         self._allowed_speed_sum, self._allowed_speed_count = 0.0, 0
-        """sum [m/s] and number of measured allowed speeds of vehicles"""
         self._contact_cavs = set[str]()
-        """CAVs that were in contact with another vehicle"""
         self._entered_vehicle_count, self._selected_cav_count = 0, 0
-        """vehicles that have entered, and CAVs among them"""
         self._limits_of_vehicle: dict[str, VehicleLimits] = {}
-        """of the vehicles that CAVs replace"""
         self._roadside_service = None
         step = self.scenario.control_step
         if "lane_speeds" in self.measured_fields:
             messages = RoadsideMessages(self.road.roadside, step, self._noise_generator)
             self._roadside_service = RoadsideService(self._simulation, messages, step)
         self._fuel_interval = max(1, int(FUEL_INTERVAL_SECONDS / step))
-        super().start(is_controlled, on_progress)
 
     @property
     def expects_cavs(self) -> bool:

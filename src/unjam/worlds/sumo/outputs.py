@@ -1,0 +1,93 @@
+"""SUMO's output: trip records (`tripinfo-output`, which take no measurable time), and warnings in its error log."""
+
+import re
+from collections import Counter
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from unjam.worlds.record import SumoWarning
+from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
+from unjam.worlds.trips import Trips
+
+NOT_ARRIVED = -1.0
+TRIP_TIME_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival"
+"""attributes of a trip that are read [s]"""
+MAX_LOG_BYTES = 2**20
+"""bytes of a log that are read; SUMO writes one example and one total for most kinds"""
+MAX_EXAMPLE_LENGTH = 300
+MAX_EXAMPLES_OPTION = "1"
+"""value of SUMO's option aggregate-warnings: further messages of a kind are only counted"""
+_TOTAL_PATTERN = re.compile(rf"(\d+) {MESSAGE_TOTAL_MARKER} (.*)")
+_VARIABLE_PATTERN = re.compile(r"'[^']*'|(?<==)[^\s,;]*[^\s,;.!]|[-+]?\b\d+(?:\.\d+)?\b")
+"""variable parts of the messages of a kind: quoted names, values after =, and numbers"""
+SEPARATELY_COUNTED = re.compile(
+    r"Teleporting vehicle|ends teleporting|teleports beyond|collision with|performs emergency braking"
+)
+"""messages about teleports, collisions and hard braking, which unjam counts itself"""
+
+
+def trip_options(path: Path) -> list[str]:
+    """Return the options by which SUMO writes all trips to a file, including those that have not ended."""
+    unfinished = ("--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted")
+    return ["--tripinfo-output", str(path), *(word for option in unfinished for word in (option, "true"))]
+
+
+def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
+    """Return the trips in a file that SUMO has closed, in SUMO's order.
+
+    `vehicle_classes` has the vehicle class of each vehicle type. Trips that ended during the warm-up, which ends at
+    `warmup_end` [s], and trips of vehicles that were to depart later are left out.
+    """
+    ids, kinds, times = list[str](), list[str](), list[list[float]]()
+    for _, element in ElementTree.iterparse(path):
+        trip = element.attrib
+        if element.tag != "tripinfo" or NOT_ARRIVED < float(trip["arrival"]) <= warmup_end:
+            continue
+        if float(trip["depart"]) >= 0.0 or float(trip["departDelay"]) > 0.0:
+            ids.append(trip["id"])
+            kinds.append(_vehicle_class(trip["vType"], vehicle_classes))
+            times.append([float(trip[name]) for name in TRIP_TIME_ATTRIBUTES])
+        element.clear()
+    depart_delay, duration, time_loss, arrival = np.array(times, np.float64).reshape(-1, len(TRIP_TIME_ATTRIBUTES)).T
+    return Trips(tuple(ids), tuple(kinds), depart_delay, duration, time_loss, arrival != NOT_ARRIVED)
+
+
+def _vehicle_class(kind: str, vehicle_classes: dict[str, str]) -> str:
+    """Return the class of a type, or of the type of which `kind` is SUMO's copy for one vehicle: `type@vehicle`."""
+    names = kind, kind.rpartition("@")[0], kind.partition("@")[0]
+    return next((vehicle_classes[name] for name in names if name in vehicle_classes), "")
+
+
+def read_warnings(log_path: Path) -> tuple[SumoWarning, ...]:
+    """Return the warnings and errors in a complete log, except those that unjam counts itself.
+
+    SUMO must have written it with `aggregate-warnings` at `MAX_EXAMPLES_OPTION` and closed it.
+    """
+    try:
+        with log_path.open(errors="replace") as file:
+            text = file.read(MAX_LOG_BYTES)
+            text = text.rpartition("\n")[0] if file.read(1) else text  # without an incomplete message
+    except OSError:
+        return ()
+    messages = re.findall(r"^(?:Warning|Error): (.*(?:\n(?!Warning:|Error:).*)*)", text, re.MULTILINE)
+    examples, counts = dict[str, str](), Counter[str]()
+    totals = list[tuple[int, str]]()
+    for message in (" ".join(each.split()) for each in messages):
+        if total := _TOTAL_PATTERN.fullmatch(message):
+            totals.append((int(total[1]), total[2]))
+        elif not SEPARATELY_COUNTED.search(message):
+            kind = warning_kind(message)
+            examples.setdefault(kind, message)
+            counts[kind] += 1
+    for count, form in totals:  # includes the example
+        pattern = re.compile(".*".join(map(re.escape, form.split("%"))))
+        for kind in [kind for kind, message in examples.items() if pattern.fullmatch(message)][:1]:
+            counts[kind] += count - 1
+    return tuple(SumoWarning(kind, message[:MAX_EXAMPLE_LENGTH], counts[kind]) for kind, message in examples.items())
+
+
+def warning_kind(message: str) -> str:
+    """Return a message with the placeholder % instead of quoted names, values and numbers."""
+    return _VARIABLE_PATTERN.sub(lambda match: "'%'" if match[0].startswith("'") else "%", message)
