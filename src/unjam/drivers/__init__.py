@@ -1,4 +1,4 @@
-"""Who drives a CAV: experts, learned residuals, your own."""
+"""Drivers of CAVs: experts, learned residuals, and the user's own drivers."""
 
 from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Human
 from unjam.drivers.check import check_driver
