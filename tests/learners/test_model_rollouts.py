@@ -193,7 +193,9 @@ def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
         return batches[-1]
 
     monkeypatch.setattr(rollouts, "simulate", recorded)
-    rows = rollouts.roll_out(network, 2, 0, 1, ExperienceFactory(lambda drawn: drawn, lambda _: pytest.fail()))
+    rows = rollouts.roll_out(
+        network, 2, 0, 1, ExperienceFactory(lambda drawn: drawn, lambda _: pytest.fail("rows have no episodes"))
+    )
     assert rows is not None
     (batch,) = batches
     assert rollouts.k_star == 30

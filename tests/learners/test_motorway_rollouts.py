@@ -220,5 +220,5 @@ def test_base_predicts_drivers_in_sumo_as_well_as_in_the_batch(
 
 
 def test_record_that_skips_steps_is_refused(in_sumo: list[Episode]) -> None:
-    with pytest.raises(InputError, match="skips moments"):
+    with pytest.raises(InputError, match="skips steps"):
         motorway_samples(replace(in_sumo[0], snapshot_stride=2), 0, ROAD)

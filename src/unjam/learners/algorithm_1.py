@@ -242,19 +242,19 @@ def return_after_exit(episode: Episode, trajectory: Trajectory, gamma: float, ho
 
 def model_experience(training: Training, part: int, parts: int) -> Experience | None:
     """Return one of `parts` of the experience of the present policy in the models of all tasks, if there is any."""
-    network, found = training.learner.network(), []
+    network, results = training.learner.network(), []
     for index, each in enumerate(training.model_rollouts):
         factory = ExperienceFactory(
             partial(privileged_inputs, training.tasks, training.policy, index),
             partial(task_experience, training, index),
         )
-        found.append(each.roll_out(network, training.iteration, part, parts, factory))
-    rows = [each for each in found if each is not None]
+        results.append(each.roll_out(network, training.iteration, part, parts, factory))
+    rows = [each for each in results if each is not None]
     return join_experience(rows) if rows else None
 
 
 def privileged_inputs(tasks: Sequence[Task], policy: PolicySettings, task_index: int, drawn_values: Floats) -> Floats:
-    """Return the inputs of the critic alone in rows of a task whose episodes drew `drawn_values`, shape (rows, m).
+    """Return the inputs of the critic alone in rows of a task with `drawn_values`, shape (rows, m).
 
     With several tasks these are the values that each of them draws, zeros for the others, and a one-hot task index.
     """

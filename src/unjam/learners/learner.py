@@ -1,4 +1,4 @@
-"""Learners: algorithms of Stable-Baselines3 whose `train()` learns from the whole episodes of Algorithm 1."""
+"""Learners: algorithms of Stable-Baselines3 with a `train()` that learns from the whole episodes of Algorithm 1."""
 
 from dataclasses import dataclass
 from importlib import import_module
@@ -142,7 +142,7 @@ def _restored_state(part: str, initial_state: dict[str, Any], tensors: Tensors) 
 
 
 def tensors_with_prefix(prefix: str, tensors: Tensors) -> Tensors:
-    """Return copies of the tensors whose names begin with `prefix`, without it."""
+    """Return copies of the tensors with names that begin with `prefix`, without it."""
     return {name.removeprefix(prefix): t.clone() for name, t in tensors.items() if name.startswith(prefix)}
 
 

@@ -159,8 +159,8 @@ def fit_ensemble(
     """Train `ensemble` further on `inputs`, (rows, inputs), and residuals of the base `targets`, (rows, outputs).
 
     Units are SI. Each network is trained on a bootstrap sample of the rows that are not `is_holdout`, and ends with the
-    weights that were best on the holdout. With `fallback_to_base`, outputs that are predicted no better than by zero
-    there are masked. Raises `UnjamError` if a loss is not finite.
+    weights that were best on the holdout. With `fallback_to_base`, outputs that are predicted no better there than by
+    zero are masked. Raises `UnjamError` if a loss is not finite.
     """
     training = generator.permutation(np.flatnonzero(~is_holdout))[: settings.max_fit_rows]
     max_holdout_rows = max(1, round(settings.max_fit_rows * settings.holdout))
@@ -209,11 +209,11 @@ def _train(
         is_better = losses < best_loss
         best_loss = torch.where(is_better, losses, best_loss)
         waited = 0 if is_better.any() else waited + 1
-        for kept, parameter in zip(best, parameters, strict=True):
-            kept.copy_(torch.where(is_better[:, None, None], parameter.detach(), kept))
+        for stored, parameter in zip(best, parameters, strict=True):
+            stored.copy_(torch.where(is_better[:, None, None], parameter.detach(), stored))
     with torch.no_grad():
-        for kept, parameter in zip(best, parameters, strict=True):
-            parameter.copy_(kept)
+        for stored, parameter in zip(best, parameters, strict=True):
+            parameter.copy_(stored)
     return last_loss, epochs
 
 

@@ -142,7 +142,7 @@ def total_variation(predictions: Floats, noise: Floats) -> float:
     """Return the mean total variation, in [0, 1], between Gaussians around a member's prediction and around the mean.
 
     `predictions` has shape (members, rows, quantities), `noise`, the standard deviation of both, (quantities,). It is
-    NaN for a single member, whose error is unknown.
+    NaN for a single member, since its error is unknown.
     """
     if len(predictions) == 1:
         return float("nan")

@@ -86,7 +86,7 @@ def check_motorway_model(scenario: OnRamp, settings: ModelSettings) -> None:
 def motorway_samples(episode: Episode, number: int, scenario: OnRamp, base: str = "idm") -> MotorwaySamples:
     """Return the samples of an environment episode; `InputError` if its record skips steps, as long ones do."""
     if episode.snapshot_stride > 1:
-        raise InputError("road: its record skips moments; allowed: a shorter horizon, with model.kind road")
+        raise InputError("road: its record skips steps; allowed: a shorter horizon, with model.kind road")
     road = cast(MotorwayRoad, scenario.draw_from_seed(episode.seed)[0])
     interval = max(1, min(MAX_SAMPLE_INTERVAL, episode.control_steps // 4))
     steps = np.arange(interval, episode.control_steps, interval)

@@ -83,7 +83,7 @@ def check_road_model(scenario: Scenario) -> None:
 
 
 def with_size(scenario: LoopScenario, size: int) -> LoopScenario:
-    """Return a scenario whose episodes all draw the same size [m], without a warm-up."""
+    """Return a scenario of which all episodes draw the same size [m], without a warm-up."""
     return replace(scenario, **{scenario.size_parameter: (size, size)}, warmup=0)
 
 

@@ -96,7 +96,7 @@ def draw_starts(
 def prepare_starts(
     data: EnvironmentData, start_indices: StartIndices, expert: Driver, device: torch.device | str
 ) -> RolloutStarts:
-    """Return the starts of rollouts at `start_indices`, with the expert's memory there."""
+    """Return the starts of rollouts at `start_indices`, with the expert's memory at these steps."""
     drawn = np.stack([data.recordings[index].drawn_values for index in start_indices[:, 0]])
     memory = reconstruct_memory(expert, data.recordings, start_indices)
     return RolloutStarts(
