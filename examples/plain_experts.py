@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 
 class State(NamedTuple):
-    """What a vehicle perceives, SI units; gaps are bumper to bumper, 100 m where nobody is."""
+    """What a vehicle observes, SI units; gaps are bumper to bumper, 100 m where no vehicle is."""
 
     speed: float
     leader_speed: float
@@ -22,12 +22,12 @@ class State(NamedTuple):
     route_position: float = math.nan
     loop_length: float = math.nan
     allowed_speed: float = math.nan
-    to_merge: float = math.nan
+    distance_to_merge: float = math.nan
     lane_speeds: Sequence[float] = ()
     road_speeds: Sequence[float] = ()
-    beside_gaps: Sequence[float] = ()
-    beside_speeds: Sequence[float] = ()
-    cav_share: float = 0.0
+    adjacent_gaps: Sequence[float] = ()
+    adjacent_speeds: Sequence[float] = ()
+    penetration_rate: float = 0.0
     congestion: Sequence[float] = ()
 
 
@@ -58,14 +58,14 @@ def pi(p: Any, s: State, m: Any) -> float:
 
 def pi_from_gap(p: Any, s: State, m: Any) -> float:
     if not hasattr(m, "first"):
-        m.first = max((s.leader_gap - p.people_gap) / p.human_time_headway, 0.0)
+        m.first = max((s.leader_gap - p.human_standstill_gap) / p.human_time_headway, 0.0)
     average = mean(p, m, s.speed)
-    left = clip(1.0 - (m.seen - 1) * (p.time_step / p.fading), 0.0, 1.0)
+    left = clip(1.0 - (m.seen - 1) * (p.time_step / p.fade_time), 0.0, 1.0)
     return toward(average + left * (m.first - average), average, p, s, m)
 
 
 def toward(wanted: float, average: float, p: Any, s: State, m: Any) -> float:
-    """PI with saturation for the mean that it follows, beside the mean that a network sees."""
+    """PI with saturation for the mean that it follows, next to the mean that the policy observes."""
     command = getattr(m, "command", s.speed if p.first_command == "own-speed" else 0.0)
     room = (s.leader_gap - p.gap_lower) / (p.gap_upper - p.gap_lower)
     target = wanted + p.catch_up_speed * clip(room, 0.0, 1.0)
@@ -123,16 +123,16 @@ TUNED = {
 
 def pacer(p: Any, s: State, m: Any) -> float:
     loop, free = s.loop_length, s.leader_gap
-    if p.varying:
+    if p.use_tuned:
         harmonics, gain, wanted = TUNED[min(TUNED, key=lambda lap: abs(loop - lap))]
-        tuned = {"harmonics": harmonics, "gain": gain, "target_gap": wanted}
+        tuned = {"harmonics": harmonics, "gap_gain": gain, "target_gap": wanted}
         p = SimpleNamespace(**{**vars(p), **tuned, "gathering_gap": 0.5, "regathering_gap": 0.45})
     was = 0.0 if free < p.regathering_gap * loop else getattr(m, "features", (0.0,))[0]
     m.features = (float(free >= p.gathering_gap * loop or was > 0.0),)
     (pace, *rest), place = p.harmonics or (loop / p.lap_time,), 2.0 * math.pi * s.route_position / loop
     for number, (cosine, sine) in enumerate(zip(rest[::2], rest[1::2], strict=True), start=1):
         pace += cosine * math.cos(number * place) + sine * math.sin(number * place)
-    pace = max(pace + p.gain * (free - p.target_gap * loop), 1.0)
+    pace = max(pace + p.gap_gain * (free - p.target_gap * loop), 1.0)
     return ((pace if m.features[0] else p.gathering_speed) - s.speed) / p.time_constant
 
 
@@ -140,10 +140,10 @@ def jam_absorber(p: Any, s: State, m: Any) -> float:
     place, gap, ahead = s.route_position, s.leader_gap, s.leader_speed
     jam = p.first_position < place < p.last_position and ahead < p.jam_speed and gap < 60.0
     waits = jam or getattr(m, "features", (0.0,))[0] > 0.0
-    gone = (gap >= p.room and ahead >= p.release_speed) or gap >= 99.0
+    gone = (gap >= p.release_gap and ahead >= p.release_speed) or gap >= 99.0
     m.features = (float(waits and not gone and not place > p.last_position + 50.0),)
     excess = gap - p.standstill_gap - p.time_gap * s.speed
-    follow = p.gap_gain * excess + p.speed_gain * (ahead - s.speed) + getattr(p, "push", 0.0)
+    follow = p.gap_gain * excess + p.speed_gain * (ahead - s.speed) + p.extra_acceleration
     return min(p.crawl_speed - s.speed, follow) if m.features[0] else follow
 
 
@@ -152,28 +152,28 @@ def cruise(p: Any, s: State, m: Any) -> float:
 
 
 def jam_ahead(p: Any, s: State, m: Any) -> float:
-    told = (s.road_speeds if p.all_lanes else s.lane_speeds)[p.first : p.last + 1]
+    told = (s.road_speeds if p.all_lanes else s.lane_speeds)[p.first_section : p.last_section + 1]
     ahead = sum(told) / len(told) if told else math.inf
-    jammed = ahead < getattr(p, "jam", 0.75) * s.allowed_speed
-    jammed = jammed and max(s.congestion[p.first : p.last + 1], default=0.0) >= 0.5
+    jammed = ahead < p.jam_speed_ratio * s.allowed_speed
+    jammed = jammed and max(s.congestion[p.first_section : p.last_section + 1], default=0.0) >= 0.5
     if not told or not (jammed if math.isnan(s.distance_to_merge) else s.distance_to_merge > 0.0):
         return cruise(p, s, m)
-    wanted = ahead + p.margin + p.margin_by_penetration * s.penetration_rate
-    cap = min(max(wanted, p.lowest), s.allowed_speed)
-    return max((cap - s.speed) / p.time_constant, -p.slowing)
+    wanted = ahead + p.speed_margin + p.margin_by_penetration * s.penetration_rate
+    cap = min(max(wanted, p.min_speed), s.allowed_speed)
+    return max((cap - s.speed) / p.time_constant, -p.max_deceleration)
 
 
 def adaptive_acc(p: Any, s: State, m: Any) -> float:
     before = getattr(m, "mean", s.speed)
-    m.mean = before + (1.0 - math.exp(-p.time_step / p.averaging)) * (s.speed - before)
+    m.mean = before + (1.0 - math.exp(-p.time_step / p.averaging_time)) * (s.speed - before)
     change, (_, leaves) = s.speed - m.mean, getattr(m, "features", (0.0, 0.0))
-    if change > p.front:
+    if change > p.jam_front_speed_change:
         leaves = 1.0
-    elif change < -p.front or m.mean > p.free_speed or m.mean < p.jam_speed:
+    elif change < -p.jam_front_speed_change or m.mean > p.free_speed or m.mean < p.jam_speed:
         leaves = 0.0
     m.features = m.mean / 10.0, leaves
-    headway, acceleration, braking = (1.0, 1.0, 0.7) if change < -p.front else (1.0, 1.0, 1.0)
-    if -p.behind < s.distance_to_merge < p.before:
+    headway, acceleration, braking = (1.0, 1.0, 0.7) if change < -p.jam_front_speed_change else (1.0, 1.0, 1.0)
+    if -p.downstream_distance < s.distance_to_merge < p.upstream_distance:
         headway, acceleration, braking = 0.7, 1.5, 1.0
     if leaves:
         headway, acceleration, braking = 0.5, 2.0, 1.0

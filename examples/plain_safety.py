@@ -7,17 +7,17 @@ from plain_experts import State
 
 
 def highest(f: SimpleNamespace, s: State, step: float) -> float:
-    """The highest acceleration after which it can still stop, and keep its headway [m/s2]."""
+    """The highest acceleration after which it can still stop, and keep its time gap [m/s2]."""
     if not f.active:
         return math.inf
     leader, room = max(s.leader_speed - f.speed_error, 0.0), s.leader_gap - f.gap_error - f.standstill_gap
     allowed = speed_to_stop_within(room + stopping(leader, f.leader_braking, step), f.braking, step)
-    if f.time_headway:
+    if f.time_gap:
         c, later = f.time_gap_braking, max(leader - f.time_gap_braking * step, 0.0)
         end = room + stopping(leader, c, step)
-        near = (end - stopping(later, c, step)) / (f.time_headway + step)
-        far = speed_to_stop_within(end - c * (f.time_headway + step / 2.0) ** 2 / 2.0, c, step)
-        allowed = min(allowed, near, max(far, later + f.time_headway * c))
+        near = (end - stopping(later, c, step)) / (f.time_gap + step)
+        far = speed_to_stop_within(end - c * (f.time_gap + step / 2.0) ** 2 / 2.0, c, step)
+        allowed = min(allowed, near, max(far, later + f.time_gap * c))
     return max((allowed - s.speed) / step, -f.braking)
 
 

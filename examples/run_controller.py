@@ -21,7 +21,7 @@ from plain_safety import highest
 
 
 class Driver:
-    """An expert, or a driver plus what a network has learned: its residual is held for some decisions."""
+    """An expert, or a driver plus what a network has learned: its residual is repeated for some control steps."""
 
     def __init__(self, recipe: dict[str, Any], weights: dict[str, np.ndarray], prefix: str = "") -> None:
         self.r, self.memory, self.age, self.held = recipe, SimpleNamespace(), 0, 0.0
@@ -30,7 +30,7 @@ class Driver:
             if recipe["name"] not in EXPERTS:
                 raise ValueError(f"{recipe['name']} is not read here; read it with unjam")
             return
-        if recipe["kind"] in ("filtered", "remembering"):
+        if recipe["kind"] in ("filtered", "history"):
             self.inner = Driver(recipe["driver"], weights, f"{prefix}inner.")
             return
         if recipe["kind"] != "residual":
@@ -47,14 +47,14 @@ class Driver:
             wanted = clip(self.inner.act(s), -self.r["action_limit"], self.r["action_limit"])
             self.memory = self.inner.memory
             return min(wanted, highest(SimpleNamespace(**self.r["safety"]), s, self.r["time_step"]))
-        if self.r["kind"] == "remembering":
+        if self.r["kind"] == "history":
             wanted, own = self.inner.act(s), remember(self.memory, s, self.r["time_step"])
             self.memory.features = (*getattr(self.inner.memory, "features", ()), *own)
             return wanted
         limit = self.r["action_limit"]
         expert = clip(self.expert.act(s), -limit, limit)
         self.memory = self.expert.memory
-        if self.age % self.r["hold"] == 0:
+        if self.age % self.r["action_repeat"] == 0:
             self.held = self.r["authority"] * math.tanh(self.network(s, expert))
         self.age += 1
         return clip(expert + self.held, -limit, limit)
@@ -68,21 +68,21 @@ class Driver:
             "expert_memory": getattr(self.memory, "features", ()),
             "loop_length": (s.loop_length / 250.0,),
             "allowed_speed": ((s.allowed_speed - s.speed) / 10.0,),
-            "approach": nearness(s.distance_to_merge),
+            "merge_proximity": nearness(s.distance_to_merge),
             "distance_to_merge": (clip(s.distance_to_merge / 1000.0, -1.0, 2.0),),
             "lane_speeds": tuple((speed - s.speed) / 10.0 for speed in s.lane_speeds),
             "road_speeds": tuple((speed - s.speed) / 10.0 for speed in s.road_speeds),
-            "beside": (
+            "adjacent_lanes": (
                 *((speed - s.speed) / 5.0 for speed in s.adjacent_speeds),
                 *(gap / 20.0 for gap in s.adjacent_gaps),
             ),
             "penetration_rate": (s.penetration_rate,),
             "route_position": (s.route_position / 100.0,),
-            "place": (math.cos(lap := 2.0 * math.pi * s.route_position / s.loop_length), math.sin(lap)),
+            "lap_position": (math.cos(lap := 2.0 * math.pi * s.route_position / s.loop_length), math.sin(lap)),
         }
-        if unknown := [part for part in self.r["parts"] if part not in parts]:
-            raise ValueError(f"a network that sees {unknown[0]} is not read here; read it with unjam")
-        units = np.array([number for part in self.r["parts"] for number in parts[part]])
+        if unknown := [part for part in self.r["inputs"] if part not in parts]:
+            raise ValueError(f"a policy with the input {unknown[0]} is not read here; read it with unjam")
+        units = np.array([number for part in self.r["inputs"] for number in parts[part]])
         for weight, bias in self.layers[:-1]:
             units = np.maximum(units @ weight + bias, 0.0)
         weight, bias = self.layers[-1]
@@ -113,7 +113,7 @@ class Controller:
         self.limit = max(-action["low"], action["high"])
 
     def act(self, *perceived: Any, **named: Any) -> float:
-        """The acceleration to drive with [m/s2], for the fields of `RunState`."""
+        """The acceleration to drive with [m/s2], for the fields of `State`."""
         return clip(self.driver.act(State(*perceived, **named)), -self.limit, self.limit)
 
 
@@ -124,5 +124,5 @@ if __name__ == "__main__":
     names = [name for name in State._fields if name in controller.sample]
     recorded = zip(*(controller.sample[name].tolist() for name in (*names, "acceleration")), strict=True)
     off = [abs(controller.act(**dict(zip(names, seen, strict=True))) - told) for *seen, told in recorded]
-    print(f"{len(off)} decisions, at most {max(off):.1e} m/s2 from what was recorded")
+    print(f"{len(off)} control steps, at most {max(off):.1e} m/s2 from what was recorded")
     sys.exit(int(max(off) > 1e-9))

@@ -18,16 +18,18 @@ import traci
 from run_controller import Controller, State
 
 LARGEST_GAP = 100.0
-"""[m]; stands for `nobody there`"""
+"""[m]; where no vehicle is near"""
 OBEDIENT = {"Accel": 20.0, "Decel": 20.0, "EmergencyDecel": 20.0, "ApparentDecel": 20.0, "MinGap": 0.5}
 """limits of SUMO's own that are wider than any command; only its check for a safe speed stays"""
-LOOK_FARTHER = "pacer jam-absorber cruise jam-ahead adaptive-acc loop_length route_position place approach to_merge"
-LOOK_FARTHER += " allowed_speed lane_speeds road_speeds beside cav_share"
-"""experts and features that need what `local_state` does not tell, or an ACC of the car's own"""
+LOOK_FARTHER = (
+    "pacer jam-absorber cruise jam-ahead adaptive-acc loop_length route_position lap_position merge_proximity"
+)
+LOOK_FARTHER += " distance_to_merge allowed_speed lane_speeds road_speeds adjacent_lanes penetration_rate"
+"""experts and features that need more than `observe` returns, or the ACC of the vehicle"""
 
 
-def perceive(vehicles: Any, name: str) -> State:
-    """What the vehicle perceives now. SUMO's gaps lack the gap that whoever is behind keeps."""
+def observe(vehicles: Any, name: str) -> State:
+    """What the vehicle observes now. The minimum gap of the follower is added to gaps of SUMO."""
     speed, seen = vehicles.getSpeed(name), []
     leader, gap = vehicles.getLeader(name, LARGEST_GAP) or ("", 0.0)
     follower, gap_behind = vehicles.getFollower(name, LARGEST_GAP)
@@ -48,10 +50,10 @@ def words(recipe: Any) -> Iterator[str]:
 
 
 def drive(sumo: Any, controller: Controller, name: str) -> int:
-    """Drive the vehicle from its entry to its exit; return the number of decisions."""
+    """Drive the vehicle from its entry to its exit; return the number of control steps."""
     if more := sorted({*LOOK_FARTHER.split()} & {*words(controller.manifest["driver"])}):
         raise SystemExit(f"the controller looks at more than leader and follower: {', '.join(more)}")
-    step, decisions = sumo.simulation.getDeltaT(), 0
+    step, control_steps = sumo.simulation.getDeltaT(), 0
     vehicles, held = sumo.vehicle, round(controller.time_step / step)
     if abs(held * step - controller.time_step) > 1e-9:
         asked = f"it decides every {controller.time_step:g} s: start SUMO with --step-length"
@@ -63,17 +65,17 @@ def drive(sumo: Any, controller: Controller, name: str) -> int:
     for limit, value in {**OBEDIENT, "Tau": step, "Imperfection": 0.0}.items():
         getattr(vehicles, f"set{limit}")(name, value)
     while name in vehicles.getIDList():
-        acceleration = controller.act(*perceive(vehicles, name))
-        decisions += 1
+        acceleration = controller.act(*observe(vehicles, name))
+        control_steps += 1
         for _ in range(held):
             if name in vehicles.getIDList():
                 vehicles.setSpeed(name, max(0.0, vehicles.getSpeed(name) + acceleration * step))
                 sumo.simulationStep()
-    return decisions
+    return control_steps
 
 
 if __name__ == "__main__":
     file, port, vehicle = sys.argv[1:]
     connection = traci.connect(int(port), host="127.0.0.1")
-    print(f"{vehicle}: {drive(connection, Controller(file), vehicle)} decisions")
+    print(f"{vehicle}: {drive(connection, Controller(file), vehicle)} control steps")
     connection.close()

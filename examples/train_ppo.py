@@ -13,7 +13,7 @@ import unjam  # tells Gymnasium of the roads
 
 STEPS = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
 
-environment = gymnasium.make("unjam/Ring-v0", expert="pi", observe=("local", "expert_acceleration", "expert_memory"))
+environment = gymnasium.make("unjam/Ring-v0", expert="pi", features=("local", "expert_acceleration", "expert_memory"))
 learner = PPO("MlpPolicy", environment, policy_kwargs={"log_std_init": -2.0}, seed=0, verbose=1)
 learner.learn(STEPS)
 mean, std = evaluate_policy(learner, environment, n_eval_episodes=3)

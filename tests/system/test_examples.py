@@ -102,7 +102,7 @@ def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Pat
     path = shipped(residual(PISaturation()), tmp_path / "it.unjam", perceived())
     ran = compared(path)
     assert (ran.returncode, ran.stderr) == (0, "")
-    assert ran.stdout.startswith("40 decisions, at most ")
+    assert ran.stdout.startswith("40 control steps, at most ")
     other = path.read_bytes().replace(b'"hold": 1,', b'"hold": 2,')
     path.write_bytes(other)
     assert compared(path).returncode != 0
@@ -205,7 +205,7 @@ def test_the_client_drives_a_vehicle_of_a_running_sumo(tmp_path: Path) -> None:
         for moment in ElementTree.parse(record).getroot()
     ]
     rows = [moment for moment in moments if "me" in moment]
-    assert f"me: {len(rows)} decisions" in ran.stdout
+    assert f"me: {len(rows)} control steps" in ran.stdout
     states = LocalState(*np.array([perceived_in(moment) for moment in rows]).T)
     done = np.diff(states.speed) / 0.1
     assert np.ptp(done) > 0.5
