@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from tests.learners.toy_task import DECISIONS, INPUTS, Target, Toy, constant_target, mean_return, same, sloped_target
+from tests.learners.toy_task import (
+    CONTROL_STEPS,
+    INPUTS,
+    Target,
+    Toy,
+    constant_target,
+    mean_return,
+    same,
+    sloped_target,
+)
 from unjam.errors import UnjamError
 from unjam.learners.algorithm_1 import environment_experience, return_after_exit, seed_iteration
 from unjam.learners.experience import make_experience
@@ -46,7 +55,7 @@ def test_other_random_numbers_do_not_change_training(agent: str) -> None:
 @pytest.mark.parametrize("hold", [1, 5])
 def test_environment_steps_count_control_steps_and_not_actions(agent: str, hold: int) -> None:
     task = Toy(agent=agent, hold=hold, episodes=3)
-    task.run(2 * 3 * DECISIONS)
+    task.run(2 * 3 * CONTROL_STEPS)
     assert [entry.environment_steps for entry in task.iterations] == [300, 600]
     assert [entry.number for entry in task.iterations] == [1, 2]
 
@@ -89,7 +98,7 @@ def test_only_the_critic_gets_the_drawn_values(agent: str, sees_road: bool) -> N
     policy = PolicySettings(hidden=(8,), privileged_critic=sees_road)
     task = Toy(policy, agent=agent, episodes=2)
     rows = environment_experience(task.training, task.collect(task.learner.network(), 1))
-    assert rows.observations.shape == (2 * DECISIONS, INPUTS + sees_road)
+    assert rows.observations.shape == (2 * CONTROL_STEPS, INPUTS + sees_road)
     if sees_road:
         assert set(rows.observations[:, INPUTS]) == {-1.0, 1.0}
     assert task.learner.sb3.observation_space.shape == (INPUTS + sees_road,)

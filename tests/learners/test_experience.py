@@ -26,22 +26,22 @@ from unjam.worlds.record import Trajectory
 INPUTS = 3
 
 
-def make_trajectory(seed: int, decisions: int, hold: int = 1, terminated: bool = False) -> Trajectory:
+def make_trajectory(seed: int, control_steps: int, hold: int = 1, terminated: bool = False) -> Trajectory:
     """A trajectory of random numbers, its residual held as a driver holds it."""
     generator = np.random.default_rng(seed)
-    choices = -(-decisions // hold)
-    nothing = np.zeros(decisions)
+    choices = -(-control_steps // hold)
+    nothing = np.zeros(control_steps)
     return Trajectory(
         vehicle="cav_0",
         start_step=0,
-        states=LocalState(*[np.zeros(decisions + 1)] * len(COMMON_FIELDS)),
+        states=LocalState(*[np.zeros(control_steps + 1)] * len(COMMON_FIELDS)),
         observations=generator.normal(size=(choices + 1, INPUTS)),
         expert_acceleration=nothing,
-        residual=np.repeat(generator.normal(size=choices), hold)[:decisions],
+        residual=np.repeat(generator.normal(size=choices), hold)[:control_steps],
         applied_acceleration=nothing,
         filter_braking=nothing,
         shield_braking=nothing,
-        reward_terms={"one": generator.normal(size=decisions), "other": generator.uniform(size=decisions)},
+        reward_terms={"one": generator.normal(size=control_steps), "other": generator.uniform(size=control_steps)},
         initial_memory={},
         action_repeat=hold,
         terminated=terminated,
@@ -73,27 +73,27 @@ def value(policy: ResidualPolicy, row: np.ndarray) -> float:
         return float(policy.predict_values(torch.as_tensor(row[None], dtype=torch.float32)))
 
 
-def looks_written_out(trajectory: Trajectory) -> list[float]:
-    """What was earned from one choice of the network to the next."""
-    earned = [
+def action_rewards(trajectory: Trajectory) -> list[float]:
+    """The rewards from one action of the network to the next."""
+    rewards = [
         float(trajectory.reward_terms["one"][t] + trajectory.reward_terms["other"][t])
         for t in range(len(trajectory.residual))
     ]
     return [
-        sum(earned[start : start + trajectory.action_repeat])
-        for start in range(0, len(earned), trajectory.action_repeat)
+        sum(rewards[start : start + trajectory.action_repeat])
+        for start in range(0, len(rewards), trajectory.action_repeat)
     ]
 
 
-def advantages_written_out(
+def explicit_advantages(
     policy: ResidualPolicy, trajectory: Trajectory, gamma: float, gae_lambda: float
 ) -> tuple[list[float], list[float]]:
     """Generalised advantage estimation and its returns, from the definition: a sum over all later errors."""
-    earned = looks_written_out(trajectory)
+    rewards = action_rewards(trajectory)
     values = [value(policy, row) for row in trajectory.observations]
     if trajectory.terminated:
         values[-1] = 0.0
-    errors = [earned[t] + gamma * values[t + 1] - values[t] for t in range(len(earned))]
+    errors = [rewards[t] + gamma * values[t + 1] - values[t] for t in range(len(rewards))]
     advantages = [
         sum((gamma * gae_lambda) ** (later - t) * errors[later] for later in range(t, len(errors)))
         for t in range(len(errors))
@@ -113,10 +113,11 @@ def test_advantages_and_returns_are_computed_per_trajectory(
 ) -> None:
     policy = random_policy()
     trajectories = [
-        make_trajectory(seed, decisions, hold, terminated) for seed, (decisions, terminated) in enumerate(shapes)
+        make_trajectory(seed, control_steps, hold, terminated)
+        for seed, (control_steps, terminated) in enumerate(shapes)
     ]
     buffer = fill(policy, trajectories, gamma=gamma, gae_lambda=gae_lambda)
-    written = [advantages_written_out(policy, entry, gamma, gae_lambda) for entry in trajectories]
+    written = [explicit_advantages(policy, entry, gamma, gae_lambda) for entry in trajectories]
     advantages = [number for found, _ in written for number in found]
     returns = [number for _, found in written for number in found]
     np.testing.assert_allclose(buffer.advantages[:, 0], advantages, rtol=1e-4, atol=1e-4)
@@ -133,7 +134,7 @@ def test_only_truncated_trajectories_are_bootstrapped() -> None:
     beyond = 0.9 * value(policy, cut.observations[-1])
     assert abs(beyond) > 0.5
     assert last["cut"] - last["ended"] == pytest.approx(beyond, rel=1e-5)
-    assert last["ended"] == pytest.approx(looks_written_out(ended)[-1], rel=1e-5)
+    assert last["ended"] == pytest.approx(action_rewards(ended)[-1], rel=1e-5)
 
 
 def test_trajectories_do_not_influence_each_other() -> None:
@@ -161,7 +162,7 @@ def test_rows_are_actions_in_order() -> None:
 def test_rewards_of_a_held_residual_are_summed() -> None:
     trajectory = make_trajectory(0, 8, hold=3, terminated=True)
     buffer = fill(random_policy(), [trajectory])
-    np.testing.assert_allclose(buffer.rewards[:, 0], looks_written_out(trajectory), rtol=1e-6)
+    np.testing.assert_allclose(buffer.rewards[:, 0], action_rewards(trajectory), rtol=1e-6)
     assert len(buffer.rewards) == 3
     assert buffer.rewards.sum() == pytest.approx(trajectory.reward.sum(), rel=1e-6)
 
@@ -176,7 +177,7 @@ def test_bootstrap_value_uses_the_critic_inputs_of_the_trajectory() -> None:
     policy = random_policy(critic_inputs=1)
     trajectory = make_trajectory(0, 5)
     buffer = fill(policy, [trajectory], [(0.7,)], gae_lambda=1.0)
-    expected = looks_written_out(trajectory)[-1] + 0.9 * value(policy, np.append(trajectory.observations[-1], 0.7))
+    expected = action_rewards(trajectory)[-1] + 0.9 * value(policy, np.append(trajectory.observations[-1], 0.7))
     assert buffer.returns[-1, 0] == pytest.approx(expected, rel=1e-5)
 
 
@@ -244,15 +245,16 @@ def test_rollout_buffer_is_resized_for_each_iteration() -> None:
 )
 def test_discounted_returns_equal_explicit_sums(shapes: list[tuple[int, bool]], hold: int, gamma: float) -> None:
     trajectories = [
-        make_trajectory(seed, decisions, hold, terminated) for seed, (decisions, terminated) in enumerate(shapes)
+        make_trajectory(seed, control_steps, hold, terminated)
+        for seed, (control_steps, terminated) in enumerate(shapes)
     ]
     expected = []
     for trajectory in trajectories:
-        earned = looks_written_out(trajectory)
-        after = 0.0 if trajectory.terminated else sum(earned) / len(earned) / (1.0 - gamma)
-        for t in range(len(earned)):
-            within = sum(gamma ** (later - t) * earned[later] for later in range(t, len(earned)))
-            expected.append(within + gamma ** (len(earned) - t) * after)
+        rewards = action_rewards(trajectory)
+        after = 0.0 if trajectory.terminated else sum(rewards) / len(rewards) / (1.0 - gamma)
+        for t in range(len(rewards)):
+            within = sum(gamma ** (later - t) * rewards[later] for later in range(t, len(rewards)))
+            expected.append(within + gamma ** (len(rewards) - t) * after)
     np.testing.assert_allclose(
         discounted_returns(make_experience(trajectories, [()] * len(trajectories)), gamma),
         expected,
@@ -283,9 +285,9 @@ def test_replay_buffer_equals_that_of_sb3_row_by_row() -> None:
         add_to_replay_buffer(ours, rows, 2.0, rows.rewards)
         for trajectory, more in zip(trajectories, extra, strict=True):
             seen = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
-            residuals, earned = trajectory.actions_and_rewards
-            for choice, (residual, reward) in enumerate(zip(residuals, earned, strict=True)):
-                done = trajectory.terminated and choice == len(earned) - 1
+            residuals, rewards = trajectory.actions_and_rewards
+            for choice, (residual, reward) in enumerate(zip(residuals, rewards, strict=True)):
+                done = trajectory.terminated and choice == len(rewards) - 1
                 action = np.array([np.float32(residual) / np.float32(2.0)])
                 theirs.add(seen[choice], seen[choice + 1], action, reward, np.array(done), [{}])
         assert (ours.pos, ours.full) == (theirs.pos, theirs.full)

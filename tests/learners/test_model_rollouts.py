@@ -29,7 +29,7 @@ torch.set_num_threads(1)
 
 RING = Ring(length=(110, 120), vehicles=9, horizon=120)
 POLICY = PolicySettings(hidden=(16,))
-VIRTUAL = ModelSettings(members=2, hidden=(16,), epochs=2, max_fit_rows=500, k_max=30, kappa=30.0)
+MODEL = ModelSettings(members=2, hidden=(16,), epochs=2, max_fit_rows=500, k_max=30, kappa=30.0)
 SETTINGS = {
     "trpo": TRPOSettings(critic_epochs=2, critic_batch_size=16),
     "ppo": PPOSettings(epochs=3),
@@ -48,11 +48,11 @@ def driver_of(network: Network) -> ResidualDriver:
 
 
 class Trained:
-    """A learner on a small ring of the actual simulator, and what its iterations told."""
+    """A learner on a small ring in SUMO, and its iterations."""
 
-    def __init__(self, simulation: Simulation, agent: str, virtual: ModelSettings | None, **policy: Any) -> None:
+    def __init__(self, simulation: Simulation, agent: str, model: ModelSettings | None, **policy: Any) -> None:
         settings = replace(POLICY, **policy)
-        self.told: list[Iteration] = []
+        self.iterations: list[Iteration] = []
         self.episodes_run = 0
 
         def collect(network: Network, iteration: int) -> TaskEpisodes:
@@ -66,12 +66,12 @@ class Trained:
             ]
 
         self.collect = collect
-        self.training = start_training([TASK], POLICY, SETTINGS[agent], virtual or FREE, 0)
+        self.training = start_training([TASK], POLICY, SETTINGS[agent], model or FREE, 0)
         self.learner: Any = self.training.learner
 
     def learn(self, iterations: int) -> "Trained":
         budget = iterations * 2 * RING.horizon
-        algorithm_1(self.training, budget, self.collect, lambda _: None, lambda done, _: self.told.append(done))
+        algorithm_1(self.training, budget, self.collect, lambda _: None, lambda done, _: self.iterations.append(done))
         return self
 
 
@@ -84,12 +84,14 @@ def shared() -> Iterator[Simulation]:
 @pytest.mark.long
 @every_learner
 def test_model_rows_change_learning_without_environment_steps(agent: str, shared: Simulation) -> None:
-    alone, imagined = (Trained(shared, agent, virtual).learn(2) for virtual in (None, VIRTUAL))
-    assert [entry.environment_steps for entry in imagined.told] == [entry.environment_steps for entry in alone.told]
-    assert imagined.episodes_run == alone.episodes_run == 4
-    assert [entry.model_steps for entry in alone.told] == [0, 0]
-    assert imagined.told[-1].model_steps >= 2 * 2 * RING.horizon
-    assert not same(policy_of(alone), policy_of(imagined))
+    alone, with_model = (Trained(shared, agent, model).learn(2) for model in (None, MODEL))
+    assert [entry.environment_steps for entry in with_model.iterations] == [
+        entry.environment_steps for entry in alone.iterations
+    ]
+    assert with_model.episodes_run == alone.episodes_run == 4
+    assert [entry.model_steps for entry in alone.iterations] == [0, 0]
+    assert with_model.iterations[-1].model_steps >= 2 * 2 * RING.horizon
+    assert not same(policy_of(alone), policy_of(with_model))
 
 
 def policy_of(trained: Trained) -> dict[str, torch.Tensor]:
@@ -99,20 +101,20 @@ def policy_of(trained: Trained) -> dict[str, torch.Tensor]:
 @every_learner
 @pytest.mark.parametrize("update", ["union", "sequential"])
 def test_resumed_learner_has_the_same_model_and_data(agent: str, update: str, shared: Simulation) -> None:
-    virtual = replace(VIRTUAL, update_mode=update, model_updates=2)
-    expected = Trained(shared, agent, virtual).learn(3)
-    stopped = Trained(shared, agent, virtual).learn(1)
-    resumed = Trained(shared, agent, virtual)
+    model = replace(MODEL, update_mode=update, model_updates=2)
+    expected = Trained(shared, agent, model).learn(3)
+    stopped = Trained(shared, agent, model).learn(1)
+    resumed = Trained(shared, agent, model)
     resumed.training.restore(*stopped.training.state())
     resumed.learn(3)
     assert same(resumed.training.state()[1], expected.training.state()[1])
-    assert resumed.told[-1].model == expected.told[-1].model
-    assert resumed.told[-1].model_steps == expected.told[-1].model_steps
+    assert resumed.iterations[-1].model == expected.iterations[-1].model
+    assert resumed.iterations[-1].model_steps == expected.iterations[-1].model_steps
 
 
 @pytest.mark.parametrize("agent", ["trpo", "ppo"])
 def test_the_ratio_is_exactly_one_before_each_update(agent: str, shared: Simulation) -> None:
-    trained = Trained(shared, agent, replace(VIRTUAL, update_mode="sequential", model_updates=2))
+    trained = Trained(shared, agent, replace(MODEL, update_mode="sequential", model_updates=2))
     learner = trained.learner
     seen: list[Update] = []
 
@@ -179,7 +181,7 @@ def test_truncated_rollouts_are_bootstrapped(shared: Simulation) -> None:
 def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
     shared: Simulation, begin: Any, episodes_begun: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rollouts = RowRollouts(replace(VIRTUAL, model_ratio=3.0, rollout_starts=begin), TASK, POLICY, 0)
+    rollouts = RowRollouts(replace(MODEL, model_ratio=3.0, rollout_starts=begin), TASK, POLICY, 0)
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, 10)
     for iteration in (1, 2):
@@ -205,21 +207,21 @@ def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
 
 
 def test_k_star_of_zero_gives_no_model_rows(shared: Simulation) -> None:
-    trained = Trained(shared, "trpo", replace(VIRTUAL, kappa=1e-6)).learn(2)
-    assert [(entry.model[0]["k_star"], entry.model_steps) for entry in trained.told] == [(0, 0), (0, 0)]
+    trained = Trained(shared, "trpo", replace(MODEL, kappa=1e-6)).learn(2)
+    assert [(entry.model[0]["k_star"], entry.model_steps) for entry in trained.iterations] == [(0, 0), (0, 0)]
     assert same(policy_of(trained), policy_of(Trained(shared, "trpo", None).learn(2)))
 
 
 def test_real_ratio_mixes_environment_and_model_rows() -> None:
     sac: Any = start_training([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
     buffer = sac.buffer
-    actual, virtual = (
+    actual, model = (
         rollout_experience(rollouts, rollouts.drawn_values.numpy())
         for rollouts in (rollouts_of(np.full((4, 3), reward), [3] * 4, [False] * 4) for reward in (1.0, 2.0))
     )
     sac.add_rows(buffer, actual)
     assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
-    sac.add_rows(buffer.new_model_buffer(12), virtual)
+    sac.add_rows(buffer.new_model_buffer(12), model)
     buffer.real_ratio = 0.25
     found = buffer.sample(8).rewards.numpy().ravel()
     assert sorted(found) == pytest.approx([0.1] * 2 + [0.2] * 6)
@@ -228,20 +230,20 @@ def test_real_ratio_mixes_environment_and_model_rows() -> None:
 
 
 def test_facts_of_the_model_are_complete(shared: Simulation) -> None:
-    told = Trained(shared, "trpo", VIRTUAL).learn(1).told[0]
-    (virtual,) = told.model
+    iteration = Trained(shared, "trpo", MODEL).learn(1).iterations[0]
+    (model,) = iteration.model
     assert {"k_star", "eps_m", "eps_m_by_estimator", "one_step", "bound", "return_model", "return_environment"} <= set(
-        virtual
+        model
     )
-    assert set(told.seconds) == {"collect", "fit", "roll_out", "update"}
-    assert 0 < told.log["eps_pi_mean"] <= told.log["eps_pi_max"] <= 1
-    assert virtual["bound"] > abs(virtual["return_model"] - virtual["return_environment"])
+    assert set(iteration.seconds) == {"collect", "fit", "roll_out", "update"}
+    assert 0 < iteration.log["eps_pi_mean"] <= iteration.log["eps_pi_max"] <= 1
+    assert model["bound"] > abs(model["return_model"] - model["return_environment"])
 
 
 def test_state_and_restore_keep_calibrated_humans(shared: Simulation) -> None:
-    one, other = (RowRollouts(VIRTUAL, TASK, POLICY, 0) for _ in range(2))
-    people = IDMParameters(time_headway=1.3, max_acceleration=0.8)
-    one.scenario = replace(RING, humans=people)
+    one, other = (RowRollouts(MODEL, TASK, POLICY, 0) for _ in range(2))
+    humans = IDMParameters(time_headway=1.3, max_acceleration=0.8)
+    one.scenario = replace(RING, humans=humans)
     one.data.add([run_episode(RING, PISaturation(), (0,), simulation=shared)], RING)
     facts, tensors = one.state()
     other.restore(json.loads(json.dumps(facts)), tensors)

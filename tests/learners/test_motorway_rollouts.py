@@ -1,4 +1,4 @@
-"""On-ramps that are imagined: the same people come, drive as in actual episodes, and misjudge anew."""
+"""Model rollouts on on-ramps: the same vehicles as in recorded episodes, with new driver errors."""
 
 from dataclasses import replace
 
@@ -30,8 +30,8 @@ from unjam.worlds.worker_pool import EpisodeTask
 ROAD = replace(ON_RAMP, horizon=160, peak=(20.0, 160.0), penetration_rate=0.2)
 EXPERT = driver_from_name("jam-ahead", 1.0)
 POLICY = PolicySettings(hidden=(8,), inputs=("local",), action_duration=5.0, exploration="antithetic")
-VIRTUAL = ModelSettings(kind="road", rollout_starts="first", k_max=160, model_ratio=1.0, max_fit_rows=2000)
-HOW = ExperienceFactory(
+MODEL = ModelSettings(kind="road", rollout_starts="first", k_max=160, model_ratio=1.0, max_fit_rows=2000)
+FACTORY = ExperienceFactory(
     lambda drawn: drawn,
     lambda episodes: join_experience(
         [make_experience(each.trajectories, np.zeros((len(each.trajectories), 0))) for each in episodes]
@@ -107,26 +107,26 @@ def test_base_predicts_drivers_without_errors_except_for_their_memory() -> None:
 @pytest.mark.usefixtures("often")
 def test_rollouts_have_the_set_ratio_in_antithetic_pairs(actual: list[Episode]) -> None:
     task = Task(ROAD, EXPERT)
-    imagination = MotorwayRollouts(replace(VIRTUAL, model_ratio=2.0), task, POLICY, 0)
-    imagination.learn(actual, 1)
-    assert imagination.k_star == 160
+    model_rollouts = MotorwayRollouts(replace(MODEL, model_ratio=2.0), task, POLICY, 0)
+    model_rollouts.learn(actual, 1)
+    assert model_rollouts.k_star == 160
     network = replace(network_of(0.05, POLICY), episode_noise=True)
-    found = imagination.roll_out(network, 1, 0, 1, HOW)
+    found = model_rollouts.roll_out(network, 1, 0, 1, FACTORY)
     assert found is not None
-    assert imagination.model_steps == 2 * len(actual) * 160
-    assert imagination.facts["return_model"] == pytest.approx(imagination.facts["return_environment"], rel=0.1)
-    assert imagination.facts["crash_share"] == 0.0
-    facts, tensors = imagination.state()
-    other = MotorwayRollouts(replace(VIRTUAL, model_ratio=2.0), task, POLICY, 0)
+    assert model_rollouts.model_steps == 2 * len(actual) * 160
+    assert model_rollouts.facts["return_model"] == pytest.approx(model_rollouts.facts["return_environment"], rel=0.1)
+    assert model_rollouts.facts["crash_share"] == 0.0
+    facts, tensors = model_rollouts.state()
+    other = MotorwayRollouts(replace(MODEL, model_ratio=2.0), task, POLICY, 0)
     other.restore(facts, tensors)
-    other._first_new_episode, other.k_star = 0, imagination.k_star
-    repeated = other.roll_out(network, 1, 0, 1, HOW)
+    other._first_new_episode, other.k_star = 0, model_rollouts.k_star
+    repeated = other.roll_out(network, 1, 0, 1, FACTORY)
     assert repeated is not None
     np.testing.assert_array_equal(repeated.observations, found.observations)
     np.testing.assert_array_equal(repeated.rewards, found.rewards)
     driver = full_policy(task, POLICY, network)
     seeds = [((1,), (2,)), ((1,), (2,))]
-    one, mirrored = imagination.simulate(driver, imagination.samples[:1] * 2, 20, seeds, [1.0, -1.0])
+    one, mirrored = model_rollouts.simulate(driver, model_rollouts.samples[:1] * 2, 20, seeds, [1.0, -1.0])
     first, second = one.trajectories[0], mirrored.trajectories[0]
     calm = network(first.observations[:1])
     assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * calm[0])
@@ -134,13 +134,13 @@ def test_rollouts_have_the_set_ratio_in_antithetic_pairs(actual: list[Episode]) 
 
 @pytest.mark.usefixtures("often")
 def test_shorter_rollouts_are_more_and_none_without_cavs(actual: list[Episode]) -> None:
-    imagination = MotorwayRollouts(replace(VIRTUAL, k_max=80), Task(ROAD, EXPERT), POLICY, 0)
-    imagination.learn(actual[:2], 1)
+    model_rollouts = MotorwayRollouts(replace(MODEL, k_max=80), Task(ROAD, EXPERT), POLICY, 0)
+    model_rollouts.learn(actual[:2], 1)
     network = replace(network_of(0.05, POLICY), episode_noise=True)
-    assert imagination.roll_out(network, 1, 0, 1, HOW) is not None
-    assert imagination.model_steps == 2 * 160
-    imagination.k_star = 5
-    assert imagination.roll_out(network, 2, 0, 64, HOW) is None
+    assert model_rollouts.roll_out(network, 1, 0, 1, FACTORY) is not None
+    assert model_rollouts.model_steps == 2 * 160
+    model_rollouts.k_star = 5
+    assert model_rollouts.roll_out(network, 2, 0, 64, FACTORY) is None
 
 
 def test_antithetic_pairs_are_held_out_together(actual: list[Episode], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,12 +148,12 @@ def test_antithetic_pairs_are_held_out_together(actual: list[Episode], monkeypat
     monkeypatch.setattr(motorway_model, "fit_human_model", lambda model, rows, *_, **__: seen.append(rows.episode))
     kept = [motorway_samples(actual[0], number, ROAD, "idm") for number in (6, 7, 8)]
     for twins, numbers in ((1, {6, 7, 8}), (2, {3, 4})):
-        motorway_model.fit_motorway_model(RoadModel(VIRTUAL, (0,)), kept, VIRTUAL, (0,), twins)
+        motorway_model.fit_motorway_model(RoadModel(MODEL, (0,)), kept, MODEL, (0,), twins)
         assert set(seen[-1].tolist()) == numbers
 
 
 def test_base_none_predicts_constant_speed() -> None:
-    model = RoadModel(replace(VIRTUAL, base="none"), (0,))
+    model = RoadModel(replace(MODEL, base="none"), (0,))
     model.noise.fill_(0.3)
     speed, known = np.linspace(5.0, 25.0, 4000), np.linspace(25.0, 5.0, 4000)
     calm, noisy = (
@@ -171,21 +171,21 @@ def test_base_none_predicts_constant_speed() -> None:
 @pytest.mark.usefixtures("often")
 def test_networks_are_used_only_if_the_base_is_wrong(actual: list[Episode]) -> None:
     others = {"time_headways": (1.6, 1.6), "accelerations": (0.73, 0.73), "decelerations": (1.67, 1.67)}
-    for people, learned in (({}, []), (others, ["speed"])):
-        imagination = MotorwayRollouts(replace(VIRTUAL, epochs=60), Task(ROAD, EXPERT), POLICY, 0)
-        imagination.scenario = replace(ROAD, **people)
-        imagination.learn(actual, 1)
-        assert imagination.facts["learned_targets"] == learned
+    for humans, learned in (({}, []), (others, ["speed"])):
+        model_rollouts = MotorwayRollouts(replace(MODEL, epochs=60), Task(ROAD, EXPERT), POLICY, 0)
+        model_rollouts.scenario = replace(ROAD, **humans)
+        model_rollouts.learn(actual, 1)
+        assert model_rollouts.facts["learned_targets"] == learned
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("often")
 def test_networks_without_base_learn_car_following(actual: list[Episode]) -> None:
-    settings = replace(VIRTUAL, base="none", epochs=60)
-    imagination = MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
-    imagination.learn(actual, 1)
-    step = imagination.facts["one_step"]["speed"]
-    assert imagination.facts["learned_targets"] == ["speed"]
+    settings = replace(MODEL, base="none", epochs=60)
+    model_rollouts = MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
+    model_rollouts.learn(actual, 1)
+    step = model_rollouts.facts["one_step"]["speed"]
+    assert model_rollouts.facts["learned_targets"] == ["speed"]
     assert step["base"] == pytest.approx(step["change"], rel=0.05)  # the base: nothing changes
     assert step["model"] < 0.9 * step["base"]
 
@@ -193,9 +193,9 @@ def test_networks_without_base_learn_car_following(actual: list[Episode]) -> Non
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (replace(VIRTUAL, rollout_starts="newest"), "model.rollout_starts: newest is not allowed"),
-        (replace(VIRTUAL, base="acc"), "model.base: acc is not allowed; allowed: idm"),
-        (replace(VIRTUAL, calibrate_base=True), "model.calibrate_base: true is not allowed"),
+        (replace(MODEL, rollout_starts="newest"), "model.rollout_starts: newest is not allowed"),
+        (replace(MODEL, base="acc"), "model.base: acc is not allowed; allowed: idm"),
+        (replace(MODEL, calibrate_base=True), "model.calibrate_base: true is not allowed"),
     ],
 )
 def test_unsupported_settings_are_refused(settings: ModelSettings, words: str) -> None:

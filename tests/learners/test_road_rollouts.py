@@ -1,4 +1,4 @@
-"""Whole roads that are imagined: they are what would have happened."""
+"""Model rollouts on closed roads, compared with recorded episodes."""
 
 import itertools
 import json
@@ -27,13 +27,13 @@ from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask
 
-DECISIONS = 100
+CONTROL_STEPS = 100
 RING = Ring(length=(220, 240), vehicles=20, cavs=2, horizon=400, warmup=0)
 EIGHT = FigureEight(cavs=2, horizon=400)
-"""those who must yield wait, and go"""
+"""with vehicles that must yield"""
 WRONG = replace(RING, sensors=Sensors(0.5, 0.5, dropout=0.1), safety=SafetyFilter(gap_error=0.5, speed_error=0.5))
 POLICY = PolicySettings(hidden=(8,))
-VIRTUAL = ModelSettings(kind="road", k_max=DECISIONS, model_ratio=1.0)
+MODEL = ModelSettings(kind="road", k_max=CONTROL_STEPS, model_ratio=1.0)
 
 
 def network_of(exploration_std: float, policy: PolicySettings = POLICY) -> Network:
@@ -46,8 +46,8 @@ def network_of(exploration_std: float, policy: PolicySettings = POLICY) -> Netwo
     return Network(tuple(layers), 1.0, exploration_std)
 
 
-def as_drawn(road: LoopScenario) -> ExperienceFactory:
-    """How imagined episodes become experience whose critic sees what they drew."""
+def experience_factory(road: LoopScenario) -> ExperienceFactory:
+    """Convert episodes to experience, with the drawn values as inputs of the critic."""
 
     def of_episodes(episodes: Sequence[Episode]) -> Experience:
         pairs = [(episode, each) for episode in episodes for each in episode.trajectories]
@@ -57,45 +57,47 @@ def as_drawn(road: LoopScenario) -> ExperienceFactory:
     return ExperienceFactory(lambda drawn: drawn, of_episodes)
 
 
-def imagined(road: LoopScenario, network: Network) -> tuple[RoadRollouts, list[Episode]]:
-    """What a virtual environment has learned from four episodes, and these."""
+def learned_rollouts(road: LoopScenario, network: Network) -> tuple[RoadRollouts, list[Episode]]:
+    """A model that is fitted to four episodes, and these."""
     task = Task(road, PISaturation())
-    imagination = RoadRollouts(VIRTUAL, task, POLICY, 0)
+    model_rollouts = RoadRollouts(MODEL, task, POLICY, 0)
     driver = full_policy(task, POLICY, network)
     tasks = [EpisodeTask(road, driver, (seed,), explore=True) for seed in range(4)]
     episodes = run_batch(tasks, allow_statistical=True)
-    imagination.learn(episodes, 1)
-    return imagination, episodes
+    model_rollouts.learn(episodes, 1)
+    return model_rollouts, episodes
 
 
 @pytest.mark.parametrize(
     "road", [RING, replace(RING, warmup=300), EIGHT], ids=["a ring", "a ring with a wave", "a figure eight"]
 )
 def test_rollouts_without_noise_equal_the_recording(road: LoopScenario) -> None:
-    imagination, episodes = imagined(replace(road, noise=0.0), network_of(0.0))
-    people = base_human_model("idm", road)
+    model_rollouts, episodes = learned_rollouts(replace(road, noise=0.0), network_of(0.0))
+    humans = base_human_model("idm", road)
     memory = ReplayDriver(np.zeros((0, 2))).initial_memory(2)
     for recording, decision in ((0, 0), (2, 130), (4, 20), (6, 290)):  # each with its neighbour, two CAVs
-        did = [imagination.data.recordings[row].applied_acceleration[decision:] for row in (recording, recording + 1)]
-        (found,) = imagination.simulate(
-            *(ReplayDriver(np.stack(did, 1)), memory, np.array([[recording, decision]])), DECISIONS, people, (1,)
+        did = [
+            model_rollouts.data.recordings[row].applied_acceleration[decision:] for row in (recording, recording + 1)
+        ]
+        (found,) = model_rollouts.simulate(
+            *(ReplayDriver(np.stack(did, 1)), memory, np.array([[recording, decision]])), CONTROL_STEPS, humans, (1,)
         )
-        actual, during = episodes[recording // 2], slice(decision, decision + DECISIONS + 1)
+        actual, during = episodes[recording // 2], slice(decision, decision + CONTROL_STEPS + 1)
         np.testing.assert_allclose(found.speeds, actual.speeds[during], atol=1e-6)
         np.testing.assert_allclose(found.gaps, actual.gaps[during], atol=1e-5)
 
 
 def test_rollouts_continue_with_the_recorded_memory() -> None:
     network = network_of(0.0)
-    imagination, episodes = imagined(replace(RING, noise=0.0), network)
-    imagination.k_star = DECISIONS
-    found = imagination.roll_out(network, 1, 0, 1, as_drawn(RING))
+    model_rollouts, episodes = learned_rollouts(replace(RING, noise=0.0), network)
+    model_rollouts.k_star = CONTROL_STEPS
+    found = model_rollouts.roll_out(network, 1, 0, 1, experience_factory(RING))
     assert found is not None
     actual = [each.actions_and_rewards[1] for episode in episodes for each in episode.trajectories]
     same = 0
-    for earned in found.rewards.reshape(-1, DECISIONS // 10):
+    for rewards in found.rewards.reshape(-1, CONTROL_STEPS // 10):
         windows = [one[at : at + 10] for one in actual for at in range(len(one) - 9)]
-        same += min(np.abs(window - earned).max() for window in windows) < 1e-6
+        same += min(np.abs(window - rewards).max() for window in windows) < 1e-6
     # A quarter begins so late that the record ends before.
     assert same > 0.5 * len(found.starts)
 
@@ -103,34 +105,34 @@ def test_rollouts_continue_with_the_recorded_memory() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("road", [RING, WRONG, EIGHT], ids=["exact sensors", "wrong sensors", "a figure eight"])
 def test_rollouts_with_noise_have_the_returns_of_the_road(road: LoopScenario) -> None:
-    imagination, _ = imagined(road, network_of(0.05))
-    found = imagination.roll_out(network_of(0.05), 1, 0, 1, as_drawn(road))
+    model_rollouts, _ = learned_rollouts(road, network_of(0.05))
+    found = model_rollouts.roll_out(network_of(0.05), 1, 0, 1, experience_factory(road))
     assert found is not None
     assert len(found.rewards) == 2 * 4 * 400 / 10
     assert found.observations.shape[1] == observation_size(POLICY.inputs, PISaturation()) + 1
-    facts = imagination.facts
+    facts = model_rollouts.facts
     assert facts["return_model"] == pytest.approx(facts["return_environment"], rel=0.1)
-    assert facts["k_star"] == DECISIONS
-    assert imagination.model_steps == 4 * 400
+    assert facts["k_star"] == CONTROL_STEPS
+    assert model_rollouts.model_steps == 4 * 400
 
 
 def test_each_rollout_has_its_own_sensor_errors() -> None:
-    imagination, _ = imagined(replace(WRONG, noise=0.0), network_of(0.0))
-    twice, people = np.array([[0, 0], [0, 0]]), base_human_model("idm", RING)
-    one, other = imagination.simulate(IDM(), {}, twice, DECISIONS, people, (1,))
+    model_rollouts, _ = learned_rollouts(replace(WRONG, noise=0.0), network_of(0.0))
+    twice, humans = np.array([[0, 0], [0, 0]]), base_human_model("idm", RING)
+    one, other = model_rollouts.simulate(IDM(), {}, twice, CONTROL_STEPS, humans, (1,))
     assert np.abs(one.speeds - other.speeds).max() > 0.01
 
 
 def test_too_short_k_star_gives_no_rollouts() -> None:
-    imagination, _ = imagined(RING, network_of(0.0))
-    imagination.k_star = 9
-    assert imagination.roll_out(network_of(0.0), 1, 0, 1, as_drawn(RING)) is None
+    model_rollouts, _ = learned_rollouts(RING, network_of(0.0))
+    model_rollouts.k_star = 9
+    assert model_rollouts.roll_out(network_of(0.0), 1, 0, 1, experience_factory(RING)) is None
 
 
 @pytest.mark.parametrize("road", [RING, EIGHT], ids=["a ring", "a figure eight"])
 def test_state_and_restore_keep_samples_and_noise(road: LoopScenario) -> None:
-    one, _ = imagined(road, network_of(0.05))
-    other = RoadRollouts(VIRTUAL, Task(road, PISaturation()), POLICY, 0)
+    one, _ = learned_rollouts(road, network_of(0.05))
+    other = RoadRollouts(MODEL, Task(road, PISaturation()), POLICY, 0)
     facts, tensors = one.state()
     other.restore(json.loads(json.dumps(facts)), tensors)
     assert len(other.samples) == 4

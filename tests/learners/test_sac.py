@@ -128,11 +128,11 @@ def test_rewards_of_sac_are_shifted_by_the_mean_of_the_first_iteration_and_scale
     policy = PolicySettings(hidden=(8,), normalize_value=normalise)
     settings = SACSettings(learning_starts=0, gradient_steps_per_step=0.01, batch_size=8, reward_scale=3.0)
     task = Toy(policy, settings, "sac").learn(2)
-    earned = [
+    rewards = [
         np.concatenate([episode.trajectories[0].reward for episode in entry.episodes[0]]) for entry in task.iterations
     ]
-    offset = earned[0].mean() if normalise else 0.0
-    expected = 3.0 * (np.concatenate(earned) - offset)
+    offset = rewards[0].mean() if normalise else 0.0
+    expected = 3.0 * (np.concatenate(rewards) - offset)
     np.testing.assert_allclose(task.parameters()["replay/rewards"][:, 0], expected, rtol=1e-5, atol=1e-6)
 
 

@@ -87,8 +87,8 @@ def test_lists_become_tuples() -> None:
 
 
 @pytest.mark.parametrize(
-    ("hold", "control_step", "decisions"),
+    ("hold", "control_step", "control_steps"),
     [(1.0, 0.1, 10), (1.0, 1.0, 1), (1.0, 0.2, 5), (0.0, 0.1, 1), (0.5, 1.0, 1), (0.3, 0.1, 3)],
 )
-def test_action_repeat_depends_on_the_control_step(hold: float, control_step: float, decisions: int) -> None:
-    assert PolicySettings(action_duration=hold).action_repeat(control_step) == decisions
+def test_action_repeat_depends_on_the_control_step(hold: float, control_step: float, control_steps: int) -> None:
+    assert PolicySettings(action_duration=hold).action_repeat(control_step) == control_steps

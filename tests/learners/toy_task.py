@@ -21,7 +21,7 @@ from unjam.scenarios import Ring
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Trajectory
 
-INPUTS, DECISIONS = 2, 100
+INPUTS, CONTROL_STEPS = 2, 100
 LENGTHS = (220.0, 270.0)
 QUICK: dict[str, LearnerSettings] = {
     "trpo": TRPOSettings(critic_epochs=3),
@@ -52,18 +52,18 @@ def sloped_target(observations: np.ndarray) -> np.ndarray:
 
 
 def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Target) -> Episode:
-    """An episode in which a residual is held for `hold` decisions."""
+    """An episode in which a residual is held for `hold` control steps."""
     generator = np.random.default_rng(seed)
-    choices = DECISIONS // hold
+    choices = CONTROL_STEPS // hold
     observations = generator.uniform(-1.0, 1.0, size=(choices + 1, INPUTS))
     chosen = network.explore(observations[:-1], generator.normal(size=choices))
     residual = np.repeat(chosen, hold)
     wanted = np.repeat(target(observations[:-1]), hold)
-    nothing = np.zeros(DECISIONS)
+    nothing = np.zeros(CONTROL_STEPS)
     trajectory = Trajectory(
         vehicle="cav_0",
         start_step=0,
-        states=LocalState(*[np.zeros(DECISIONS + 1)] * len(COMMON_FIELDS)),
+        states=LocalState(*[np.zeros(CONTROL_STEPS + 1)] * len(COMMON_FIELDS)),
         observations=observations,
         expert_acceleration=nothing,
         residual=residual,
@@ -76,13 +76,13 @@ def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Targe
         terminated=False,
     )
     drawn = {"length": LENGTHS[seed[-1] % 2]}
-    speeds = np.zeros((DECISIONS + 1, 1))
+    speeds = np.zeros((CONTROL_STEPS + 1, 1))
     return Episode(seed=seed, status="completed", drawn_values=drawn, speeds=speeds, trajectories=(trajectory,))
 
 
 @dataclass
 class Toy:
-    """A learner of the task, and what its iterations told."""
+    """A learner of the task, and its iterations."""
 
     policy: PolicySettings = field(default_factory=lambda: PolicySettings(hidden=(16,), exploration_std=0.2))
     settings: LearnerSettings | None = None
@@ -108,14 +108,14 @@ class Toy:
             ]
         ]
 
-    def run(self, actual_steps: int) -> None:
-        algorithm_1(self.training, actual_steps, self.collect, lambda _: None, self.write)
+    def run(self, environment_steps: int) -> None:
+        algorithm_1(self.training, environment_steps, self.collect, lambda _: None, self.write)
 
     def write(self, iteration: Iteration, _: ValidationReturns) -> None:
         self.iterations.append(iteration)
 
     def learn(self, iterations: int) -> "Toy":
-        self.run(iterations * self.episodes * DECISIONS)
+        self.run(iterations * self.episodes * CONTROL_STEPS)
         return self
 
     def parameters(self) -> dict[str, torch.Tensor]:

@@ -74,14 +74,14 @@ def test_each_member_replays_separately_from_recorded_states() -> None:
     model = alone()
     fit_row_model(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
     choices = data.start_indices(30)[:5]
-    actual, virtual = recorded_states(data, choices, 30), replay_accelerations(model, data, choices, 30, RING)
+    actual, predicted = recorded_states(data, choices, 30), replay_accelerations(model, data, choices, 30, RING)
     for name in STATE_FIELDS:
-        assert virtual[name].shape == (3, 5, 30)
+        assert predicted[name].shape == (3, 5, 30)
         assert actual[name].shape == (5, 31)
         np.testing.assert_array_equal(actual[name][:, 0], getattr(data.states_at(choices), name))
-    assert np.ptp(virtual["leader_speed"], axis=0)[:, -1].min() > 0.0
+    assert np.ptp(predicted["leader_speed"], axis=0)[:, -1].min() > 0.0
     np.testing.assert_allclose(
-        virtual["leader_speed"][1, :1],
+        predicted["leader_speed"][1, :1],
         replay_accelerations(model, data, choices[:1], 30, RING)["leader_speed"][1],
         rtol=1e-4,
     )

@@ -69,10 +69,10 @@ def test_route_position_wraps_around_the_loop() -> None:
 
 
 def test_step_keeps_penetration_rate_and_distance_to_crossing() -> None:
-    told = {"penetration_rate": torch.tensor([0.1, 0.1]), "distance_to_crossing": torch.tensor([20.0, 0.5])}
-    state = some_state(2)._replace(speed=torch.tensor([10.0, 10.0]), **told)
+    provided = {"penetration_rate": torch.tensor([0.1, 0.1]), "distance_to_crossing": torch.tensor([20.0, 0.5])}
+    state = some_state(2)._replace(speed=torch.tensor([10.0, 10.0]), **provided)
     step = world(model(residual={})).step(state, torch.zeros(2), torch.zeros(2, 1))
-    assert_close(step.state.penetration_rate, told["penetration_rate"])
+    assert_close(step.state.penetration_rate, provided["penetration_rate"])
     assert_close(step.state.distance_to_crossing, torch.tensor([19.0, 229.5]))
     silent = world(model(residual={})).step(some_state(2), torch.zeros(2), torch.zeros(2, 1))
     assert silent.state.penetration_rate is silent.state.distance_to_crossing is None

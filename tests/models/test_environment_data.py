@@ -19,10 +19,10 @@ from unjam.worlds.record import Episode, Trajectory
 RING = Ring()
 
 
-def trajectory(number: int, decisions: int, hold: int = 1, terminated: bool = False) -> Trajectory:
+def trajectory(number: int, control_steps: int, hold: int = 1, terminated: bool = False) -> Trajectory:
     """A trajectory in which every number tells where it comes from."""
-    steps = np.arange(decisions + 1, dtype=np.float64) + 1000.0 * number
-    nothing = np.zeros(decisions)
+    steps = np.arange(control_steps + 1, dtype=np.float64) + 1000.0 * number
+    nothing = np.zeros(control_steps)
     return Trajectory(
         vehicle="cav_0",
         start_step=0,
@@ -44,9 +44,9 @@ def episode(*trajectories: Trajectory, length: float = 245.0, status: str = "com
     return Episode(seed=(1,), status=status, drawn_values={"length": length}, trajectories=trajectories)
 
 
-def filled(*decisions: int, rows: int = 10**6, hold: int = 1) -> EnvironmentData:
+def filled(*control_steps: int, rows: int = 10**6, hold: int = 1) -> EnvironmentData:
     data = EnvironmentData(rows)
-    data.add([episode(trajectory(number, count, hold)) for number, count in enumerate(decisions)], RING)
+    data.add([episode(trajectory(number, count, hold)) for number, count in enumerate(control_steps)], RING)
     return data
 
 
@@ -73,13 +73,13 @@ def test_failed_episodes_are_not_stored() -> None:
 
 
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=12), st.integers(1, 60))
-def test_newest_episodes_are_stored_completely(decisions: list[int], rows: int) -> None:
-    data = filled(*decisions, rows=rows)
+def test_newest_episodes_are_stored_completely(control_steps: list[int], rows: int) -> None:
+    data = filled(*control_steps, rows=rows)
     kept = [recording.episode for recording in data.recordings]
-    assert kept == list(range(len(decisions)))[-len(kept) :]
-    assert len(data) == sum(decisions[-len(kept) :])
-    assert len(data) >= min(rows, sum(decisions))
-    assert len(data) - decisions[kept[0]] < rows  # without the oldest there would be too few
+    assert kept == list(range(len(control_steps)))[-len(kept) :]
+    assert len(data) == sum(control_steps[-len(kept) :])
+    assert len(data) >= min(rows, sum(control_steps))
+    assert len(data) - control_steps[kept[0]] < rows  # without the oldest there would be too few
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.5])
@@ -102,9 +102,9 @@ def test_holdout_episode_stays_complete_and_held_out() -> None:
         data.add([episode(trajectory(9, 1))], RING)
 
 
-@pytest.mark.parametrize("decisions", [(10,), (10, 1)])
-def test_end_of_a_single_episode_is_held_out(decisions: tuple[int, ...]) -> None:
-    data = filled(*decisions)
+@pytest.mark.parametrize("control_steps", [(10,), (10, 1)])
+def test_end_of_a_single_episode_is_held_out(control_steps: tuple[int, ...]) -> None:
+    data = filled(*control_steps)
     data.recordings = [replace(recording, episode=0) for recording in data.recordings]
     found = data.transitions(0.2)
     np.testing.assert_array_equal(found.states.speed[found.is_holdout], [8, 9])

@@ -37,7 +37,7 @@ def residual_driver(expert: Driver, hold: int = 1, limit: float = 1.0) -> Residu
 )
 def test_rollout_length_is_equation_15(eps_m: float, k_max: int, kappa: float) -> None:
     found = rollout_length(eps_m, ModelSettings(k_max=k_max, kappa=kappa))
-    expected = 0  # the most decisions whose error adds up to kappa at most, counted one by one
+    expected = 0  # the largest number of steps with a total error of at most kappa
     while expected < k_max and (eps_m == 0.0 or kappa / eps_m >= expected + 1):
         expected += 1
     assert found == expected
@@ -77,12 +77,12 @@ def value(observations: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("hold", [1, 4])
 def test_rollouts_with_true_dynamics_equal_recordings(number: int, hold: int, my_drivers: Path) -> None:
     """From any actual row: the same observations, residuals, rewards, and value targets."""
-    world, gamma, decisions = ToyDynamics(), 0.97, 41
+    world, gamma, control_steps = ToyDynamics(), 0.97, 41
     driver = residual_driver(experts(my_drivers)[number], hold)
     data = actual_data(world, driver, 3, 120, explore=False)
-    choices = data.start_indices(min_control_steps=decisions)
-    found = roll_out(driver, world, prepare_starts(data, choices, driver.expert, "cpu"), decisions, None)
-    made = decisions // hold
+    choices = data.start_indices(min_control_steps=control_steps)
+    found = roll_out(driver, world, prepare_starts(data, choices, driver.expert, "cpu"), control_steps, None)
+    made = control_steps // hold
     assert found.rewards.shape == (len(choices), made)
     assert not found.terminated.any()
     drives = [replay(driver, data, place) for place in range(3)]
@@ -92,15 +92,15 @@ def test_rollouts_with_true_dynamics_equal_recordings(number: int, hold: int, my
         np.testing.assert_allclose(found.observations[row].numpy(), seen, atol=2e-4)
         residuals = driven[1][at : at + made * hold : hold]
         np.testing.assert_allclose(found.actions[row].numpy(), residuals, atol=2e-4)
-        earned = recording.reward[at : at + made * hold].reshape(made, hold).sum(1)
-        np.testing.assert_allclose(found.rewards[row].numpy(), earned, atol=1e-3)
+        rewards = recording.reward[at : at + made * hold].reshape(made, hold).sum(1)
+        np.testing.assert_allclose(found.rewards[row].numpy(), rewards, atol=1e-3)
         powers = gamma ** np.arange(made + 1)
         target = powers @ np.append(found.rewards[row], value(found.observations[row, -1:].numpy()))
-        assert target == pytest.approx(powers @ np.append(earned, value(seen[-1:])), abs=5e-3)
+        assert target == pytest.approx(powers @ np.append(rewards, value(seen[-1:])), abs=5e-3)
 
 
 def replay(driver: ResidualDriver, data: EnvironmentData, place: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the network saw, or would have seen, in every decision of a recording, and its residuals."""
+    """The observation of the network in every control step of a recording, and its residual."""
     recording = data.recordings[place]
     memory, seen, residuals = driver.initial_memory(1), [], []
     for step in range(len(recording.states.speed)):
@@ -143,8 +143,8 @@ class Bounded(ToyDynamics):
     def step(self, state: LocalState, acceleration: torch.Tensor, drawn_values: torch.Tensor) -> ModelTransition:
         self.steps += 1
         always = torch.ones_like(acceleration)
-        told = torch.stack([always, always * 0, always * (self.steps == 1)]) > 0
-        return super().step(state, acceleration, drawn_values)._replace(clipped=told)
+        clipped = torch.stack([always, always * 0, always * (self.steps == 1)]) > 0
+        return super().step(state, acceleration, drawn_values)._replace(clipped=clipped)
 
 
 def test_clipped_share_counts_steps_before_the_crash() -> None:

@@ -21,7 +21,7 @@ MERGE_LIKE = Ring(simulation_step=0.2, steps_per_control_step=5, humans=IDMParam
 
 
 def literal_step(row: dict[str, float], applied: float, ring: Ring) -> dict[str, float]:
-    """One decision written down for one row: IDM behind, constant speed ahead, Euler steps."""
+    """One control step of one row, written out: IDM behind, constant speed ahead, Euler steps."""
     p, dt = ring.humans, ring.simulation_step
     own, behind, gap, gap_behind = row["speed"], row["follower_speed"], row["leader_gap"], row["follower_gap"]
     for _ in range(ring.steps_per_control_step):
@@ -58,7 +58,7 @@ def test_base_step_follows_equations_5_and_6_with_euler_steps(seed: int, ring: R
 @pytest.mark.parametrize("ring", [Ring(), MERGE_LIKE])
 def test_base_step_of_tensors_equals_arrays(base: str, ring: Ring) -> None:
     generator = np.random.default_rng(1)
-    state, applied = with_nobody(random_state(generator, 8)), generator.uniform(-1, 1, 8)
+    state, applied = without_neighbors(random_state(generator, 8)), generator.uniform(-1, 1, 8)
     expected = base_step(base, ring, state, applied)
     tensors = state.map(lambda values: torch.tensor(values))
     found = base_step(base, ring, tensors, torch.tensor(applied))
@@ -66,8 +66,8 @@ def test_base_step_of_tensors_equals_arrays(base: str, ring: Ring) -> None:
         np.testing.assert_allclose(getattr(found, name).numpy(), getattr(expected, name), atol=1e-12)
 
 
-def with_nobody(state: LocalState) -> LocalState:
-    """The same on an open road; nobody is ahead of the first row, and nobody behind the second."""
+def without_neighbors(state: LocalState) -> LocalState:
+    """The same on an open road; the first row has no leader, and the second no follower."""
     gaps, behind = state.leader_gap.copy(), state.follower_gap.copy()
     gaps[0] = behind[1] = MAX_OBSERVED_GAP
     leader, follower = state.leader_speed.copy(), state.follower_speed.copy()
@@ -77,7 +77,7 @@ def with_nobody(state: LocalState) -> LocalState:
 
 
 def test_missing_neighbors_stay_missing() -> None:
-    state = with_nobody(random_state(np.random.default_rng(2), 4))
+    state = without_neighbors(random_state(np.random.default_rng(2), 4))
     found = base_step("idm", MERGE_LIKE, state, np.array([1.0, -1.0, 0.5, 0.0]))
     assert found.leader_gap[0] == MAX_OBSERVED_GAP
     assert found.leader_speed[0] == found.speed[0]
@@ -111,7 +111,7 @@ def expected_reward(name: str, speeds: list[float], headway: float, applied: flo
 @pytest.mark.parametrize("kind", [np.array, torch.tensor])
 @pytest.mark.parametrize("name", ["released", "eq16"])
 def test_reward_uses_the_mean_speed_of_present_vehicles(name: str, kind: Any) -> None:
-    state = with_nobody(random_state(np.random.default_rng(5), 3))
+    state = without_neighbors(random_state(np.random.default_rng(5), 3))
     applied = np.array([0.5, -1.0, 0.0])
     on_kind = state.map(lambda values: kind(values))
     found = base_reward("idm", make_reward(name), on_kind, kind(applied), kind([False, False, False]))

@@ -60,9 +60,9 @@ class ToyDynamics:
 
 
 def drive(
-    world: ToyDynamics, driver: ResidualDriver, seed: int, decisions: int, explore: bool = True, episode: int = 0
+    world: ToyDynamics, driver: ResidualDriver, seed: int, control_steps: int, explore: bool = True, episode: int = 0
 ) -> Recording:
-    """Drive from a random start to the last decision or a crash, and record it."""
+    """Drive from a random start to the last control step or a crash, and record it."""
     generator = np.random.default_rng(seed)
     state = random_state(generator, 1)._replace(
         leader_gap=generator.uniform(10, 30, 1), follower_gap=generator.uniform(10, 30, 1)
@@ -71,7 +71,7 @@ def drive(
     memory = driver.initial_memory(1)
     began = map_leaves(lambda values: np.array(values[0]), memory[EXPERT_KEY])
     states, applied, rewards, crashed = [state], [], [], False
-    while len(applied) < decisions and not crashed:
+    while len(applied) < control_steps and not crashed:
         noise = generator.standard_normal(1)
         decision = driver.decide(state, memory, (lambda: noise) if explore else None)  # noqa: B023
         memory = decision.memory
@@ -102,7 +102,7 @@ def recording(
     drawn: np.ndarray | None = None,
     episode: int = 0,
 ) -> Recording:
-    """Return a recording of which nobody asks what the driver saw and decided."""
+    """Return a recording without observations and decisions of a driver."""
     nothing = np.zeros_like(applied)
     return Recording(
         *("cav", 0, states, np.zeros((1, 0)), applied, nothing, applied, nothing, nothing, memory or {}, hold),
@@ -114,10 +114,10 @@ def recording(
 
 
 def actual_data(
-    world: ToyDynamics, driver: ResidualDriver, episodes: int, decisions: int, explore: bool = True
+    world: ToyDynamics, driver: ResidualDriver, episodes: int, control_steps: int, explore: bool = True
 ) -> EnvironmentData:
     """Return the data of some episodes, one trajectory each."""
-    data = EnvironmentData(episodes * decisions)
-    data.recordings = [drive(world, driver, seed, decisions, explore, episode=seed) for seed in range(episodes)]
+    data = EnvironmentData(episodes * control_steps)
+    data.recordings = [drive(world, driver, seed, control_steps, explore, episode=seed) for seed in range(episodes)]
     data.episode_count = episodes
     return data
