@@ -58,10 +58,8 @@ class Agreement:
 def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
     """Return whether a CSV file names places by `edge` or by `lane`, and its measurements; all in SI units.
 
-    It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown. Other columns are ignored.
-
-    Raises:
-        InputError: the file, a column or all rows are missing, or a value is wrong; the message has the line.
+    It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown, and other columns are ignored. Raise
+    `InputError` if a value is wrong, with its line, and if the file, a column or all rows are missing.
     """
     if not path.is_file():  # reading a device would never end
         raise InputError(f"detectors: {str(path)!r} is not a file; allowed: a CSV file")

@@ -321,16 +321,6 @@ def plotted_result(results: Sequence[ControllerResult]) -> ControllerResult | No
     return recommended_result(results) or _quickest(results)
 
 
-def free_flow_note(baseline: Sequence[dict[str, Any]]) -> str:
-    """Return a sentence if the human baseline has hardly any delay; else an empty text."""
-    time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
-    above_free = delay / (time - delay)
-    if not above_free <= NEGLIGIBLE_DELAY_SHARE:
-        return ""
-    within = max(1, ceil(100 * above_free))
-    return f"Nothing to gain here: the human baseline is within {within} % of free flow. "
-
-
 def assessment_headline(
     results: Sequence[ControllerResult], acc_results: Sequence[AccResult], baseline: Sequence[dict[str, Any]] = ()
 ) -> str:
@@ -363,8 +353,11 @@ def assessment_headline(
         second = f"change travel time by {TOO_SMALL}"
     else:
         second = "are not shown to shorten travel time"
-    if not best and (free := free_flow_note(baseline)):
-        return free + first
+    if best is None:
+        travel_time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
+        if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
+            within = max(1, ceil(100 * delay_share))
+            return f"Nothing to gain here: the human baseline is within {within} % of free flow. {first}"
     return f"{first} ACC vehicles alone {second}."
 
 

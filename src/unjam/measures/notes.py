@@ -51,9 +51,7 @@ def _early_end_text(rows: Sequence[dict[str, Any]]) -> str:
 def check_baseline(rows: Sequence[dict[str, Any]], planned_episodes: int = 0) -> None:
     """Raise `InputError` if so many episodes of the human baseline ended early that comparisons would mislead.
 
-    Args:
-        rows: those of human-only traffic so far.
-        planned_episodes: their planned number, at least.
+    `planned_episodes` is their planned number, if it is larger than that of the `rows` so far.
     """
     if sum(count_early_ends(rows).values()) > MAX_EARLY_END_SHARE * max(len(rows), planned_episodes):
         raise InputError(

@@ -99,9 +99,7 @@ def calibrate(
         seed: of the proposals.
         on_message: called with a line for each trial.
 
-    Raises:
-        InputError: the folder is not empty and of something else.
-        UnjamError: SUMO cannot simulate the original network, or its process was lost repeatedly.
+    Raise `UnjamError` if SUMO cannot simulate the original network, or if its process was lost repeatedly.
     """
     original = dict.fromkeys(space, 1.0)
     log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})

@@ -178,11 +178,7 @@ class RunConfig(AgentSettings):
         return configs
 
     def make_tasks(self) -> list[Task]:
-        """Return the tasks of the training, one for each road.
-
-        Raises:
-            InputError: the inputs of the network would differ between tasks.
-        """
+        """Return the tasks of the training; raise `InputError` if the inputs of the network differ between them."""
         weights = [task.weight for task in self.tasks] or [1.0]
         tasks = [
             Task(road.make_scenario(), road.make_expert(), road.reward, weight, name)
@@ -221,11 +217,8 @@ def planned_steps(config: RunConfig) -> int:
 def load_config(file: Path | None = None, preset: str = "", changes: dict[str, Any] | None = None) -> RunConfig:
     """Return a configuration: the defaults, changed by a preset, a TOML file and `changes`, in this order.
 
-    Keys of `changes` may have dots: `trpo.gamma`.
-
-    Raises:
-        InputError: an unknown key or preset, a value out of range, an unreadable file; or a file in a run folder
-            names Python code that is not trusted.
+    Keys of `changes` may have dots: `trpo.gamma`. Raise `InputError` for an unknown key or preset, a value out of
+    range, an unreadable file, and a file in a run folder that names untrusted Python code.
     """
     file_values = read_toml(file) if file is not None else {}
     if file is not None and _is_in_run_folder(file):  # other files are the user's own

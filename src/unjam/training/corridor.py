@@ -81,8 +81,7 @@ def load_corridor(file: str, detectors: Path, begin: float | None = None, end: f
         begin: start time [s]; None: that of the configuration.
         end: end time [s]; None: that of the configuration, or of the last interval.
 
-    Raises:
-        InputError: an argument is wrong, a detector is not on the network, or nothing can be varied.
+    Raise `InputError` if an argument is wrong, a detector is not on the network, or nothing can be varied.
     """
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")

@@ -19,6 +19,8 @@ from unjam.worlds.record import Episode
 if TYPE_CHECKING:
     import pandas as pd
 
+EFFECT_ENTRIES = ("travel_time", "delay_reduction", "speed", "flow", "fuel", "hard_braking")
+
 
 def rows_to_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
     """Return a row per episode and driver: `driver`, `seed` as text, `status`, and every metric."""
@@ -122,18 +124,12 @@ class DriveResult:
             "episodes": self.rows[driver],
             "mean": {name: summary[name].mean for name in METRICS},
             "ci95": {name: [summary[name].low, summary[name].high] for name in METRICS},
-            "effect": _effect_document(effect) if effect else None,
+            "effect": {name: _mean_and_interval(getattr(effect, name)) for name in EFFECT_ENTRIES} if effect else None,
             "early_ends": count_early_ends(self.rows[driver]),
             "notes": self.notes,
             "folder": str(self.folder) if self.folder else None,
             "report": str(self.report) if self.report else None,
         }
-
-
-def _effect_document(effect: Effect) -> dict[str, Any]:
-    """Return the paired differences to the human baseline as JSON: mean and ends of the CI."""
-    names = ("travel_time", "delay_reduction", "speed", "flow", "fuel", "hard_braking")
-    return {name: _mean_and_interval(getattr(effect, name)) for name in names}
 
 
 def _mean_and_interval(estimate: Estimate) -> list[float]:

@@ -116,11 +116,8 @@ class LocalExecutor:
 def open_executor(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine], Future[int]]]:
     """Yield a function that starts a command line and returns the future of its exit code.
 
-    At most `workers` run at once; on a Ray cluster its machines must share the folders. An exception in the block
-    ends all of them.
-
-    Raises:
-        MissingPartError: Ray is not installed.
+    At most `workers` run at once; the machines of a Ray cluster must share the folders. An exception in the block ends
+    all of them. Raise `MissingPartError` if Ray is not installed.
     """
     local = LocalExecutor()
     opened = _open_ray(workers) if executor == "ray" else nullcontext(local.run)
@@ -136,9 +133,7 @@ def open_executor(executor: Executor, workers: int) -> Iterator[Callable[[Comman
 def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, on_message: MessageCallback) -> None:
     """Run command lines, given by name, `workers` at once; `on_message` is called when one has ended.
 
-    Raises:
-        UnjamError: one or several failed; all others have run.
-        MissingPartError: Ray is not installed.
+    Raise `UnjamError` at the end if one failed, and `MissingPartError` if Ray is not installed.
     """
     if not commands:
         return

@@ -20,7 +20,6 @@ from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork
 from unjam.sumo_files import read_sumo_files
 from unjam.training.config import RunConfig
-from unjam.worlds.episode import Task
 
 _LOG = logging.getLogger(__name__)
 
@@ -31,19 +30,19 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
     `settings` has all but steps and workers, by name; `files` the hashes of the experts and of the user's code and
     networks; `packages` and `kernels` the numerical environment.
     """
-    tasks = zip(config.task_configs().values(), config.make_tasks(), strict=True)
-    files = {name: sha256 for each, task in tasks for name, sha256 in _task_file_hashes(each, task).items()}
+    files: dict[str, str] = {}
+    for each, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):
+        recipe, arrays = driver_recipe(task.expert)
+        weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
+        files[f"expert {each.expert}"] = sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)
+        files |= file_hashes((each.reward, *each.policy.inputs), task.scenario)
     settings = flatten_keys(asdict(replace(config, steps=1, workers=1)))
     entries = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
     return json.loads(to_json(entries))
 
 
 def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
-    """Compare the fingerprint of a checkpoint with the current one; other packages and kernels only give a warning.
-
-    Raises:
-        InputError: a setting, the expert or a file of the user has changed.
-    """
+    """Raise `InputError` if a setting, the expert or a user file has changed; warn of other packages and kernels."""
     for name, value in current["settings"].items():
         if name in stored["settings"] and stored["settings"][name] != value:
             raise invalid_value(f"resume: {name}", value, f"{stored['settings'][name]!r}, as in the checkpoint")
@@ -58,14 +57,6 @@ def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: 
     for name in sorted(stored["files"].keys() | current["files"].keys()):
         if stored["files"].get(name) != current["files"].get(name):
             raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
-
-
-def _task_file_hashes(config: RunConfig, task: Task) -> dict[str, str]:
-    """Return the hashes of a task by the name of what they cover."""
-    recipe, arrays = driver_recipe(task.expert)
-    weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
-    hashes = {f"expert {config.expert}": sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)}
-    return hashes | file_hashes((config.reward, *config.policy.inputs), task.scenario)
 
 
 def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:

@@ -109,17 +109,13 @@ ROAD_GROUPS = (*dict.fromkeys(GROUP_BY_SCENARIO.values()), SHARED_RINGS_GROUP, A
 """names of all groups"""
 
 
-def _is_in(road: FamilyRoad, group: str) -> bool:
-    """Return whether a road belongs to a group, one of `ROAD_GROUPS`."""
-    if group == SHARED_RINGS_GROUP:
-        options = road.options
-        return road.scenario == "ring" and options["cavs"] >= MIN_SHARED_PENETRATION_RATE * options["vehicles"]
-    return group in (GROUP_BY_SCENARIO[road.scenario], ALL_ROADS_GROUP)
-
-
 def family_roads(group: str) -> dict[str, FamilyRoad]:
     """Return all roads of a group, one of `ROAD_GROUPS`, by name."""
-    return {name: road for name, road in FAMILY.items() if _is_in(road, group)}
+    if group == SHARED_RINGS_GROUP:
+        rings, limit = family_roads(GROUP_BY_SCENARIO["ring"]), MIN_SHARED_PENETRATION_RATE
+        return {name: ring for name, ring in rings.items() if ring.options["cavs"] >= limit * ring.options["vehicles"]}
+    groups = {name: (GROUP_BY_SCENARIO[road.scenario], ALL_ROADS_GROUP) for name, road in FAMILY.items()}
+    return {name: road for name, road in FAMILY.items() if group in groups[name]}
 
 
 def family_scenarios(group: str, *parts: FamilyPart) -> dict[str, Scenario]:

@@ -105,12 +105,9 @@ def make_new_folder(folder: Path, alternative: str = "") -> None:
 
 @contextmanager
 def lock_new_folder(folder: Path, resumable_file: str = "") -> Iterator[None]:
-    """Make a folder and lock it for this process; a folder that stays empty is removed again.
+    """Make a folder and lock it for this process; remove it if it stays empty.
 
-    An existing folder is allowed if it has the file `resumable_file`.
-
-    Raises:
-        InputError: the folder is not empty, or another process has locked it.
+    Raise `InputError` if it is locked, or not empty and without the file `resumable_file`.
     """
 
     def check() -> None:
@@ -127,11 +124,7 @@ def lock_new_folder(folder: Path, resumable_file: str = "") -> Iterator[None]:
 
 
 def create_run_folder(folder: Path, config: RunConfig) -> None:
-    """Make the folder of a new run with its configuration and manifest.
-
-    Raises:
-        InputError: the folder is not empty.
-    """
+    """Make the folder of a new run, with configuration and manifest; raise `InputError` if it is not empty."""
     make_new_folder(folder, f", or --resume {folder}")
     atomic_write(folder / CONFIG_FILE, to_toml(config))
     _write_manifest(folder)
@@ -142,12 +135,9 @@ def _write_manifest(folder: Path) -> None:
 
 
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
-    """Return the configuration of a run folder.
+    """Return the configuration of a run folder; raise `InputError` if it is none, or of another format.
 
-    Without `check_trust` the configuration may name Python code that is not trusted; then nothing of it may be run.
-
-    Raises:
-        InputError: it is not a run folder, or one of another format, or it names untrusted code.
+    With `check_trust` also if the configuration names untrusted Python code; without, nothing of it may be run.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
@@ -155,27 +145,18 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     try:
         return load_config(path) if check_trust else build_dataclass(RunConfig, read_toml(path), "")
     except InputError:
-        _check_format(folder)
+        with suppress(OSError, ValueError, RecursionError, AttributeError, KeyError):
+            made = json.loads((folder / MANIFEST_FILE).read_text())
+            if (found := made.get("format", 4)) != CHECKPOINT_FORMAT:
+                version = f"format {found}, written by unjam {made['unjam']} (commit {made['commit']})"
+                raise InputError(f"run: {str(folder)!r} has {version}; allowed: format {CHECKPOINT_FORMAT}") from None
         raise
 
 
-def _check_format(folder: Path) -> None:
-    """Raise `InputError` if the manifest of a run folder says that it has another format."""
-    made: Any = {}
-    with suppress(OSError, ValueError, RecursionError):
-        made = json.loads((folder / MANIFEST_FILE).read_text())
-    if isinstance(made, dict) and "unjam" in made and made.get("format") != CHECKPOINT_FORMAT:
-        raise InputError(
-            f"run: {str(folder)!r} has format {made.get('format', 4)}, written by unjam {made['unjam']}, started "
-            f"{made.get('started')}; allowed: format {CHECKPOINT_FORMAT}: train again"
-        )
-
-
 def resume_run_folder(folder: Path, config: RunConfig) -> None:
-    """Check that `config` can resume the run in `folder`, and write its new budget.
+    """Write the new budget of `config` into the run in `folder`.
 
-    Raises:
-        InputError: more than the steps and the number of workers differs, or the folder belongs to one task of a run.
+    Raise `InputError` if more than steps and workers differs, or if the folder belongs to one task of a run.
     """
     parent = folder.absolute().parent
     if folder.name in _task_names(parent):
@@ -243,10 +224,8 @@ def restore_newest_checkpoint(
 ) -> "tuple[dict[str, Any], Tensors] | None":
     """Return the newest checkpoint of a run; None before the first one.
 
-    Everything later than the checkpoint is removed: rows of progress in `progress_folders`, and incomplete files.
-
-    Raises:
-        InputError: no checkpoint is valid, or its fingerprint differs from the `expected` one.
+    Everything later is removed: rows of progress in `progress_folders`, and incomplete files. Raise `InputError` if no
+    checkpoint is valid, or if its fingerprint differs from the `expected` one.
     """
     checkpoint = load_checkpoint(folder / "checkpoint")
     if checkpoint and expected and "fingerprint" in checkpoint[0]:
@@ -263,11 +242,7 @@ def restore_newest_checkpoint(
 
 
 def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
-    """Return the newest valid checkpoint; None if there is none at all.
-
-    Raises:
-        InputError: all checkpoints are damaged, or of another format.
-    """
+    """Return the newest valid checkpoint, or None; raise `InputError` if all are damaged or of another format."""
     from safetensors.torch import load
 
     for place, state, data in _valid_checkpoints(folder):

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -53,32 +54,23 @@ def list_runs(root: Path | str = "runs", scenario: str = "") -> list[Run]:
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"root: {str(root)!r} is not a folder; allowed: a folder with run folders")
-    runs = [_read_listed_run(folder, str(folder.relative_to(root))) for folder in sorted(_run_folders(root))]
-    return [
-        run
-        for run in runs
-        if not scenario or scenario in {Path(task.scenario).name for task in run.config.task_configs().values()}
-    ]
+    runs: list[Run] = []
+    for folder, config in _run_folders(root):
+        if not scenario or scenario in {Path(task.scenario).name for task in config.task_configs().values()}:
+            name = str(folder.relative_to(root))
+            try:
+                runs.append(read_run(folder, name))
+            except InputError:
+                runs.append(Run(name, folder, config, "damaged", 0, dict.fromkeys(config.task_configs())))
+    return sorted(runs, key=lambda run: run.folder)
 
 
-def _read_listed_run(folder: Path, name: str) -> Run:
-    """Return a run; a damaged one has this state."""
-    try:
-        return read_run(folder, name)
-    except InputError:
-        config = read_config(folder, check_trust=False)
-        return Run(name, folder, config, "damaged", 0, dict.fromkeys(config.task_configs()))
-
-
-def _run_folders(root: Path) -> Iterator[Path]:
+def _run_folders(root: Path) -> Iterator[tuple[Path, RunConfig]]:
     for place, subfolders, files in os.walk(root):
         if {CONFIG_FILE, MANIFEST_FILE} <= set(files):
             subfolders.clear()  # the tasks of a run are not runs
-            try:
-                read_config(Path(place), check_trust=False)
-            except UnjamError:  # of another version, or another program
-                continue
-            yield Path(place)
+            with suppress(UnjamError):  # folders of other versions or programs
+                yield Path(place), read_config(Path(place), check_trust=False)
 
 
 def read_run(folder: Path, name: str = "") -> Run:

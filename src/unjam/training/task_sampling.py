@@ -110,12 +110,8 @@ def warm_up_iterations(
 ) -> range:
     """Return the iterations with a common warm-up of their rings: `iteration` and some that follow.
 
-    Args:
-        iteration: number of the current one.
-        remaining_steps: environment steps, including those of the current iteration.
-        steps_per_iteration: environment steps of an iteration.
-        tasks: tasks of the training.
-        counts: episodes of each task in an iteration; if they fill the cache of warm-up states, there is no other one.
+    Their number is limited by the `remaining_steps` of the training, those of `iteration` included, and by the cache of
+    warm-up states, which has room for the `counts` of episodes of each task in so many iterations.
     """
     pairs = zip((task.scenario for task in tasks), counts, strict=True)
     cavs = sum(count * scenario.cavs for scenario, count in pairs if isinstance(scenario, Ring))
