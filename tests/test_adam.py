@@ -7,7 +7,7 @@ from unjam.adam import Adam
 
 
 @pytest.mark.parametrize("fused", [True, False])
-def test_it_steps_as_torchs_to_the_bit_and_goes_on_from_its_state(fused: bool) -> None:
+def test_adam_equals_torchs_to_the_bit_and_resumes_from_its_state(fused: bool) -> None:
     def trained(kind: type[torch.optim.Adam]) -> list[bytes]:
         torch.manual_seed(0)
         network = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))

@@ -11,7 +11,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
 EXAMPLES = dict(re.findall(r"^### ([^\n]+)\n.*?^```python\n(.*?)^```$", PAGE, flags=re.S | re.M))
 
 
-def test_the_page_works_six_of_the_ten_changes() -> None:
+def test_the_page_has_six_worked_examples_of_ten_changes() -> None:
     assert len(EXAMPLES) == 6
     table = PAGE.partition("## Ten changes")[2].partition("\nSix of them")[0]
     assert len(re.findall(r"^\| [^|]+ \| \d \|", table, flags=re.M)) == 10
@@ -28,7 +28,7 @@ def test_an_example_of_the_architecture_runs(title: str, tmp_path: Path, monkeyp
         RECIPE_BUILDERS.update(before)
 
 
-def test_the_house_has_the_rooms_that_the_page_names() -> None:
+def test_the_page_lists_all_sub_packages() -> None:
     house = PAGE.partition("## The house")[2].partition("\n## ")[0]
     named = set(re.findall(r"^\| `(\w+)/`", house, flags=re.M))
     rooms = {place.parent.name for place in Path(__file__).parents[1].glob("src/unjam/*/__init__.py")}

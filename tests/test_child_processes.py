@@ -28,13 +28,15 @@ def test_a_child_and_its_children_search_no_relative_folder(
         assert not [each for each in path if not os.path.isabs(each) or str(tmp_path) in each]
 
 
-def test_the_folder_that_unjam_itself_comes_from_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_of_unjam_itself_stays_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(Path(PACKAGE_PARENT).parent)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([Path(PACKAGE_PARENT).name, "."]))
     assert child_environment()["PYTHONPATH"] == PACKAGE_PARENT
 
 
-def test_a_child_gets_what_the_program_added_to_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_inherits_the_folders_that_the_program_added_to_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     script, mine, here = tmp_path / "script", tmp_path / "mine", tmp_path / "here"
     packages = tmp_path / "site-packages"
     for folder in (script, mine, here, packages):

@@ -23,13 +23,13 @@ from unjam.worlds.reward import make_reward
         (lambda: load_config(changes={"scenaro": "ring"}), "scenario"),
     ],
 )
-def test_a_name_that_is_nearly_right_is_suggested(make: Callable[[], object], meant: str) -> None:
+def test_a_similar_name_is_suggested(make: Callable[[], object], meant: str) -> None:
     with pytest.raises(InputError) as caught:
         make()
     assert str(caught.value).endswith(f"; did you mean {meant!r}?")
 
 
-def test_nothing_is_suggested_for_what_is_like_nothing() -> None:
+def test_nothing_is_suggested_without_a_similar_name() -> None:
     with pytest.raises(InputError) as caught:
         make_scenario("xyz")
     assert "did you mean" not in str(caught.value)

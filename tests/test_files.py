@@ -27,7 +27,7 @@ from unjam.folders import protect_folder
 from unjam.processes import bind_to_parent, lock_folder
 
 
-def test_writes_text_and_bytes_over_what_was_there(tmp_path: Path) -> None:
+def test_text_and_bytes_replace_the_previous_content(tmp_path: Path) -> None:
     path = tmp_path / "file"
     atomic_write(path, "grün\n")
     assert path.read_bytes() == "grün\n".encode()
@@ -38,7 +38,7 @@ def test_writes_text_and_bytes_over_what_was_there(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO])
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_a_failed_write_leaves_what_was_there(
+def test_a_failed_write_keeps_the_previous_content(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, number: int
 ) -> None:
     path = tmp_path / "file"
@@ -56,7 +56,7 @@ def test_a_failed_write_leaves_what_was_there(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of files")
-def test_a_write_that_the_system_cuts_short_leaves_what_was_there(tmp_path: Path) -> None:
+def test_a_write_that_the_system_cuts_short_keeps_the_previous_content(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("old")
     program = f"""
@@ -77,7 +77,7 @@ except DiskError as error:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_an_error_that_is_not_the_disks_stays_what_it_is(tmp_path: Path) -> None:
+def test_an_error_that_is_not_about_the_disk_is_unchanged(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         atomic_write(tmp_path / "nowhere" / "file", "new")
 
@@ -98,7 +98,7 @@ def test_appending_to_a_full_disk_is_a_disk_error(tmp_path: Path, monkeypatch: p
         append_line(tmp_path / "lines", "more")
 
 
-def test_makes_a_folder_and_those_above_it_and_may_find_it_there(tmp_path: Path) -> None:
+def test_makes_a_folder_and_its_parents_unless_it_exists(tmp_path: Path) -> None:
     for _ in range(2):
         make_folder(tmp_path / "a" / "b")
     assert (tmp_path / "a" / "b").is_dir()
@@ -169,7 +169,7 @@ DEEP: dict[str, Writer] = {
 
 
 @pytest.mark.parametrize("how", DEEP)
-def test_inside_a_held_folder_no_path_leads_out(how: str, outside: Path, tmp_path: Path) -> None:
+def test_inside_a_protected_folder_no_path_leads_out(how: str, outside: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "results").symlink_to("elsewhere")  # the user's own choice
     results = tmp_path / "results"
@@ -183,9 +183,7 @@ def test_inside_a_held_folder_no_path_leads_out(how: str, outside: Path, tmp_pat
         pass
 
 
-def test_a_folder_in_place_of_a_link_and_a_removed_folder_spare_what_links_lead_to(
-    outside: Path, tmp_path: Path
-) -> None:
+def test_replacing_and_removing_folders_never_touches_the_targets_of_links(outside: Path, tmp_path: Path) -> None:
     (tmp_path / "it").symlink_to(outside)
     write_folder(tmp_path / "it", {"file": "new"})
     assert (tmp_path / "it" / "file").read_text() == "new"
@@ -198,14 +196,14 @@ def test_a_folder_in_place_of_a_link_and_a_removed_folder_spare_what_links_lead_
     assert [path.name for path in tmp_path.iterdir()] == ["outside"]
 
 
-def test_a_link_that_leads_nowhere_is_no_place_for_a_folder(tmp_path: Path) -> None:
+def test_a_folder_is_not_made_in_place_of_a_broken_link(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("nowhere")
     with pytest.raises(InputError, match="link' is a symbolic link"):
         make_folder(tmp_path / "link")
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_a_child_process_follows_no_link_in_what_its_parent_holds(outside: Path, tmp_path: Path) -> None:
+def test_a_child_process_follows_no_link_in_a_folder_that_its_parent_protects(outside: Path, tmp_path: Path) -> None:
     (tmp_path / "results" / "trials").mkdir(parents=True)
     code = (
         "import sys\nfrom pathlib import Path\nfrom unjam.errors import InputError\n"
@@ -222,7 +220,7 @@ def test_a_child_process_follows_no_link_in_what_its_parent_holds(outside: Path,
 
 
 @pytest.mark.parametrize("before", WRITERS)
-def test_without_handles_of_folders_links_are_refused_too(
+def test_without_handles_of_folders_links_are_refused_as_well(
     before: str, outside: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "supports_dir_fd", set())  # as on Windows
@@ -237,7 +235,7 @@ def test_without_handles_of_folders_links_are_refused_too(
             WRITERS[before](tmp_path / "results" / "sub" / "file")
 
 
-def test_what_is_left_of_a_killed_write_has_a_name_that_nobody_can_guess(
+def test_the_leftover_of_a_killed_write_has_a_name_that_cannot_be_guessed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def die(*_: object, **options: object) -> None:
@@ -263,6 +261,6 @@ def test_json_has_null_where_a_number_is_not_finite(value: float) -> None:
         lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
     )
 )
-def test_json_gives_back_every_finite_value(value: object) -> None:
+def test_json_preserves_every_finite_value(value: object) -> None:
     assert json.loads(to_json(value)) == value
     assert json.loads(to_json(value, indent=1)) == value

@@ -17,7 +17,7 @@ def test_all_tested_versions_have_hashes() -> None:
     assert pinned("hashes/all.txt") == pinned("constraints.txt")
 
 
-def test_what_drives_is_installed_by_hash_in_the_tested_versions() -> None:
+def test_core_packages_are_installed_by_hash_in_the_tested_versions() -> None:
     tested, core = pinned("constraints.txt"), pinned("hashes/core.txt")
     assert core.pop("colorama")  # on Windows alone, where nothing was tested
     assert core.items() <= tested.items()

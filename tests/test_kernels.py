@@ -62,7 +62,7 @@ STATE = "import {first}, json; import unjam; from unjam.kernels import kernel_in
 
 @pytest.mark.long
 @needs_avx2
-def test_whatever_the_shell_says_the_bits_are_the_committed_ones() -> None:
+def test_the_bits_are_the_committed_ones_whatever_the_environment() -> None:
     assert run(OPERATIONS, **UNPINNED) == GOLDEN["operations"]
 
 
@@ -92,7 +92,7 @@ def test_trainings_of_all_learners_end_with_the_committed_bits() -> None:
 
 @pytest.mark.long
 @needs_avx2
-def test_says_what_is_in_force() -> None:
+def test_kernel_info_describes_the_active_kernels() -> None:
     found = run(STATE.format(first="unjam, torch"))
     assert found["pinned"]
     assert found["unpinned_reason"] is None
@@ -103,14 +103,14 @@ def test_says_what_is_in_force() -> None:
 
 
 @needs_avx2
-def test_says_that_numpy_came_first() -> None:
+def test_kernel_info_reports_that_numpy_was_imported_first() -> None:
     found = run(STATE.format(first="numpy"))
     assert not found["pinned"]
     assert found["unpinned_reason"] == "numpy was imported before unjam"
     assert run(STATE.format(first="numpy"), **kernels.kernel_settings())["pinned"]
 
 
-def test_leaves_all_as_it_is_where_asked() -> None:
+def test_native_kernels_change_no_variable() -> None:
     found = run(STATE.format(first="unjam"), **{kernels.KERNELS_VARIABLE: "native"})
     assert not found["pinned"]
     assert set(found["settings"].values()) == {None}
@@ -119,9 +119,7 @@ def test_leaves_all_as_it_is_where_asked() -> None:
 @pytest.mark.parametrize(
     ("machine", "flags", "words"), [("aarch64", "asimd", "not x86-64"), ("x86_64", "sse2 avx", "no AVX2")]
 )
-def test_asks_nothing_of_other_processors(
-    machine: str, flags: str, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_processors_are_not_pinned(machine: str, flags: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "machine", lambda: machine)
     monkeypatch.setattr(kernels, "processor_info", lambda: {"flags": flags})
     assert words in (kernels._find_obstacle() or "")
@@ -156,7 +154,7 @@ except InputError as error:
 
 @pytest.mark.long
 @needs_avx2
-def test_what_is_wrong_is_told_by_the_other_process_too(tmp_path: Path) -> None:
+def test_errors_of_the_pinned_process_are_reported(tmp_path: Path) -> None:
     (tmp_path / "something").touch()
     program = LATE.partition("config = ")[0] + REFUSED
     given = json.dumps([asdict(small_config()), str(tmp_path)])

@@ -122,7 +122,7 @@ def test_a_module_imports_only_what_lies_below_it() -> None:
         assert own_imports(tree) <= allowed_parts(part_of(module)), module
 
 
-def test_what_all_may_import_imports_no_layer() -> None:
+def test_common_modules_import_no_layer() -> None:
     for part in EVERYWHERE - {""}:
         assert own_imports(MODULES[f"{part}.py"]) <= EVERYWHERE
 
@@ -138,7 +138,7 @@ def test_reports_read_folders_and_know_neither_learners_nor_trainings() -> None:
             assert not own_imports(tree) & {"learners", "training", "controller", "cli"}, module
 
 
-def test_what_measures_draws_nothing() -> None:
+def test_measures_draw_nothing() -> None:
     drawing = {"matplotlib", "PIL"}
     for module in importers(drawing):
         assert part_of(module) != "measures", module
@@ -152,7 +152,7 @@ def test_sumo_is_imported_in_one_place() -> None:
     assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/backends.py"}
 
 
-def test_learning_libraries_are_imported_only_where_we_learn() -> None:
+def test_learning_libraries_are_imported_only_by_learning_parts() -> None:
     found = importers(TORCH)
     parts = {part_of(module) for module in found}
     assert parts <= {"adam", "controller", "following", "learners", "models", "training", "unjam_paper"}
@@ -272,7 +272,7 @@ def changes_files(call: ast.Call) -> bool:
         *("figure.savefig(path)", "frame.to_csv(path)", "np.savez(path, a)", "image.save(path)"),
     ],
 )
-def test_a_call_that_changes_files_is_recognised(line: str) -> None:
+def test_a_call_that_changes_files_is_recognized(line: str) -> None:
     assert changes_files(next(calls(ast.parse(line))))
 
 
@@ -336,7 +336,7 @@ CHANGES_THE_PROCESS = {
 """modules that make such calls, and when"""
 
 
-def test_what_holds_for_a_whole_process_is_changed_only_where_it_may_be() -> None:
+def test_process_wide_settings_are_changed_only_in_the_listed_modules() -> None:
     found = {
         module.removesuffix(".py")
         for module, tree in MODULES.items()
@@ -346,7 +346,7 @@ def test_what_holds_for_a_whole_process_is_changed_only_where_it_may_be() -> Non
     assert found == set(CHANGES_THE_PROCESS)
 
 
-def test_a_file_can_be_read_at_one_sitting() -> None:
+def test_modules_are_short() -> None:
     lengths = {module: len(text.splitlines()) for module, text in TEXTS.items()}
     assert not {module: lines for module, lines in lengths.items() if lines > MAX_MODULE_LINES}
 
@@ -376,7 +376,7 @@ def test_help_loads_nothing_that_takes_time() -> None:
     assert not found & (TORCH | {"libsumo", "traci", "matplotlib", "pandas", "scipy", "cryptography"})
 
 
-def test_what_learns_nothing_loads_no_learning_library() -> None:
+def test_modules_without_learning_load_no_learning_library() -> None:
     of_training = [f"unjam.training.{name}" for name in ("evaluate", "run_folder", "config")]
     modules = ["unjam.worlds.worker", "unjam.controller", *of_training]
     found = loaded_by(f"import {', '.join(modules)}")

@@ -19,7 +19,7 @@ def git(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, check=False)
 
 
-def test_names_what_the_result_depends_on() -> None:
+def test_the_manifest_names_versions_and_machine() -> None:
     made = manifest()
     assert made["unjam"] == unjam.__version__
     assert made["python"] == ".".join(map(str, sys.version_info[:3]))
@@ -28,16 +28,16 @@ def test_names_what_the_result_depends_on() -> None:
     assert made["machine"]["cores"] >= 1
 
 
-def test_is_json() -> None:
+def test_the_manifest_is_json() -> None:
     assert json.loads(json.dumps(manifest())).keys() == manifest().keys()
 
 
-def test_was_made_now() -> None:
+def test_the_manifest_has_the_current_time() -> None:
     age = datetime.now(UTC) - datetime.fromisoformat(manifest()["started"])
     assert timedelta(seconds=-2) < age < timedelta(minutes=1)
 
 
-def test_names_the_command_without_the_place_of_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_manifest_names_the_command_without_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["/somewhere/bin/unjam", "train", "--set", "seed=3"])
     assert manifest()["command"] == ["unjam", "train", "--set", "seed=3"]
 
@@ -48,18 +48,18 @@ def test_a_package_that_is_missing_has_no_version(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.skipif(not shutil.which("git") or git("rev-parse").returncode != 0, reason="no checkout")
-def test_names_the_commit_of_its_source() -> None:
+def test_the_manifest_names_the_commit_of_its_source() -> None:
     commit = manifest()["commit"]
     assert git("rev-parse", commit.removesuffix("+")).stdout == git("rev-parse", "HEAD").stdout
 
 
-def test_elsewhere_than_in_a_checkout_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outside_a_checkout_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "__file__", str(tmp_path / "manifest.py"))
     assert manifest()["commit"] is None
 
 
 @pytest.mark.skipif(not shutil.which("git"), reason="no git")
-def test_of_a_package_inside_another_repository_nothing_is_asked(
+def test_git_is_not_called_for_a_package_inside_another_repository(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The settings of a repository name programs that Git runs."""
@@ -94,7 +94,7 @@ OF_RECORDED_PEOPLE = {"field/field", "field/ngsim-drivers"}
 """among whom is no CAV"""
 
 
-def test_no_result_with_cavs_is_older_than_their_filter() -> None:
+def test_no_result_with_cavs_is_older_than_the_safety_filter() -> None:
     older = set[str]()
     for path in RESULTS.glob("*.json"):
         for name, found in read_parts(path).items():

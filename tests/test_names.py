@@ -34,5 +34,7 @@ def test_a_public_name_has_one_definition() -> None:
 
 
 def test_definitions_of_all_kinds_are_found() -> None:
-    source = "import a\nA = B, C = 1, 2\nD: int = 3\nD += 1\n_E = 4\nclass F: G = 5\ndef h(): i = 6\nasync def j(): ...\n"
+    source = (
+        "import a\nA = B, C = 1, 2\nD: int = 3\nD += 1\n_E = 4\nclass F: G = 5\ndef h(): i = 6\nasync def j(): ...\n"
+    )
     assert sorted(public_names(ast.parse(source))) == ["A", "B", "C", "D", "F", "h", "j"]

@@ -41,7 +41,7 @@ class Outer:
         return self
 
 
-def test_builds_nested_parameters() -> None:
+def test_nested_parameters_are_built() -> None:
     made = build_dataclass(Outer, {"needed": 2, "inner": {"size": 3}, "names": ["a"], "extra": 3}, "here")
     assert made == Outer(needed=2.0, inner=Inner(size=3), names=("a",), extra=3)
     assert type(made.needed) is float
@@ -65,7 +65,7 @@ def test_builds_nested_parameters() -> None:
         ({"needed": 1, "names": [1]}, "here.names.0: 1 is not allowed; allowed: a valid string"),
     ],
 )
-def test_says_in_one_line_what_is_wrong(values: dict[str, Any], line: str) -> None:
+def test_an_invalid_value_is_reported_in_one_line(values: dict[str, Any], line: str) -> None:
     with pytest.raises(InputError) as caught:
         build_dataclass(Outer, values, "here")
     assert str(caught.value) == line
@@ -97,26 +97,26 @@ def test_without_a_field_the_line_begins_with_the_name() -> None:
         ("my driver.py:x", "my driver.py:x"),
     ],
 )
-def test_reads_a_value_as_toml_does_and_else_as_text(text: str, value: object) -> None:
+def test_a_value_is_read_as_toml_or_as_text(text: str, value: object) -> None:
     found = parse_value(text)
     assert found == value
     assert type(found) is type(value)
 
 
-def test_reads_assignments() -> None:
+def test_assignments_are_read() -> None:
     found = parse_assignments(["trpo.gamma=0.9", " seed = 3 ", "expert=pi:window=30"], "--set")
     assert found == {"trpo.gamma": 0.9, "seed": 3, "expert": "pi:window=30"}
 
 
 @pytest.mark.parametrize("text", ["gamma", "=3", " =3", ""])
-def test_refuses_what_assigns_nothing(text: str) -> None:
+def test_a_text_without_assignment_is_refused(text: str) -> None:
     with pytest.raises(InputError) as caught:
         parse_assignments([text], "--set")
     assert str(caught.value) == f"--set: {text!r} is not allowed; allowed: key=value"
 
 
 @given(st.integers() | st.booleans() | st.floats(allow_nan=False, allow_infinity=False))
-def test_numbers_come_back_as_they_were_written(value: float) -> None:
+def test_numbers_are_read_as_written(value: float) -> None:
     assert parse_value(str(value).lower()) == value
 
 

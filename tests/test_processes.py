@@ -54,7 +54,7 @@ def soon(process: int) -> bool:
     return has_ended(process)
 
 
-def test_a_folder_has_one_owner_and_is_free_when_that_is_killed(tmp_path: Path) -> None:
+def test_a_folder_has_one_owner_and_is_unlocked_when_that_is_killed(tmp_path: Path) -> None:
     process = holder(tmp_path)
     words = "is being written by another process; allowed: one at a time"
     with pytest.raises(InputError, match=words), lock_folder(tmp_path):
@@ -66,7 +66,7 @@ def test_a_folder_has_one_owner_and_is_free_when_that_is_killed(tmp_path: Path) 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_owner_in_this_process_keeps_others_out_too(tmp_path: Path) -> None:
+def test_an_owner_in_the_same_process_excludes_others_too(tmp_path: Path) -> None:
     with lock_folder(tmp_path), pytest.raises(InputError), lock_folder(tmp_path):
         pass
     with lock_folder(tmp_path):
@@ -84,7 +84,7 @@ def test_a_second_training_of_a_run_is_refused_in_one_line_and_writes_nothing(tm
     process.communicate("")
 
 
-def test_what_a_killed_owner_left_of_a_folder_is_a_new_one(tmp_path: Path) -> None:
+def test_a_folder_with_only_leftovers_of_a_killed_owner_is_new(tmp_path: Path) -> None:
     for name in (LOCK_FILE, ".config.toml.part"):
         (tmp_path / name).touch()
     create_run_folder(tmp_path, small_config())
@@ -99,7 +99,7 @@ CHILD = (
 
 
 @linux
-def test_a_busy_process_ends_with_the_one_that_started_it() -> None:
+def test_a_busy_process_ends_with_its_parent() -> None:
     code = (
         "import os, signal, subprocess, sys\nfrom unjam.processes import bind_to_parent\n"
         f"child = subprocess.Popen([sys.executable, '-c', {CHILD!r}], stdout=subprocess.PIPE, text=True,\n"
@@ -112,7 +112,7 @@ def test_a_busy_process_ends_with_the_one_that_started_it() -> None:
 
 
 @linux
-def test_a_process_whose_parent_was_gone_before_ends_at_once() -> None:
+def test_a_process_ends_at_once_if_its_parent_has_already_ended() -> None:
     gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True)
     done = subprocess.run(
         [sys.executable, "-c", CHILD], env={**os.environ, PARENT_VARIABLE: gone.stdout.decode().strip()}, timeout=60
@@ -120,7 +120,7 @@ def test_a_process_whose_parent_was_gone_before_ends_at_once() -> None:
     assert done.returncode == -signal.SIGKILL
 
 
-def test_nobody_else_is_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_without_the_variable_is_not_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(PARENT_VARIABLE, raising=False)
     exit_with_parent(signal.SIGKILL)
     assert bind_to_parent({"A": "b"}) == {"A": "b", PARENT_VARIABLE: str(os.getpid()), PROTECTED_FOLDERS_VARIABLE: "[]"}
@@ -128,7 +128,7 @@ def test_nobody_else_is_bound(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.long
 @linux
-def test_a_training_that_was_started_for_another_ends_with_it(tmp_path: Path) -> None:
+def test_a_training_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys, threading, time\nfrom pathlib import Path\n"
         "from unjam.training.executors import CommandLine, LocalExecutor\n"
@@ -147,7 +147,7 @@ def test_a_training_that_was_started_for_another_ends_with_it(tmp_path: Path) ->
     assert soon(int(parent.stdout))
 
 
-def test_who_only_looks_neither_makes_nor_changes_a_lock(tmp_path: Path) -> None:
+def test_checking_a_lock_neither_makes_nor_changes_it(tmp_path: Path) -> None:
     folder, lock, other = tmp_path / "run", tmp_path / "run" / LOCK_FILE, tmp_path / "other"
     folder.mkdir()
     assert not is_locked(folder)
@@ -169,7 +169,7 @@ def test_who_only_looks_neither_makes_nor_changes_a_lock(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("link", [Path.symlink_to, Path.hardlink_to])
-def test_a_lock_that_is_a_link_is_refused_and_what_it_leads_to_stays(
+def test_a_lock_that_is_a_link_is_refused_and_its_target_unchanged(
     link: Callable[[Path, Path], None], tmp_path: Path
 ) -> None:
     (tmp_path / "run").mkdir()
@@ -180,7 +180,7 @@ def test_a_lock_that_is_a_link_is_refused_and_what_it_leads_to_stays(
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-def test_an_owner_on_another_machine_holds_a_folder_while_its_heart_beats(tmp_path: Path) -> None:
+def test_an_owner_on_another_machine_locks_a_folder_while_it_sends_heartbeats(tmp_path: Path) -> None:
     (tmp_path / LOCK_FILE).write_text("elsewhere 12\n")  # a file system whose locks end at the machine
     with pytest.raises(InputError, match="is being written on elsewhere; allowed: "), lock_folder(tmp_path):
         pass
@@ -191,7 +191,7 @@ def test_an_owner_on_another_machine_holds_a_folder_while_its_heart_beats(tmp_pa
         assert (tmp_path / LOCK_FILE).read_text().split() == [platform.node(), str(os.getpid())]
 
 
-def test_the_heart_of_an_owner_beats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_owner_sends_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("unjam.processes.HEARTBEAT_INTERVAL", 0.01)
     with lock_folder(tmp_path):
         os.utime(tmp_path / LOCK_FILE, (1, 1))
@@ -201,9 +201,7 @@ def test_the_heart_of_an_owner_beats(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert (tmp_path / LOCK_FILE).stat().st_mtime > 1
 
 
-def test_what_killed_processes_left_in_the_temporary_folder_is_swept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_private_folders_of_killed_processes_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     code = (
         "import sys, tempfile\ntempfile.tempdir = sys.argv[1]\nfrom unjam.processes import PrivateFolder\n"

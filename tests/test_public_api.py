@@ -9,7 +9,7 @@ import unjam
 
 
 @pytest.mark.parametrize("name", unjam.__all__)
-def test_each_public_name_is_there_and_explained(name: str) -> None:
+def test_each_public_name_exists_and_is_documented(name: str) -> None:
     found = getattr(unjam, name)
     assert found.__name__ == name
     assert len(inspect.getdoc(found) or "") > 20
@@ -29,24 +29,24 @@ def test_completion_offers_the_public_names_and_nothing_else() -> None:
     assert set(dir(unjam)) == {*unjam.__all__, "__version__"}
 
 
-def test_type_checkers_are_told_of_its_types() -> None:
+def test_the_package_has_type_information() -> None:
     assert Path(unjam.__file__).with_name("py.typed").is_file()
 
 
-def test_importing_all_of_it_gives_all_of_it() -> None:
+def test_a_star_import_gives_all_public_names() -> None:
     namespace: dict[str, object] = {}
     exec("from unjam import *", namespace)
     assert set(unjam.__all__) <= namespace.keys()
 
 
-def test_importing_it_alone_imports_nothing_heavy() -> None:
+def test_importing_unjam_imports_nothing_heavy() -> None:
     heavy = {"torch", "libsumo", "matplotlib", "pandas"}  # Gymnasium, with NumPy, is told of the roads
     program = f"import sys, unjam; print(*({heavy!r} & set(sys.modules)))"
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60, check=True)
     assert ran.stdout.strip() == b""
 
 
-def test_functions_name_the_types_of_what_they_take_and_return() -> None:
+def test_public_functions_have_type_annotations() -> None:
     for name in unjam.__all__:
         found = getattr(unjam, name)
         if inspect.isfunction(found):

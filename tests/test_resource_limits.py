@@ -25,9 +25,7 @@ def test_a_controller_is_verified_in_a_limited_process(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_code_that_a_folder_names_runs_where_it_is_trusted_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_code_that_a_folder_names_runs_only_if_it_is_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = tmp_path / "code.py"
     code.write_text("def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n")
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(FileDriver(code, "gentle"), ABOUT))
@@ -39,7 +37,7 @@ def test_code_that_a_folder_names_runs_where_it_is_trusted_alone(
 
 
 @pytest.mark.long
-def test_who_signed_a_controller_is_checked_in_a_limited_process(tmp_path: Path) -> None:
+def test_the_signer_of_a_controller_is_checked_in_a_limited_process(tmp_path: Path) -> None:
     path, made = tmp_path / "it.unjam", make_keys(tmp_path / "maker")
     path.write_bytes(content_of())
     with pytest.raises(InputError, match=r"^controller: it is not signed; allowed: signed by "):

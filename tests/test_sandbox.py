@@ -58,7 +58,7 @@ def tries(state):
 
 
 @kept
-def test_a_confined_program_reads_and_writes_into_its_folder_alone(tmp_path: Path) -> None:
+def test_a_confined_program_reads_and_writes_only_into_its_folder(tmp_path: Path) -> None:
     program, inside, canary = (tmp_path / name for name in ("tries.py", "inside", "canary"))
     program.write_text(TRIES)
     canary.write_text("as it was")
@@ -71,7 +71,7 @@ def test_a_confined_program_reads_and_writes_into_its_folder_alone(tmp_path: Pat
 
 
 @kept
-def test_a_worker_loses_its_rights_for_networks_of_others_alone(tmp_path: Path) -> None:
+def test_a_worker_is_confined_only_for_user_networks(tmp_path: Path) -> None:
     (tmp_path / "driver.py").write_text(DRIVER)
     driver, left = FileDriver(tmp_path / "driver.py", "tries"), tmp_path / "left"
     path = straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0" departSpeed="5"/>')
@@ -84,7 +84,7 @@ def test_a_worker_loses_its_rights_for_networks_of_others_alone(tmp_path: Path) 
             assert left.exists() == (found == 0.0)
 
 
-def test_networks_of_others_are_read_under_a_smaller_limit_of_memory(tmp_path: Path) -> None:
+def test_user_networks_are_read_under_a_smaller_memory_limit(tmp_path: Path) -> None:
     path = straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
     code = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (2**31, 2**31))\n"
@@ -118,7 +118,7 @@ TOO_LONG = "it: cannot be read within 1 GiB and 1 s: signal "
         ("os.abort()", 1, TOO_LONG),
     ],
 )
-def test_what_reads_files_of_others_ends_in_one_line(what: str, code: int, words: str) -> None:
+def test_a_limited_child_that_fails_is_reported_in_one_line(what: str, code: int, words: str) -> None:
     ran = subprocess.run([sys.executable, "-c", LIMITED + what], capture_output=True, text=True, check=False)
     assert (ran.returncode, words in ran.stderr) == (code, True), ran.stderr
     if words == TOO_LONG:

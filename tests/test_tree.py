@@ -36,7 +36,7 @@ def record() -> Record:
     return Record((first, Leaf("b", Pair(np.zeros((0, 2)), 1.0), note="x")), [1, 2])
 
 
-def test_what_was_taken_apart_is_put_together_again() -> None:
+def test_unpack_restores_what_pack_converted() -> None:
     facts, arrays = pack(record())
     paths = ("0.pair.low", "0.memory.expert.window", "0.memory.age", "1.pair.low")
     assert set(arrays) == {f"leaves.{path}" for path in paths}
@@ -61,7 +61,7 @@ def test_what_was_taken_apart_is_put_together_again() -> None:
         (lambda facts: facts.update(leaves=3), "not allowed"),
     ],
 )
-def test_what_is_no_such_record_is_refused(change: Any, words: str) -> None:
+def test_unpack_refuses_other_records(change: Any, words: str) -> None:
     facts, arrays = pack(record())
     change(facts)
     with pytest.raises(ValueError, match=words):
@@ -76,7 +76,7 @@ TREES = st.recursive(
 
 
 @given(TREES)
-def test_leaves_and_rebuilt_undo_each_other(tree: dict[str, Any]) -> None:
+def test_replace_leaves_is_the_inverse_of_leaves(tree: dict[str, Any]) -> None:
     again = replace_leaves(tree, {path: 2.0 * leaf for path, leaf in leaves(tree)})
     twice = map_leaves(lambda leaf, same: leaf + same, tree, tree)
     for (path, found), (other, expected) in zip(leaves(again), leaves(twice), strict=True):

@@ -38,7 +38,7 @@ def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     "text", ["{}:gentle", "{}:Keeper:gain=0.2", "pi+{}:gentle", "pi:window=30+{}:gentle", "{}:a+{}:b", "{}:a:b=[1,2]"]
 )
 @pytest.mark.parametrize("deep", [False, True])
-def test_a_file_is_found_wherever_a_text_names_it(text: str, deep: bool, code: Path) -> None:
+def test_a_code_file_is_found_wherever_a_text_names_it(text: str, deep: bool, code: Path) -> None:
     named = text.replace("{}", str(code))
     values = {"tasks": [{"expert": "pi"}, {"evaluation": {"baselines": ["human", named]}}]}
     with pytest.raises(InputError, match=r"^run names Python code \('.*code\+1\.py'\), which "):
@@ -47,20 +47,20 @@ def test_a_file_is_found_wherever_a_text_names_it(text: str, deep: bool, code: P
     check_trusted_values("run", values if deep else named)
 
 
-def test_a_name_relative_to_here_is_found(code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_relative_name_is_found(code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(code.parent)
     with pytest.raises(InputError, match="it runs only with --trust-code"):
         check_trusted_values("run", f"{code.name}:gentle")
 
 
-def test_a_link_to_code_is_that_code(code: Path) -> None:
+def test_a_link_to_trusted_code_is_trusted(code: Path) -> None:
     link = code.with_name("link.py")
     link.symlink_to(code)
     remember_trusted(code)
     check_trusted_values("run", f"{link}:gentle")
 
 
-def test_trust_ends_with_the_block_and_what_ran_in_it_is_remembered(code: Path) -> None:
+def test_trust_ends_with_the_block_and_its_code_is_remembered(code: Path) -> None:
     other = code.with_name("other.py")
     other.write_text("y = 2\n")
     with trusting_code():
@@ -72,7 +72,7 @@ def test_trust_ends_with_the_block_and_what_ran_in_it_is_remembered(code: Path) 
     assert TRUSTED_VARIABLE not in os.environ
 
 
-def test_trust_ends_with_the_last_of_the_blocks_that_overlap() -> None:
+def test_trust_ends_with_the_last_of_overlapping_blocks() -> None:
     """Blocks of two threads end in any order: the first to begin must not be the one that ends the trust."""
     first, second = trusting_code(), trusting_code()
     first.__enter__()
@@ -83,7 +83,7 @@ def test_trust_ends_with_the_last_of_the_blocks_that_overlap() -> None:
     assert not is_all_code_trusted()
 
 
-def test_what_code_imports_from_beside_it_is_trusted_as_it_was(code: Path) -> None:
+def test_modules_that_code_imports_are_trusted_only_unchanged(code: Path) -> None:
     helper, file = code.with_name("helper_beside.py"), FileReference(code, "x")
     helper.write_text("value = 1\n")
     code.write_text("from helper_beside import value as x\n")
@@ -99,7 +99,7 @@ def test_what_code_imports_from_beside_it_is_trusted_as_it_was(code: Path) -> No
         check_trusted("run", code)
 
 
-def test_what_cannot_be_remembered_is_told_to_this_process_and_its_children(
+def test_trust_that_cannot_be_stored_is_kept_for_this_process_and_its_children(
     code: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("UNJAM_STATE", str(code / "no folder"))
@@ -111,7 +111,7 @@ def test_what_cannot_be_remembered_is_told_to_this_process_and_its_children(
         check_trusted("run", code)
 
 
-def test_the_state_of_programs_is_where_the_system_has_it(
+def test_trust_is_stored_in_the_state_folder_of_the_system(
     code: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("UNJAM_STATE")
@@ -137,7 +137,7 @@ def folder_with_code(code: Path) -> Path:
     return run
 
 
-def test_what_code_imports_late_is_trusted_as_it_was(code: Path, folder_with_code: Path) -> None:
+def test_modules_that_code_imports_late_are_trusted_only_unchanged(code: Path, folder_with_code: Path) -> None:
     check_trusted("run", code)
     code.with_name("helper_later.py").write_text("value = 2\n")
     with pytest.raises(InputError, match="not run yourself in this version"):

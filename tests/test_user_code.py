@@ -67,7 +67,7 @@ def late():
 """
 
 
-def test_what_runs_was_hashed_also_where_it_is_imported_late(tmp_path: Path) -> None:
+def test_hashed_code_runs_also_if_it_is_imported_late(tmp_path: Path) -> None:
     (tmp_path / "package").mkdir()
     for name in ("neighbor", "later", "package/inner"):
         (tmp_path / f"{name}.py").write_text(GOOD)
@@ -154,7 +154,7 @@ def test_packages_of_the_folder_are_imported_as_usual(tmp_path: Path) -> None:
         ("from neighbor import other", "cannot import name 'other'"),
     ],
 )
-def test_what_is_not_there_is_an_import_error_as_usual(source: str, words: str, tmp_path: Path) -> None:
+def test_a_missing_module_is_an_import_error_as_usual(source: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "neighbor.py").write_text(GOOD)
     (tmp_path / "main.py").write_text(source)
     with pytest.raises(ImportError, match=words):
@@ -190,7 +190,7 @@ assert type(again) is Inner
 """
 
 
-def test_classes_of_neighbors_are_found_by_what_looks_them_up(tmp_path: Path) -> None:
+def test_classes_of_neighbors_are_found_by_typing_and_pickle(tmp_path: Path) -> None:
     (tmp_path / "gains.py").write_text(DATACLASS)
     (tmp_path / "main.py").write_text(
         "import importlib, pickle, gains\n"
@@ -203,7 +203,7 @@ def test_classes_of_neighbors_are_found_by_what_looks_them_up(tmp_path: Path) ->
     assert "gains" not in sys.modules
 
 
-def test_every_run_begins_anew(tmp_path: Path) -> None:
+def test_every_run_executes_all_modules_again(tmp_path: Path) -> None:
     (tmp_path / "count.py").write_text("calls = []\n")
     (tmp_path / "main.py").write_text("import count\ndef call():\n    import count\n    count.calls.append(1)\n")
     code = read_code(tmp_path / "main.py")
@@ -214,7 +214,7 @@ def test_every_run_begins_anew(tmp_path: Path) -> None:
     assert len([name for name in names if name.endswith(".count")]) == 1
 
 
-def test_a_neighbor_that_the_program_has_imported_itself_is_read_all_the_same(
+def test_a_neighbor_that_the_program_has_already_imported_is_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "gains_of_mine.py").write_text(EVIL)

@@ -29,7 +29,7 @@ def test_a_fault_does_no_harm(name: str, tmp_path: Path) -> None:
     assert outcome.injected == fault.quick
 
 
-def test_the_committed_soak_has_every_fault_as_often_as_it_should() -> None:
+def test_the_committed_soak_has_every_fault_as_often_as_required() -> None:
     document = json.loads(SOAK.read_text())
     assert document["manifest"]["packages"]["libsumo"].startswith("1.28")
     assert {row["name"]: row["injected"] for row in document["rows"]} == {

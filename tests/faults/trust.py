@@ -129,7 +129,13 @@ class _Run:
 
 def _another_setting(at: _Run, generator: np.random.Generator) -> Any:
     with_checkpoint(at.folder, small_config())
-    changes = [{"seed": 5}, {"trpo__gamma": 0.5}, {"scenario_options__vehicles": 9}, {"expert": "idm"}, {"agent": "ppo"}]
+    changes = [
+        {"seed": 5},
+        {"trpo__gamma": 0.5},
+        {"scenario_options__vehicles": 9},
+        {"expert": "idm"},
+        {"agent": "ppo"},
+    ]
     return small_config(**changes[int(generator.integers(len(changes)))])
 
 

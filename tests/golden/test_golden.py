@@ -28,7 +28,7 @@ def episodes() -> dict[str, Episode]:
 
 
 @pytest.mark.parametrize("case", cases(), ids="-".join)
-def test_a_trajectory_is_what_it_was(case: tuple[str, str], episodes: dict[str, Episode]) -> None:
+def test_a_trajectory_is_the_golden_one(case: tuple[str, str], episodes: dict[str, Episode]) -> None:
     name = "-".join(case)
     episode, golden = episodes[name], (folder() / f"{name}.csv").read_text()
     assert episode.has_run
@@ -43,7 +43,7 @@ def numbers(table: str) -> np.ndarray:
     return np.array([[float(cell or "nan") for cell in row.split(",")] for row in rows])
 
 
-def test_every_expert_has_one_and_almost_all_differ(episodes: dict[str, Episode]) -> None:
+def test_every_expert_has_a_golden_trajectory_and_almost_all_differ(episodes: dict[str, Episode]) -> None:
     assert {driver for _, driver in cases()} == set(DRIVERS)
     hashes = read_hashes(folder())
     assert hashes.keys() == episodes.keys() == {path.stem for path in folder().glob("*.csv")}
@@ -52,14 +52,14 @@ def test_every_expert_has_one_and_almost_all_differ(episodes: dict[str, Episode]
         assert len(set(own)) >= len(own) - 1, road  # without noise, `human` and `idm` are the same
 
 
-def test_each_blessing_has_its_line_in_the_changelog() -> None:
+def test_the_changelog_names_the_golden_trajectories() -> None:
     changelog = (Path(__file__).parents[2] / "CHANGELOG.md").read_text()
     for place in folder().parent.glob("*/hashes.json"):
         line = f"Golden trajectories of SUMO {place.parent.name} ({fingerprint(read_hashes(place.parent))}): "
         assert line in changelog, BLESS
 
 
-def test_a_small_change_of_a_trajectory_is_seen(episodes: dict[str, Episode]) -> None:
+def test_a_small_change_of_a_trajectory_is_detected(episodes: dict[str, Episode]) -> None:
     episode = episodes["ring-pi"]
     before = hash_of(episode)
     episode.speeds[-1, 3] += 2 * GRAIN

@@ -21,7 +21,7 @@ def drawn(radius: int, **changes: object) -> ClosedRoad:
 
 
 @pytest.mark.parametrize("radius", [20, 30, 32, 35, 50])
-def test_lap_is_as_long_as_in_the_network_file(radius: int) -> None:
+def test_the_lap_length_is_that_of_the_network_file(radius: int) -> None:
     tree = ElementTree.parse(network_file(drawn(radius).network))
     lanes = {lane.get("id"): float(lane.get("length", "nan")) for lane in tree.iter("lane")}
     links = {(link.get("from"), link.get("to")): link.get("via") for link in tree.iter("connection") if link.get("via")}
@@ -55,14 +55,14 @@ def test_the_first_cav_leads_a_queue_with_free_road_ahead() -> None:
     assert ahead > 50 + np.diff(road.start_positions).mean()
 
 
-def test_nobody_starts_on_the_crossing() -> None:
+def test_no_vehicle_starts_on_the_crossing() -> None:
     for radius in range(20, 51):
         road = drawn(radius)
         for start, end in road.crossings:
             assert not np.any((road.start_positions > start) & (road.start_positions < end))
 
 
-def test_outline_is_the_lap() -> None:
+def test_the_outline_is_as_long_as_the_lap() -> None:
     road = drawn(32)
     coordinates, places = road.center_line[:, 0], road.center_line[:, 1:]
     assert coordinates[0] == 0
@@ -78,7 +78,7 @@ def test_limit_is_near_what_a_queue_of_half_a_lap_allows(radius: int, limit: flo
     assert FigureEight().limit_speed(radius) == pytest.approx(limit, rel=0.03)
 
 
-def test_recipe_makes_the_same_scenario_again() -> None:
+def test_a_recipe_restores_the_scenario() -> None:
     scenario = FigureEight(radius=(30, 40), cavs=2)
     assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
 
@@ -94,7 +94,7 @@ def test_recipe_makes_the_same_scenario_again() -> None:
         ({"human_control": "wild"}, "human_control"),
     ],
 )
-def test_wrong_parameters_get_one_clear_line(changes: dict[str, object], words: str) -> None:
+def test_invalid_parameters_are_reported_in_one_line(changes: dict[str, object], words: str) -> None:
     with pytest.raises(InputError, match=words) as raised:
         make_scenario("figure-eight", changes)
     assert "\n" not in str(raised.value)

@@ -34,7 +34,7 @@ def times_of(road: MergeRoad, pattern: str) -> list[float]:
     return [float(entry["depart"]) for entry in entries(road) if re.fullmatch(pattern, entry["id"])]
 
 
-def test_as_many_want_to_enter_as_the_flows_say_evenly_spaced() -> None:
+def test_entries_are_evenly_spaced_according_to_the_flows() -> None:
     road = drawn()
     highway, ramp = times_of(road, r"(human|cav)_\d+"), times_of(road, r"human_r\d+")
     assert (len(highway), len(ramp)) == (333, 16)  # 2,000 and 100 an hour, in 600 s
@@ -43,7 +43,7 @@ def test_as_many_want_to_enter_as_the_flows_say_evenly_spaced() -> None:
     assert times_of(road, r"human_s\d+") == [0.0] * 5
 
 
-def test_the_file_lists_vehicles_by_time_of_entry_as_sumo_wants_them() -> None:
+def test_the_file_lists_vehicles_by_entry_time() -> None:
     road = drawn(warmup=100)
     times = [float(entry["depart"]) for entry in entries(road)]
     assert times == sorted(times)
@@ -52,11 +52,11 @@ def test_the_file_lists_vehicles_by_time_of_entry_as_sumo_wants_them() -> None:
     assert {entry["type"] for entry in entries(road)} == {"human"}  # until the driver takes over
 
 
-def test_a_warmup_lasts_as_long_as_its_vehicles() -> None:
+def test_vehicles_enter_during_the_warm_up_too() -> None:
     assert len(times_of(drawn(warmup=500, horizon=100), r"(human|cav)_\d+")) == 200 * 2000 // 3600
 
 
-def test_vehicles_enter_where_their_origin_says() -> None:
+def test_vehicles_enter_at_their_origin() -> None:
     road = drawn(standing_vehicles=3)
     highway, ramp = JUNCTION_LENGTHS
     starts = {"from_inflow_highway": -(600.1 + highway), "from_highway": -(500 + highway)}
@@ -68,12 +68,12 @@ def test_vehicles_enter_where_their_origin_says() -> None:
     np.testing.assert_allclose(np.diff(standing), 200.0, atol=0.11)
 
 
-def test_nobody_stands_where_none_shall() -> None:
+def test_without_standing_vehicles_the_road_is_empty() -> None:
     assert times_of(drawn(standing_vehicles=0), r"human_s\d+") == []
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
-def test_a_share_is_drawn_for_each_vehicle_by_itself(seed: int, cav_share: float) -> None:
+def test_cavs_are_drawn_independently(seed: int, cav_share: float) -> None:
     count = len(cavs(drawn(seed, penetration_rate=cav_share)))
     spread = np.sqrt(333 * cav_share * (1 - cav_share))
     assert abs(count - 333 * cav_share) <= 5.5 * spread + 1e-9
@@ -91,7 +91,7 @@ def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
 
 
 @given(st.floats(0, 1))
-def test_even_spacing_spreads_the_share_evenly(cav_share: float) -> None:
+def test_even_spacing_spreads_cavs_evenly(cav_share: float) -> None:
     found = cavs(drawn(penetration_rate=cav_share, cav_spacing="even"))
     assert abs(len(found) - 333 * cav_share) <= 1.0
     assert len(np.unique(np.diff(found))) <= 2
@@ -104,19 +104,19 @@ def test_random_cavs_differ_from_episode_to_episode() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 166))
-def test_so_many_cavs_enter_in_the_first_half_as_were_asked_for(seed: int, count: int) -> None:
+def test_the_set_number_of_cavs_enters_in_the_first_half(seed: int, count: int) -> None:
     road = drawn(seed, cavs=count)
     assert len(cavs(road)) == count
     assert max(cavs(road)) * 1.8 < 300.0
 
 
-def test_cavs_have_names_that_were_announced() -> None:
+def test_cav_ids_are_among_the_possible_ones() -> None:
     some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"penetration_rate": 1.0}, {"inflow": 700.0}]
     for changes in some:
         assert drawn(**changes).cav_ids <= set(Merge(**changes).possible_cav_ids())
 
 
-def test_ways_across_the_junction_are_those_of_the_network_file() -> None:
+def test_lanes_across_the_junction_are_those_of_the_network_file() -> None:
     tree = ElementTree.parse(network_file(drawn().network))
     lanes = {lane.get("id"): float(lane.get("length", "nan")) for lane in tree.iter("lane")}
     via = {
@@ -152,7 +152,7 @@ def plain_highway(flow: float, vehicles: int = 120, step: float = 0.2) -> float:
 
 
 @pytest.mark.parametrize("flow", [1200.0, 2000.0])
-def test_limit_is_the_speed_of_people_whom_nothing_disturbs(flow: float) -> None:
+def test_limit_is_the_speed_of_undisturbed_human_drivers(flow: float) -> None:
     assert drawn(inflow=flow).limit_speed == pytest.approx(plain_highway(flow), rel=1e-9)
 
 
@@ -162,7 +162,7 @@ def test_limit_is_about_twenty_and_falls_with_the_flow() -> None:
     assert 20.0 < limits[-1] < limits[0] < 30.0
 
 
-def test_recipe_makes_the_same_scenario_again() -> None:
+def test_a_recipe_restores_the_scenario() -> None:
     scenario = Merge(cavs=3, cav_spacing="even", inflow=1500.0)
     assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
     assert scenario.stratum(1, 3) == scenario
@@ -184,7 +184,7 @@ def test_recipe_makes_the_same_scenario_again() -> None:
         ({"length": (230, 230)}, "length: unknown name"),
     ],
 )
-def test_wrong_values_get_one_clear_line(changes: Any, words: str) -> None:
+def test_invalid_values_are_reported_in_one_line(changes: Any, words: str) -> None:
     with pytest.raises(InputError, match=re.escape(words)) as caught:
         make_scenario("merge", changes)
     assert "\n" not in str(caught.value)

@@ -16,7 +16,7 @@ def drawn(scenario: OnRamp = ROAD, seed: int = 0) -> MotorwayRoad:
     return scenario.draw(np.random.default_rng(seed))
 
 
-def test_a_larger_share_contains_the_smaller_and_changes_nobody_else() -> None:
+def test_a_larger_penetration_rate_only_adds_cavs() -> None:
     few, many = drawn(replace(ROAD, penetration_rate=0.05)), drawn(replace(ROAD, penetration_rate=0.2))
     assert few.cav_ids < many.cav_ids
     assert few.entries == many.entries
@@ -26,7 +26,7 @@ def test_a_larger_share_contains_the_smaller_and_changes_nobody_else() -> None:
     assert any(entry.route == "ramp" for entry in many.entries if entry.name in many.cav_ids)
 
 
-def test_as_many_want_to_enter_as_the_demand_says() -> None:
+def test_entries_follow_the_demand() -> None:
     begin, end = ROAD.peak
     flows: dict[tuple[str, bool], list[float]] = {}
     for seed in range(5):
@@ -42,7 +42,7 @@ def test_as_many_want_to_enter_as_the_demand_says() -> None:
         assert np.mean(flows[key]) == pytest.approx(flow, rel=0.05), key
 
 
-def test_nobody_enters_a_lane_closer_behind_another_than_the_smallest_headway() -> None:
+def test_entry_headways_are_at_least_the_smallest_one() -> None:
     by_lane: dict[tuple[str, int], list[float]] = {}
     for entry in drawn().entries:
         by_lane.setdefault((entry.route, entry.lane), []).append(entry.time)
@@ -53,7 +53,7 @@ def test_nobody_enters_a_lane_closer_behind_another_than_the_smallest_headway() 
         assert (np.sort(within)[4:] >= smallest - 0.011).all()  # a period begins anew
 
 
-def test_people_differ_within_their_ranges() -> None:
+def test_human_drivers_differ_within_their_ranges() -> None:
     people = list(drawn().vehicle_types.values())
     assert len(people) == 200
     for values, (low, high) in (
@@ -67,7 +67,7 @@ def test_people_differ_within_their_ranges() -> None:
     assert np.std([person.speed_factor for person in people]) == pytest.approx(0.1, abs=0.02)
 
 
-def test_with_one_lane_and_with_a_steady_peak_it_has_names() -> None:
+def test_variants_with_one_lane_and_with_a_steady_peak_have_names() -> None:
     one = make_scenario("on-ramp-1")
     assert isinstance(one, OnRamp)
     assert {entry.lane for entry in drawn(one).entries} == {0}
@@ -89,6 +89,6 @@ def test_with_one_lane_and_with_a_steady_peak_it_has_names() -> None:
         ({"roadside.loss_rate": 1.0}, "roadside.loss_rate: 1.0"),
     ],
 )
-def test_what_is_not_possible_is_refused_in_one_line(changes: dict[str, object], message: str) -> None:
+def test_invalid_values_are_reported_in_one_line(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make_scenario("on-ramp", changes)

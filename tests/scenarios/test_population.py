@@ -26,7 +26,7 @@ def written(folder: Path, residual: Network | None = None) -> Path:
 
 
 @pytest.mark.parametrize("residual", [None, NETWORK])
-def test_what_is_written_is_read_again(tmp_path: Path, residual: Network | None) -> None:
+def test_a_written_population_is_read_unchanged(tmp_path: Path, residual: Network | None) -> None:
     found = read_population(written(tmp_path, residual))
     assert (found.typical, found.drivers, found.limits) == (PAPER_IDM, DRIVERS, (-4.0, 2.0))
     assert [detail["name"] for detail in found.details] == ["a", "b"]
@@ -38,7 +38,7 @@ def test_what_is_written_is_read_again(tmp_path: Path, residual: Network | None)
         np.testing.assert_allclose(found.residual(seen), NETWORK(seen))
 
 
-def test_a_file_that_changes_is_read_anew(tmp_path: Path) -> None:
+def test_a_changed_population_is_read_again(tmp_path: Path) -> None:
     path = written(tmp_path)
     assert len(read_population(path).drivers) == 2
     write_population(path, Population(PAPER_IDM, DRIVERS[:1], (-4.0, 2.0)))
@@ -78,7 +78,7 @@ def test_damaged_weights_are_refused(tmp_path: Path) -> None:
         read_population(path)
 
 
-def test_what_is_no_population(tmp_path: Path) -> None:
+def test_other_files_are_not_populations(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("[1, 2")
     with pytest.raises(InputError, match="not a population"):
         read_population(tmp_path / "x.json")
@@ -87,7 +87,7 @@ def test_what_is_no_population(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["ring", "figure-eight", "merge"])
-def test_a_road_draws_its_people_from_it(tmp_path: Path, name: str) -> None:
+def test_a_road_draws_its_human_drivers_from_a_population(tmp_path: Path, name: str) -> None:
     scenario = make_scenario(name, {"population": str(written(tmp_path))})
     assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
     assert scenario.humans == PAPER_IDM
@@ -101,7 +101,7 @@ def test_a_road_draws_its_people_from_it(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "drivers"), [("unjam:ngsim", 100), ("unjam:astazero", 8)])
-def test_people_who_were_recorded_are_part_of_the_package(name: str, drivers: int) -> None:
+def test_recorded_human_drivers_are_part_of_the_package(name: str, drivers: int) -> None:
     found = read_population(name)
     assert len(found.drivers) == drivers
     assert {found.typical, *found.drivers} != {found.typical}
@@ -109,12 +109,12 @@ def test_people_who_were_recorded_are_part_of_the_package(name: str, drivers: in
     assert f"{drivers} calibrated drivers of {name}" in make_scenario("ring", {"population": name}).human_description
 
 
-def test_an_unknown_population_of_the_package_is_refused_with_those_that_are_there() -> None:
+def test_an_unknown_packaged_population_is_refused_with_the_known_ones() -> None:
     with pytest.raises(InputError, match=r"'unjam:nobody' is not allowed; allowed: unjam:astazero, unjam:ngsim"):
         read_population("unjam:nobody")
 
 
-def test_on_a_motorway_people_follow_as_they_were_calibrated_and_want_to_drive_as_others_do(tmp_path: Path) -> None:
+def test_on_a_motorway_only_car_following_is_calibrated(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="population: one with a residual network is not allowed on the on-ramp"):
         make_scenario("on-ramp", {"population": str(written(tmp_path, NETWORK))})
     road = make_scenario("on-ramp", {"population": str(written(tmp_path))}).draw(np.random.default_rng(0))
@@ -126,7 +126,7 @@ def test_on_a_motorway_people_follow_as_they_were_calibrated_and_want_to_drive_a
     assert all(0.8 <= one.speed_factor <= 1.2 for one in kinds.values())
 
 
-def test_without_a_population_roads_are_as_they_were() -> None:
+def test_without_a_population_roads_are_unchanged() -> None:
     scenario = make_scenario("ring")
     road = scenario.draw(np.random.default_rng(0))
     assert road.human_parameters == {}

@@ -30,7 +30,7 @@ def test_limit_is_the_equilibrium_speed_of_the_length() -> None:
     assert road.limit_speed == pytest.approx(4.816, abs=5e-4)
 
 
-def test_parts_cover_the_range_without_overlap() -> None:
+def test_strata_cover_the_range_without_overlap() -> None:
     parts = [Ring().stratum(index, 4) for index in range(4)]
     assert parts[0].length[0] == 220
     assert parts[-1].length[1] == 270
@@ -39,11 +39,11 @@ def test_parts_cover_the_range_without_overlap() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 8, 60])
-def test_parts_of_a_single_length_are_that_length(count: int) -> None:
+def test_strata_of_a_single_length_are_that_length(count: int) -> None:
     assert {Ring(length=(230, 230)).stratum(index, count).length for index in range(count)} == {(230, 230)}
 
 
-def test_draws_are_scaled_over_their_range() -> None:
+def test_drawn_values_are_scaled_over_their_range() -> None:
     ring = Ring()
     assert ring.scale_drawn_values({"length": 220}) == (-1.0,)
     assert ring.scale_drawn_values({"length": 245}) == (0.0,)
@@ -61,7 +61,7 @@ def test_noise_is_flows_by_default_and_the_papers_on_request() -> None:
     assert Ring(noise_scaling="none").noise_per_step == 0.2
 
 
-def test_recipe_makes_the_same_scenario_again() -> None:
+def test_a_recipe_restores_the_scenario() -> None:
     ring = make_scenario("ring-warm", {"length": (230, 240), "humans": {"time_headway": 1.3}, "noise": 0.1})
     assert scenario_from_recipe(scenario_recipe(ring)) == ring
 
@@ -82,7 +82,7 @@ def test_recipe_makes_the_same_scenario_again() -> None:
         ({"length": (230.5, 240)}, "length.0: 230.5 is not allowed"),
     ],
 )
-def test_wrong_parameters_get_one_clear_line(changes: dict, words: str) -> None:
+def test_invalid_parameters_are_reported_in_one_line(changes: dict, words: str) -> None:
     with pytest.raises(InputError) as caught:
         make_scenario("ring", changes)
     assert words in str(caught.value)

@@ -57,14 +57,14 @@ TIMES = '<time><begin value="30"/><end value="90"/><step-length value="0.2"/></t
         ({"begin": 40.0, "end": 70.0, "warmup": 50}, 0.2, 100),
     ],
 )
-def test_step_and_horizon_are_its_own_unless_said_otherwise(
+def test_step_and_horizon_are_those_of_the_configuration_unless_set(
     changes: dict[str, Any], step: float, horizon: int, tmp_path: Path
 ) -> None:
     found = own(tmp_path, TIMES, penetration_rate=0.1, **changes)
     assert (found.simulation_step, found.horizon) == (step, horizon)
 
 
-def test_who_would_depart_before_the_begin_is_left_out(tmp_path: Path, simulation: Simulation) -> None:
+def test_vehicles_that_depart_before_the_begin_are_left_out(tmp_path: Path, simulation: Simulation) -> None:
     departing = (f'<vehicle id="{at}" type="car" route="along" depart="{at}"/>' for at in (0, 5, 40, 60))
     road = str(straight(tmp_path, "".join(departing)))
     asked = {"penetration_rate": 1.0, "end": 80.0}
@@ -91,13 +91,13 @@ def test_an_end_before_the_begin_is_refused(times: dict[str, Any], tmp_path: Pat
         own(tmp_path, TIMES, penetration_rate=0.1, **times)
 
 
-def test_sumo_is_told_the_begin_to_the_last_digit(tmp_path: Path) -> None:
+def test_sumo_receives_all_digits_of_the_begin(tmp_path: Path) -> None:
     road = own(tmp_path, penetration_rate=0.1, begin=1234567.5, end=1234667.5).draw(np.random.default_rng(0))
     assert isinstance(road, UserNetworkRoad)
     assert float(road.files.options["begin"]) == 1234567.5
 
 
-def test_without_an_end_an_episode_is_an_hour(tmp_path: Path) -> None:
+def test_without_an_end_an_episode_lasts_an_hour(tmp_path: Path) -> None:
     assert own(tmp_path).horizon == 3600
 
 
@@ -123,7 +123,7 @@ TYPE = (
         ({}, {"carFollowModel": "Krauss", "minGap": 0.5}, {"decel", "emergencyDecel", "actionStepLength"}),
     ],
 )
-def test_a_cav_type_has_all_attributes_and_parameters_of_its_type_but_the_law(
+def test_a_cav_type_has_all_properties_of_its_type_except_car_following(
     changes: dict[str, Any], law: dict[str, Any], replaced: set[str], tmp_path: Path
 ) -> None:
     scenario = own(tmp_path, routes=TYPE, penetration_rate=0.5, **changes)
@@ -145,7 +145,7 @@ def test_a_cav_type_has_all_attributes_and_parameters_of_its_type_but_the_law(
         ({"cav_classes": ["passenger", "truck"]}, {"car", "truck"}),
     ],
 )
-def test_a_share_picks_passenger_cars_unless_other_classes_are_named(
+def test_passenger_cars_become_cavs_unless_other_classes_are_named(
     changes: dict[str, Any], eligible: set[str], tmp_path: Path
 ) -> None:
     scenario = own(tmp_path, penetration_rate=0.5, **changes)
@@ -176,7 +176,7 @@ def test_types_within_distributions_are_eligible_by_their_own_class(tmp_path: Pa
     assert drawn(tmp_path, routes=routes, penetration_rate=0.5).eligible_types == {"a", "b"}
 
 
-def test_the_acc_has_the_limits_of_its_vehicle_unless_it_is_given_others(tmp_path: Path) -> None:
+def test_the_acc_has_the_limits_of_its_vehicle_by_default(tmp_path: Path) -> None:
     def cruise(**changes: Any) -> tuple[float | None, float | None]:
         found = own(tmp_path, penetration_rate=0.1, **changes).cruise
         return found.acceleration, found.deceleration
@@ -187,14 +187,14 @@ def test_the_acc_has_the_limits_of_its_vehicle_unless_it_is_given_others(tmp_pat
         make_scenario("on-ramp", {"cruise.acceleration": None})
 
 
-def test_other_episodes_pick_other_vehicles(tmp_path: Path) -> None:
+def test_other_episodes_have_other_cavs(tmp_path: Path) -> None:
     scenario = own(tmp_path)
     seeds = {scenario.draw(np.random.default_rng(seed)).cav_seed for seed in range(5)}
     assert len(seeds) == 5
     assert np.isnan(scenario.draw(np.random.default_rng(0)).limit_speed)
 
 
-def test_recipe_makes_the_same_scenario_again(tmp_path: Path) -> None:
+def test_a_recipe_restores_the_scenario(tmp_path: Path) -> None:
     scenario = own(tmp_path, TIMES, cav_types=["car", "truck"], penetration_rate=0.25)
     assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
     assert (
@@ -203,7 +203,7 @@ def test_recipe_makes_the_same_scenario_again(tmp_path: Path) -> None:
     )
 
 
-def test_its_vehicles_are_not_known_before(tmp_path: Path) -> None:
+def test_its_cav_ids_are_unknown_before_an_episode(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cavs: None is not allowed here"):
         own(tmp_path).possible_cav_ids()
 
@@ -234,13 +234,15 @@ BIKES = '<routes><vType id="bike" vClass="bicycle"/><flow id="g" type="bike"/></
         ({"penetration_rate": 0.1, "length": 3}, TYPES, "length: unknown name"),
     ],
 )
-def test_wrong_values_get_one_clear_line(changes: dict[str, Any], routes: str, words: str, tmp_path: Path) -> None:
+def test_invalid_values_are_reported_in_one_line(
+    changes: dict[str, Any], routes: str, words: str, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match=re.escape(words)) as caught:
         own(tmp_path, routes=routes, **changes)
     assert "\n" not in str(caught.value)
 
 
-def test_a_type_that_sumo_has_by_itself_may_be_a_cav(tmp_path: Path) -> None:
+def test_a_predefined_type_of_sumo_can_become_a_cav(tmp_path: Path) -> None:
     routes = '<routes><flow id="g" type="DEFAULT_BIKETYPE"/></routes>'
     with pytest.raises(InputError, match="no vehicle has one of the classes"):
         own(tmp_path, routes=routes)
@@ -275,9 +277,7 @@ def test_demand_that_begins_after_the_end_is_refused(changes: dict[str, Any], tm
     assert make_scenario(str(path), {"penetration_rate": 0.5, "begin": 25200.0, "end": 25300.0}).horizon == 100
 
 
-def test_without_a_rate_a_tenth_of_the_vehicles_become_cavs_and_a_line_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_default_penetration_rate_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     _log_once.cache_clear()
     path = str(configuration(tmp_path))
     rates = [load_user_network(path, changes).penetration_rate for changes in ({}, {"cav_types": ["car"]})]
@@ -285,7 +285,7 @@ def test_without_a_rate_a_tenth_of_the_vehicles_become_cavs_and_a_line_says_so(
     assert "penetration rate: 10 % by default; --penetration-rate changes it" in caplog.messages
 
 
-def test_what_differs_from_sumo_alone_is_noted(tmp_path: Path) -> None:
+def test_differences_from_plain_sumo_are_noted(tmp_path: Path) -> None:
     inside = '<seed value="7"/><max-depart-delay value="9"/><fcd-output value="x"/><tripinfo value="y"/>'
     assert own(tmp_path, inside).notes[:-1] == [
         "road.sumocfg: left out because they only write or listen: option fcd-output, option tripinfo",

@@ -65,7 +65,7 @@ def test_every_option_of_sumo_is_passed_or_refused_unless_it_changes_no_vehicle(
     assert fates["replaced"] == {"seed", "random", "max-depart-delay"}
 
 
-def test_other_names_of_an_option_have_its_fate(options: dict[str, tuple[str, str, list[str]]]) -> None:
+def test_synonyms_of_an_option_are_treated_alike(options: dict[str, tuple[str, str, list[str]]]) -> None:
     for name, (_, kind, others) in options.items():
         for other in others:
             if name in FILE_OPTIONS:
@@ -89,7 +89,7 @@ def test_other_names_of_an_option_have_its_fate(options: dict[str, tuple[str, st
         ('<n value="other.net.xml"/>', "n: is set twice"),
     ],
 )
-def test_what_sumo_would_refuse_or_unjam_cannot_do_is_told(inside: str, words: str, tmp_path: Path) -> None:
+def test_unsupported_options_are_refused(inside: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_sumo_files(configuration(tmp_path, inside))
     assert words in str(caught.value)

@@ -39,15 +39,13 @@ def test_a_document_type_is_refused(name: str, file: str, tmp_path: Path) -> Non
     assert refused(path) == f"{file}: a document type (<!DOCTYPE ...>) is not allowed"
 
 
-def test_the_word_in_a_comment_or_a_text_is_harmless(tmp_path: Path) -> None:
+def test_the_word_doctype_in_a_comment_is_harmless(tmp_path: Path) -> None:
     path = configuration(tmp_path, network="<!-- <!DOCTYPE net> -->" + NETWORK)
     assert read_sumo_files(path).used_types == {"car"}
 
 
 @pytest.mark.long
-def test_what_unpacks_to_too_much_is_refused_and_takes_no_memory_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sumo_files, "MAX_READER_MEMORY", 150 * 2**20)
     path = configuration(tmp_path)
     bomb = b'<routes name="' + b"a" * 200_000_000 + b'"/>'
@@ -56,19 +54,19 @@ def test_what_unpacks_to_too_much_is_refused_and_takes_no_memory_here(
     assert "road.rou.xml.gz: cannot be read: out of memory" in refused(path)
 
 
-def test_what_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_that_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = configuration(tmp_path)
     monkeypatch.setattr(sumo_files, "MAX_READER_TIME", 0.001)
     assert refused(path) == "road.sumocfg: its files cannot be read within 4 GiB, 0.001 s"
 
 
-def test_a_reader_that_is_lost_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_reader_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = configuration(tmp_path)
     monkeypatch.setattr(sumo_files, "READER_PROGRAM", tmp_path / "none.py")
     assert "cannot be read within" in refused(path)
 
 
-def test_it_needs_pythons_own_library_alone(tmp_path: Path) -> None:
+def test_the_reader_needs_only_the_standard_library(tmp_path: Path) -> None:
     program = [sys.executable, "-I", "-S", sandbox.__file__, str(2**30), "60", "", str(sumo_files.READER_PROGRAM)]
     ran = subprocess.run([*program, "configuration", str(configuration(tmp_path))], capture_output=True, check=True)
     assert json.loads(ran.stdout)["result"]["used_types"] == ["car"]
@@ -82,14 +80,14 @@ def test_lanes_are_read_with_their_edges(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lane", ['<lane id="a_0"/>', '<lane id="a_0" length="1" shape="0"/>'])
-def test_lanes_that_are_none_are_refused(lane: str, tmp_path: Path) -> None:
+def test_invalid_lanes_are_refused(lane: str, tmp_path: Path) -> None:
     path = tmp_path / "road.net.xml"
     path.write_text(f'<net version="1"><edge id="a">{lane}</edge></net>')
     with pytest.raises(InputError, match=r"road\.net\.xml: cannot be read: "):
         read_lanes(path)
 
 
-def test_in_this_process_it_answers_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_reader_answers_in_this_process_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = configuration(tmp_path, routes=ROUTES)
     reader._main("configuration", str(path))
     assert json.loads(capsys.readouterr().out)["result"]["network"] == str(tmp_path / "road.net.xml")
@@ -112,7 +110,7 @@ INCLUDES = {
 
 
 @pytest.mark.parametrize("name", INCLUDES)
-def test_included_files_that_harm_are_refused(name: str, tmp_path: Path) -> None:
+def test_harmful_included_files_are_refused(name: str, tmp_path: Path) -> None:
     files, words = INCLUDES[name]
     path = configuration(tmp_path)
     for file, included in files.items():
@@ -121,7 +119,7 @@ def test_included_files_that_harm_are_refused(name: str, tmp_path: Path) -> None
     assert words in refused(path)
 
 
-def test_included_files_count_wherever_they_are_included(tmp_path: Path) -> None:
+def test_included_files_are_read_wherever_they_are_included(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "types.xml").write_text(
         '<routes><vType id="a"/><edgeData id="e" file="x"/><include href="more.xml"/></routes>'
@@ -143,9 +141,7 @@ def test_included_files_count_wherever_they_are_included(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-def test_a_large_file_takes_no_memory_and_is_read_by_sumo_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_large_file_takes_no_memory_and_needs_no_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sumo_files, "MAX_READER_MEMORY", 100 * 2**20)
     vehicle = '<vehicle id="v" type="car" depart="7.5" departLane="best"><route edges="a b"/></vehicle>\n'
     found = read_sumo_files(configuration(tmp_path, routes=f"<routes>{vehicle * 300_000}</routes>"))
@@ -162,7 +158,5 @@ def test_a_large_file_takes_no_memory_and_is_read_by_sumo_itself(
         ('<flow id="a" begin="9"/><person id="p" depart="1"/>', None),
     ],
 )
-def test_the_first_departure_is_known_unless_something_else_decides_it(
-    routes: str, first: float | None, tmp_path: Path
-) -> None:
+def test_the_first_departure_is_known_if_files_define_it(routes: str, first: float | None, tmp_path: Path) -> None:
     assert read_sumo_files(configuration(tmp_path, routes=f"<x>{routes}</x>")).first_departure == first

@@ -47,19 +47,19 @@ def test_files_times_and_types_are_what_the_configuration_says(tmp_path: Path) -
     assert found.used_types == {"car"}
 
 
-def test_options_may_be_written_shortly_as_sumo_reads_them(tmp_path: Path) -> None:
+def test_the_short_attribute_of_options_is_read(tmp_path: Path) -> None:
     path = configuration(tmp_path, '<step-length v="0.1"/>')
     path.write_text(path.read_text().replace("net-file value", "net-file v"))
     assert read_sumo_files(path).step == 0.1
 
 
-def test_a_simulation_without_single_vehicles_is_refused(tmp_path: Path) -> None:
+def test_a_mesoscopic_simulation_is_refused(tmp_path: Path) -> None:
     assert read_sumo_files(configuration(tmp_path, '<mesosim value="false"/>')).dropped_items == ()
     with pytest.raises(InputError, match=r"road\.sumocfg: mesosim: true is not allowed; allowed: false"):
         read_sumo_files(configuration(tmp_path, '<mesosim value="true"/>'))
 
 
-def test_names_of_files_may_have_spaces(tmp_path: Path) -> None:
+def test_names_of_files_can_have_spaces(tmp_path: Path) -> None:
     path = configuration(tmp_path)
     (tmp_path / "road.rou.xml").rename(tmp_path / "my road.rou.xml")
     (tmp_path / "other.rou.xml").write_text("<routes/>")
@@ -67,7 +67,7 @@ def test_names_of_files_may_have_spaces(tmp_path: Path) -> None:
     assert read_sumo_files(path).route_files == (tmp_path / "my road.rou.xml", tmp_path / "other.rou.xml")
 
 
-def test_what_a_configuration_does_not_say_is_as_sumo_has_it(tmp_path: Path) -> None:
+def test_missing_options_have_sumos_defaults(tmp_path: Path) -> None:
     found = read_sumo_files(configuration(tmp_path))
     assert (found.begin, found.end, found.step, found.additional_files) == (0.0, None, 1.0, ())
 
@@ -83,7 +83,7 @@ def test_short_names_of_options_are_understood(tmp_path: Path) -> None:
     ("text", "seconds"),
     [("90", 90.0), ("90.5", 90.5), ("1:30:00", 5400.0), ("00:01:30", 90.0), ("2:00:00:05", 172805.0)],
 )
-def test_times_may_have_hours_and_days(text: str, seconds: float, tmp_path: Path) -> None:
+def test_times_can_have_hours_and_days(text: str, seconds: float, tmp_path: Path) -> None:
     found = read_sumo_files(configuration(tmp_path, f'<time><end value="{text}"/></time>'))
     assert found.end == seconds
 
@@ -100,13 +100,13 @@ def test_minus_one_is_no_end(tmp_path: Path) -> None:
         *(("step-length", text) for text in ("0", "nan", "fast", "-1")),
     ],
 )
-def test_a_time_that_is_none_is_refused(option: str, text: str, tmp_path: Path) -> None:
+def test_an_invalid_time_is_refused(option: str, text: str, tmp_path: Path) -> None:
     path = configuration(tmp_path, f'<{option} value="{text}"/>')
     with pytest.raises(InputError, match=f"road.sumocfg: {option}: '{text}' is not allowed; allowed: "):
         read_sumo_files(path)
 
 
-def test_an_end_before_the_beginning_is_refused(tmp_path: Path) -> None:
+def test_an_end_before_the_begin_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="end: 10 s is not allowed; allowed: after begin, 20 s"):
         read_sumo_files(configuration(tmp_path, '<begin value="20"/><end value="10"/>'))
 
@@ -122,7 +122,7 @@ def test_types_are_those_that_vehicles_trips_and_flows_have(tmp_path: Path) -> N
     assert set(found.types) == {"a", "b", "c", "never", "DEFAULT_VEHTYPE"}
 
 
-def test_of_a_distribution_its_types_are_used(tmp_path: Path) -> None:
+def test_the_types_of_a_used_distribution_are_used(tmp_path: Path) -> None:
     found = types_of(
         tmp_path,
         '<vType id="c"/><vTypeDistribution id="inside"><vType id="a"/><vType id="b"/></vTypeDistribution>'
@@ -133,7 +133,7 @@ def test_of_a_distribution_its_types_are_used(tmp_path: Path) -> None:
     assert set(found.types) == {"a", "b", "c", "d", "DEFAULT_VEHTYPE"}
 
 
-def test_a_distribution_may_name_types_of_elsewhere_and_other_distributions(tmp_path: Path) -> None:
+def test_a_distribution_can_name_other_types_and_distributions(tmp_path: Path) -> None:
     found = types_of(
         tmp_path,
         '<vType id="c"/><vTypeDistribution id="m"><vType refId="c" probability="1"/><vType id="a">'
@@ -144,7 +144,7 @@ def test_a_distribution_may_name_types_of_elsewhere_and_other_distributions(tmp_
     assert found.used_types == {"a", "c"}
 
 
-def test_distributions_of_one_file_serve_the_vehicles_of_another(tmp_path: Path) -> None:
+def test_vehicles_can_use_distributions_of_another_file(tmp_path: Path) -> None:
     mixture = '<vTypeDistribution id="mix"><vType id="a"/><vType id="b"/></vTypeDistribution>'
     (tmp_path / "types.add.xml").write_text(f"<additional>{mixture}</additional>")
     inside = '<input><additional-files value="types.add.xml"/></input>'
@@ -154,7 +154,7 @@ def test_distributions_of_one_file_serve_the_vehicles_of_another(tmp_path: Path)
     assert types_of(tmp_path, mixture, inside).used_types == {"a", "b"}
 
 
-def test_vehicles_without_a_type_may_be_a_distribution_too(tmp_path: Path) -> None:
+def test_the_default_type_can_be_a_distribution(tmp_path: Path) -> None:
     found = types_of(
         tmp_path, '<vTypeDistribution id="DEFAULT_VEHTYPE"><vType id="a"/></vTypeDistribution><trip id="1"/>'
     )
@@ -172,7 +172,7 @@ def test_compressed_files_are_read(tmp_path: Path) -> None:
     assert read_sumo_files(path).used_types == {"car"}
 
 
-def test_a_changed_file_is_read_anew(tmp_path: Path) -> None:
+def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
     path = configuration(tmp_path)
     assert read_sumo_files(path).used_types == {"car"}
     (tmp_path / "road.rou.xml").write_text('<routes><vehicle id="v" type="truck"/></routes>')
@@ -193,7 +193,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_what_is_broken_is_told_in_one_line(name: str, tmp_path: Path) -> None:
+def test_a_broken_file_is_reported_in_one_line(name: str, tmp_path: Path) -> None:
     network, routes, instead, words = BROKEN[name]
     path = configuration(tmp_path, network=network, routes=routes)
     if instead:
@@ -212,7 +212,7 @@ def test_a_missing_file_is_named(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("keep", [0, 5, 20, 45])
-def test_a_compressed_file_that_is_cut_short_is_told(keep: int, tmp_path: Path) -> None:
+def test_a_truncated_compressed_file_is_reported(keep: int, tmp_path: Path) -> None:
     path = configuration(tmp_path)
     (tmp_path / "road.net.xml.gz").write_bytes(gzip.compress(NETWORK.encode())[:keep])
     path.write_text(path.read_text().replace("road.net.xml", "road.net.xml.gz"))
@@ -239,7 +239,7 @@ SNIPPETS = [*PIECES.replace("\n", "/").replace("_", " ").split("/"), "/>", "/"]
         st.tuples(st.integers(0, 90), st.binary(max_size=4)),
     ),
 )
-def test_whatever_files_hold_is_read_or_refused(name: str, content: bytes | tuple[int, bytes], tmp_path: Path) -> None:
+def test_any_content_is_read_or_refused(name: str, content: bytes | tuple[int, bytes], tmp_path: Path) -> None:
     path = configuration(tmp_path)
     (tmp_path / "road.rou.xml.gz").write_bytes(gzip.compress(ROUTES.encode()))
     if name.endswith("gz"):
@@ -253,7 +253,7 @@ def test_whatever_files_hold_is_read_or_refused(name: str, content: bytes | tupl
         assert read_sumo_files(path).used_types
 
 
-def test_a_network_that_is_torn_off_is_told_however_long_it_is(tmp_path: Path) -> None:
+def test_a_truncated_network_is_reported_however_long_it_is(tmp_path: Path) -> None:
     network = '<net version="1.20">' + '<edge id="a"/>' * 20_000
     with pytest.raises(InputError, match=re.escape("road.net.xml: cannot be read: no element found")):
         read_sumo_files(configuration(tmp_path, network=network))

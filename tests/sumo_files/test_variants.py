@@ -32,14 +32,14 @@ def test_types_are_changed_wherever_they_are_defined(tmp_path: Path) -> None:
     assert found.used_types == {"car", "van", "DEFAULT_VEHTYPE"}
 
 
-def test_the_network_stays_where_it_is_and_no_file_of_the_user_changes(tmp_path: Path) -> None:
+def test_the_network_and_the_users_files_are_unchanged(tmp_path: Path) -> None:
     path = changed(tmp_path, {"car": {"tau": "1.5"}}, 1.0)
     assert read_sumo_files(path).network.resolve() == (tmp_path / "mine" / "road.net.xml").resolve()
     assert (tmp_path / "mine" / "road.rou.xml").read_text() == ROUTES
     assert sorted(file.name for file in path.parent.iterdir()) == ["0.rou.xml", "other.sumocfg"]
 
 
-def test_times_and_harmless_options_stay_and_traffic_is_scaled_once_more(tmp_path: Path) -> None:
+def test_times_and_harmless_options_stay_and_the_scale_is_multiplied(tmp_path: Path) -> None:
     inside = '<begin value="10"/><end value="100"/><step-length value="0.5"/><scale value="2"/>'
     path = changed(tmp_path, {}, 0.75, inside + '<fcd-output value="big.xml"/>')
     found = read_sumo_files(path)
@@ -49,18 +49,18 @@ def test_times_and_harmless_options_stay_and_traffic_is_scaled_once_more(tmp_pat
 
 
 @pytest.mark.parametrize("text", ["tau<5", 'a"b&c'])
-def test_signs_of_xml_within_attributes_stay_attributes(text: str, tmp_path: Path) -> None:
+def test_special_characters_in_attributes_are_quoted(text: str, tmp_path: Path) -> None:
     path = changed(tmp_path, {"car": {"imgFile2": text}, "DEFAULT_VEHTYPE": {"x": text}}, 1.0)
     found = read_sumo_files(path).types
     assert found["car"]["imgFile2"] == found["DEFAULT_VEHTYPE"]["x"] == text
 
 
-def test_a_scale_that_is_no_number_is_told(tmp_path: Path) -> None:
+def test_a_scale_that_is_not_a_number_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"road\.sumocfg: scale: 'much' is not allowed; allowed: a number"):
         changed(tmp_path, {}, 1.0, '<scale value="much"/>')
 
 
-def test_a_file_that_has_broken_since_is_told(tmp_path: Path) -> None:
+def test_a_file_that_has_become_broken_is_reported(tmp_path: Path) -> None:
     files = read_sumo_files(configuration(tmp_path))
     (tmp_path / "road.rou.xml").write_text("<routes><vTyp")
     with pytest.raises(InputError, match=r"road\.rou\.xml: cannot be read"):
@@ -68,7 +68,7 @@ def test_a_file_that_has_broken_since_is_told(tmp_path: Path) -> None:
     assert not (tmp_path / "other.sumocfg").exists()
 
 
-def test_included_types_are_changed_too_and_weights_of_edges_are_kept(tmp_path: Path) -> None:
+def test_included_types_are_changed_and_weights_of_edges_are_kept(tmp_path: Path) -> None:
     mine, new = tmp_path / "mine", tmp_path / "new"
     mine.mkdir()
     new.mkdir()
