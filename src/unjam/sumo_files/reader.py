@@ -166,7 +166,7 @@ class XmlReader:
             self._drop_content()  # as SUMO does
 
     def _drop_content(self) -> None:
-        """Leave out the content of the element that has just begun, and its end."""
+        """Leave out the content of the element that has just started, and its end."""
         self._dropped_depth = 1
         self._parsers[-1].EndElementHandler = self._on_end
 
