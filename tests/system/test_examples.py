@@ -78,7 +78,7 @@ def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
         residual(residual(residual(FollowerStopper(), 1, hold=3), 2), 3, hold=5),
         residual(HistoryDriver(PISaturation(), 0.1), hold=10),
         residual(FilteredDriver(PISaturation(), 1.0, SafetyFilter(), 0.1), hold=10),
-        residual(PISaturation(), hold=10, parts=("approach", "distance_to_merge")),
+        residual(PISaturation(), hold=10, parts=("merge_proximity", "distance_to_merge")),
         FilteredDriver(residual(PISaturation(), hold=10), 1.0, SafetyFilter(gap_error=0.5), 0.1),
         FilteredDriver(driver_from_name("constant:acceleration=1", 0.1), 1.5, SafetyFilter(time_gap=0.0), 0.1),
     ]
@@ -103,7 +103,7 @@ def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Pat
     ran = compared(path)
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ran.stdout.startswith("40 control steps, at most ")
-    other = path.read_bytes().replace(b'"hold": 1,', b'"hold": 2,')
+    other = path.read_bytes().replace(b'"action_repeat": 1,', b'"action_repeat": 2,')
     path.write_bytes(other)
     assert compared(path).returncode != 0
 

@@ -75,7 +75,7 @@ def test_trusted_code_runs(command: str, unjam: Run, ran: Path) -> None:
 def test_certify_of_trusted_code_checks_its_requirements(unjam: Run, ran: Path) -> None:
     done = unjam(*COMMANDS["certify"], "--trust-code")
     assert (done.returncode, done.stdout, one_line(done.stderr)) == (2, "", True), done.stderr
-    assert "a controller without its safety filter and sample is not allowed" in done.stderr
+    assert "a controller without safety filter and sample is not allowed" in done.stderr
     assert ran.exists()
 
 
