@@ -1,1 +1,1 @@
-"""Learning how people follow the car ahead: data, calibration, networks, and how they are judged."""
+"""Car following of human drivers: data, calibration, networks, and open-loop tests."""

@@ -1,7 +1,6 @@
-"""Driving behind a recorded leader: what a model of a driver is worth over a whole trajectory.
+"""Open-loop simulation of driver models behind recorded leaders.
 
-One step ahead, errors say little: models that are better there collide more often when they drive on from
-their own predictions.
+One-step errors say little: models with smaller ones collide more often when they drive from their own predictions.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.car_following import _MIN_GAP
+from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.following.pairs import Floats, Segments
 from unjam.physics.arrays import Array, clamp_min, clip, namespace
 from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMArrays, IDMParameters, idm_acceleration
@@ -19,58 +18,54 @@ from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.population import residual_inputs
 
 AccelerationFunction = Callable[[Array, Array, Array], Array]
-"""a model of a driver: (own speed, leader's speed, gap) -> acceleration; [m/s], [m] and [m/s2]"""
-
+"""from own speed, leader speed and gap to the acceleration; [m/s], [m] and [m/s2]"""
 DriverModel = Callable[[Array, Array], AccelerationFunction]
-"""a driver who takes over: (speed, gap) at that moment -> how it drives on"""
-
+"""a driver that takes over: from speed and gap at that moment to how it drives on"""
 ResidualFunction = Callable[[Array], Array]
-"""a network: what it sees, shape (..., 3) -> acceleration"""
+"""a network: from inputs, shape (..., 3), to the acceleration"""
+AnyIDM = IDMParameters | IDMArrays
 AccelerationBounds = tuple[float, float]
 """lowest and highest acceleration [m/s2]"""
 
 MIN_HEADWAY_SPEED = 2.0
-"""speed below which a time headway is not to be told from the gap [m/s]: it counts as this"""
+"""minimum speed in the estimation of a time headway, which slow driving does not reveal [m/s]"""
 HEADWAY_LIMITS = (0.2, 6.0)
-"""what a time headway may be [s]"""
+"""of estimated time headways [s]"""
 
 
 def fixed_driver(follow: AccelerationFunction) -> DriverModel:
-    """Return the driver that drives alike wherever it takes over."""
+    """Return a driver that drives the same wherever it takes over."""
     return lambda speed, gap: follow
 
 
-def replace_parameters(parameters: IDMParameters | IDMArrays, **values: Array) -> IDMArrays:
-    """Return the parameters with arrays in some places."""
+def replace_parameters(parameters: AnyIDM, **values: Array) -> IDMArrays:
+    """Return the parameters with arrays for some of them."""
     return IDMArrays(*(values.get(name, getattr(parameters, name)) for name in IDM_PARAMETER_NAMES))
 
 
-def idm_function(
-    parameters: IDMParameters | IDMArrays, limits: AccelerationBounds | None = None
-) -> AccelerationFunction:
-    """Return the IDM as a model of a driver, its acceleration kept within `limits` [m/s2]."""
+def idm_function(parameters: AnyIDM, limits: AccelerationBounds | None = None) -> AccelerationFunction:
+    """Return the IDM as a function, with its acceleration within `limits` [m/s2]."""
 
     def follow(speed: Array, leader_speed: Array, gap: Array) -> Array:
-        found = idm_acceleration(speed, leader_speed, clamp_min(gap, _MIN_GAP), parameters)
-        return found if limits is None else clip(found, *limits)
+        acceleration = idm_acceleration(speed, leader_speed, clamp_min(gap, MIN_IDM_GAP), parameters)
+        return acceleration if limits is None else clip(acceleration, *limits)
 
     return follow
 
 
 def individual_idm(
-    parameters: IDMParameters | IDMArrays, initial_headway_weight: Array, limits: AccelerationBounds | None = None
+    parameters: AnyIDM, initial_headway_weight: Array, limits: AccelerationBounds | None = None
 ) -> DriverModel:
-    """Return an IDM that keeps a part of the headway with which a driver was found.
+    """Return an IDM that keeps a part of the time headway at which it takes over.
 
-    People differ most in the distance they keep. Of a driver nothing is known but the moment of taking over,
-    whose time headway T0 = (gap - s0) / v says a part of it: the driver's own T is T^(1 - kept) T0^kept. With
-    `remaining_rows` 0 all drive alike, with 1 everybody keeps the headway of that moment.
+    Human drivers differ most in their distance, of which a model only knows the headway T0 = (gap - s0) / v at that
+    moment. The driver's own headway is T^(1 - w) T0^w: with the initial headway weight w = 0 all drivers are equal.
     """
     p = parameters
 
     def take_over(speed: Array, gap: Array) -> AccelerationFunction:
-        found = clip((gap - p.minimum_gap) / clamp_min(speed, MIN_HEADWAY_SPEED), *HEADWAY_LIMITS)
-        own = p.time_headway ** (1.0 - initial_headway_weight) * found**initial_headway_weight
+        initial = clip((gap - p.minimum_gap) / clamp_min(speed, MIN_HEADWAY_SPEED), *HEADWAY_LIMITS)
+        own = p.time_headway ** (1.0 - initial_headway_weight) * initial**initial_headway_weight
         return idm_function(replace_parameters(p, time_headway=own), limits)
 
     return take_over
@@ -79,16 +74,16 @@ def individual_idm(
 def add_residual(
     base: DriverModel | None, network: ResidualFunction, limits: AccelerationBounds | None = None
 ) -> DriverModel:
-    """Return a network on a base, or alone where there is none, kept within `limits` [m/s2]."""
+    """Return a base with a network as its residual, or the network alone, within `limits` [m/s2]."""
 
     def take_over(speed: Array, gap: Array) -> AccelerationFunction:
-        known = base(speed, gap) if base is not None else None
+        base_function = base(speed, gap) if base is not None else None
 
         def follow(speed: Array, leader_speed: Array, gap: Array) -> Array:
-            found = network(residual_inputs(speed, leader_speed, gap))
-            if known is not None:
-                found = found + known(speed, leader_speed, gap)
-            return found if limits is None else clip(found, *limits)
+            acceleration = network(residual_inputs(speed, leader_speed, gap))
+            if base_function is not None:
+                acceleration = acceleration + base_function(speed, leader_speed, gap)
+            return acceleration if limits is None else clip(acceleration, *limits)
 
         return follow
 
@@ -96,13 +91,11 @@ def add_residual(
 
 
 def follow_leader(follow: AccelerationFunction, start: tuple[Array, Array], leader: Any, step: float) -> Iterator[Any]:
-    """Yield (speed, gap) after each step of driving behind a recorded leader.
+    """Yield speed and gap after each step behind a recorded leader.
 
-    Who uses the gap up touches the leader and is no faster, until it brakes: without that, a network that has
-    driven through its leader would be asked what nobody can know.
-
-    Starts are a speed [m/s] and a gap [m], shape (..., n); leaders (speeds, paths), each of shape (T, n),
-    paths as in `Pair.leader_path`; `step` lies between two moments [s].
+    A vehicle that uses up its gap touches the leader and drives at most at its speed until it brakes: data contain no
+    states inside a leader, on which a network could act. `start` is speed [m/s] and gap [m], shape (..., n); `leader`
+    is speeds and paths as in `Pair`, shape (T, n); `step` is the time between two moments [s].
     """
     (speed, gap), (leader_speeds, paths) = start, leader
     position = gap * 0.0
@@ -120,35 +113,30 @@ def follow_leader(follow: AccelerationFunction, start: tuple[Array, Array], lead
 
 @dataclass(frozen=True, eq=False)
 class OpenLoopResult:
-    """How a model drove behind recorded leaders, beside those who really did; n stretches of T moments."""
+    """A model behind recorded leaders, compared with the recorded followers; n segments of T moments."""
 
     speed: Floats
     """[m/s], shape (T, n)"""
     gap: Floats
     """[m], shape (T, n)"""
     speed_mse: Floats
-    """mean squared error of the speed, of each stretch, shape (n,)"""
+    """mean squared error of the speed in each segment, shape (n,)"""
     gap_mse: Floats
     """mean squared error of the gap, shape (n,)"""
     has_collided: NDArray[np.bool_]
     """whether the gap was used up, shape (n,)"""
     sample_counts: NDArray[np.int64]
-    """moments of each stretch but the first, shape (n,)"""
+    """number of moments of each segment after the first, shape (n,)"""
 
 
 def simulate_open_loop(model: DriverModel, segments: Segments) -> OpenLoopResult:
-    """Drive behind the leader of each stretch from its first moment on, and compare with the follower."""
-    start, present, moments = segments.start, segments.is_present, segments.sample_counts
-    driven = follow_leader(model(*start), start, segments.leader, segments.step)
-    speed, gap = map(np.stack, zip(start, *driven, strict=True))
-    return OpenLoopResult(
-        speed,
-        gap,
-        (np.square(speed - segments.speed) * present).sum(0) / moments,
-        (np.square(gap - segments.gap) * present).sum(0) / moments,
-        np.any((gap <= 0.0) & present, axis=0),
-        moments,
-    )
+    """Simulate a model behind the leader of each segment from its first moment on."""
+    start, is_present, counts = segments.start, segments.is_present, segments.sample_counts
+    states = follow_leader(model(*start), start, segments.leader, segments.step)
+    speed, gap = map(np.stack, zip(start, *states, strict=True))
+    speed_mse = (np.square(speed - segments.speed) * is_present).sum(0) / counts
+    gap_mse = (np.square(gap - segments.gap) * is_present).sum(0) / counts
+    return OpenLoopResult(speed, gap, speed_mse, gap_mse, np.any((gap <= 0.0) & is_present, axis=0), counts)
 
 
 def one_step_error(model: DriverModel, segments: Segments) -> Floats:

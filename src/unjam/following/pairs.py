@@ -1,4 +1,4 @@
-"""What is known of how people drive: one follower behind one leader; and what was found in a file."""
+"""Car-following data: pairs of one follower and one leader, their samples and segments, and the content of files."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,23 +15,23 @@ from unjam.physics.kinematics import distance_driven, next_position
 
 SPLITS = ("train", "validation", "test")
 SEGMENT_FIELDS = ("speed", "leader_speed", "gap", "leader_path")
-"""of a `Pair`, what stretches have side by side"""
+"""fields of a `Pair` that segments stack"""
 MIN_PAIR_SECONDS = 20.0
-"""drives behind a CAV that are shorter tell too little [s]"""
+"""minimum duration of a pair behind a CAV; shorter ones contain too little information [s]"""
 MAX_GAP_JUMP = 0.5
-"""change of the gap in a decision that speeds do not explain, beyond which another vehicle is behind [m]"""
+"""change of the gap in a control step beyond that of the speeds, above which the follower is another vehicle [m]"""
 MAX_LISTED_ROWS = 5
-"""bad rows that a message names"""
+"""bad rows that a message lists"""
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """How one driver followed one leader; T evenly spaced moments."""
+    """A trajectory of one driver behind one leader; T evenly spaced moments."""
 
     name: str
-    """of this trajectory, unlike that of any other"""
+    """unique name of the trajectory"""
     driver: str
-    """who followed; several trajectories may be of one driver"""
+    """the follower; several trajectories may have the same driver"""
     step: float
     """time between two moments [s]"""
     speed: Floats = field(repr=False)
@@ -41,39 +41,38 @@ class Pair:
     gap: Floats = field(repr=False)
     """from the follower's front bumper to the leader's rear bumper [m], shape (T,)"""
     kind: str = ""
-    """of driver, where the data say it: `human`, `ACC`"""
+    """of driver, if the data contain it: `human`, `ACC`"""
     split: str = ""
-    """to which part of a published split it belongs, where there is one"""
+    """part of a published split, if there is one"""
 
     @property
     def seconds(self) -> float:
-        """How long it lasts [s]."""
+        """Duration [s]."""
         return (len(self.speed) - 1) * self.step
 
     @cached_property
     def acceleration(self) -> Floats:
-        """Between each moment and the next, as an Euler step has it [m/s2], shape (T - 1,)."""
+        """Acceleration between each moment and the next as in an Euler step [m/s2], shape (T - 1,)."""
         return np.diff(self.speed) / self.step
 
     @cached_property
     def leader_path(self) -> Floats:
-        """Where the leader's rear bumper is, from where the follower's front began [m], shape (T,).
+        """Position of the leader's rear bumper relative to the follower's initial front bumper [m], shape (T,).
 
-        The follower's way by Euler steps, plus the gap: so a follower that drives as this one did keeps
-        exactly the recorded gap, whatever errors there are in the leader's speed.
+        It is the follower's path in Euler steps plus the gap, so that a model that drives like the follower keeps
+        exactly the recorded gap, regardless of errors in the leader's speed.
         """
-        way = next_position(np.zeros(len(self.speed)), np.r_[0.0, np.cumsum(self.speed[1:])], self.step)
-        return self.gap + way
+        path = next_position(np.zeros(len(self.speed)), np.r_[0.0, np.cumsum(self.speed[1:])], self.step)
+        return self.gap + path
 
     def part(self, first: int, last: int) -> "Pair":
-        """Return the moments from `first` on and before `last` as a trajectory of its own."""
-        cut = {each: getattr(self, each)[first:last] for each in ("speed", "leader_speed", "gap")}
-        return replace(self, **cut)
+        """Return the moments from `first` to before `last` as a trajectory."""
+        return replace(self, **{name: getattr(self, name)[first:last] for name in ("speed", "leader_speed", "gap")})
 
 
 @dataclass(frozen=True, eq=False)
 class FollowingSamples:
-    """Single moments, without what came before; n of them."""
+    """Single moments of car following without a history; n of them."""
 
     speed: Floats
     leader_speed: Floats
@@ -86,45 +85,40 @@ class FollowingSamples:
 
     @property
     def inputs(self) -> tuple[Floats, Floats, Floats]:
-        """What a driver sees: own speed, leader's speed and gap."""
+        """The inputs of a driver: own speed, leader speed and gap."""
         return self.speed, self.leader_speed, self.gap
 
     def select(self, indices: NDArray[np.int64]) -> "FollowingSamples":
-        """Return the chosen moments."""
+        """Return some of the samples."""
         return FollowingSamples(*(values[indices] for values in vars(self).values()))
 
 
 def following_samples(pairs: Sequence[Pair]) -> FollowingSamples:
-    """Return all moments of `pairs` but the last of each, one after the other."""
-
-    def concatenate(name: str) -> Floats:
-        return np.concatenate([getattr(pair, name)[: len(pair.acceleration)] for pair in pairs])
-
-    return FollowingSamples(
-        concatenate("speed"), concatenate("leader_speed"), concatenate("gap"), concatenate("acceleration")
-    )
+    """Return all moments of `pairs` except the last of each, concatenated."""
+    columns = [(each.speed[:-1], each.leader_speed[:-1], each.gap[:-1], each.acceleration) for each in pairs]
+    return FollowingSamples(*map(np.concatenate, zip(*columns, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Trajectories side by side, of up to T moments; the first index is time. n stretches."""
+    """Parts of trajectories in columns; n segments of up to T moments."""
 
     speed: Floats = field(repr=False)
-    """[m/s], shape (T, n); past the end of a stretch its last value"""
+    """[m/s], shape (T, n); after the end of a segment its last value"""
     leader_speed: Floats = field(repr=False)
     gap: Floats = field(repr=False)
     leader_path: Floats = field(repr=False)
     """of `Pair`"""
     is_present: NDArray[np.bool_] = field(repr=False)
-    """whether the stretch lasts that long, shape (T, n)"""
+    """whether the segment lasts that long, shape (T, n)"""
     step: float
     """[s]"""
     pair_index: NDArray[np.int64] = field(repr=False)
-    """which pair each stretch is of, shape (n,)"""
+    """index of the pair of each segment, shape (n,)"""
 
     @cached_property
     def sample_counts(self) -> NDArray[np.int64]:
-        """Moments of each stretch but the first, shape (n,)."""
+        """Number of moments of each segment after the first, shape (n,)."""
         return self.is_present[1:].sum(0)
 
     @property
@@ -138,104 +132,86 @@ class Segments:
         return self.leader_speed, self.leader_path
 
     def select(self, indices: NDArray[np.int64]) -> "Segments":
-        """Return the chosen stretches, as long as the longest of them."""
-        long = int(self.is_present[:, indices].sum(0).max())
-        cut = {name: getattr(self, name)[:long, indices] for name in (*SEGMENT_FIELDS, "is_present")}
-        return replace(self, **cut, pair_index=self.pair_index[indices])
+        """Return some of the segments, cut to the longest of them."""
+        length = int(self.is_present[:, indices].sum(0).max())
+        columns = {name: getattr(self, name)[:length, indices] for name in (*SEGMENT_FIELDS, "is_present")}
+        return replace(self, **columns, pair_index=self.pair_index[indices])
 
 
 def make_segments(pairs: Sequence[Pair], segment_seconds: float | None = None) -> Segments:
-    """Return `pairs` side by side, cut into stretches of `seconds`, the last of each as long as it is.
-
-    None: each pair whole. What is left at an end and shorter than two moments is not there.
+    """Return `pairs` cut into segments of `segment_seconds`, the last of each pair shorter; None: whole pairs.
 
     Raises:
         InputError: the pairs have different time steps.
     """
     steps = {pair.step for pair in pairs}
     if len(steps) != 1:
-        raise invalid_value("time step", sorted(steps), "one and the same in all trajectories [s]")
+        raise invalid_value("time step", sorted(steps), "the same in all trajectories [s]")
     (step,) = steps
-    parts: list[Pair] = []
-    owner: list[int] = []
+    parts, pair_index = list[Pair](), list[int]()
     for number, pair in enumerate(pairs):
         length = len(pair.speed) if segment_seconds is None else round(segment_seconds / step) + 1
         for first in range(0, len(pair.speed) - 1, max(1, length - 1)):
             parts.append(pair.part(first, first + length))
-            owner.append(number)
+            pair_index.append(number)
     lengths = np.array([len(part.speed) for part in parts])
     longest = int(lengths.max())
 
     def stack(name: str) -> Floats:
-        columns = [getattr(part, name) for part in parts]
+        columns = (getattr(part, name) for part in parts)
         return np.stack([np.pad(column, (0, longest - len(column)), mode="edge") for column in columns], 1)
 
-    return Segments(
-        **{name: stack(name) for name in SEGMENT_FIELDS},
-        is_present=np.arange(longest)[:, None] < lengths,
-        step=step,
-        pair_index=np.array(owner),
-    )
+    is_present = np.arange(longest)[:, None] < lengths
+    return Segments(*map(stack, SEGMENT_FIELDS), is_present, step, np.array(pair_index))
 
 
 def split_by_driver(pairs: Sequence[Pair], shares: Sequence[float], seed: int) -> list[Pair]:
-    """Return `pairs` with `split` set to train, validation or test; all pairs of a driver go together.
-
-    `penetration_rates` are those of training, validation and test in the number of drivers; they add up to one.
-    """
+    """Return `pairs` with `split` set to train, validation or test, which have these `shares` of the drivers."""
     drivers = sorted({pair.driver for pair in pairs})
     order = np.random.default_rng(seed).permutation(len(drivers))
     borders = np.round(np.cumsum(shares) * len(drivers)).astype(int)
-    places = np.searchsorted(borders, np.argsort(order), side="right").clip(max=len(SPLITS) - 1)
-    split = {driver: SPLITS[place] for driver, place in zip(drivers, places, strict=True)}
-    return [replace(pair, split=split[pair.driver]) for pair in pairs]
+    indices = np.searchsorted(borders, np.argsort(order), side="right").clip(max=len(SPLITS) - 1)
+    splits = {driver: SPLITS[index] for driver, index in zip(drivers, indices, strict=True)}
+    return [replace(pair, split=splits[pair.driver]) for pair in pairs]
 
 
 def pairs_in_splits(pairs: Sequence[Pair], *splits: str) -> list[Pair]:
-    """Return the pairs of these parts of the split."""
+    """Return the pairs of some parts of a split."""
     return [pair for pair in pairs if pair.split in splits]
 
 
 def pairs_behind_cavs(
     recordings: Iterable[LocalState], control_step: float, steps_per_control_step: int = 1
 ) -> list[Pair]:
-    """Return the drives of those who followed a CAV, each of the same vehicle throughout.
-
-    `recordings` are what CAVs perceived, each of shape (T,), a decision every `step` [s], of so many `steps`
-    of the simulation.
-    """
+    """Return trajectories of the followers of CAVs from observations of shape (T,), one every `control_step` [s]."""
     pairs = []
     for number, states in enumerate(recordings):
-        largest = np.where(np.isnan(states.loop_length), MAX_OBSERVED_GAP, states.loop_length)
-        nobody = states.follower_gap >= largest
-        ahead, behind = (
-            distance_driven(speed[:-1], speed[1:], control_step / steps_per_control_step, steps_per_control_step)
-            for speed in (states.speed, states.follower_speed)
-        )
-        expected = states.follower_gap[:-1] + ahead - behind
-        other = np.abs(states.follower_gap[1:] - expected) > MAX_GAP_JUMP
-        ends = np.flatnonzero(np.r_[True, other | nobody[1:] | nobody[:-1], True])
-        for first, last in pairwise(ends):
+        max_gap = np.where(np.isnan(states.loop_length), MAX_OBSERVED_GAP, states.loop_length)
+        is_missing = states.follower_gap >= max_gap
+        own, behind, steps = states.speed, states.follower_speed, steps_per_control_step
+        expected = states.follower_gap[:-1] + distance_driven(own[:-1], own[1:], control_step / steps, steps)
+        expected = expected - distance_driven(behind[:-1], behind[1:], control_step / steps, steps)
+        is_other = np.abs(states.follower_gap[1:] - expected) > MAX_GAP_JUMP
+        cuts = np.flatnonzero(np.r_[True, is_other | is_missing[1:] | is_missing[:-1], True])
+        for first, last in pairwise(cuts):
             if (last - first) * control_step >= MIN_PAIR_SECONDS:
-                seen = (states.follower_speed, states.speed, states.follower_gap)
-                own, leader, gap = (np.asarray(values[first:last], np.float64) for values in seen)
-                name = f"{number}-{first}"
-                pairs.append(Pair(name, name, control_step, own, leader, gap))
+                columns = (np.asarray(each[first:last], np.float64) for each in (behind, own, states.follower_gap))
+                pairs.append(Pair(f"{number}-{first}", f"{number}-{first}", control_step, *columns))
     return pairs
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How a file is read."""
+    """Options for reading a file."""
 
     drop_bad_rows: bool = False
-    """whether bad rows are cut out, and end their trajectory, instead of refused"""
+    """whether bad rows are dropped, which ends their trajectory, instead of refused"""
     min_seconds: float = 20.0
-    """trajectories shorter than that are left out, and counted [s]"""
+    """minimum duration of a trajectory; shorter ones are skipped and counted [s]"""
     driver_columns: tuple[str, ...] = ()
-    """plain tables: columns that together name the driver, where `driver` is not one"""
+    """columns of a plain table that together name the driver, if it has no column `driver`"""
     kind_columns: tuple[str, ...] = ()
-    """plain tables: columns that together name the kind of driver, where `kind` is not one"""
+    """the same for `kind`"""
 
 
 @dataclass(frozen=True)
@@ -243,28 +219,28 @@ class BadRow:
     """A row that cannot be used."""
 
     line: int
-    """in the file, its header being line 1"""
+    """in the file, where the header is line 1"""
     reason: str
 
 
 @dataclass(frozen=True)
 class ReadResult:
-    """What a file holds."""
+    """The content of a file."""
 
     pairs: list[Pair] = field(repr=False)
     rows: int
     """in the file"""
     bad_rows: list[BadRow]
-    """rows that were cut out, with what was wrong"""
+    """dropped rows"""
     skipped_rows: dict[str, int]
-    """rows that are not wrong but of no use, by reason"""
+    """numbers of valid rows that are not used, by reason"""
 
     def summary_lines(self) -> list[str]:
-        """Return lines that say what was read and what was not."""
-        moments = sum(len(pair.speed) for pair in self.pairs)
-        lines = [f"{len(self.pairs)} trajectories with {moments:,} of {self.rows:,} rows"]
-        lines += [f"left out: {count:,} rows: {why}" for why, count in self.skipped_rows.items() if count]
-        lines += [f"cut out: line {row.line}: {row.reason}" for row in self.bad_rows[:MAX_LISTED_ROWS]]
+        """Return a summary of what was read and what was not."""
+        used = sum(len(pair.speed) for pair in self.pairs)
+        lines = [f"{len(self.pairs)} trajectories with {used:,} of {self.rows:,} rows"]
+        lines += [f"skipped: {count:,} rows: {reason}" for reason, count in self.skipped_rows.items() if count]
+        lines += [f"dropped: line {row.line}: {row.reason}" for row in self.bad_rows[:MAX_LISTED_ROWS]]
         if len(self.bad_rows) > MAX_LISTED_ROWS:
-            lines.append(f"cut out: {len(self.bad_rows) - MAX_LISTED_ROWS} more bad rows")
+            lines.append(f"dropped: {len(self.bad_rows) - MAX_LISTED_ROWS} more bad rows")
         return lines

@@ -36,6 +36,6 @@ def errors(eight: FigureEight, driver: Driver, seed: int, simulation: Simulation
         if controlled:
             told = np.maximum(speed[controlled] + applied[:, [moment]] * step, 0.0)
         ahead = Leader(np.roll(speed, -1, 0), gap)
-        moved = movement.next_speeds(speed, position, ahead, noise[moment][:, None], told)
+        moved = movement.move(speed, position, ahead, noise[moment][:, None], told)
         found[moment] = moved[:, 0] - episode.speeds[moment + 1]
     return found

@@ -96,13 +96,13 @@ def test_warmed_up_with_others_it_goes_on_to_the_same_bits() -> None:
 
 
 def test_who_waits_is_known_from_the_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen, moved = [], FigureEightMovement.next_speeds
+    seen, moved = [], FigureEightMovement.move
 
     def watched(movement: FigureEightMovement, *arguments: Any) -> Any:
         seen.append([each[:, 0] for each in movement.memory])
         return moved(movement, *arguments)
 
-    monkeypatch.setattr(FigureEightMovement, "next_speeds", watched)
+    monkeypatch.setattr(FigureEightMovement, "move", watched)
     (episode,) = run_batch(tasks(SHORT, "human", range(1)), allow_statistical=True)
     road = cast(ClosedRoad, SHORT.draw_from_seed((0,))[0])
     waited, entered = np.stack(seen, 1)

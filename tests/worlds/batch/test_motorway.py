@@ -174,7 +174,13 @@ def test_who_changes_lanes_is_who_does_in_sumo(simulation: Simulation) -> None:
             | {
                 **{"road": np.zeros(160, int), "entry": np.arange(160), "lane": before["way"].astype(int)},
                 **{"position": place, "speed": speed, "acceleration": (speed - before["speed"]) / STEP},
-                **{"time_headway": time_headway, "max_acceleration": most, "braking": braking, "minimum_gap": gap, "speed_factor": factor},
+                **{
+                    "time_headway": time_headway,
+                    "max_acceleration": most,
+                    "braking": braking,
+                    "minimum_gap": gap,
+                    "speed_factor": factor,
+                },
                 **{"is_eidm": np.ones(160, bool), "speed_cap": free, "desired_speed": LIMIT * factor},
             }
         )

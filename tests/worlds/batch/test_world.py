@@ -193,7 +193,14 @@ def test_a_network_sees_explores_and_is_recorded_as_in_sumo(
         actual = run_episode(ring, driver, seed, explore=True, simulation=simulation)
         assert_alike(found, actual)
         for one, other in zip(found.trajectories, actual.trajectories, strict=True):
-            for name in ("observations", "expert_acceleration", "residual", "applied_acceleration", "filter_braking", "reward"):
+            for name in (
+                "observations",
+                "expert_acceleration",
+                "residual",
+                "applied_acceleration",
+                "filter_braking",
+                "reward",
+            ):
                 assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-9), name
             for name, values in other.initial_memory.items():
                 assert one.initial_memory[name] == pytest.approx(values, abs=1e-9, nan_ok=True), name
@@ -300,7 +307,9 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
     world = RingBatch([replace(ring, warmup=60)] * 50, [(seed,) for seed in range(50)], singles("cpu"), draw=draw)
     episodes = finish_drive(start_batch_drive(world, Constant(0.2), singles("cpu"))).episodes
     noise = [
-        each.speeds[1:] - np.diff(each.positions, axis=0) / each.control_step for each in episodes if each.speeds.min() > 0.5
+        each.speeds[1:] - np.diff(each.positions, axis=0) / each.control_step
+        for each in episodes
+        if each.speeds.min() > 0.5
     ]
     cav = episodes[0].vehicle_ids.index("cav_0")
     added = np.array(noise)

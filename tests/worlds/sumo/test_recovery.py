@@ -53,7 +53,7 @@ def follow(gaps: list[float], speeds: list[float]) -> FollowingStatistics:
         places, both = np.array([100.0, 100.0 + length + gap]), np.array([speed, 20.0])
         vehicles = make_vehicles(road, entry, way, places, both, column, *known, column + 30.0)
         no_vehicles = MotorwayVehicles(*(each[:0] for each in vehicles))
-        log.record_step(vehicles, np.array([1, -1]), no_vehicles, np.array([0]), True)
+        log.record_step(vehicles, np.array([1, -1]), no_vehicles, np.array([0]))
     settled = np.concatenate(log._steady_following, 1)
     assert (settled[0] == 1).all()
     return log._audit(1, [], settled[1:]).following

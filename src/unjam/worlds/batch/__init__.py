@@ -1,1 +1,1 @@
-"""Whole rings, many at once, stepped as arrays: what SUMO's episodes of the same seeds do, without SUMO."""
+"""Simulation of many roads at once as arrays, with the same results as SUMO, but without SUMO."""

@@ -9,17 +9,10 @@ from functools import reduce
 import numpy as np
 
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
-from unjam.physics.idm import (
-    IDM_PARAMETER_NAMES,
-    IDMArrays,
-    IDMParameters,
-    fast_power,
-    idm_acceleration,
-    stack_idm_parameters,
-)
+from unjam.physics.idm import IDMArrays, IDMParameters, fast_power, idm_acceleration, stack_idm_parameters
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.road import ClosedRoad
-from unjam.worlds.batch.leaders import Leader, lane_end_leader, leaders
+from unjam.worlds.batch.leaders import HumanParameters, Leader, lane_end_leader, leaders
 from unjam.worlds.batch.noise import ArrayFactory
 
 HumanSpeedModel = Callable[[Array, Array, Array], Array]
@@ -37,9 +30,7 @@ STANDSTILL_ACCELERATION = 1e-4
 """SUMO's NUMERICAL_EPS_SPEED over the time step: slower vehicles stand after a step [m/s2]"""
 
 
-def human_idm_speed(
-    speed: Array, leader_speed: Array, gap: Array, parameters: IDMParameters | IDMArrays, step: float
-) -> Array:
+def human_idm_speed(speed: Array, leader_speed: Array, gap: Array, parameters: HumanParameters, step: float) -> Array:
     """Return the speeds of human drivers after a step behind their leaders, before noise is added [m/s].
 
     Shapes: any, broadcast together. Units: m/s, m/s, m, s. Steps are at most 0.375 s; SUMO divides longer ones.
@@ -52,17 +43,9 @@ def human_idm_speed(
 
 
 def human_ring_speed(
-    speed: Array,
-    position: Array,
-    leader: Leader,
-    loop_length: Array,
-    parameters: IDMParameters | IDMArrays,
-    step: float,
+    speed: Array, position: Array, leader: Leader, loop_length: Array, parameters: HumanParameters, step: float
 ) -> Array:
-    """Return the speeds of human drivers after a step on a ring of four lanes, before noise is added [m/s].
-
-    Arguments as in `unjam.worlds.batch.leaders.leaders`.
-    """
+    """Return the speeds of human drivers after a step on a ring, before noise [m/s]; arguments as of `leaders`."""
     xp, visible = namespace(speed), leaders(speed, position, leader, loop_length, parameters, step)
     new_speed = reduce(xp.minimum, (human_idm_speed(speed, *each, parameters, step) for each in visible))
     is_too_fast = speed > parameters.desired_speed  # because of noise
@@ -75,16 +58,14 @@ def human_ring_speed(
     return new_speed
 
 
-def without_minimum_gap(parameters: IDMParameters | IDMArrays) -> IDMArrays:
+def without_minimum_gap(parameters: HumanParameters) -> IDMArrays:
     """Return drivers with a standstill gap of zero, as at the end of a lane."""
-    return IDMArrays(**{name: getattr(parameters, name) for name in IDM_PARAMETER_NAMES})._replace(minimum_gap=0.0)
+    return IDMArrays(*(getattr(parameters, name) for name in IDMArrays._fields))._replace(minimum_gap=0.0)
 
 
-def human_parameters(
-    roads: Sequence[ClosedRoad], shared_parameters: IDMParameters, to_array: ArrayFactory
-) -> IDMParameters | IDMArrays:
+def human_parameters(roads: Sequence[ClosedRoad], shared: IDMParameters, to_array: ArrayFactory) -> HumanParameters:
     """Return the parameters of the human drivers of W roads: shared, or of each vehicle, shape (vehicles, W)."""
     if not roads[0].human_parameters:
-        return shared_parameters
+        return shared
     drivers = [stack_idm_parameters([road.human_parameters[name] for name in road.vehicle_ids]) for road in roads]
     return IDMArrays(*(to_array(np.stack(values, 1)) for values in zip(*drivers, strict=True)))

@@ -23,6 +23,10 @@ FREE_GAP = 1e6
 """gap in SUMO's `freeSpeed` without a leader; the leader then drives at the desired speed [m]"""
 
 
+HumanParameters = IDMParameters | IDMArrays
+"""of all human drivers, or of each"""
+
+
 class Leader(NamedTuple):
     """Leaders of drivers; arrays of shape (vehicles, W)."""
 
@@ -33,22 +37,12 @@ class Leader(NamedTuple):
 
 
 def leaders(
-    speed: Array,
-    position: Array,
-    leader: Leader,
-    loop_length: Array,
-    parameters: IDMParameters | IDMArrays,
-    step: float,
+    speed: Array, position: Array, leader: Leader, loop_length: Array, parameters: HumanParameters, step: float
 ) -> Iterator[Leader]:
     """Yield the leader of each vehicle on its own lane, on the next one, and so on as far as any driver sees.
 
-    Args:
-        speed: [m/s], shape (vehicles, W).
-        position: front bumpers along the ring, wrapped or not [m], shape (vehicles, W).
-        leader: the vehicle ahead of each.
-        loop_length: lengths of the rings [m], shape (W,).
-        parameters: of the drivers.
-        step: of the simulation [s].
+    Shapes: (vehicles, W); `loop_length` (W,). Units: m/s, m, m, s. Positions are those of front bumpers, wrapped or
+    not; `leader` is the vehicle ahead.
     """
     xp, lane_length, place = namespace(speed), loop_length / RING_EDGES, position % loop_length
     lane = xp.floor(place / lane_length)
@@ -80,17 +74,17 @@ def leaders(
 
 
 def look_ahead_distance(max_speed: Array, time_headway: Array, braking: Array, step: float) -> Array:
-    """Return how far drivers look ahead who reach `max_speed` in this step: far enough to stop after a headway [m].
+    """Return how far drivers look ahead: far enough to stop after a headway at the maximum speed of this step [m].
 
     Shapes: any, broadcast together. Units: m/s, s, m/s2, s.
     """
     return max_speed * (step + time_headway) + stopping_distance(max_speed, braking, step)
 
 
-def lane_end_leader(speed: Array, position: Array, loop_length: Array, parameters: IDMParameters | IDMArrays) -> Leader:
+def lane_end_leader(speed: Array, position: Array, loop_length: Array, parameters: HumanParameters) -> Leader:
     """Return the leader of drivers above their desired speed: the end of their lane, as a standing vehicle.
 
-    Shapes as in `leaders`. The gap is at least that of SUMO's `getSecureGap` at the desired speed.
+    Arguments as of `leaders`. The gap is at least that of SUMO's `getSecureGap` at the desired speed.
     """
     lane_length, desired = loop_length / RING_EDGES, parameters.desired_speed
     secure_gap = desired * (parameters.time_headway + desired / parameters.interaction_scale)
@@ -100,10 +94,7 @@ def lane_end_leader(speed: Array, position: Array, loop_length: Array, parameter
 def ring_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
     """Return which vehicles touch the vehicle ahead according to SUMO, which requires both fronts on the same lane.
 
-    Args:
-        position: front bumpers along the ring [m], shape (vehicles, ...).
-        gap: to the vehicle ahead [m], likewise.
-        loop_length: length of the ring [m].
+    Shapes: (vehicles, ...); `loop_length` broadcasts with them. Units: m.
     """
     xp = namespace(position)
     lane = xp.floor(position % loop_length / (loop_length / RING_EDGES))

@@ -1,7 +1,7 @@
 """Random numbers of many episodes at once: those of SUMO's episodes of the same seeds, or quick ones."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,8 @@ ArrayFactory = Callable[[Floats], Array]
 """makes arrays of the library and precision of a batch"""
 DrawNormal = Callable[[tuple[int, ...]], Array]
 """draws standard normal numbers of a shape"""
+WorldSeeds = Sequence[Sequence[np.random.SeedSequence]]
+"""of each world, from `Scenario.draw_from_seed`"""
 
 
 class NoiseState(NamedTuple):
@@ -27,13 +29,9 @@ class SeededNoise:
     """Standard normal numbers for W worlds, equal to those of SUMO's episodes: each world has its own generators."""
 
     def __init__(
-        self,
-        seeds: Sequence[Sequence[np.random.SeedSequence]],
-        vehicle_count: int,
-        exploration_shape: tuple[int, int],
-        to_array: ArrayFactory,
+        self, seeds: WorldSeeds, vehicle_count: int, exploration_shape: tuple[int, int], to_array: ArrayFactory
     ) -> None:
-        """Take the seeds of each world, of `Scenario.draw_from_seed`, and the numbers of control steps and of CAVs."""
+        """Take the numbers of vehicles, and of control steps and CAVs."""
         self._human_generators = [np.random.default_rng(noise) for noise, *_ in seeds]
         self._exploration_seeds = [exploration for _, exploration, *_ in seeds]
         self._block = np.empty((len(seeds), NOISE_BLOCK_STEPS, vehicle_count))
@@ -59,7 +57,7 @@ class SeededNoise:
         ]
 
     def restore(self, states: Sequence[NoiseState]) -> None:
-        """Continue from these states, whose remaining blocks must have the same length."""
+        """Continue from these states; all remaining blocks have the same length."""
         for generator, state in zip(self._human_generators, states, strict=True):
             generator.bit_generator.state = dict(state.generator)
         self._remaining_steps = list(self._to_array(np.stack([state.remaining_block for state in states], 2)))
@@ -71,51 +69,42 @@ class SeededNoise:
     def exploration_noise(self, step_index: int) -> Array:
         """Return a number for each CAV in a control step, shape (CAVs * W,), for the exploration of its network."""
         if self._exploration is None:
-            draws = [
-                np.random.default_rng(seed).standard_normal(self._exploration_shape) for seed in self._exploration_seeds
-            ]
-            self._exploration = self._to_array(np.stack(draws, 2).reshape(len(draws[0]), -1))
+            draws = np.stack(self._draw_exploration(self._exploration_shape), 2)
+            self._exploration = self._to_array(draws.reshape(len(draws), -1))
         return self._exploration[step_index]
 
     def episode_noise(self, count: int) -> Array:
         """Return `count` numbers for each CAV, shape (CAVs * W, count), which are constant in each world."""
         if self._exploration is None:
-            draws = [np.random.default_rng(seed).standard_normal(count) for seed in self._exploration_seeds]
+            draws = self._draw_exploration(count)
             self._exploration = self._to_array(np.tile(draws, (self._exploration_shape[1], 1)))
         return self._exploration
 
+    def _draw_exploration(self, shape: Any) -> list[Floats]:
+        return [np.random.default_rng(seed).standard_normal(shape) for seed in self._exploration_seeds]
 
-class _QuickNoise:
+
+class QuickNoise:
     """The same from one generator for all worlds: different numbers than SUMO's, with the same distribution."""
 
     def __init__(self, draw: DrawNormal, vehicle_count: int, cav_count: int, world_count: int) -> None:
         self._draw, self._human_shape, self._cav_count = draw, (vehicle_count, world_count), cav_count
-        self._exploration = cast(Array, None)
+        self._exploration: Array = None
 
     def human_noise(self) -> Array:
+        """Return a number for each vehicle in this step, shape (vehicles, W)."""
         return self._draw(self._human_shape)
 
     def drop_block(self) -> None:
         """Do nothing: nothing is drawn in advance."""
 
     def exploration_noise(self, step_index: int) -> Array:
+        """Return a number for each CAV, shape (CAVs * W,)."""
         return self._draw((self._cav_count * self._human_shape[1],))
 
     def episode_noise(self, count: int) -> Array:
+        """Return `count` constant numbers for each CAV, shape (CAVs * W, count)."""
         if self._exploration is None:
             draws = self._draw((self._human_shape[1], count))
             self._exploration = namespace(draws).tile(draws, (self._cav_count, 1))
         return self._exploration
-
-
-def make_noise(
-    seeds: Sequence[Sequence[np.random.SeedSequence]],
-    vehicle_count: int,
-    exploration_shape: tuple[int, int],
-    to_array: ArrayFactory,
-    draw: DrawNormal | None,
-) -> SeededNoise | _QuickNoise:
-    """Return the noise of SUMO's episodes, arguments as of `SeededNoise`; with `draw`, quick noise that it draws."""
-    if draw is None:
-        return SeededNoise(seeds, vehicle_count, exploration_shape, to_array)
-    return _QuickNoise(draw, vehicle_count, exploration_shape[1], len(seeds))

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import compress
+from operator import not_
 from typing import cast
 
 import numpy as np
@@ -15,17 +17,12 @@ from unjam.physics.arrays import Array
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import LoopScenario
 from unjam.tree import map_leaves
+from unjam.worlds.batch import support
 from unjam.worlds.batch.noise import ArrayFactory
 from unjam.worlds.batch.on_ramp.world import MotorwayBatch
 from unjam.worlds.batch.ring.record import RingResults
 from unjam.worlds.batch.ring.warm_up import WarmUpCache, WarmUpState
 from unjam.worlds.batch.ring.world import RingBatch
-from unjam.worlds.batch.support import (
-    check_batch_scenarios,
-    differ_only_in_size,
-    statistically_unsupported_reason,
-    unsupported_reason,
-)
 from unjam.worlds.drive import DriveLoop, finish_drive
 from unjam.worlds.episode import add_reward_terms, check_can_drive, check_has_cavs
 from unjam.worlds.record import Episode
@@ -50,12 +47,8 @@ def start_batch_drive(
 ) -> DriveLoop:
     """Return the loop of a driver that starts to drive all CAVs of a batch.
 
-    Args:
-        world: the batch.
-        driver: of every CAV; if arrays are tensors, it must accept tensors.
-        to_array: makes the world's arrays.
-        explore: factor of the exploration noise of networks.
-        memory: the driver's memory; None: it remembers only the warm-up.
+    `to_array` makes the world's arrays, which the driver must accept; `explore` is the factor of exploration noise.
+    Without a `memory`, the driver remembers only the warm-up.
     """
     world.measured_fields = driver.measured_fields
     if memory is None:  # the driver of each CAV of a ring does not depend on the other rings
@@ -65,9 +58,7 @@ def start_batch_drive(
     loop = DriveLoop(world, driver, explore, memory)
     loop.memory = map_leaves(to_array, loop.memory)
     if driver.action_repeat > 1 and RESIDUAL_AGE_KEY in loop.memory:
-        loop.memory[RESIDUAL_AGE_KEY] = (
-            0.0  # the same for all rows, so that no network is called while residuals are held
-        )
+        loop.memory[RESIDUAL_AGE_KEY] = 0.0  # equal for all rows: no network is called while residuals are held
     return loop
 
 
@@ -82,8 +73,8 @@ def run_batch(
     Args:
         tasks: differ at most in road length, seed and driver, and on motorways in exploration.
         to_array: makes the arrays of the simulation.
-        upcoming: similar tasks that will follow; if warm-ups are needed now, theirs are simulated together with these.
-        allow_statistical: whether to allow scenarios whose episodes equal SUMO's only in distribution.
+        upcoming: similar tasks that will follow; their warm-ups are simulated together with those of `tasks`.
+        allow_statistical: whether to allow scenarios with episodes that equal SUMO's only in distribution.
 
     Raises:
         InputError: the tasks differ in more, or `unjam.worlds.batch.support` says why they are not supported.
@@ -103,7 +94,7 @@ def _run_at_once(
     for task in tasks:
         check_can_drive(task.driver, task.scenario)
     if isinstance(first.scenario, OnRamp):
-        check_batch_scenarios([task.scenario for task in tasks], allow_statistical)
+        support.check_batch_scenarios([task.scenario for task in tasks], allow_statistical)
         if len(tasks) > 1 and any(
             _depends_on_entry_order(task.driver) for task in tasks
         ):  # which must be that of one road
@@ -148,10 +139,7 @@ def _depends_on_entry_order(driver: Driver) -> bool:
 
 
 def _combined_driver(tasks: Sequence[EpisodeTask], to_cavs: Callable[[Array], Array]) -> Driver:
-    """Return the common driver of tasks, or one that drives each road with its own driver.
-
-    `to_cavs` maps values of the roads, shape (W,), to those of the CAVs on them.
-    """
+    """Return a driver of all tasks; `to_cavs` maps values of the roads, shape (W,), to those of the CAVs on them."""
     drivers = list[Driver]()
     for task in tasks:
         if task.driver not in drivers:
@@ -180,10 +168,7 @@ def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
 def run_batches(
     tasks: Sequence[EpisodeTask], upcoming: Sequence[EpisodeTask] = (), allow_statistical: bool = False
 ) -> list[Episode]:
-    """Return the episodes of tasks on roads of any kinds, in their order; similar tasks are simulated at once.
-
-    `upcoming` are tasks of any kinds that will follow; see `run_batch`, also for `allow_statistical`.
-    """
+    """Return the episodes of tasks of any kinds, in their order; similar ones share batches, see `run_batch`."""
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
         size = MAX_BATCH_MOTORWAYS if isinstance(task.scenario, OnRamp) else MAX_BATCH_ROADS
@@ -206,18 +191,13 @@ def run_batched_if_supported(
     upcoming: Sequence[EpisodeTask] = (),
     allow_statistical: bool = False,
 ) -> list[Episode]:
-    """Return the episodes of tasks in their order: from batches if these support them, else from `run_unsupported`.
-
-    `upcoming` are tasks that will follow; see `run_batch`, also for `allow_statistical`.
-    """
-    reason_of = statistically_unsupported_reason if allow_statistical else unsupported_reason
+    """Return the episodes of tasks in their order: from `run_batches` if supported, else from `run_unsupported`."""
+    reason_of = support.statistically_unsupported_reason if allow_statistical else support.unsupported_reason
     is_supported = [not reason_of(task.scenario) for task in tasks]
-    supported, unsupported = (
-        [task for task, flag in zip(tasks, is_supported, strict=True) if flag is wanted] for wanted in (True, False)
-    )
+    supported, others = list(compress(tasks, is_supported)), list(compress(tasks, map(not_, is_supported)))
     batched = iter(run_batches(supported, upcoming, allow_statistical))
-    others = iter(run_unsupported(unsupported) if unsupported else ())
-    return [next(batched if flag else others) for flag in is_supported]
+    unbatched = iter(run_unsupported(others) if others else ())
+    return [next(batched if flag else unbatched) for flag in is_supported]
 
 
 def _shared_settings(task: EpisodeTask) -> tuple[object, ...]:
@@ -228,8 +208,6 @@ def _shared_settings(task: EpisodeTask) -> tuple[object, ...]:
 
 
 def _can_share_batch(first: EpisodeTask, second: EpisodeTask) -> bool:
-    return (
-        (isinstance(first.scenario, OnRamp) or first.driver == second.driver)
-        and _shared_settings(first) == _shared_settings(second)
-        and differ_only_in_size(first.scenario, second.scenario)
-    )
+    has_equal_drivers = isinstance(first.scenario, OnRamp) or first.driver == second.driver
+    has_equal_settings = _shared_settings(first) == _shared_settings(second)
+    return has_equal_drivers and has_equal_settings and support.differ_only_in_size(first.scenario, second.scenario)

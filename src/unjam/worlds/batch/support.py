@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
+from operator import attrgetter
 
 from unjam.errors import InputError
 from unjam.scenarios.figure_eight import FigureEight
@@ -20,9 +21,8 @@ def unsupported_reason(scenario: Scenario) -> str:
     """Return why a batch cannot reproduce SUMO's episodes of a scenario exactly; empty if it can."""
     if not isinstance(scenario, Ring):
         return f"{scenario.title} is not a ring"
-    if scenario.human_control != "native":
-        return f"human_control: {scenario.human_control}; allowed: native"
-    return _control_unsupported_reason(scenario)
+    is_native = "human_control", scenario.human_control == "native", "native"
+    return _first_reason(scenario, is_native, *_controls(scenario))
 
 
 def statistically_unsupported_reason(scenario: Scenario) -> str:
@@ -33,55 +33,44 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     human drivers follow as in SUMO, but all vehicles change lanes at once, and drivers' errors are other draws.
     """
     if isinstance(scenario, OnRamp):
-        return _on_ramp_unsupported_reason(scenario)
+        return _first_reason(
+            scenario,
+            ("actuation", scenario.actuation == "cruise", "cruise"),
+            ("safety.active", not scenario.safety.active, "False: CAVs have their own ACC"),
+            ("cruise.keep_right", scenario.cruise.keep_right is None, "None: CAVs change lanes as human drivers do"),
+            ("cruise.speed_gain", scenario.cruise.speed_gain is None, "None: CAVs change lanes as human drivers do"),
+            ("simulation_step", scenario.simulation_step == ON_RAMP_SIMULATION_STEP, f"{ON_RAMP_SIMULATION_STEP:g} s"),
+            ("sensors.is_exact", scenario.sensors.is_exact, "True"),
+            ("actuator.is_instant", scenario.actuator.is_instant, "True"),
+            ("warmup", scenario.warmup == 0, "0"),
+            ("roadside.loss_rate", scenario.roadside.loss_rate == 0, "0"),
+        )
     if not isinstance(scenario, FigureEight):
         return unsupported_reason(scenario)
-    radius = scenario.radius[0]
     return _first_reason(
-        (scenario.human_control != "commanded", f"human_control: {scenario.human_control}; allowed: commanded"),
-        (not scenario.right_of_way, "right_of_way: false; allowed: true"),
-        (not scenario.enforce_human_limits, "enforce_human_limits: false; allowed: true"),
-        (
-            radius <= MIN_LOOK_AHEAD,
-            f"radius: {radius} m, where drivers look past a lane; allowed: > {MIN_LOOK_AHEAD:g} m",
-        ),
-        (bool(scenario.population), "population: calibrated human drivers; allowed: none"),
-        (scenario.actuation == "raw", "actuation: raw; allowed: shielded, with an active safety filter"),
-    ) or _control_unsupported_reason(scenario)
-
-
-def _on_ramp_unsupported_reason(scenario: OnRamp) -> str:
-    cruise, step = scenario.cruise, scenario.simulation_step
-    has_own_acc = scenario.actuation == "cruise" and not scenario.safety.active
-    changes_lanes = cruise.keep_right is not None or cruise.speed_gain is not None
-    is_ideal = scenario.sensors.is_exact and scenario.actuator.is_instant
-    return _first_reason(
-        (
-            not has_own_acc,
-            "actuation: CAVs have no ACC that follows on its own; allowed: cruise, without a safety filter",
-        ),
-        (changes_lanes, "cruise.keep_right and cruise.speed_gain: CAVs change lanes unlike humans; allowed: neither"),
-        (step != ON_RAMP_SIMULATION_STEP, f"simulation_step: {step:g} s; allowed: {ON_RAMP_SIMULATION_STEP:g} s"),
-        (not is_ideal, "sensors and actuator: errors or delays; allowed: exact sensors and instant actuators"),
-        (scenario.warmup > 0, f"warmup: {scenario.warmup}; allowed: 0"),
-        (scenario.roadside.loss_rate > 0, f"roadside.loss_rate: {scenario.roadside.loss_rate:g}; allowed: 0"),
+        scenario,
+        ("human_control", scenario.human_control == "commanded", "commanded"),
+        ("right_of_way", scenario.right_of_way, "True"),
+        ("enforce_human_limits", scenario.enforce_human_limits, "True"),
+        ("radius", scenario.radius[0] > MIN_LOOK_AHEAD, f"> {MIN_LOOK_AHEAD:g} m: drivers do not look past a lane"),
+        ("population", not scenario.population, "none"),
+        ("actuation", scenario.actuation != "raw", "shielded, with an active safety filter"),
+        *_controls(scenario),
     )
 
 
-def _control_unsupported_reason(scenario: Scenario) -> str:
+def _controls(scenario: Scenario) -> tuple[tuple[str, bool, str], ...]:
     is_exact = scenario.actuation == "raw" or (scenario.actuation == "shielded" and scenario.safety.active)
-    step = scenario.simulation_step
-    return _first_reason(
-        (
-            not is_exact,
-            "actuation: SUMO's own check limits CAVs; allowed: raw, or shielded with an active safety filter",
-        ),
-        (step > MAX_SIMULATION_STEP, f"simulation_step: {step:g} s; allowed: <= {MAX_SIMULATION_STEP:g} s"),
+    return (
+        ("actuation", is_exact, "raw, or shielded with an active safety filter instead of SUMO's own check"),
+        ("simulation_step", scenario.simulation_step <= MAX_SIMULATION_STEP, f"<= {MAX_SIMULATION_STEP:g} s"),
     )
 
 
-def _first_reason(*checks: tuple[bool, str]) -> str:
-    return next((reason for has_failed, reason in checks if has_failed), "")
+def _first_reason(scenario: Scenario, *checks: tuple[str, bool, str]) -> str:
+    """Return the name, the value and the allowed values of the first setting that is not supported."""
+    failed = ((name, allowed) for name, is_supported, allowed in checks if not is_supported)
+    return next((f"{name}: {attrgetter(name)(scenario)}; allowed: {allowed}" for name, allowed in failed), "")
 
 
 def differ_only_in_size(first: Scenario, second: Scenario) -> bool:

@@ -1,1 +1,1 @@
-"""Batch simulation of figure eights, with the crossing as SUMO drives it."""
+"""Batch simulation of figure eights, with the right of way of SUMO."""

@@ -50,7 +50,6 @@ class CrossingMemory(NamedTuple):
 class _Motion(NamedTuple):
     """The vehicles in a step, and their speed limits without the crossing."""
 
-    models: CarFollowingModels
     speed: Array
     leader: Leader
     free_speed: Array
@@ -61,7 +60,7 @@ class _Motion(NamedTuple):
     """distance up to which vehicles look ahead [m]"""
 
 
-class _LastVehicle(NamedTuple):
+class _Vehicle(NamedTuple):
     """The last vehicle past the start of a crossing; shapes (W,)."""
 
     front: Array
@@ -89,9 +88,9 @@ class _Approach(NamedTuple):
     """from the crossing [s]"""
 
 
-def _last_vehicle(speed: Array, distance_past: Array) -> _LastVehicle:
+def _last_vehicle(speed: Array, distance_past: Array) -> _Vehicle:
     index, columns = distance_past.argmin(0), np.arange(distance_past.shape[1])
-    return _LastVehicle(distance_past[index, columns], speed[index, columns], index)
+    return _Vehicle(distance_past[index, columns], speed[index, columns], index)
 
 
 class Crossing:
@@ -99,6 +98,8 @@ class Crossing:
 
     def __init__(self, scenario: Scenario, roads: Sequence[ClosedRoad], to_array: ArrayFactory) -> None:
         """Take roads that cross themselves once, the direction with the right of way first."""
+        self.models = CarFollowingModels(scenario, len(roads[0].vehicle_ids), [], to_array)
+        """SUMO's car-following models of the vehicles"""
         self._figure_eights = make_figure_eights(roads, to_array)
         self._sumo_loop_length = self._figure_eights.loop_length
         self._crossings = to_array(np.transpose([road.crossings for road in roads], (1, 2, 0)))
@@ -115,43 +116,31 @@ class Crossing:
         return ((major_start <= place) & (place < major_end)) | ((minor_start <= place) & (place < minor_end))
 
     def next_speeds(
-        self,
-        models: CarFollowingModels,
-        speed: Array,
-        position: Array,
-        leader: Leader,
-        commanded_speed: Array,
-        is_commanded: Array,
+        self, speed: Array, position: Array, leader: Leader, commanded_speed: Array, is_commanded: Array
     ) -> Array:
-        """Return the speeds after a step, and update the memory.
+        """Return the speeds after a step, and update the memory; SUMO drives vehicles that are not commanded.
 
-        Args:
-            models: SUMO's car-following models.
-            speed: [m/s].
-            position: front bumpers along the road, wrapped or not [m].
-            leader: the vehicle ahead of each.
-            commanded_speed: [m/s].
-            is_commanded: whether each vehicle is commanded; SUMO drives the others.
+        Positions are those of front bumpers, wrapped or not; `leader` is the vehicle ahead. Units: m/s, m.
         """
-        xp, step = namespace(speed), self._step
+        xp, step, models = namespace(speed), self._step, self.models
         free_speed = xp.where(is_commanded, models.clip_speed(speed, commanded_speed), models.max_speed(speed))
         look_ahead = models.look_ahead_distance(speed)
         distances_past, (major_side, minor_side, *_) = self._figure_eights.distances_past(position), self._figure_eights
         is_visible = leader.gap <= self._visible_distance(look_ahead, distances_past)
         leader_speed = xp.where(is_visible, leader.speed, models.speed_limit)
         follow_speed = models.follow_speed(speed, leader_speed, xp.where(is_visible, leader.gap, FREE_GAP))
-        motion = _Motion(models, speed, leader, free_speed, follow_speed, look_ahead)
+        motion = _Motion(speed, leader, free_speed, follow_speed, look_ahead)
         major_last, minor_last = (_last_vehicle(speed, each) for each in distances_past)
         safe = xp.minimum(free_speed, follow_speed)
         for distance_past, foe in zip(distances_past, (minor_last, major_last), strict=True):
-            safe = self._speed_on_crossing(motion, safe, distance_past, foe)
+            safe = self._speed_on_crossing(speed, safe, distance_past, foe)
         to_major, to_minor = (self._sumo_loop_length - each for each in distances_past)
         major = self._approach(motion, major_side, MAJOR_STOP_DISTANCE, to_major, major_last, minor_last)
         minor = self._approach(motion, minor_side, MINOR_STOP_DISTANCE, to_minor, minor_last, major_last)
         safe = xp.where(major.is_approaching, major.go_speed, safe)
         safe = xp.where(minor.is_approaching, minor.stop_speed, safe)
         first = minor.distance.argmin(0), self._columns
-        may_enter, can_brake = self._may_enter(motion, major, minor, first)
+        may_enter, can_brake = self._may_enter(speed, major, minor, first)
         # A vehicle that would have to slow down to enter, and can still stop before the crossing, stops.
         go_speed = minor.go_speed[first]
         slows_down = go_speed + SUMO_MIN_GAP < xp.minimum(minor.approach_speed, models.max_speed(speed))[first]
@@ -184,17 +173,11 @@ class Crossing:
         return xp.where(visible <= look_ahead, look_ahead + self._sumo_loop_length, visible)
 
     def _approach(
-        self,
-        motion: _Motion,
-        side: CrossingSide,
-        stop_distance: float,
-        distance: Array,
-        last: _LastVehicle,
-        foe: _LastVehicle,
+        self, motion: _Motion, side: CrossingSide, stop_distance: float, distance: Array, last: _Vehicle, foe: _Vehicle
     ) -> _Approach:
         """Return the plans of all vehicles for one side, `last` being the last vehicle past its start."""
-        models, speed, leader, free_speed, follow_speed, look_ahead = motion
-        xp, speed_limit = namespace(speed), models.speed_limit
+        speed, leader, free_speed, follow_speed, look_ahead = motion
+        xp, models, speed_limit = namespace(speed), self.models, self.models.speed_limit
         is_approaching, is_on_lane = distance <= side.approach_distance, distance <= side.lane_length
         front = xp.where(is_on_lane, -distance, self._sumo_loop_length - distance)
         rearmost = front.argmin(0)
@@ -221,7 +204,7 @@ class Crossing:
         stop_gap = clamp_min(clamp_max(distance - models.brake_gap(speed), stop_distance), MINOR_STOP_DISTANCE)
         stop_speed = xp.minimum(to_crossing, models.stop_speed(speed, clamp_min(distance - stop_gap, 0.0)))
         stop_speed = xp.where(is_occupied, xp.minimum(stop_speed, behind_last), stop_speed)
-        behind_foe = self._speed_behind_foe(models, speed, distance, foe)
+        behind_foe = self._speed_behind_foe(speed, distance, foe)
         is_crossed = looks & (foe.front < CONFLICT_AREA_START + CROSSED_LANE_WIDTH + VEHICLE_LENGTH)
         go_speed = xp.where(is_crossed, xp.maximum(xp.minimum(go_speed, behind_foe), stop_speed), go_speed)
         leaving = xp.where(is_crossed, xp.minimum(leaving, behind_foe), leaving)
@@ -230,29 +213,26 @@ class Crossing:
         leave_time = arrival_time + (CROSSING_LINK + VEHICLE_LENGTH) / mean_speed
         return _Approach(distance, is_approaching, to_crossing, stop_speed, go_speed, arrival_time, leave_time)
 
-    def _speed_behind_foe(self, models: CarFollowingModels, speed: Array, distance: Array, foe: _LastVehicle) -> Array:
+    def _speed_behind_foe(self, speed: Array, distance: Array, foe: _Vehicle) -> Array:
         """Return the maximum speed of vehicles that must let a foe on the crossing pass [m/s]."""
-        xp, minimum_gap = namespace(speed), models.minimum_gap
+        xp, models, minimum_gap = namespace(speed), self.models, self.models.minimum_gap
         rear = CONFLICT_AREA_START - (foe.front - VEHICLE_LENGTH)
         to_area = distance + CONFLICT_AREA_START
         gap = to_area - rear - CROSSED_LANE_WIDTH
-        safe = xp.where(
-            gap - minimum_gap >= 0.0,
-            models.follow_speed(speed, foe.speed + 0.0 * speed, gap),
-            models.stop_speed(speed, clamp_min(distance - MINOR_STOP_DISTANCE, 0.0)),
-        )
+        safe = models.stop_speed(speed, clamp_min(distance - MINOR_STOP_DISTANCE, 0.0))
+        follow_speed = models.follow_speed(speed, foe.speed + 0.0 * speed, gap)
+        safe = xp.where(gap - minimum_gap >= 0.0, follow_speed, safe)
         stop_speed = models.stop_speed(speed, clamp_min(to_area - minimum_gap, 0.0))
         pass_time = clamp_min((minimum_gap + rear + CROSSED_LANE_WIDTH) / clamp_min(foe.speed, HALTING_SPEED), 1e-3)
         final = xp.maximum(speed, 2.0 * (to_area - minimum_gap) / pass_time - speed)
         drives_up = speed + (final - speed) / pass_time * self._step
         return xp.where(to_area >= 0.0, xp.maximum(safe, xp.minimum(drives_up, stop_speed)), safe)
 
-    def _speed_on_crossing(self, motion: _Motion, safe_speed: Array, distance_past: Array, foe: _LastVehicle) -> Array:
+    def _speed_on_crossing(self, speed: Array, safe_speed: Array, distance_past: Array, foe: _Vehicle) -> Array:
         """Return the maximum speed of vehicles that just entered the crossing: the earlier vehicle goes first [m/s]."""
-        xp, speed = namespace(motion.speed), motion.speed
-        has_conflict = (distance_past < CONFLICT_AREA_START + MINOR_STOP_DISTANCE) & (
-            foe.front < CONFLICT_AREA_START + CROSSED_LANE_WIDTH + VEHICLE_LENGTH
-        )
+        xp = namespace(speed)
+        is_before_area = distance_past < CONFLICT_AREA_START + MINOR_STOP_DISTANCE
+        has_conflict = is_before_area & (foe.front < CONFLICT_AREA_START + CROSSED_LANE_WIDTH + VEHICLE_LENGTH)
         if not bool(has_conflict.any()):
             return safe_speed
         entry = self.memory.entry_step
@@ -260,31 +240,31 @@ class Crossing:
         is_foe_earlier = (entry > foe_entry) | ((entry == foe_entry) & (speed < foe.speed))
         is_foe_in_area = (foe.front > CONFLICT_AREA_START) & (distance_past < CONFLICT_AREA_START)
         yields = has_conflict & (is_foe_earlier | is_foe_in_area | (foe.front > CROSSING_LINK))
-        behind = self._speed_behind_foe(motion.models, speed, -distance_past, foe)
-        return xp.where(yields, xp.minimum(safe_speed, behind), safe_speed)
+        behind_foe = self._speed_behind_foe(speed, -distance_past, foe)
+        return xp.where(yields, xp.minimum(safe_speed, behind_foe), safe_speed)
 
     def _may_enter(
-        self, motion: _Motion, major: _Approach, minor: _Approach, first: tuple[Array, Array]
+        self, speed: Array, major: _Approach, minor: _Approach, first: tuple[Array, Array]
     ) -> tuple[Array, Array]:
         """Return whether the first yielding vehicle may enter, and whether it can still stop, (W,) each."""
-        (models, speed, *_), xp = motion, namespace(motion.speed)
-        distance, arrival, leave = (each[first] for each in (minor.distance, minor.arrival_time, minor.leave_time))
+        xp, models = namespace(speed), self.models
+        distance, arrival, leave = minor.distance[first], minor.arrival_time[first], minor.leave_time[first]
         can_brake = (distance > models.brake_gap(speed)[first]) | (models.min_speed(speed)[first] == 0.0)
         impatience = clamp_max(self._impatience + self.memory.waiting_time[first] / IMPATIENCE_TIME, 1.0)
         impatience = xp.where(can_brake, impatience, 1.0)
-        expected = major.arrival_time + impatience * self._foe_delay(models, major, arrival, impatience)
+        expected = major.arrival_time + impatience * self._foe_delay(major, arrival, impatience)
         expected = xp.where(arrival < major.arrival_time, expected, major.arrival_time)
         has_room = (major.leave_time < arrival) | (expected > leave + FOE_TIME_MARGIN)
         moves = major.approach_speed > STANDSTILL_ACCELERATION * self._step
         is_blocked = (major.is_approaching & moves & ~has_room).any(0)
         return (distance <= FOE_VISIBILITY_DISTANCE) & minor.is_approaching[first] & ~is_blocked, can_brake
 
-    def _foe_delay(self, models: CarFollowingModels, major: _Approach, arrival_time: Array, impatience: Array) -> Array:
+    def _foe_delay(self, major: _Approach, arrival_time: Array, impatience: Array) -> Array:
         """Return the delay of each foe that starts to brake when the other vehicle arrives [s]."""
         xp, step = namespace(arrival_time), self._step
         start = xp.ceil(arrival_time / step) * step
         is_same_step = xp.floor(arrival_time / step) == xp.floor(major.arrival_time / step)
-        braking = clamp_min(models.braking * impatience, 1e-6)
+        braking = clamp_min(self.models.braking * impatience, 1e-6)
         duration = major.arrival_time - start
         speed_drop = duration * braking
         lost_distance = duration * speed_drop / 2.0
@@ -292,8 +272,8 @@ class Crossing:
         can_stop = 0.5 * speed * speed / braking <= major.distance - speed * start
         final_speed = speed - speed_drop
         root = square_root(clamp_min(4.0 * final_speed * final_speed - 8.0 * braking * lost_distance, 1e-12))
-        delay = (final_speed - 0.5 * root) / braking
-        return xp.where(is_same_step, 0.0, xp.where(can_stop, STOPPING_FOE_DELAY, delay))
+        delay = xp.where(can_stop, STOPPING_FOE_DELAY, (final_speed - 0.5 * root) / braking)
+        return xp.where(is_same_step, 0.0, delay)
 
     def _update_memory(self, speed: Array, next_speed: Array, distances_past: list[Array]) -> None:
         xp, step = namespace(speed), self._step

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unjam.physics.arrays import Array, Floats, namespace
+from unjam.physics.arrays import Array, namespace
 from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK, figure_eight_radius, lane_lengths
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
@@ -49,32 +49,23 @@ class FigureEights(NamedTuple):
 
 
 def make_figure_eights(roads: Sequence[ClosedRoad], to_array: ArrayFactory) -> FigureEights:
-    """Return figure eights whose lane lengths are rounded as in SUMO's networks."""
+    """Return figure eights with lane lengths rounded as in SUMO's networks."""
     radius = np.array([road.drawn_values["radius"] for road in roads])
     start = np.stack([road.start_positions for road in roads], 1)
     exact_arc = 1.5 * pi * radius
     arc = exact_arc.round(LANE_LENGTH_DIGITS)
     before = 2 * radius + CROSSING_LINK + 2 * INNER_LINK
     major, minor = (
-        CrossingSide(to_array(side_start), to_array(radius), to_array(radius + link + arc))
+        CrossingSide(*map(to_array, (side_start, radius, radius + link + arc)))
         for side_start, link in ((radius, OUTER_LINK), (before + arc + radius, INNER_LINK))
     )
-    return FigureEights(
-        major=major,
-        minor=minor,
-        loop_length=to_array(2 * (2 * radius + CROSSING_LINK + INNER_LINK + OUTER_LINK + arc)),
-        position_offset=to_array(np.where(start >= before + exact_arc, arc - exact_arc, 0.0)),
-    )
+    loop_length = 2 * (2 * radius + CROSSING_LINK + INNER_LINK + OUTER_LINK + arc)
+    offset = np.where(start >= before + exact_arc, arc - exact_arc, 0.0)
+    return FigureEights(major, minor, to_array(loop_length), to_array(offset))
 
 
 def figure_eight_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
-    """Return which vehicles touch the vehicle ahead on the same lane, or overlap with another one on the crossing.
-
-    Args:
-        position: front bumpers along the road [m], shape (vehicles, ...).
-        gap: to the vehicle ahead [m], likewise.
-        loop_length: of the road [m].
-    """
+    """Return which vehicles touch the leader on the same lane, or overlap on the crossing; see `ring_contacts`."""
     xp, place = namespace(position), position % loop_length
     lengths, touches = lane_lengths(figure_eight_radius(loop_length)), gap < CONTACT_GAP
     if bool(touches.any()):
@@ -83,13 +74,7 @@ def figure_eight_contacts(position: Array, gap: Array, loop_length: Array) -> Ar
             end = end + length
             lane = lane + (place > end)
         touches = touches & (lane == xp.concatenate([lane[1:], lane[:1]]))
-    first, second = (
-        (front > CROSSING_LINK / 2 - CAR_WIDTH / 2) & (front < CROSSING_LINK / 2 + CAR_WIDTH / 2 + VEHICLE_LENGTH)
-        for front in ((place - start) % loop_length for start in (lengths[0], sum(lengths[:7])))
-    )
+    low, high = CROSSING_LINK / 2 - CAR_WIDTH / 2, CROSSING_LINK / 2 + CAR_WIDTH / 2 + VEHICLE_LENGTH
+    fronts = ((place - start) % loop_length for start in (lengths[0], sum(lengths[:7])))
+    first, second = ((front > low) & (front < high) for front in fronts)
     return touches | ((first | second) & (first.any(0) & second.any(0)))
-
-
-def crossing_starts(roads: Sequence[ClosedRoad]) -> Floats:
-    """Return the positions where roads cross themselves, shape (crossings, W) [m]."""
-    return np.array([[start for start, _ in road.crossings] for road in roads]).T

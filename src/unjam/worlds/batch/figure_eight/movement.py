@@ -1,4 +1,4 @@
-"""Movement of all vehicles of W figure eights: human drivers are commanded, and SUMO's right of way limits everyone."""
+"""Movement of all vehicles of W figure eights: human drivers are commanded, and SUMO's right of way limits all."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -25,14 +25,11 @@ COMMANDED_SPEED_TOLERANCE = 1e-9
 
 
 def commanded_speed(speed: Array, leader_speed: Array, gap: Array, parameters: Any, step: float) -> Array:
-    """Return the commanded speeds of human drivers before noise is added, not clipped at 0.
-
-    Arguments as of `human_idm_speed`.
-    """
+    """Return the commanded speeds of human drivers without noise, not clipped at 0; see `human_idm_speed`."""
     return speed + idm_acceleration(speed, leader_speed, clamp_min(gap, MIN_IDM_GAP), parameters) * step
 
 
-class FigureEightMovement:
+class FigureEightMovement(Crossing):
     """Commands the IDM with noise to human drivers, except on the crossing, and applies the right of way."""
 
     def __init__(
@@ -44,52 +41,30 @@ class FigureEightMovement:
         human_model: HumanSpeedModel | None = None,
     ) -> None:
         """Take the indices of the CAVs, which humans drive until `hand_over`; `human_model` replaces the road's IDM."""
+        super().__init__(scenario, roads, to_array)
         idm = partial(commanded_speed, parameters=scenario.humans, step=scenario.simulation_step)
         self._human_model, self._cav_indices = human_model or idm, cav_indices
-        self._crossing = Crossing(scenario, roads, to_array)
-        self._models, self._models_with_cavs = (
-            CarFollowingModels(scenario, len(roads[0].vehicle_ids), each, to_array) for each in ([], cav_indices)
-        )
+        self._models_with_cavs = CarFollowingModels(scenario, len(roads[0].vehicle_ids), cav_indices, to_array)
 
     def hand_over(self) -> None:
         """Hand the CAVs over to their driver."""
-        self._models = self._models_with_cavs
+        self.models = self._models_with_cavs
 
-    def next_speeds(self, speed: Array, position: Array, leader: Leader, noise: Array, cav_speeds: Array) -> Array:
+    def move(self, speed: Array, position: Array, leader: Leader, noise: Array, cav_speeds: Array) -> Array:
         """Return the speeds after a step [m/s], shape (vehicles, W).
 
-        Args:
-            speed: [m/s], likewise.
-            position: front bumpers along the road, not wrapped [m], likewise.
-            leader: the vehicle ahead of each.
-            noise: added to each speed [m/s], likewise, or 0.
-            cav_speeds: commanded speeds of the CAVs, shape (CAVs, W) [m/s]; None: they are human.
+        `noise` is added to each speed; `cav_speeds` are the commands of the CAVs, shape (CAVs, W), or None if they are
+        human; the others are as in `next_speeds`.
         """
         commanded = clamp_min(self._human_model(speed, *leader) + noise, 0.0)
-        is_commanded = ~self._crossing.is_on_crossing(position)
+        is_commanded = ~self.is_on_crossing(position)
         if cav_speeds is not None:
             commanded[self._cav_indices], is_commanded[self._cav_indices] = cav_speeds, True
-        return self._crossing.next_speeds(self._models, speed, position, leader, commanded, is_commanded)
-
-    @property
-    def memory(self) -> CrossingMemory:
-        """The memory of the right of way."""
-        return self._crossing.memory
-
-    def restore_memory(self, memories: Sequence[CrossingMemory]) -> None:
-        """Continue from the memories of the roads."""
-        self._crossing.restore_memory(memories)
+        return self.next_speeds(speed, position, leader, commanded, is_commanded)
 
 
 def crossing_memories(scenario: Scenario, road: ClosedRoad, speeds: Floats, positions: Floats) -> CrossingMemory:
-    """Return the memory of the right of way at each step of a recorded episode, shape (steps, vehicles).
-
-    Args:
-        scenario: of the episode.
-        road: of the episode.
-        speeds: of all vehicles in road order at each step [m/s], shape (steps, vehicles).
-        positions: front bumpers along the road [m], likewise.
-    """
+    """Return the memory of the right of way at each step of an episode; all have the shape (steps, vehicles)."""
     crossing = Crossing(scenario, [road], np.asarray)
     memories = [crossing.memory]
     for speed, next_speed, position in zip(speeds, speeds[1:], positions, strict=False):
@@ -106,15 +81,9 @@ def may_follow_commands(
     motion: tuple[Floats, Floats],
     commanded_speeds: Floats,
 ) -> NDArray[np.bool_]:
-    """Return whether the right of way lets vehicles follow their commands, shape (moments, vehicles).
+    """Return whether the right of way lets vehicles follow their commands; all have the shape (moments, vehicles).
 
-    Args:
-        scenario: of the episode.
-        road: of the episode.
-        cav_indices: of the CAVs among the vehicles.
-        memories: of `crossing_memories`, at the moments.
-        motion: speeds and positions [m/s, m], shape (moments, vehicles).
-        commanded_speeds: of the vehicles [m/s], likewise.
+    `memories` are those of `crossing_memories`; `motion` is speeds [m/s] and positions [m].
     """
     speed, position, commanded = (each.T for each in (*motion, commanded_speeds))
     roads = [road] * len(commanded_speeds)
@@ -123,5 +92,5 @@ def may_follow_commands(
     movement.restore_memory([CrossingMemory(*each) for each in zip(*memories, strict=True)])
     gap = gap_on_loop(position, np.roll(position, -1, 0), road.loop_length, VEHICLE_LENGTH)
     leader = Leader(np.roll(speed, -1, 0), gap)
-    moved = movement.next_speeds(speed, position, leader, 0.0, commanded[cav_indices])
+    moved = movement.move(speed, position, leader, 0.0, commanded[cav_indices])
     return (np.abs(moved - commanded) < COMMANDED_SPEED_TOLERANCE).T

@@ -1,1 +1,1 @@
-"""Batch simulation of motorways with an on-ramp: the EIDM and lane changes as in SUMO."""
+"""Batch simulation of motorways with an on-ramp, with the EIDM and the lane changes of SUMO."""

@@ -46,24 +46,38 @@ class DriverErrors(NamedTuple):
 
     def next_errors(self, speed: Array, noise: Array, step: float) -> "DriverErrors":
         """Return the errors after a step, given the speed after it and standard normal noise of shape (3, n)."""
-        xp, changes = namespace(speed), speed > LOW_SPEED_THRESHOLD
-        estimation = ESTIMATION_ERROR_TIME, 0.5
-
-        def next_error(value: Array, process: tuple[float, float], normal: Array) -> Array:
-            time, strength = process
-            new = exp(-step / time) * value + sqrt(2.0 * step / time) * strength * normal
-            return xp.where(changes, new, value)
-
-        return DriverErrors(*map(next_error, self, (estimation, estimation, (DRIVING_ERROR_TIME, 1.0)), noise))
+        processes = (ESTIMATION_ERROR_TIME, 0.5), (ESTIMATION_ERROR_TIME, 0.5), (DRIVING_ERROR_TIME, 1.0)
+        changed = (
+            exp(-step / time) * value + sqrt(2.0 * step / time) * strength * normal
+            for value, (time, strength), normal in zip(self, processes, noise, strict=True)
+        )
+        where, is_fast = namespace(speed).where, speed > LOW_SPEED_THRESHOLD
+        return DriverErrors(*(where(is_fast, new, old) for new, old in zip(changed, self, strict=True)))
 
 
 class LeaderMotion(NamedTuple):
-    """The acceleration of each leader, about which the driver behind may stay cool."""
+    """The acceleration of each leader [m/s2], and whether the driver behind may stay cool about it."""
 
     acceleration: Array
-    """[m/s2]"""
     may_stay_cool: Array
-    """whether the driver may"""
+
+    def cooled(
+        self, uncooled: Array, speed: Array, leader_speed: Array, gap: Array, wanted_gap: Array, parameters: IDMArrays
+    ) -> Array:
+        """Return accelerations with less braking where a leader with constant acceleration does not require it."""
+        xp, braking = namespace(speed), parameters.comfortable_deceleration
+        leader = xp.minimum(self.acceleration, parameters.max_acceleration)
+        leader = xp.where(gap > 1.5 * wanted_gap, leader * 1.5 * wanted_gap / gap, leader)
+        leader = xp.where(leader_speed >= LEADER_STANDING_SPEED, leader, EIDM_EPSILON)
+        leader_speed = clamp_min(leader_speed, LEADER_STANDING_SPEED)
+        closing_speed = speed - leader_speed
+        divisor = leader_speed * leader_speed - 2.0 * gap * leader
+        both_stop = leader_speed * closing_speed <= -2.0 * gap * leader
+        stopping = speed * speed * leader / xp.where(both_stop, divisor, 1.0)
+        required = xp.where(both_stop, stopping, leader - clamp_min(closing_speed, 0.0) ** 2 / (2.0 * gap))
+        smooth = required + braking * xp.tanh((uncooled - required) / braking)
+        cooled = (1.0 - COOLNESS) * uncooled + COOLNESS * smooth
+        return xp.where(self.may_stay_cool & (uncooled < required), cooled, uncooled)
 
 
 def eidm_acceleration(speed: Array, gap_ratio: Array, parameters: IDMArrays) -> Array:
@@ -113,9 +127,7 @@ def eidm_follow_speed(
         wanted_gap = xp.where(stops, xp.maximum(wanted_gap, stop_gap), wanted_gap)
         acceleration = uncooled = eidm_acceleration(new, wanted_gap / seen_gap, parameters)
         if leader_motion is not None:
-            acceleration = _with_coolness(
-                acceleration, new, seen_speed, seen_gap, wanted_gap, parameters, leader_motion
-            )
+            acceleration = leader_motion.cooled(acceleration, new, seen_speed, seen_gap, wanted_gap, parameters)
         new = clamp_min(new + acceleration * substep, 0.0)
         remaining = clamp_min(remaining - clamp_min(new - leader_speed, 0.0) * substep, EIDM_EPSILON)
     return DesiredSpeed(new, uncooled)
@@ -127,33 +139,6 @@ def eidm_effective_gap(gap: Array, parameters: IDMArrays) -> Array:
     return clamp_min(gap - minimum_gap + clamp_min(minimum_gap - 0.25, EIDM_EPSILON), EIDM_EPSILON)
 
 
-def _with_coolness(
-    acceleration: Array,
-    speed: Array,
-    leader_speed: Array,
-    gap: Array,
-    wanted_gap: Array,
-    parameters: IDMArrays,
-    leader_motion: LeaderMotion,
-) -> Array:
-    """Return the acceleration with less braking where a leader with constant acceleration does not require it."""
-    xp, braking = namespace(speed), parameters.comfortable_deceleration
-    leader_acceleration = xp.minimum(leader_motion.acceleration, parameters.max_acceleration)
-    scaled = leader_acceleration * 1.5 * wanted_gap / gap
-    leader_acceleration = xp.where(gap > 1.5 * wanted_gap, scaled, leader_acceleration)
-    leader_acceleration = xp.where(leader_speed >= LEADER_STANDING_SPEED, leader_acceleration, EIDM_EPSILON)
-    leader_speed = clamp_min(leader_speed, LEADER_STANDING_SPEED)
-    closing_speed = speed - leader_speed
-    divisor = leader_speed * leader_speed - 2.0 * gap * leader_acceleration
-    both_stop = leader_speed * closing_speed <= -2.0 * gap * leader_acceleration
-    stopping = speed * speed * leader_acceleration / xp.where(both_stop, divisor, 1.0)
-    following = leader_acceleration - clamp_min(closing_speed, 0.0) ** 2 / (2.0 * gap)
-    required = xp.where(both_stop, stopping, following)
-    smooth = required + braking * xp.tanh((acceleration - required) / braking)
-    cooled = (1.0 - COOLNESS) * acceleration + COOLNESS * smooth
-    return xp.where(leader_motion.may_stay_cool & (acceleration < required), cooled, acceleration)
-
-
 def eidm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, errors: DriverErrors, step: float) -> Array:
     """Return the desired speeds after a step of drivers that must stop within a distance."""
     xp, highest = namespace(speed), parameters.max_acceleration
@@ -162,12 +147,10 @@ def eidm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, errors
     start = remaining = clamp_min(distance + minimum_gap, EIDM_EPSILON)
     new, substep = speed, step / EIDM_SUBSTEPS
     for number in range(EIDM_SUBSTEPS):
-        weight = clamp_max(new / LOW_SPEED_THRESHOLD, 1.0)
-        seen_gap = remaining * xp.exp(GAP_ERROR_STRENGTH * errors.gap * weight)
+        seen_gap = remaining * xp.exp(GAP_ERROR_STRENGTH * errors.gap * clamp_max(new / LOW_SPEED_THRESHOLD, 1.0))
         wanted_gap = desired_gap(new, new, own) + EIDM_SLACK
         stop_gap = seen_gap * square_root(1.0 + EIDM_SLACK / highest)
-        stops = seen_gap < minimum_gap + 2.0 * EIDM_SLACK
-        wanted_gap = xp.where(stops, xp.maximum(wanted_gap, stop_gap), wanted_gap)
+        wanted_gap = xp.where(seen_gap < minimum_gap + 2.0 * EIDM_SLACK, xp.maximum(wanted_gap, stop_gap), wanted_gap)
         new = clamp_min(new + eidm_acceleration(new, wanted_gap / seen_gap, parameters) * substep, 0.0)
         remaining = clamp_min(remaining - new * substep, EIDM_EPSILON)
         mean_speed = clamp_min((start - remaining) / step * EIDM_SUBSTEPS / (number + 1.0), 0.0)
@@ -181,14 +164,6 @@ def eidm_secure_gap(speed: Array, leader_speed: Array, parameters: IDMArrays) ->
     return (desired_gap(speed, speed - leader_speed, parameters) - parameters.minimum_gap) / divisor
 
 
-class SpeedBounds(NamedTuple):
-    """Minimum, desired and maximum speeds after a step."""
-
-    lowest: Array
-    desired: Array
-    highest: Array
-
-
 def eidm_speed_bounds(
     speed: Array,
     safe_speed: Array,
@@ -197,8 +172,8 @@ def eidm_speed_bounds(
     parameters: IDMArrays,
     errors: DriverErrors,
     step: float,
-) -> SpeedBounds:
-    """Return the speeds that engine, brakes and safety allow, and the desired ones with driving errors."""
+) -> tuple[Array, Array, Array]:
+    """Return minimum, desired and maximum speeds after a step, the desired ones with driving errors."""
     xp, max_acceleration = namespace(speed), parameters.max_acceleration
     emergency = clamp_min(speed - EIDM_EMERGENCY_BRAKING * step, 0.0)
     comfortable = clamp_min(speed - parameters.comfortable_deceleration * step, 0.0)
@@ -208,8 +183,7 @@ def eidm_speed_bounds(
     critical = clamp_max(clamp_min(critical, -0.4), 0.0)
     strength = xp.minimum(max_acceleration, clamp_min(highest - 0.5 * max_acceleration, 0.0))
     strength = strength * (2.75**2 * critical * critical + 1.0)
-    desired = xp.maximum(lowest, highest + step * DRIVING_ERROR_STRENGTH * errors.driving * strength)
-    return SpeedBounds(lowest, desired, highest)
+    return lowest, xp.maximum(lowest, highest + step * DRIVING_ERROR_STRENGTH * errors.driving * strength), highest
 
 
 def finalize_eidm_speed(
@@ -224,13 +198,13 @@ def finalize_eidm_speed(
 ) -> tuple[Array, Array]:
     """Return the speeds after a step with bounded jerk and slow starts, and the time of the last start [s].
 
-    `acceleration` is that of the previous step; the step ends at `end_time`; the others are as in `SpeedBounds`.
+    `acceleration` is that of the previous step; the step ends at `end_time`; speeds are those of `eidm_speed_bounds`.
     """
     xp, is_rolling = namespace(speed), speed > 2.0 * CLUTCH_ENGAGE_SPEED
     change, previous_change = desired - speed, acceleration * step
     jerk = MAX_JERK * step * step
-    rise = xp.where(MAX_JERK * step + acceleration < 0.0, 2.0 * jerk, jerk)
-    faster = xp.minimum(change, previous_change + rise)
+    faster = xp.where(MAX_JERK * step + acceleration < 0.0, 2.0 * jerk, jerk)
+    faster = xp.minimum(change, previous_change + faster)
     slower = xp.minimum(highest - speed, xp.maximum(change, previous_change - jerk))
     up = (change > 0.0) & is_rolling & (start_time + START_UP_DURATION + EIDM_EPSILON < end_time)
     down = (change <= 0.0) & is_rolling & (desired < highest - EIDM_EPSILON)

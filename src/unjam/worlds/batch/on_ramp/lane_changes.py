@@ -6,16 +6,12 @@ Source: SUMO's MSLCM_LC2013 (`_wantsChange`, `anticipateFollowSpeed`).
 """
 
 from unjam.physics.arrays import Array, clamp_min, namespace
+from unjam.worlds.batch.on_ramp import mandatory_changes
 from unjam.worlds.batch.on_ramp.lane_change_context import (
     LaneChangeContext,
     MotorwayGeometry,
     Neighbor,
     lane_change_context,
-)
-from unjam.worlds.batch.on_ramp.mandatory_changes import (
-    HELP_SPEED_DIFFERENCE,
-    UNCONGESTED_SPEED,
-    mandatory_lane_changes,
 )
 from unjam.worlds.batch.on_ramp.vehicles import (
     NO_ADVICE,
@@ -50,7 +46,7 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     advice = dict.fromkeys(("own_advice", "cooperative_advice", "adjacent_advice"), speed * 0.0 + NO_ADVICE)
     vehicles = vehicles._replace(**advice, speed_bias=speed * 0.0, look_ahead_speed=look_ahead_speed)
     context = lane_change_context(vehicles, geometry, step)
-    vehicles, is_urgent, is_asked = mandatory_lane_changes(vehicles, context, geometry)
+    vehicles, is_urgent, is_asked = mandatory_changes.mandatory_lane_changes(vehicles, context, geometry)
     has_target = context.target_lane != NO_VEHICLE
     is_clear = ~(context.is_leader_blocking | context.is_follower_blocking) & has_target
     vehicles, wants_change = _speed_gain_changes(vehicles, context, geometry, ~is_urgent & has_target)
@@ -93,7 +89,7 @@ def _speed_gain_changes(
     remaining = xp.where(is_before, geometry.length, geometry.length - geometry.merge_start)
     remaining = xp.where(position < geometry.merge_end, remaining, geometry.length - geometry.merge_end)
     own_remaining = xp.where(vehicles.lane == 0, geometry.merge_end - geometry.merge_start, remaining)
-    gain, keep, is_fast = vehicles.speed_gain, vehicles.keep_right, speed >= UNCONGESTED_SPEED
+    gain, keep, is_fast = vehicles.speed_gain, vehicles.keep_right, speed >= mandatory_changes.UNCONGESTED_SPEED
     # Vehicles do not pass on the right: behind a slower vehicle on the left lane, they slow down or change to the left.
     difference = xp.maximum(own_speed - allowed_speed(speed_limit, ahead.row), speed - ahead.speed)
     is_held_back = may_change & is_left & ahead.is_present & is_fast & (difference > 0.0)
@@ -107,9 +103,8 @@ def _speed_gain_changes(
         relative = step * difference / clamp_min(own_speed, MIN_REFERENCE_SPEED)
         gain = gain + xp.where(must_brake_soon, relative, 0.0 * gain)
     # Anticipated speeds on both lanes.
-    accelerates = (ahead.is_present & (vehicles.acceleration[ahead.row] > 0.0)) | (
-        leader.is_present & (vehicles.acceleration[leader.row] > 0.0)
-    )
+    accelerates = ahead.is_present & (vehicles.acceleration[ahead.row] > 0.0)
+    accelerates = accelerates | (leader.is_present & (vehicles.acceleration[leader.row] > 0.0))
 
     def anticipated_speed(neighbor: Neighbor, end_distance: Array) -> Array:
         gap = xp.where(neighbor.is_present, neighbor.gap, end_distance)
@@ -165,16 +160,11 @@ def _speed_behind_left_leader(
     vehicles: MotorwayVehicles, context: LaneChangeContext, rows: Array, speed_difference: Array
 ) -> tuple[Array, Array]:
     """Return the speeds of vehicles that do not pass a slower one on the left, and whether each must brake soon."""
-    speed, drivers, step, xp = (
-        vehicles.speed[rows],
-        context.drivers.select(rows),
-        context.step,
-        namespace(vehicles.speed),
-    )
+    xp, speed, drivers, step = namespace(rows), vehicles.speed[rows], context.drivers.select(rows), context.step
     leader_speed, gap = context.target_leader.speed[rows], (context.target_leader.gap + vehicles.minimum_gap)[rows]
     comfortable = clamp_min(speed - vehicles.braking[rows] * step, 0.0)
     safe = drivers.follow_speed(speed, gap, leader_speed, step)
-    limited = xp.maximum(comfortable, leader_speed - HELP_SPEED_DIFFERENCE)
+    limited = xp.maximum(comfortable, leader_speed - mandatory_changes.HELP_SPEED_DIFFERENCE)
     safe = xp.where(safe >= comfortable, safe, limited)
     safe = xp.where(vehicles.speed_gain[rows] < LEFT_GAIN_THRESHOLD, xp.maximum(safe, leader_speed), safe)
     later = drivers.follow_speed(speed, gap - speed_difference * OVERTAKING_LOOK_AHEAD, leader_speed, step)
@@ -190,7 +180,6 @@ def _has_change_conflict(vehicles: MotorwayVehicles, changes_lane: Array, geomet
     neighbors = find_neighbors(vehicles._replace(lane=xp.where(merges, 1, vehicles.lane)), 2)
     ahead, behind = (neighbors_on_lane(each, 1 + 0 * vehicles.lane) for each in neighbors)
     min_distance = 2.0 * (geometry.vehicle_length + vehicles.minimum_gap)
-    is_tight = ((ahead >= 0) & merges[ahead] & (position[ahead] - position < min_distance)) | (
-        (behind >= 0) & merges[behind] & (position - position[behind] < min_distance)
-    )
-    return changes_lane & (vehicles.lane == 2) & is_tight
+    is_tight_ahead = (ahead >= 0) & merges[ahead] & (position[ahead] - position < min_distance)
+    is_tight_behind = (behind >= 0) & merges[behind] & (position - position[behind] < min_distance)
+    return changes_lane & (vehicles.lane == 2) & (is_tight_ahead | is_tight_behind)

@@ -30,17 +30,15 @@ def mandatory_lane_changes(
     total = lengths.cumsum(0)
     first = xp.searchsorted(vehicles.road, vehicles.road)
     occupied = total - xp.where(first > 0, total[first - 1], 0.0 * position)
-    remaining = geometry.merge_end - position
-    needed = vehicles.look_ahead_speed * (MERGE_LOOK_AHEAD_TIME * LEFT_LOOK_AHEAD_FACTOR) + 2.0 * (
-        vehicles.minimum_gap + geometry.vehicle_length
-    )
-    is_urgent = is_on_lane & (remaining - occupied < needed)
+    needed = vehicles.look_ahead_speed * (MERGE_LOOK_AHEAD_TIME * LEFT_LOOK_AHEAD_FACTOR)
+    needed = needed + 2.0 * (vehicles.minimum_gap + geometry.vehicle_length)
+    is_urgent = is_on_lane & (geometry.merge_end - position - occupied < needed)
     is_asked = vehicles.speed < 0.0
     rows = xp.arange(len(position))[is_urgent]
     if len(rows) == 0:
         return vehicles, is_urgent, is_asked
     own, cooperative, bias = map(copy_array, (vehicles.own_advice, vehicles.cooperative_advice, vehicles.speed_bias))
-    merging = _MergingVehicles(vehicles, context, geometry, rows, remaining[rows])
+    merging = _MergingVehicles(vehicles, context, geometry, rows)
     leader, follower = merging.leader, merging.follower
     planned, own_advice, overtakes = merging.plan_with_leader()
     is_blocked = merging.is_leader_blocking & leader.is_present
@@ -61,29 +59,21 @@ class _MergingVehicles:
     """Vehicles that must leave the ramp's lane, and their requests."""
 
     def __init__(
-        self,
-        vehicles: MotorwayVehicles,
-        context: LaneChangeContext,
-        geometry: MotorwayGeometry,
-        rows: Array,
-        remaining_distance: Array,
+        self, vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry, rows: Array
     ) -> None:
-        """Take their rows, and the remaining length of the lane [m]."""
-        self.speed, self._remaining_distance, self._step = vehicles.speed[rows], remaining_distance, context.step
+        self.speed, self._step = vehicles.speed[rows], context.step
+        self._remaining_distance = geometry.merge_end - vehicles.position[rows]
         self._vehicle_length, self._minimum_gap = geometry.vehicle_length, vehicles.minimum_gap[rows]
-        self.leader, self.follower = (
-            Neighbor(*(each[rows] for each in neighbor))
-            for neighbor in (context.target_leader, context.target_follower)
-        )
-        self.is_leader_blocking, self.is_follower_blocking = (
-            each[rows] for each in (context.is_leader_blocking, context.is_follower_blocking)
-        )
+        self.leader = Neighbor(*(each[rows] for each in context.target_leader))
+        self.follower = Neighbor(*(each[rows] for each in context.target_follower))
+        self.is_leader_blocking = context.is_leader_blocking[rows]
+        self.is_follower_blocking = context.is_follower_blocking[rows]
         self._drivers, self._follower_drivers = context.drivers.select(rows), context.follower_drivers.select(rows)
         self._leader_drivers = context.drivers.select(self.leader.row)
         self._leader_acceleration = vehicles.acceleration[self.leader.row]
         self._braking = vehicles.braking[rows]
         look_ahead_speed = clamp_min(vehicles.look_ahead_speed[rows], 1e-3)
-        self._remaining_time = clamp_min(remaining_distance / look_ahead_speed / URGENCY_FACTOR, context.step)
+        self._remaining_time = clamp_min(self._remaining_distance / look_ahead_speed / URGENCY_FACTOR, context.step)
 
     def plan_with_leader(self) -> tuple[Array, Array, Array]:
         """Return planned speeds, advised accelerations [m/s2], and whether each vehicle overtakes its leader."""
@@ -110,7 +100,7 @@ class _MergingVehicles:
         return xp.where(falls_behind, behind, planned), advice, overtakes
 
     def request_from_follower(self, planned_speed: Array, may_request: Array) -> tuple[Array, Array, Array, Array]:
-        """Return whether each follower is asked for a speed, the speed, own advice, and whether it is asked to change."""
+        """Return whether each follower is asked for a speed, the speed, own advice, and if it is asked to change."""
         xp, speed, step, follower = namespace(self.speed), self.speed, self._step, self.follower
         may_ask, drivers, seconds = may_request & follower.is_present, self._follower_drivers, self._remaining_time
         braking, minimum_gap = drivers.parameters.comfortable_deceleration, drivers.parameters.minimum_gap

@@ -11,39 +11,26 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import LocalState
 from unjam.physics.arrays import Floats
 from unjam.scenarios.road import MotorwayRoad
-from unjam.worlds.audit import (
-    BRAKING_THRESHOLDS,
-    BRAKING_TOLERANCE,
-    CAV_AFTER_CUT_IN,
-    CAV_DRIVER,
-    CUT_IN_SECONDS,
-    HUMAN_DRIVER,
-    SHORT_TIME_GAP,
-    STEADY_FOLLOWING_SECONDS,
-    Audit,
-    BrakingStatistics,
-    FollowingPair,
-    following_statistics,
-    is_recovering,
-)
+from unjam.worlds import audit
 from unjam.worlds.batch.on_ramp.vehicles import MotorwayVehicles
 from unjam.worlds.record import SHARED_COLUMN_FRAMES, Episode, Trajectory, assign_columns, make_trajectory
 from unjam.worlds.world import DriverLog
 
+Integers = NDArray[np.intp]
 NO_END_STEP = int(np.iinfo(np.intp).max)
 """last control step of roads without a collision"""
-_DRIVER_KINDS = (HUMAN_DRIVER, CAV_DRIVER, CAV_AFTER_CUT_IN)
+_DRIVER_KINDS = (audit.HUMAN_DRIVER, audit.CAV_DRIVER, audit.CAV_AFTER_CUT_IN)
 
 
 class _Placements(NamedTuple):
     """Positions of vehicles; arrays of shape (n,)."""
 
-    step_index: NDArray[np.intp]
+    step_index: Integers
     """number of control steps before"""
-    road: NDArray[np.intp]
-    entry: NDArray[np.intp]
+    road: Integers
+    entry: Integers
     """index among the entries of the road"""
-    lane: NDArray[np.intp]
+    lane: Integers
     position: Floats
     """[m]"""
     speed: Floats
@@ -65,73 +52,58 @@ class MotorwayLog:
     """[s]"""
     planned_duration: float
     """[s]"""
-    end_steps: NDArray[np.intp] = field(init=False)
+    end_steps: Integers = field(init=False)
     """control step after which vehicles touched on each road, or `NO_END_STEP`"""
 
     def __post_init__(self) -> None:
         roads, kinds = len(self.roads), len(_DRIVER_KINDS)
         self.end_steps = np.full(roads, NO_END_STEP)
-        self._placements = list[_Placements]()
-        self._backlogs = list[NDArray[np.intp]]()
-        self._cav_numbers = list[NDArray[np.intp]]()
-        self._states = list[LocalState]()
-        self._accelerations = list[Floats]()
+        self._placements, self._states = list[_Placements](), list[LocalState]()
+        self._backlogs, self._cav_numbers, self._accelerations = list[Integers](), list[Integers](), list[Floats]()
         self._arrivals = np.zeros(roads, np.intp)
         self._max_braking, self._observed_steps = np.zeros((roads, kinds)), np.zeros((roads, kinds), np.intp)
-        self._hard_braking_counts = np.zeros((roads, kinds, len(BRAKING_THRESHOLDS)), np.intp)
+        self._hard_braking_counts = np.zeros((roads, kinds, len(audit.BRAKING_THRESHOLDS)), np.intp)
         self._leader, self._leader_since = np.full((2, roads, self.entry_count), -1)
         self._step_count, self._steady_following = 0, list[Floats]()
         self._is_recovering = np.zeros((roads, self.entry_count), bool)
         """whether each CAV recovers from a change of leader"""
-        self._following_pairs = np.zeros((len(FollowingPair._fields), roads, self.entry_count))
+        self._following_pairs = np.zeros((len(audit.FollowingPair._fields), roads, self.entry_count))
         """each CAV and its leader in the last step, with the fields of `FollowingPair`"""
 
     def record_step(
-        self,
-        vehicles: MotorwayVehicles,
-        leader_rows: NDArray[np.intp],
-        arrived_vehicles: MotorwayVehicles,
-        cav_rows: NDArray[np.intp],
-        is_controlled: bool,
+        self, vehicles: MotorwayVehicles, leader_rows: Integers, arrived: MotorwayVehicles, cav_rows: Integers
     ) -> None:
-        """Record the braking of all vehicles in a simulation step, and the car following of the CAVs."""
+        """Record the braking of all vehicles in a simulation step, and the car following of controlled CAVs."""
         self._step_count += 1
         is_running = self.end_steps == NO_END_STEP
-        self._arrivals += np.bincount(arrived_vehicles.road, minlength=len(self.roads)) * is_running
+        self._arrivals += np.bincount(arrived.road, minlength=len(self.roads)) * is_running
         road, entry = vehicles.road, vehicles.entry
-        kind = np.full(len(road), HUMAN_DRIVER)
-        if is_controlled:
-            rows = cav_rows[cav_rows >= 0]
-            own, leader = (road[rows], entry[rows]), leader_rows[rows]
-            leader_entry = np.where(leader >= 0, entry[leader], -1)
-            is_new = self._leader[own] != leader_entry
-            self._leader[own] = leader_entry
-            self._leader_since[own] = np.where(is_new, self._step_count, self._leader_since[own])
-            duration = (self._step_count - self._leader_since[own]) * self.simulation_step
-            kind[rows] = np.where(duration < CUT_IN_SECONDS, CAV_AFTER_CUT_IN, CAV_DRIVER)
-            is_steady = (leader >= 0) & (duration > STEADY_FOLLOWING_SECONDS) & is_running[road[rows]]
-            gap = vehicles.position[leader] - self.roads[0].vehicle_length - vehicles.position[rows]
-            pair = FollowingPair(vehicles.speed[rows], vehicles.speed[leader], gap)
-            previous = FollowingPair(*self._following_pairs[:, *own])
-            recovers = is_recovering(self._is_recovering[own], duration, previous, pair) & (leader >= 0)
-            self._is_recovering[own], self._following_pairs[:, *own] = recovers, pair
-            columns = road[rows], *pair, recovers
-            self._steady_following.append(np.stack([each[is_steady].astype(np.float64) for each in columns]))
+        own, leader = (road[cav_rows], entry[cav_rows]), leader_rows[cav_rows]
+        leader_entry = np.where(leader >= 0, entry[leader], -1)
+        is_new = self._leader[own] != leader_entry
+        self._leader[own] = leader_entry
+        self._leader_since[own] = np.where(is_new, self._step_count, self._leader_since[own])
+        duration = (self._step_count - self._leader_since[own]) * self.simulation_step
+        kind = np.full(len(road), audit.HUMAN_DRIVER)
+        kind[cav_rows] = np.where(duration < audit.CUT_IN_SECONDS, audit.CAV_AFTER_CUT_IN, audit.CAV_DRIVER)
+        is_steady = (leader >= 0) & (duration > audit.STEADY_FOLLOWING_SECONDS) & is_running[own[0]]
+        gap = vehicles.position[leader] - self.roads[0].vehicle_length - vehicles.position[cav_rows]
+        pair = audit.FollowingPair(vehicles.speed[cav_rows], vehicles.speed[leader], gap)
+        previous = audit.FollowingPair(*self._following_pairs[:, *own])
+        recovers = audit.is_recovering(self._is_recovering[own], duration, previous, pair) & (leader >= 0)
+        self._is_recovering[own], self._following_pairs[:, *own] = recovers, pair
+        columns = own[0], *pair, recovers
+        self._steady_following.append(np.stack([each[is_steady].astype(np.float64) for each in columns]))
         np.add.at(self._observed_steps, (road, kind), is_running[road])
         brakes = np.flatnonzero((vehicles.acceleration < 0.0) & is_running[road])
         braking = -vehicles.acceleration[brakes].astype(np.float64)
         np.maximum.at(self._max_braking, (road[brakes], kind[brakes]), braking)
-        for number, threshold in enumerate(BRAKING_THRESHOLDS):
-            hard = brakes[braking > threshold + BRAKING_TOLERANCE]
+        for number, threshold in enumerate(audit.BRAKING_THRESHOLDS):
+            hard = brakes[braking > threshold + audit.BRAKING_TOLERANCE]
             np.add.at(self._hard_braking_counts[..., number], (road[hard], kind[hard]), 1)
 
     def record_control_step(
-        self,
-        vehicles: MotorwayVehicles,
-        gaps: Floats,
-        backlog: NDArray[np.intp],
-        cav_numbers: NDArray[np.intp],
-        states: LocalState,
+        self, vehicles: MotorwayVehicles, gaps: Floats, backlog: Integers, cav_numbers: Integers, states: LocalState
     ) -> None:
         """Record the positions of all vehicles after a control step, and what the CAVs observe."""
         step_index = np.full(len(gaps), len(self._placements))
@@ -159,9 +131,9 @@ class MotorwayLog:
             rows = order[start:end]
             rows = rows[every.step_index[rows] <= self.end_steps[number]]
             placements = _Placements(*(values[rows] for values in every))
-            audit = self._audit(number, trips[number], steady[1:, steady[0] == number])
-            seed = tuple(seeds[number])
-            episodes.append(self._make_episode(number, seed, placements, trips[number], backlogs[number], audit))
+            own_steady = steady[1:, steady[0] == number]
+            episode = self._make_episode(number, placements, trips[number], backlogs[number], own_steady)
+            episodes.append(replace(episode, seed=tuple(seeds[number])))
         return tuple(episodes)
 
     def _trips(self, driver_log: DriverLog, numbers_per_road: int) -> list[list[Trajectory]]:
@@ -200,13 +172,7 @@ class MotorwayLog:
         return trips
 
     def _make_episode(
-        self,
-        road_index: int,
-        seed: tuple[int, ...],
-        placements: _Placements,
-        trips: list[Trajectory],
-        backlog: Floats,
-        audit: Audit,
+        self, road_index: int, placements: _Placements, trips: list[Trajectory], backlog: Floats, steady: Floats
     ) -> Episode:
         road, steps = self.roads[road_index], placements.step_index
         moments = min(len(backlog), int(self.end_steps[road_index]) + 1)
@@ -229,7 +195,7 @@ class MotorwayLog:
             return table
 
         return Episode(
-            seed=seed,
+            seed=(),
             status="collision" if has_crashed else "completed",
             collisions=2 * int(has_crashed),
             control_step=self.control_step,
@@ -249,13 +215,12 @@ class MotorwayLog:
             demand_peak=road.peak,
             free_flow_time=road.free_flow_time,
             trajectories=tuple(trips),
-            audit=audit,
+            audit=self._audit(road_index, trips, steady),
         )
 
-    def _audit(self, road_index: int, trips: list[Trajectory], steady_following: Floats) -> Audit:
-        """Return the audit of every simulation step of a road."""
+    def _audit(self, road_index: int, trips: list[Trajectory], steady_following: Floats) -> audit.Audit:
         humans, cavs, cut_ins = (
-            BrakingStatistics(
+            audit.BrakingStatistics(
                 float(self._max_braking[road_index, kind]),
                 tuple(map(int, self._hard_braking_counts[road_index, kind])),
                 int(self._observed_steps[road_index, kind]),
@@ -264,6 +229,6 @@ class MotorwayLog:
         )
         jerks = [np.abs(np.diff(each.states.speed, 2)).max(initial=0.0) for each in trips]
         speed, leader_speed, gap, in_recovery = steady_following[:, None]
-        following = following_statistics(speed, leader_speed, gap, self.simulation_step, in_recovery=in_recovery)
+        following = audit.following_statistics(speed, leader_speed, gap, self.simulation_step, in_recovery=in_recovery)
         following = replace(following, max_jerk=float(max(jerks, default=0.0) / self.control_step**2))
-        return Audit(humans, cavs, following, SHORT_TIME_GAP, has_lanes=True, cut_in_braking=cut_ins)
+        return audit.Audit(humans, cavs, following, audit.SHORT_TIME_GAP, has_lanes=True, cut_in_braking=cut_ins)

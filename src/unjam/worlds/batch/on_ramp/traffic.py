@@ -14,15 +14,7 @@ from unjam.scenarios.on_ramp import DOWNSTREAM_LENGTH, MERGING_LENGTH, RAMP_LENG
 from unjam.scenarios.road import MotorwayRoad, VehicleType
 from unjam.scenarios.scenario import CruiseControl
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal
-from unjam.worlds.batch.on_ramp.eidm import (
-    EIDM_EPSILON,
-    EIDM_HALTING_SPEED,
-    START_UP_DURATION,
-    LeaderMotion,
-    eidm_effective_gap,
-    eidm_speed_bounds,
-    finalize_eidm_speed,
-)
+from unjam.worlds.batch.on_ramp import eidm
 from unjam.worlds.batch.on_ramp.lane_change_context import MotorwayGeometry
 from unjam.worlds.batch.on_ramp.lane_changes import change_lanes
 from unjam.worlds.batch.on_ramp.vehicles import (
@@ -57,19 +49,18 @@ class InsertionQueue:
     """The vehicles of W roads that wait to enter, by lane in the order of their entry times."""
 
     def __init__(self, roads: Sequence[MotorwayRoad], to_array: ArrayFactory) -> None:
-        """Take the entries of each road."""
-        lane_count = 1 + max(lane.lane_index for lane in roads[0].edge_lanes)
         self._roads, self._to_array = roads, to_array
-        self._queues: list[list[list[int]]] = [[[] for _ in roads] for _ in range(lane_count)]
-        for road, each in enumerate(roads):
-            for number, entry in enumerate(each.entries):
-                self._queues[0 if entry.route == "ramp" else 1 + int(entry.lane)][road].append(number)
-        longest = max(len(queue) for queues in self._queues for queue in queues) + 1
-        self._entry_times = np.full((lane_count, len(roads), longest), np.inf)
-        for lane, queues in enumerate(self._queues):
-            for road, queue in enumerate(queues):
-                self._entry_times[lane, road, : len(queue)] = [roads[road].entries[number].time for number in queue]
-        self._next = np.zeros((lane_count, len(roads)), np.intp)
+        shape = 1 + max(lane.lane_index for lane in roads[0].edge_lanes), len(roads)
+        self._entry_times = np.full((*shape, 1 + max(len(road.entries) for road in roads)), np.inf)
+        self._entry_numbers = np.zeros(self._entry_times.shape, np.intp)
+        counts = np.zeros(shape, np.intp)
+        for index, road in enumerate(roads):
+            for number, entry in enumerate(road.entries):
+                lane = 0 if entry.route == "ramp" else 1 + int(entry.lane)
+                self._entry_times[lane, index, counts[lane, index]] = entry.time
+                self._entry_numbers[lane, index, counts[lane, index]] = number
+                counts[lane, index] += 1
+        self._next = np.zeros(shape, np.intp)
 
     @property
     def entry_counts(self) -> np.ndarray:
@@ -97,7 +88,7 @@ class InsertionQueue:
             last[road[is_on_lane]] = is_on_lane  # sorted: the last assignment is the last vehicle on the road
             for index in np.flatnonzero(due_roads).tolist():
                 built, row = self._roads[index], last[index]
-                entry_number = self._queues[number][index][self._next[number, index]]
+                entry_number = int(self._entry_numbers[number, index, self._next[number, index]])
                 entry = built.entries[entry_number]
                 vehicle_type = built.vehicle_types[entry.vehicle_type]
                 room = position[row] - built.vehicle_length - start if row >= 0 else np.inf
@@ -126,10 +117,7 @@ def driver_columns(vehicle_type: VehicleType) -> tuple[float, ...]:
 
 
 def make_vehicles(*columns: np.ndarray) -> MotorwayVehicles:
-    """Return vehicles without memory, errors and advice.
-
-    `columns` are those of `MotorwayVehicles` up to `is_eidm`, and then the desired speed.
-    """
+    """Return vehicles without memory, errors and advice; `columns` are those up to `is_eidm`, and the desired speed."""
     *known, is_eidm, desired_speed = columns
     zeros = 0.0 * desired_speed
     advice = dict.fromkeys(("own_advice", "cooperative_advice", "adjacent_advice"), zeros + NO_ADVICE)
@@ -141,14 +129,10 @@ def make_vehicles(*columns: np.ndarray) -> MotorwayVehicles:
 
 def enable_acc(vehicles: MotorwayVehicles, rows: np.ndarray, cruise_control: CruiseControl) -> MotorwayVehicles:
     """Return the vehicles with some of them driven by their ACC instead of human drivers."""
-    return vehicles.replace_rows(
-        rows,
-        is_eidm=False,
-        time_headway=cruise_control.time_gap,
-        max_acceleration=cruise_control.acceleration,
-        braking=cruise_control.deceleration,
-        minimum_gap=cruise_control.minimum_gap,
-    )
+    acc = cruise_control
+    gaps = {"time_headway": acc.time_gap, "minimum_gap": acc.minimum_gap}
+    limits = {"max_acceleration": acc.acceleration, "braking": acc.deceleration}
+    return vehicles.replace_rows(rows, is_eidm=False, **gaps, **limits)
 
 
 def _convert_like(column: np.ndarray, reference: Array, to_array: ArrayFactory) -> Array:
@@ -161,9 +145,9 @@ def _convert_like(column: np.ndarray, reference: Array, to_array: ArrayFactory) 
 def empty_vehicles(to_array: ArrayFactory) -> MotorwayVehicles:
     """Return the vehicles of empty roads."""
     empty = to_array(np.zeros(0))
-    xp, columns = namespace(empty), dict.fromkeys(MotorwayVehicles._fields, empty)
-    columns |= dict.fromkeys(("road", "entry", "lane"), xp.zeros(0, dtype=xp.int64))
-    return MotorwayVehicles(**columns | {"is_eidm": empty > 0.0})
+    integers = namespace(empty).zeros(0, dtype=namespace(empty).int64)
+    columns = dict.fromkeys(MotorwayVehicles._fields, empty) | {"is_eidm": empty > 0.0}
+    return MotorwayVehicles(**columns | dict.fromkeys(("road", "entry", "lane"), integers))
 
 
 class BatchMotorways:
@@ -180,15 +164,10 @@ class BatchMotorways:
     ) -> None:
         """Take empty roads; `correction` is that of a control step."""
         self._correction, self._steps_per_control_step = correction, steps_per_control_step
-        self.geometry = MotorwayGeometry(
-            merge_start=UPSTREAM_LENGTH,
-            merge_end=UPSTREAM_LENGTH + MERGING_LENGTH,
-            length=UPSTREAM_LENGTH + MERGING_LENGTH + DOWNSTREAM_LENGTH,
-            speed_limit=roads[0].limit_speed,
-            ramp_speed_limit=RAMP_SPEED_LIMIT,
-            lane_count=len(roads[0].lane_names) - 1,
-            vehicle_length=roads[0].vehicle_length,
-        )
+        merge_end, first = UPSTREAM_LENGTH + MERGING_LENGTH, roads[0]
+        limits, lane_count = (first.limit_speed, RAMP_SPEED_LIMIT), len(first.lane_names) - 1
+        lengths = UPSTREAM_LENGTH, merge_end, merge_end + DOWNSTREAM_LENGTH
+        self.geometry = MotorwayGeometry(*lengths, *limits, lane_count, first.vehicle_length)
         self.vehicles, self.time = empty_vehicles(to_array), 0.0
         self._cached_neighbors: tuple[Array, LaneNeighbors] | None = None
         self.insertion_queue = InsertionQueue(roads, to_array)
@@ -231,23 +210,22 @@ class BatchMotorways:
         drivers = vehicles.drivers
         leader_speed, free_gap = xp.where(has_leader, speed[row], allowed), FREE_DRIVING_GAP + vehicles.minimum_gap
         gap = xp.where(has_leader, position[row] - geometry.vehicle_length - position, free_gap)
-        is_started = vehicles.start_time + START_UP_DURATION + EIDM_EPSILON < self.time
-        may_stay_cool = is_started & (speed > EIDM_HALTING_SPEED) & has_leader
-        motion = LeaderMotion(xp.where(has_leader, vehicles.acceleration[row], 0.0 * speed), may_stay_cool)
+        is_started = vehicles.start_time + eidm.START_UP_DURATION + eidm.EIDM_EPSILON < self.time
+        may_stay_cool = is_started & (speed > eidm.EIDM_HALTING_SPEED) & has_leader
+        motion = eidm.LeaderMotion(xp.where(has_leader, vehicles.acceleration[row], 0.0 * speed), may_stay_cool)
         follow, uncooled = drivers.desired_speed(speed, gap, leader_speed, step, motion)
         next_allowed = xp.minimum(limit, vehicles.speed_cap)
         # EIDMs desire the allowed speed, and drive a little faster or slower; IDMs never drive faster.
         max_speed = xp.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
         safe = xp.minimum(xp.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
         may_be_free = safe > speed - LEADER_BRAKING_THRESHOLD * step
-        free = drivers.select(may_be_free).desired_speed(
-            speed[may_be_free], free_gap[may_be_free], next_allowed[may_be_free], step
-        )
+        free_state = (each[may_be_free] for each in (speed, free_gap, next_allowed))
+        free = drivers.select(may_be_free).desired_speed(*free_state, step)
         # Of the leader and the allowed speed, drivers obey the one that requires more braking without coolness.
         is_free = copy_array(may_be_free)
-        is_free[may_be_free] = free.uncooled_acceleration < uncooled[may_be_free] + EIDM_EPSILON
+        is_free[may_be_free] = free.uncooled_acceleration < uncooled[may_be_free] + eidm.EIDM_EPSILON
         safe[may_be_free] = xp.where(is_free[may_be_free], xp.minimum(safe[may_be_free], free.speed), safe[may_be_free])
-        effective_gap = xp.where(is_free, FREE_DRIVING_GAP, eidm_effective_gap(gap, drivers.parameters))
+        effective_gap = xp.where(is_free, FREE_DRIVING_GAP, eidm.eidm_effective_gap(gap, drivers.parameters))
         leader_speed = xp.where(is_free, next_allowed, leader_speed)
         if bool(is_on_lane.any()):
             remaining = clamp_min(geometry.merge_end - position[is_on_lane], 0.0)
@@ -261,15 +239,9 @@ class BatchMotorways:
         if self._correction is not None:
             new = self._corrected_speeds(new, row, self._correction)
         errors = drivers.errors.next_errors(new, self._draw((3, len(speed))), step)
-        return vehicles._replace(
-            position=position + new * step,
-            speed=new,
-            acceleration=(new - speed) / step,
-            start_time=start_time,
-            gap_error=errors.gap,
-            leader_error=errors.leader_speed,
-            driving_error=errors.driving,
-        )
+        vehicles = vehicles._replace(gap_error=errors[0], leader_error=errors[1], driving_error=errors[2])
+        position, acceleration = position + new * step, (new - speed) / step
+        return vehicles._replace(position=position, speed=new, acceleration=acceleration, start_time=start_time)
 
     def _corrected_speeds(self, speeds: Array, leader_rows: Array, correction: LearnedCorrection) -> Array:
         """Return the speeds after this step with the learned correction of EIDM drivers with a leader."""
@@ -290,7 +262,7 @@ class BatchMotorways:
     ) -> tuple[Array, Array]:
         """Return the speeds after this step, and the times of the last start."""
         step, speed, drivers, xp = self._step, vehicles.speed, vehicles.drivers, namespace(vehicles.speed)
-        lowest, desired, highest = eidm_speed_bounds(
+        lowest, desired, highest = eidm.eidm_speed_bounds(
             speed, safe_speed, effective_gap, leader_speed, drivers.parameters, drivers.errors, step
         )
         desired = xp.where(vehicles.is_eidm, desired, highest)
@@ -303,5 +275,5 @@ class BatchMotorways:
         room = xp.where(vehicles.speed_bias > 0.0, highest - desired, desired - lowest)
         desired = xp.where(is_advised, patched, desired + 0.5 * room * vehicles.speed_bias)
         start_limits = vehicles.start_time, vehicles.max_acceleration, self.time + step, step
-        eidm_speed, start_time = finalize_eidm_speed(speed, vehicles.acceleration, desired, highest, *start_limits)
+        eidm_speed, start_time = eidm.finalize_eidm_speed(speed, vehicles.acceleration, desired, highest, *start_limits)
         return xp.where(vehicles.is_eidm, eidm_speed, desired), start_time

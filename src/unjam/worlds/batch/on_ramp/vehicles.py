@@ -11,15 +11,8 @@ from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, running
 from unjam.physics.idm import IDMArrays, desired_gap, fast_power, idm_acceleration
 from unjam.physics.kinematics import next_speed, stopping_distance
 from unjam.worlds.batch.human_idm import SUMO_MIN_GAP
-from unjam.worlds.batch.on_ramp.eidm import (
-    EIDM_SUBSTEPS,
-    DesiredSpeed,
-    DriverErrors,
-    LeaderMotion,
-    eidm_follow_speed,
-    eidm_secure_gap,
-    eidm_stop_speed,
-)
+from unjam.worlds.batch.on_ramp import eidm
+from unjam.worlds.batch.on_ramp.eidm import DesiredSpeed, DriverErrors, LeaderMotion
 
 NO_VEHICLE = -1
 """row or lane of a vehicle or lane that does not exist"""
@@ -111,12 +104,8 @@ class MotorwayDrivers(NamedTuple):
 
     def select(self, index: Array) -> "MotorwayDrivers":
         """Return some of the drivers."""
-        p = self.parameters
-        return MotorwayDrivers(
-            IDMArrays(*(each if each is p.exponent else each[index] for each in p)),
-            DriverErrors(*(each[index] for each in self.errors)),
-            self.is_eidm[index],
-        )
+        parameters = IDMArrays(*(each if type(each) is float else each[index] for each in self.parameters))
+        return MotorwayDrivers(parameters, DriverErrors(*(each[index] for each in self.errors)), self.is_eidm[index])
 
     def follow_speed(self, speed: Array, gap: Array, leader_speed: Array, step: float) -> Array:
         """Return the desired speeds after a step at bumper-to-bumper gaps behind leaders."""
@@ -126,18 +115,20 @@ class MotorwayDrivers(NamedTuple):
         self, speed: Array, gap: Array, leader_speed: Array, step: float, leader_motion: LeaderMotion | None = None
     ) -> DesiredSpeed:
         """Return the same with its urgency; drivers may stay cool about `leader_motion`."""
-        values, urgency = eidm_follow_speed(speed, gap, leader_speed, self.parameters, self.errors, step, leader_motion)
+        values, urgency = eidm.eidm_follow_speed(
+            speed, gap, leader_speed, self.parameters, self.errors, step, leader_motion
+        )
         desired = self._eidm_or_idm(values, _idm_follow_speed, speed, gap, leader_speed, step=step)
         return DesiredSpeed(desired, namespace(desired).where(self.is_eidm, urgency, (desired - speed) / step))
 
     def stop_speed(self, speed: Array, distance: Array, step: float) -> Array:
         """Return the desired speeds after a step of drivers that must stop within a distance."""
-        values = eidm_stop_speed(speed, distance, self.parameters, self.errors, step)
+        values = eidm.eidm_stop_speed(speed, distance, self.parameters, self.errors, step)
         return self._eidm_or_idm(values, _idm_stop_speed, speed, distance, step=step)
 
     def secure_gap(self, speed: Array, leader_speed: Array) -> Array:
         """Return the gap, beyond the minimum gap, that drivers require for a lane change."""
-        values = eidm_secure_gap(speed, leader_speed, self.parameters)
+        values = eidm.eidm_secure_gap(speed, leader_speed, self.parameters)
         return self._eidm_or_idm(values, _idm_secure_gap, speed, leader_speed)
 
     def safe_speed(self, gap: Array, leader_speed: Array, leader_braking: Array, step: float) -> Array:
@@ -156,8 +147,8 @@ class MotorwayDrivers(NamedTuple):
 
     def brake_gap(self, speed: Array, step: float) -> Array:
         """Return the stopping distance of drivers that brake after their time headway."""
-        p = self.parameters
-        return stopping_distance(speed, p.comfortable_deceleration, step) + speed * p.time_headway
+        braking, time_headway = self.parameters.comfortable_deceleration, self.parameters.time_headway
+        return stopping_distance(speed, braking, step) + speed * time_headway
 
     def _eidm_or_idm(
         self, eidm_values: Array, idm_function: Callable[..., Array], *values: Array, **options: float
@@ -172,8 +163,8 @@ class MotorwayDrivers(NamedTuple):
 
 
 def _idm_follow_speed(speed: Array, gap: Array, leader_speed: Array, parameters: IDMArrays, step: float) -> Array:
-    substep = step / EIDM_SUBSTEPS
-    for _ in range(EIDM_SUBSTEPS):
+    substep = step / eidm.EIDM_SUBSTEPS
+    for _ in range(eidm.EIDM_SUBSTEPS):
         acceleration = idm_acceleration(speed, leader_speed, clamp_min(gap, SUMO_MIN_GAP), parameters, fast_power)
         speed = next_speed(speed, acceleration, substep)
         gap = gap - clamp_min(speed - leader_speed, 0.0) * substep
@@ -197,7 +188,7 @@ class LaneNeighbors(NamedTuple):
 
 
 def copy_array(values: Array) -> Array:
-    """Return a copy that may be changed."""
+    """Return a copy."""
     return namespace(values).asarray(values, copy=True)
 
 

@@ -53,11 +53,7 @@ class MotorwayBatch:
         explore: Sequence[float] | None = None,
         replay: ReplayOptions | None = None,
     ) -> None:
-        """Take empty roads, one for each seed.
-
-        `dtype` is the precision of the simulation, `explore` the factor of exploration noise on each road (None: 1);
-        `replay` changes the episodes of these seeds.
-        """
+        """Take empty roads, one for each seed; `dtype` is the precision, `explore` the factor of exploration noise."""
         self._exploration_scales = np.ones(len(seeds)) if explore is None else np.array(explore)
         self.scenario, self._seeds, self._replay, self._dtype = scenario, seeds, replay, dtype
         drawn = [scenario.draw_from_seed(seed) for seed in seeds]
@@ -141,7 +137,8 @@ class MotorwayBatch:
             vehicles = traffic.vehicles
             leader_rows = neighbors_on_lane(traffic.neighbors.leaders, vehicles.lane)
             cav_rows = find_rows(self._cav_numbers, vehicles)
-            self._log.record_step(vehicles, leader_rows, arrived, cav_rows, self._is_controlled)
+            cav_rows = cav_rows[(cav_rows >= 0) & self._is_controlled]
+            self._log.record_step(vehicles, leader_rows, arrived, cav_rows)
         self.control_steps += 1
         self._update_cavs()
         after = before.copy()
@@ -199,9 +196,7 @@ class MotorwayBatch:
         """Return the readings of exact sensors of the CAVs."""
         traffic, vehicles, road = self._traffic, self._traffic.vehicles, self.roads[0]
         rows, neighbors, geometry = find_rows(self._cav_numbers, vehicles), traffic.neighbors, traffic.geometry
-        lane, position, speed, roads = (
-            each[rows] for each in (vehicles.lane, vehicles.position, vehicles.speed, vehicles.road)
-        )
+        roads, _, lane, position, speed = (each[rows] for each in vehicles[:5])
 
         def neighbor_state(neighbors: NDArray[np.intp], lane_offset: int, direction: float) -> tuple[Floats, Floats]:
             row = neighbors_on_lane(neighbors, vehicles.lane + lane_offset)[rows]
@@ -209,10 +204,8 @@ class MotorwayBatch:
             is_near = (row >= 0) & (gap < MAX_OBSERVED_GAP)
             return np.where(is_near, vehicles.speed[row], speed), np.where(is_near, gap, MAX_OBSERVED_GAP)
 
-        own, left, right = (
-            (neighbor_state(neighbors.leaders, offset, 1.0), neighbor_state(neighbors.followers, offset, -1.0))
-            for offset in (0, 1, -1)
-        )
+        sides = ((neighbors.leaders, 1.0), (neighbors.followers, -1.0))
+        own, left, right = ([neighbor_state(each, offset, sign) for each, sign in sides] for offset in (0, 1, -1))
         is_on_ramp = (lane == 0) & (position < road.merge_position)
         limit = np.where(is_on_ramp, geometry.ramp_speed_limit, geometry.speed_limit)
         lane_speeds, road_speeds = self._road_sections.speeds_ahead(self._messages.latest, lane, position, roads)

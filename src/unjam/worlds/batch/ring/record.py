@@ -70,15 +70,13 @@ class RingLog:
         Vehicles that touched may be separate again at the end, because a control step has several simulation steps.
         """
         last = driver_log.last_observation
-        driver_log = replace(
-            driver_log,
-            decisions=[tuple(map(as_numpy, decision)) for decision in driver_log.decisions],
-            last_observation=None if last is None else as_numpy(last),
-        )
+        decisions = [tuple(map(as_numpy, decision)) for decision in driver_log.decisions]
+        last = None if last is None else as_numpy(last)
+        driver_log = replace(driver_log, decisions=decisions, last_observation=last)
         vehicle_count, cav_count = len(self.start_positions), len(roads[0].cav_ids)
         values = {name: self._stack(name, vehicle_count) for name in ("noise_free_speeds", "speeds")}
-        for name in ("requested_accelerations", "safe_accelerations", "commanded_speeds"):
-            values[name] = self._stack(name, cav_count)
+        cav_names = ("requested_accelerations", "safe_accelerations", "commanded_speeds")
+        values |= {name: self._stack(name, cav_count) for name in cav_names}
         episodes = []
         for ring, (scenario, road, seed, count, crashed) in enumerate(
             zip(scenarios, roads, seeds, control_steps.astype(int), has_crashed.astype(bool), strict=True)
@@ -87,9 +85,8 @@ class RingLog:
             ends = {"requested_accelerations": count, "speeds": steps + 1}
             own: dict[str, Any] = {name: each[: ends.get(name, steps), :, ring] for name, each in values.items()}
             start = self.start_positions[:, ring]
-            log = ClosedRoadLog(
-                scenario, road, start, **own, has_crashed=bool(crashed), penetration_rate=penetration_rate
-            )
+            own |= {"has_crashed": bool(crashed), "penetration_rate": penetration_rate}
+            log = ClosedRoadLog(scenario, road, start, **own)
             motion = log.speeds_and_positions()
             position = motion[1][:, -1]
             # The leader's position is not wrapped: a vehicle that touches its leader may be a little beyond it.

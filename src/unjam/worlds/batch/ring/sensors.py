@@ -9,21 +9,14 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import FollowingState
 from unjam.drivers.sensors import SensorReadings
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.batch.noise import ArrayFactory
+from unjam.worlds.batch.noise import ArrayFactory, WorldSeeds
 from unjam.worlds.batch.ring.record import as_numpy
 
 
 class RingReadings:
     """Readings of W rings; each ring has its own generators and calls them in the same order as SUMO's worlds."""
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        cav_ids: Sequence[str],
-        seeds: Sequence[Sequence[np.random.SeedSequence]],
-        to_array: ArrayFactory,
-    ) -> None:
-        """Take the ids of a ring's CAVs, and the seeds of each ring, of `Scenario.draw_from_seed`."""
+    def __init__(self, scenario: Scenario, cav_ids: Sequence[str], seeds: WorldSeeds, to_array: ArrayFactory) -> None:
         sensors, braking = scenario.sensors, scenario.safety.leader_braking
         self._ring_readings = [
             SensorReadings(sensors, braking, scenario.simulation_step, seed)

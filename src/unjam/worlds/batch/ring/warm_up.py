@@ -46,11 +46,7 @@ class WarmUpCache(dict[WarmUpKey, WarmUpState]):
         upcoming: Sequence[WarmUpKey],
         warm_up: Callable[[Sequence[WarmUpKey]], Mapping[WarmUpKey, WarmUpState]],
     ) -> list[WarmUpState]:
-        """Return the state of each key.
-
-        If one is missing, `warm_up` also simulates the missing ones of `upcoming`: many rings at once take hardly
-        longer than a few.
-        """
+        """Return the state of each key; with missing ones, `warm_up` also simulates those of `upcoming`, at little cost."""
         if all(key in self for key in keys):
             return [self[key] for key in keys]
         known = {**self, **warm_up([key for key in dict.fromkeys([*keys, *upcoming]) if key not in self])}

@@ -22,11 +22,11 @@ from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import MIN_TIME_GAP_SPEED
 from unjam.worlds.batch.figure_eight.crossing import CrossingMemory
-from unjam.worlds.batch.figure_eight.geometry import crossing_starts, figure_eight_contacts
+from unjam.worlds.batch.figure_eight.geometry import figure_eight_contacts
 from unjam.worlds.batch.figure_eight.movement import FigureEightMovement
 from unjam.worlds.batch.human_idm import HumanSpeedModel, human_idm_speed, human_parameters, human_ring_speed
 from unjam.worlds.batch.leaders import CONTACT_GAP, Leader, ring_contacts
-from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, SeededNoise, make_noise
+from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, QuickNoise, SeededNoise
 from unjam.worlds.batch.ring.record import RingLog, RingResults, as_numpy
 from unjam.worlds.batch.ring.sensors import RingReadings
 from unjam.worlds.batch.ring.warm_up import WarmUpState
@@ -70,10 +70,7 @@ class RingBatch:
             keep_record: whether to keep whole episodes, some 16 bytes for each vehicle and step in float64.
             draw: draws all noise; None: each road draws the same noise as SUMO's episode.
             human_model: of human drivers away from junctions, instead of SUMO's IDM.
-            allow_statistical: whether to allow scenarios that equal SUMO's only in distribution.
-
-        Raises:
-            InputError: a scenario is not supported, or the scenarios differ in more.
+            allow_statistical: see `run_batch`.
         """
         check_batch_scenarios(scenarios, allow_statistical)
         scenario = self.scenario = scenarios[0]
@@ -94,16 +91,20 @@ class RingBatch:
         start = np.stack([road.start_positions for road in roads], 1)
         self._set_motion(np.zeros((vehicles, len(roads))), start, loops)
         self._human_parameters, self._human_model = human_parameters(roads, scenario.humans, to_array), human_model
-        has_crossings = bool(roads[0].crossings)
-        self._figure_eight = (
-            FigureEightMovement(scenario, roads, self._cav_indices, to_array, human_model) if has_crossings else None
-        )
-        self._find_contacts = figure_eight_contacts if has_crossings else ring_contacts
-        self._crossing_starts = [to_array(np.tile(each, cavs)) for each in crossing_starts(roads)]
+        self._figure_eight, self._find_contacts = None, ring_contacts
+        if roads[0].crossings:
+            self._figure_eight = FigureEightMovement(scenario, roads, self._cav_indices, to_array, human_model)
+            self._find_contacts = figure_eight_contacts
+        crossings = zip(*(road.crossings for road in roads), strict=True)
+        self._crossing_starts = [to_array(np.tile([start for start, _ in each], cavs)) for each in crossings]
         self._noise_scale = to_array(np.full((vehicles, 1), scenario.noise_per_step * step))
         self._actuation = CAVActuation(scenario.safety, scenario.actuator, step)
         self._readings = RingReadings(scenario, roads[0].cav_ids, generator_seeds, to_array)
-        self._noise = make_noise(generator_seeds, vehicles, (scenario.horizon, cavs), to_array, draw)
+        self._noise = (
+            SeededNoise(generator_seeds, vehicles, (scenario.horizon, cavs), to_array)
+            if draw is None
+            else QuickNoise(draw, vehicles, cavs, len(roads))
+        )
         self._reward, self._has_quick_noise = make_reward(reward or scenario.reward), draw is not None
         self._reset_log()
 
@@ -114,12 +115,11 @@ class RingBatch:
         self._gap = self._to_array(gap_on_loop(positions, np.roll(positions, -1, 0), loop_lengths, VEHICLE_LENGTH))
 
     def _reset_log(self) -> None:
-        """Clear the log and the sums."""
         self._log = RingLog(as_numpy(self._position), [self._speed[:-1]], self._find_contacts)
         zeros = self._loop_lengths * 0.0
         cav_zeros = self._cav_loop_lengths.reshape(self._shape) * 0.0
-        self._is_running, self._control_step_counts = zeros + 1.0, zeros
-        self._reward_sums, self._mean_speed_sums, self._has_crashed = dict[str, Array](), zeros, zeros > 0.0
+        self._is_running, self._has_crashed, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
+        self._reward_sums, self._mean_speed_sums = dict[str, Array](), zeros
         self._min_time_gap, self._max_braking = cav_zeros + np.inf, cav_zeros
 
     def place_vehicles(self, speeds: Array, positions: Array, memories: Sequence[CrossingMemory | None]) -> None:
@@ -151,10 +151,10 @@ class RingBatch:
     def _drive_warm_up(self) -> LocalState | None:
         """Simulate the warm-up and return the same as `start`."""
         scenario, states = self.scenario, list[LocalState]()
-        interval = scenario.steps_per_control_step
         max_count = round(MAX_RECALL_SECONDS / scenario.control_step)
         for remaining in range(scenario.warmup, 0, -1):
-            if remaining % interval == 0 and remaining // interval <= max_count:
+            control_steps, rest = divmod(remaining, scenario.steps_per_control_step)
+            if rest == 0 and control_steps <= max_count:
                 states.append(self._exact_state().map(as_numpy))
             self._simulate(None)
         if not states or not scenario.remember_warmup:
@@ -171,17 +171,15 @@ class RingBatch:
         for ring, crashed in enumerate(self._has_crashed.tolist()):
             memory = self._figure_eight and CrossingMemory(*(each[:, ring] for each in self._figure_eight.memory))
             own_history = None if history is None else history.select(ring)
-            states.append(
-                WarmUpState(speed[ring], position[ring], gap[ring], crashed, noise[ring], own_history, memory)
-            )
+            motion = speed[ring], position[ring], gap[ring]
+            states.append(WarmUpState(*motion, crashed, noise[ring], own_history, memory))
         return states
 
     def _restore(self, states: Sequence[WarmUpState]) -> LocalState | None:
         """Continue from the states of the rings, and return the same as `start`."""
         *motion, noise, histories, memories = zip(*states, strict=True)
-        self._speed, self._position, self._gap, self._has_crashed = (
-            self._to_array(np.stack(each, -1)) for each in motion
-        )
+        arrays = (self._to_array(np.stack(each, -1)) for each in motion)
+        self._speed, self._position, self._gap, self._has_crashed = arrays
         cast(SeededNoise, self._noise).restore(noise)
         if self._figure_eight:
             self._figure_eight.restore_memory(memories)
@@ -218,9 +216,8 @@ class RingBatch:
     def _following_state(self) -> FollowingState:
         """Return the exact inputs of the CAVs' safety filters."""
         speed, own = self._speed, self._cav_indices
-        return FollowingState(
-            self._rows_of(speed, own), self._rows_of(speed, self._leader_indices), self._rows_of(self._gap, own)
-        )
+        leader_speed = self._rows_of(speed, self._leader_indices)
+        return FollowingState(self._rows_of(speed, own), leader_speed, self._rows_of(self._gap, own))
 
     def _rows_of(self, values: Array, indices: list[int]) -> Array:
         """Return the values of some vehicles of all rings, shape (CAVs * W,)."""
@@ -292,7 +289,7 @@ class RingBatch:
         commanded = None if cav_speeds is None else cav_speeds.reshape(self._shape)
         if self._figure_eight:
             noise = self._noise.human_noise() * self._noise_scale if self.scenario.noise > 0 else 0.0
-            return (self._figure_eight.next_speeds(speed, self._position, leader, noise, commanded),) * 2
+            return (self._figure_eight.move(speed, self._position, leader, noise, commanded),) * 2
         moved = self._human_speeds(speed, leader)
         if commanded is not None:
             min_speed = speed[self._cav_indices] - self.scenario.cav_max_braking * self.scenario.simulation_step
