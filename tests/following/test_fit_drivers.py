@@ -79,7 +79,7 @@ def test_speeds_in_another_unit_than_gaps_are_doubted() -> None:
     assert unit_warnings([pair]) == []
     kilometres = replace(pair, speed=3.6 * pair.speed, leader_speed=3.6 * pair.leader_speed)
     (line,) = unit_warnings([kilometres])
-    assert line.startswith("warning: gaps change 0.28 times as fast as the speeds say")
+    assert line.startswith("warning: gaps change 0.28 times as fast as the speeds imply")
 
 
 def test_a_file_becomes_a_population(data: Path) -> None:
@@ -111,7 +111,7 @@ def test_drivers_of_several_files_are_told_apart(data: Path, tmp_path: Path) -> 
     ("changes", "more", "words"),
     [
         ({"calibration.speed": 2}, {}, "calibration.speed: unknown name"),
-        ({}, {"filters": {"kind": "robot"}}, "no trajectory has kind 'robot'; there are: ACC, human"),
+        ({}, {"filters": {"kind": "robot"}}, "no trajectory has the kind 'robot'; available: ACC, human"),
         ({}, {"filters": {"color": "red"}}, "select: 'color' is not allowed"),
         ({}, {"out": Path("drivers.toml")}, "out: 'drivers.toml' is not allowed"),
     ],

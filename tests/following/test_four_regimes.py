@@ -36,5 +36,5 @@ def test_leaders_keep_their_speed_and_followers_move_by_euler_steps() -> None:
 
 
 def test_nobody_starts_faster_than_it_wants_to_be() -> None:
-    with pytest.raises(InputError, match=r"speed: 40.0 m/s is not allowed at the start"):
+    with pytest.raises(InputError, match=r"speed: 40.0 m/s is not allowed"):
         build_dataclass(FourRegimesSettings, {"speed": (5.0, 40.0)}, "regimes")

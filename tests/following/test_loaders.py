@@ -151,12 +151,12 @@ def test_who_has_nobody_ahead_is_counted(tmp_path: Path) -> None:
     found = read_pairs(ngsim(tmp_path / "data.csv"), options=SHORT)
     assert found.summary_lines() == [
         "1 trajectories with 30 of 60 rows",
-        "left out: 30 rows: no leader, or leader not recorded",
+        "skipped: 30 rows: no leader, or leader not recorded",
     ]
 
 
 def test_metres_are_not_taken_for_feet(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"median length of its vehicles would be 1\.5 m"):
+    with pytest.raises(InputError, match=r"a median vehicle length of 1\.5 m is not allowed"):
         read_pairs(ngsim(tmp_path / "data.csv", feet=1.0), options=SHORT)
 
 
@@ -194,7 +194,7 @@ def spoilt(path: Path, row: int, column: str, value: object) -> Path:
         ("gap", "near", r"line 7: gap: nan is not allowed; allowed: 0 to 1000"),
         ("speed", -3, r"line 7: speed: -3 is not allowed; allowed: 0 to 70"),
         ("leader_speed", 300, r"line 7: leader_speed: 300 is not allowed"),
-        ("time", 0.3, r"line 7: time: 0.3 is there twice in its pair"),
+        ("time", 0.3, r"line 7: time: 0.3 occurs twice in its pair"),
     ],
 )
 def test_a_bad_row_is_refused_by_its_line(tmp_path: Path, column: str, value: object, words: str) -> None:
@@ -208,7 +208,7 @@ def test_a_bad_row_may_be_cut_out_and_is_told(tmp_path: Path) -> None:
     assert [len(pair.speed) for pair in found.pairs] == [12, 17, 30]
     assert len({pair.name for pair in found.pairs}) == 3
     assert [(row.line, row.reason) for row in found.bad_rows] == [(14, "gap: nan is not allowed; allowed: 0 to 1000")]
-    assert "cut out: line 14: gap: nan is not allowed; allowed: 0 to 1000" in found.summary_lines()
+    assert "dropped: line 14: gap: nan is not allowed; allowed: 0 to 1000" in found.summary_lines()
 
 
 def test_short_trajectories_are_counted(tmp_path: Path) -> None:

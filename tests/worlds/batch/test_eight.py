@@ -141,7 +141,7 @@ def test_who_covers_the_crossing_with_another_one_collides() -> None:
 @pytest.mark.parametrize(
     ("scenario", "why"),
     [
-        (replace(SHORT, human_control="native"), "SUMO drives people"),
+        (replace(SHORT, human_control="native"), "human_control: native"),
         (replace(SHORT, right_of_way=False), "right_of_way"),
         (replace(SHORT, enforce_human_limits=False), "enforce_human_limits"),
         (replace(SHORT, radius=(20, 22), vehicles=5, free_length=30.0), "radius"),
@@ -160,7 +160,7 @@ def test_it_is_no_exact_road_and_driven_only_where_that_is_asked_for() -> None:
     assert unsupported_reason(SHORT)
     assert not statistically_unsupported_reason(SHORT)
     assert not statistically_unsupported_reason(Ring())
-    with pytest.raises(InputError, match="it is no ring"):
+    with pytest.raises(InputError, match="is not a ring"):
         run_batch(tasks(SHORT, "pi", range(1)))
 
 

@@ -371,8 +371,8 @@ REFUSED: dict[str, dict[str, Any]] = {
     "warmup": {"warmup": 100},
     "roadside.loss_rate": {"roadside": replace(SHORT.roadside, loss_rate=0.1)},
     "cruise.keep_right": {"cruise": replace(SHORT.cruise, keep_right=5.0)},
-    "cruise.keep_right and cruise.speed_gain": {"cruise": replace(SHORT.cruise, speed_gain=0.0)},
-    "sensors": {"actuator": replace(SHORT.actuator, lag=0.3)},
+    "cruise.speed_gain": {"cruise": replace(SHORT.cruise, speed_gain=0.0)},
+    "actuator.is_instant": {"actuator": replace(SHORT.actuator, lag=0.3)},
 }
 
 

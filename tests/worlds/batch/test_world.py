@@ -321,8 +321,8 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
 @pytest.mark.parametrize(
     ("scenario", "why"),
     [
-        (FigureEight(), "it is no ring"),
-        (replace(SHORT, human_control="commanded"), "people are commanded"),
+        (FigureEight(), "is not a ring"),
+        (replace(SHORT, human_control="commanded"), "human_control: commanded"),
         (replace(SHORT, safety=NO_FILTER), "SUMO's own check"),
         (replace(SHORT, actuation="flow"), "SUMO's own check"),
         (replace(SHORT, simulation_step=0.5), "simulation_step: 0.5"),
