@@ -50,7 +50,7 @@ LAZY = {
 }
 """modules that import other parts when they are used"""
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
-MAX_MODULE_LINES = 400
+MAX_MODULE_LINES = 450
 EXECUTABLE = ("sys.executable", "sys._base_executable", "executable", "_base_executable")
 
 

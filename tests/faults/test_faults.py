@@ -8,6 +8,7 @@ import pytest
 
 from tests.faults.registry import FAULTS
 from tests.test_sandbox import kept
+from unjam_paper.results_file import read_part
 
 MARKS = {True: [pytest.mark.slow], False: []}
 NEEDED = {"sandbox": kept}
@@ -32,6 +33,6 @@ def test_a_fault_does_no_harm(name: str, tmp_path: Path) -> None:
 def test_the_committed_soak_has_every_fault_as_often_as_required() -> None:
     document = json.loads(SOAK.read_text())
     assert document["manifest"]["packages"]["libsumo"].startswith("1.28")
-    assert {row["name"]: row["injected"] for row in document["rows"]} == {
+    assert {row["name"]: row["injected"] for row in read_part(SOAK, "rows")} == {
         name: fault.long for name, fault in FAULTS.items()
     }

@@ -55,7 +55,9 @@ def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., Any]],
         @wraps(command)
         def wrapper(**arguments: Any) -> Any:
             for name, group in groups.items():
-                arguments[name] = group(**{option: arguments.pop(option) for option in members[name]})
+                arguments[name] = group(
+                    **{option: arguments.pop(option) for option in members[name] if option in arguments}
+                )
             return command(**arguments)
 
         options = inspect.signature(command).parameters.items()
