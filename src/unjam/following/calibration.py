@@ -128,9 +128,9 @@ def calibrate_idm(
     shares = simulated.sample_counts / simulated.sample_counts.sum()
     gap_error, speed_error = (float(np.sqrt((mse * shares).sum())) for mse in (simulated.gap_mse, simulated.speed_mse))
     collisions, seconds = int(simulated.has_collided.sum()), sum(pair.seconds for pair in pairs)
-    bounds = {name: (getattr(parameters, name), getattr(settings, name)) for name in CALIBRATED_PARAMETERS}
-    at_bounds = tuple(name for name, value_and_range in bounds.items() if is_at_bound(*value_and_range))
-    return CalibratedIDM(parameters, weight, gap_error, speed_error, collisions, seconds, at_bounds)
+    names = CALIBRATED_PARAMETERS
+    at_bounds = [name for name in names if is_at_bound(getattr(parameters, name), getattr(settings, name))]
+    return CalibratedIDM(parameters, weight, gap_error, speed_error, collisions, seconds, tuple(at_bounds))
 
 
 def gap_objective(

@@ -108,12 +108,10 @@ def fit_drivers_from_files(
     """Return the population of the drivers in files.
 
     Args:
-        files: with the same time step.
         overrides: of `FitDriversSettings`; keys may have dots.
         format: of the files, see `read_pairs`; options of reading are those of `ReadOptions`.
         filters: values of `kind`, `split` or `driver` that select trajectories.
         out: future file of the population, which is checked before the calibration.
-        on_progress: called with the number of finished drivers, and that of all drivers.
 
     Raises:
         InputError: a file, a row or a setting is wrong, or no trajectory is selected.
@@ -177,8 +175,6 @@ def fit_drivers(
 
     The parameters minimize the error of the gap that is simulated behind the recorded leader. A residual learns from
     simulated driving; it is left out unless it improves the gaps of drivers that it did not learn from.
-
-    `on_progress` is called with the number of finished drivers, and that of all drivers.
 
     Raises:
         InputError: there are too few drivers for a residual, or the time steps differ.

@@ -118,11 +118,8 @@ class Crossing:
     def next_speeds(
         self, speed: Array, position: Array, leader: Leader, commanded_speed: Array, is_commanded: Array
     ) -> Array:
-        """Return the speeds after a step, and update the memory; SUMO drives vehicles that are not commanded.
-
-        Positions are those of front bumpers, wrapped or not; `leader` is the vehicle ahead. Units: m/s, m.
-        """
-        xp, step, models = namespace(speed), self._step, self.models
+        """Return the speeds after a step [m/s], and update the memory; arguments as of `leaders`, and commands."""
+        xp, models = namespace(speed), self.models
         free_speed = xp.where(is_commanded, models.clip_speed(speed, commanded_speed), models.max_speed(speed))
         look_ahead = models.look_ahead_distance(speed)
         distances_past, (major_side, minor_side, *_) = self._figure_eights.distances_past(position), self._figure_eights
@@ -149,11 +146,11 @@ class Crossing:
         go_speed = xp.where(slows_down, xp.minimum(go_speed, stop_speed), go_speed)
         safe[first] = xp.where(may_enter, go_speed, safe[first])
         uncommanded = models.finalize_speed(speed, safe)
-        uncommanded = uncommanded * (uncommanded > STANDSTILL_ACCELERATION * step)
+        uncommanded = uncommanded * (uncommanded > STANDSTILL_ACCELERATION * self._step)
         commanded = models.clip_speed(speed, xp.minimum(commanded_speed, safe))
-        moved = xp.where(is_commanded, commanded, uncommanded)
-        self._update_memory(speed, moved, distances_past)
-        return moved
+        next_speed = xp.where(is_commanded, commanded, uncommanded)
+        self._update_memory(speed, next_speed, distances_past)
+        return next_speed
 
     def record_step(self, speed: Array, next_speed: Array, position: Array) -> None:
         """Update the memory after a recorded step; arguments as of `next_speeds`."""

@@ -53,8 +53,7 @@ class FigureEightMovement(Crossing):
     def move(self, speed: Array, position: Array, leader: Leader, noise: Array, cav_speeds: Array) -> Array:
         """Return the speeds after a step [m/s], shape (vehicles, W).
 
-        `noise` is added to each speed; `cav_speeds` are the commands of the CAVs, shape (CAVs, W), or None if they are
-        human; the others are as in `next_speeds`.
+        `noise` is added to each speed; `cav_speeds` are commands, shape (CAVs, W), or None if the CAVs are human.
         """
         commanded = clamp_min(self._human_model(speed, *leader) + noise, 0.0)
         is_commanded = ~self.is_on_crossing(position)

@@ -158,12 +158,6 @@ def eidm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, errors
     return new
 
 
-def eidm_secure_gap(speed: Array, leader_speed: Array, parameters: IDMArrays) -> Array:
-    """Return the gap, beyond the minimum gap, that drivers require for a lane change (`getSecureGap`)."""
-    divisor = square_root(parameters.comfortable_deceleration / parameters.max_acceleration + 1.0)
-    return (desired_gap(speed, speed - leader_speed, parameters) - parameters.minimum_gap) / divisor
-
-
 def eidm_speed_bounds(
     speed: Array,
     safe_speed: Array,

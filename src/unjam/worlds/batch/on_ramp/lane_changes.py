@@ -14,6 +14,7 @@ from unjam.worlds.batch.on_ramp.lane_change_context import (
     lane_change_context,
 )
 from unjam.worlds.batch.on_ramp.vehicles import (
+    ADVICE_FIELDS,
     NO_ADVICE,
     NO_VEHICLE,
     MotorwayVehicles,
@@ -43,7 +44,7 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     xp, speed, previous = namespace(vehicles.speed), vehicles.speed, vehicles.look_ahead_speed
     retention = 1.0 - (1.0 - LOOK_AHEAD_RETENTION) * step
     look_ahead_speed = xp.where(speed > previous, speed, retention * previous + (1.0 - retention) * speed)
-    advice = dict.fromkeys(("own_advice", "cooperative_advice", "adjacent_advice"), speed * 0.0 + NO_ADVICE)
+    advice = dict.fromkeys(ADVICE_FIELDS, speed * 0.0 + NO_ADVICE)
     vehicles = vehicles._replace(**advice, speed_bias=speed * 0.0, look_ahead_speed=look_ahead_speed)
     context = lane_change_context(vehicles, geometry, step)
     vehicles, is_urgent, is_asked = mandatory_changes.mandatory_lane_changes(vehicles, context, geometry)
@@ -55,20 +56,13 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     bias = xp.where(helps & ~is_clear, xp.where(context.is_leader_blocking, -1.0, 1.0), vehicles.speed_bias)
     vehicles = vehicles._replace(speed_bias=bias)
     changes = changes & ~_has_change_conflict(vehicles, changes, geometry)
-
-    def reset(values: Array, value: float = 0.0) -> Array:
-        return xp.where(changes, 0.0 * values + value, values)
-
-    return vehicles._replace(
-        lane=xp.where(changes, context.target_lane, vehicles.lane),
-        speed_gain=reset(vehicles.speed_gain),
-        keep_right=reset(vehicles.keep_right),
-        look_ahead_speed=reset(vehicles.look_ahead_speed),
-        own_advice=reset(vehicles.own_advice, NO_ADVICE),
-        cooperative_advice=reset(vehicles.cooperative_advice, NO_ADVICE),
-        adjacent_advice=reset(vehicles.adjacent_advice, NO_ADVICE),
-        speed_bias=reset(vehicles.speed_bias),
-    )
+    initial = dict.fromkeys(("speed_gain", "keep_right", "look_ahead_speed", "speed_bias"), 0.0)
+    initial |= dict.fromkeys(ADVICE_FIELDS, NO_ADVICE)
+    columns = {
+        name: (0.0 * getattr(vehicles, name) + value, getattr(vehicles, name)) for name, value in initial.items()
+    }
+    columns["lane"] = context.target_lane, vehicles.lane
+    return vehicles._replace(**{name: xp.where(changes, *values) for name, values in columns.items()})
 
 
 def _speed_gain_changes(
@@ -126,34 +120,32 @@ def _speed_gain_changes(
     is_slower = here - RIGHT_SPEED_TOLERANCE > there
     decay = xp.where(right & is_slower & (gain < 0.0), 0.5**step, 1.0)
     is_suitable = right & ~is_slower
-    counts = is_suitable & ((gain < 0.0) | (relative > 0.0))
-    gain = gain * decay - xp.where(counts, step * relative, 0.0 * gain)
+    is_counted = is_suitable & ((gain < 0.0) | (relative > 0.0))
+    gain = gain * decay - xp.where(is_counted, step * relative, 0.0 * gain)
     accepted = KEEP_RIGHT_ACCEPTANCE_TIME * (own_speed / speed_limit) * clamp_min(speed, 1.0)
     distance = clamp_min(remaining - drivers.brake_gap(own_speed, step), 0.0)
     seconds = xp.minimum(accepted, distance / own_speed)
     closes_in = ahead.is_present & (ahead.speed < own_speed)
-    secure_distance = xp.minimum(distance, ahead.gap - drivers.secure_gap(own_speed, ahead.speed))
-    secure_distance = clamp_min(secure_distance, 0.0)
-    closing_seconds = xp.minimum(seconds, secure_distance / clamp_min(own_speed - ahead.speed, 1e-6))
-    seconds = xp.where(closes_in, closing_seconds, seconds)
-    distance = xp.where(closes_in, secure_distance, distance)
+    secure = clamp_min(xp.minimum(distance, ahead.gap - drivers.secure_gap(own_speed, ahead.speed)), 0.0)
+    closing_seconds = xp.minimum(seconds, secure / clamp_min(own_speed - ahead.speed, 1e-6))
+    seconds, distance = xp.where(closes_in, closing_seconds, seconds), xp.where(closes_in, secure, distance)
     is_behind = is_suitable & is_fast & leader.is_present & (allowed_speed(speed_limit, leader.row) < own_speed)
     surplus = own_speed - leader.speed
     surplus = xp.where(surplus * surplus < 1e-12, 1e-6, surplus)
     seconds = xp.where(is_behind, xp.minimum(seconds, xp.minimum(distance, leader.gap) / surplus), seconds)
     obligation = step * RIGHT_GAIN_THRESHOLD * seconds / accepted / KEEP_RIGHT_TIME
     keep = keep - xp.where(is_suitable, obligation, 0.0 * keep)
-    wants_change = is_suitable & (keep < -RIGHT_GAIN_THRESHOLD)
-    wants_change = wants_change | (right & (gain < -RIGHT_GAIN_THRESHOLD) & continues)
+    keeps_right = is_suitable & (keep < -RIGHT_GAIN_THRESHOLD)
+    wants_change = keeps_right | (right & (gain < -RIGHT_GAIN_THRESHOLD) & continues)
     # To the left.
     left = may_change & is_left
     decay = xp.where(here > there, 0.5**step, 0.8**step)
     gain = xp.where(left & (here >= there) & (gain > 0.0), gain * decay, gain)
     gain = gain + xp.where(left & (here < there), step * relative, 0.0 * gain)
     gains = (gain > LEFT_GAIN_THRESHOLD) & ((relative > 1e-3) | must_brake_soon) & continues
-    wants_change = wants_change | (left & gains)
-    wants_change = wants_change | (left & (vehicles.lane == 0) & (relative >= 0.0) & (gain > 0.0))
-    return vehicles._replace(speed_gain=gain, keep_right=keep, adjacent_advice=advice), wants_change
+    merges = (vehicles.lane == 0) & (relative >= 0.0) & (gain > 0.0)
+    vehicles = vehicles._replace(speed_gain=gain, keep_right=keep, adjacent_advice=advice)
+    return vehicles, wants_change | (left & (gains | merges))
 
 
 def _speed_behind_left_leader(

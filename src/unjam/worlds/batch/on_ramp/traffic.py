@@ -18,6 +18,7 @@ from unjam.worlds.batch.on_ramp import eidm
 from unjam.worlds.batch.on_ramp.lane_change_context import MotorwayGeometry
 from unjam.worlds.batch.on_ramp.lane_changes import change_lanes
 from unjam.worlds.batch.on_ramp.vehicles import (
+    ADVICE_FIELDS,
     NO_ADVICE,
     LaneNeighbors,
     MotorwayVehicles,
@@ -76,38 +77,33 @@ class InsertionQueue:
         is_due = np.take_along_axis(self._entry_times, self._next[..., None], 2)[..., 0] <= time + 1e-9
         if not is_due.any():
             return vehicles
-        new = list[tuple[float, ...]]()
+        new, last = list[tuple[float, ...]](), np.full(is_due.shape, -1)
         road, lane, position, speed = (np.asarray(each) for each in vehicles[:1] + vehicles[2:5])
-        for number, due_roads in enumerate(is_due):
-            if not due_roads.any():
-                continue
+        upstream = np.flatnonzero(position < UPSTREAM_LENGTH)
+        last[lane[upstream], road[upstream]] = upstream  # sorted: the last assignment is the last vehicle on the lane
+        for number, index in np.argwhere(is_due).tolist():
+            built, row = self._roads[index], last[number, index]
             start = UPSTREAM_LENGTH - RAMP_LENGTH if number == 0 else 0.0
-            start = start + self._roads[0].vehicle_length + INSERTION_OFFSET
-            is_on_lane = np.flatnonzero((lane == number) & (position < UPSTREAM_LENGTH))
-            last = np.full(len(self._roads), -1)
-            last[road[is_on_lane]] = is_on_lane  # sorted: the last assignment is the last vehicle on the road
-            for index in np.flatnonzero(due_roads).tolist():
-                built, row = self._roads[index], last[index]
-                entry_number = int(self._entry_numbers[number, index, self._next[number, index]])
-                entry = built.entries[entry_number]
-                vehicle_type = built.vehicle_types[entry.vehicle_type]
-                room = position[row] - built.vehicle_length - start if row >= 0 else np.inf
-                if room < vehicle_type.minimum_gap:
-                    continue
-                limit = RAMP_SPEED_LIMIT if number == 0 else built.limit_speed
-                allowed = limit * vehicle_type.speed_factor
-                desired = allowed if entry.speed == "last" else float(entry.speed)
-                if entry.speed == "last" and row >= 0:
-                    desired = min(desired, float(speed[row]))
-                motion = index, entry_number, number, start, min(desired, allowed), 0.0
-                new.append((*motion, *driver_columns(vehicle_type), allowed))
-                self._next[number, index] += 1
+            start = start + built.vehicle_length + INSERTION_OFFSET
+            entry_number = int(self._entry_numbers[number, index, self._next[number, index]])
+            entry = built.entries[entry_number]
+            vehicle_type = built.vehicle_types[entry.vehicle_type]
+            room = position[row] - built.vehicle_length - start if row >= 0 else np.inf
+            if room < vehicle_type.minimum_gap:
+                continue
+            allowed = (RAMP_SPEED_LIMIT if number == 0 else built.limit_speed) * vehicle_type.speed_factor
+            desired = allowed if entry.speed == "last" else float(entry.speed)
+            if entry.speed == "last" and row >= 0:
+                desired = min(desired, float(speed[row]))
+            motion = index, entry_number, number, start, min(desired, allowed), 0.0
+            new.append((*motion, *driver_columns(vehicle_type), allowed))
+            self._next[number, index] += 1
         if not new:
             return vehicles
         xp = namespace(vehicles.speed)
         entered = make_vehicles(*map(np.array, zip(*new, strict=True)))
-        joined = vehicles.map(lambda old, new: xp.concatenate([old, _convert_like(new, old, self._to_array)]), entered)
-        return sort_vehicles(joined)
+        converted = entered.map(lambda new, old: xp.asarray(self._to_array(new * 1.0), dtype=old.dtype), vehicles)
+        return sort_vehicles(vehicles.map(lambda old, new: xp.concatenate([old, new]), converted))
 
 
 def driver_columns(vehicle_type: VehicleType) -> tuple[float, ...]:
@@ -120,7 +116,7 @@ def make_vehicles(*columns: np.ndarray) -> MotorwayVehicles:
     """Return vehicles without memory, errors and advice; `columns` are those up to `is_eidm`, and the desired speed."""
     *known, is_eidm, desired_speed = columns
     zeros = 0.0 * desired_speed
-    advice = dict.fromkeys(("own_advice", "cooperative_advice", "adjacent_advice"), zeros + NO_ADVICE)
+    advice = dict.fromkeys(ADVICE_FIELDS, zeros + NO_ADVICE)
     times = {"speed_cap": zeros + NO_SPEED_CAP, "start_time": zeros + LONG_BEFORE_START}
     first = dict(zip(MotorwayVehicles._fields, [*known, is_eidm.astype(bool)], strict=False))
     defaults = dict.fromkeys(MotorwayVehicles._fields, zeros)
@@ -133,13 +129,6 @@ def enable_acc(vehicles: MotorwayVehicles, rows: np.ndarray, cruise_control: Cru
     gaps = {"time_headway": acc.time_gap, "minimum_gap": acc.minimum_gap}
     limits = {"max_acceleration": acc.acceleration, "braking": acc.deceleration}
     return vehicles.replace_rows(rows, is_eidm=False, **gaps, **limits)
-
-
-def _convert_like(column: np.ndarray, reference: Array, to_array: ArrayFactory) -> Array:
-    """Return a column as an array of the library and type of another."""
-    if isinstance(reference, np.ndarray):
-        return column.astype(reference.dtype)
-    return to_array(column.astype(np.float64)).to(reference.dtype)
 
 
 def empty_vehicles(to_array: ArrayFactory) -> MotorwayVehicles:

@@ -20,6 +20,7 @@ NUMBERS_PER_ROAD = 100_000
 """more than the vehicles that enter a road in an episode"""
 NO_ADVICE = 1e6
 """advised acceleration of vehicles without advice [m/s2]"""
+ADVICE_FIELDS = ("own_advice", "cooperative_advice", "adjacent_advice")
 MIN_IDM_STOP_DISTANCE = 0.01
 """distance below which an IDM stands [m]"""
 
@@ -127,9 +128,11 @@ class MotorwayDrivers(NamedTuple):
         return self._eidm_or_idm(values, _idm_stop_speed, speed, distance, step=step)
 
     def secure_gap(self, speed: Array, leader_speed: Array) -> Array:
-        """Return the gap, beyond the minimum gap, that drivers require for a lane change."""
-        values = eidm.eidm_secure_gap(speed, leader_speed, self.parameters)
-        return self._eidm_or_idm(values, _idm_secure_gap, speed, leader_speed)
+        """Return the gap, beyond the minimum gap, that drivers require for a lane change (`getSecureGap`)."""
+        p = self.parameters
+        gap = desired_gap(speed, speed - leader_speed, p) - p.minimum_gap
+        divisor = square_root(p.comfortable_deceleration / p.max_acceleration + 1.0)
+        return gap / namespace(gap).where(self.is_eidm, divisor, 1.0)
 
     def safe_speed(self, gap: Array, leader_speed: Array, leader_braking: Array, step: float) -> Array:
         """Return the maximum speed from which drivers that brake a headway later stop behind leaders that brake.
@@ -174,10 +177,6 @@ def _idm_follow_speed(speed: Array, gap: Array, leader_speed: Array, parameters:
 def _idm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, step: float) -> Array:
     near = parameters._replace(minimum_gap=0.0 * parameters.minimum_gap)
     return _idm_follow_speed(speed, distance, 0.0 * speed, near, step) * (distance >= MIN_IDM_STOP_DISTANCE)
-
-
-def _idm_secure_gap(speed: Array, leader_speed: Array, parameters: IDMArrays) -> Array:
-    return desired_gap(speed, speed - leader_speed, parameters) - parameters.minimum_gap
 
 
 class LaneNeighbors(NamedTuple):

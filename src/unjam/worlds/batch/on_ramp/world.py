@@ -62,14 +62,9 @@ class MotorwayBatch:
         self._human_generators, self._exploration_generators = (
             [np.random.default_rng(seed) for seed in each] for each in zip(*generator_seeds, strict=True)
         )
-        self._traffic = BatchMotorways(
-            self.roads,
-            scenario.simulation_step,
-            self._draw_errors,
-            lambda values: values.astype(dtype),
-            replay and replay.correction,
-            scenario.steps_per_control_step,
-        )
+        settings = replay and replay.correction, scenario.steps_per_control_step
+        step, to_array = scenario.simulation_step, lambda values: values.astype(dtype)
+        self._traffic = BatchMotorways(self.roads, step, self._draw_errors, to_array, *settings)
         entry_count = max(len(road.entries) for road in self.roads)
         self._is_cav = np.zeros((len(seeds), entry_count), bool)
         for number, road in enumerate(self.roads):
@@ -85,8 +80,8 @@ class MotorwayBatch:
         self._is_controlled, self._has_time_gap_commands = False, False
         self._episode_noise: Floats | None = None
         """per-episode exploration noise of each road"""
-        step, duration = scenario.control_step, scenario.horizon * scenario.control_step
-        self._log = MotorwayLog(self.roads, entry_count, scenario.simulation_step, step, duration)
+        duration = scenario.horizon * scenario.control_step
+        self._log = MotorwayLog(self.roads, entry_count, step, scenario.control_step, duration)
 
     def _draw_errors(self, shape: tuple[int, ...]) -> Floats:
         """Return noise for the errors of all drivers in this step, which each road draws itself."""

@@ -40,6 +40,9 @@ class RingResults:
 class RingLog:
     """All simulation steps of W rings, in arrays of the batch."""
 
+    scenarios: Sequence[LoopScenario]
+    roads: Sequence[ClosedRoad]
+    seeds: Sequence[Sequence[int]]
     start_positions: Floats
     """front bumpers at the start [m], shape (vehicles, W)"""
     speeds: list[Array]
@@ -56,16 +59,9 @@ class RingLog:
     """speeds that result from them; likewise"""
 
     def make_episodes(
-        self,
-        scenarios: Sequence[LoopScenario],
-        roads: Sequence[ClosedRoad],
-        seeds: Sequence[Sequence[int]],
-        control_steps: Floats,
-        has_crashed: Floats,
-        driver_log: DriverLog,
-        penetration_rate: float | None,
+        self, control_steps: Floats, has_crashed: Floats, driver_log: DriverLog, penetration_rate: float | None
     ) -> tuple[Episode, ...]:
-        """Return the record of each ring until its last control step; arguments as in `Episode` and `RingResults`.
+        """Return the record of each ring until its last control step.
 
         Vehicles that touched may be separate again at the end, because a control step has several simulation steps.
         """
@@ -73,17 +69,17 @@ class RingLog:
         decisions = [tuple(map(as_numpy, decision)) for decision in driver_log.decisions]
         last = None if last is None else as_numpy(last)
         driver_log = replace(driver_log, decisions=decisions, last_observation=last)
-        vehicle_count, cav_count = len(self.start_positions), len(roads[0].cav_ids)
+        vehicle_count, cav_count = len(self.start_positions), len(self.roads[0].cav_ids)
         values = {name: self._stack(name, vehicle_count) for name in ("noise_free_speeds", "speeds")}
         cav_names = ("requested_accelerations", "safe_accelerations", "commanded_speeds")
         values |= {name: self._stack(name, cav_count) for name in cav_names}
         episodes = []
-        for ring, (scenario, road, seed, count, crashed) in enumerate(
-            zip(scenarios, roads, seeds, control_steps.astype(int), has_crashed.astype(bool), strict=True)
-        ):
+        ends = control_steps.astype(int), has_crashed.astype(bool)
+        rings = zip(self.scenarios, self.roads, self.seeds, *ends, strict=True)
+        for ring, (scenario, road, seed, count, crashed) in enumerate(rings):
             steps = count * scenario.steps_per_control_step
-            ends = {"requested_accelerations": count, "speeds": steps + 1}
-            own: dict[str, Any] = {name: each[: ends.get(name, steps), :, ring] for name, each in values.items()}
+            counts = {"requested_accelerations": count, "speeds": steps + 1}
+            own: dict[str, Any] = {name: each[: counts.get(name, steps), :, ring] for name, each in values.items()}
             start = self.start_positions[:, ring]
             own |= {"has_crashed": bool(crashed), "penetration_rate": penetration_rate}
             log = ClosedRoadLog(scenario, road, start, **own)
@@ -102,7 +98,7 @@ class RingLog:
                 "collisions": max(2 * int(crashed), int((touches | is_touched).sum())),
                 "limit_speed": road.limit_speed,
             }
-            rows = np.arange(cav_count) * len(roads) + ring
+            rows = np.arange(cav_count) * len(self.roads) + ring
             episodes.append(log.episode(motion, fields, driver_log, rows))
         return tuple(episodes)
 

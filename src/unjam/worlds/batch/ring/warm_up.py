@@ -12,6 +12,7 @@ MAX_CACHED_CAVS = 2048
 """CAVs on cached rings: some 60 kB each, mostly the history of the CAV's last minute"""
 
 WarmUpKey = TypeVar("WarmUpKey", bound=Hashable)
+WarmUpFunction = Callable[[Sequence[WarmUpKey]], Mapping[WarmUpKey, "WarmUpState"]]
 
 
 class WarmUpState(NamedTuple):
@@ -41,12 +42,9 @@ class WarmUpCache(dict[WarmUpKey, WarmUpState]):
     """The newest warm-up states."""
 
     def get_states(
-        self,
-        keys: Sequence[WarmUpKey],
-        upcoming: Sequence[WarmUpKey],
-        warm_up: Callable[[Sequence[WarmUpKey]], Mapping[WarmUpKey, WarmUpState]],
+        self, keys: Sequence[WarmUpKey], upcoming: Sequence[WarmUpKey], warm_up: WarmUpFunction[WarmUpKey]
     ) -> list[WarmUpState]:
-        """Return the state of each key; with missing ones, `warm_up` also simulates those of `upcoming`, at little cost."""
+        """Return the state of each key; `warm_up` simulates missing ones, together with those of `upcoming`."""
         if all(key in self for key in keys):
             return [self[key] for key in keys]
         known = {**self, **warm_up([key for key in dict.fromkeys([*keys, *upcoming]) if key not in self])}

@@ -60,17 +60,14 @@ class RingBatch:
         human_model: HumanSpeedModel | None = None,
         allow_statistical: bool = False,
     ) -> None:
-        """Put the vehicles on the roads, at rest.
+        """Put the vehicles on the roads, at rest; the scenarios differ only in their lengths.
 
         Args:
-            scenarios: of the roads, which differ only in their lengths.
-            seeds: of the roads, as in `run_episode`.
             to_array: makes the arrays of the simulation, for instance NumPy's or torch's, in any precision.
             reward: name; empty: that of the scenario.
             keep_record: whether to keep whole episodes, some 16 bytes for each vehicle and step in float64.
             draw: draws all noise; None: each road draws the same noise as SUMO's episode.
             human_model: of human drivers away from junctions, instead of SUMO's IDM.
-            allow_statistical: see `run_batch`.
         """
         check_batch_scenarios(scenarios, allow_statistical)
         scenario = self.scenario = scenarios[0]
@@ -115,7 +112,8 @@ class RingBatch:
         self._gap = self._to_array(gap_on_loop(positions, np.roll(positions, -1, 0), loop_lengths, VEHICLE_LENGTH))
 
     def _reset_log(self) -> None:
-        self._log = RingLog(as_numpy(self._position), [self._speed[:-1]], self._find_contacts)
+        start = as_numpy(self._position), [self._speed[:-1]], self._find_contacts
+        self._log = RingLog(self._scenarios, self.roads, self._seeds, *start)
         zeros = self._loop_lengths * 0.0
         cav_zeros = self._cav_loop_lengths.reshape(self._shape) * 0.0
         self._is_running, self._has_crashed, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
@@ -259,8 +257,8 @@ class RingBatch:
 
     def _simulate(self, accelerations: Array | None) -> Array:
         """Simulate one step, and return the CAVs' safe accelerations; None: the CAVs are human."""
-        step, speed = self.scenario.simulation_step, self._speed
-        state, safe, commanded = self._following_state(), None, None
+        step, speed, state = self.scenario.simulation_step, self._speed, self._following_state()
+        safe, commanded = None, None
         if accelerations is not None:
             safe, applied = self._actuation.apply("all", accelerations, self._readings.read_for_filters(state))
             commanded = next_speed(state.speed, applied, step)
@@ -315,7 +313,6 @@ class RingBatch:
         """Return what happened since the start."""
         steps, crashed = as_numpy(self._control_step_counts), 1.0 - as_numpy(self._is_running)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
-        details = self._scenarios, self.roads, self._seeds, steps, crashed, driver_log, rate
         return RingResults(
             control_steps=steps,
             has_crashed=crashed,
@@ -323,5 +320,5 @@ class RingBatch:
             mean_speed=as_numpy(self._mean_speed_sums) / steps,
             min_time_gap=as_numpy(self._update_min_time_gap(self._following_state())).min(0),
             max_braking=as_numpy(self._max_braking).max(0),
-            episodes=self._log.make_episodes(*details) if self._keep_record else (),
+            episodes=self._log.make_episodes(steps, crashed, driver_log, rate) if self._keep_record else (),
         )
