@@ -365,6 +365,17 @@ def test_nobody_enters_before_the_time_or_without_room() -> None:
     assert traffic.insertion_queue.entry_counts[0] >= len(traffic.vehicles.entry) > 20
 
 
+def test_a_control_step_does_not_change_earlier_records_of_vehicles() -> None:
+    world = MotorwayBatch(replace(SHORT, penetration_rate=0.5), seeds_of(1))
+    world.start(True)
+    for _ in range(80):
+        before = world._traffic.vehicles
+        copies = before.map(np.copy)
+        world.advance(Command(np.full(world.cav_count, -1.0), np.full(world.cav_count, 1.5)))
+        for values, copied in zip(before, copies, strict=True):
+            np.testing.assert_array_equal(values, copied)
+
+
 REFUSED: dict[str, dict[str, Any]] = {
     "actuation": {"actuation": "shielded"},
     "simulation_step": {"simulation_step": 0.25, "steps_per_control_step": 4},
