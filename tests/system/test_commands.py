@@ -141,9 +141,9 @@ def test_drive_without_a_driver_compares_human_drivers_and_the_default_controlle
     ran = unjam("drive", *common, pictures=False)
     assert ran.returncode == 0, ran.stderr
     assert "unjam:best compared with human drivers" in ran.stdout
-    assert "holds back" not in ran.stderr, "each CAV has an ACC"
+    assert "limits the ACC" not in ran.stderr, "each CAV has an ACC"
     without = unjam("drive", *common, "-d", "unjam:best", pictures=False)
-    assert "note: unjam:best holds back a car's own ACC" in " ".join(without.stderr.split())
+    assert "note: unjam:best limits the ACC of a " in " ".join(without.stderr.split())
 
 
 @pytest.mark.long
@@ -171,7 +171,7 @@ def test_assess_prints_text_and_json_and_writes_a_page(unjam: Run, tmp_path: Pat
     starts = ("- acc at a penetration rate of 50 %: ", "- ACC vehicles alone at a penetration rate of 50 %: ")
     assert [line.startswith(start) for line, start in zip(summaries, starts, strict=True)] == [True, True]
     assert "an episode of the human baseline took " in ran.stderr
-    assert "test seeds: 10; travel time known to ±" in ran.stderr
+    assert "test seeds: 10; CI of travel time at most ±" in ran.stderr
     assert "report: answer/assessment.html" in ran.stderr
     found = document(unjam(*ASSESS, "-n", 36, "--json", pictures=False))
     assert found["folder"] == "runs/assess-straight-001"

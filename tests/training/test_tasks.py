@@ -157,7 +157,7 @@ def test_each_task_is_evaluated_in_its_own_folder(tmp_path: Path) -> None:
         assert road.gain is not None
         assert read_config(road.folder) == mixture().task_configs()[name]
         assert json.loads((road.folder / "evaluation.json").read_text())["scenario"] == "ring"
-        with pytest.raises(InputError, match="is one road of a run of several"):
+        with pytest.raises(InputError, match="is one task of a run"):
             train(read_config(road.folder), road.folder, resume=True)
     networks = [load_controller(road.controller) for road in result.tasks.values()]
     first, second = (driver.network.layers for driver in networks if isinstance(driver, ResidualDriver))

@@ -116,7 +116,7 @@ def test_screened_scores_equal_those_of_sumo(tmp_path: Path, simulation: Simulat
         assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-9)
         assert setting.verdict == overall_feasibility(rows)
     written = json.loads((tmp_path / TUNING_FILE).read_text())
-    assert written["steps_per_iteration"] == found.batch_steps
+    assert written["batch_steps"] == found.batch_steps
 
 
 def test_unsupported_roads_are_not_screened(tmp_path: Path) -> None:

@@ -212,15 +212,18 @@ def _calibrate_one_parameter(
         return _group_errors(squares, segments, group, settings.weighting)
 
     bounds = getattr(settings, name)
-    values = _minimize_on_grid(errors, np.linspace(*bounds, CALIBRATION_GRID_SIZE), len(groups))
+    values = _minimize_on_grid(errors, np.linspace(bounds[0], bounds[1], CALIBRATION_GRID_SIZE), len(groups))
     simulated = simulate_open_loop(model(values), segments)
     gap_errors = _group_errors(simulated.gap_mse, segments, group, "sample").tolist()
     speed_errors = _group_errors(simulated.speed_mse, segments, group, "sample").tolist()
     collisions = np.bincount(group, simulated.has_collided, len(groups)).astype(int).tolist()
     calibrated = []
-    for value, pairs, *results in zip(values.tolist(), groups, gap_errors, speed_errors, collisions, strict=True):
+    for value, pairs, gap_error, speed_error, crashes in zip(
+        values.tolist(), groups, gap_errors, speed_errors, collisions, strict=True
+    ):
         parameters, at_bounds = replace(typical, **{name: value}), (name,) if is_at_bound(value, bounds) else ()
-        calibrated.append(CalibratedIDM(parameters, 0.0, *results, sum(pair.seconds for pair in pairs), at_bounds))
+        seconds = sum(pair.seconds for pair in pairs)
+        calibrated.append(CalibratedIDM(parameters, 0.0, gap_error, speed_error, crashes, seconds, at_bounds))
     return calibrated
 
 

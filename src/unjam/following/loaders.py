@@ -104,7 +104,7 @@ def _read_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResu
     is_free = vehicles["gap"] < 0
     driver = frame["vehicle_id"].astype(str)
     vehicles = vehicles.assign(pair=_join_columns(frame, key), driver=driver, kind="simulated")
-    return _split_trajectories(vehicles.loc[~is_free], path, options, {"no leader": int(is_free.sum())})
+    return _split_trajectories(vehicles.loc[~is_free], path, options, {"no leader": int(np.sum(is_free))})
 
 
 def _pairs_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
@@ -130,7 +130,7 @@ def _pairs_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOption
         leader_speed=vehicles["speed_ahead"],
         gap=vehicles["front_ahead"] - vehicles["length_ahead"] - vehicles["front"],
     )
-    return _split_trajectories(frame, path, options, {"no leader, or leader not recorded": int(is_free.sum())})
+    return _split_trajectories(frame, path, options, {"no leader, or leader not recorded": int(np.sum(is_free))})
 
 
 def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
@@ -152,7 +152,8 @@ def _read_openacc(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Read
     for number in numbers:
         columns = ("Time", f"Speed{number + 1}", f"Speed{number}", f"IVS{number}")
         part = _select_columns(frame, columns, PAIR_COLUMNS[1:], path)
-        kind = frame.get(f"Driver{number + 1}", pd.Series("", frame.index)).astype(str)
+        label = f"Driver{number + 1}"
+        kind = frame[label].astype(str) if label in frame else pd.Series("", frame.index)
         suffix = np.where(kind == "", "", "-" + kind)
         name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
         driver = name + suffix if len(set(kind)) > 1 else name  # another kind that takes over is another driver

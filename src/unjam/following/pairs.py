@@ -162,7 +162,8 @@ def make_segments(pairs: Sequence[Pair], segment_seconds: float | None = None) -
         return np.stack([np.pad(column, (0, longest - len(column)), mode="edge") for column in columns], 1)
 
     is_present = np.arange(longest)[:, None] < lengths
-    return Segments(*map(stack, SEGMENT_FIELDS), is_present, step, np.array(pair_index))
+    speed, leader_speed, gap, leader_path = map(stack, SEGMENT_FIELDS)
+    return Segments(speed, leader_speed, gap, leader_path, is_present, step, np.array(pair_index))
 
 
 def split_by_driver(pairs: Sequence[Pair], shares: Sequence[float], seed: int) -> list[Pair]:
@@ -195,8 +196,11 @@ def pairs_behind_cavs(
         cuts = np.flatnonzero(np.r_[True, is_other | is_missing[1:] | is_missing[:-1], True])
         for first, last in pairwise(cuts):
             if (last - first) * control_step >= MIN_PAIR_SECONDS:
-                columns = (np.asarray(each[first:last], np.float64) for each in (behind, own, states.follower_gap))
-                pairs.append(Pair(f"{number}-{first}", f"{number}-{first}", control_step, *columns))
+                speed, leader_speed, gap = (
+                    np.asarray(each[first:last], np.float64) for each in (behind, own, states.follower_gap)
+                )
+                name = f"{number}-{first}"
+                pairs.append(Pair(name, name, control_step, speed, leader_speed, gap))
     return pairs
 
 

@@ -130,7 +130,7 @@ class MotorwayLog:
         for number, (start, end) in enumerate(pairwise(starts)):
             rows = order[start:end]
             rows = rows[every.step_index[rows] <= self.end_steps[number]]
-            placements = _Placements(*(values[rows] for values in every))
+            placements = _Placements(*(values[rows] for values in every))  # pyright: ignore[reportCallIssue, reportArgumentType]
             own_steady = steady[1:, steady[0] == number]
             episode = self._make_episode(number, placements, trips[number], backlogs[number], own_steady)
             episodes.append(replace(episode, seed=tuple(seeds[number])))
