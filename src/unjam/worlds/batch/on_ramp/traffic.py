@@ -208,8 +208,9 @@ class BatchMotorways:
         max_speed = xp.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
         safe = xp.minimum(xp.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
         may_be_free = safe > speed - LEADER_BRAKING_THRESHOLD * step
-        free_state = (each[may_be_free] for each in (speed, free_gap, next_allowed))
-        free = drivers.select(may_be_free).desired_speed(*free_state, step)
+        free = drivers.select(may_be_free).desired_speed(
+            speed[may_be_free], free_gap[may_be_free], next_allowed[may_be_free], step
+        )
         # Of the leader and the allowed speed, drivers obey the one that requires more braking without coolness.
         is_free = copy_array(may_be_free)
         is_free[may_be_free] = free.uncooled_acceleration < uncooled[may_be_free] + eidm.EIDM_EPSILON
