@@ -165,7 +165,7 @@ def test_each_task_is_evaluated_in_its_own_folder(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one[0], other[0])
     page = (tmp_path / "run" / "report.html").read_text()
     assert "short: trained" in page
-    assert "2 results compared" in page
+    assert "comparison of 2 results" in page
 
 
 @pytest.mark.long
