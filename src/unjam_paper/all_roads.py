@@ -1,12 +1,14 @@
-"""Gain of drivers on every road of the family, training roads and unseen roads.
+"""Gain of drivers on roads of the family, training roads and unseen roads: any drivers, and joint trainings.
 
 On each road a gain of 0 is the human baseline and 1 is the best tuned expert known there, which is selected on other
-seeds than the test seeds.
+seeds than the test seeds. The controllers of a joint training learned on many roads together. There, rings are stepped
+in batches, which equal SUMO's except for rounding.
 """
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -28,17 +30,31 @@ from unjam.measures.gain import (
 )
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import estimate, format_difference
+from unjam.measures.statistics import estimate_on_shared_seeds, format_difference
 from unjam.physics.arrays import Floats
 from unjam.reports.figures import TEXT_COLOR, new_figure
 from unjam.scenarios.scenario import Scenario
-from unjam.training.road_family import FAMILY, GROUP_BY_SCENARIO
+from unjam.training.road_family import (
+    ACTUATOR_LATENCY,
+    AGGRESSIVE_IDM,
+    FAMILY,
+    GROUP_BY_SCENARIO,
+    LONG_WARM_UP,
+    SHARED_RINGS_GROUP,
+    SHORT_WARM_UP,
+    FamilyRoad,
+    family_roads,
+    ring_options,
+)
 from unjam.training.seeds import make_test_seeds, tuning_seeds
+from unjam.worlds.batch.run import run_batches
+from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
-from unjam_paper.parts import controller_digest
+from unjam_paper.parts import StudyPart, controller_digest, measure_parts
 from unjam_paper.results_file import read_parts
-from unjam_paper.study import Study, StudyFolder
+from unjam_paper.study import PlannedRun, Study, StudyFolder
+from unjam_paper.variants import RINGS_EXPERT, SHARED_RINGS_EXPERT, VARIANTS
 
 EPISODES_PER_ROAD = 10
 """episodes of each driver on each road"""
@@ -93,6 +109,33 @@ FAMILY_DRIVERS: dict[str, str] = {
 """drivers that are evaluated on every road, by label"""
 TWO_LAWS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned on all roads)"
 """the combination of two single controllers by the type of road: its rows are theirs"""
+RING_GROUP = "rings"
+RING_BASELINES = {
+    RINGS_EXPERT: RINGS_EXPERT,
+    **{label: FAMILY_DRIVERS[label] for label in (PI_ON_RINGS_LABEL, "unjam:ring-best")},
+}
+SHARED_RING_BASELINES = {SHARED_RINGS_EXPERT: SHARED_RINGS_EXPERT, RINGS_EXPERT: RINGS_EXPERT}
+ALL_ROADS_BASELINES = {label: FAMILY_DRIVERS[label] for label in ("unjam:best", PI_ON_RINGS_LABEL, "jam-ahead")}
+"""drivers that are evaluated together with the trained ones; the first is the expert for these roads"""
+SHARED_RING_ROADS = {
+    **family_roads(SHARED_RINGS_GROUP),
+    **{
+        name: FamilyRoad("ring", options, "axis")
+        for name, options in {
+            "ring-88-grown-6-cavs": ring_options(88, 6, LONG_WARM_UP),
+            "ring-44-aggressive-3-cavs": ring_options(44, 3, LONG_WARM_UP, humans=AGGRESSIVE_IDM),
+            "ring-44-delayed-4-cavs": ring_options(44, 4, LONG_WARM_UP, actuator=ACTUATOR_LATENCY),
+            "ring-55-dense-4-cavs": ring_options(55, 4, LONG_WARM_UP, (9.1, 9.8)),
+            "ring-66-wide-4-cavs": ring_options(66, 4, LONG_WARM_UP, (13.0, 16.0)),
+            "ring-44-no-warm-up-3-cavs": ring_options(44, 3, 0),
+            "ring-33-growing-2-cavs": ring_options(33, 2, SHORT_WARM_UP),
+            "ring-66-growing-4-cavs": ring_options(66, 4, SHORT_WARM_UP),
+        }.items()
+    },
+}
+"""rings that several CAVs share: those of the family, and further unseen ones"""
+FRESH_TEST_SEEDS = make_test_seeds(20, 1000)
+"""test seeds that were not used in the decision which rings get an expert of their own"""
 FAMILY_METRICS = (
     *("seed", "status", "travel_time", "delay", "mean_speed", "mean_speed_second_half", "speed_limit_ratio"),
     *("outflow_veh_per_h", "fuel_ml_per_km", "required_time_gap", "has_lanes", "collisions", "min_time_gap"),
@@ -126,40 +169,55 @@ def _write_all_roads(study_folder: StudyFolder, seeds: int, folder: Path, worker
     with WorkerPool(workers) as pool:
         run_episodes = partial(pool.run_and_map, transform=family_metrics)
         for number, name, road, scenario in sorted(roads, key=lambda each: not each[3].is_closed):  # quick ones first
-            file = folder / f"{number:02d}.json"
-            results: dict[str, Any] = {"road": name, "part": road.part, "best": HUMAN_LABEL}
-            results |= {"expert_files": {}, "driver_files": {}, "rows": {}}
+            file, results = folder / f"{number:02d}.json", no_results(name, road)
             if file.is_file():
                 results |= json.loads(file.read_text(encoding="utf-8"))
-            _drive_missing(scenario, FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]], results, run_episodes)
+            drive_missing(scenario, road_experts(road), FAMILY_DRIVERS, FAMILY_TEST_SEEDS, results, run_episodes)
             atomic_write(file, to_json(results))
 
 
-def _drive_missing(
-    scenario: Scenario, experts: Sequence[str], results: dict[str, Any], run_episodes: EpisodeRunner
+def no_results(name: str, road: FamilyRoad) -> dict[str, Any]:
+    """Return the results of a road on which no driver has been evaluated."""
+    facts = {"road": name, "part": road.part, "best": HUMAN_LABEL}
+    return {**facts, "expert_files": {}, "driver_files": {}, "rows": {}}
+
+
+def road_experts(road: FamilyRoad) -> tuple[str, ...]:
+    """Return the experts from which the best one of a road is selected."""
+    return FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]]
+
+
+def drive_missing(
+    scenario: Scenario,
+    experts: Sequence[str],
+    drivers: Mapping[str, str],
+    seeds: list[tuple[int, ...]],
+    results: dict[str, Any],
+    run_episodes: EpisodeRunner,
 ) -> None:
-    """Run the drivers of a road without results, or with a changed packaged file, and add their results."""
+    """Run the drivers of a road without results, or with a changed packaged file, and add their results.
+
+    The best expert is selected on other seeds than `seeds`. A driver is known by the digest of its packaged file, or by
+    its name with parameters.
+    """
     new = [driver for driver in experts if results["expert_files"].get(driver) != controller_digest(driver)]
     if new:
         others = experts if results["best"] in new else (results["best"], *new)
         candidates = {driver: driver for driver in (HUMAN_LABEL, *others)}
-        rows = drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, run_episodes)
-        results["best"] = best_feasible_driver(rows)
+        results["best"] = best_feasible_driver(
+            drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, run_episodes)
+        )
         results["expert_files"] |= {driver: controller_digest(driver) for driver in new}
-    drivers = {HUMAN_LABEL: HUMAN_LABEL, results["best"]: results["best"], **FAMILY_DRIVERS}
+    evaluated = {HUMAN_LABEL: HUMAN_LABEL, results["best"]: results["best"], **drivers}
+    files = {label: controller_digest(driver) or driver for label, driver in evaluated.items()}
     missing = {
         label: driver
-        for label, driver in drivers.items()
-        if label not in results["rows"] or results["driver_files"].get(label) != driver_identity(driver)
+        for label, driver in evaluated.items()
+        if label not in results["rows"] or results["driver_files"].get(label) != files[label]
     }
     if missing:
-        results["rows"] |= drive_by_label(scenario, missing, FAMILY_TEST_SEEDS, run_episodes)
-        results["driver_files"] |= {label: driver_identity(driver) for label, driver in missing.items()}
-
-
-def driver_identity(driver: str) -> str:
-    """Return what distinguishes a driver from others with the same label: its digest, or its name with parameters."""
-    return controller_digest(driver) or driver
+        results["rows"] |= drive_by_label(scenario, missing, seeds, run_episodes)
+        results["driver_files"] |= {label: files[label] for label in missing}
 
 
 def best_feasible_driver(rows: Mapping[str, EpisodeRows]) -> str:
@@ -171,7 +229,7 @@ def best_feasible_driver(rows: Mapping[str, EpisodeRows]) -> str:
     return max(feasible, key=lambda label: float(np.mean([performance(row) for row in rows[label]])))
 
 
-def road_gains(folder: Path) -> dict[str, dict[str, Any]]:
+def road_gains(folder: Path, parts: Sequence[str] = ("training", *UNSEEN_PARTS)) -> dict[str, dict[str, Any]]:
     """Return for each road its part, its best expert, and for each label the gain, the speeds and the verdict.
 
     `has_potential_gain` is whether the best expert is better than the human baseline by more than a negligible amount.
@@ -179,7 +237,7 @@ def road_gains(folder: Path) -> dict[str, dict[str, Any]]:
     """
     roads: dict[str, dict[str, Any]] = {}
     for number, results in read_parts(folder).items():
-        if not number.isdecimal():
+        if not number.isdecimal() or results["part"] not in parts:
             continue
         rows: dict[str, EpisodeRows] = {
             label: [{key: np.nan if value is None else value for key, value in row.items()} for row in own]
@@ -189,7 +247,6 @@ def road_gains(folder: Path) -> dict[str, dict[str, Any]]:
         baseline = rows.pop(HUMAN_LABEL)
         roads[results["road"]] = {
             **{key: results[key] for key in ("part", "best")},
-            "human": float(np.mean([performance(row) for row in baseline])),
             "has_potential_gain": not is_gain_negligible(baseline, best),
             "gains": {label: normalized_gain(own, baseline, best) for label, own in rows.items()},
             "by_seed": {label: gain_by_seed(own, baseline, best) for label, own in rows.items()},
@@ -201,33 +258,31 @@ def road_gains(folder: Path) -> dict[str, dict[str, Any]]:
 
 def all_roads_table(parts: Sequence[str], folder: Path) -> pd.DataFrame:
     """Return the gain of each single controller on each road of some parts of the family, the mean and the worst."""
-    roads = _roads_in_parts(road_gains(folder), parts)
+    roads = road_gains(folder, parts)
     labels = {driver: label for label, driver in FAMILY_DRIVERS.items()}
     rows = []
     for name, road in roads.items():
-        best: str = road["best"]
-        best = labels.get(best, best).removeprefix(PACKAGED_PREFIX)
+        best: str = labels.get(road["best"], road["best"])
         gains = {label: format_difference(road["gains"][label], 2) for label in SINGLE_CONTROLLERS}
-        rows.append({"road": name, "best expert": best, **gains})
+        rows.append({"road": name, "best expert": best.removeprefix(PACKAGED_PREFIX), **gains})
     gainful = [road for road in roads.values() if road["has_potential_gain"]]
-    for name, of in (("mean", [*roads.values()]), ("mean, roads with a potential gain", gainful)):
-        rows.append(
-            {"road": name, **{label: _mean_gain(road["by_seed"][label] for road in of) for label in SINGLE_CONTROLLERS}}
-        )
+    for name, averaged in (("mean", [*roads.values()]), ("mean, roads with a potential gain", gainful)):
+        means = {label: _mean_gain(road["by_seed"][label] for road in averaged) for label in SINGLE_CONTROLLERS}
+        rows.append({"road": name, **means})
     rows.append({"road": "worst", **{label: _worst_gain(roads, label) for label in SINGLE_CONTROLLERS}})
     return pd.DataFrame(rows).fillna("")
 
 
 def all_drivers_table(folder: Path) -> pd.DataFrame:
     """Return the mean gain of each driver over the roads of each part, and how much larger that of the first is."""
-    (first, *others), gains = FAMILY_DRIVERS, road_gains(folder)
-    for name, road in gains.items():
-        is_motorway = GROUP_BY_SCENARIO[FAMILY[name].scenario] == "motorways"
-        for values in (road["gains"], road["by_seed"]):
-            values[TWO_LAWS_LABEL] = values[JAM_AHEAD_ON_ALL_LABEL if is_motorway else PI_ON_ALL_LABEL]
+    first, *others = FAMILY_DRIVERS
     rows = {label: {"": label} for label in (first, TWO_LAWS_LABEL, *others)}
     for heading, parts in TABLE_PARTS.items():
-        roads = _roads_in_parts(gains, parts)
+        roads = road_gains(folder, parts)
+        for name, road in roads.items():
+            is_motorway = GROUP_BY_SCENARIO[FAMILY[name].scenario] == "motorways"
+            for values in (road["gains"], road["by_seed"]):
+                values[TWO_LAWS_LABEL] = values[JAM_AHEAD_ON_ALL_LABEL if is_motorway else PI_ON_ALL_LABEL]
         for label, row in rows.items():
             differences = (road["by_seed"][first] - road["by_seed"][label] for road in roads.values())
             row[heading] = _mean_gain(road["by_seed"][label] for road in roads.values())
@@ -236,16 +291,17 @@ def all_drivers_table(folder: Path) -> pd.DataFrame:
     return pd.DataFrame([*rows.values()])
 
 
-def _roads_in_parts(roads: Mapping[str, dict[str, Any]], parts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    return {name: road for name, road in roads.items() if road["part"] in parts}
-
-
 def _worst_gain(roads: Mapping[str, dict[str, Any]], label: str) -> str:
     return f"{min(road['gains'][label].mean for road in roads.values()):+.2f}"
 
 
 def _mean_gain(by_road: Iterable[Floats]) -> str:
-    return format_difference(estimate(np.mean(list(by_road), 0)), 2)
+    return _seed_cell(np.mean([*by_road], 0)[None])
+
+
+def _seed_cell(values: Floats) -> str:
+    """Return the mean over drivers and seeds with its 95 % CI; values have the shape (drivers, seeds)."""
+    return format_difference(estimate_on_shared_seeds(values), 2)
 
 
 def all_roads_figure(folder: Path) -> Figure:
@@ -276,3 +332,112 @@ ALL_ROADS_STUDY = Study(
         "drivers": all_drivers_table,
     },
 )
+
+
+def joint_training_study(
+    title: str,
+    variants: Mapping[str, int],
+    group: str = RING_GROUP,
+    baselines: Mapping[str, str] = RING_BASELINES,
+    roads: Mapping[str, FamilyRoad] | None = None,
+    test_seeds: Sequence[tuple[int, ...]] = FAMILY_TEST_SEEDS,
+) -> Study:
+    """Return the study of variants, each with its maximum number of trainings.
+
+    They are trained on the training roads of a group of the family, and evaluated on all its roads, or on `roads`.
+    """
+
+    def make_runs(seeds: int) -> list[PlannedRun]:
+        return [PlannedRun(group, name, seed) for name, limit in variants.items() for seed in range(min(seeds, limit))]
+
+    def write(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+        parts: dict[str, StudyPart] = {}
+        for number, (name, road) in enumerate((roads or family_roads(group)).items()):
+            trained = {
+                f"{VARIANTS[run.variant].label} {run.seed}": str(joint_controller(road, run, study_folder))
+                for run in make_runs(seeds)
+            }
+            parts[f"{number:02d}"] = measure_road, (name, road, {**baselines, **trained}, list(test_seeds))
+        measure_parts(folder, parts, workers)
+
+    labels = [VARIANTS[name].label for name in variants]
+    tables = {name: partial(joint_training_table, labels, parts, baselines) for name, parts in TABLE_PARTS.items()}
+    return Study(title, write, make_runs, minutes=25.0, is_resumable=True, tables=tables)
+
+
+def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolder) -> Path:
+    """Return the folder of a training's controller for a road.
+
+    One network drives all roads, but limits and control step are those of a type of road: the controller of the first
+    training road of the same type.
+    """
+    group = GROUP_BY_SCENARIO[road.scenario]
+    configs = run.config.task_configs().items()
+    name = next(name for name, config in configs if GROUP_BY_SCENARIO[config.scenario] == group)
+    return study_folder.run_folder(run) / name
+
+
+def measure_road(
+    name: str, road: FamilyRoad, drivers: Mapping[str, str], seeds: list[tuple[int, ...]]
+) -> dict[str, Any]:
+    """Return the metrics of all drivers on a road on the test seeds; its best expert is selected on other seeds."""
+    results = no_results(name, road)
+    with WorkerPool() as workers:
+        run = partial(_run_in_batches, workers)
+        drive_missing(road.make_scenario(), road_experts(road), drivers, seeds, results, run)
+    return {key: results[key] for key in ("road", "part", "best", "rows")}
+
+
+def _run_in_batches(workers: WorkerPool, tasks: list[EpisodeTask]) -> EpisodeRows:
+    """Return the metrics of episodes of one road and several drivers, in batches where they are supported."""
+    if unsupported_reason(tasks[0].scenario):
+        return workers.run_and_map(tasks, family_metrics)
+    by_driver = groupby(tasks, key=lambda task: id(task.driver))
+    return [family_metrics(*each) for _, own in by_driver for each in enumerate(run_batches(list(own)))]
+
+
+def joint_training_table(
+    labels: Sequence[str], parts: Sequence[str], baselines: Mapping[str, str], folder: Path
+) -> pd.DataFrame:
+    """Return the gain of each driver on each road, and the difference of trainings to the expert for such roads.
+
+    Confidence intervals of several trainings take into account that they share the seeds.
+    """
+    roads = road_gains(folder, parts)
+    drivers = next(iter(roads.values()))["gains"]
+    expert = next(iter(baselines))
+    groups = {
+        label: [driver for driver in drivers if label in (driver, driver.rpartition(" ")[0])]
+        for label in (*baselines, *labels)
+    }
+
+    def values_by_label(name: str) -> dict[str, Floats]:
+        """Return a quantity of the drivers of each label, shape (roads, drivers, seeds)."""
+        return {
+            label: np.array([[road[name][driver] for driver in group] for road in roads.values()])
+            for label, group in groups.items()
+        }
+
+    gains, speeds = values_by_label("by_seed"), values_by_label("speeds")
+    columns = dict(gains)
+    pairs = [(label, expert) for label in labels]
+    if expert != RINGS_EXPERT and RINGS_EXPERT in baselines:
+        pairs.append((expert, RINGS_EXPERT))
+    for one, other in pairs:
+        columns[f"{one}, difference to {other}"] = gains[one] - gains[other]
+        columns[f"{one}, mean speed, difference to {other} [m/s]"] = speeds[one] - speeds[other]
+    rows = [
+        {
+            "road": name,
+            "best expert": road["best"].removeprefix("unjam:"),
+            **{column: _seed_cell(values[number]) for column, values in columns.items()},
+        }
+        for number, (name, road) in enumerate(roads.items())
+    ]
+    rows.append({"road": "mean", **{column: _seed_cell(values.mean(0)) for column, values in columns.items()}})
+    worst, infeasible = {"road": "worst"}, {"road": "infeasible"}
+    for label, group in groups.items():
+        worst[label] = f"{gains[label].mean((1, 2)).min():+.2f}"
+        verdicts = [road["verdicts"][driver] for road in roads.values() for driver in group]
+        infeasible[label] = f"{sum(verdict != FEASIBLE for verdict in verdicts)} of {len(verdicts)}"
+    return pd.DataFrame([*rows, worst, infeasible]).fillna("")

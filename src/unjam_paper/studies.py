@@ -2,20 +2,21 @@
 
 from unjam.training.road_family import ALL_ROADS_GROUP, SHARED_RINGS_GROUP
 from unjam_paper.adaptation import ADAPTATION
-from unjam_paper.all_roads import ALL_ROADS_STUDY, FAMILY_TEST_SEEDS
+from unjam_paper.all_roads import (
+    ALL_ROADS_BASELINES,
+    ALL_ROADS_STUDY,
+    FAMILY_TEST_SEEDS,
+    FRESH_TEST_SEEDS,
+    SHARED_RING_BASELINES,
+    SHARED_RING_ROADS,
+    joint_training_study,
+)
 from unjam_paper.assess_examples import ASSESS_EXAMPLES
 from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study
 from unjam_paper.do_no_harm import DO_NO_HARM
 from unjam_paper.envelope import ENVELOPE
 from unjam_paper.feasible import FEASIBLE_FIGURE_EIGHT, FEASIBLE_RING, FEASIBLE_RING_JAMMED, on_ramp_study
 from unjam_paper.figure_6 import FIGURE_6
-from unjam_paper.joint_training import (
-    ALL_ROADS_BASELINES,
-    FRESH_TEST_SEEDS,
-    SHARED_RING_BASELINES,
-    SHARED_RING_ROADS,
-    joint_training_study,
-)
 from unjam_paper.road_model import road_model_study
 from unjam_paper.robustness import FIGURE_10, ROBUSTNESS
 from unjam_paper.study import PAPER_ROADS, Study

@@ -99,11 +99,12 @@ def test_only_missing_drivers_run_and_the_best_can_change(tmp_path: Path, monkey
     row = {**found["rows"]["unjam:best"][0], "travel_time": nan}
     files = {"unjam:ring-tuned": "one"}
     monkeypatch.setattr(all_roads, "drive_by_label", drive)
-    monkeypatch.setattr(all_roads, "FAMILY_DRIVERS", {"PI": "pi"})
     monkeypatch.setattr(all_roads, "controller_digest", lambda driver: files.get(driver, ""))
 
     road: dict[str, Any] = {"best": HUMAN_LABEL, "expert_files": {}, "driver_files": {}, "rows": {}}
-    resume = partial(all_roads._drive_missing, Ring(), results=road, run_episodes=lambda tasks: [])
+    drivers = {"PI": "pi"}
+    given: dict[str, Any] = {"drivers": drivers, "seeds": [(1,)], "results": road, "run_episodes": lambda tasks: []}
+    resume = partial(all_roads.drive_missing, Ring(), **given)
     resume(("pi",))
     assert (runs, road["best"]) == ([[HUMAN_LABEL, "pi"], [HUMAN_LABEL, "pi", "pi"]], "pi")
     resume(("pi",))
@@ -119,7 +120,7 @@ def test_only_missing_drivers_run_and_the_best_can_change(tmp_path: Path, monkey
     del road["driver_files"][HUMAN_LABEL]  # as in older files
     resume(("pi", "unjam:ring-tuned"))
     assert runs[6:] == [[HUMAN_LABEL]]
-    monkeypatch.setattr(all_roads, "FAMILY_DRIVERS", {"PI": "pi:window=9"})
+    drivers["PI"] = "pi:window=9"
     speeds["pi:window=9"] = 4.1
     resume(("pi", "unjam:ring-tuned"))
     assert runs[7:] == [["pi:window=9"]], "other parameters are another driver"

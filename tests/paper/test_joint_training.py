@@ -8,15 +8,15 @@ import pytest
 
 from unjam.drivers.road_type_switch import MIN_SHARED_PENETRATION_RATE
 from unjam.training.road_family import FAMILY, family_roads
-from unjam_paper.all_roads import FAMILY_TEST_SEEDS
-from unjam_paper.joint_training import (
+from unjam_paper.all_roads import (
+    FAMILY_TEST_SEEDS,
     FRESH_TEST_SEEDS,
     RING_BASELINES,
     RING_GROUP,
     SHARED_RING_ROADS,
-    _measure_road,
     joint_controller,
     joint_training_table,
+    measure_road,
 )
 from unjam_paper.results_file import read_part
 from unjam_paper.study import PlannedRun, StudyFolder
@@ -92,9 +92,9 @@ def test_all_drivers_of_a_ring_have_the_same_seeds(monkeypatch: pytest.MonkeyPat
         runs.append((set(drivers.values()), seeds))
         return {label: [] for label in drivers}
 
-    monkeypatch.setattr("unjam_paper.joint_training.drive_by_label", drive)
-    monkeypatch.setattr("unjam_paper.joint_training.best_feasible_driver", lambda rows: "pi")
-    found = _measure_road(
+    monkeypatch.setattr("unjam_paper.all_roads.drive_by_label", drive)
+    monkeypatch.setattr("unjam_paper.all_roads.best_feasible_driver", lambda rows: "pi")
+    found = measure_road(
         "ring-22-grown", FAMILY["ring-22-grown"], RING_BASELINES | {"residual 0": "runs/0"}, FAMILY_TEST_SEEDS
     )
     (candidates, tuning), (evaluated, testing) = runs
