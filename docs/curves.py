@@ -10,7 +10,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from studies import rows_of
 from tables import results_part
 
-from unjam_paper.road_model import compared_variants
+from unjam_paper.comparison import compared_variants
 from unjam_paper.study import PlannedRun, interval_text
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}

@@ -20,7 +20,7 @@ from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE, sumo_inputs
 from unjam.worlds.sumo.networks import network_file, xml_element
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.open_test_roads import OpenTestRoad, RoadSection, write_road_files
-from unjam_paper.results_file import read_part, write_part
+from unjam_paper.results_file import read_optional_part, read_part, write_part
 from unjam_paper.road_files import (
     EPISODE_SECONDS,
     connection_element,
@@ -143,7 +143,7 @@ def assess_examples(folder: Path, workers: int = 2, episodes: int = MAX_EPISODES
         episodes: maximum number of episodes per road.
         seconds: length of an episode; None: as in the configuration.
     """
-    roads = read_part(folder, EXAMPLES_PART) if (folder / f"{EXAMPLES_PART}.json").is_file() else {}
+    roads = read_optional_part(folder, EXAMPLES_PART)
     for name, example in EXAMPLES.items():
         settings = {"rate": example.rate, "episodes": episodes, "seconds": seconds, "precision": PRECISION}
         if roads.get(name, {}).get("settings") != settings:

@@ -1,13 +1,15 @@
 """Comparisons of learners: Tables 1 and 2 and Figures 4, 5, 7 and 9 of the paper, and its exact settings.
 
 A table has the convention of the paper with the numbers of the paper, and that of unjam: test seeds, paired differences
-and confidence intervals. Curves are the mean and the range over trainings of a variant.
+and confidence intervals. Curves are the mean and the range over trainings of a variant. Other studies of comparisons
+are about the environment steps that a model of the whole road saves.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from math import ceil, inf
+from itertools import cycle
+from math import ceil, inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from unjam.measures.feasibility import feasibility_by_driver, overall_feasibilit
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
+    estimate,
     estimate_crossed,
     estimate_over_trainings,
     metric_estimate,
@@ -32,6 +35,7 @@ from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figur
 from unjam.reports.results import PlotEpisode, read_results, validation_gains
 from unjam.training.config import load_config
 from unjam.training.early_stopping import has_converged
+from unjam.worlds.record import Floats
 from unjam_paper.references import best_expert
 from unjam_paper.results_file import read_part, write_figure, write_part
 from unjam_paper.study import (
@@ -93,6 +97,17 @@ PAPER_EXACT_VARIANTS = {
     "merge": ("trpo-exact-million", "proposed-exact-million"),
 }
 """variants with the exact settings of the paper, by road"""
+EFFICIENCY_STEPS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
+ON_RAMP_EFFICIENCY_STEPS = (28_800,)
+"""environment steps after which trainings are compared; on the on-ramp, those of a training with the model"""
+STEP_MULTIPLES = (1, 2, 3)
+"""multiples of the environment steps that variants without the model use"""
+MODEL_FREE_VARIANTS = {
+    "eight": ("eight-few", "eight-double", "best-in-batches"),
+    "ramp": ("ramp-few",) * len(STEP_MULTIPLES) + ("ramp-small",) * len(STEP_MULTIPLES),
+}
+"""variants without the model, for `STEP_MULTIPLES`, where they differ from few, double and all steps. On figure eights,
+which a batch steps only in distribution, the last is trained in batches, too"""
 
 
 def comparison_study(title: str, variants: Sequence[str], road: str = "ring") -> Study:
@@ -126,7 +141,10 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
         row |= {"best_expert": label == best, "feasibility": verdicts[label]}
         row |= estimate_metrics(found, COMPARISON_METRICS)
         row["gain_over_best_expert"] = asdict(paired_difference(found, references[best], metric))
-        convention = {key: _mean_and_std(_finite_values(found, name)) for key, (name, _) in PAPER_COLUMNS.items()}
+        convention = {
+            key: _mean_and_std([row[name] for row in found if np.isfinite(row[name])])
+            for key, (name, _) in PAPER_COLUMNS.items()
+        }
         rows.append({**row, "paper_convention": convention, "steady_speed_by_value": _speed_by_value(road, found)})
     trained = {variant: study_folder.trained_runs(road, variant, seeds) for variant in variants}
     return [*rows, *(_variant_row(road, variant, runs, references) for variant, runs in trained.items())]
@@ -141,7 +159,7 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
     row["paper"] = dict(zip(PAPER_COLUMNS, reported, strict=True)) if reported else None
     for name in COMPARISON_METRICS:
         is_comparable = name != "return" or metric == "return"  # returns of another reward are not comparable
-        values = [_mean(_finite_values(run.rows, name)) if is_comparable else float("nan") for run in runs]
+        values = [_finite_mean(run.rows, name) if is_comparable else nan for run in runs]
         row[name] = asdict(estimate_over_trainings(values, TRIMMED_SHARE, METRICS[name].bounds))
     differences = paired_differences([run.rows for run in runs], reference_rows[best], metric)
     validated = [gains for run in runs if (gains := validation_gains(run.progress))]
@@ -157,7 +175,7 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
         "probability_of_improvement": asdict(probability_of_improvement(differences)),
         "untrained_count": sum(best <= 0 for best, _ in validated),
         "feasibility": [overall_feasibility(run.rows, reference_rows["human"]) for run in runs],
-        "seconds": _mean([run.seconds for run in runs]),
+        "seconds": float(np.mean([run.seconds for run in runs])),
         "gains": differences.mean(1).tolist(),
     }
 
@@ -166,7 +184,7 @@ def _speed_by_value(road: str, rows: Table) -> dict[str, dict[str, float]]:
     """Return the steady mean speed by each value that episodes draw: the length or the radius."""
     return {
         name: {
-            f"{value:g}": _mean(_finite_values([row for row in rows if row[name] == value], "mean_speed_steady"))
+            f"{value:g}": _finite_mean([row for row in rows if row[name] == value], "mean_speed_steady")
             for value in sorted({row[name] for row in rows})
         }
         for name in load_config(changes=STUDY_ROADS[road]).make_scenario().drawn_ranges
@@ -179,15 +197,11 @@ def estimate_metrics(rows: Table, names: Sequence[str]) -> dict[str, dict[str, f
 
 
 def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
-    return {"mean": _mean(values), "std": float(np.std(values)) if len(values) else float("nan")}
+    return {"mean": float(np.mean(values)), "std": float(np.std(values))} if values else {"mean": nan, "std": nan}
 
 
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if len(values) else float("nan")
-
-
-def _finite_values(rows: Table, name: str) -> list[float]:
-    return [row[name] for row in rows if np.isfinite(row[name])]
+def _finite_mean(rows: Table, name: str) -> float:
+    return estimate([row[name] for row in rows]).mean
 
 
 def write_comparison_table(rows: Table, folder: Path) -> None:
@@ -362,3 +376,50 @@ def _paper_exact_table(variants: Sequence[str], folder: Path) -> pd.DataFrame:
         cells["eps_m rises in"] = f"{rises} of {len(errors)}" if errors else NO_VALUE_TEXT
         table.append(cells)
     return pd.DataFrame(table)
+
+
+def road_model_study(road: str, prefix: str) -> Study:
+    """Return the study of the environment steps that a model of the whole road saves, for variants with a prefix."""
+    variants = compared_variants(prefix)
+    title = f"environment steps that a model of the whole road saves, on {road}"
+    study = comparison_study(title, tuple(dict.fromkeys(variants)), road)
+    step_counts = ON_RAMP_EFFICIENCY_STEPS if road == "on-ramp" else EFFICIENCY_STEPS
+    return replace(study, tables={**study.tables, "efficiency": partial(efficiency_table, road, variants, step_counts)})
+
+
+def compared_variants(prefix: str) -> tuple[str, ...]:
+    """Return the variant of a prefix with the model, and those without it by `STEP_MULTIPLES`."""
+    return (f"{prefix}-road-model", *MODEL_FREE_VARIANTS.get(prefix, (f"{prefix}-few", f"{prefix}-double", "best")))
+
+
+def efficiency_table(road: str, variants: Sequence[str], step_counts: Sequence[int], folder: Path) -> pd.DataFrame:
+    """Return the validation returns after numbers of environment steps, and the differences to the first variant.
+
+    The first variant is the one with the model.
+    """
+    curves, (modeled, *others) = read_part(folder, "curves")[road], variants
+    returns = {name: partial(_returns_after, curves[name], _first_validation(road, name)) for name in variants}
+    rows = [
+        {"": VARIANTS[name].label, **{f"{at:,}": trainings_text(after(at), 0) for at in step_counts}}
+        for name, after in returns.items()
+    ]
+    for name, times in zip(others, cycle(STEP_MULTIPLES)):
+        more = "as many" if times == 1 else f"{times} times as many"
+        gains = {at: returns[modeled](at) - returns[name](times * at) for at in step_counts}
+        label = f"with the model, difference to “{VARIANTS[name].label}” after {more}"
+        rows.append({"": label, **{f"{at:,}": trainings_text(gain, 0, "+") for at, gain in gains.items()}})
+    return pd.DataFrame(rows)
+
+
+def _first_validation(road: str, variant: str) -> int:
+    """Return the number of steps before the first validation of a training."""
+    config = PlannedRun(road, variant, 0).config
+    return config.learner.steps_per_iteration * (config.evaluation.validation_interval or 1)
+
+
+def _returns_after(curve: dict[str, list[float]], first_validation: int, steps: int) -> Floats:
+    """Return the validation return of each training after some steps; NaN outside of its validated range."""
+    trainings = curve["return_validation"]
+    if steps < first_validation:
+        return np.full(len(trainings), np.nan)
+    return np.array([np.interp(steps, curve["steps"], each, np.nan, np.nan) for each in trainings])

@@ -1,31 +1,55 @@
-"""Gain of feasible residuals over tuned experts, on closed roads of every size and on the on-ramp.
+"""Feasible controllers: their gain over tuned experts, and their feasibility far from their training roads.
 
-All drivers are evaluated on the same test seeds; the confidence intervals take into account that trainings share them.
+Residuals are compared with tuned experts on closed roads of every size and on the on-ramp: all drivers on the same test
+seeds, with confidence intervals that take into account that trainings share them.
+
+The study `envelope` takes packaged controllers to rings with 5 to 44 vehicles, shorter and longer than in training,
+jammed or not, with one to three CAVs; to smaller and larger figure eights; to the rings and a motorway lane without
+SUMO's safety checks; and to the default ring with actuation delay, lag and sensor errors.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from unjam.controller import make_driver
+from unjam.controller.certificate import make_certificate
+from unjam.controller.file import SUFFIX, read_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.follower_stopper import FollowerStopper
+from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.drivers.sensors import Sensors
+from unjam.files import atomic_write, to_json
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.metric_table import HUMAN_LABEL
+from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.statistics import estimate
 from unjam.physics.arrays import Floats
 from unjam.scenarios.figure_eight import FigureEight
-from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.scenarios.on_ramp import ON_RAMP, OnRamp
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
+from unjam.training.export import export_controller
 from unjam.training.presets import preset_values
 from unjam.training.road_family import LONG_WARM_UP
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.results_file import read_part, write_part
-from unjam_paper.study import NO_VALUE_TEXT, DriverComparison, Study, StudyFolder, evaluate_on_test_seeds, planned_runs
+from unjam_paper.parts import controller_digest
+from unjam_paper.results_file import read_optional_part, read_part, write_part
+from unjam_paper.study import (
+    NO_VALUE_TEXT,
+    DriverComparison,
+    DriverSource,
+    PlannedRun,
+    Study,
+    StudyFolder,
+    evaluate_on_test_seeds,
+    planned_runs,
+)
 from unjam_paper.variants import ON_RAMP_JAM_AHEAD
 
 SEEDS_PER_SIZE = 10
@@ -48,8 +72,6 @@ PACER_LONG_TUNED = (
 )
 """result of `unjam tune figure-eight --expert pacer --reward eq16 --steps 4860000`, without parameters that have no
 effect; with 600,000 steps it is `unjam:figure-eight-tuned`"""
-CEILING_LABEL = "speed-limit leader"
-"""a driver that leads all vehicles to the speed limit of the road, which no vehicle can know"""
 OTHER_ROAD_LABEL = "residual trained on the other road"
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
 PACER_LONG_LABEL = "pacer, tuned, training budget"
@@ -71,6 +93,50 @@ ON_RAMP_METRICS = (
     *(ON_RAMP_TIME, ON_RAMP_FLOW, "human_braking_beyond_4_5", "mean_speed", "fuel_ml_per_km"),
     *("feasibility", "min_time_gap", "cav_max_braking"),
 )
+ENVELOPE_SEEDS, RAW_ACTUATION_SEEDS, IMPAIRED_SEEDS = 2, 5, 8
+"""test seeds of each driver on each road"""
+CONTROLLER_ROADS: dict[str, str] = {
+    "unjam:best": "ring-jammed",
+    **{f"unjam:{name}": "ring" for name in ("ring-best", "ring-gap-tuned", "ring-tuned")},
+    **{f"unjam:{name}": "ring" for name in ("rings-tuned", "shared-rings-tuned")},
+    **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
+    **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned")},
+}
+"""packaged controllers for closed roads, and the road of each"""
+LANE_CONTROLLERS = ("unjam:on-ramp-tuned", *(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight"))
+IMPAIRED_DRIVERS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
+VEHICLE_SPACINGS = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
+"""range of the road length per vehicle [m]"""
+WORST_FILE, CONTROLLER_HASHES_FILE = "worst", "controller-hashes"
+"""names of parts: the worst cases of the certificates, and the digests of the controllers by part"""
+ENVELOPE_METRICS = ("return", "mean_speed", "min_time_gap", "cav_max_braking", "steps", "collisions")
+LANE_CONDITIONS: dict[str, dict[str, Any]] = {
+    "a free lane": {"inflow": 1200.0, "off_peak_inflow": 1200.0},
+    "a full lane": {"inflow": 2400.0, "off_peak_inflow": 2000.0},
+    "a full lane, half of all automated": {"inflow": 2400.0, "off_peak_inflow": 2000.0, "penetration_rate": 0.5},
+}
+"""demand on one lane of a motorway without cut-ins"""
+IMPAIRMENTS: dict[str, dict[str, Any]] = {
+    "at once, exact": {},
+    "lag 0.2 s": {"actuator": Actuator(lag=0.2)},
+    "lag 0.5 s": {"actuator": Actuator(lag=0.5)},
+    "delay 0.2 s": {"actuator": Actuator(delay=0.2)},
+    "delay 0.5 s": {"actuator": Actuator(delay=0.5)},
+    "lag 0.3 s, delay 0.2 s": {"actuator": Actuator(lag=0.3, delay=0.2)},
+    **{
+        label: {
+            "sensors": Sensors(gap_error=error, speed_error=error),
+            "safety": SafetyFilter(gap_error=error, speed_error=error),
+        }
+        for label, error in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
+    },
+    "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},
+    "every third reading missing": {"sensors": Sensors(dropout=1.0 / 3.0)},
+}
+"""changes to the actuation and the sensors of CAVs"""
+
+NamedRoads = Iterator[tuple[str, Scenario]]
+"""scenarios with their names"""
 
 
 @dataclass(frozen=True)
@@ -80,51 +146,45 @@ class EvaluationRoad:
     sizes: tuple[int, ...]
     """lengths or radii [m]"""
     make_scenario: Callable[[int], Scenario]
-    driver_names: dict[str, str]
-    """drivers by label"""
+    drivers: dict[str, DriverSource]
+    """by label"""
     baselines: tuple[str, ...]
     """labels of the tuned experts to which drivers are compared"""
     metric: str = "return"
     """the return that the trainings maximize"""
-    make_ceiling: Callable[[int], Driver] | None = None
-
-    def make_drivers(self, size: int, trained_drivers: dict[str, Driver]) -> dict[str, Driver]:
-        """Return all drivers of a size by label."""
-        step = self.make_scenario(size).control_step
-        drivers = {label: make_driver(name, step) for label, name in self.driver_names.items()}
-        return drivers | ({CEILING_LABEL: self.make_ceiling(size)} if self.make_ceiling else {}) | trained_drivers
 
 
 def _make_ring(warmup: int, length: int) -> Ring:
     return Ring(length=(length, length), warmup=warmup)
 
 
-def _limit_leader(length: int) -> Driver:
-    return FollowerStopper(desired_speed=Ring().limit_speed(length), gaps=(0.5, 1.0, 1.5), time_constant=3.0)
+def _limit_leader(ring: Ring) -> Driver:
+    return FollowerStopper(desired_speed=ring.limit_speed(ring.length[0]), gaps=(0.5, 1.0, 1.5), time_constant=3.0)
 
 
-RING_ROAD = EvaluationRoad(
-    sizes=(220, 230, 240, 250, 260, 270),
-    make_scenario=partial(_make_ring, 0),
-    driver_names={
-        **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0", PI_TUNED_LABEL: PI_LONG_TUNED},
-        **{GAP_PI_LABEL: "unjam:ring-gap-tuned", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned"},
-    },
-    baselines=(PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL),
-    make_ceiling=_limit_leader,
-)
+CEILING: dict[str, DriverSource] = {"speed-limit leader": _limit_leader}
+"""a driver that leads all vehicles to the speed limit of the road, which no vehicle can know"""
+RING_DRIVERS: dict[str, DriverSource] = {
+    **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0", PI_TUNED_LABEL: PI_LONG_TUNED},
+    **{GAP_PI_LABEL: "unjam:ring-gap-tuned", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned"},
+}
 FEASIBLE_ROADS = {
-    "ring": RING_ROAD,
-    "ring-jammed": replace(
-        RING_ROAD,
+    "ring": EvaluationRoad(
+        sizes=(220, 230, 240, 250, 260, 270),
+        make_scenario=partial(_make_ring, 0),
+        drivers=RING_DRIVERS | CEILING,
+        baselines=(PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL),
+    ),
+    "ring-jammed": EvaluationRoad(
+        sizes=(220, 230, 240, 250, 260, 270),
         make_scenario=partial(_make_ring, LONG_WARM_UP),
-        driver_names={**RING_ROAD.driver_names, GAP_PI_JAMMED_LONG_LABEL: GAP_PI_JAMMED_LONG_TUNED},
+        drivers={**RING_DRIVERS, GAP_PI_JAMMED_LONG_LABEL: GAP_PI_JAMMED_LONG_TUNED, **CEILING},
         baselines=(GAP_PI_LABEL, GAP_PI_JAMMED_LABEL, GAP_PI_JAMMED_LONG_LABEL),
     ),
     "figure-eight": EvaluationRoad(
         sizes=(32, 33, 34, 35),
         make_scenario=lambda radius: FigureEight(radius=(radius, radius)),
-        driver_names={
+        drivers={
             **{HUMAN_LABEL: "human", "pacer": "pacer", "varying pacer": "pacer:use_tuned=true"},
             **{PACER_TUNED_LABEL: "unjam:figure-eight-tuned", PACER_LONG_LABEL: PACER_LONG_TUNED},
             PACER_GENTLE_LABEL: preset_values("best", "figure-eight")["expert"],
@@ -138,52 +198,40 @@ FEASIBLE_ROADS = {
 def _write_feasible(
     roads: Sequence[str], variant: str, study_folder: StudyFolder, seeds: int, folder: Path, workers: int
 ) -> None:
-    trained = {
-        road: [make_driver(str(study_folder.run_folder(run)), 0.1) for run in planned_runs([road], [variant], seeds)]
-        for road in roads
-    }
     with WorkerPool(workers) as pool:
         for name in roads:
-            drivers = {f"training {seed}": driver for seed, driver in enumerate(trained[name])}
-            for other in set(roads) - {name}:
-                drivers[OTHER_ROAD_LABEL] = trained[other][0]
             road = FEASIBLE_ROADS[name]
+            runs = {f"training {run.seed}": run for run in planned_runs([name], [variant], seeds)}
+            for other in set(roads) - {name}:
+                runs[OTHER_ROAD_LABEL] = PlannedRun(other, variant, 0)
+            drivers = road.drivers | {label: study_folder.run_folder(run) for label, run in runs.items()}
             results = {}
             for size in road.sizes:
-                evaluated = road.make_drivers(size, drivers)
                 scenario, metrics = road.make_scenario(size), FEASIBILITY_STUDY_METRICS
-                results[str(size)] = evaluate_on_test_seeds(scenario, evaluated, SEEDS_PER_SIZE, metrics, pool)
+                results[str(size)] = evaluate_on_test_seeds(scenario, drivers, SEEDS_PER_SIZE, metrics, pool)
             write_part(folder, name, results)
 
 
 def feasible_table(road: str, folder: Path) -> pd.DataFrame:
     """Return for each driver the metrics over all sizes, and the differences to the tuned experts."""
     comparison, about = DriverComparison([*read_part(folder, road).values()]), FEASIBLE_ROADS[road]
-    labels = list(comparison.roads[0])
     rows = []
-    for label, group in _group_trainings(labels, "training", "residual").items():
-        dissolved = _dissolution_text(comparison.values(group, "time_to_dissolve"))
+    for label, group in comparison.groups({"training": "residual"}).items():
         differences = {
             f"difference to {baseline}": comparison.difference(group, baseline, about.metric, 0)
             for baseline in about.baselines
-            if baseline in labels
+            if baseline in comparison.roads[0]
         }
         row = {"driver": label, "return": comparison.mean(group, about.metric, 0), **differences}
         row["mean speed [m/s]"] = comparison.mean(group, "mean_speed", 2)
         row["difference to human baseline [m/s]"] = comparison.difference(group, HUMAN_LABEL, "mean_speed", 2)
         row["flow [veh/h]"] = comparison.mean(group, "outflow_veh_per_h", 0)
         row["fuel [ml/km]"] = comparison.mean(group, "fuel_ml_per_km", 0)
-        row |= {"dissolved after [s]": dissolved, "min time gap [s]": comparison.min_time_gap(group)}
+        row["dissolved after [s]"] = _dissolution_text(comparison.values(group, "time_to_dissolve"))
+        row["min time gap [s]"] = comparison.min_time_gap(group)
         rows.append({**row, "feasible": comparison.feasibility(group)})
     table = pd.DataFrame(rows)
     return table.loc[:, (table != NO_VALUE_TEXT).any()]
-
-
-def _group_trainings(labels: Sequence[str], prefix: str, name: str) -> dict[str, list[str]]:
-    """Return labels by row of a table: one row for each driver, and one for all trainings `PREFIX SEED`."""
-    trainings = [label for label in labels if label.rpartition(" ")[0] == prefix]
-    groups = {label: [label] for label in labels if label not in trainings}
-    return groups | ({f"{name}, {len(trainings)} trainings": trainings} if trainings else {})
 
 
 def _dissolution_text(times: Floats) -> str:
@@ -226,12 +274,9 @@ def on_ramp_study(variants: Mapping[str, str]) -> Study:
 
 
 def _write_on_ramp(variants: Sequence[str], study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    names = ON_RAMP_DRIVERS | {
-        f"{run.variant} {run.seed}": str(study_folder.controller_folder(run))
-        for variant in variants
-        for run in planned_runs(["on-ramp"], [variant], seeds)
-    }
-    drivers = {label: make_driver(name, ON_RAMP_ROAD.control_step) for label, name in names.items()}
+    drivers: dict[str, DriverSource] = {**ON_RAMP_DRIVERS}
+    for variant, seed in product(variants, range(seeds)):
+        drivers[f"{variant} {seed}"] = study_folder.controller_folder(PlannedRun("on-ramp", variant, seed))
     with WorkerPool(workers) as pool:
         results = evaluate_on_test_seeds(ON_RAMP_ROAD, drivers, ON_RAMP_SEEDS, ON_RAMP_METRICS, pool)
     write_part(folder, "on-ramp", results)
@@ -240,22 +285,167 @@ def _write_on_ramp(variants: Sequence[str], study_folder: StudyFolder, seeds: in
 def _on_ramp_table(variants: Mapping[str, str], folder: Path) -> pd.DataFrame:
     """Return travel time and flow of each driver, and the differences to tuned experts and to the human baseline."""
     comparison = DriverComparison([read_part(folder, "on-ramp")])
-    groups = {label: [label] for label in ON_RAMP_DRIVERS}
-    for variant, label in variants.items():
-        trainings = [each for each in comparison.roads[0] if each.rpartition(" ")[0] == variant]
-        groups[f"{label}, {len(trainings)} trainings"] = trainings
     rows = []
-    for label, group in groups.items():
-        tuned = {
-            f"difference to {baseline} [s]": comparison.difference(group, baseline, ON_RAMP_TIME, 1)
-            for baseline in (ON_RAMP_TUNED_LABEL, LARGER_BUDGET_LABEL)
-        }
-        row = {"driver": label, "travel time [s]": comparison.mean(group, ON_RAMP_TIME, 1), **tuned}
+    for label, group in comparison.groups(variants).items():
+        row = {"driver": label, "travel time [s]": comparison.mean(group, ON_RAMP_TIME, 1)}
+        for baseline in (ON_RAMP_TUNED_LABEL, LARGER_BUDGET_LABEL):
+            row[f"difference to {baseline} [s]"] = comparison.difference(group, baseline, ON_RAMP_TIME, 1)
         row["difference to human baseline [s]"] = comparison.difference(group, HUMAN_LABEL, ON_RAMP_TIME, 1)
         flow = comparison.difference(group, HUMAN_LABEL, ON_RAMP_FLOW, 0)
         row["flow, difference to human baseline [veh/h]"] = flow
         row["min time gap [s]"] = NO_VALUE_TEXT if label == HUMAN_LABEL else comparison.min_time_gap(group)
-        verdicts = comparison.verdicts(group)
-        several = f"{verdicts.count(FEASIBLE)} of {len(group)}"
+        several = f"{comparison.verdicts(group).count(FEASIBLE)} of {len(group)}"
         rows.append({**row, "feasible": comparison.feasibility(group) if len(group) == 1 else several})
     return pd.DataFrame(rows)
+
+
+def envelope_rings(**changes: Any) -> Iterator[tuple[str, Ring]]:
+    """Yield the rings by name, with changes to all of them."""
+    each = product((5, 11, 22, 44), (1, 2, 3), VEHICLE_SPACINGS.items(), (0, LONG_WARM_UP))
+    for vehicles, cavs, (words, (low, high)), warmup in each:
+        name = f"{vehicles} vehicles, {cavs} automated, {words}{', jammed' if warmup else ''}"
+        length = low * vehicles, high * vehicles
+        yield name, Ring(vehicles=vehicles, cavs=cavs, length=length, warmup=warmup, **changes)
+
+
+def envelope_figure_eights() -> Iterator[tuple[str, FigureEight]]:
+    """Yield the figure eights by name."""
+    for low, high in ((27, 29), (30, 31), (32, 35), (36, 40), (41, 50)):
+        yield f"radius {low} to {high} m", FigureEight(radius=(low, high))
+
+
+def envelope_lanes() -> Iterator[tuple[str, OnRamp]]:
+    """Yield motorway lanes by name on which the safety filter is active and the checks of SUMO are not."""
+    for name, changes in LANE_CONDITIONS.items():
+        lane = OnRamp(lanes=1, ramp_flow=0.0, off_peak_ramp_flow=0.0, horizon=900)
+        yield name, replace(lane, actuation="raw", safety=SafetyFilter(), **changes)
+
+
+def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
+    """Yield the default ring with each impairment, by its name."""
+    for name, changes in IMPAIRMENTS.items():
+        yield name, replace(Ring(warmup=warmup), **changes)
+
+
+def _write_envelope(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    closed = tuple(CONTROLLER_ROADS)
+    parts: dict[str, tuple[NamedRoads, tuple[str, ...], int]] = {
+        WORST_FILE: (iter(()), closed, 1),
+        "rings": (envelope_rings(), closed, ENVELOPE_SEEDS),
+        "figure-eights": (envelope_figure_eights(), closed, ENVELOPE_SEEDS),
+        "rings-raw": (envelope_rings(actuation="raw"), closed, RAW_ACTUATION_SEEDS),
+        "lanes-raw": (envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
+        "impaired": (impaired_rings(0), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
+        "impaired-jammed": (impaired_rings(LONG_WARM_UP), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
+    }
+    digests = read_optional_part(folder, CONTROLLER_HASHES_FILE)
+    with WorkerPool(workers) as pool:
+        for part, (roads, drivers, count) in parts.items():
+            known = digests.setdefault(part, {})
+            missing = [driver for driver in drivers if known.get(driver) != controller_digest(driver)]
+            if not missing:
+                continue
+            results = read_optional_part(folder, part)
+            if part == WORST_FILE:
+                results |= {driver: _certify_worst_cases(driver, CONTROLLER_ROADS[driver]) for driver in missing}
+            for name, road in roads:
+                named = {driver: driver for driver in (HUMAN_LABEL, *missing)}
+                found = evaluate_on_test_seeds(road, named, count, ENVELOPE_METRICS, pool)
+                results[name] = results.get(name, {}) | found
+            atomic_write(folder / f"{part}.json", to_json(results))
+            known |= {driver: controller_digest(driver) for driver in missing}
+            write_part(folder, CONTROLLER_HASHES_FILE, digests)
+
+
+def _certify_worst_cases(controller: str, road: str) -> dict[str, Any]:
+    """Return the worst cases that the certificate finds for a controller on its road."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder, f"controller{SUFFIX}")
+        export_controller(controller, file, scenario=road)
+        return make_certificate(read_controller(file))["worst_cases"]
+
+
+def worst_table(folder: Path) -> pd.DataFrame:
+    """Return how close each controller came to leaders that brake to a stop and to leaders found by a search."""
+    return pd.DataFrame(
+        {
+            "controller": controller,
+            "road": CONTROLLER_ROADS[controller],
+            "stops": f"{worst['leader_stops']:,}",
+            "steps": f"{worst['steps']:,}",
+            "contacts": worst["contacts"],
+            "min gap [m]": f"{worst['min_gap']:.2f}",
+            "min time gap [s]": f"{worst['min_time_gap']:.2f}",
+            "max braking [m/s²]": f"{worst['max_braking']:.1f}",
+        }
+        for controller, worst in read_part(folder, WORST_FILE).items()
+    )
+
+
+def domain_table(part: str, folder: Path) -> pd.DataFrame:
+    """Return on how many roads each controller is feasible, and its gain in speed in the mean and on the worst road."""
+    roads, rows = read_part(folder, part), []
+    comparison = DriverComparison([*roads.values()])
+    for driver in (driver for driver in comparison.roads[0] if driver != HUMAN_LABEL):
+        speeds = (comparison.values([label], "mean_speed").mean((1, 2)) for label in (driver, HUMAN_LABEL))
+        gains = np.subtract(*speeds)
+        least = int(np.argmin(gains))
+        rows.append(
+            {
+                "controller": driver,
+                "feasible on": f"{comparison.verdicts([driver]).count(FEASIBLE)} of {len(roads)} roads",
+                **_safety_cells(comparison, driver),
+                "mean difference to human baseline [m/s]": f"{gains.mean():+.2f}",
+                "smallest difference [m/s]": f"{gains[least]:+.2f} ({list(roads)[least]})",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def contact_table(part: str, folder: Path) -> pd.DataFrame:
+    """Return the contacts and the smallest time gap of each controller where SUMO's safety checks are off."""
+    comparison = DriverComparison([*read_part(folder, part).values()])
+    return pd.DataFrame(
+        {
+            "controller": driver,
+            "episodes": comparison.values([driver], "steps").size,
+            "control steps": f"{comparison.values([driver], 'steps').sum():,.0f}",
+            "in contact": int(comparison.values([driver], "collisions").sum()),
+            **_safety_cells(comparison, driver),
+        }
+        for driver in comparison.roads[0]
+        if driver != HUMAN_LABEL
+    )
+
+
+def _safety_cells(comparison: DriverComparison, driver: str) -> dict[str, str]:
+    max_braking = comparison.values([driver], "cav_max_braking").max()
+    return {"min time gap [s]": comparison.min_time_gap([driver]), "max braking [m/s²]": f"{max_braking:.1f}"}
+
+
+def impaired_table(part: str, folder: Path) -> pd.DataFrame:
+    """Return the return of each controller with impaired vehicles, its minimum time gap, and why it is infeasible."""
+    rows: list[dict[str, Any]] = []
+    for name, results in read_part(folder, part).items():
+        comparison, row = DriverComparison([results]), {"impairment": name}
+        for driver in results:
+            row[driver] = str(estimate_cell(estimate(comparison.values([driver], "return").ravel().tolist()), 0))
+            time_gap, verdict = comparison.min_time_gap([driver]), comparison.feasibility([driver])
+            if driver != HUMAN_LABEL and time_gap != NO_VALUE_TEXT:
+                row[driver] += f"; {time_gap} s" + ("" if verdict == "yes" else f", {verdict}")
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+ENVELOPE = Study(
+    title="feasibility of packaged controllers far from their training roads, with actuation delay and sensor errors",
+    write=_write_envelope,
+    minutes=30.0,
+    is_resumable=True,
+    tables={
+        WORST_FILE: worst_table,
+        **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
+        **{part: partial(contact_table, part) for part in ("rings-raw", "lanes-raw")},
+        **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},
+    },
+)

@@ -12,7 +12,7 @@ from typing import Any
 from unjam.child_processes import isolated_start
 from unjam.controller import PACKAGED_PREFIX, packaged_file
 from unjam.files import atomic_write, make_folder, to_json
-from unjam_paper.results_file import read_part, write_part
+from unjam_paper.results_file import read_optional_part, read_part, write_part
 
 CONTROLLERS_FILE = "controllers"
 """name of the part with the digests of the packaged controllers that drove, by part"""
@@ -29,8 +29,7 @@ def measure_parts(
 
     A part is not current if a packaged controller in it has another digest than when it was measured.
     """
-    file = folder / f"{CONTROLLERS_FILE}.json"
-    digests: dict[str, dict[str, str]] = read_part(folder, CONTROLLERS_FILE) if file.is_file() else {}
+    digests: dict[str, dict[str, str]] = read_optional_part(folder, CONTROLLERS_FILE)
 
     def is_current(name: str) -> bool:
         current = _packaged_digests(parts[name][1])

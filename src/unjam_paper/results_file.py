@@ -68,6 +68,11 @@ def read_part(path: Path, name: str) -> Any:
     return _by_rows(json.loads(path.read_text(encoding="utf-8"))[name])
 
 
+def read_optional_part(folder: Path, name: str) -> dict[str, Any]:
+    """Return one part of a study from its working folder, or an empty part if there is none yet."""
+    return read_part(folder, name) if (folder / f"{name}.json").is_file() else {}
+
+
 def read_parts(path: Path) -> dict[str, Any]:
     """Return all parts of a study by name, from its results file or from its working folder."""
     if path.is_dir():

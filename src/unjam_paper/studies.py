@@ -12,12 +12,10 @@ from unjam_paper.all_roads import (
     joint_training_study,
 )
 from unjam_paper.assess_examples import ASSESS_EXAMPLES
-from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study
+from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study, road_model_study
 from unjam_paper.do_no_harm import DO_NO_HARM
-from unjam_paper.envelope import ENVELOPE
-from unjam_paper.feasible import FEASIBLE_FIGURE_EIGHT, FEASIBLE_RING, FEASIBLE_RING_JAMMED, on_ramp_study
+from unjam_paper.feasible import ENVELOPE, FEASIBLE_FIGURE_EIGHT, FEASIBLE_RING, FEASIBLE_RING_JAMMED, on_ramp_study
 from unjam_paper.figure_6 import FIGURE_6
-from unjam_paper.road_model import road_model_study
 from unjam_paper.robustness import FIGURE_10, ROBUSTNESS
 from unjam_paper.study import PAPER_ROADS, Study
 from unjam_paper.theory import FIGURE_8, THEORY

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.files import atomic_write, make_folder
 from unjam.manifest import manifest
@@ -43,6 +44,8 @@ NO_VALUE_TEXT = "–"
 
 Table = list[dict[str, Any]]
 """rows of results, or of the metrics of episodes"""
+DriverSource = str | Path | Callable[[Any], Driver]
+"""name of a driver, folder of a training, or a function that makes a driver for a scenario"""
 
 
 @dataclass(frozen=True)
@@ -165,13 +168,17 @@ def study_manifest(folder: Path, **metadata: Any) -> dict[str, Any]:
 
 
 def evaluate_on_test_seeds(
-    scenario: Scenario, drivers: dict[str, Driver], seeds: int, metrics: Sequence[str], workers: WorkerPool
+    scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: WorkerPool
 ) -> dict[str, Any]:
     """Return the verdict on each driver and these metrics of its episodes on test seeds.
 
     The human baseline, if it is one of the drivers, is `human`.
     """
-    evaluation = evaluate(scenario, drivers, make_test_seeds(seeds), workers)
+    made = {
+        label: source(scenario) if callable(source) else make_driver(str(source), scenario.control_step)
+        for label, source in drivers.items()
+    }
+    evaluation = evaluate(scenario, made, make_test_seeds(seeds), workers)
     raise_failures(evaluation)
     verdicts = feasibility_by_driver(evaluation.rows)
     return {
@@ -185,6 +192,17 @@ class DriverComparison:
     """What `evaluate_on_test_seeds` returned for the same drivers on one or several roads."""
 
     roads: Sequence[Mapping[str, Any]]
+
+    def groups(self, trainings: Mapping[str, str]) -> dict[str, list[str]]:
+        """Return the drivers of each row of a table: all trainings `PREFIX SEED` in one, and the others alone.
+
+        `trainings` has the names of the rows of trainings by prefix.
+        """
+        groups = {label: [label] for label in self.roads[0] if label.rpartition(" ")[0] not in trainings}
+        for prefix, name in trainings.items():
+            own = [label for label in self.roads[0] if label.rpartition(" ")[0] == prefix]
+            groups |= {f"{name}, {len(own)} trainings": own} if own else {}
+        return groups
 
     def values(self, labels: Sequence[str], metric: str) -> Floats:
         """Return a metric of drivers, shape (roads, drivers, seeds)."""

@@ -4,18 +4,18 @@ import pytest
 
 from unjam.controller import PACKAGED_PREFIX, certificate, packaged_names
 from unjam.scenarios import OnRamp, Ring
-from unjam_paper import envelope
-from unjam_paper.envelope import ENVELOPE
+from unjam_paper import feasible
+from unjam_paper.feasible import ENVELOPE
 from unjam_paper.study import StudyFolder
 
 
 def test_all_packaged_controllers_for_closed_roads_are_tested() -> None:
     closed = {f"{PACKAGED_PREFIX}{name}" for name in packaged_names() if not name.startswith("on-ramp")}
-    assert set(envelope.CONTROLLER_ROADS) == closed
+    assert set(feasible.CONTROLLER_ROADS) == closed
 
 
 def test_rings_have_the_documented_range() -> None:
-    rings = [ring for _, ring in envelope.envelope_rings()]
+    rings = [ring for _, ring in feasible.envelope_rings()]
     assert {ring.vehicles for ring in rings} == {5, 11, 22, 44}
     assert {ring.cavs for ring in rings} == {1, 2, 3}
     assert {ring.warmup > 0 for ring in rings} == {True, False}
@@ -24,7 +24,7 @@ def test_rings_have_the_documented_range() -> None:
 
 
 def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None:
-    for roads in (envelope.envelope_rings(actuation="raw"), envelope.envelope_lanes()):
+    for roads in (feasible.envelope_rings(actuation="raw"), feasible.envelope_lanes()):
         for _, road in roads:
             assert road.actuation == "raw"
             assert road.safety.active
@@ -33,16 +33,16 @@ def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None
 @pytest.mark.long
 def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = "unjam:ring-gap-tuned"
-    monkeypatch.setattr(envelope, "CONTROLLER_ROADS", {one: "ring"})
+    monkeypatch.setattr(feasible, "CONTROLLER_ROADS", {one: "ring"})
     for name in ("IMPAIRED_DRIVERS", "LANE_CONTROLLERS"):
-        monkeypatch.setattr(envelope, name, (one,))
+        monkeypatch.setattr(feasible, name, (one,))
     for name in ("ENVELOPE_SEEDS", "RAW_ACTUATION_SEEDS", "IMPAIRED_SEEDS"):
-        monkeypatch.setattr(envelope, name, 1)
+        monkeypatch.setattr(feasible, name, 1)
     short = Ring(length=(60, 60), vehicles=5, horizon=60)
     for name in ("envelope_rings", "envelope_figure_eights"):
-        monkeypatch.setattr(envelope, name, lambda **changes: iter([("a short ring", short)]))
-    monkeypatch.setattr(envelope, "envelope_lanes", lambda: iter([("a short lane", OnRamp(lanes=1, horizon=60))]))
-    monkeypatch.setattr(envelope, "impaired_rings", lambda warmup: iter([("late", short)]))
+        monkeypatch.setattr(feasible, name, lambda **changes: iter([("a short ring", short)]))
+    monkeypatch.setattr(feasible, "envelope_lanes", lambda: iter([("a short lane", OnRamp(lanes=1, horizon=60))]))
+    monkeypatch.setattr(feasible, "impaired_rings", lambda warmup: iter([("late", short)]))
     monkeypatch.setattr(certificate, "ATTACK_GENERATIONS", 1)
     monkeypatch.setattr(certificate, "STRING_SPEED_RATIOS", ())
 

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from unjam_paper.road_model import compared_variants, road_model_study
+from unjam_paper.comparison import compared_variants, road_model_study
 
 
 def test_returns_are_compared_after_multiples_of_the_steps(tmp_path: Path) -> None:
