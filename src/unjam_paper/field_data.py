@@ -8,6 +8,7 @@ or platoon is for training and another for testing.
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from unjam.following.open_loop import (
 from unjam.following.pairs import Pair, Segments, following_samples, make_segments, pairs_in_splits, split_by_driver
 from unjam.physics.idm import PAPER_IDM, stack_idm_parameters
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
-from unjam_paper.parts import PartCallback, measure_parts
+from unjam_paper.parts import measure_parts
 from unjam_paper.results_file import write_figure, write_part
 from unjam_paper.study import Table, study_manifest
 
@@ -52,14 +53,8 @@ ONE_STEP_SETTINGS = NetworkSettings(learning_rate=1e-3, epochs=40, patience=8)
 MULTI_STEP_SETTINGS = MultiStepSettings()
 BOOTSTRAP_DRAWS = 2000
 """of the bootstrap over trajectories"""
-PAPER_IDM_MODELS: dict[str, AccelerationBounds | None] = {
-    "paper's IDM": None,
-    "paper's IDM, clipped": ACCELERATION_LIMITS,
-}
-KNOWLEDGE_MODELS: dict[str, AccelerationBounds | None] = {
-    "knowledge, paper's IDM": None,
-    "knowledge, paper's IDM clipped": ACCELERATION_LIMITS,
-}
+PAPER_IDM_MODELS = {"paper's IDM": None, "paper's IDM, clipped": ACCELERATION_LIMITS}
+KNOWLEDGE_MODELS = {"knowledge, paper's IDM": None, "knowledge, paper's IDM clipped": ACCELERATION_LIMITS}
 """the paper's IDM within these limits, alone and as the base of a network"""
 FIELD_CALIBRATION = CalibrationSettings(limits=ACCELERATION_LIMITS, segment_seconds=MAX_SEGMENT_SECONDS)
 WEIGHTED_MODEL = "IDM, initial headway weighted"
@@ -129,28 +124,26 @@ def _load_ngsim(path: Path) -> FieldData:
     return FieldData(pairs_in_splits(pairs, "paper_train"), tests, max_segment=None)
 
 
-def _load_astazero(path: Path, kind: str, training_runs: tuple[str, ...], test_runs: tuple[str, ...]) -> FieldData:
+def _load_astazero(path: Path, split: tuple[str, tuple[str, ...], tuple[str, ...]]) -> FieldData:
+    kind, *runs = split
     reading = ReadOptions(driver_columns=("run", "follower"), kind_columns=("acc", "setting"))
     pairs = [pair for pair in read_pairs(path, "table", reading).pairs if pair.kind == kind]
-    training, test = ([pair for pair in pairs if pair.driver.startswith(runs)] for runs in (training_runs, test_runs))
+    training, test = ([pair for pair in pairs if pair.driver.startswith(names)] for names in runs)
     return FieldData(training, {"test": test})
 
 
-TEN_VEHICLE_PLATOON, THREE_VEHICLE_PLATOON = ("040719_platoon10-",), ("040719_platoon3-",)
-FIRST_DAY_PLATOONS = tuple(f"040719_platoon{number}-" for number in range(5, 10))
-SECOND_DAY_PLATOONS = ("050719_platoon1-", "050719_platoon2-")
 ASTAZERO_SPLITS = {
-    "human": ("False-none", TEN_VEHICLE_PLATOON, THREE_VEHICLE_PLATOON),
-    "human-reversed": ("False-none", THREE_VEHICLE_PLATOON, TEN_VEHICLE_PLATOON),
-    "acc": ("True-min", FIRST_DAY_PLATOONS, SECOND_DAY_PLATOONS),
+    "human": ("False-none", ("040719_platoon10-",), ("040719_platoon3-",)),
+    "human-reversed": ("False-none", ("040719_platoon3-",), ("040719_platoon10-",)),
+    "acc": (
+        *("True-min", tuple(f"040719_platoon{number}-" for number in range(5, 10))),
+        ("050719_platoon1-", "050719_platoon2-"),
+    ),
 }
-"""kind of the pairs, training runs and test runs"""
+"""kind of the pairs, training runs and test runs: platoons of ten and of three vehicles, or those of two days"""
 FIELD_DATA_LOADERS: dict[str, Callable[[Path], FieldData]] = {
     "ngsim": _load_ngsim,
-    **{
-        f"astazero-{name}": partial(_load_astazero, kind=kind, training_runs=training, test_runs=test)
-        for name, (kind, training, test) in ASTAZERO_SPLITS.items()
-    },
+    **{f"astazero-{name}": partial(_load_astazero, split=split) for name, split in ASTAZERO_SPLITS.items()},
 }
 
 
@@ -166,10 +159,10 @@ def field_fits(files: dict[str, str]) -> list[FieldFit]:
     for data in FIELD_DATA_LOADERS:
         source = data.partition("-")[0]
         multi_step = MULTI_STEP_MODELS if data == "ngsim" else MULTI_STEP_MODELS[1:]
-        single = [(model, 0) for model in (*PAPER_IDM_MODELS, *CALIBRATED_MODELS, *PERSONAL_MODELS)]
-        seeds = range(TRAINING_SEED_COUNTS[source])
-        repeated = [(model, seed) for models in (ONE_STEP_MODELS, multi_step) for seed in seeds for model in models]
-        fits += [FieldFit(data, files[source], model, seed) for model, seed in (*single, *repeated)]
+        models = [(model, 0) for model in (*PAPER_IDM_MODELS, *CALIBRATED_MODELS, *PERSONAL_MODELS)]
+        for trained in (ONE_STEP_MODELS, multi_step):
+            models += [(model, seed) for seed, model in product(range(TRAINING_SEED_COUNTS[source]), trained)]
+        fits += [FieldFit(data, files[source], model, seed) for model, seed in models]
     return fits
 
 
@@ -248,14 +241,11 @@ def _fit_personal_idm(data: FieldData, personal_parameters: Sequence[str]) -> tu
     return model, {"calibrated": [asdict(one) for one in found]}
 
 
-def run_field_study(
-    folder: Path, ngsim: Path, astazero: Path, workers: int = 2, on_part: PartCallback = lambda name: None
-) -> None:
+def run_field_study(folder: Path, ngsim: Path, astazero: Path, workers: int = 2) -> None:
     """Measure the parts that are missing in `folder/parts`, and write `field.json` and `field.png`."""
     about = study_manifest(folder)
     fits = field_fits({"ngsim": str(ngsim), "astazero": str(astazero)})
-    parts = {fit.name: (evaluate_fit, (fit,)) for fit in fits}
-    rows = field_rows(measure_parts(folder / "parts", parts, workers, on_part))
+    rows = field_rows(measure_parts(folder / "parts", {fit.name: (evaluate_fit, (fit,)) for fit in fits}, workers))
     about["command"] = [about["command"][0], "FOLDER", ngsim.name, astazero.name]
     write_part(folder, "field", {"manifest": about, "rows": rows})
     write_figure(folder, "field", field_figure(rows))
@@ -263,27 +253,25 @@ def run_field_study(
 
 def field_rows(results: Table) -> Table:
     """Return a row for each model, test set and seed, with confidence intervals from a bootstrap over trajectories."""
-    rows = []
-    for part in results:
-        facts = {key: value for key, value in part.items() if key != "tests"}
-        rows += [{**facts, "test": test, **_bootstrap_errors(found)} for test, found in part["tests"].items()]
-    return rows
+    return [
+        {**{key: value for key, value in part.items() if key != "tests"}, "test": test, **_bootstrap_errors(found)}
+        for part in results
+        for test, found in part["tests"].items()
+    ]
 
 
 def _bootstrap_errors(square_errors: dict[str, list[float]]) -> dict[str, Any]:
     values = {name: np.array(each) for name, each in square_errors.items()}
     weights = values["samples"]
     draws = np.random.default_rng(0).integers(len(weights), size=(BOOTSTRAP_DRAWS, len(weights)))
-    each = np.sqrt(values["gap_square"])
     errors: dict[str, Any] = {"trajectories": len(weights), "collision_share": float(values["collision_share"].mean())}
     for name in ("gap", "speed", "one_step"):
         squares = values[f"{name}_square"] * weights
         drawn = np.sqrt(squares[draws].sum(1) / weights[draws].sum(1))
         errors[name] = float(np.sqrt(squares.sum() / weights.sum()))
         errors[f"{name}_interval"] = np.quantile(drawn, [0.025, 0.975]).tolist()
-    errors["gap_of_trajectories"] = float(each.mean())
-    errors["gap_each"] = [round(one, 3) for one in each.tolist()]
-    return errors
+    each = np.sqrt(values["gap_square"])
+    return {**errors, "gap_of_trajectories": float(each.mean()), "gap_each": [round(one, 3) for one in each.tolist()]}
 
 
 @rc_context(PLOT_STYLE)

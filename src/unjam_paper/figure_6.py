@@ -6,7 +6,6 @@ data. Here it is either a driver with other parameters than the paper's IDM (`ot
 that the base is the truth.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import product
@@ -28,9 +27,9 @@ from unjam.following.pairs import SPLITS, Floats, FollowingSamples, following_sa
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
-from unjam_paper.parts import PartCallback, measure_parts
+from unjam_paper.parts import measure_parts
 from unjam_paper.results_file import write_figure, write_part
-from unjam_paper.study import Study, Table, study_manifest
+from unjam_paper.study import Study, StudyFolder, Table, study_manifest
 
 SplitKind = Literal["trajectories", "rows", "released"]
 """How test rows are separated from training rows. `trajectories`: no row of their trajectory is in training. `rows`:
@@ -69,8 +68,8 @@ class FourRegimeFit:
     @property
     def name(self) -> str:
         """The name of its part."""
-        words = [self.driver, self.split, self.network.replace(" ", "-"), f"{100 * self.size:g}", f"{self.repeat}"]
-        return "-".join([*words, *(["is_long"] if self.is_long else [])])
+        words = (self.driver, self.split, self.network.replace(" ", "-"), f"{100 * self.size:g}", f"{self.repeat}")
+        return "-".join((*words, "is_long") if self.is_long else words)
 
 
 class DataSplit(NamedTuple):
@@ -83,27 +82,19 @@ class DataSplit(NamedTuple):
     """share of the test rows that are also training rows"""
 
 
-def four_regime_fits(repeats: int = FIT_REPEATS) -> list[FourRegimeFit]:
+def four_regime_fits() -> list[FourRegimeFit]:
     """Return all fits of the study, the most important first."""
-
-    def make_fits(
-        count: int,
-        sizes: Sequence[float],
-        networks: Sequence[str] = FIGURE_6_NETWORKS,
-        splits: Sequence[SplitKind] = ("trajectories",),
-        driver: str = "other",
-        is_long: bool = False,
-    ) -> list[FourRegimeFit]:
-        each = product(range(count), splits, sizes, networks)
-        return [FourRegimeFit(driver, net, size, repeat, split, is_long) for repeat, split, size, net in each]
-
-    fewer = min(FEWER_REPEATS, repeats)
+    unseen, both = get_args(SplitKind)[:1], FIGURE_6_NETWORKS
     return [
-        *make_fits(repeats, TRAINING_SIZES),
-        *make_fits(fewer, TRAINING_SIZES[:1], is_long=True),
-        *make_fits(fewer, TRAINING_SIZES[:2], driver="same"),
-        *make_fits(fewer, LEAKING_SIZES, splits=("rows", "released")),
-        *make_fits(1, (*LEAKING_SIZES, 1.0), networks=(NEAREST_ROW,), splits=get_args(SplitKind)),
+        FourRegimeFit(driver, network, size, repeat, split, is_long)
+        for repeats, splits, sizes, networks, driver, is_long in (
+            (FIT_REPEATS, unseen, TRAINING_SIZES, both, "other", False),
+            (FEWER_REPEATS, unseen, TRAINING_SIZES[:1], both, "other", True),
+            (FEWER_REPEATS, unseen, TRAINING_SIZES[:2], both, "same", False),
+            (FEWER_REPEATS, ("rows", "released"), LEAKING_SIZES, both, "other", False),
+            (1, get_args(SplitKind), (*LEAKING_SIZES, 1.0), (NEAREST_ROW,), "other", False),
+        )
+        for repeat, split, size, network in product(range(repeats), splits, sizes, networks)
     ]
 
 
@@ -170,19 +161,17 @@ def _predict_learned(fit: FourRegimeFit, training: FollowingSamples, rows: DataS
     if fit.is_long:
         training = training.select(np.tile(np.arange(len(training)), LONG_PASS_REPEATS))
     chosen = np.random.default_rng(0).permutation(len(rows.validation))[:MAX_VALIDATION_ROWS]
-    validation, test = rows.validation.select(chosen), rows.test
-    network, losses = fit_one_step(training, validation, base, NetworkSettings(), fit.repeat)
+    network, losses = fit_one_step(training, rows.validation.select(chosen), base, NetworkSettings(), fit.repeat)
     model = add_residual(fixed_driver(base) if base else None, batched_network(network.to_numpy_network()))
-    predicted = model(test.speed[:1], test.gap[:1])(test.speed, test.leader_speed, test.gap)
+    predicted = model(rows.test.speed[:1], rows.test.gap[:1])(*rows.test.inputs)
     facts = {"training_loss": losses.training, "validation_loss": losses.validation}
     return predicted, {"epochs": len(losses.training), **facts}
 
 
 def _predict_nearest(fit: FourRegimeFit, training: FollowingSamples, rows: DataSplit) -> tuple[Floats, dict[str, Any]]:
-    """Return the acceleration of the most similar training row for each test row."""
     from scipy.spatial import KDTree
 
-    known, asked = (np.column_stack([each.speed, each.leader_speed, each.gap]) for each in (training, rows.test))
+    known, asked = (np.column_stack(each.inputs) for each in (training, rows.test))
     scale = known.std(0)
     _, nearest = KDTree(known / scale).query(asked / scale)
     return training.acceleration[np.asarray(nearest, np.int64)], {}
@@ -192,14 +181,11 @@ def _rms(error: Floats) -> float:
     return float(np.sqrt(np.square(error).mean()))
 
 
-def run_figure_6(
-    folder: Path, workers: int = 2, on_part: PartCallback = lambda name: None, repeats: int = FIT_REPEATS
-) -> None:
-    """Measure the parts that are missing in `folder/parts`, and write `figure-6.json` and `figure-6.png`."""
+def _write_figure_6(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    """Measure the parts that are missing in `folder/parts`; the losses of fits to all data only are written."""
     about = study_manifest(folder)
-    parts = {fit.name: (measure_fit, (fit,)) for fit in four_regime_fits(repeats)}
-    rows = measure_parts(folder / "parts", parts, workers, on_part)
-    stored = [  # with the losses of fits to all data only
+    rows = measure_parts(folder / "parts", {fit.name: (measure_fit, (fit,)) for fit in four_regime_fits()}, workers)
+    stored = [
         {key: value for key, value in row.items() if row["size"] == 1.0 or not key.endswith("_loss")} for row in rows
     ]
     write_part(folder, "figure-6", {"manifest": about, "rows": stored})
@@ -257,6 +243,6 @@ def _set_log_axes(axes: Axes, title: str) -> None:
 
 FIGURE_6 = Study(
     title="networks that learn car following, with and without a car-following model",
-    write=lambda study_folder, seeds, folder, workers: run_figure_6(folder, workers),
+    write=_write_figure_6,
     minutes=25.0,
 )

@@ -21,6 +21,7 @@ from unjam_paper.figure_6 import (
     measure_fit,
     split_rows,
 )
+from unjam_paper.study import StudyFolder
 
 
 @pytest.fixture
@@ -80,8 +81,8 @@ def test_with_the_true_model_as_base_the_error_is_smaller(small: None) -> None:
 def test_the_study_writes_results_and_a_figure(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = [FourRegimeFit("other", name, size, 0) for name in ("knowledge", "vanilla") for size in (0.3, 1.0)]
     long_fits = [FourRegimeFit("other", name, 0.01, 0, is_long=True) for name in ("knowledge", "vanilla")]
-    monkeypatch.setattr(figure_6, "four_regime_fits", lambda repeats: [*chosen, *long_fits])
-    figure_6.run_figure_6(tmp_path, workers=1)
+    monkeypatch.setattr(figure_6, "four_regime_fits", lambda: [*chosen, *long_fits])
+    figure_6.FIGURE_6.write(StudyFolder(tmp_path), 1, tmp_path, 1)
     rows = json.loads((tmp_path / "figure-6.json").read_text())["rows"]
     assert len(rows) == 6
     assert ["training_loss" in row for row in rows] == [False, True, False, True, False, False]
