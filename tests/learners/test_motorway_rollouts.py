@@ -11,8 +11,8 @@ from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError
 from unjam.learners.experience import join_experience, make_experience
 from unjam.learners.model_rollouts import ExperienceFactory, full_policy
-from unjam.learners.motorway_rollouts import MotorwayRollouts
 from unjam.learners.settings import PolicySettings
+from unjam.learners.whole_road_rollouts import MotorwayRollouts
 from unjam.models import motorway_model
 from unjam.models.ensemble import torch_generator
 from unjam.models.motorway_model import learned_correction, motorway_samples
@@ -126,7 +126,7 @@ def test_rollouts_have_the_set_ratio_in_antithetic_pairs(actual: list[Episode]) 
     np.testing.assert_array_equal(repeated.rewards, found.rewards)
     driver = full_policy(task, POLICY, network)
     seeds = [((1,), (2,)), ((1,), (2,))]
-    one, mirrored = model_rollouts.simulate(driver, model_rollouts.samples[:1] * 2, 20, seeds, [1.0, -1.0])
+    one, mirrored = model_rollouts.simulate(driver, model_rollouts.samples[:1] * 2, 20, None, seeds, [1.0, -1.0])
     first, second = one.trajectories[0], mirrored.trajectories[0]
     calm = network(first.observations[:1])
     assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * calm[0])

@@ -15,8 +15,8 @@ from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.learners.experience import Experience, make_experience
 from unjam.learners.model_rollouts import ExperienceFactory, full_policy
-from unjam.learners.road_rollouts import RoadRollouts
 from unjam.learners.settings import PolicySettings
+from unjam.learners.whole_road_rollouts import RoadRollouts
 from unjam.models.comparison import ReplayDriver
 from unjam.models.road_model import base_human_model
 from unjam.models.settings import ModelSettings

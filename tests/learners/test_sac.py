@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.learners.toy_task import INPUTS, Toy, make_policy, of_any_size, random_rows, residual_of, shake
-from unjam.learners.sac import SquashedResidualPolicy, uniform_network
+from unjam.learners.sac_td3 import SquashedResidualPolicy, uniform_network
 from unjam.learners.settings import PolicySettings, SACSettings
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.learners.toy_task import INPUTS, Toy, make_policy, of_any_size, random_rows, residual_of, shake
+from unjam.learners.sac_td3 import DeterministicResidualPolicy
 from unjam.learners.settings import PolicySettings, TD3Settings
-from unjam.learners.td3 import DeterministicResidualPolicy
 
 torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
 fresh = partial(make_policy, DeterministicResidualPolicy)

@@ -104,7 +104,7 @@ def test_samples_are_recorded_states_and_next_states(episodes: list[Episode]) ->
 )
 def test_unsupported_roads_are_refused(road: Any, why: str) -> None:
     with pytest.raises(InputError, match=f"model.kind: road is not allowed; allowed: row, for .*{why}"):
-        check_road_model(road)
+        check_road_model(road, ModelSettings(kind="road"))
 
 
 def test_learned_human_model_on_tensors_equals_arrays(episodes: list[Episode]) -> None:

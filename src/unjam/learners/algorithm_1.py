@@ -28,9 +28,8 @@ from unjam.learners.learner import (
     tensors_with_prefix,
 )
 from unjam.learners.model_rollouts import ExperienceFactory, ModelRollouts, RowRollouts
-from unjam.learners.motorway_rollouts import MotorwayRollouts
-from unjam.learners.road_rollouts import RoadRollouts
 from unjam.learners.settings import LearnerSettings, PolicySettings
+from unjam.learners.whole_road_rollouts import MotorwayRollouts, RoadRollouts
 from unjam.models.settings import ModelSettings
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.worlds.episode import Task

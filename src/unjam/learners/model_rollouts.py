@@ -1,6 +1,6 @@
 """What Algorithm 1 does between environment episodes: fit a model to them, and roll the policy out in it."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from math import ceil
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -12,30 +12,25 @@ from numpy.typing import NDArray
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver
 from unjam.following.calibration import calibrate_human_drivers
-from unjam.learners.experience import Experience, join_experience
+from unjam.learners.experience import Experience
 from unjam.learners.learner import Tensors, tensors_with_prefix
 from unjam.learners.settings import PolicySettings
-from unjam.models.comparison import Waves, return_gap
+from unjam.models.comparison import return_gap
 from unjam.models.dynamics import ModelDynamics, check_device
 from unjam.models.ensemble import Ensemble, Seed, torch_generator
-from unjam.models.environment_data import EnvironmentData, is_holdout_episode
+from unjam.models.environment_data import EnvironmentData
 from unjam.models.fitting import ModelFit, fit_row_model
-from unjam.models.road_model import EpisodeSamples, RoadModel
 from unjam.models.rollouts import RolloutBatch, draw_starts, prepare_starts, return_bound, roll_out, rollout_length
 from unjam.models.row_model import RowModel
 from unjam.models.settings import ModelSettings
 from unjam.physics.idm import IDMParameters
-from unjam.tree import Arrays, pack, unpack
+from unjam.tree import pack, unpack
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.worker_pool import EpisodeTask
 
 FIT_SEED, STARTS_SEED, NOISE_SEED, EXPLORATION_SEED = 2, 3, 4, 5
 """purposes of the random numbers of an iteration, in their seeds"""
-_DATA_PREFIX, _SAMPLES_PREFIX = "data/", "samples/"
-"""prefixes of tensors in checkpoints"""
 EnsembleT = TypeVar("EnsembleT", bound=Ensemble)
-SamplesT = TypeVar("SamplesT", bound=EpisodeSamples)
 
 
 class ExperienceFactory(NamedTuple):
@@ -186,92 +181,28 @@ class ModelRollouts(Generic[EnsembleT]):
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all that a run needs to resume, as JSON and tensors."""
-        data, arrays = pack(self.data)
-        tensors = _to_tensors(_DATA_PREFIX, arrays) | {name: t.cpu() for name, t in self.model.state_dict().items()}
+        data, tensors = pack_tensors(self.data, "data")
+        tensors |= {name: tensor.cpu() for name, tensor in self.model.state_dict().items()}
         return {"model_steps": self.model_steps, "data": data, "humans": asdict(self.scenario.humans)}, tensors
 
     def restore(self, facts: dict[str, Any], tensors: Tensors) -> None:
         """Resume from what `state` returned."""
-        self.data = unpack(EnvironmentData, facts["data"], _to_arrays(_DATA_PREFIX, tensors))
+        self.data = unpack_tensors(EnvironmentData, facts["data"], tensors, "data")
         self.model_steps = facts["model_steps"]
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["humans"]))
         self.model.load_state_dict({name: tensor for name, tensor in tensors.items() if "/" not in name})
 
 
-def _to_tensors(prefix: str, arrays: Arrays) -> Tensors:
-    return {f"{prefix}{name}": torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+def pack_tensors(tree: Any, name: str) -> tuple[Any, Tensors]:
+    """Return a tree as JSON and tensors, whose names begin with `name` and a slash; see `pack`."""
+    packed, arrays = pack(tree)
+    return packed, {f"{name}/{path}": torch.from_numpy(np.array(array)) for path, array in arrays.items()}
 
 
-def _to_arrays(prefix: str, tensors: Tensors) -> Arrays:
-    return {name: tensor.numpy() for name, tensor in tensors_with_prefix(prefix, tensors).items()}
-
-
-class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
-    """The learned model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
-
-    sample_type: type[SamplesT]
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.samples: list[SamplesT] = []
-        """of the episodes in D_a, oldest first"""
-
-    def _new_model(self) -> RoadModel:
-        return RoadModel(self.settings, self._seed(FIT_SEED))
-
-    def _sample_episode(self, episode: Episode, number: int) -> SamplesT:
-        raise NotImplementedError
-
-    def _fit_samples(self, seed: Seed) -> ModelFit:
-        raise NotImplementedError
-
-    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
-        raise NotImplementedError
-
-    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
-        """Return a holdout episode in environment and model; `run_episode` runs one where environment episodes run."""
-        raise NotImplementedError
-
-    def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
-        steps, returns, crashed, parts = 0, list[float](), list[bool](), list[Experience]()
-        for episodes in self._simulate_batches(plan):
-            steps += sum(episode.control_steps for episode in episodes)
-            returns += [float(episode.reward.sum()) for episode in episodes]
-            crashed += [episode.status == "collision" for episode in episodes]
-            if any(episode.trajectories for episode in episodes):
-                parts.append(experience_factory.from_episodes(episodes))
-        experience = join_experience(parts) if parts else None
-        return RolloutResult(experience, steps, np.array(returns), {"crash_share": float(np.mean(crashed))})
-
-    @property
-    def _holdout_samples(self) -> SamplesT:
-        """The newest holdout episode, or the newest one if there is none."""
-        holdout, group_size = self.settings.holdout, len(self._policy.exploration_signs)
-        held_out = [each for each in self.samples if is_holdout_episode(each.episode // group_size, holdout)]
-        return (held_out or self.samples)[-1]
-
-    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
-        """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
-        first = self.data.episode_count
-        self.samples += [self._sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
-        super().learn(episodes, iteration)
-
-    def _fit_model(self, seed: Seed) -> ModelFit:
-        oldest = self.data.recordings[0].episode
-        self.samples = [each for each in self.samples if each.episode >= oldest]
-        return self._fit_samples(seed)
-
-    def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return all that a run needs to resume, as JSON and tensors."""
-        facts, tensors = super().state()
-        samples, arrays = pack(self.samples)
-        return {**facts, "samples": samples}, tensors | _to_tensors(_SAMPLES_PREFIX, arrays)
-
-    def restore(self, facts: dict[str, Any], tensors: Tensors) -> None:
-        """Resume from what `state` returned."""
-        super().restore(facts, tensors)
-        arrays = _to_arrays(_SAMPLES_PREFIX, tensors)
-        self.samples = unpack(list[self.sample_type], facts["samples"], arrays)
+def unpack_tensors(kind: Any, packed: Any, tensors: Tensors, name: str) -> Any:
+    """Return the tree of type `kind` that `pack_tensors` converted."""
+    arrays = {path: tensor.numpy() for path, tensor in tensors_with_prefix(f"{name}/", tensors).items()}
+    return unpack(kind, packed, arrays)
 
 
 class RowRollouts(ModelRollouts[RowModel]):

@@ -136,7 +136,7 @@ class OffPolicySettings(LearnerSettings):
 class SACSettings(OffPolicySettings):
     """Soft actor-critic; the preset `paper` has the values of Table B4 where these differ."""
 
-    learner_class: ClassVar[str] = "unjam.learners.sac:SAC"
+    learner_class: ClassVar[str] = "unjam.learners.sac_td3:SAC"
     temperature: Positive = 0.05
     """weight of the policy's entropy, in units of scaled rewards; with the paper's 0.2 the noise alone costs a quarter
     of the return on the ring, and what is learned from it fails on short rings"""
@@ -150,7 +150,7 @@ class SACSettings(OffPolicySettings):
 class TD3Settings(OffPolicySettings):
     """Twin delayed deep deterministic policy gradient; the values of Fujimoto et al. 2018 where they fit."""
 
-    learner_class: ClassVar[str] = "unjam.learners.td3:TD3"
+    learner_class: ClassVar[str] = "unjam.learners.sac_td3:TD3"
     learning_rate: Positive = 1e-3
     policy_delay: PositiveInt = 2
     """gradient steps of the critics per update of the policy and the target networks"""

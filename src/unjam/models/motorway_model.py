@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 from unjam.errors import InputError
 from unjam.models.ensemble import Seed
 from unjam.models.fitting import ModelFit
-from unjam.models.road_model import (
-    EpisodeSamples,
-    HumanRows,
-    RoadModel,
-    check_road_model,
-    fit_human_model,
-    residual_function,
-)
+from unjam.models.road_model import HumanRows, RoadModel, fit_human_model, residual_function
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Floats
 from unjam.scenarios.on_ramp import RAMP_SPEED_LIMIT, OnRamp
@@ -57,9 +50,11 @@ PERCEPTION_ERROR_STD = 0.5
 
 
 @dataclass(frozen=True)
-class MotorwaySamples(EpisodeSamples):
+class MotorwaySamples:
     """Human drivers on an on-ramp at some steps of an environment episode."""
 
+    episode: int
+    """its number"""
     seed: tuple[int, ...]
     """of the episode: it determines the vehicles and their entry times"""
     episode_return: float
@@ -67,20 +62,6 @@ class MotorwaySamples(EpisodeSamples):
     """steps of human drivers that keep their lane; the base is without perception errors"""
     noise_variance: float
     """mean square of what perception errors add to a speed in a control step [m2/s2]"""
-
-
-def check_motorway_model(scenario: OnRamp, settings: ModelSettings) -> None:
-    """Raise `InputError` if the road model of on-ramps does not support a scenario or settings."""
-    check_road_model(scenario)
-    if settings.rollout_starts != "first":
-        setting, allowed = f"rollout_starts: {settings.rollout_starts}", "first"
-    elif settings.base not in ("idm", "none"):
-        setting, allowed = f"base: {settings.base}", "idm, each vehicle's own driver model, or none"
-    elif settings.calibrate_base:
-        setting, allowed = "calibrate_base: true", "false"
-    else:
-        return
-    raise InputError(f"model.{setting} is not allowed; allowed: {allowed}, on on-ramps")
 
 
 def motorway_samples(episode: Episode, number: int, scenario: OnRamp, base: str = "idm") -> MotorwaySamples:

@@ -25,6 +25,7 @@ from unjam.models.row_model import BASE_DRIVERS
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Array, clamp_min
 from unjam.physics.kinematics import gap_on_loop, next_speed
+from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
@@ -44,16 +45,11 @@ MAX_NOISE_STDS = 3.0
 
 
 @dataclass(frozen=True)
-class EpisodeSamples:
-    """What a model is fitted to of an environment episode with this number."""
-
-    episode: int
-
-
-@dataclass(frozen=True)
-class RoadSamples(EpisodeSamples):
+class RoadSamples:
     """N vehicles of a closed road, in its order, at M steps at which a residual was due; arrays (M, N), SI units."""
 
+    episode: int
+    """number of the environment episode"""
     interval: int
     """control steps between samples"""
     size: int
@@ -73,13 +69,20 @@ class RoadSamples(EpisodeSamples):
     """on a road that crosses itself: waiting times and entry steps"""
 
 
-def check_road_model(scenario: Scenario) -> None:
-    """Raise `InputError` if the road model does not support a scenario."""
+def check_road_model(scenario: Scenario, settings: ModelSettings) -> None:
+    """Raise `InputError` if the road model does not support a scenario with these settings."""
     reason = statistically_unsupported_reason(scenario)
     if isinstance(scenario, LoopScenario) and scenario.steps_per_control_step > 1:
         reason = f"{scenario.title}: steps_per_control_step is {scenario.steps_per_control_step}"
     if reason:
         raise InputError(f"model.kind: road is not allowed; allowed: row, for {reason}")
+    for setting, is_allowed, allowed in (
+        (f"rollout_starts: {settings.rollout_starts}", settings.rollout_starts == "first", "first"),
+        (f"base: {settings.base}", settings.base in ("idm", "none"), "idm, each vehicle's own driver model, or none"),
+        ("calibrate_base: true", not settings.calibrate_base, "false"),
+    ):
+        if isinstance(scenario, OnRamp) and not is_allowed:
+            raise InputError(f"model.{setting} is not allowed; allowed: {allowed}, on on-ramps")
 
 
 def with_size(scenario: LoopScenario, size: int) -> LoopScenario:

@@ -15,7 +15,8 @@ from unjam.errors import InputError, resume_hint
 from unjam.files import atomic_write, to_json
 from unjam.learners.algorithm_1 import model_rollouts_class
 from unjam.learners.learner import tensors_with_prefix
-from unjam.learners.model_rollouts import RowRollouts, WholeRoadRollouts
+from unjam.learners.model_rollouts import RowRollouts
+from unjam.learners.whole_road_rollouts import WholeRoadRollouts
 from unjam.models.comparison import one_step_errors, open_loop_errors, recorded_states, replay_accelerations
 from unjam.models.fitting import OneStepErrors, root_mean_square
 from unjam.models.row_model import STATE_FIELDS, TARGET_NAMES, RowModel

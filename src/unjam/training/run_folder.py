@@ -31,7 +31,6 @@ from unjam.parameters import build_dataclass
 from unjam.processes import LOCK_FILE, lock_folder
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
-from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, read_toml, to_toml
 from unjam.training.early_stopping import should_stop_early
@@ -65,13 +64,9 @@ def check_config(config: RunConfig) -> None:
         if config.model.model_ratio > 0 and config.model.kind == "row":
             _check_row_model(task, scenario, expert)
         elif config.model.model_ratio > 0:
-            from unjam.models.motorway_model import check_motorway_model  # which needs torch
-            from unjam.models.road_model import check_road_model
+            from unjam.models.road_model import check_road_model  # which needs torch
 
-            if isinstance(scenario, OnRamp):
-                check_motorway_model(scenario, config.model)
-            else:
-                check_road_model(scenario)
+            check_road_model(scenario, config.model)
     config.make_tasks()
 
 

@@ -1,7 +1,7 @@
-"""SAC, and what off-policy learners share: a replay buffer and a pair of critics."""
+"""SAC and TD3, which learn from a replay buffer with a pair of critics, and their policies."""
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import stable_baselines3
@@ -9,7 +9,8 @@ import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.sac.policies import Actor, SACPolicy
+from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.td3.policies import TD3Policy
 from torch import Tensor, nn
 from torch.distributions import Normal
 
@@ -17,7 +18,7 @@ from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.learners.experience import Experience, MixedReplayBuffer, add_to_replay_buffer, shift_rewards
 from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, network_layers, zero_layer
-from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings
+from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings, TD3Settings
 
 UNIFORM_STD = 0.85
 """standard deviation of normal noise with a tanh that is uniform in [-1, 1] to one percent"""
@@ -48,7 +49,7 @@ class NormalizedReLU(nn.Module):
 
 
 class OffPolicyResidualMixin(BasePolicy):
-    """What the policies of off-policy learners share, as a base class before one of SB3's with a pair of critics."""
+    """Base class, before one of SB3's with a pair of critics, for a residual that starts with `zero_init` at zero."""
 
     critic_kwargs: dict[str, Any]
     reward_offset: Tensor
@@ -61,6 +62,13 @@ class OffPolicyResidualMixin(BasePolicy):
         )
         self.register_buffer("reward_offset", torch.zeros((), dtype=torch.float64))
 
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
+        """Return the actor, which takes the first `inputs` inputs."""
+        actor = super().make_actor(ActorInputExtractor(self.observation_space, self.inputs))  # pyright: ignore[reportAttributeAccessIssue]
+        if self.settings.zero_init:
+            zero_layer([layer for layer in actor.mu.modules() if isinstance(layer, nn.Linear)][-1])
+        return actor
+
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         """Return a pair of critics, which take all inputs and normalize their hidden layers."""
         self.critic_kwargs["activation_fn"] = NormalizedReLU
@@ -68,16 +76,13 @@ class OffPolicyResidualMixin(BasePolicy):
 
 
 class SquashedResidualPolicy(OffPolicyResidualMixin, SACPolicy):
-    """SB3's policy of SAC for a residual that starts, with `zero_init`, at zero, with noise of `exploration_std`."""
+    """SB3's policy of SAC for a residual with noise that starts with the standard deviation `exploration_std`."""
 
-    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """Return the actor, which takes the first `inputs` inputs."""
-        actor = super().make_actor(ActorInputExtractor(self.observation_space, self.inputs))
-        log_std = cast(nn.Linear, actor.log_std)
-        nn.init.zeros_(log_std.weight)
-        nn.init.constant_(log_std.bias, math.log(self.settings.exploration_std / self.settings.authority))
-        if self.settings.zero_init:
-            zero_layer(cast(nn.Linear, actor.mu))
+        actor = super().make_actor(features_extractor)
+        nn.init.zeros_(actor.log_std.weight)
+        nn.init.constant_(actor.log_std.bias, math.log(self.settings.exploration_std / self.settings.authority))
         return actor
 
     def network(self) -> Network:
@@ -86,6 +91,19 @@ class SquashedResidualPolicy(OffPolicyResidualMixin, SACPolicy):
         *hidden, (mean, mean_bias), (log_std, log_std_bias) = layers
         output = np.hstack([mean, log_std]), np.hstack([mean_bias, log_std_bias])
         return Network((*hidden, output), self.authority)
+
+
+class DeterministicResidualPolicy(OffPolicyResidualMixin, TD3Policy):
+    """SB3's policy of TD3 for a residual."""
+
+    @property
+    def exploration_std(self) -> float:
+        """Standard deviation of the exploration noise [m/s2]."""
+        return self.settings.exploration_std * self.authority / self.settings.authority
+
+    def network(self) -> Network:
+        """Return the policy as a NumPy network: the same residual to 1e-6, and the exploration noise."""
+        return Network(network_layers(self.actor.mu), self.authority, self.exploration_std)
 
 
 class OffPolicyLearner(Learner):
@@ -187,3 +205,22 @@ class SAC(OffPolicyLearner):
         """Return the filled part of the replay buffer and, if it is learned, the temperature."""
         learned = {} if self.sb3.log_ent_coef is None else {"log_ent_coef": self.sb3.log_ent_coef}
         return super()._shared_tensors() | learned
+
+
+class TD3(OffPolicyLearner):
+    """Twin delayed deep deterministic policy gradient (Fujimoto, van Hoof and Meger 2018) on whole episodes."""
+
+    def __init__(self, spec: AgentSpec, settings: TD3Settings) -> None:
+        kwargs = {
+            "policy_delay": settings.policy_delay,
+            "target_policy_noise": settings.target_noise,
+            "target_noise_clip": settings.target_noise_clip,
+        }
+        super().__init__(spec, settings, stable_baselines3.TD3, DeterministicResidualPolicy, **kwargs)
+
+    @torch.no_grad()
+    def residual_distribution(self, observations: Tensor) -> Normal:
+        """Return the residual and the standard deviation of its exploration noise [m/s2]."""
+        policy = self.sb3.policy
+        mean = policy.authority * policy.actor(observations).squeeze(1)
+        return Normal(mean, torch.full_like(mean, policy.exploration_std))

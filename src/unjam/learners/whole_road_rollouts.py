@@ -1,0 +1,284 @@
+"""Model rollouts on whole roads: closed ones drive on from recorded states, on-ramps are driven again."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from math import nan
+from typing import Any, Generic, TypeVar, cast
+
+import numpy as np
+
+from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.residual import EXPERT_KEY
+from unjam.learners.experience import Experience, join_experience
+from unjam.learners.learner import Tensors
+from unjam.learners.model_rollouts import (
+    FIT_SEED,
+    ExperienceFactory,
+    ModelRollouts,
+    RolloutPlan,
+    RolloutResult,
+    pack_tensors,
+    unpack_tensors,
+)
+from unjam.models.comparison import ReplayDriver, RoadTrajectories, Waves, road_trajectories
+from unjam.models.ensemble import Seed, torch_generator
+from unjam.models.environment_data import StartIndices, is_holdout_episode, reconstruct_memory
+from unjam.models.fitting import ModelFit
+from unjam.models.motorway_model import MotorwaySamples, fit_motorway_model, learned_correction, motorway_samples
+from unjam.models.road_model import (
+    RoadModel,
+    RoadSamples,
+    base_human_model,
+    check_road_model,
+    fit_road_model,
+    learned_human_model,
+    road_samples,
+    with_size,
+)
+from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.ring import LoopScenario
+from unjam.tree import map_leaves
+from unjam.worlds.batch.figure_eight.crossing import CrossingMemory
+from unjam.worlds.batch.human_idm import HumanSpeedModel
+from unjam.worlds.batch.on_ramp.traffic import LearnedCorrection
+from unjam.worlds.batch.on_ramp.world import MotorwayBatch, ReplayOptions
+from unjam.worlds.batch.ring.world import RingBatch
+from unjam.worlds.batch.run import MAX_BATCH_MOTORWAYS, start_batch_drive
+from unjam.worlds.drive import DriveLoop, finish_drive
+from unjam.worlds.episode import add_reward_terms
+from unjam.worlds.record import Episode, Floats
+from unjam.worlds.reward import make_reward
+from unjam.worlds.worker_pool import EpisodeTask
+
+WAVE_INTERVAL = 10.0
+"""time between the states of `Waves` on an on-ramp [s]"""
+SamplesT = TypeVar("SamplesT", RoadSamples, MotorwaySamples)
+
+
+class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
+    """The learned model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
+
+    sample_type: type[SamplesT]
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        check_road_model(self.scenario, self.settings)
+        self.samples: list[SamplesT] = []
+        """of the episodes in D_a, oldest first"""
+
+    def _new_model(self) -> RoadModel:
+        return RoadModel(self.settings, self._seed(FIT_SEED))
+
+    def _sample_episode(self, episode: Episode, number: int) -> SamplesT:
+        raise NotImplementedError
+
+    def _fit_samples(self, seed: Seed) -> ModelFit:
+        raise NotImplementedError
+
+    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+        raise NotImplementedError
+
+    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
+        """Return a holdout episode in environment and model; `run_episode` runs one where environment episodes run."""
+        raise NotImplementedError
+
+    def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
+        steps, returns, crashed, parts = 0, list[float](), list[bool](), list[Experience]()
+        reward = make_reward(self._task.reward or self.scenario.reward)
+        for batch in self._simulate_batches(plan):
+            episodes = [add_reward_terms(episode, reward) for episode in batch]
+            steps += sum(episode.control_steps for episode in episodes)
+            returns += [float(episode.reward.sum()) for episode in episodes]
+            crashed += [episode.status == "collision" for episode in episodes]
+            if any(episode.trajectories for episode in episodes):
+                parts.append(experience_factory.from_episodes(episodes))
+        experience = join_experience(parts) if parts else None
+        return RolloutResult(experience, steps, np.array(returns), {"crash_share": float(np.mean(crashed))})
+
+    @property
+    def _holdout_samples(self) -> SamplesT:
+        """The newest holdout episode, or the newest one if there is none."""
+        holdout, group_size = self.settings.holdout, len(self._policy.exploration_signs)
+        held_out = [each for each in self.samples if is_holdout_episode(each.episode // group_size, holdout)]
+        return (held_out or self.samples)[-1]
+
+    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
+        """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
+        first = self.data.episode_count
+        self.samples += [self._sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
+        super().learn(episodes, iteration)
+
+    def _fit_model(self, seed: Seed) -> ModelFit:
+        oldest = self.data.recordings[0].episode
+        self.samples = [each for each in self.samples if each.episode >= oldest]
+        return self._fit_samples(seed)
+
+    def state(self) -> tuple[dict[str, Any], Tensors]:
+        """Return all that a run needs to resume, as JSON and tensors."""
+        facts, tensors = super().state()
+        samples, sample_tensors = pack_tensors(self.samples, "samples")
+        return {**facts, "samples": samples}, tensors | sample_tensors
+
+    def restore(self, facts: dict[str, Any], tensors: Tensors) -> None:
+        """Resume from what `state` returned."""
+        super().restore(facts, tensors)
+        self.samples = unpack_tensors(list[self.sample_type], facts["samples"], tensors, "samples")
+
+
+class RoadRollouts(WholeRoadRollouts[RoadSamples]):
+    """The learned model of whole closed roads."""
+
+    sample_type = RoadSamples
+
+    def _sample_episode(self, episode: Episode, number: int) -> RoadSamples:
+        return road_samples(episode, number, cast(LoopScenario, self.scenario))
+
+    def _fit_samples(self, seed: Seed) -> ModelFit:
+        return fit_road_model(self.model, self.samples, self.settings, self.scenario, seed)
+
+    def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> StartIndices:
+        cavs_per_road = len(self.scenario.possible_cav_ids())
+        return super()._draw_starts(parts * cavs_per_road, seed, control_steps)
+
+    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+        rows = len(self.scenario.possible_cav_ids()) * len(plan.starts)
+        memory = plan.driver.initial_memory(rows) | {EXPERT_KEY: self._expert_memory(plan.starts)}
+        human_model = learned_human_model(self.model, self.scenario, torch_generator(plan.noise_seed, "cpu"))
+        yield self.simulate(plan.driver, memory, plan.starts, plan.control_steps, human_model, plan.exploration_seed)
+
+    def simulate(
+        self,
+        driver: Driver,
+        memory: Memory,
+        start_indices: StartIndices,
+        control_steps: int,
+        human_model: HumanSpeedModel,
+        seed: Seed,
+    ) -> list[Episode]:
+        """Return the episodes that follow recorded states; `seed` is that of all noise, and of sensor errors.
+
+        `driver` controls all CAVs and explores; its `memory` has all rows of the first CAV, then of the second.
+        """
+        road = cast(LoopScenario, self.scenario)
+        by_episode = {each.episode: each for each in self.samples}
+        samples = [by_episode[self.data.recordings[index].episode] for index, _ in start_indices]
+        pairs = [(each, at // each.interval) for each, (_, at) in zip(samples, start_indices, strict=True)]
+        noise = float(self.model.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
+        common = replace(road, horizon=control_steps, noise=noise if self.settings.add_noise else 0.0, population="")
+        world = RingBatch(
+            [with_size(common, each.size) for each in samples],
+            [(*seed, number) for number in range(len(samples))],  # of sensors alone: everything else is given
+            reward=self._task.reward,
+            draw=np.random.default_rng(list(seed)).standard_normal,
+            human_model=human_model,
+            allow_statistical=True,
+        )
+        world.place_vehicles(
+            np.stack([each.speeds[row] for each, row in pairs], 1),
+            np.stack([each.positions[row] for each, row in pairs], 1),
+            [
+                each.crossing_memory and CrossingMemory(*(values[row] for values in each.crossing_memory))
+                for each, row in pairs
+            ],
+        )
+        return finish_drive(start_batch_drive(world, driver, explore=True, memory=memory)).episodes
+
+    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
+        """Return a recorded holdout episode, and its CAVs' accelerations replayed in model and base with new noise."""
+        samples, recordings = self._holdout_samples, self.data.recordings
+        rows = [index for index, each in enumerate(recordings) if each.episode == samples.episode]
+        driver = ReplayDriver(np.stack([recordings[row].applied_acceleration for row in rows], 1))
+        human_models = {
+            "model": learned_human_model(self.model, self.scenario, torch_generator((0,), "cpu")),
+            "base": base_human_model(self.settings.base, self.scenario),
+        }
+        cav_columns = np.flatnonzero(samples.is_human == 0.0).tolist()
+        roads = {"recorded": RoadTrajectories(samples.speeds, samples.positions, np.zeros((0, 0)), cav_columns)}
+        start, memory = np.array([[rows[0], 0]]), driver.initial_memory(len(rows))
+        for label, human_model in human_models.items():
+            (episode,) = self.simulate(driver, memory, start, len(driver.accelerations), human_model, (1,))
+            roads[label] = road_trajectories(episode, samples.interval)
+        return Waves(samples.interval * self.scenario.control_step, samples.length, (), roads)
+
+    def _expert_memory(self, start_indices: StartIndices) -> Memory:
+        """Return the expert's memory: all rows of the first CAV, then of the second."""
+        cavs = len(self.scenario.possible_cav_ids())  # each episode has as many recordings
+        first = start_indices[:, 0] // cavs * cavs
+        starts = [np.column_stack([first + cav, start_indices[:, 1]]) for cav in range(cavs)]
+        memories = [reconstruct_memory(self._task.expert, self.data.recordings, each) for each in starts]
+        return map_leaves(lambda *values: np.concatenate(values), *memories)
+
+
+class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
+    """The learned model of an on-ramp."""
+
+    sample_type = MotorwaySamples
+
+    def _sample_episode(self, episode: Episode, number: int) -> MotorwaySamples:
+        return motorway_samples(episode, number, cast(OnRamp, self.scenario), self.model.base)
+
+    def _fit_samples(self, seed: Seed) -> ModelFit:
+        group_size = len(self._policy.exploration_signs)
+        return fit_motorway_model(self.model, self.samples, self.settings, seed, group_size)
+
+    @property
+    def _max_control_steps(self) -> int:
+        return min(self.k_star, self.scenario.horizon)
+
+    def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> list[MotorwaySamples]:
+        """Return random samples, each of them once for each sign of the exploration."""
+        new_episodes, signs = self.data.episode_count - self._first_new_episode, self._policy.exploration_signs
+        episodes = self.settings.model_ratio * new_episodes * self.scenario.horizon / control_steps
+        count = max(1, round(episodes / parts / len(signs)))
+        indices = np.random.default_rng(list(seed)).integers(len(self.samples), size=count).tolist()
+        return [self.samples[index] for index in indices for _ in signs]
+
+    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+        signs = self._policy.exploration_signs
+        for first in range(0, len(plan.starts), MAX_BATCH_MOTORWAYS):
+            samples = plan.starts[first : first + MAX_BATCH_MOTORWAYS]
+            numbers = range(first, first + len(samples))
+            groups = [number // len(signs) for number in numbers]
+            seeds = [((*plan.noise_seed, group), (*plan.exploration_seed, group)) for group in groups]
+            scales = [signs[number % len(signs)] for number in numbers]
+            correction = self._correction(self.model, seeds[0][0])
+            yield self.simulate(plan.driver, samples, plan.control_steps, correction, seeds, scales)
+
+    def _compare_returns(self, plan: RolloutPlan, returns: Floats) -> tuple[float | None, float | None]:
+        is_new = [samples.episode >= self._first_new_episode for samples in plan.starts]
+        if plan.control_steps < self.scenario.horizon or not any(is_new):
+            return None, None
+        recorded = np.array([samples.episode_return for samples in plan.starts])
+        return float(returns[is_new].mean()), float(recorded[is_new].mean())
+
+    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
+        """Return a holdout episode, run again, and what model and base make of its vehicles; the expert drives CAVs."""
+        road, expert, samples = self.scenario, self._task.expert, self._holdout_samples
+        recorded = run_episode(EpisodeTask(road, expert, samples.seed))
+        interval = max(1, round(WAVE_INTERVAL / road.control_step))
+        roads = {"recorded": road_trajectories(recorded, interval)}
+        for label, model in (("model", self.model), ("base", self._new_model())):
+            correction = self._correction(model, (0,))
+            (episode,) = self.simulate(expert, [samples], road.horizon, correction, [((1,), (2,))])
+            roads[label] = road_trajectories(episode, interval)
+        return Waves(interval * road.control_step, nan, recorded.lane_names, roads)
+
+    def simulate(
+        self,
+        driver: Driver,
+        samples: Sequence[MotorwaySamples],
+        control_steps: int,
+        correction: LearnedCorrection | None,
+        seeds: Sequence[tuple[Seed, Seed]],
+        exploration_scales: Sequence[float] | None = None,
+    ) -> list[Episode]:
+        """Return recorded episodes with the same vehicles, and seeds of human drivers' errors and of exploration."""
+        replay = ReplayOptions(seeds, control_steps, self.settings.add_noise, correction)
+        road, vehicle_seeds = cast(OnRamp, self.scenario), [each.seed for each in samples]
+        world = MotorwayBatch(road, vehicle_seeds, explore=exploration_scales, replay=replay)
+        world.measured_fields = driver.measured_fields
+        return finish_drive(DriveLoop(world, driver, 0.0 if exploration_scales is None else 1.0))
+
+    def _correction(self, model: RoadModel, seed: Sequence[int]) -> LearnedCorrection | None:
+        generator, steps = torch_generator(seed, "cpu"), self.scenario.steps_per_control_step
+        return learned_correction(model, generator, steps, self.settings.add_noise)
