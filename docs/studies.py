@@ -12,11 +12,10 @@ from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import with_no_break_spaces
 from unjam.measures.statistics import estimate_over_trainings
 from unjam_paper.comparison import COMPARISON_METRICS, estimate_metrics
-from unjam_paper.references import REFERENCE_DRIVERS, TUNED_REFERENCES
 from unjam_paper.results_file import read_parts
 from unjam_paper.studies import STUDIES
 from unjam_paper.study import STUDY_ROADS, interval_text, number_text
-from unjam_paper.variants import VARIANTS
+from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES, VARIANTS
 
 FREE = 15.0
 """mean speed of an episode on the merge in which no jam stayed [m/s]"""

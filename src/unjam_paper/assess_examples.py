@@ -19,16 +19,18 @@ from unjam.training.assess import Assessment, assess, make_request
 from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE, sumo_inputs
 from unjam.worlds.sumo.networks import network_file, xml_element
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.open_test_roads import OpenTestRoad, RoadSection, write_road_files
-from unjam_paper.results_file import read_optional_part, read_part, write_part
-from unjam_paper.road_files import (
+from unjam_paper.open_test_roads import (
     EPISODE_SECONDS,
+    OpenTestRoad,
+    RoadSection,
     connection_element,
     edge_element,
     node_element,
     write_configuration,
     write_network,
+    write_road_files,
 )
+from unjam_paper.results_file import read_optional_part, read_part, write_part
 from unjam_paper.study import NO_VALUE_TEXT, Study
 
 EXAMPLES_PART = "roads"

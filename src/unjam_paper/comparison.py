@@ -36,7 +36,6 @@ from unjam.reports.results import PlotEpisode, read_results, validation_gains
 from unjam.training.config import load_config
 from unjam.training.early_stopping import has_converged
 from unjam.worlds.record import Floats
-from unjam_paper.references import best_expert
 from unjam_paper.results_file import read_part, write_figure, write_part
 from unjam_paper.study import (
     FINAL_SHARE,
@@ -52,7 +51,7 @@ from unjam_paper.study import (
     planned_runs,
     trainings_text,
 )
-from unjam_paper.variants import VARIANTS
+from unjam_paper.variants import NON_EXPERTS, VARIANTS
 
 PAPER_RESULTS: dict[tuple[str, str], tuple[float, float, float]] = {
     ("ring", "trpo"): (1699.15, 3.42, 0.55),
@@ -124,6 +123,12 @@ def comparison_study(title: str, variants: Sequence[str], road: str = "ring") ->
 
     tables = {"checkpoints": partial(_checkpoint_table, road)}
     return Study(title, write, lambda seeds: planned_runs([road], variants, seeds), (road,), tables=tables)
+
+
+def best_expert(reference_rows: dict[str, Table], metric: str = "return") -> str:
+    """Return the label of the expert with the largest mean of a metric."""
+    experts = [label for label in reference_rows if label not in NON_EXPERTS]
+    return max(experts, key=lambda label: metric_estimate(reference_rows[label], metric).mean)
 
 
 def return_metric(road: str, variant: str) -> str:

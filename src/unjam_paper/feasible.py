@@ -135,9 +135,6 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
 }
 """changes to the actuation and the sensors of CAVs"""
 
-NamedRoads = Iterator[tuple[str, Scenario]]
-"""scenarios with their names"""
-
 
 @dataclass(frozen=True)
 class EvaluationRoad:
@@ -240,7 +237,8 @@ def _dissolution_text(times: Floats) -> str:
     return NO_VALUE_TEXT if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
 
 
-def _feasible_study(title: str, roads: Sequence[str], minutes: float, variant: str = "best") -> Study:
+def feasible_study(title: str, roads: Sequence[str], minutes: float, variant: str = "best") -> Study:
+    """Return the study that compares trainings of a variant with the tuned experts of closed roads."""
     return Study(
         title=title,
         write=partial(_write_feasible, roads, variant),
@@ -248,18 +246,6 @@ def _feasible_study(title: str, roads: Sequence[str], minutes: float, variant: s
         minutes=minutes,
         tables={road: partial(feasible_table, road) for road in roads},
     )
-
-
-FEASIBLE_RING = _feasible_study(
-    "feasible residual compared with the tuned expert, on the ring and the jammed ring", ("ring", "ring-jammed"), 20.0
-)
-FEASIBLE_FIGURE_EIGHT = _feasible_study(
-    "feasible residual compared with the tuned expert, on the figure eight", ("figure-eight",), 5.0
-)
-FEASIBLE_RING_JAMMED = _feasible_study(
-    "residual trained on the first half of jammed episodes compared with the tuned expert",
-    *(("ring-jammed",), 20.0, "first-150-seconds"),
-)
 
 
 def on_ramp_study(variants: Mapping[str, str]) -> Study:
@@ -329,7 +315,7 @@ def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
 
 def _write_envelope(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
     closed = tuple(CONTROLLER_ROADS)
-    parts: dict[str, tuple[NamedRoads, tuple[str, ...], int]] = {
+    parts: dict[str, tuple[Iterator[tuple[str, Scenario]], tuple[str, ...], int]] = {
         WORST_FILE: (iter(()), closed, 1),
         "rings": (envelope_rings(), closed, ENVELOPE_SEEDS),
         "figure-eights": (envelope_figure_eights(), closed, ENVELOPE_SEEDS),

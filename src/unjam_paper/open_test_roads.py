@@ -1,7 +1,7 @@
-"""Open roads of the study `do-no-harm` as user networks: their definitions and their files."""
+"""Small SUMO networks, as a user would write them: their files, and the open roads of the study `do-no-harm`."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, product
 from pathlib import Path
@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from unjam.physics.idm import IDMParameters, equilibrium_gap
-from unjam.worlds.sumo.networks import xml_element
-from unjam_paper.road_files import EPISODE_SECONDS, connection_element, edge_element, node_element, write_network
+from unjam.worlds.sumo.networks import run_netconvert, xml_element
 
+EPISODE_SECONDS, ROAD_SIMULATION_STEP = 900.0, 0.5
+"""length of an episode, and simulation step [s]"""
 CAR_LENGTH, TRUCK_LENGTH = 4.8, 12.0
 """lengths of vehicles [m]"""
 TRUCK_SPEED = 24.0
@@ -202,3 +203,53 @@ def _vehicle_types(road: OpenTestRoad) -> Iterator[str]:
     slow = {"accel": humans.max_acceleration / 2.0, "maxSpeed": TRUCK_SPEED, "vClass": "truck"}
     yield xml_element("vType", id="car", length=CAR_LENGTH, **shared, **fast)
     yield xml_element("vType", id="truck", length=TRUCK_LENGTH, **shared, **slow)
+
+
+def element_document(root: str, elements: Sequence[str]) -> str:
+    """Return an XML document with these elements below its root."""
+    return f"<{root}>{''.join(elements)}</{root}>"
+
+
+def node_element(name: str, x: float, y: float, kind: str = "priority") -> str:
+    """Return a node at a position [m]."""
+    return xml_element("node", id=name, x=round(x, 2), y=round(y, 2), type=kind)
+
+
+def edge_element(name: str, start: str, end: str, lanes: int, speed: float) -> str:
+    """Return an edge between two nodes with a speed limit [m/s]."""
+    return xml_element("edge", id=name, **{"from": start, "to": end}, numLanes=lanes, speed=speed, priority=3)
+
+
+def connection_element(start: str, end: str, lane: int, next_lane: int) -> str:
+    """Return a connection between lanes of two edges."""
+    return xml_element("connection", **{"from": start, "to": end}, fromLane=lane, toLane=next_lane)
+
+
+def write_network(
+    folder: Path,
+    nodes: Sequence[str],
+    edges: Sequence[str],
+    connections: Sequence[str],
+    traffic: Sequence[str],
+    *options: str,
+) -> Path:
+    """Write a network and its traffic with options of netconvert, and return the SUMO configuration."""
+    parts = {"node": ("nod", nodes), "edge": ("edg", edges), "connection": ("con", connections)}
+    inputs = {
+        (f"--{name}-files", f"road.{suffix}.xml"): element_document(f"{name}s", elements)
+        for name, (suffix, elements) in parts.items()
+        if elements
+    }
+    run_netconvert(inputs, ["--no-turnarounds=true", *options], folder)
+    (folder / "road.rou.xml").write_text(element_document("routes", traffic))
+    return write_configuration(folder, {})
+
+
+def write_configuration(folder: Path, options: Mapping[str, str]) -> Path:
+    """Write and return the SUMO configuration of `road.net.xml` and `road.rou.xml`."""
+    files = {"net-file": "road.net.xml", "route-files": "road.rou.xml"}
+    values = {**files, "end": EPISODE_SECONDS, "step-length": ROAD_SIMULATION_STEP, **options}
+    path = folder / "road.sumocfg"
+    lines = [xml_element(name, value=value) for name, value in values.items()]
+    path.write_text(element_document("configuration", lines))
+    return path

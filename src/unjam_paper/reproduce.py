@@ -6,19 +6,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from unjam.controller import make_driver
 from unjam.controller.file import WEIGHTS_PART, sha256_of, unpack_parts
 from unjam.errors import InputError, unknown_name
 from unjam.files import make_folder
 from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE
 from unjam.scenarios import SCENARIOS
+from unjam.training.config import load_config
+from unjam.training.evaluate import evaluate, raise_failures, save_evaluation
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.run_folder import read_config
+from unjam.training.seeds import make_test_seeds
+from unjam.worlds.episode import can_drive
+from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.parts import PartCallback
-from unjam_paper.references import drive_references
 from unjam_paper.results_file import collect_results, write_part
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
 from unjam_paper.study import STUDY_ROADS, PlannedRun, Study, StudyFolder, study_manifest
+from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES
 
 TRAINING_SECONDS: dict[str, dict[str, float]] = {
     "trpo": {"ring": 45, "figure-eight": 80, "merge": 900, "on-ramp": 170},
@@ -139,6 +145,20 @@ def run_plan(
         write_part(folder, "manifest", about)
         collect_results(folder)
     return [studies.folder / name for name in plan.names]
+
+
+def drive_references(road: str, study_folder: StudyFolder, workers: int) -> None:
+    """Evaluate the reference drivers of a road on the test seeds of the trainings."""
+    config = load_config(changes=STUDY_ROADS[road])
+    scenario = config.make_scenario()
+    names = {**REFERENCE_DRIVERS, **TUNED_REFERENCES.get(road, {})}
+    drivers = {label: make_driver(name, scenario.control_step) for label, name in names.items()}
+    drivers = {label: driver for label, driver in drivers.items() if can_drive(driver, scenario)}
+    with WorkerPool(workers) as pool:
+        evaluation = evaluate(scenario, drivers, make_test_seeds(config.evaluation.episodes), pool)
+    raise_failures(evaluation)
+    metadata = {"scenario": config.scenario, "manifest": manifest()}
+    save_evaluation(study_folder.reference_folder(road), evaluation, metadata)
 
 
 def _training_record(run: PlannedRun, study_folder: StudyFolder) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from unjam_paper.all_roads import (
 from unjam_paper.assess_examples import ASSESS_EXAMPLES
 from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study, road_model_study
 from unjam_paper.do_no_harm import DO_NO_HARM
-from unjam_paper.feasible import ENVELOPE, FEASIBLE_FIGURE_EIGHT, FEASIBLE_RING, FEASIBLE_RING_JAMMED, on_ramp_study
+from unjam_paper.feasible import ENVELOPE, feasible_study, on_ramp_study
 from unjam_paper.figure_6 import FIGURE_6
 from unjam_paper.robustness import FIGURE_10, ROBUSTNESS
 from unjam_paper.study import PAPER_ROADS, Study
@@ -54,9 +54,17 @@ STUDIES: dict[str, Study] = {
     ),
     **PAPER_EXACT_STUDIES,
     "robustness": ROBUSTNESS,
-    "feasible-ring": FEASIBLE_RING,
-    "feasible-figure-eight": FEASIBLE_FIGURE_EIGHT,
-    "feasible-ring-jammed": FEASIBLE_RING_JAMMED,
+    "feasible-ring": feasible_study(
+        "feasible residual compared with the tuned expert, on the ring and the jammed ring",
+        *(("ring", "ring-jammed"), 20.0),
+    ),
+    "feasible-figure-eight": feasible_study(
+        "feasible residual compared with the tuned expert, on the figure eight", ("figure-eight",), 5.0
+    ),
+    "feasible-ring-jammed": feasible_study(
+        "residual trained on the first half of jammed episodes compared with the tuned expert",
+        *(("ring-jammed",), 20.0, "first-150-seconds"),
+    ),
     "on-ramp-trained": on_ramp_study({"ramp-long": "residual on the expert tuned with the larger budget"}),
     "on-ramp-alternating": on_ramp_study({"ramp-alternating": "residual on unjam:on-ramp-tuned, alternating updates"}),
     "envelope": ENVELOPE,

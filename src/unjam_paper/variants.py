@@ -1,4 +1,4 @@
-"""Variants of training: the methods of the paper with its settings, and those of unjam."""
+"""Reference drivers that do not learn, and variants of training: the paper's methods with its settings, and unjam's."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -128,3 +128,33 @@ VARIANTS: dict[str, Variant] = {
     "all-roads-ppo": Variant("PPO", "all-roads", {**PPO_AGENT, **FROM_SCRATCH}, MILLION_STEPS),
 }
 """variants by name"""
+REFERENCE_DRIVERS: dict[str, str] = {
+    **{"human": "human", "zero": "constant", "constant +0.1": "constant:acceleration=0.1"},
+    **{"PI (paper)": "pi:time_constant=0", "PI": "pi", "FollowerStopper": "follower-stopper"},
+    **{"IDM": "idm", "ACC": "acc", "LACC": "lacc", "BCM": "bcm", "OVM": "ovm"},
+    **{"pacer": "pacer", "varying pacer": "pacer:use_tuned=true"},
+    "gentle varying pacer": "pacer:use_tuned=true,time_constant=1",
+    **{"jam absorber": "jam-absorber", "closing jam absorber": MERGE_JAM_ABSORBER},
+}
+"""drivers of all roads: label, and name as in `unjam drive`"""
+TUNED_REFERENCES: dict[str, dict[str, str]] = {
+    "ring": {"tuned PI": "unjam:ring-tuned", "tuned gap PI": "unjam:ring-gap-tuned"},
+    "ring-jammed": {"tuned gap PI": "unjam:ring-jammed-tuned"},
+    "ring-5": {
+        "tuned jam absorber": "jam-absorber:gap_gain=0.2656,speed_gain=0.9472,time_gap=0.7288,"
+        "standstill_gap=8.556,extra_acceleration=0.4562"
+    },
+    "ring-11": {
+        "tuned jam absorber": "jam-absorber:gap_gain=0.4263,speed_gain=1.443,time_gap=0.7305,"
+        "standstill_gap=4.266,extra_acceleration=0.09394"
+    },
+    "figure-eight": {
+        "tuned pacer": "pacer:lap_time=88.83,gap_gain=0.006993,target_gap=0.4577,time_constant=0.2108",
+        "tuned varying pacer": "unjam:figure-eight-tuned",
+    },
+    "on-ramp": {"tuned jam-ahead": "unjam:on-ramp-tuned"},
+}
+"""drivers that `unjam tune` found with at least the steps of a training (results/tuned.json), by road; on the merge no
+setting is feasible, so none is tuned"""
+NON_EXPERTS = ("human", "zero", "constant +0.1")
+"""reference drivers to which no residual is added"""

@@ -8,13 +8,13 @@ import pytest
 
 from unjam.cli import app
 from unjam.training.executors import CommandLine
-from unjam_paper import references, study
 from unjam_paper import reproduce as reproduction
+from unjam_paper import study
 from unjam_paper.comparison import comparison_study
 from unjam_paper.reproduce import make_plan, run_plan
 from unjam_paper.studies import STUDIES
 from unjam_paper.study import StudyFolder
-from unjam_paper.variants import VARIANTS, Variant
+from unjam_paper.variants import TUNED_REFERENCES, VARIANTS, Variant
 
 SMALL: dict[str, Any] = {
     "scenario": "ring",
@@ -46,8 +46,8 @@ def small_study() -> Iterator[pytest.MonkeyPatch]:
         patch.setitem(study.STUDY_ROADS, "small", SMALL)
         for name, variant in SMALL_VARIANTS.items():
             patch.setitem(VARIANTS, name, variant)
-        patch.setattr(references, "REFERENCE_DRIVERS", REFERENCES)
-        patch.setitem(references.TUNED_REFERENCES, "small", TUNED)
+        patch.setattr(reproduction, "REFERENCE_DRIVERS", REFERENCES)
+        patch.setitem(TUNED_REFERENCES, "small", TUNED)
         yield patch
 
 

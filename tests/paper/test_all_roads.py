@@ -39,6 +39,7 @@ def test_each_road_has_a_row_followed_by_mean_and_worst() -> None:
         assert table["unjam:best"].iloc[-1] == f"{worst:+.2f}"
 
 
+@pytest.mark.long
 def test_each_driver_has_mean_gains_and_the_difference_to_the_first() -> None:
     table = all_drivers_table(RESULTS).set_index("")
     first, *others = FAMILY_DRIVERS

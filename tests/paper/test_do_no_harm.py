@@ -16,7 +16,7 @@ from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper import do_no_harm, open_test_roads, road_files
+from unjam_paper import do_no_harm, open_test_roads
 from unjam_paper.do_no_harm import (
     ACC_BASELINE,
     DO_NO_HARM,
@@ -28,8 +28,7 @@ from unjam_paper.do_no_harm import (
     evaluate_harm,
     has_breakdown,
 )
-from unjam_paper.open_test_roads import OPEN_TEST_ROADS, OpenTestRoad, RoadSection, write_road_files
-from unjam_paper.road_files import EPISODE_SECONDS
+from unjam_paper.open_test_roads import EPISODE_SECONDS, OPEN_TEST_ROADS, OpenTestRoad, RoadSection, write_road_files
 from unjam_paper.study import StudyFolder
 
 
@@ -107,14 +106,9 @@ def test_sumo_loads_the_files_of_each_road(name: str, tmp_path: Path) -> None:
     assert ('type="traffic_light"' in network) == road.has_signals
 
 
-def set_episode_seconds(patch: pytest.MonkeyPatch, seconds: float) -> None:
-    for module in (open_test_roads, road_files):
-        patch.setattr(module, "EPISODE_SECONDS", seconds)
-
-
 def travel_time(road: OpenTestRoad, driver: str, seconds: float, folder: Path, simulation: Simulation) -> float:
     with pytest.MonkeyPatch.context() as patch:
-        set_episode_seconds(patch, seconds)
+        patch.setattr(open_test_roads, "EPISODE_SECONDS", seconds)
         file = write_road_files(road, folder)
     scenario = make_scenario(str(file), {"penetration_rate": 0.1, "steps_per_control_step": 2, **ACC_SETTINGS})
     made = make_driver(driver, scenario.control_step)
@@ -150,7 +144,7 @@ def test_the_study_ends_by_itself_and_can_be_resumed(tmp_path: Path, monkeypatch
     monkeypatch.setattr(do_no_harm, "OPEN_TEST_ROADS", short)
     monkeypatch.setattr(do_no_harm, "SEED_BATCH", 3)
     monkeypatch.setattr(do_no_harm, "PENETRATION_RATES", (0.4, 0.6))
-    set_episode_seconds(monkeypatch, 60.0)
+    monkeypatch.setattr(open_test_roads, "EPISODE_SECONDS", 60.0)
     run_each = WorkerPool.run_and_map
     batches: list[int] = []
 
