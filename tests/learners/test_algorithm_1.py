@@ -195,6 +195,7 @@ TO_LEARN: dict[str, LearnerSettings] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("target", "hold"), [(constant_target, 1), pytest.param(sloped_target, 5, marks=pytest.mark.slow)]
 )

@@ -98,6 +98,7 @@ def policy_of(trained: Trained) -> dict[str, torch.Tensor]:
     return dict(trained.learner.sb3.policy.state_dict())
 
 
+@pytest.mark.long
 @every_learner
 @pytest.mark.parametrize("update", ["union", "sequential"])
 def test_resumed_learner_has_the_same_model_and_data(agent: str, update: str, shared: Simulation) -> None:

@@ -65,7 +65,7 @@ def again(errs: bool, beyond: float = 0.0, seed: int = 9) -> Episode:
     return episode
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rollouts_have_the_same_vehicles_with_new_driver_errors(actual: list[Episode]) -> None:
     one, other = again(True), again(True, seed=10)
     for episode in (one, other):
@@ -77,7 +77,7 @@ def test_rollouts_have_the_same_vehicles_with_new_driver_errors(actual: list[Epi
     np.testing.assert_array_equal(again(False).speeds, again(False, seed=10).speeds)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_correction_changes_speeds_per_control_step() -> None:
     calm, pushed = again(False), again(False, beyond=-0.05)
     assert np.nanmean(pushed.speeds[40:]) < np.nanmean(calm.speeds[40:]) - 0.2
@@ -94,6 +94,7 @@ def test_base_step_differs_from_the_record_by_perception_errors(actual: list[Epi
     assert 0.3 < kept.noise_variance / float(np.square(wrong).mean()) < 1.5
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("often")
 def test_base_predicts_drivers_without_errors_except_for_their_memory() -> None:
     kept = motorway_samples(replace(again(False), seed=(0,), trajectories=()), 0, ROAD)

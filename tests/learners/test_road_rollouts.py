@@ -68,6 +68,7 @@ def learned_rollouts(road: LoopScenario, network: Network) -> tuple[RoadRollouts
     return model_rollouts, episodes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "road", [RING, replace(RING, warmup=300), EIGHT], ids=["a ring", "a ring with a wave", "a figure eight"]
 )
@@ -129,6 +130,7 @@ def test_too_short_k_star_gives_no_rollouts() -> None:
     assert model_rollouts.roll_out(network_of(0.0), 1, 0, 1, experience_factory(RING)) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("road", [RING, EIGHT], ids=["a ring", "a figure eight"])
 def test_state_and_restore_keep_samples_and_noise(road: LoopScenario) -> None:
     one, _ = learned_rollouts(road, network_of(0.05))

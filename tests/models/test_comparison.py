@@ -5,18 +5,16 @@ from tests.conftest import random_network
 from tests.models.toy_dynamics import RING, ToyDynamics, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.models.comparison import (
-    ReturnGap,
+    mean_returns,
     one_step_errors,
     open_loop_errors,
     recorded_states,
     replay_accelerations,
-    return_gap,
 )
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import EnvironmentData
-from unjam.models.fitting import fit_row_model
 from unjam.models.rollouts import prepare_starts, roll_out
-from unjam.models.row_model import STATE_FIELDS, RowModel
+from unjam.models.row_model import STATE_FIELDS, RowModel, fit_row_model
 from unjam.models.settings import ModelSettings
 
 DRIVER = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
@@ -103,28 +101,32 @@ def test_new_model_has_the_errors_of_its_base() -> None:
         np.testing.assert_array_equal(member, errors.base)
 
 
-def gap_of(driver: ResidualDriver, world: ToyDynamics, data: EnvironmentData) -> ReturnGap:
+def returns_of(driver: ResidualDriver, world: ToyDynamics, data: EnvironmentData) -> tuple[float, float]:
+    """Return the mean returns of model and environment."""
     starts = prepare_starts(data, data.start_indices(20), driver.expert, "cpu")
     rollouts = roll_out(driver, world, starts, 20, torch_generator((1,), "cpu"))
-    found = return_gap(rollouts.rewards.sum(1).double().numpy(), rollouts.start_indices, data, 18)
-    assert found is not None
-    return found
+    model, environment = mean_returns(
+        rollouts.rewards.sum(1).double().numpy(), rollouts.start_indices, data, control_steps=18
+    )
+    assert model is not None
+    assert environment is not None
+    return model, environment
 
 
-def test_exact_dynamics_have_no_return_gap() -> None:
+def test_exact_dynamics_have_the_returns_of_the_environment() -> None:
     world = ToyDynamics()
     data = actual_data(world, DRIVER, 6, 60, explore=False)
     quiet = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
     object.__setattr__(quiet.network, "exploration_std", 0.0)
-    found = gap_of(quiet, world, data)
-    choices = data.start_indices(20)
-    actual = [data.recordings[place].reward[at : at + 18].sum() for place, at in choices]
-    assert found.environment_return == pytest.approx(np.mean(actual))
-    assert found.model_return == pytest.approx(found.environment_return, abs=2e-3)
-    assert found.standard_error < 1e-3
+    model, environment = returns_of(quiet, world, data)
+    recorded = [data.recordings[index].reward[at : at + 18].sum() for index, at in data.start_indices(20)]
+    assert environment == pytest.approx(np.mean(recorded))
+    assert model == pytest.approx(environment, abs=2e-3)
 
 
-def test_higher_model_reward_gives_a_return_gap() -> None:
+def test_higher_model_reward_gives_a_higher_return() -> None:
     data = actual_data(ToyDynamics(), DRIVER, 6, 60)
-    found = gap_of(DRIVER, ToyDynamics(bonus=5.0), data)
-    assert found.model_return - found.environment_return > 5 * found.standard_error
+    exact, environment = returns_of(DRIVER, ToyDynamics(), data)
+    higher, same_environment = returns_of(DRIVER, ToyDynamics(bonus=5.0), data)
+    assert same_environment == environment
+    assert higher - environment > 5 * abs(exact - environment)

@@ -15,8 +15,8 @@ from unjam.drivers import LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import MAX_OBSERVED_GAP
 from unjam.drivers.safety import FollowingState
-from unjam.models.dynamics import CLIPPED_QUANTITIES, ModelDynamics, tensor_reward
 from unjam.models.ensemble import torch_generator
+from unjam.models.rollouts import CLIPPED_QUANTITIES, ModelDynamics, tensor_reward
 from unjam.models.row_model import STATE_FIELDS, TARGET_NAMES, RowModel, base_reward, base_step
 from unjam.models.settings import ModelSettings
 from unjam.scenarios import Ring

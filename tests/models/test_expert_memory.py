@@ -12,8 +12,8 @@ from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import COMMON_FIELDS, state_of_ones
 from unjam.drivers.user_driver import FileDriver
 from unjam.errors import InputError
-from unjam.models.dynamics import NumPyDriverAdapter, tensor_driver, tensor_memory
 from unjam.models.environment_data import EnvironmentData, reconstruct_memory
+from unjam.models.rollouts import NumPyDriverAdapter, tensor_driver, tensor_memory
 from unjam.scenarios import Ring
 from unjam.tree import leaves, map_leaves
 from unjam.worlds.episode import run_episode

@@ -8,10 +8,9 @@ from tests.conftest import random_network
 from tests.models.toy_dynamics import RING, ToyDynamics, actual_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.errors import UnjamError
-from unjam.models.ensemble import predict
+from unjam.models.ensemble import ModelFit, predict
 from unjam.models.environment_data import EnvironmentData, Transitions
-from unjam.models.fitting import ModelFit, fit_row_model, residual_targets
-from unjam.models.row_model import NOISE_SAMPLES, TARGET_NAMES, RowModel, model_inputs
+from unjam.models.row_model import NOISE_SAMPLES, TARGET_NAMES, RowModel, fit_row_model, model_inputs, residual_targets
 from unjam.models.settings import ModelSettings
 
 SETTINGS = ModelSettings(members=3, hidden=(32,), epochs=25, patience=6, batch_size=128, learning_rate=1e-2)

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from unjam.drivers import PISaturation
+from unjam.models.ensemble import OneStepRMSE, total_variation, transition_variation
 from unjam.models.environment_data import EnvironmentData, Transitions
-from unjam.models.fitting import (
+from unjam.models.row_model import (
+    TARGET_NAMES,
     OneStepErrors,
-    OneStepRMSE,
+    RowModel,
+    base_step,
     fit_row_model,
     recorded_noise,
-    total_variation,
-    transition_variation,
     unexplained_variance,
 )
-from unjam.models.row_model import TARGET_NAMES, RowModel, base_step
 from unjam.models.settings import ModelSettings
 from unjam.scenarios import FigureEight, Ring, Scenario
 from unjam.worlds.batch.run import run_batch

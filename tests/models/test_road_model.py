@@ -7,8 +7,7 @@ import torch
 
 from unjam.drivers import PISaturation
 from unjam.errors import InputError
-from unjam.models.ensemble import torch_generator
-from unjam.models.fitting import ModelFit
+from unjam.models.ensemble import ModelFit, torch_generator
 from unjam.models.road_model import (
     RoadModel,
     base_human_model,

@@ -15,10 +15,19 @@ from unjam.drivers import IDM, Constant, Driver, LocalState, PISaturation, Resid
 from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.user_driver import FileDriver
 from unjam.errors import UnjamError
-from unjam.models.dynamics import CLIPPED_QUANTITIES, ModelDynamics, ModelTransition
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import EnvironmentData
-from unjam.models.rollouts import RolloutBatch, draw_starts, prepare_starts, return_bound, roll_out, rollout_length
+from unjam.models.rollouts import (
+    CLIPPED_QUANTITIES,
+    ModelDynamics,
+    ModelTransition,
+    RolloutBatch,
+    draw_starts,
+    prepare_starts,
+    return_bound,
+    roll_out,
+    rollout_length,
+)
 from unjam.models.row_model import RowModel
 from unjam.models.settings import ModelSettings
 

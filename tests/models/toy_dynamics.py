@@ -8,8 +8,8 @@ from unjam.drivers import IDM, LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
 from unjam.drivers.safety import SafetyFilter
-from unjam.models.dynamics import ModelTransition
 from unjam.models.environment_data import EnvironmentData, Recording
+from unjam.models.rollouts import ModelDynamics, ModelTransition
 from unjam.physics.arrays import Array, as_column, namespace, stack_columns
 from unjam.scenarios import Ring
 from unjam.tree import map_leaves
@@ -19,7 +19,7 @@ LOOP = 230.0
 RING = Ring(length=(int(LOOP), int(LOOP)), safety=SafetyFilter(active=False))
 
 
-class ToyDynamics:
+class ToyDynamics(ModelDynamics):
     """IDM behind; ahead a vehicle that settles at a speed that depends on its gap to the CAV.
 
     `leader` 0: it keeps its speed, so that the base model `idm` is all there is to know.

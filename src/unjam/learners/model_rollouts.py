@@ -15,13 +15,20 @@ from unjam.following.calibration import calibrate_human_drivers
 from unjam.learners.experience import Experience
 from unjam.learners.learner import Tensors, tensors_with_prefix
 from unjam.learners.settings import PolicySettings
-from unjam.models.comparison import return_gap
-from unjam.models.dynamics import ModelDynamics, check_device
-from unjam.models.ensemble import Ensemble, Seed, torch_generator
+from unjam.models.comparison import mean_returns
+from unjam.models.ensemble import Ensemble, ModelFit, Seed, torch_generator
 from unjam.models.environment_data import EnvironmentData
-from unjam.models.fitting import ModelFit, fit_row_model
-from unjam.models.rollouts import RolloutBatch, draw_starts, prepare_starts, return_bound, roll_out, rollout_length
-from unjam.models.row_model import RowModel
+from unjam.models.rollouts import (
+    ModelDynamics,
+    RolloutBatch,
+    check_device,
+    draw_starts,
+    prepare_starts,
+    return_bound,
+    roll_out,
+    rollout_length,
+)
+from unjam.models.row_model import RowModel, fit_row_model
 from unjam.models.settings import ModelSettings
 from unjam.physics.idm import IDMParameters
 from unjam.tree import pack, unpack
@@ -159,8 +166,7 @@ class ModelRollouts(Generic[EnsembleT]):
     def _compare_returns(self, plan: RolloutPlan, returns: Floats) -> tuple[float | None, float | None]:
         """Return the mean returns of model and environment from starts in episodes of the newest policy."""
         is_new = [self.data.recordings[index].episode >= self._first_new_episode for index in plan.starts[:, 0]]
-        gap = return_gap(returns[is_new], plan.starts[is_new], self.data, plan.control_steps)
-        return (gap.model_return, gap.environment_return) if gap else (None, None)
+        return mean_returns(returns[is_new], plan.starts[is_new], self.data, plan.control_steps)
 
     def bound(self, eps_pi: float, gamma: float) -> float:
         """Return the bound C for this iteration; `gamma` is the discount from action to action."""

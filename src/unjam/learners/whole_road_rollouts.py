@@ -21,9 +21,8 @@ from unjam.learners.model_rollouts import (
     unpack_tensors,
 )
 from unjam.models.comparison import ReplayDriver, RoadTrajectories, Waves, road_trajectories
-from unjam.models.ensemble import Seed, torch_generator
+from unjam.models.ensemble import ModelFit, Seed, torch_generator
 from unjam.models.environment_data import StartIndices, is_holdout_episode, reconstruct_memory
-from unjam.models.fitting import ModelFit
 from unjam.models.motorway_model import MotorwaySamples, fit_motorway_model, learned_correction, motorway_samples
 from unjam.models.road_model import (
     RoadModel,

@@ -9,12 +9,10 @@ import torch
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
-from unjam.models.dynamics import ModelDynamics, to_device
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import EnvironmentData, StartIndices, Transitions
-from unjam.models.fitting import OneStepErrors, residual_targets
-from unjam.models.rollouts import ModelWorld, RolloutStarts
-from unjam.models.row_model import STATE_FIELDS, RowModel, model_inputs
+from unjam.models.rollouts import ModelDynamics, ModelWorld, RolloutStarts, to_device
+from unjam.models.row_model import STATE_FIELDS, OneStepErrors, RowModel, model_inputs, residual_targets
 from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import DriveLoop
@@ -102,19 +100,10 @@ def one_step_errors(model: RowModel, transitions: Transitions, scenario: Scenari
     return OneStepErrors(targets, predictions * model.output_mask.cpu().numpy(), change)
 
 
-class ReturnGap(NamedTuple):
-    """Mean return of model rollouts, and of the environment from the same starts over the same number of steps."""
-
-    model_return: float
-    environment_return: float
-    standard_error: float
-    """of their difference, for independent rows"""
-
-
-def return_gap(
+def mean_returns(
     model_returns: Floats, start_indices: StartIndices, data: EnvironmentData, control_steps: int
-) -> ReturnGap | None:
-    """Compare `model_returns`, (n,), with the recorded returns from the same starts.
+) -> tuple[float, float] | tuple[None, None]:
+    """Return the mean of `model_returns`, (n,), and that of the recorded returns from the same starts.
 
     The comparison is fair if the same policy drove both, with exploration. Returns are undiscounted sums of rewards up
     to the last step or a crash. Rows with fewer than `control_steps` recorded steps are skipped; None if none is left.
@@ -122,11 +111,9 @@ def return_gap(
     rewards = [data.recordings[index].reward[at : at + control_steps] for index, at in start_indices]
     is_complete = [len(each) == control_steps for each in rewards]
     if not any(is_complete):
-        return None
-    model = model_returns[is_complete]
+        return None, None
     environment = np.array([each.sum() for each in itertools.compress(rewards, is_complete)])
-    error = (model - environment).std() / np.sqrt(len(environment))
-    return ReturnGap(float(model.mean()), float(environment.mean()), float(error))
+    return float(model_returns[is_complete].mean()), float(environment.mean())
 
 
 class RoadTrajectories(NamedTuple):

@@ -1,7 +1,8 @@
-"""An ensemble of small networks, computed as one batched network: the learned part of a model."""
+"""An ensemble of small networks, computed as one: the learned part of a model, its fit, and its error eps_m."""
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import sqrt
 from typing import NamedTuple
 
@@ -221,3 +222,64 @@ def _train(
 def _member_losses(ensemble: Ensemble, inputs: Tensor, targets: Tensor) -> Tensor:
     """Return each member's mean squared error, shape (members,)."""
     return (ensemble(inputs) - targets).square().mean((1, 2))
+
+
+class OneStepRMSE(NamedTuple):
+    """One-step root mean squared errors on the holdout [m/s, m, reward]."""
+
+    base: float
+    """of the base alone"""
+    model: float
+    """of a member of the ensemble; of the base where it is better"""
+    change: float
+    """standard deviation of what is predicted: the change in the step, or the reward"""
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """The result of a fit."""
+
+    errors: dict[str, float]
+    """the model error eps_m by estimator
+
+    `unexplained_variance`: holdout mean squared error divided by the variance of the change, mean over `STATE_FIELDS`.
+    `transitions`: total variation between the next speeds of leader and follower as predicted by a member and as
+    drawn, see `transition_variation`. `total_variation`: between the distributions of the next state predicted by a
+    member and by the ensemble mean, averaged over the holdout; NaN for a single member. `training_loss`: mean squared
+    training error of the last epoch, in units of the targets' variance, as in the authors' code.
+    """
+    one_step: dict[str, OneStepRMSE]
+    """by name of `TARGET_NAMES`"""
+    learned_targets: tuple[str, ...]
+    """targets that the networks predict better than the base; the others are left to the base"""
+    training_rows: int
+    """per network"""
+    holdout_rows: int
+    epochs: int
+
+
+def root_mean_square(values: Floats) -> float:
+    """Return the root mean square of all values."""
+    return float(np.sqrt(np.square(values).mean()))
+
+
+def transition_variation(errors: Floats, noise: float) -> float:
+    """Return eps_m of the paper's theorem A3: Gaussians of std `noise`, means with `errors`, (..., quantities)."""
+    return _gaussian_variation(np.sqrt(np.square(errors).sum(-1)) / max(noise, MIN_CHANGE))
+
+
+def total_variation(predictions: Floats, noise: Floats) -> float:
+    """Return the mean total variation, in [0, 1], between Gaussians around a member's prediction and around the mean.
+
+    `predictions` has shape (members, rows, quantities), `noise`, the standard deviation of both, (quantities,). It is
+    NaN for a single member, since its error is unknown.
+    """
+    if len(predictions) == 1:
+        return float("nan")
+    variance = predictions.var(0, ddof=1) / np.square(noise.clip(MIN_CHANGE))
+    return _gaussian_variation(np.sqrt(variance.sum(-1)))
+
+
+def _gaussian_variation(distance: Floats) -> float:
+    """Return the mean total variation of unit Gaussians: TV(N(m1, s), N(m2, s)) = erf(|m1 - m2| / (2 sqrt 2 s))."""
+    return float(torch.erf(torch.as_tensor(distance) / (2.0 * sqrt(2.0))).mean())

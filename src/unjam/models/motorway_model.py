@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from unjam.errors import InputError
-from unjam.models.ensemble import Seed
-from unjam.models.fitting import ModelFit
+from unjam.models.ensemble import ModelFit, Seed
 from unjam.models.road_model import HumanRows, RoadModel, fit_human_model, residual_function
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Floats

@@ -18,9 +18,20 @@ from torch import Tensor
 
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.errors import InputError
-from unjam.models.ensemble import MIN_CHANGE, Ensemble, Seed, fit_ensemble, predict, random_members
+from unjam.models.ensemble import (
+    MIN_CHANGE,
+    Ensemble,
+    ModelFit,
+    OneStepRMSE,
+    Seed,
+    fit_ensemble,
+    predict,
+    random_members,
+    root_mean_square,
+    total_variation,
+    transition_variation,
+)
 from unjam.models.environment_data import is_holdout_episode
-from unjam.models.fitting import ModelFit, OneStepRMSE, root_mean_square, total_variation, transition_variation
 from unjam.models.row_model import BASE_DRIVERS
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Array, clamp_min

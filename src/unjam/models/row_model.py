@@ -1,23 +1,39 @@
 """The row model: a base model of a CAV, its leader and its follower, and an ensemble for its residual; Eq. 4."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from math import nan
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from unjam.drivers.car_following import ACC, IDM, MIN_IDM_GAP, OVM
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
-from unjam.models.ensemble import Ensemble, Seed
+from unjam.models.ensemble import (
+    MIN_CHANGE,
+    Ensemble,
+    EnsembleFit,
+    ModelFit,
+    OneStepRMSE,
+    Seed,
+    fit_ensemble,
+    root_mean_square,
+    total_variation,
+    transition_variation,
+)
+from unjam.models.environment_data import Transitions
 from unjam.models.settings import BaseName, ModelSettings
 from unjam.physics.arrays import Array, as_column, clamp_min, namespace, stack_columns
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.population import apply_population
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.reward import Outcome, Reward, time_gap
+from unjam.worlds.record import Floats
+from unjam.worlds.reward import Outcome, Reward, make_reward, time_gap
 
 SPEED_FIELDS = ("speed", "leader_speed", "follower_speed")
 GAP_FIELDS = ("leader_gap", "follower_gap")
@@ -129,3 +145,96 @@ class RowModel(Ensemble):
         self.register_buffer("noise", torch.zeros((NOISE_SAMPLES, len(TARGET_NAMES))))
         self.register_buffer("reward_range", torch.zeros(2))
         self.to(device)
+
+
+class OneStepErrors(NamedTuple):
+    """One-step prediction errors [m/s, m, reward]; R rows, columns as `TARGET_NAMES`."""
+
+    base: Floats
+    """of the base alone, shape (R, 6)"""
+    predictions: Floats
+    """of these errors, by each member of the ensemble, shape (members, R, 6)"""
+    change: Floats
+    """what is predicted: the change in the step, and the reward, shape (R, 6)"""
+
+    @property
+    def model(self) -> Floats:
+        """Errors of each member of the ensemble, shape (members, R, 6)."""
+        return self.base - self.predictions
+
+    def rmse_by_target(self) -> dict[str, OneStepRMSE]:
+        """Return the root mean squared errors, by name of `TARGET_NAMES`."""
+        parts = (np.moveaxis(each, -1, 0) for each in (self.base, self.model, self.change))
+        return {
+            name: OneStepRMSE(root_mean_square(base), root_mean_square(model), float(change.std()))
+            for name, base, model, change in zip(TARGET_NAMES, *parts, strict=True)
+        }
+
+
+def fit_row_model(
+    model: RowModel, transitions: Transitions, settings: ModelSettings, scenario: Scenario, reward: str, seed: Seed
+) -> ModelFit:
+    """Fit `model` further, in place, see `fit_ensemble`; the result depends on the arguments alone."""
+    generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
+    to_device: Any = {"device": model.input_mean.device}
+    columns = model_inputs(transitions.states, transitions.acceleration, transitions.drawn_values)
+    targets = torch.as_tensor(residual_targets(transitions, model.base, scenario, reward), **to_device)
+    model.reward_range.copy_(torch.stack([targets[:, -1].min(), targets[:, -1].max()]))
+    inputs = torch.as_tensor(columns, **to_device)
+    fit = fit_ensemble(model, inputs, targets, transitions.is_holdout, settings, generator)
+    error = fit.targets - fit.predictions.mean(0)
+    noise = error[generator.integers(len(error), size=NOISE_SAMPLES)] - error.mean(0)
+    model.noise.copy_(torch.as_tensor(noise))
+
+    holdout = transitions.select(fit.holdout_indices)
+    change = residual_targets(holdout, "none", scenario, reward)
+    one_step = OneStepErrors(fit.targets, fit.predictions, change).rmse_by_target()
+    errors = {
+        "unexplained_variance": unexplained_variance([one_step[name] for name in STATE_FIELDS]),
+        "transitions": _row_transition_variation(fit, holdout, scenario),
+        "total_variation": total_variation(fit.predictions[:, :, :-1], error[:, :-1].std(0)),
+        "training_loss": fit.loss,
+    }
+    learned = tuple(itertools.compress(TARGET_NAMES, model.output_mask.tolist()))
+    return ModelFit(errors, one_step, learned, fit.training_rows, len(fit.holdout_indices), fit.epochs)
+
+
+def residual_targets(transitions: Transitions, base: str, scenario: Scenario, reward: str) -> Floats:
+    """Return the residuals of `base`, (rows, 6), SI units; of `none`, the change of the state, and the reward."""
+    states, next_states, acceleration = transitions.states, transitions.next_states, transitions.acceleration
+    predicted = base_step(base, scenario, states, acceleration)
+    reward_function = make_reward(reward or scenario.reward)
+    predicted_reward = base_reward(base, reward_function, next_states, acceleration, transitions.crashed)
+    residual = [getattr(next_states, name) - getattr(predicted, name) for name in STATE_FIELDS]
+    return np.column_stack([*residual, transitions.reward - predicted_reward])
+
+
+def unexplained_variance(one_step: Sequence[OneStepRMSE]) -> float:
+    """Return the mean ratio of squared error to variance; a constant quantity counts as predicted."""
+    ratios = [(step.model / step.change) ** 2 if step.change > MIN_CHANGE else 0.0 for step in one_step]
+    return sum(ratios) / len(ratios)
+
+
+def recorded_noise(transitions: Transitions, scenario: Scenario) -> Floats | None:
+    """Return what noise added to the speeds of leader and follower in each control step, shape (rows, 2).
+
+    SUMO's drivers add it after they have moved, so that their distance gives the intended speed. Noise moves commanded
+    drivers too: then it is unknown, None.
+    """
+    if scenario.human_control != "native" or scenario.steps_per_control_step > 1:
+        return None
+    state, following, step = transitions.states, transitions.next_states, scenario.simulation_step
+    leader_intended = following.speed + (following.leader_gap - state.leader_gap) / step
+    follower_intended = following.speed - (following.follower_gap - state.follower_gap) / step
+    return np.column_stack([following.leader_speed - leader_intended, following.follower_speed - follower_intended])
+
+
+def _row_transition_variation(fit: EnsembleFit, transitions: Transitions, scenario: Scenario) -> float:
+    """Return `transition_variation` of leader and follower; unknown noise is subtracted from the errors' variance."""
+    columns = [TARGET_NAMES.index("leader_speed"), TARGET_NAMES.index("follower_speed")]
+    errors = (fit.targets - fit.predictions)[..., columns]
+    noise, sigma = recorded_noise(transitions, scenario), scenario.noise_per_step * scenario.simulation_step
+    if noise is not None:
+        return transition_variation(errors - noise, sigma)
+    excess = np.square(errors).mean((0, 1)) - sigma**2
+    return transition_variation(np.sqrt(excess.clip(0.0)), sigma)

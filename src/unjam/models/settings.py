@@ -52,7 +52,7 @@ class ModelSettings:
     """rollout length times model error, Eq. 15. The paper uses 2; with noisy human drivers most of the measured error
     is their noise, and model returns agree with environment returns over hundreds of steps"""
     error_estimator: ErrorEstimator = "unexplained_variance"
-    """estimator of the model error eps_m that sets the rollout length, see `unjam.models.fitting.ModelFit`"""
+    """estimator of the model error eps_m that sets the rollout length, see `unjam.models.ensemble.ModelFit`"""
     model_ratio: NonNegative = 5.0
     """model steps per environment step, at least one rollout in each iteration; 0: model-free"""
     rollout_starts: Literal["newest", "all", "first"] = "newest"

@@ -16,9 +16,9 @@ from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.learners.settings import PolicySettings
 from unjam.manifest import manifest
-from unjam.models.dynamics import check_device, to_device
 from unjam.models.ensemble import torch_generator
 from unjam.models.road_model import RoadModel, learned_human_model
+from unjam.models.rollouts import check_device, to_device
 from unjam.models.settings import Device, ModelSettings
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import MAX_HORIZON

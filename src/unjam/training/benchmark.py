@@ -16,10 +16,9 @@ import torch
 
 from unjam.drivers.residual import ResidualDriver
 from unjam.learners.settings import PolicySettings
-from unjam.models.dynamics import ModelDynamics
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import EnvironmentData
-from unjam.models.rollouts import draw_starts, prepare_starts, roll_out
+from unjam.models.rollouts import ModelDynamics, draw_starts, prepare_starts, roll_out
 from unjam.models.row_model import RowModel
 from unjam.models.settings import ModelSettings
 from unjam.scenarios import SCENARIOS

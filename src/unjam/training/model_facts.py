@@ -18,8 +18,8 @@ from unjam.learners.learner import tensors_with_prefix
 from unjam.learners.model_rollouts import RowRollouts
 from unjam.learners.whole_road_rollouts import WholeRoadRollouts
 from unjam.models.comparison import one_step_errors, open_loop_errors, recorded_states, replay_accelerations
-from unjam.models.fitting import OneStepErrors, root_mean_square
-from unjam.models.row_model import STATE_FIELDS, TARGET_NAMES, RowModel
+from unjam.models.ensemble import root_mean_square
+from unjam.models.row_model import STATE_FIELDS, TARGET_NAMES, OneStepErrors, RowModel
 from unjam.reports.results import MODEL_FILE, read_model_facts, read_progress
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig

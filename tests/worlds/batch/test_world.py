@@ -21,7 +21,7 @@ from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
-from unjam.models.dynamics import to_device
+from unjam.models.rollouts import to_device
 from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
@@ -175,7 +175,7 @@ def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.Monkey
     assert list(kept) == ["b", "c", "e", "f"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_it_stays_so_for_five_minutes(simulation: Simulation) -> None:
     ring, driver = Ring(cavs=2), driver_from_name("pi", 0.1)
     for found, seed in zip(run_batch(tasks(ring, driver, (7, 8))), (7, 8), strict=True):
@@ -348,6 +348,7 @@ def test_rings_differ_in_their_lengths_alone() -> None:
         run_batch([other[0], replace(other[1], reward="eq16")])
 
 
+@pytest.mark.long
 def test_who_of_a_mixture_drives_does_not_depend_on_the_other_rings() -> None:
     two = replace(SHORT, cavs=2)
     for ring in (SHORT, two):
