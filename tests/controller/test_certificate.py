@@ -112,6 +112,7 @@ def written(folder: Path, driver: Driver | None = None) -> Path:
     return file
 
 
+@pytest.mark.long
 def test_a_certificate_becomes_a_part_of_the_file_and_is_tried_again(tmp_path: Path) -> None:
     file = written(tmp_path)
     controller = read_controller(file)
@@ -124,6 +125,7 @@ def test_a_certificate_becomes_a_part_of_the_file_and_is_tried_again(tmp_path: P
     assert "No contact in" in (tmp_path / "page.html").read_text()
 
 
+@pytest.mark.long
 def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
     file = written(tmp_path)
     controller = read_controller(file)
@@ -140,6 +142,7 @@ def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_pa
         verify_controller_file(file)
 
 
+@pytest.mark.long
 def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
     file = written(tmp_path, filtered(FollowerStopper()))
     other = make_certificate(read_controller(file))
@@ -152,6 +155,7 @@ def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash
             verify_controller_file(file)
 
 
+@pytest.mark.long
 def test_counts_and_answers_of_a_certificate_are_compared_exactly(tmp_path: Path) -> None:
     file = written(tmp_path)
     for change in (

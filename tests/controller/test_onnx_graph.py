@@ -122,6 +122,7 @@ def same(driver: Driver) -> None:
     np.testing.assert_allclose(run_graph(part, driver, states), replay_states(driver, states, 1.0), atol=PARITY)
 
 
+@pytest.mark.long
 def test_the_graph_takes_any_number_of_vehicles_and_names_nothing_of_this_machine() -> None:
     driver = LACC()
     part = onnx_graph(driver, 0.5)

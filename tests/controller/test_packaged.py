@@ -57,7 +57,7 @@ def test_the_rings_earns_more_than_its_expert_on_every_seed() -> None:
     assert {found.document()["drivers"][number]["feasibility"] for number in (0, 1)} == {FEASIBLE}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_tuned_expert_earns_more_than_the_papers_on_ring_and_jammed_ring() -> None:
     for road in ("ring", "ring-jammed"):
         found = unjam.drive(road, ["pi", "unjam:ring-jammed-tuned"], episodes=2, workers=1)
@@ -65,7 +65,7 @@ def test_the_tuned_expert_earns_more_than_the_papers_on_ring_and_jammed_ring() -
         assert gain.smallest > 50
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_jammed_rings_earns_more_than_its_expert_and_ends_the_wave_sooner_than_pi() -> None:
     expert, trained = "unjam:ring-jammed-tuned", "unjam:ring-jammed-best"
     found = unjam.drive("ring-jammed", ["pi", expert, trained], episodes=2, workers=1)
@@ -113,7 +113,7 @@ def row_of(name: str, road: Ring | FigureEight, simulation: Simulation) -> dict[
     return measure(run_episode(road, make_driver(name, 0.1), (11,), simulation=simulation))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({*packaged_names()} - {"on-ramp-best"}))  # it must know a ramp
 def test_none_is_undrivable_on_roads_it_was_never_trained_on(name: str, simulation: Simulation) -> None:
     for road in [*RINGS, *EIGHTS]:

@@ -55,6 +55,7 @@ def test_the_same_seed_gives_the_same_observations() -> None:
     np.testing.assert_array_equal(*seen)
 
 
+@pytest.mark.long
 def test_passes_the_seed_test_of_pettingzoo() -> None:
     parallel_seed_test(lambda: unjam.parallel_env("ring", **SHORT), num_cycles=10)
 
@@ -85,6 +86,7 @@ def test_on_an_own_network_cavs_are_called_in_order_of_entry(tmp_path: Path) -> 
 MERGE: Any = {"horizon": 60, "penetration_rate": 0.3}
 
 
+@pytest.mark.long
 def test_the_merge_passes_the_checks_of_pettingzoo_without_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

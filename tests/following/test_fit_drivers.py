@@ -50,6 +50,7 @@ def test_the_typical_headway_is_one_that_suits_all(seed: int) -> None:
     assert 1.1 < found.typical.time_headway < 1.7
 
 
+@pytest.mark.long
 def test_a_residual_is_kept_where_it_is_better(pairs: list[Pair]) -> None:
     steps = MultiStepSettings(hidden=(4,), segment_seconds=5.0, batch_size=8, gradient_steps=2, validation_interval=1)
     settings = FitDriversSettings(calibration=CalibrationSettings(generations=2), residual=True, multi_step=steps)
@@ -82,6 +83,7 @@ def test_speeds_in_another_unit_than_gaps_are_doubted() -> None:
     assert line.startswith("warning: gaps change 0.28 times as fast as the speeds imply")
 
 
+@pytest.mark.long
 def test_a_file_becomes_a_population(data: Path) -> None:
     found = fit_drivers_from_files([data], CHANGES)
     assert len(found.population.drivers) == 3
@@ -91,16 +93,19 @@ def test_a_file_becomes_a_population(data: Path) -> None:
     assert found.facts()["drivers"] == 3
 
 
+@pytest.mark.long
 def test_a_population_names_no_folder_of_the_machine(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["unjam", "fit-drivers", str(data)])
     command = fit_drivers_from_files([data], CHANGES).population.metadata["manifest"]["command"]
     assert command == ["unjam", "fit-drivers", "data.parquet"]
 
 
+@pytest.mark.long
 def test_trajectories_can_be_chosen(data: Path) -> None:
     assert len(fit_drivers_from_files([data], CHANGES, filters={"kind": "human"}).population.drivers) == 2
 
 
+@pytest.mark.long
 def test_drivers_of_several_files_are_told_apart(data: Path, tmp_path: Path) -> None:
     other = Path(table(tmp_path / "other.parquet", [{}]))
     names = [one["name"] for one in fit_drivers_from_files([data, other], CHANGES).population.details]

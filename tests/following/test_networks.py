@@ -90,6 +90,7 @@ def known(seeds: range) -> CalibratedPairs:
     return CalibratedPairs(pairs, [PAPER_IDM] * len(pairs))
 
 
+@pytest.mark.long
 def test_a_residual_learns_what_the_base_lacks_when_it_drives() -> None:
     fitted = fit_multi_step(known(range(4)), known(range(4, 6)), LIMITS, DRIVING, seed=0)
     assert min(fitted.validation_errors) < 0.5 * fitted.validation_errors[0]

@@ -143,6 +143,7 @@ class Opener:
         return visit
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
 @pytest.mark.parametrize(
     ("report", "figures"),
@@ -162,6 +163,7 @@ def test_page_has_every_figure(
     assert all(width > 200 for width in widths)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "size", [PHONE, *map(mark_slow, (LAPTOP, (320, 640), (820, 1180)))], ids=lambda size: str(size[0])
 )

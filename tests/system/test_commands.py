@@ -65,7 +65,7 @@ def document(ran: subprocess.CompletedProcess[str]) -> Any:
     return json.loads(ran.stdout)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_train_on_several_roads_prints_a_table_for_each(unjam: Run, tmp_path: Path) -> None:
     mixture = tmp_path / "mixture.toml"
     mixture.write_text('[[tasks]]\nscenario_options = {length = [70, 70]}\n[[tasks]]\nname = "short"\n')
@@ -390,6 +390,7 @@ def wait_until(condition: Any, seconds: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.long
 def test_a_closed_pipe_is_no_error(tmp_path: Path) -> None:
     command = [str(UNJAM), "scenarios", "ring"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:

@@ -31,7 +31,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
     ("name", "argument", "words"),
     [
         pytest.param("train_ppo.py", 100, "over 3 episodes", marks=pytest.mark.slow),
-        ("plain_loop.py", 2, "episode 1: return"),
+        ("plain_loop.py", 1, "episode 0: return"),
     ],
 )
 def test_the_examples_run(name: str, argument: int, words: str, tmp_path: Path) -> None:

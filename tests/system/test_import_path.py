@@ -90,30 +90,33 @@ scenarios ring
 scenarios straight.sumocfg --picture road.png
 drivers
 drive ring --set horizon=20 --set warmup=0 -n 2 --workers 2 -d mine.py:gentle --out driven
+report driven --out page.html
+runs --folder .
+watch ring --set horizon=20 --set warmup=0 -d pi --video video.gif
+reproduce theory --dry-run
+"""
+SLOW_COMMANDS = """
 assess straight.sumocfg -d acc --penetration-rates 0.5 -n 34 --out assessed
 train --config small.toml --out run
 train --resume run --steps 200
 evaluate run -n 1
 model run
-report run driven --out page.html
-runs --folder .
 export run --out it.unjam --onnx
 verify it.unjam
 certify it.unjam
 keys maker
 sign it.unjam --key maker.key
-watch ring --set horizon=20 --set warmup=0 -d pi --video video.gif
 watch ring --set horizon=20 --set warmup=0 -d pi --video video.mp4
 search ring --config small.toml --vary trpo.target_kl=0.1,0.2 --trials 1 --out search
 tune ring --set horizon=20 --set warmup=0 --expert pi --steps 8000 --out tuned
 fit-drivers data.csv --set calibration.generations=2
-reproduce theory --dry-run
 """
 
 
 @pytest.mark.long
-def test_commands_import_nothing_from_the_working_folder(planted: Path, preloaded: Run) -> None:
-    for words in map(str.split, COMMANDS.strip().splitlines()):
+@pytest.mark.parametrize("commands", [COMMANDS, pytest.param(SLOW_COMMANDS, marks=pytest.mark.slow)], ids=["", "slow"])
+def test_commands_import_nothing_from_the_working_folder(commands: str, planted: Path, preloaded: Run) -> None:
+    for words in map(str.split, commands.strip().splitlines()):
         done = preloaded(*words, folder=planted, pictures=True)
         assert "Traceback" not in done.stderr, (words, done.stderr)
         assert done.returncode in ((0, 1) if words[0] == "certify" else (0,)), (words, done.stderr)
@@ -138,7 +141,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("name", "here"), [("script", "here"), ("notebook", "''")])
+@pytest.mark.parametrize(("name", "here"), [pytest.param("script", "here", marks=pytest.mark.slow), ("notebook", "''")])
 def test_children_of_a_program_import_nothing_from_its_folder(name: str, here: str, planted: Path) -> None:
     (planted / "program.py").write_text(SCRIPT.format(name=name, here=here))
     root = str(Path(__file__).parents[2])

@@ -25,6 +25,7 @@ def document(run: Run, *words: object) -> dict[str, Any]:
     return json.loads(ran.stdout)
 
 
+@pytest.mark.long
 def test_ignored_demand_is_in_terminal_json_and_report(unjam: Run, tmp_path: Path) -> None:
     straight(tmp_path, UNSORTED, end=90.0, step=0.5)
     drive = ("drive", "straight.sumocfg", "--penetration-rate", 0.5, "-d", "human", "-n", 2)
@@ -55,6 +56,7 @@ def test_traffic_without_vehicles_is_refused_in_one_line(words: tuple[str, ...],
     assert not list(tmp_path.glob("runs/*"))
 
 
+@pytest.mark.long
 def test_the_proposed_begin_helps_also_in_python(tmp_path: Path) -> None:
     file, options = str(straight(tmp_path, LATE, step=0.5)), {"penetration_rate": 0.5}
     with pytest.raises(InputError, match=NONE_ENTERED):
@@ -85,6 +87,7 @@ def test_overlaps_at_junctions_that_sumo_ignores_do_not_end_the_baseline(unjam: 
     assert [few[name] for name in traffic] == [half[name] for name in traffic]
 
 
+@pytest.mark.long
 def test_assess_refuses_a_baseline_that_a_limit_of_teleports_ends(unjam: Run, tmp_path: Path) -> None:
     options = TELEPORTS + '<max-num-teleports value="0"/>'
     straight(tmp_path, STANDING, end=120.0, step=0.5, options=options)

@@ -242,6 +242,7 @@ def with_weights_of(kind: type) -> bytes:
     return controller_bytes(HELD, {}, parts)
 
 
+@pytest.mark.long
 def test_special_files_are_not_written_to(unjam: Run, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.html")
     assert unjam("drive", "ring", "--driver", "pi", *SMALL, "--out", "new", pictures=False).returncode == 0

@@ -70,6 +70,15 @@ CASES = {
     "verify": Case(["verify", "run"], "run", is_read_only=True),
     "runs remove": Case(["runs", "remove", "run", "--folder", ".", "--yes"], "run"),
 }
+SLOW = ("search", "tune", "calibrate", "assess", "certify", "fit-drivers", "watch, .mp4", "resume, several roads")
+BASE = {
+    "search": [*SEARCH, "--trials", "1"],
+    "tune": TUNE,
+    "calibrate": CASES["calibrate"].words,
+    "resume, several roads": [*TINY_RUN, "--config", "roads.toml", "--steps", "160", "--out", "roads"],
+}
+"""what makes the files that a command continues"""
+PARAMETERS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CASES]
 TOO_LONG = {"reproduce": (Case(STUDY, "studies"), ("configs", "runs", "logs", "references", "table-1"))}
 """commands that take hours, and the names that they write, where links are refused at the start"""
 SYMBOLIC = [kind for kind in KINDS if kind != "hard link"]
@@ -79,7 +88,7 @@ RANDOM = re.compile(r"\.[0-9a-f]{16}(\.part)?$")
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory, preloaded: Run) -> Path:
-    """Make a folder with examples of all files that commands write or continue."""
+    """Make a folder with examples of the files that commands write or continue."""
     place = tmp_path_factory.mktemp("base")
     (place / "files").mkdir()
     (place / "studies").mkdir()
@@ -89,16 +98,22 @@ def base(tmp_path_factory: pytest.TempPathFactory, preloaded: Run) -> Path:
     (place / "roads.toml").write_text(TWO_ROADS)
     for words in (
         [*TINY_RUN, "--steps", "160", "--out", "run", "--tensorboard"],
-        [*TINY_RUN, "--config", "roads.toml", "--steps", "160", "--out", "roads"],
-        [*SEARCH, "--trials", "1"],
-        TUNE,
-        CASES["calibrate"].words,
         ["export", "run", "--out", "files/it.unjam"],
         ["keys", "files/maker"],
     ):
         ran = preloaded(*words, folder=place, pictures=False)
         assert ran.returncode == 0, ran.stderr
     return place
+
+
+def complete_base(command: str, base: Path, tmp_path: Path, preloaded: Run) -> Path:
+    """Return the base with the files that a command continues."""
+    if command not in BASE:
+        return base
+    copy = shutil.copytree(base, tmp_path / "base")
+    ran = preloaded(*BASE[command], folder=copy, pictures=False)
+    assert ran.returncode == 0, ran.stderr
+    return copy
 
 
 class Sandbox:
@@ -152,9 +167,9 @@ def plantings(written: dict[str, bool]) -> list[list[tuple[str, str]]]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("command", CASES)
+@pytest.mark.parametrize("command", PARAMETERS)
 def test_commands_do_not_write_through_links(command: str, base: Path, tmp_path: Path, preloaded: Run) -> None:
-    case = CASES[command]
+    case, base = CASES[command], complete_base(command, base, tmp_path, preloaded)
     written = written_by(case, base, tmp_path / "first", preloaded)
     assert not case.is_read_only or not written
     for number, planted in enumerate(filter(None, plantings(written))):
@@ -197,9 +212,10 @@ CHANGES = "mkdir,mkdirat,rename,renameat,renameat2,unlink,unlinkat,rmdir,link,li
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("strace"), reason="no strace")
 @pytest.mark.parametrize("command", CASES)
-def test_commands_write_relative_to_open_folders(command: str, base: Path, tmp_path: Path) -> None:
+def test_commands_write_relative_to_open_folders(command: str, base: Path, tmp_path: Path, preloaded: Run) -> None:
     """All system calls are checked, including those of other packages and programs."""
-    case, scene, log = CASES[command], Sandbox(base, tmp_path, CASES[command].folder), tmp_path / "log"
+    case, log, base = CASES[command], tmp_path / "log", complete_base(command, base, tmp_path, preloaded)
+    scene = Sandbox(base, tmp_path, case.folder)
     trace = ["strace", "-f", "-qq", "-y", "-s", "4096", "-e", f"trace=open,creat,openat,{CHANGES}", "-o", str(log)]
     environment = {**os.environ, **PLAIN}
     ran = subprocess.run(

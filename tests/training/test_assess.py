@@ -148,6 +148,7 @@ def test_result_does_not_depend_on_the_number_of_workers(
     assert again.document["candidates"] == answer.document["candidates"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "vehicle",
     ['<vType id="own" sigma="0"/>', '<vType id="own" vClass="truck" accel="0.5" maxSpeed="18" sigma="0"/>'],
@@ -163,6 +164,7 @@ def test_vehicle_properties_alone_give_no_gain(vehicle: str, tmp_path: Path) -> 
     assert found.acc_results[0].effect.travel_time.mean >= -0.1
 
 
+@pytest.mark.long
 def test_seeds_without_a_cav_use_the_human_baseline(file: str, tmp_path: Path) -> None:
     few = make_request(file, [0.06], 20, 0.02, None, ["acc"], HELD)
     with WorkerPool(2) as workers:

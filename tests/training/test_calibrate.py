@@ -92,7 +92,7 @@ def test_calibration_improves_the_agreement(asked: Corridor, done: tuple[Path, C
     assert read_sumo_files(asked.files.path) == asked.files  # the files have not changed
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_written_network_has_the_reported_agreement(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     folder, found = done
     files = read_sumo_files(folder / CALIBRATED_NETWORK_FILE)

@@ -57,6 +57,7 @@ def assert_same(found: Arrays, expected: Arrays) -> None:
         assert found[name].tobytes() == array.tobytes()
 
 
+@pytest.mark.long
 @given(FACTS, ARRAYS)
 def test_a_message_arrives_as_it_was_sent(facts: dict[str, Any], arrays: Arrays) -> None:
     found, found_arrays = read_message(BytesIO(frame(facts, arrays)))

@@ -148,6 +148,7 @@ def test_any_number_of_workers_gives_the_same_bytes_as_this_process(count: int, 
     assert [episode.status for episode in first] == ["completed"] * 3 + ["collision"] + ["completed"] * 2
 
 
+@pytest.mark.long
 def test_episodes_are_in_the_order_of_their_tasks() -> None:
     horizons = [6000, 10, 3000, 20, 30, 1000, 40]
     tasks = [EpisodeTask(Ring(horizon=horizon), IDM(), (seed,)) for seed, horizon in enumerate(horizons)]
@@ -258,6 +259,7 @@ def test_a_worker_stopped_while_idle_is_noticed_also_by_a_task_larger_than_the_p
     assert fingerprint(found) == fingerprint(run_episode(SHORT, large, (0,)))
 
 
+@pytest.mark.long
 def test_a_driver_that_always_kills_its_process_fails_alone_after_three_attempts(drivers: Path) -> None:
     good = [EpisodeTask(SHORT, IDM(), (seed,)) for seed in range(4)]
     bad = EpisodeTask(SHORT, FileDriver(drivers, "kills_its_process"), (7, 8))
@@ -358,6 +360,7 @@ def test_sumos_error_message_is_reported_and_the_worker_continues(workers: Worke
     assert fingerprint(found) == fingerprint(run_episode(SHORT, IDM(), (0,)))
 
 
+@pytest.mark.long
 def test_every_task_has_an_episode_whatever_happens(my_drivers: Path, drivers: Path) -> None:
     tasks = [
         EpisodeTask(SHORT, driver, (seed,), reward)

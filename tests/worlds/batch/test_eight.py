@@ -71,7 +71,7 @@ def test_from_each_of_sumos_moments_a_step_is_sumos(expert: str, simulation: Sim
     assert (found > 1e-4).sum() <= 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_whole_episodes_are_alike(simulation: Simulation) -> None:
     eight, seeds = FigureEight(), range(3)
     found = run_batch(tasks(eight, "idm", seeds), allow_statistical=True)
@@ -113,6 +113,7 @@ def test_who_waits_is_known_from_the_record(monkeypatch: pytest.MonkeyPatch) -> 
     np.testing.assert_array_equal(found.entry_step[:-1], entered)
 
 
+@pytest.mark.long
 def test_tensors_do_what_arrays_do() -> None:
     def doubles(values: Floats) -> Tensor:
         return torch.as_tensor(values)

@@ -269,7 +269,7 @@ def test_nobody_touches_anybody_or_is_lost(driven: dict[str, list[Episode]]) -> 
         assert episode.audit.human_braking.max_braking <= 9.0 + 1e-9
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_each_road_has_its_own_driver_and_exploration() -> None:
     road = replace(SHORT, horizon=150, penetration_rate=0.3)
     drivers = [driver_of("jam-ahead"), driver_of("cruise"), driver_of("gap-maker")]

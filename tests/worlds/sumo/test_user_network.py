@@ -362,6 +362,7 @@ def test_a_vehicle_that_sumo_refuses_later_is_reported_in_one_line(tmp_path: Pat
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.long
 def test_an_error_of_sumo_during_the_episode_is_reported_in_one_line(tmp_path: Path) -> None:
     flow = '<flow id="f" type="car" from="road" to="road" begin="0" end="690" period="9"/>'
     late = flow + '<trip id="w" type="car" from="road" to="road" depart="690"/>'  # so far SUMO reads ahead
