@@ -3,10 +3,10 @@
 Rings are stepped in batches, which equal SUMO's except for rounding. Drivers do not know of the change.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -47,11 +47,13 @@ ADAPTATION_DRIVERS = {
     **{HUMAN_LABEL: "human", PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
     **{"FollowerStopper": "follower-stopper", "unjam:best": "unjam:best"},
 }
-HURRIED_IDM = replace(PAPER_IDM, **AGGRESSIVE_IDM)
 
 
 class ChangingRings(RingBatch):
     """Rings on which something changes in control step `CHANGE_STEP`."""
+
+    humans_after: ClassVar[IDMParameters] = PAPER_IDM
+    """parameters of the human drivers after the change"""
 
     @property
     def has_changed(self) -> bool:
@@ -74,9 +76,11 @@ class WaveArrives(ChangingRings):
 class HumansChange(ChangingRings):
     """Human drivers follow closer, and accelerate and brake harder after the change."""
 
+    humans_after = replace(PAPER_IDM, **AGGRESSIVE_IDM)
+
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
         if self.has_changed:
-            self._human_parameters = HURRIED_IDM
+            self._human_parameters = self.humans_after
         return super()._human_speeds(speed, leader)
 
 
@@ -93,32 +97,24 @@ class CAVSwitchesOff(ChangingRings):
         super().advance(command)
 
 
-@dataclass(frozen=True)
-class RoadChange:
-    """A change on a road."""
-
-    ring: Ring
-    world: type[ChangingRings]
-    humans: IDMParameters = PAPER_IDM
-    """parameters of the human drivers after the change"""
-
-
-TWO_CAVS = Ring(length=(440, 540), vehicles=44, cavs=2, horizon=END_STEP, warmup=SHORT_WARM_UP)
-ROAD_CHANGES: dict[str, RoadChange] = {
-    "a wave arrives": RoadChange(Ring(horizon=END_STEP), WaveArrives),
-    "human drivers change": RoadChange(Ring(horizon=END_STEP, warmup=SHORT_WARM_UP), HumansChange, HURRIED_IDM),
-    "one of two CAVs switches off": RoadChange(TWO_CAVS, CAVSwitchesOff),
+ROAD_CHANGES: dict[str, tuple[Ring, type[ChangingRings]]] = {
+    "a wave arrives": (Ring(horizon=END_STEP), WaveArrives),
+    "human drivers change": (Ring(horizon=END_STEP, warmup=SHORT_WARM_UP), HumansChange),
+    "one of two CAVs switches off": (
+        Ring(length=(440, 540), vehicles=44, cavs=2, horizon=END_STEP, warmup=SHORT_WARM_UP),
+        CAVSwitchesOff,
+    ),
 }
 
 
 def _measure_speeds(name: str, driver: str) -> dict[str, list[Any]]:
     """Return the mean speed of all vehicles in each second and the limit after the change, by episode [m/s]."""
-    change = ROAD_CHANGES[name]
-    rings = [change.ring.stratum(number, ADAPTATION_EPISODES) for number in range(ADAPTATION_EPISODES)]
-    world = change.world(rings, make_test_seeds(ADAPTATION_EPISODES))
-    episodes = finish_drive(start_batch_drive(world, make_driver(driver, rings[0].control_step))).episodes
+    ring, world = ROAD_CHANGES[name]
+    rings = [ring.stratum(number, ADAPTATION_EPISODES) for number in range(ADAPTATION_EPISODES)]
+    changing = world(rings, make_test_seeds(ADAPTATION_EPISODES))
+    episodes = finish_drive(start_batch_drive(changing, make_driver(driver, ring.control_step))).episodes
     speeds = [episode.speeds[1:].mean(1).reshape(-1, STEPS_PER_SECOND).mean(1) for episode in episodes]
-    after = replace(change.ring, humans=change.humans)
+    after = replace(ring, humans=world.humans_after)
     limits = [after.limit_speed(episode.drawn_values[after.size_parameter]) for episode in episodes]
     return {"limits": limits, "speeds": [values.round(4).tolist() for values in speeds]}
 

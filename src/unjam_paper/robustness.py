@@ -6,8 +6,9 @@ the experiment of Sugiyama et al. (2008), 22 cars on 230 m, a jam arose without 
 traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from functools import partial
+from itertools import product
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,6 @@ from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics, write_comparison_table
-from unjam_paper.parts import PartCallback
 from unjam_paper.results_file import read_part, write_part
 from unjam_paper.study import (
     STUDY_ROADS,
@@ -59,39 +59,30 @@ WAVE_LAG = 8.0
 """time between the two compared speed profiles [s]: a wave moves far less than half a lap in it"""
 MIN_WAVE_STD = 0.5
 """standard deviation of the speed along the road below which there is no wave [m/s]"""
-
-
-@dataclass(frozen=True)
-class Condition:
-    """A difference from training."""
-
-    name: str
-    scenario_changes: dict[str, Any] = field(default_factory=dict)
-    impairments: dict[str, float] = field(default_factory=dict)
-    """arguments of `ImpairedDriver`"""
-
-
-TRAINING_CONDITION = Condition("as in training")
-RING_CONDITIONS = (
-    TRAINING_CONDITION,
-    Condition("twice the noise", {"noise": 0.4}),
-    Condition("NGSIM drivers", {"humans": NGSIM_IDM}),
-    Condition("gaps ± 0.5 m", impairments={"gap_noise": 0.5}),
-    Condition("0.3 s delay", impairments={"delay": 0.3}),
-    Condition("two CAVs", {"cavs": 2}),
-    Condition("one CAV in 44, 520 m", {"vehicles": 44, "length": [520, 520]}),
-    Condition("200 to 219 m", {"length": [200, 219]}),
-    Condition("271 to 300 m", {"length": [271, 300]}),
-)
-ROAD_CONDITIONS: dict[str, tuple[Condition, ...]] = {
-    "ring": (*RING_CONDITIONS, Condition("after ten minutes of jam", {"warmup": 6000})),
-    "ring-jammed": (*RING_CONDITIONS, Condition("before there is a jam", {"warmup": 0})),
-    "figure-eight": (
-        *RING_CONDITIONS[:6],
-        Condition("radius 30 m", {"radius": [30, 30]}),
-        Condition("radius 36 to 38 m", {"radius": [36, 38]}),
-        Condition("twice as long", {"horizon": 3000}),
-    ),
+COMMON_CONDITIONS: dict[str, dict[str, Any]] = {
+    "as in training": {},
+    "twice the noise": {"noise": 0.4},
+    "NGSIM drivers": {"humans": NGSIM_IDM},
+    "gaps ± 0.5 m": {"impairments": {"gap_noise": 0.5}},
+    "0.3 s delay": {"impairments": {"delay": 0.3}},
+    "two CAVs": {"cavs": 2},
+}
+"""differences from training: changes to the scenario, and `impairments`, the arguments of `ImpairedDriver`"""
+RING_CONDITIONS: dict[str, dict[str, Any]] = {
+    **COMMON_CONDITIONS,
+    "one CAV in 44, 520 m": {"vehicles": 44, "length": [520, 520]},
+    "200 to 219 m": {"length": [200, 219]},
+    "271 to 300 m": {"length": [271, 300]},
+}
+ROAD_CONDITIONS: dict[str, dict[str, dict[str, Any]]] = {
+    "ring": {**RING_CONDITIONS, "after ten minutes of jam": {"warmup": 6000}},
+    "ring-jammed": {**RING_CONDITIONS, "before there is a jam": {"warmup": 0}},
+    "figure-eight": {
+        **COMMON_CONDITIONS,
+        "radius 30 m": {"radius": [30, 30]},
+        "radius 36 to 38 m": {"radius": [36, 38]},
+        "twice as long": {"horizon": 3000},
+    },
 }
 ROAD_CONTROLLERS = {
     "ring": ("unjam:ring-best", "unjam:ring-gap-tuned"),
@@ -122,11 +113,12 @@ def condition_rows(road: str, worker_count: int, episodes: int = CONDITION_EPISO
     trained, tuned = ROAD_CONTROLLERS[road]
     names = {HUMAN_LABEL: HUMAN_LABEL, TUNED_EXPERT: tuned, TRAINED_LABEL: trained}
     with WorkerPool(worker_count) as workers:
-        for condition in ROAD_CONDITIONS[road]:
-            options = {f"scenario_options.{key}": value for key, value in condition.scenario_changes.items()}
-            found = _drive_named({**STUDY_ROADS[road], **options}, names, episodes, workers, **condition.impairments)
+        for condition, changes in ROAD_CONDITIONS[road].items():
+            options = {f"scenario_options.{key}": value for key, value in changes.items() if key != "impairments"}
+            impairments = changes.get("impairments", {})
+            found = _drive_named({**STUDY_ROADS[road], **options}, names, episodes, workers, **impairments)
             for label, own in found.items():
-                row: dict[str, Any] = {"road": road, "condition": condition.name, "driver": label}
+                row: dict[str, Any] = {"road": road, "condition": condition, "driver": label}
                 row |= {"feasibility": overall_feasibility(own, found[HUMAN_LABEL])}
                 row |= estimate_metrics(own, ROBUSTNESS_METRICS)
                 gain = paired_difference(own, found[TUNED_EXPERT], "mean_speed")
@@ -172,8 +164,8 @@ def _robustness_table(road: str, folder: Path) -> pd.DataFrame:
 def transfer_rows(study_folder: StudyFolder, seeds: int, worker_count: int = 2) -> Table:
     """Return the metrics of controllers trained with 22 vehicles on roads with other numbers, without training."""
     names = {"human": "human", "pi": "pi"}
-    for run in (PlannedRun(TRANSFER_SOURCE, variant, seed) for variant in TRANSFER_VARIANTS for seed in range(seeds)):
-        names[f"{run.variant} {run.seed}"] = str(study_folder.run_folder(run))
+    for variant, seed in product(TRANSFER_VARIANTS, range(seeds)):
+        names[f"{variant} {seed}"] = str(study_folder.run_folder(PlannedRun(TRANSFER_SOURCE, variant, seed)))
     with WorkerPool(worker_count) as workers:
         return [
             {"road": road, "driver": label, **estimate_metrics(rows, COMPARISON_METRICS)}
@@ -200,21 +192,10 @@ def _mean_and_range(values: pd.Series) -> str:
     return interval_text(asdict(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2)
 
 
-def humans_on_ring(
-    folder: Path,
-    populations: dict[str, Path],
-    controller: Path,
-    workers: int = 2,
-    on_part: PartCallback = lambda name: None,
-) -> None:
+def humans_on_ring(folder: Path, populations: dict[str, Path], controller: Path, workers: int = 2) -> None:
     """Write `ring.json` and `ring.png` into `folder`: human baseline, PI and a trained controller on the ring.
 
-    Args:
-        folder: where the files are written.
-        populations: files of `unjam fit-drivers` by label.
-        controller: a run folder or a .unjam file.
-        workers: worker processes.
-        on_part: receives the name of each finished group of episodes.
+    `populations` are files of `unjam fit-drivers` by label; `controller` is a run folder or a .unjam file.
     """
     make_folder(folder)
     about, rows = manifest(), []
@@ -237,7 +218,6 @@ def humans_on_ring(
                 if label == "human":  # the seed with the largest wave of the human baseline is plotted
                     largest = int(np.argmax([row["speed_std_fleet_steady"] for row in measured]))
                 episodes_to_plot[f"{humans}: {DRIVER_TITLES[label]}"] = episodes[largest]
-                on_part(f"{humans}, {label}")
     write_part(folder, "ring", {"manifest": about, "rows": rows})
     save_evaluation(folder / "episodes", Evaluation({}, episodes_to_plot), {})
     figure = trajectory_figure(list(read_results(folder / "episodes").plot_episodes.values()))

@@ -16,7 +16,6 @@ from unjam.worlds.record import Floats
 from unjam_paper import adaptation
 from unjam_paper.adaptation import (
     ADAPTATION_DRIVERS,
-    HURRIED_IDM,
     ROAD_CHANGES,
     STEPS_PER_SECOND,
     CAVSwitchesOff,
@@ -63,8 +62,9 @@ def test_a_human_driven_vehicle_brakes_to_a_low_speed() -> None:
 def test_human_drivers_that_follow_closer_are_faster_in_the_end() -> None:
     calm = replace(RING, horizon=900, noise=0.0)
     assert speeds_on(HumansChange, calm, "idm")[-1].mean() > 1.05 * speeds_on(RingBatch, calm, "idm")[-1].mean()
-    changed = ROAD_CHANGES["human drivers change"]
-    assert changed.humans == HURRIED_IDM != ROAD_CHANGES["a wave arrives"].humans
+    _, changed = ROAD_CHANGES["human drivers change"]
+    assert changed is HumansChange
+    assert changed.humans_after.time_headway < WaveArrives.humans_after.time_headway
 
 
 @pytest.mark.usefixtures("early_change")

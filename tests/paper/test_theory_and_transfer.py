@@ -13,7 +13,6 @@ import torch
 from unjam.reports.results import read_rows
 from unjam_paper import comparison, robustness, theory
 from unjam_paper.comparison import comparison_rows, training_curves
-from unjam_paper.robustness import Condition
 from unjam_paper.study import PlannedRun, StudyFolder
 from unjam_paper.variants import VARIANTS
 
@@ -60,13 +59,12 @@ def test_controllers_and_experts_are_evaluated_under_other_conditions(
 ) -> None:
     folder, _ = reproduced
     run = folder / "runs" / "small" / "plain" / "0"
-    delay = Condition("delay", impairments={"delay": 0.3})
-    conditions = (Condition("as in training"), Condition("noise", {"noise": 0.4}), delay)
+    conditions = {"as in training": {}, "noise": {"noise": 0.4}, "delay": {"impairments": {"delay": 0.3}}}
     monkeypatch.setitem(robustness.ROAD_CONDITIONS, "small", conditions)
     monkeypatch.setitem(robustness.ROAD_CONTROLLERS, "small", (str(run), "pi"))
     rows = robustness.condition_rows("small", 2, episodes=2)
     assert [(row["condition"], row["driver"]) for row in rows] == [
-        (condition.name, driver) for condition in conditions for driver in ("human", "tuned expert", "trained")
+        (condition, driver) for condition in conditions for driver in ("human", "tuned expert", "trained")
     ]
     speeds = {(row["condition"], row["driver"]): row["mean_speed"]["mean"] for row in rows}
     driven = read_rows(run)["trained"]
