@@ -302,7 +302,7 @@ def test_python_children_start_in_one_way() -> None:
         called = {name_of(call.func) for call in calls(tree)}
         assert "python_command" not in called or "child_environment" in called, module
     started_by_a_library = importers({"multiprocessing", "ray"})
-    assert started_by_a_library == {"unjam_paper/parts.py", "training/executors.py"}
+    assert started_by_a_library == {"unjam_paper/results_file.py", "training/executors.py"}
     for module in started_by_a_library:
         assert "isolated_start" in {name_of(call.func) for call in calls(MODULES[module])}
 

@@ -28,8 +28,7 @@ from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.drive import finish_drive
 from unjam_paper.all_roads import PI_ON_RINGS_LABEL, PI_TUNED_ON_RINGS
-from unjam_paper.parts import measure_parts
-from unjam_paper.results_file import read_part, write_figure
+from unjam_paper.results_file import measure_parts, read_part, write_figure
 from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder
 
 ADAPTATION_EPISODES = 20

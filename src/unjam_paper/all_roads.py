@@ -51,8 +51,7 @@ from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
-from unjam_paper.parts import StudyPart, controller_digest, measure_parts
-from unjam_paper.results_file import read_parts
+from unjam_paper.results_file import StudyPart, controller_digest, measure_parts, read_parts
 from unjam_paper.study import PlannedRun, Study, StudyFolder
 from unjam_paper.variants import RINGS_EXPERT, SHARED_RINGS_EXPERT, VARIANTS
 

@@ -38,8 +38,7 @@ from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.open_test_roads import OPEN_TEST_ROADS, OpenTestRoad, write_road_files
-from unjam_paper.parts import controller_digest
-from unjam_paper.results_file import read_part, write_part
+from unjam_paper.results_file import controller_digest, read_part, write_part
 from unjam_paper.study import Study, StudyFolder, Table
 
 TESTED_CONTROLLER, ACC_BASELINE = "unjam:best", "cruise"

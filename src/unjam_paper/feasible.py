@@ -38,8 +38,7 @@ from unjam.training.export import export_controller
 from unjam.training.presets import preset_values
 from unjam.training.road_family import LONG_WARM_UP
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.parts import controller_digest
-from unjam_paper.results_file import read_optional_part, read_part, write_part
+from unjam_paper.results_file import controller_digest, read_optional_part, read_part, write_part
 from unjam_paper.study import (
     NO_VALUE_TEXT,
     DriverComparison,

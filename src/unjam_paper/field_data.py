@@ -40,8 +40,7 @@ from unjam.following.open_loop import (
 from unjam.following.pairs import Pair, Segments, following_samples, make_segments, pairs_in_splits, split_by_driver
 from unjam.physics.idm import PAPER_IDM, stack_idm_parameters
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
-from unjam_paper.parts import measure_parts
-from unjam_paper.results_file import write_figure, write_part
+from unjam_paper.results_file import measure_parts, write_figure, write_part
 from unjam_paper.study import Table, study_manifest
 
 ACCELERATION_LIMITS: AccelerationBounds = (-4.0, 2.0)

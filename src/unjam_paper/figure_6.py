@@ -27,8 +27,7 @@ from unjam.following.pairs import SPLITS, Floats, FollowingSamples, following_sa
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
-from unjam_paper.parts import measure_parts
-from unjam_paper.results_file import write_figure, write_part
+from unjam_paper.results_file import measure_parts, write_figure, write_part
 from unjam_paper.study import Study, StudyFolder, Table, study_manifest
 
 SplitKind = Literal["trajectories", "rows", "released"]

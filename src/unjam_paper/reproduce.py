@@ -1,7 +1,7 @@
 """Run the trainings that studies need, each once, and write the studies: `unjam reproduce`."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from unjam.training.run_folder import read_config
 from unjam.training.seeds import make_test_seeds
 from unjam.worlds.episode import can_drive
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.parts import PartCallback
 from unjam_paper.results_file import collect_results, write_part
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
 from unjam_paper.study import STUDY_ROADS, PlannedRun, Study, StudyFolder, study_manifest
@@ -111,7 +110,7 @@ def _scenario_kind(road: str) -> str:
 
 
 def run_plan(
-    plan: StudyPlan, workers: int, executor: Executor = "local", on_message: PartCallback = lambda line: None
+    plan: StudyPlan, workers: int, executor: Executor = "local", on_message: Callable[[str], None] = lambda line: None
 ) -> list[Path]:
     """Run what is missing, `workers` trainings at once, write the studies, and return their folders.
 

@@ -1,4 +1,6 @@
-"""Read and write the results file of a study: one JSON object with its manifest and an entry for each part.
+"""Measure, write and read the parts of a study, and its results file: one JSON object with its manifest and each part.
+
+A part is measured once, and again if a packaged controller that drives in it has changed.
 
 Tables of rows with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; a number or a text that is the
 same in all rows is stored once, `{NAME: VALUE}`. This takes a third of the space. Figures and controllers are separate
@@ -7,7 +9,12 @@ commit that made the results, and may have the names before version 0.1 (CONTRIB
 """
 
 import json
-from collections.abc import Mapping
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -15,13 +22,19 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from matplotlib.figure import Figure
 
-from unjam.files import atomic_write, to_json
+from unjam.child_processes import isolated_start
+from unjam.controller import PACKAGED_PREFIX, packaged_file
+from unjam.files import atomic_write, make_folder, to_json
 from unjam.reports.figures import png_bytes
 
 COLUMNS = "columns"
 """the only key of a table that is stored by columns"""
 CONTROLLERS = "controllers"
 """subfolder with controllers, in the working folder of a study"""
+CONTROLLERS_FILE = "controllers"
+"""name of the part with the digests of the packaged controllers that drove, by part"""
+StudyPart = tuple[Callable[..., Any], tuple[Any, ...]]
+"""a function of a module and its arguments; it returns a JSON value"""
 
 
 def write_part(folder: Path, name: str, part: Any) -> None:
@@ -129,3 +142,51 @@ def _by_rows(value: Any) -> Any:
     rows = max(len(entries) for entries in columns.values() if isinstance(entries, list))
     full_columns = (entries if isinstance(entries, list) else [entries] * rows for entries in columns.values())
     return [dict(zip(columns, row, strict=True)) for row in zip(*full_columns, strict=True)]
+
+
+def measure_parts(folder: Path, parts: dict[str, StudyPart], workers: int) -> list[Any]:
+    """Return the results of all parts; those without a current `folder/NAME.json` are measured and written.
+
+    A part is not current if a packaged controller in it has another digest than when it was measured.
+    """
+    digests: dict[str, dict[str, str]] = read_optional_part(folder, CONTROLLERS_FILE)
+
+    def is_current(name: str) -> bool:
+        current = _packaged_digests(parts[name][1])
+        return (folder / f"{name}.json").is_file() and digests.get(name, current) == current
+
+    def save_part(name: str, result: Any) -> None:
+        atomic_write(folder / f"{name}.json", to_json(result))
+        if packaged := _packaged_digests(parts[name][1]):
+            digests[name] = packaged
+            write_part(folder, CONTROLLERS_FILE, digests)
+
+    make_folder(folder)
+    missing = {name: part for name, part in parts.items() if not is_current(name)}
+    if workers == 1 or len(missing) < 2:
+        for name, (function, arguments) in missing.items():
+            save_part(name, function(*arguments))
+    else:
+        # Spawned processes: a forked one would inherit the locks of torch's threads without the threads.
+        context = multiprocessing.get_context("spawn")
+        absolute = filter(os.path.isabs, sys.path)  # in a notebook it holds the working folder
+        with isolated_start(absolute), ProcessPoolExecutor(workers, mp_context=context) as pool:
+            running = {pool.submit(function, *arguments): name for name, (function, arguments) in missing.items()}
+            for done in as_completed(running):
+                save_part(running[done], done.result())
+    return [read_part(folder, name) for name in parts]
+
+
+def controller_digest(driver: str) -> str:
+    """Return the digest of a packaged controller; an empty text for other drivers, which their name identifies."""
+    name = driver.removeprefix(PACKAGED_PREFIX)
+    return "" if name == driver else sha256(packaged_file(name).read_bytes()).hexdigest()[:12]
+
+
+def _packaged_digests(arguments: Any) -> dict[str, str]:
+    """Return the digest of each packaged controller that arguments name."""
+    if isinstance(arguments, str):
+        return {arguments: controller_digest(arguments)} if arguments.startswith(PACKAGED_PREFIX) else {}
+    inner = list(arguments.values()) if isinstance(arguments, Mapping) else arguments
+    inner = inner if isinstance(inner, list | tuple) else ()
+    return {name: digest for each in inner for name, digest in _packaged_digests(each).items()}

@@ -8,12 +8,20 @@ from unjam.scenarios import Ring
 from unjam.training.evaluate import Evaluation
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper import study
-from unjam_paper.parts import CONTROLLERS_FILE, StudyPart, measure_parts
-from unjam_paper.results_file import read_part
+from unjam_paper.results_file import CONTROLLERS_FILE, StudyPart, measure_parts, read_part
 from unjam_paper.study import evaluate_on_test_seeds, study_manifest
+
+MEASURED: list[object] = []
+"""arguments of the functions below, in calls of this process"""
+
+
+@pytest.fixture(autouse=True)
+def nothing_measured() -> None:
+    MEASURED.clear()
 
 
 def square(number: int) -> dict[str, int]:
+    MEASURED.append(number)
     return {"square": number * number}
 
 
@@ -22,6 +30,7 @@ def refuse(number: int) -> None:
 
 
 def named(drivers: dict[str, str]) -> dict[str, str]:
+    MEASURED.extend(drivers.values())
     return drivers
 
 
@@ -30,9 +39,8 @@ def parts(count: int) -> dict[str, StudyPart]:
 
 
 def test_each_part_is_a_file(tmp_path: Path) -> None:
-    messages: list[str] = []
-    measure_parts(tmp_path / "parts", parts(3), 1, messages.append)
-    assert messages == ["of-0", "of-1", "of-2"]
+    measure_parts(tmp_path / "parts", parts(3), 1)
+    assert MEASURED == [0, 1, 2]
     assert read_part(tmp_path / "parts", "of-2") == {"square": 4}
 
 
@@ -46,20 +54,19 @@ def test_finished_parts_are_not_measured_again(tmp_path: Path) -> None:
 def test_a_part_is_measured_again_if_a_packaged_controller_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    messages: list[str] = []
     given: dict[str, StudyPart] = {
         "packaged": (named, ({"ours": "unjam:ring-tuned"},)),
         "other": (named, ({"ours": "pi"},)),
     }
     for _ in range(2):
-        measure_parts(tmp_path, given, 1, messages.append)
-    assert messages == ["packaged", "other"]
-    monkeypatch.setattr("unjam_paper.parts.controller_digest", lambda driver: "another")
-    measure_parts(tmp_path, given, 1, messages.append)
-    assert messages == ["packaged", "other", "packaged"]
+        measure_parts(tmp_path, given, 1)
+    assert MEASURED == ["unjam:ring-tuned", "pi"]
+    monkeypatch.setattr("unjam_paper.results_file.controller_digest", lambda driver: "another")
+    measure_parts(tmp_path, given, 1)
+    assert MEASURED == ["unjam:ring-tuned", "pi", "unjam:ring-tuned"]
     (tmp_path / f"{CONTROLLERS_FILE}.json").unlink()  # as in older folders
-    measure_parts(tmp_path, given, 1, messages.append)
-    assert len(messages) == 3
+    measure_parts(tmp_path, given, 1)
+    assert len(MEASURED) == 3
 
 
 def test_a_failing_part_keeps_the_others(tmp_path: Path) -> None:
