@@ -1,0 +1,30 @@
+"""Files and Python names that the documentation mentions exist."""
+
+import re
+from pathlib import Path
+from pkgutil import resolve_name
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
+FOLDERS = ("src", "tests", "docs", "results", "examples")
+FILE = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]*\w)/?`")
+NAME = re.compile(r"`(?!unjam\.cdx\.json)(unjam(?:_paper)?(?:\.\w+)+)(?:\(\))?`")
+
+
+def is_importable(name: str) -> bool:
+    """Return whether a dotted name is a module, or an attribute of one."""
+    try:
+        resolve_name(name)
+    except (ImportError, AttributeError):
+        return False
+    return True
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_and_names_of_a_page_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    missing = [path for path in FILE.findall(text) if not (ROOT / path).exists()]
+    missing += [name for name in NAME.findall(text) if not is_importable(name)]
+    assert missing == []
