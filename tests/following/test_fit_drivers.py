@@ -6,10 +6,9 @@ import pytest
 from tests.following.made_up import idm_driver
 from tests.paper.test_field_data import table
 from unjam.errors import DiskError, InputError
-from unjam.following.calibration import CalibrationSettings
+from unjam.following.calibration import CalibrationSettings, MultiStepSettings
 from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files, unit_warnings
 from unjam.following.pairs import Pair
-from unjam.following.settings import MultiStepSettings
 from unjam.physics.idm import IDMParameters
 
 HEADWAYS = (0.9, 1.1, 1.3, 1.5, 1.7)

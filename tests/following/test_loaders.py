@@ -207,7 +207,7 @@ def test_a_bad_row_may_be_cut_out_and_is_told(tmp_path: Path) -> None:
     found = read_pairs(path, options=ReadOptions(drop_bad_rows=True, min_seconds=1.0))
     assert [len(pair.speed) for pair in found.pairs] == [12, 17, 30]
     assert len({pair.name for pair in found.pairs}) == 3
-    assert [(row.line, row.reason) for row in found.bad_rows] == [(14, "gap: nan is not allowed; allowed: 0 to 1000")]
+    assert found.bad_rows == {14: "gap: nan is not allowed; allowed: 0 to 1000"}
     assert "dropped: line 14: gap: nan is not allowed; allowed: 0 to 1000" in found.summary_lines()
 
 

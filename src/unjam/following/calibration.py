@@ -8,10 +8,11 @@ method: Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.local_state import LocalState
@@ -29,6 +30,7 @@ from unjam.physics.idm import IDMArrays, IDMParameters
 from unjam.scenarios.scenario import Scenario
 
 ParameterRange = tuple[Positive, Positive]
+HiddenSizes = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -60,6 +62,29 @@ class CalibrationSettings:
     tolerance: Positive = 1e-3
     """spread of the candidates' errors, relative to their mean, at which the search ends"""
     seed: NonNegativeInt = 0
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class MultiStepSettings:
+    """A network that learns a residual from simulated driving."""
+
+    hidden: HiddenSizes = (32, 32)
+    """sizes of the hidden layers"""
+    authority: Positive = 2.0
+    """largest residual [m/s2]"""
+    segment_seconds: Positive = 30.0
+    """duration of the simulated segments [s]"""
+    batch_size: PositiveInt = 64
+    """segments in a gradient step"""
+    gradient_steps: PositiveInt = 120
+    learning_rate: Positive = 1e-3
+    """initial learning rate of Adam, which falls to zero as a cosine"""
+    speed_weight: NonNegative = 2.0
+    """weight of a speed error of 1 m/s relative to a gap error of 1 m"""
+    residual_weight: NonNegative = 0.1
+    """weight of the squared residual, so that the base drives where there are no data"""
+    validation_interval: PositiveInt = 20
+    """gradient steps between two validations, which select the weights"""
 
 
 CALIBRATED_PARAMETERS = ("desired_speed", "time_headway", "max_acceleration", "comfortable_deceleration", "minimum_gap")

@@ -17,12 +17,12 @@ from unjam.following.calibration import (
     CALIBRATED_PARAMETERS,
     CalibratedIDM,
     CalibrationSettings,
+    MultiStepSettings,
     calibrate_groups,
     calibrate_idm,
 )
 from unjam.following.loaders import ReadOptions, read_pairs
 from unjam.following.pairs import Pair, pairs_in_splits, split_by_driver
-from unjam.following.settings import MultiStepSettings
 from unjam.manifest import manifest
 from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclass, nest_keys
 from unjam.physics.idm import IDMParameters
@@ -40,7 +40,6 @@ MIN_SUSPICIOUS_PARAMETERS = 3
 """number of parameters at bounds that suggests wrong units or data"""
 PAIR_FILTERS = ("kind", "split", "driver")
 """fields by which trajectories can be selected"""
-_HIDDEN_DETAILS = ("parameters", "initial_headway_weight")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -243,4 +242,6 @@ def _fit_residual(
 
 
 def _calibration_details(calibrated: CalibratedIDM) -> dict[str, Any]:
-    return {name: value for name, value in asdict(calibrated).items() if name not in _HIDDEN_DETAILS}
+    details = asdict(calibrated)
+    del details["parameters"], details["initial_headway_weight"]
+    return details

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from unjam.errors import InputError, unknown_name
-from unjam.following.pairs import BadRow, Pair, ReadOptions, ReadResult
+from unjam.following.pairs import Pair, ReadOptions, ReadResult
 
 PAIR_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
 """required columns: [s], [m/s], [m/s], [m]"""
@@ -263,8 +263,8 @@ def _split_trajectories(
     (is_bad, bad_rows), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
     if bad_rows and not options.drop_bad_rows:
         more = f" ({len(bad_rows)} bad rows)" if len(bad_rows) > 1 else ""
-        reason = f"line {bad_rows[0].line}: {bad_rows[0].reason}{more}"
-        raise InputError(f"{path.name}: {reason}; --drop-bad-rows leaves them out")
+        line, reason = next(iter(bad_rows.items()))
+        raise InputError(f"{path.name}: line {line}: {reason}{more}; --drop-bad-rows leaves them out")
     good = frame.loc[~is_bad].sort_values(by=["pair", "time"], kind="stable")
     steps = good.groupby("pair", sort=False, dropna=False)["time"].diff()
     if steps.isna().all():
@@ -289,8 +289,8 @@ def _split_trajectories(
     return ReadResult(pairs, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
 
 
-def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, list[BadRow]]:
-    """Return whether each row is bad, shape (rows,), and the lines of bad rows, each once."""
+def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
+    """Return whether each row is bad, shape (rows,), and the first reason of each line with bad rows."""
     reasons: dict[int, str] = {}
     is_bad = np.zeros(len(frame), bool)
     for name in PAIR_COLUMNS[1:]:
@@ -304,4 +304,4 @@ def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, list[BadRow]]:
     is_repeated = frame.assign(time=frame["time"].round(6)).duplicated(["pair", "time"])
     for line, time in zip(frame["line"][is_repeated], frame["time"][is_repeated], strict=True):
         reasons.setdefault(int(line), f"time: {time:g} occurs twice in its pair")
-    return is_bad | is_repeated.to_numpy(), [BadRow(line, reasons[line]) for line in sorted(reasons)]
+    return is_bad | is_repeated.to_numpy(), dict(sorted(reasons.items()))

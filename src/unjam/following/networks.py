@@ -12,11 +12,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic.dataclasses import dataclass as checked_dataclass
 from torch import Tensor, nn
 
 from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
+from unjam.following.calibration import HiddenSizes, MultiStepSettings
 from unjam.following.open_loop import (
     AccelerationBounds,
     AccelerationFunction,
@@ -28,16 +30,35 @@ from unjam.following.open_loop import (
     simulate_open_loop,
 )
 from unjam.following.pairs import SEGMENT_FIELDS, FollowingSamples, Pair, Segments, following_samples, make_segments
-from unjam.following.settings import MultiStepSettings, NetworkSettings
+from unjam.parameters import STRICT, Positive, PositiveInt
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMArrays, IDMParameters, stack_idm_parameters
 from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
 
 MEAN_SQUARE_OFFSET = 1e-2
 """added to a mean square before its root, so that the slope of a perfect trajectory is finite [m2]"""
-AnyNetworkSettings = NetworkSettings | MultiStepSettings
 MAX_GRADIENT_NORM = 1.0
 """norm to which gradients are clipped, which can be very large after many steps"""
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class NetworkSettings:
+    """A network that learns single accelerations; the defaults are those of the paper."""
+
+    hidden: HiddenSizes = (128, 128)
+    """sizes of the hidden layers"""
+    learning_rate: Positive = 1e-4
+    """of Adam"""
+    batch_size: PositiveInt = 1024
+    epochs: PositiveInt = 200
+    """maximum number"""
+    patience: PositiveInt = 200
+    """epochs without improvement in validation after which learning ends; as many as `epochs`: never"""
+    authority: Positive = 8.0
+    """largest acceleration, which cars can reach [m/s2]"""
+
+
+AnyNetworkSettings = NetworkSettings | MultiStepSettings
 
 
 class FollowingNetwork(nn.Module):

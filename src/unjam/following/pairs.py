@@ -219,23 +219,14 @@ class ReadOptions:
 
 
 @dataclass(frozen=True)
-class BadRow:
-    """A row that cannot be used."""
-
-    line: int
-    """in the file, where the header is line 1"""
-    reason: str
-
-
-@dataclass(frozen=True)
 class ReadResult:
     """The content of a file."""
 
     pairs: list[Pair] = field(repr=False)
     rows: int
     """in the file"""
-    bad_rows: list[BadRow]
-    """dropped rows"""
+    bad_rows: dict[int, str]
+    """reason for each dropped row, by its line in the file, where the header is line 1"""
     skipped_rows: dict[str, int]
     """numbers of valid rows that are not used, by reason"""
 
@@ -244,7 +235,6 @@ class ReadResult:
         used = sum(len(pair.speed) for pair in self.pairs)
         lines = [f"{len(self.pairs)} trajectories with {used:,} of {self.rows:,} rows"]
         lines += [f"skipped: {count:,} rows: {reason}" for reason, count in self.skipped_rows.items() if count]
-        lines += [f"dropped: line {row.line}: {row.reason}" for row in self.bad_rows[:MAX_LISTED_ROWS]]
-        if len(self.bad_rows) > MAX_LISTED_ROWS:
-            lines.append(f"dropped: {len(self.bad_rows) - MAX_LISTED_ROWS} more bad rows")
-        return lines
+        dropped = [f"dropped: line {line}: {reason}" for line, reason in self.bad_rows.items()]
+        more = len(dropped) - MAX_LISTED_ROWS
+        return [*lines, *dropped[:MAX_LISTED_ROWS], *([f"dropped: {more} more bad rows"] if more > 0 else [])]

@@ -63,15 +63,9 @@ def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
 
 
 def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM) -> Array:
-    """Return the desired gap s* at this speed and approach rate (Eq. 6).
+    """Return the desired bumper-to-bumper gap s* [m] (Eq. 6), of the shape of `speed` and `approach_rate` [m/s].
 
-    Args:
-        speed: own speed [m/s], any shape.
-        approach_rate: own speed minus the leader's [m/s], same shape.
-        parameters: of one driver, or of the driver of each row.
-
-    Returns:
-        Desired bumper-to-bumper gap [m], same shape.
+    The approach rate is the own speed minus the leader's; the parameters are those of one driver, or of each row's.
     """
     p = parameters
     return p.minimum_gap + clamp_min(speed * p.time_headway + speed * approach_rate / p.interaction_scale, 0.0)
@@ -95,17 +89,10 @@ def idm_acceleration(
     parameters: IDMParameters | IDMArrays = PAPER_IDM,
     power: Callable[[Array, Array], Array] = pow,
 ) -> Array:
-    """Return the acceleration of a driver behind a leader (Eq. 5).
+    """Return the acceleration of a driver behind a leader [m/s2] (Eq. 5), unbounded below as the gap closes.
 
-    Args:
-        speed: own speed [m/s], any shape.
-        leader_speed: speed of the vehicle ahead [m/s], same shape.
-        gap: bumper-to-bumper distance [m], same shape; positive (the model divides by it).
-        parameters: of one driver, or of the driver of each row.
-        power: function that computes powers: `pow`, or `fast_power`.
-
-    Returns:
-        Acceleration [m/s2], same shape; unbounded below as the gap closes.
+    Speeds [m/s] and bumper-to-bumper gap [m], which must be positive, have the same shape. The parameters are those of
+    one driver, or of each row's; `power` computes powers: `pow`, or `fast_power`.
     """
     p = parameters
     free_road = power(speed / p.desired_speed, p.exponent)

@@ -1,32 +1,24 @@
-"""Motion of a vehicle in one step and until standstill: exactly as in SUMO."""
+"""Motion of a vehicle in one step and until standstill, exactly as by SUMO's Euler update.
+
+Arguments have any shapes, which broadcast together; units are m, s, m/s and m/s2.
+Source: https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
+"""
 
 from unjam.physics.arrays import Array, clamp_min, namespace, square_root
 
 
 def next_speed(speed: Array, acceleration: Array, time_step: float) -> Array:
-    """Return the speed one step later, v' = max(0, v + a dt): vehicles do not drive backwards.
-
-    Shapes: any, broadcast together. Units: m/s, m/s2, s.
-    Source: SUMO's Euler update, https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
-    """
+    """Return the speed one step later, v' = max(0, v + a dt): vehicles do not drive backwards."""
     return clamp_min(speed + acceleration * time_step, 0.0)
 
 
 def next_position(position: Array, new_speed: Array, time_step: float) -> Array:
-    """Return the position one step later, x' = x + v' dt, with the speed *after* the step.
-
-    Shapes: any, broadcast together. Units: m, m/s, s.
-    Source: SUMO's Euler update, https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
-    """
+    """Return the position one step later, x' = x + v' dt, with the speed *after* the step."""
     return position + new_speed * time_step
 
 
 def distance_driven(speed: Array, new_speed: Array, time_step: float, steps: int) -> Array:
-    """Return the distance driven in `steps` steps in which the speed changes linearly to `new_speed`.
-
-    Each step is the Euler step of `next_position`, so that one step gives v' dt.
-    Shapes: any, broadcast together. Units: m/s, s; the result in m.
-    """
+    """Return the distance driven in `steps` steps in which the speed changes linearly; one step gives v' dt."""
     return time_step * (steps * speed + (steps + 1) / 2 * (new_speed - speed))
 
 
@@ -34,7 +26,6 @@ def gap_on_loop(position: Array, leader_position: Array, loop_length: Array, lea
     """Return the bumper-to-bumper gap to the leader on a closed road.
 
     Positions are those of front bumpers along the road; they may exceed the length of the loop.
-    Shapes: any, broadcast together. Units: m.
     """
     return (leader_position - position) % loop_length - leader_length
 
@@ -45,9 +36,6 @@ def stopping_distance(speed: Array, braking: Array, time_step: float) -> Array:
     With v_j = max(0, v - j b h) after j steps of length h it is h (v_1 + v_2 + ...). The first
     n = floor(v / (b h)) terms are not zero, so the sum is h (n v - b h n (n + 1) / 2). It increases with v, and
     exceeds v^2 / (2 b) - v h / 2 by 0 to b h^2 / 8.
-
-    Shapes: any. Units: m/s, m/s2, s.
-    Source: SUMO's Euler update, https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
     """
     change = braking * time_step
     steps = namespace(speed).floor(speed / change)
@@ -59,8 +47,6 @@ def max_speed_to_stop(distance: Array, braking: float, time_step: float) -> Arra
 
     It drives one step at the result v and then brakes: v h + `stopping_distance`(v) = `distance`, which is
     piecewise linear in v; n is the number of whole steps of braking. Zero where the distance is not positive.
-
-    Shapes: any. Units: m, m/s2, s.
     """
     change = braking * time_step
     room = clamp_min(distance, 0.0) / time_step
