@@ -31,7 +31,7 @@ from unjam_paper.open_test_roads import (
     write_road_files,
 )
 from unjam_paper.results_file import read_optional_part, read_part, write_part
-from unjam_paper.study import NO_VALUE_TEXT, Study
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder
 
 EXAMPLES_PART = "roads"
 MAX_EPISODES = 51
@@ -136,29 +136,20 @@ EXAMPLES: dict[str, Example] = {
 }
 
 
-def assess_examples(folder: Path, workers: int = 2, episodes: int = MAX_EPISODES, seconds: float | None = None) -> None:
-    """Assess the roads that have no results with these settings yet, and write the results after each of them.
-
-    Args:
-        folder: the working folder of the study.
-        workers: worker processes.
-        episodes: maximum number of episodes per road.
-        seconds: length of an episode; None: as in the configuration.
-    """
+def _write_examples(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    """Assess the roads that have no results with these settings yet, and write the results after each of them."""
     roads = read_optional_part(folder, EXAMPLES_PART)
     for name, example in EXAMPLES.items():
-        settings = {"rate": example.rate, "episodes": episodes, "seconds": seconds, "precision": PRECISION}
+        settings = {"rate": example.rate, "episodes": MAX_EPISODES, "seconds": None, "precision": PRECISION}
         if roads.get(name, {}).get("settings") != settings:
             with TemporaryDirectory() as place:
-                roads[name] = {"settings": settings, **_assess_road(example, Path(place), workers, episodes, seconds)}
+                roads[name] = {"settings": settings, **_assess_road(example, Path(place), workers)}
             write_part(folder, EXAMPLES_PART, roads)
 
 
-def _assess_road(example: Example, folder: Path, workers: int, episodes: int, seconds: float | None) -> dict[str, Any]:
+def _assess_road(example: Example, folder: Path, workers: int) -> dict[str, Any]:
     (folder / "road").mkdir()
-    file = example.write(folder / "road")
-    changes = {} if seconds is None else {"end": seconds}
-    request = make_request(str(file), [example.rate], episodes, PRECISION, options=changes)
+    request = make_request(str(example.write(folder / "road")), [example.rate], MAX_EPISODES, PRECISION)
     with WorkerPool(workers) as pool:
         assessment = assess(request, folder / "assessment", pool, on_message=partial(print, flush=True))
     document = assessment.document
@@ -215,7 +206,7 @@ def _difference_text(row: Mapping[str, Any], name: str, digits: int) -> str:
 
 ASSESS_EXAMPLES = Study(
     title="assessments of five small roads",
-    write=lambda study_folder, seeds, folder, workers: assess_examples(folder, workers),
+    write=_write_examples,
     minutes=25.0,
     is_resumable=True,
     tables={"roads": examples_table},

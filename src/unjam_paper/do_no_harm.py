@@ -107,10 +107,9 @@ def has_breakdown(episode: Episode, road: OpenTestRoad) -> bool:
     is_present = np.isfinite(positions) & np.isfinite(speeds)
     length = sum(section.length for section in road.sections)
     shape = int(np.ceil(times[-1] / SECTION_SECONDS)) + 1, int(np.ceil(length / SECTION_LENGTH))
-    period = np.broadcast_to((times // SECTION_SECONDS)[:, None], positions.shape)[is_present].astype(int)
-    section = (positions[is_present] // SECTION_LENGTH).clip(0, shape[1] - 1).astype(int)
-    cells, size = period * shape[1] + section, shape[0] * shape[1]
-    count, total = (np.bincount(cells, weights, size).reshape(shape) for weights in (None, speeds[is_present]))
+    edges = SECTION_SECONDS * np.arange(shape[0] + 1), SECTION_LENGTH * np.arange(shape[1] + 1)
+    place = np.broadcast_to(times[:, None], positions.shape)[is_present], positions[is_present].clip(0, edges[1][-1])
+    count, total = (np.histogram2d(*place, edges, weights=weights)[0] for weights in (None, speeds[is_present]))
     # Vehicles brake before a lower limit, and accelerate behind it: it counts on the adjacent sections, too.
     free = [road.free_speed(SECTION_LENGTH * (number - 1), SECTION_LENGTH * (number + 2)) for number in range(shape[1])]
     flow = 3600.0 * total / (SECTION_LENGTH * SECTION_SECONDS / snapshot_step)
@@ -168,24 +167,21 @@ def _run_seed_batch(
     seeds = make_test_seeds(SEED_BATCH, first=len(results["rows"].get(HUMAN_LABEL, ())))
     drivers = {HUMAN_LABEL: (HUMAN_LABEL, rates[0])}
     drivers |= {_rate_label(name, rate): (name, rate) for rate in rates for name in (ACC_BASELINE, TESTED_CONTROLLER)}
-    labels, tasks = list[str](), list[EpisodeTask]()
-    for label, (name, rate) in drivers.items():
+    tasks = list[EpisodeTask]()
+    for name, rate in drivers.values():
         changes = {"penetration_rate": rate, "steps_per_control_step": STEPS_PER_CONTROL_STEP, **ACC_SETTINGS}
         scenario = make_scenario(str(file), changes)
         driver = make_driver(name, scenario.control_step)
-        labels += [label] * len(seeds)
-        tasks += [EpisodeTask(scenario, driver, seed, record_details=label == HUMAN_LABEL) for seed in seeds]
+        tasks += [EpisodeTask(scenario, driver, seed, record_details=name == HUMAN_LABEL) for seed in seeds]
 
     def episode_row(number: int, episode: Episode) -> dict[str, Any]:
         measured = measure(episode)
         raise_failure([measured])
         row = {name: measured[name] for name in HARM_METRICS}
-        return row | {"breakdown": has_breakdown(episode, road)} if labels[number] == HUMAN_LABEL else row
+        return row | {"breakdown": has_breakdown(episode, road)} if number < len(seeds) else row
 
-    rows: dict[str, Table] = {}
-    for label, row in zip(labels, pool.run_and_map(tasks, episode_row), strict=True):
-        rows.setdefault(label, []).append(row)
-    return rows
+    rows = pool.run_and_map(tasks, episode_row)
+    return {label: rows[index * len(seeds) : (index + 1) * len(seeds)] for index, label in enumerate(drivers)}
 
 
 def harm_table(folder: Path) -> pd.DataFrame:

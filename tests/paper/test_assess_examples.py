@@ -9,10 +9,10 @@ from unjam.drivers import Human
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
-from unjam_paper import assess_examples
-from unjam_paper.assess_examples import EXAMPLES, EXAMPLES_PART, Example, examples_table
-from unjam_paper.assess_examples import assess_examples as run_examples
+from unjam_paper import assess_examples, open_test_roads
+from unjam_paper.assess_examples import ASSESS_EXAMPLES, EXAMPLES, EXAMPLES_PART, Example, examples_table
 from unjam_paper.results_file import read_part
+from unjam_paper.study import StudyFolder
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -39,7 +39,9 @@ def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
 
     short: dict[str, Example] = {"first": Example(write, 0.3)}
     monkeypatch.setattr(assess_examples, "EXAMPLES", short)
-    run_examples(out, 2, episodes=15, seconds=60.0)
+    monkeypatch.setattr(assess_examples, "MAX_EPISODES", 15)
+    monkeypatch.setattr(open_test_roads, "EPISODE_SECONDS", 60.0)
+    ASSESS_EXAMPLES.write(StudyFolder(tmp_path), 1, out, 2)
     found: dict[str, Any] = read_part(out, EXAMPLES_PART)["first"]
     human, acc, controller = found["drivers"]
     assert (human["driver"], acc["driver"]) == ("human", "cruise")
@@ -50,7 +52,7 @@ def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
     assert len(found["sentences"]) == 2
     assert list(examples_table(out)["driver"]) == ["human", "cruise", controller["driver"]]
     short["second"] = Example(write, 0.3)
-    run_examples(out, 2, episodes=15, seconds=60.0)
+    ASSESS_EXAMPLES.write(StudyFolder(tmp_path), 1, out, 2)
     assert len(written) == 2
     assert list(read_part(out, EXAMPLES_PART)) == ["first", "second"]
     assert read_part(out, EXAMPLES_PART)["first"] == found
