@@ -151,7 +151,7 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
             for key, (name, _) in PAPER_COLUMNS.items()
         }
         rows.append({**row, "paper_convention": convention, "steady_speed_by_value": _speed_by_value(road, found)})
-    trained = {variant: study_folder.trained_runs(road, variant, seeds) for variant in variants}
+    trained = study_folder.trained_runs(road, variants, seeds)
     return [*rows, *(_variant_row(road, variant, runs, references) for variant, runs in trained.items())]
 
 
@@ -212,16 +212,15 @@ def _finite_mean(rows: Table, name: str) -> float:
 def write_comparison_table(rows: Table, folder: Path) -> None:
     """Write a table as JSON with all entries and as CSV with the main numbers."""
     write_part(folder, "table", rows)
-    atomic_write(folder / "table.csv", pd.DataFrame([_csv_row(row) for row in rows]).to_csv(index=False))
-
-
-def _csv_row(row: dict[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {name: row[name] for name in ("road", "name", "trainings")}
-    for key in PAPER_COLUMNS:
-        flat[f"{key}, paper"] = (row.get("paper") or {}).get(key)
-        flat[f"{key}, paper convention"] = round(row["paper_convention"][key]["mean"], 2)
     names = (*COMPARISON_METRICS, "gain_over_best_expert", "probability_of_improvement")
-    return flat | {name: round(row[name]["mean"], 3) for name in names if name in row}
+    table = []
+    for row in rows:
+        cells = {name: row[name] for name in ("road", "name", "trainings")}
+        for key in PAPER_COLUMNS:
+            cells[f"{key}, paper"] = (row.get("paper") or {}).get(key)
+            cells[f"{key}, paper convention"] = round(row["paper_convention"][key]["mean"], 2)
+        table.append(cells | {name: round(row[name]["mean"], 3) for name in names if name in row})
+    atomic_write(folder / "table.csv", pd.DataFrame(table).to_csv(index=False))
 
 
 def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
@@ -231,8 +230,7 @@ def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str
     """
     curves: dict[str, Any] = {}
     reward = PlannedRun(road, variants[0], 0).config.reward
-    for variant in variants:
-        runs = study_folder.trained_runs(road, variant, seeds)
+    for variant, runs in study_folder.trained_runs(road, variants, seeds).items():
         first = max(run.progress[0]["environment_steps"] for run in runs)
         last = min(run.progress[-1]["environment_steps"] for run in runs)
         grid = np.linspace(first, last, CURVE_POINTS)
@@ -328,19 +326,21 @@ def paper_exact_study(road: str) -> Study:
 
     def write(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
         study.write(study_folder, seeds, folder, workers)
-        runs = {name: study_folder.trained_runs(road, name, seeds) for name in variants}
-        write_part(folder, "paper-exact", {name: [_run_facts(run) for run in each] for name, each in runs.items()})
+        facts = {
+            variant: [
+                {
+                    "converged": paper_convergence(run.progress),
+                    "eps_m": transition_model_errors(run.progress),
+                    "last": run.final_training_mean("return_mean"),
+                    "test_return": float(np.mean([row["return"] for row in run.rows])),
+                }
+                for run in runs
+            ]
+            for variant, runs in study_folder.trained_runs(road, variants, seeds).items()
+        }
+        write_part(folder, "paper-exact", facts)
 
-    return replace(study, write=write, tables={"paper-exact": partial(_paper_exact_table, variants)})
-
-
-def _run_facts(run: TrainedRun) -> dict[str, Any]:
-    return {
-        "converged": paper_convergence(run.progress),
-        "eps_m": transition_model_errors(run.progress),
-        "last": run.final_training_mean("return_mean"),
-        "test_return": float(np.mean([row["return"] for row in run.rows])),
-    }
+    return replace(study, write=write, tables={"paper-exact": _paper_exact_table})
 
 
 def paper_convergence(progress: Table) -> dict[str, float] | None:
@@ -363,7 +363,7 @@ def transition_model_errors(progress: Table) -> list[float] | None:
     return [float(np.mean(errors[:count])), float(np.mean(errors[-count:]))]
 
 
-def _paper_exact_table(variants: Sequence[str], folder: Path) -> pd.DataFrame:
+def _paper_exact_table(folder: Path) -> pd.DataFrame:
     """Return when trainings converge by the rule of the paper, their returns then and at the end, and eps_m."""
     table = []
     for variant, trainings in read_part(folder, "paper-exact").items():

@@ -126,10 +126,13 @@ class StudyFolder:
         files = [folder / road / EVALUATION_FILE for road in run.config.task_configs()]
         return all(file.is_file() for file in files) and read_config(folder) == run.config
 
-    def trained_runs(self, road: str, variant: str, seeds: int) -> list[TrainedRun]:
-        """Return the finished trainings of a variant on a road, one for each seed."""
-        runs = {run: self.run_folder(run) for run in planned_runs([road], [variant], seeds)}
-        return [TrainedRun(run, read_progress(at), read_rows(at)[TRAINED_LABEL]) for run, at in runs.items()]
+    def trained_runs(self, road: str, variants: Iterable[str], seeds: int) -> dict[str, list[TrainedRun]]:
+        """Return the finished trainings on a road by variant, one for each seed."""
+        runs: dict[str, list[TrainedRun]] = {variant: [] for variant in variants}
+        for run in planned_runs([road], tuple(runs), seeds):
+            folder = self.run_folder(run)
+            runs[run.variant].append(TrainedRun(run, read_progress(folder), read_rows(folder)[TRAINED_LABEL]))
+        return runs
 
     def reference_rows(self, road: str) -> dict[str, Table]:
         """Return the rows of the reference drivers on the test seeds, by label."""

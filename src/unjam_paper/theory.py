@@ -86,7 +86,7 @@ def untrained_rows(roads: Sequence[str] = PAPER_ROADS, policies: int = RANDOM_PO
 
 def convergence_rows(study_folder: StudyFolder, seeds: int) -> Table:
     """A2: which trainings come within a tolerance of the best known return, and after how many steps."""
-    runs = {variant: study_folder.trained_runs(THEORY_ROAD, variant, seeds) for variant in CONVERGENCE_VARIANTS}
+    runs = study_folder.trained_runs(THEORY_ROAD, CONVERGENCE_VARIANTS, seeds)
     best = max(row["return_mean"] for found in runs.values() for run in found for row in run.progress)
     threshold = best - CONVERGENCE_TOLERANCE * abs(best)
     rows = []
@@ -104,13 +104,8 @@ def convergence_rows(study_folder: StudyFolder, seeds: int) -> Table:
 
 def model_error_history(study_folder: StudyFolder, seeds: int) -> dict[str, list[Table]]:
     """A3: eps_m, k*, the bound and the gap between returns in model and environment, by variant and seed."""
-    return {
-        variant: [
-            [_model_facts(row) for row in run.progress]
-            for run in study_folder.trained_runs(THEORY_ROAD, variant, seeds)
-        ]
-        for variant in MODEL_VARIANTS
-    }
+    runs = study_folder.trained_runs(THEORY_ROAD, MODEL_VARIANTS, seeds)
+    return {variant: [[_model_facts(row) for row in run.progress] for run in found] for variant, found in runs.items()}
 
 
 def _model_facts(row: dict[str, Any]) -> dict[str, Any]:
