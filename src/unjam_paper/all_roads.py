@@ -5,7 +5,6 @@ seeds than the test seeds. The controllers of a joint training learned on many r
 in batches, which equal SUMO's except for rounding.
 """
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import groupby
@@ -51,13 +50,14 @@ from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
-from unjam_paper.results_file import StudyPart, controller_digest, measure_parts, read_parts
+from unjam_paper.results_file import StudyPart, controller_digest, measure_parts, read_optional_part, read_parts
 from unjam_paper.study import PlannedRun, Study, StudyFolder
 from unjam_paper.variants import RINGS_EXPERT, SHARED_RINGS_EXPERT, VARIANTS
 
 EPISODES_PER_ROAD = 10
 """episodes of each driver on each road"""
 EXPERT_SELECTION_SEEDS, FAMILY_TEST_SEEDS = tuning_seeds(EPISODES_PER_ROAD, 1000), make_test_seeds(EPISODES_PER_ROAD)
+Seeds = Sequence[tuple[int, ...]]
 EpisodeRunner = Callable[[list[EpisodeTask]], EpisodeRows]
 """runs tasks and returns the result of `family_metrics` for each of them, in order"""
 PI_TUNED_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
@@ -144,7 +144,7 @@ FAMILY_METRICS = (
 
 
 def drive_by_label(
-    scenario: Scenario, drivers: Mapping[str, str], seeds: list[tuple[int, ...]], run_episodes: EpisodeRunner
+    scenario: Scenario, drivers: Mapping[str, str], seeds: Seeds, run_episodes: EpisodeRunner
 ) -> dict[str, EpisodeRows]:
     """Return the metrics of each driver's episodes by label; `drivers` are names of drivers by label."""
     made = [make_driver(name, scenario.control_step) for name in drivers.values()]  # one each: networks have memory
@@ -164,48 +164,34 @@ def family_metrics(index: int, episode: Episode) -> dict[str, Any]:
 
 
 def _write_all_roads(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    roads = [(number, name, road, road.make_scenario()) for number, (name, road) in enumerate(FAMILY.items())]
+    roads = sorted(enumerate(FAMILY.items()), key=lambda each: _is_motorway(each[1][1]))  # quick ones first
     with WorkerPool(workers) as pool:
         run_episodes = partial(pool.run_and_map, transform=family_metrics)
-        for number, name, road, scenario in sorted(roads, key=lambda each: not each[3].is_closed):  # quick ones first
-            file, results = folder / f"{number:02d}.json", no_results(name, road)
-            if file.is_file():
-                results |= json.loads(file.read_text(encoding="utf-8"))
-            drive_missing(scenario, road_experts(road), FAMILY_DRIVERS, FAMILY_TEST_SEEDS, results, run_episodes)
-            atomic_write(file, to_json(results))
+        for number, (name, road) in roads:
+            known = read_optional_part(folder, f"{number:02d}")
+            results = drive_missing(name, road, FAMILY_DRIVERS, FAMILY_TEST_SEEDS, known, run_episodes)
+            atomic_write(folder / f"{number:02d}.json", to_json(results))
 
 
-def no_results(name: str, road: FamilyRoad) -> dict[str, Any]:
-    """Return the results of a road on which no driver has been evaluated."""
-    facts = {"road": name, "part": road.part, "best": HUMAN_LABEL}
-    return {**facts, "expert_files": {}, "driver_files": {}, "rows": {}}
-
-
-def road_experts(road: FamilyRoad) -> tuple[str, ...]:
-    """Return the experts from which the best one of a road is selected."""
-    return FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]]
+def _is_motorway(road: FamilyRoad) -> bool:
+    return GROUP_BY_SCENARIO[road.scenario] == "motorways"
 
 
 def drive_missing(
-    scenario: Scenario,
-    experts: Sequence[str],
-    drivers: Mapping[str, str],
-    seeds: list[tuple[int, ...]],
-    results: dict[str, Any],
-    run_episodes: EpisodeRunner,
-) -> None:
-    """Run the drivers of a road without results, or with a changed packaged file, and add their results.
+    name: str, road: FamilyRoad, drivers: Mapping[str, str], seeds: Seeds, known: dict[str, Any], run: EpisodeRunner
+) -> dict[str, Any]:
+    """Return the results of a road: what is known, and drivers without results or with a changed packaged file.
 
     The best expert is selected on other seeds than `seeds`. A driver is known by the digest of its packaged file, or by
     its name with parameters.
     """
+    results = {"road": name, "part": road.part, "best": HUMAN_LABEL, "expert_files": {}, "driver_files": {}, "rows": {}}
+    results, scenario, experts = results | known, road.make_scenario(), FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]]
     new = [driver for driver in experts if results["expert_files"].get(driver) != controller_digest(driver)]
     if new:
         others = experts if results["best"] in new else (results["best"], *new)
         candidates = {driver: driver for driver in (HUMAN_LABEL, *others)}
-        results["best"] = best_feasible_driver(
-            drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, run_episodes)
-        )
+        results["best"] = best_feasible_driver(drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, run))
         results["expert_files"] |= {driver: controller_digest(driver) for driver in new}
     evaluated = {HUMAN_LABEL: HUMAN_LABEL, results["best"]: results["best"], **drivers}
     files = {label: controller_digest(driver) or driver for label, driver in evaluated.items()}
@@ -215,8 +201,9 @@ def drive_missing(
         if label not in results["rows"] or results["driver_files"].get(label) != files[label]
     }
     if missing:
-        results["rows"] |= drive_by_label(scenario, missing, seeds, run_episodes)
+        results["rows"] |= drive_by_label(scenario, missing, seeds, run)
         results["driver_files"] |= {label: files[label] for label in missing}
+    return results
 
 
 def best_feasible_driver(rows: Mapping[str, EpisodeRows]) -> str:
@@ -279,9 +266,9 @@ def all_drivers_table(folder: Path) -> pd.DataFrame:
     for heading, parts in TABLE_PARTS.items():
         roads = road_gains(folder, parts)
         for name, road in roads.items():
-            is_motorway = GROUP_BY_SCENARIO[FAMILY[name].scenario] == "motorways"
+            law = JAM_AHEAD_ON_ALL_LABEL if _is_motorway(FAMILY[name]) else PI_ON_ALL_LABEL
             for values in (road["gains"], road["by_seed"]):
-                values[TWO_LAWS_LABEL] = values[JAM_AHEAD_ON_ALL_LABEL if is_motorway else PI_ON_ALL_LABEL]
+                values[TWO_LAWS_LABEL] = values[law]
         for label, row in rows.items():
             differences = (road["by_seed"][first] - road["by_seed"][label] for road in roads.values())
             row[heading] = _mean_gain(road["by_seed"][label] for road in roads.values())
@@ -339,7 +326,7 @@ def joint_training_study(
     group: str = RING_GROUP,
     baselines: Mapping[str, str] = RING_BASELINES,
     roads: Mapping[str, FamilyRoad] | None = None,
-    test_seeds: Sequence[tuple[int, ...]] = FAMILY_TEST_SEEDS,
+    test_seeds: Seeds = FAMILY_TEST_SEEDS,
 ) -> Study:
     """Return the study of variants, each with its maximum number of trainings.
 
@@ -356,7 +343,7 @@ def joint_training_study(
                 f"{VARIANTS[run.variant].label} {run.seed}": str(joint_controller(road, run, study_folder))
                 for run in make_runs(seeds)
             }
-            parts[f"{number:02d}"] = measure_road, (name, road, {**baselines, **trained}, list(test_seeds))
+            parts[f"{number:02d}"] = measure_road, (name, road, {**baselines, **trained}, test_seeds)
         measure_parts(folder, parts, workers)
 
     labels = [VARIANTS[name].label for name in variants]
@@ -376,14 +363,10 @@ def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolde
     return study_folder.run_folder(run) / name
 
 
-def measure_road(
-    name: str, road: FamilyRoad, drivers: Mapping[str, str], seeds: list[tuple[int, ...]]
-) -> dict[str, Any]:
+def measure_road(name: str, road: FamilyRoad, drivers: Mapping[str, str], seeds: Seeds) -> dict[str, Any]:
     """Return the metrics of all drivers on a road on the test seeds; its best expert is selected on other seeds."""
-    results = no_results(name, road)
     with WorkerPool() as workers:
-        run = partial(_run_in_batches, workers)
-        drive_missing(road.make_scenario(), road_experts(road), drivers, seeds, results, run)
+        results = drive_missing(name, road, drivers, seeds, {}, partial(_run_in_batches, workers))
     return {key: results[key] for key in ("road", "part", "best", "rows")}
 
 

@@ -1,6 +1,5 @@
 """Tables and resumption of the study `all-roads`."""
 
-from functools import partial
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ import pytest
 
 from unjam.measures.gain import MAX_GAIN, MIN_GAIN
 from unjam.measures.metric_table import HUMAN_LABEL
-from unjam.scenarios import Ring
 from unjam.training.road_family import FAMILY
 from unjam_paper import all_roads
 from unjam_paper.all_roads import (
@@ -103,9 +101,13 @@ def test_only_missing_drivers_run_and_the_best_can_change(tmp_path: Path, monkey
     monkeypatch.setattr(all_roads, "controller_digest", lambda driver: files.get(driver, ""))
 
     road: dict[str, Any] = {"best": HUMAN_LABEL, "expert_files": {}, "driver_files": {}, "rows": {}}
-    drivers = {"PI": "pi"}
-    given: dict[str, Any] = {"drivers": drivers, "seeds": [(1,)], "results": road, "run_episodes": lambda tasks: []}
-    resume = partial(all_roads.drive_missing, Ring(), **given)
+    monkeypatch.setattr(all_roads, "FAMILY_EXPERTS", experts := {"rings": ("pi",)})
+    drivers, name = {"PI": "pi"}, "ring-22-grown"
+
+    def resume(names: tuple[str, ...]) -> None:
+        experts["rings"] = names
+        road.update(all_roads.drive_missing(name, FAMILY[name], drivers, [(1,)], road, lambda tasks: []))
+
     resume(("pi",))
     assert (runs, road["best"]) == ([[HUMAN_LABEL, "pi"], [HUMAN_LABEL, "pi", "pi"]], "pi")
     resume(("pi",))
