@@ -144,7 +144,6 @@ def rollouts_of(rewards: np.ndarray, made: list[int], terminated: list[bool]) ->
         lengths=torch.tensor(made),
         terminated=torch.tensor(terminated),
         drawn_values=torch.linspace(-1, 1, rows)[:, None],
-        start_indices=np.zeros((rows, 2), np.int64),
         control_steps=sum(made),
         clipped_share={},
     )
@@ -188,10 +187,11 @@ def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
     for iteration in (1, 2):
         episodes = [run_episode(RING, driver, (9, iteration, n), explore=True, simulation=shared) for n in (0, 1)]
         rollouts.learn(episodes, iteration)
-    batches = list[RolloutBatch]()
+    plans, batches = list[RolloutPlan](), list[RolloutBatch]()
     simulate = rollouts.simulate
 
     def recorded(plan: RolloutPlan) -> RolloutBatch:
+        plans.append(plan)
         batches.append(simulate(plan))
         return batches[-1]
 
@@ -203,8 +203,8 @@ def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
     (batch,) = batches
     assert rollouts.k_star == 30
     assert batch.rewards.numel() == 3 * 240 / 10
-    assert set(batch.start_indices[:, 0]) == episodes_begun
-    assert (set(batch.start_indices[:, 1]) == {0}) == (begin == "first")
+    assert set(plans[0].starts[:, 0]) == episodes_begun
+    assert (set(plans[0].starts[:, 1]) == {0}) == (begin == "first")
 
 
 def test_k_star_of_zero_gives_no_model_rows(shared: Simulation) -> None:

@@ -103,11 +103,10 @@ def test_new_model_has_the_errors_of_its_base() -> None:
 
 def returns_of(driver: ResidualDriver, world: ToyDynamics, data: EnvironmentData) -> tuple[float, float]:
     """Return the mean returns of model and environment."""
-    starts = prepare_starts(data, data.start_indices(20), driver.expert, "cpu")
+    indices = data.start_indices(20)
+    starts = prepare_starts(data, indices, driver.expert, "cpu")
     rollouts = roll_out(driver, world, starts, 20, torch_generator((1,), "cpu"))
-    model, environment = mean_returns(
-        rollouts.rewards.sum(1).double().numpy(), rollouts.start_indices, data, control_steps=18
-    )
+    model, environment = mean_returns(rollouts.rewards.sum(1).double().numpy(), indices, data, control_steps=18)
     assert model is not None
     assert environment is not None
     return model, environment

@@ -180,7 +180,8 @@ def algorithm_1(
         eps_pi = policy_distance(before, learner.residual_distribution(compared))
         log |= {"eps_pi_mean": float(eps_pi.mean()), "eps_pi_max": float(eps_pi.max())}
         for each in model_rollouts:
-            each.facts["bound"] = each.bound(log["eps_pi_max"], learner.gamma)
+            eps_m = each.facts["eps_m_by_estimator"]["transitions"]
+            each.facts["bound"] = each.bound(each.k_star, log["eps_pi_max"], eps_m, learner.gamma)
 
         # Line 9: until the policy performs well in the environment; the best one is stored.
         facts = [each.facts for each in model_rollouts]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from math import ceil
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -78,6 +78,8 @@ class ModelRollouts(Generic[EnsembleT]):
     """The learned model of a task, the environment data D_a that it is fitted to, and the rollouts in it."""
 
     model: EnsembleT
+    stored_types: ClassVar[dict[str, Any]] = {"data": EnvironmentData}
+    """types of the attributes that checkpoints store"""
 
     def __init__(
         self, settings: ModelSettings, task: Task, policy: PolicySettings, run_seed: int, task_index: int = 0
@@ -100,6 +102,9 @@ class ModelRollouts(Generic[EnsembleT]):
 
     def _new_model(self) -> EnsembleT:
         raise NotImplementedError
+
+    def _store_episodes(self, episodes: Sequence[Episode]) -> None:
+        self.data.add(episodes, self.scenario)
 
     def _fit_model(self, seed: Seed) -> ModelFit:
         raise NotImplementedError
@@ -137,9 +142,8 @@ class ModelRollouts(Generic[EnsembleT]):
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
-        first = self.data.episode_count
-        self.data.add(episodes, self.scenario)
-        self._first_new_episode = first
+        first = self._first_new_episode = self.data.episode_count
+        self._store_episodes(episodes)
         self._new_steps = sum(len(each.reward) for episode in episodes for each in episode.trajectories)
         if self.settings.calibrate_base and first == 0:
             states = (recording.states for recording in self.data.recordings)
@@ -168,11 +172,7 @@ class ModelRollouts(Generic[EnsembleT]):
         is_new = [self.data.recordings[index].episode >= self._first_new_episode for index in plan.starts[:, 0]]
         return mean_returns(returns[is_new], plan.starts[is_new], self.data, plan.control_steps)
 
-    def bound(self, eps_pi: float, gamma: float) -> float:
-        """Return the bound C for this iteration; `gamma` is the discount from action to action."""
-        return self.bound_at(self.k_star, eps_pi, self.facts["eps_m_by_estimator"]["transitions"], gamma)
-
-    def bound_at(self, k: int, eps_pi: float, eps_m: float, gamma: float) -> float:
+    def bound(self, k: int, eps_pi: float, eps_m: float, gamma: float) -> float:
         """Return the bound C for rollouts of `k` control steps; `gamma` is the discount from action to action."""
         return return_bound(eps_pi, eps_m, k, self.step_discount(gamma), self.max_reward)
 
@@ -187,28 +187,21 @@ class ModelRollouts(Generic[EnsembleT]):
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all that a run needs to resume, as JSON and tensors."""
-        data, tensors = pack_tensors(self.data, "data")
-        tensors |= {name: tensor.cpu() for name, tensor in self.model.state_dict().items()}
-        return {"model_steps": self.model_steps, "data": data, "humans": asdict(self.scenario.humans)}, tensors
+        facts: dict[str, Any] = {"model_steps": self.model_steps, "humans": asdict(self.scenario.humans)}
+        tensors = {name: tensor.cpu() for name, tensor in self.model.state_dict().items()}
+        for name in self.stored_types:
+            facts[name], arrays = pack(getattr(self, name))
+            tensors |= {f"{name}/{path}": torch.from_numpy(np.array(array)) for path, array in arrays.items()}
+        return facts, tensors
 
     def restore(self, facts: dict[str, Any], tensors: Tensors) -> None:
         """Resume from what `state` returned."""
-        self.data = unpack_tensors(EnvironmentData, facts["data"], tensors, "data")
+        for name, kind in self.stored_types.items():
+            arrays = {path: tensor.numpy() for path, tensor in tensors_with_prefix(f"{name}/", tensors).items()}
+            setattr(self, name, unpack(kind, facts[name], arrays))
         self.model_steps = facts["model_steps"]
         self.scenario = replace(self.scenario, humans=IDMParameters(**facts["humans"]))
         self.model.load_state_dict({name: tensor for name, tensor in tensors.items() if "/" not in name})
-
-
-def pack_tensors(tree: Any, name: str) -> tuple[Any, Tensors]:
-    """Return a tree as JSON and tensors, whose names begin with `name` and a slash; see `pack`."""
-    packed, arrays = pack(tree)
-    return packed, {f"{name}/{path}": torch.from_numpy(np.array(array)) for path, array in arrays.items()}
-
-
-def unpack_tensors(kind: Any, packed: Any, tensors: Tensors, name: str) -> Any:
-    """Return the tree of type `kind` that `pack_tensors` converted."""
-    arrays = {path: tensor.numpy() for path, tensor in tensors_with_prefix(f"{name}/", tensors).items()}
-    return unpack(kind, packed, arrays)
 
 
 class RowRollouts(ModelRollouts[RowModel]):

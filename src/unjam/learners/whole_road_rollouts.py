@@ -3,26 +3,17 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import nan
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import EXPERT_KEY
 from unjam.learners.experience import Experience, join_experience
-from unjam.learners.learner import Tensors
-from unjam.learners.model_rollouts import (
-    FIT_SEED,
-    ExperienceFactory,
-    ModelRollouts,
-    RolloutPlan,
-    RolloutResult,
-    pack_tensors,
-    unpack_tensors,
-)
-from unjam.models.comparison import ReplayDriver, RoadTrajectories, Waves, road_trajectories
+from unjam.learners.model_rollouts import FIT_SEED, ExperienceFactory, ModelRollouts, RolloutPlan, RolloutResult
+from unjam.models.comparison import ReplayDriver
 from unjam.models.ensemble import ModelFit, Seed, torch_generator
-from unjam.models.environment_data import StartIndices, is_holdout_episode, reconstruct_memory
+from unjam.models.environment_data import EnvironmentData, StartIndices, is_holdout_episode, reconstruct_memory
 from unjam.models.motorway_model import MotorwaySamples, fit_motorway_model, learned_correction, motorway_samples
 from unjam.models.road_model import (
     RoadModel,
@@ -50,14 +41,13 @@ from unjam.worlds.reward import make_reward
 from unjam.worlds.worker_pool import EpisodeTask
 
 WAVE_INTERVAL = 10.0
-"""time between the states of `Waves` on an on-ramp [s]"""
+"""time between the stored states of waves on an on-ramp [s]"""
+Facts = dict[str, Any]
 SamplesT = TypeVar("SamplesT", RoadSamples, MotorwaySamples)
 
 
 class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
     """The learned model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
-
-    sample_type: type[SamplesT]
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -71,14 +61,14 @@ class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
     def _sample_episode(self, episode: Episode, number: int) -> SamplesT:
         raise NotImplementedError
 
-    def _fit_samples(self, seed: Seed) -> ModelFit:
-        raise NotImplementedError
-
     def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
         raise NotImplementedError
 
-    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
-        """Return a holdout episode in environment and model; `run_episode` runs one where environment episodes run."""
+    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
+        """Return a holdout episode as recorded, in the model, and in its base alone, as facts for `model.json`.
+
+        `run_episode` runs an episode where environment episodes run.
+        """
         raise NotImplementedError
 
     def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
@@ -101,38 +91,23 @@ class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
         held_out = [each for each in self.samples if is_holdout_episode(each.episode // group_size, holdout)]
         return (held_out or self.samples)[-1]
 
-    def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
-        """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
+    def _store_episodes(self, episodes: Sequence[Episode]) -> None:
         first = self.data.episode_count
-        self.samples += [self._sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
-        super().learn(episodes, iteration)
-
-    def _fit_model(self, seed: Seed) -> ModelFit:
+        new = [self._sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
+        super()._store_episodes(episodes)
         oldest = self.data.recordings[0].episode
-        self.samples = [each for each in self.samples if each.episode >= oldest]
-        return self._fit_samples(seed)
-
-    def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return all that a run needs to resume, as JSON and tensors."""
-        facts, tensors = super().state()
-        samples, sample_tensors = pack_tensors(self.samples, "samples")
-        return {**facts, "samples": samples}, tensors | sample_tensors
-
-    def restore(self, facts: dict[str, Any], tensors: Tensors) -> None:
-        """Resume from what `state` returned."""
-        super().restore(facts, tensors)
-        self.samples = unpack_tensors(list[self.sample_type], facts["samples"], tensors, "samples")
+        self.samples = [each for each in (*self.samples, *new) if each.episode >= oldest]
 
 
 class RoadRollouts(WholeRoadRollouts[RoadSamples]):
     """The learned model of whole closed roads."""
 
-    sample_type = RoadSamples
+    stored_types: ClassVar = {"data": EnvironmentData, "samples": list[RoadSamples]}
 
     def _sample_episode(self, episode: Episode, number: int) -> RoadSamples:
         return road_samples(episode, number, cast(LoopScenario, self.scenario))
 
-    def _fit_samples(self, seed: Seed) -> ModelFit:
+    def _fit_model(self, seed: Seed) -> ModelFit:
         return fit_road_model(self.model, self.samples, self.settings, self.scenario, seed)
 
     def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> StartIndices:
@@ -182,7 +157,7 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
         )
         return finish_drive(start_batch_drive(world, driver, explore=True, memory=memory)).episodes
 
-    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
+    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
         """Return a recorded holdout episode, and its CAVs' accelerations replayed in model and base with new noise."""
         samples, recordings = self._holdout_samples, self.data.recordings
         rows = [index for index, each in enumerate(recordings) if each.episode == samples.episode]
@@ -191,13 +166,13 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
             "model": learned_human_model(self.model, self.scenario, torch_generator((0,), "cpu")),
             "base": base_human_model(self.settings.base, self.scenario),
         }
-        cav_columns = np.flatnonzero(samples.is_human == 0.0).tolist()
-        roads = {"recorded": RoadTrajectories(samples.speeds, samples.positions, np.zeros((0, 0)), cav_columns)}
+        lanes, cav_columns = np.zeros((0, 0)), np.flatnonzero(samples.is_human == 0.0).tolist()
+        roads = {"recorded": _road_facts(samples.speeds, samples.positions, lanes, cav_columns)}
         start, memory = np.array([[rows[0], 0]]), driver.initial_memory(len(rows))
         for label, human_model in human_models.items():
             (episode,) = self.simulate(driver, memory, start, len(driver.accelerations), human_model, (1,))
-            roads[label] = road_trajectories(episode, samples.interval)
-        return Waves(samples.interval * self.scenario.control_step, samples.length, (), roads)
+            roads[label] = _episode_facts(episode, samples.interval)
+        return _wave_facts(samples.interval * self.scenario.control_step, samples.length, (), roads)
 
     def _expert_memory(self, start_indices: StartIndices) -> Memory:
         """Return the expert's memory: all rows of the first CAV, then of the second."""
@@ -211,12 +186,12 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
 class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
     """The learned model of an on-ramp."""
 
-    sample_type = MotorwaySamples
+    stored_types: ClassVar = {"data": EnvironmentData, "samples": list[MotorwaySamples]}
 
     def _sample_episode(self, episode: Episode, number: int) -> MotorwaySamples:
         return motorway_samples(episode, number, cast(OnRamp, self.scenario), self.model.base)
 
-    def _fit_samples(self, seed: Seed) -> ModelFit:
+    def _fit_model(self, seed: Seed) -> ModelFit:
         group_size = len(self._policy.exploration_signs)
         return fit_motorway_model(self.model, self.samples, self.settings, seed, group_size)
 
@@ -250,17 +225,17 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
         recorded = np.array([samples.episode_return for samples in plan.starts])
         return float(returns[is_new].mean()), float(recorded[is_new].mean())
 
-    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Waves:
+    def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
         """Return a holdout episode, run again, and what model and base make of its vehicles; the expert drives CAVs."""
         road, expert, samples = self.scenario, self._task.expert, self._holdout_samples
         recorded = run_episode(EpisodeTask(road, expert, samples.seed))
         interval = max(1, round(WAVE_INTERVAL / road.control_step))
-        roads = {"recorded": road_trajectories(recorded, interval)}
+        roads = {"recorded": _episode_facts(recorded, interval)}
         for label, model in (("model", self.model), ("base", self._new_model())):
             correction = self._correction(model, (0,))
             (episode,) = self.simulate(expert, [samples], road.horizon, correction, [((1,), (2,))])
-            roads[label] = road_trajectories(episode, interval)
-        return Waves(interval * road.control_step, nan, recorded.lane_names, roads)
+            roads[label] = _episode_facts(episode, interval)
+        return _wave_facts(interval * road.control_step, nan, recorded.lane_names, roads)
 
     def simulate(
         self,
@@ -281,3 +256,17 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
     def _correction(self, model: RoadModel, seed: Sequence[int]) -> LearnedCorrection | None:
         generator, steps = torch_generator(seed, "cpu"), self.scenario.steps_per_control_step
         return learned_correction(model, generator, steps, self.settings.add_noise)
+
+
+def _wave_facts(control_step: float, loop_length: float, lane_names: Sequence[str], roads: Facts) -> Facts:
+    return {"control_step": control_step, "loop_length": loop_length, "lane_names": lane_names, "waves": roads}
+
+
+def _episode_facts(episode: Episode, interval: int) -> Facts:
+    speeds, positions, lanes = (each[::interval] for each in (episode.speeds, episode.positions, episode.lane_indices))
+    return _road_facts(speeds, positions, lanes, episode.cav_columns)
+
+
+def _road_facts(speeds: Floats, positions: Floats, lanes: Floats, cav_columns: list[int]) -> Facts:
+    """Return all vehicles on a road at M times, in N columns: tables (M, N), SI units, NaN without a vehicle."""
+    return {"speeds": speeds, "positions": positions, "lanes": lanes, "cav_columns": cav_columns}

@@ -16,7 +16,7 @@ from unjam.models.row_model import STATE_FIELDS, OneStepErrors, RowModel, model_
 from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.drive import DriveLoop
-from unjam.worlds.record import Episode, Floats
+from unjam.worlds.record import Floats
 
 
 class OpenLoopErrors(NamedTuple):
@@ -83,8 +83,7 @@ def replay_accelerations(
     generator = torch_generator((0,), device)  # not used
     members = torch.arange(model.members, device=device)
     dynamics = ModelDynamics(model, scenario, "", generator, add_noise=False, members=members)
-    starts = RolloutStarts(states, {}, drawn, indices)
-    world = ModelWorld(dynamics, starts, control_steps, scenario.acceleration_limits, None)
+    world = ModelWorld(dynamics, RolloutStarts(states, {}, drawn), control_steps, scenario.acceleration_limits, None)
     for _ in DriveLoop(world, ReplayDriver(to_device(accelerations, device))):
         pass
     shape = model.members, len(start_indices), control_steps
@@ -114,33 +113,3 @@ def mean_returns(
         return None, None
     environment = np.array([each.sum() for each in itertools.compress(rewards, is_complete)])
     return float(model_returns[is_complete].mean()), float(environment.mean())
-
-
-class RoadTrajectories(NamedTuple):
-    """All vehicles on a road at M times, in N columns; arrays (M, N), SI units, NaN without a vehicle."""
-
-    speeds: Floats
-    positions: Floats
-    """front bumpers"""
-    lanes: Floats
-    """lane indices, or of shape (0, 0)"""
-    cav_columns: list[int]
-
-
-class Waves(NamedTuple):
-    """The same road in the environment and in the model."""
-
-    time_step: float
-    """[s]"""
-    loop_length: float
-    """of a closed road [m], or NaN"""
-    lane_names: tuple[str, ...]
-    roads: dict[str, RoadTrajectories]
-    """`recorded`; `model`, with what was learned; and the `base` alone"""
-
-
-def road_trajectories(episode: Episode, interval: int) -> RoadTrajectories:
-    """Return every `interval`-th state of an episode."""
-    tables = episode.speeds, episode.positions, episode.lane_indices
-    speeds, positions, lanes = (values[::interval] for values in tables)
-    return RoadTrajectories(speeds, positions, lanes, episode.cav_columns)

@@ -215,7 +215,6 @@ class RolloutStarts(NamedTuple):
     """of the expert, as its `tensor_driver` takes it"""
     drawn_values: Tensor
     """scaled values that the episodes drew, shape (n, m)"""
-    indices: StartIndices
 
 
 @dataclass(frozen=True)
@@ -234,7 +233,6 @@ class RolloutBatch:
     """whether the row crashed; otherwise it was truncated, shape (n,)"""
     drawn_values: Tensor
     """scaled values that the episodes drew, shape (n, m)"""
-    start_indices: StartIndices
     control_steps: int
     """total number of valid control steps"""
     clipped_share: dict[str, float]
@@ -269,7 +267,6 @@ def prepare_starts(
         state=data.states_at(start_indices).map(lambda values: to_device(values, device)),
         memory=tensor_memory(tensor_driver(expert, device), memory, device),
         drawn_values=to_device(drawn, device),
-        indices=start_indices,
     )
 
 
@@ -347,7 +344,6 @@ class ModelWorld:
             lengths=sum((self._running_log[step] for step in steps), zeros).long(),
             terminated=self._is_running == 0.0,
             drawn_values=self._starts.drawn_values,
-            start_indices=self._starts.indices,
             control_steps=int(self._step_total.item()),
             clipped_share=dict(zip(CLIPPED_QUANTITIES, clipped_shares, strict=True)),
         )

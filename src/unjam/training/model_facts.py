@@ -90,15 +90,9 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     rollouts.restore(state[rollouts.name], tensors_with_prefix(f"{rollouts.name}/", tensors))
     facts = {"iteration": state["iteration"], "base": settings.base, "members": settings.members}
     if settings.kind == "road":
-        return _round_values(facts | _wave_facts(cast(WholeRoadRollouts[Any], rollouts), config.simulator))
+        run = _run_in_batch if config.simulator == "batch" else _run_in_sumo
+        return _round_values(facts | cast(WholeRoadRollouts[Any], rollouts).waves(run))
     return _round_values(facts | _row_facts(cast(RowRollouts, rollouts), config, progress[-1]))
-
-
-def _wave_facts(rollouts: WholeRoadRollouts[Any], simulator: str) -> dict[str, Any]:
-    """Return the waves on a road in the environment, run in a simulator, and in the model."""
-    step, length, lane_names, roads = rollouts.waves(_run_in_batch if simulator == "batch" else _run_in_sumo)
-    waves = {label: road._asdict() for label, road in roads.items()}
-    return {"control_step": step, "loop_length": length, "lane_names": lane_names, "waves": waves}
 
 
 def _run_in_batch(task: EpisodeTask) -> Episode:
@@ -213,7 +207,7 @@ def _bound_facts(rollouts: RowRollouts, progress_row: dict[str, Any], gamma: flo
         "max_reward": rollouts.max_reward,
         "largest_return": rollouts.max_reward / (1.0 - discount),
         "k": ROLLOUT_LENGTHS,
-        "bound": [rollouts.bound_at(k, eps_pi, eps_m, gamma) for k in ROLLOUT_LENGTHS],
+        "bound": [rollouts.bound(k, eps_pi, eps_m, gamma) for k in ROLLOUT_LENGTHS],
     }
 
 
