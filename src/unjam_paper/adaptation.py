@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 
 from unjam.controller import make_driver
 from unjam.drivers.command import Command
-from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
-from unjam.measures.statistics import estimate
+from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.physics.arrays import Array, Floats, clamp_min
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
 from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, new_figure
@@ -29,7 +28,7 @@ from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.drive import finish_drive
 from unjam_paper.all_roads import PI_ON_RINGS_LABEL, PI_TUNED_ON_RINGS
 from unjam_paper.results_file import measure_parts, read_part, write_figure
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, mean_text
 
 ADAPTATION_EPISODES = 20
 STEPS_PER_SECOND = 10
@@ -160,16 +159,15 @@ def adaptation_table(name: str, folder: Path) -> pd.DataFrame:
         speeds, times = results["speeds"], settling_times(**results)
         slowest = np.array([_moving_average(values[CHANGE_SECOND:]).min() for values in speeds])
         median = np.median(np.where(np.isfinite(times), times, np.inf))  # episodes that never settle come last
-        row = {"": label, "before [m/s]": _mean_cell(speeds[:, CHANGE_SECOND - FINAL_SECONDS : CHANGE_SECOND].mean(1))}
-        row |= {"slowest ten seconds after [m/s]": _mean_cell(slowest)}
-        row |= {"last minute [m/s]": _mean_cell(speeds[:, -FINAL_SECONDS:].mean(1))}
+        row = {
+            "": label,
+            "before [m/s]": mean_text(speeds[:, CHANGE_SECOND - FINAL_SECONDS : CHANGE_SECOND].mean(1), 2),
+        }
+        row |= {"slowest ten seconds after [m/s]": mean_text(slowest, 2)}
+        row |= {"last minute [m/s]": mean_text(speeds[:, -FINAL_SECONDS:].mean(1), 2)}
         row |= {"settled": f"{np.isfinite(times).sum()} of {len(times)}"}
         rows.append({**row, "after, median [s]": f"{median:.0f}" if np.isfinite(median) else NO_VALUE_TEXT})
     return pd.DataFrame(rows)
-
-
-def _mean_cell(values: Floats) -> str:
-    return str(estimate_cell(estimate(values.tolist()), 2))
 
 
 @rc_context(PLOT_STYLE)

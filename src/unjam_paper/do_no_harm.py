@@ -67,12 +67,10 @@ NO_HARM, HARM, UNDECIDED = "no harm", "harm", "undecided"
 
 
 class HarmVerdict(NamedTuple):
-    """Comparison of a controller with the ACC alone on a road at a penetration rate."""
+    """Verdict on a controller on a road, and its paired differences in travel time and flow relative to the ACC."""
 
     time: Estimate
-    """paired difference in travel time relative to the ACC"""
     flow: Estimate
-    """paired difference in flow relative to the ACC"""
     verdict: str
 
 

@@ -27,8 +27,7 @@ from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.files import atomic_write, to_json
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
-from unjam.measures.statistics import estimate
+from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.physics.arrays import Floats
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.on_ramp import ON_RAMP, OnRamp
@@ -47,6 +46,7 @@ from unjam_paper.study import (
     Study,
     StudyFolder,
     evaluate_on_test_seeds,
+    mean_text,
     planned_runs,
 )
 from unjam_paper.variants import ON_RAMP_JAM_AHEAD
@@ -143,7 +143,6 @@ class EvaluationRoad:
     """lengths or radii [m]"""
     make_scenario: Callable[[int], Scenario]
     drivers: dict[str, DriverSource]
-    """by label"""
     baselines: tuple[str, ...]
     """labels of the tuned experts to which drivers are compared"""
     metric: str = "return"
@@ -414,7 +413,7 @@ def impaired_table(part: str, folder: Path) -> pd.DataFrame:
     for name, results in read_part(folder, part).items():
         comparison, row = DriverComparison([results]), {"impairment": name}
         for driver in results:
-            row[driver] = str(estimate_cell(estimate(comparison.values([driver], "return").ravel().tolist()), 0))
+            row[driver] = mean_text(comparison.values([driver], "return"), 0)
             time_gap, verdict = comparison.min_time_gap([driver]), comparison.feasibility([driver])
             if driver != HUMAN_LABEL and time_gap != NO_VALUE_TEXT:
                 row[driver] += f"; {time_gap} s" + ("" if verdict == "yes" else f", {verdict}")

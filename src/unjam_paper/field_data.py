@@ -51,7 +51,6 @@ MAX_SEGMENT_SECONDS = 120.0
 ONE_STEP_SETTINGS = NetworkSettings(learning_rate=1e-3, epochs=40, patience=8)
 MULTI_STEP_SETTINGS = MultiStepSettings()
 BOOTSTRAP_DRAWS = 2000
-"""of the bootstrap over trajectories"""
 PAPER_IDM_MODELS = {"paper's IDM": None, "paper's IDM, clipped": ACCELERATION_LIMITS}
 KNOWLEDGE_MODELS = {"knowledge, paper's IDM": None, "knowledge, paper's IDM clipped": ACCELERATION_LIMITS}
 """the paper's IDM within these limits, alone and as the base of a network"""

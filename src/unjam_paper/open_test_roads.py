@@ -140,7 +140,6 @@ OPEN_TEST_ROADS: dict[str, OpenTestRoad] = {
         0.35, *(RoadSection(700, 2, 25, has_signal=True) for _ in range(4)), RoadSection(700, 2, 25)
     ),
 }
-"""by name"""
 
 
 def write_road_files(road: OpenTestRoad, folder: Path) -> Path:

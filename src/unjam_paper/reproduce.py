@@ -46,12 +46,10 @@ class StudyPlan:
 
     names: tuple[str, ...]
     seeds: int
-    """number of trainings of each variant"""
     study_folder: StudyFolder
     runs: list[PlannedRun]
     """trainings that are not finished"""
     finished_count: int
-    """number of finished trainings"""
     roads: list[str]
     """roads on which the reference drivers have not been evaluated"""
 

@@ -89,7 +89,6 @@ STUDIES: dict[str, Study] = {
         *(ALL_ROADS_GROUP, ALL_ROADS_BASELINES, None, FAMILY_TEST_SEEDS[:5]),  # for each of twenty trainings
     ),
 }
-"""every study by name"""
 STUDY_GROUPS: dict[str, tuple[str, ...]] = {
     "table-1": tuple(TABLE_1_STUDIES),
     "figure-4": tuple(TABLE_1_STUDIES),

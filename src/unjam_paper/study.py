@@ -18,7 +18,7 @@ from unjam.files import atomic_write, make_folder
 from unjam.manifest import manifest
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
-from unjam.measures.statistics import Estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
+from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
 from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig, load_config
@@ -236,6 +236,11 @@ class DriverComparison:
         """Return `yes` if drivers are feasible on all roads, else the first reason against it."""
         reasons = (verdict for verdict in self.verdicts(labels) if verdict != FEASIBLE)
         return next((reason or NO_VALUE_TEXT for reason in reasons), "yes")
+
+
+def mean_text(values: Floats, digits: int) -> str:
+    """Return the mean of independent values with its 95 % CI."""
+    return str(estimate_cell(estimate(values.ravel().tolist()), digits))
 
 
 def trainings_text(values: Sequence[float] | Floats, digits: int, sign: str = "") -> str:

@@ -127,7 +127,6 @@ VARIANTS: dict[str, Variant] = {
     "all-roads-trpo": Variant("TRPO", "all-roads", FROM_SCRATCH, MILLION_STEPS),
     "all-roads-ppo": Variant("PPO", "all-roads", {**PPO_AGENT, **FROM_SCRATCH}, MILLION_STEPS),
 }
-"""variants by name"""
 REFERENCE_DRIVERS: dict[str, str] = {
     **{"human": "human", "zero": "constant", "constant +0.1": "constant:acceleration=0.1"},
     **{"PI (paper)": "pi:time_constant=0", "PI": "pi", "FollowerStopper": "follower-stopper"},
