@@ -21,8 +21,8 @@ import pandas as pd
 
 from unjam.controller.certificate import make_certificate
 from unjam.controller.file import SUFFIX, read_controller
+from unjam.drivers.car_following import FollowerStopper
 from unjam.drivers.driver import Driver
-from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.files import atomic_write, to_json

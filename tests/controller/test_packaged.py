@@ -15,8 +15,7 @@ from unjam.controller.file import CERTIFICATE_PART, read_controller
 from unjam.controller.verify import verify_controller_file
 from unjam.drivers import ResidualDriver
 from unjam.drivers.registry import driver_recipe
-from unjam.drivers.road_type_switch import RoadTypeSwitch
-from unjam.drivers.wrappers import FilteredDriver
+from unjam.drivers.wrappers import FilteredDriver, RoadTypeSwitch
 from unjam.errors import InputError
 from unjam.measures.effect import effect_of
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility

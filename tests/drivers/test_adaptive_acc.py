@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from unjam.drivers.adaptive_acc import (
+from unjam.drivers.car_following import (
     BOTTLENECK_STRATEGY,
     FREE_ROAD_STRATEGY,
     JAM_HEAD_STRATEGY,

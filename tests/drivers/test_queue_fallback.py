@@ -10,9 +10,9 @@ from unjam.controller.file import controller_bytes
 from unjam.drivers import Constant, PISaturation, check_driver
 from unjam.drivers.driver import scalar_memory
 from unjam.drivers.local_state import COMMON_FIELDS, LocalState, state_of_ones
-from unjam.drivers.queue_fallback import MAX_GATHERING_TIME, QueueFallback
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION
+from unjam.drivers.wrappers import MAX_GATHERING_TIME, QueueFallback
 from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import FigureEight

@@ -11,7 +11,7 @@ from unjam.drivers import Constant, PISaturation
 from unjam.drivers.check import check_driver
 from unjam.drivers.local_state import COMMON_FIELDS, LocalState, state_of_ones
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
-from unjam.drivers.road_type_switch import ROAD_TYPES, RoadTypeSwitch
+from unjam.drivers.wrappers import ROAD_TYPES, RoadTypeSwitch
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 

@@ -12,9 +12,8 @@ from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.residual import ResidualDriver
-from unjam.drivers.road_type_switch import RoadTypeSwitch
 from unjam.drivers.user_driver import as_driver
-from unjam.drivers.wrappers import HistoryDriver, ImpairedDriver, MixedDriver
+from unjam.drivers.wrappers import HistoryDriver, ImpairedDriver, MixedDriver, RoadTypeSwitch
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
 from unjam.tree import map_leaves

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from unjam.drivers.road_type_switch import MIN_SHARED_PENETRATION_RATE
+from unjam.drivers.wrappers import MIN_SHARED_PENETRATION_RATE
 from unjam.training.road_family import FAMILY, family_roads
 from unjam_paper.all_roads import (
     FAMILY_TEST_SEEDS,

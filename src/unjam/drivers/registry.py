@@ -10,19 +10,23 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from unjam.drivers.adaptive_acc import AdaptiveACC
-from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, Constant, Human
+from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, AdaptiveACC, Constant, FollowerStopper, Human
 from unjam.drivers.driver import Driver, Recipe
-from unjam.drivers.follower_stopper import FollowerStopper
 from unjam.drivers.network import network_from_weights
 from unjam.drivers.observation import FEATURES, FeatureName, check_user_files, observation_size
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
-from unjam.drivers.queue_fallback import QueueFallback
 from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
-from unjam.drivers.road_type_switch import RoadTypeSwitch
 from unjam.drivers.user_driver import FileDriver, FileReference, is_file_reference
-from unjam.drivers.wrappers import INNER_KEY, FilteredDriver, HistoryDriver, ImpairedDriver, MixedDriver
+from unjam.drivers.wrappers import (
+    INNER_KEY,
+    FilteredDriver,
+    HistoryDriver,
+    ImpairedDriver,
+    MixedDriver,
+    QueueFallback,
+    RoadTypeSwitch,
+)
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, build_dataclass, split_parameters
 from unjam.tree import Arrays

@@ -1,9 +1,11 @@
-"""Drivers that contain other drivers: mixtures, impaired sensing, the safety filter, history features."""
+"""Drivers that contain other drivers: mixtures and switches, impaired sensing, the safety filter, history features."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property
+from itertools import chain
 from math import exp
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import ConfigDict, model_validator
@@ -12,12 +14,14 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
+from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION
 from unjam.drivers.safety import FollowingState, SafetyFilter
 from unjam.drivers.sensors import MIN_SENSED_GAP
 from unjam.drivers.speed_history import MAX_WINDOW_STEPS
 from unjam.errors import InputError
 from unjam.parameters import STRICT, NonNegative, Positive
-from unjam.physics.arrays import Array, clamp_min, join_columns, namespace, square_root, stack_columns
+from unjam.physics.arrays import Array, clamp_min, clip, join_columns, namespace, square_root, stack_columns
+from unjam.tree import map_leaves
 
 COMPOSITE_CONFIG: ConfigDict = {**STRICT, "arbitrary_types_allowed": True}
 """configuration of parameter dataclasses with drivers among their fields"""
@@ -33,6 +37,21 @@ HISTORY_STEPS_KEY = "steps"
 """name in the memory: observed control steps"""
 MEAN_KEYS = ("mean_speed", "mean_square", "mean_gap")
 """names of the means in the memory, before their averaging time"""
+MAX_GATHERING_TIME = 30.0
+"""time in which all vehicles gather if their queue fits on the road [s]"""
+PRIMARY_KEY, FALLBACK_KEY = "primary", "fallback"
+"""names of both drivers in the memory, as of their fields"""
+ELAPSED_KEY, GATHERED_KEY, GAVE_UP_KEY = "elapsed", "has_gathered", "gave_up"
+"""names in the memory: elapsed time [s]; whether all had gathered; whether the fallback drives"""
+ROAD_TYPES = ("motorway", "crossing_loop", "loop", "open_road", "shared_loop")
+MIN_SHARED_PENETRATION_RATE = 0.06
+"""penetration rate from which a closed road counts as shared by several CAVs; one CAV among 16 vehicles counts, too,
+because the rate does not give their number"""
+
+
+def _combine_inner(name: str, combine: Callable[[Iterable[Any]], Any]) -> Any:
+    """Return the property that combines the attribute `name` of all inner drivers."""
+    return property(lambda self: combine(getattr(inner, name) for inner in self.inner_drivers.values()))
 
 
 class CompositeDriver(Driver):
@@ -40,32 +59,16 @@ class CompositeDriver(Driver):
 
     kind: ClassVar[str] = ""
     """kind of its recipe"""
+    accepts_floats = _combine_inner("accepts_floats", all)
+    accepts_tensors = _combine_inner("accepts_tensors", all)
+    needs_loop = _combine_inner("needs_loop", any)
+    policy_inputs = _combine_inner("policy_inputs", lambda inner: tuple(chain.from_iterable(inner)))
 
     @cached_property
     def inner_drivers(self) -> dict[str, Driver]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The drivers in its fields, in order."""
         drivers = ((field.name, getattr(self, field.name)) for field in fields(self))  # pyright: ignore[reportArgumentType]
         return {INNER_KEY if name == "driver" else name: each for name, each in drivers if isinstance(each, Driver)}
-
-    @property
-    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether all inner drivers take plain numbers."""
-        return all(inner.accepts_floats for inner in self.inner_drivers.values())
-
-    @property
-    def accepts_tensors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether all inner drivers take tensors."""
-        return all(inner.accepts_tensors for inner in self.inner_drivers.values())
-
-    @property
-    def needs_loop(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether an inner driver needs the position on a closed road."""
-        return any(inner.needs_loop for inner in self.inner_drivers.values())
-
-    @property
-    def policy_inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Features that the networks of inner drivers read."""
-        return tuple(name for inner in self.inner_drivers.values() for name in inner.policy_inputs)
 
     def recipe(self) -> Recipe:
         """Return the recipes of its inner drivers, and its settings."""
@@ -104,7 +107,7 @@ class MixedDriver(CompositeDriver):
     After the last driver it starts again with the first; CAVs that enter an open road count in order of entry.
     """
 
-    accepts_floats: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
+    accepts_floats: ClassVar[bool] = False
 
     drivers: tuple[Driver, ...]
 
@@ -155,8 +158,8 @@ class ImpairedDriver(DriverWrapper):
     """Drives as another driver does with noisy gaps and delayed commands."""
 
     kind: ClassVar[str] = "impaired"
-    accepts_tensors: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
-    accepts_floats: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleMethodOverride]
+    accepts_tensors: ClassVar[bool] = False
+    accepts_floats: ClassVar[bool] = False
 
     driver: Driver
     delay: NonNegative = 0.0
@@ -225,14 +228,10 @@ class FilteredDriver(DriverWrapper):
         """Limits of the result: those of the driver, and the brakes of the vehicle."""
         return Limits(-max(self.action_limit, self.safety.braking), self.action_limit)
 
-    @cached_property
-    def _driver_limits(self) -> Limits:
-        return Limits.symmetric(self.action_limit)
-
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the filtered acceleration of the inner driver, and the new memory."""
         acceleration, after = self.driver.act(state, memory[INNER_KEY])
-        acceleration = self._driver_limits.clip(acceleration)
+        acceleration = clip(acceleration, -self.action_limit, self.action_limit)
         return self.safety.limit(acceleration, FollowingState(*state[:3]), self.time_step), {INNER_KEY: after}
 
     def describe(self) -> str:
@@ -267,11 +266,6 @@ class HistoryDriver(DriverWrapper):
         )
         return (*self.driver.memory_inputs, *own)
 
-    @cached_property
-    def _step_weights(self) -> tuple[tuple[float, float], ...]:
-        """Averaging times, and the weights of one step in their means."""
-        return tuple((time, 1.0 - exp(-self.time_step / time)) for time in AVERAGING_TIMES)
-
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the inner driver, and means over no steps."""
         means = {f"{name}_{time:g}": np.zeros(n) for time in AVERAGING_TIMES for name in MEAN_KEYS}
@@ -293,7 +287,8 @@ class HistoryDriver(DriverWrapper):
         xp, after = namespace(speed), dict(memory)
         after[HISTORY_STEPS_KEY] = memory[HISTORY_STEPS_KEY] + 1.0
         early_weight = 1.0 / after[HISTORY_STEPS_KEY]
-        for time, late_weight in self._step_weights:
+        for time in AVERAGING_TIMES:
+            late_weight = 1.0 - exp(-self.time_step / time)
             weight = xp.where(early_weight > late_weight, early_weight, early_weight * 0.0 + late_weight)
             for name, value in zip(MEAN_KEYS, (speed, speed * speed, gap), strict=True):
                 mean = memory[f"{name}_{time:g}"]
@@ -314,3 +309,118 @@ class HistoryDriver(DriverWrapper):
     def describe(self) -> str:
         """Return the inner driver, and that it has a history."""
         return f"{self.driver.describe()}, with history"
+
+
+@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
+class QueueFallback(CompositeDriver):
+    """Drives by a driver that leads all others in one queue, and by a fallback once that queue has not held.
+
+    Human drivers with larger time gaps, or more of them, form a queue that is longer than half a lap at the pace of
+    the CAV, and meets its own tail at the crossing. No map provides their time gaps. The criterion is therefore that
+    the queue has not formed within `MAX_GATHERING_TIME`, or has broken. The switch is final.
+    """
+
+    primary: Driver
+    fallback: Driver
+    time_step: Positive
+    """control step [s]"""
+
+    kind: ClassVar[str] = "queue-fallback"
+    accepts_tensors: ClassVar[bool] = False
+    needs_loop: ClassVar[bool] = True
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return the memories of both, without elapsed time, queue and switch."""
+        own = {key: np.zeros(n) for key in (ELAPSED_KEY, GATHERED_KEY, GAVE_UP_KEY)}
+        return {**super().initial_memory(n), **own}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration by the active driver, and the new memory; that of the fallback starts with it."""
+        after = self._update_memory(state, memory)
+        gave_up = after[GAVE_UP_KEY]
+        if type(gave_up) is float:
+            key, driver = (FALLBACK_KEY, self.fallback) if gave_up else (PRIMARY_KEY, self.primary)
+            acceleration, after[key] = driver.act(state, memory[key])
+            return acceleration, after
+        acceleration, after[PRIMARY_KEY] = self.primary.act(state, memory[PRIMARY_KEY])
+        fallback_acceleration, fallback_memory = self.fallback.act(state, memory[FALLBACK_KEY])
+
+        def select_rows(if_given_up: Array, if_not_given_up: Array) -> Array:
+            rows = (gave_up > 0.0).reshape(-1, *[1] * (np.ndim(if_given_up) - 1))
+            return np.where(rows, if_given_up, if_not_given_up)
+
+        after[FALLBACK_KEY] = map_leaves(select_rows, fallback_memory, memory[FALLBACK_KEY])
+        return select_rows(fallback_acceleration, acceleration), after
+
+    def _update_memory(self, state: LocalState, memory: Memory) -> Memory:
+        free, elapsed = state.leader_gap / state.loop_length, memory[ELAPSED_KEY] + self.time_step
+        xp, one = namespace(free), memory[GATHERED_KEY] * 0.0 + 1.0
+        gathered = xp.where(free >= GATHERED_LAP_FRACTION, one, memory[GATHERED_KEY])
+        is_broken = (gathered > 0.0) & (free < BROKEN_LAP_FRACTION)
+        failed = is_broken | ((gathered == 0.0) & (elapsed > MAX_GATHERING_TIME))
+        gave_up = xp.where(failed, one, memory[GAVE_UP_KEY])
+        return {**memory, ELAPSED_KEY: elapsed, GATHERED_KEY: gathered, GAVE_UP_KEY: gave_up}
+
+    def describe(self) -> str:
+        """Return both."""
+        return f"{self.primary.describe()} while the queue holds, else {self.fallback.describe()}"
+
+
+@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
+class RoadTypeSwitch(CompositeDriver):
+    """Drives by one of its inner drivers, selected by road type: from the vehicle's map and roadside messages.
+
+    All CAVs of an episode are on one road. The memories for other road types keep their initial values.
+    """
+
+    kind: ClassVar[str] = "road-type-switch"
+    accepts_tensors: ClassVar[bool] = False
+    needs_loop: ClassVar[bool] = False
+    policy_inputs: ClassVar[tuple[str, ...]] = ()
+    required_fields: ClassVar[tuple[str, ...]] = ("distance_to_crossing", "penetration_rate")
+
+    motorway: Driver
+    """on roads with measured speeds of the lanes ahead"""
+    crossing_loop: Driver
+    """on a closed road that crosses itself"""
+    loop: Driver
+    """on any other closed road"""
+    open_road: Driver
+    """on open roads without roadside information"""
+    shared_loop: Driver | None = None
+    """on closed roads without a crossing and with at least `MIN_SHARED_PENETRATION_RATE`; None: `loop`"""
+
+    @property
+    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether those of closed roads take plain numbers, which no other road uses."""
+        closed = (self.crossing_loop, self.loop, self.shared_loop or self.loop)
+        return all(driver.accepts_floats for driver in closed)
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration by the driver for this road type, and the new memory."""
+        name = self._road_type(state)
+        acceleration, after = self.inner_drivers[name].act(state, memory[name])
+        return acceleration, {**memory, name: after}
+
+    def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
+        """Return those of the driver for this road type."""
+        name = self._road_type(state)
+        return self.inner_drivers[name].time_gaps(state, memory[name])
+
+    def describe(self) -> str:
+        """Return all of them with their road types."""
+        return ", ".join(f"{name}: {driver.describe()}" for name, driver in self.inner_drivers.items())
+
+    def _road_type(self, state: LocalState) -> str:
+        if state.lane_speeds is not None:
+            return "motorway"
+        if state.distance_to_crossing is not None:
+            return "crossing_loop"
+        length, rate = state.loop_length, state.penetration_rate
+        is_open = length != length if isinstance(length, float) else namespace(length).isnan(length).all()
+        if bool(is_open):
+            return "open_road"
+        if self.shared_loop is None or rate is None:
+            return "loop"
+        rate = rate if isinstance(rate, float) else float(rate[0])
+        return "shared_loop" if rate >= MIN_SHARED_PENETRATION_RATE else "loop"

@@ -9,7 +9,7 @@ populations were added last, as unseen roads.
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from unjam.drivers.road_type_switch import MIN_SHARED_PENETRATION_RATE
+from unjam.drivers.wrappers import MIN_SHARED_PENETRATION_RATE
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers import Human
-from unjam.drivers.adaptive_acc import AdaptiveACC
+from unjam.drivers.car_following import AdaptiveACC
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import MAX_OBSERVED_GAP
 from unjam.drivers.road_experts import Cruise, JamAhead
