@@ -90,12 +90,6 @@ CURVE_POINTS = 100
 CURVE_LABELS = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed, in training [m/s]"}
 RETURN_COLUMNS, SPEED_COLUMNS = ("return_mean", "return_validation"), ("cav_mean_speed", "speed_std_cav")
 FIGURE_5_VARIANTS = ("proposed", "ours")
-PAPER_EXACT_VARIANTS = {
-    "ring": ("trpo-exact", "proposed-exact"),
-    "figure-eight": ("trpo-exact", "proposed-exact"),
-    "merge": ("trpo-exact-million", "proposed-exact-million"),
-}
-"""variants with the exact settings of the paper, by road"""
 EFFICIENCY_STEPS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
 ON_RAMP_EFFICIENCY_STEPS = (28_800,)
 """environment steps after which trainings are compared; on the on-ramp, those of a training with the model"""
@@ -321,7 +315,8 @@ def paper_exact_study(road: str) -> Study:
 
     All steps are made; the iteration at which the convergence rule of the paper ends the training is computed.
     """
-    variants = PAPER_EXACT_VARIANTS[road]
+    fewer = "-million" if road == "merge" else ""
+    variants = (f"trpo-exact{fewer}", f"proposed-exact{fewer}")
     study = comparison_study(f"exact settings of the paper, on {road}", variants, road)
 
     def write(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:

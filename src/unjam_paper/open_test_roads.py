@@ -20,8 +20,6 @@ TRUCK_SPEED = 24.0
 """speed limit of trucks [m/s]"""
 CROSSING_SHARE = 0.05
 """demand on each road that crosses at a signal, as a share of the demand on the main road"""
-NETCONVERT_OPTION = "--junctions.limit-turn-speed=-1"
-"""curves have the speed limit of their definition"""
 SIDE_ROAD = (1, 20.0)
 """lanes and speed limit [m/s] of ramps and of crossing roads"""
 
@@ -176,7 +174,8 @@ def write_road_files(road: OpenTestRoad, folder: Path) -> Path:
     route_elements = [xml_element("route", id=name, edges=" ".join(route)) for name, (route, _) in routes.items()]
     shares = {name: share for name, (_, share) in routes.items()}
     traffic = [*_vehicle_types(road), *route_elements, *_flows(road, shares)]
-    return write_network(folder, nodes, edges, links, traffic, NETCONVERT_OPTION)
+    # Curves have the speed limit of their definition.
+    return write_network(folder, nodes, edges, links, traffic, "--junctions.limit-turn-speed=-1")
 
 
 def _flows(road: OpenTestRoad, shares: Mapping[str, float]) -> list[str]:

@@ -102,8 +102,6 @@ TRANSFER_ROADS: dict[str, dict[str, Any]] = {
 }
 EXPERIMENT_RING: dict[str, Any] = {"length": (230, 230)}
 """changes to `ring-jammed` for calibrated human drivers: the length of the experiment [m]"""
-PAPER_HUMANS = "paper's IDM"
-"""label of the human drivers of the training"""
 DRIVER_TITLES = {"human": "no CAV", "pi": "PI", TRAINED_LABEL: "PI + residual"}
 
 
@@ -199,7 +197,7 @@ def humans_on_ring(folder: Path, populations: dict[str, Path], controller: Path,
     """
     make_folder(folder)
     about, rows = manifest(), []
-    roads: dict[str, dict[str, Any]] = {PAPER_HUMANS: {}}
+    roads: dict[str, dict[str, Any]] = {"paper's IDM": {}}  # the human drivers of the training
     roads |= {label: {"population": str(file.absolute())} for label, file in populations.items()}
     names = {"human": "human", "pi": "pi", TRAINED_LABEL: str(controller)}
     episodes_to_plot: dict[str, Episode] = {}

@@ -47,8 +47,6 @@ TIMED_VARIANTS = (
 )
 TIMED_STEPS, TIMED_START_STEPS, TIMING_ROUNDS = 24_000, 3_000, 3
 """environment steps of each timed training, those before SAC's first update, and rounds over all variants"""
-EXCLUDED_PART = "validation"
-"""the part of training that is switched off, because it is the same for all variants"""
 
 
 def random_network(inputs: int, authority: float, seed: int) -> Network:
@@ -160,7 +158,7 @@ def training_seconds(steps: int = TIMED_STEPS, rounds: int = TIMING_ROUNDS) -> d
             Trainer(folder, config, workers).train()
             rows = read_progress(folder)
             thousands, parts = rows[-1]["environment_steps"] / 1000.0, seconds_by_part(rows)
-            parts.pop(EXCLUDED_PART, None)
+            parts.pop("validation", None)  # switched off, because it is the same for all variants
             seconds[variant].append({part: each / thousands for part, each in parts.items()})
     return seconds
 

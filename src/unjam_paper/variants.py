@@ -17,8 +17,6 @@ ON_RAMP_JAM_AHEAD = (
 )
 """result of `unjam tune on-ramp --expert jam-ahead --set penetration_rate=0.05 --steps 4608000`, mostly in batches;
 with 710,400 steps, all in SUMO, it is `unjam:on-ramp-tuned`"""
-MERGE_JAM_ABSORBER = "jam-absorber:gap_gain=0,extra_acceleration=0.9,speed_gain=0.8"
-"""best expert on the merge"""
 
 
 @dataclass(frozen=True)
@@ -133,9 +131,10 @@ REFERENCE_DRIVERS: dict[str, str] = {
     **{"IDM": "idm", "ACC": "acc", "LACC": "lacc", "BCM": "bcm", "OVM": "ovm"},
     **{"pacer": "pacer", "varying pacer": "pacer:use_tuned=true"},
     "gentle varying pacer": "pacer:use_tuned=true,time_constant=1",
-    **{"jam absorber": "jam-absorber", "closing jam absorber": MERGE_JAM_ABSORBER},
+    "jam absorber": "jam-absorber",
+    "closing jam absorber": "jam-absorber:gap_gain=0,extra_acceleration=0.9,speed_gain=0.8",
 }
-"""drivers of all roads: label, and name as in `unjam drive`"""
+"""drivers of all roads: label, and name as in `unjam drive`; the last one is the best expert on the merge"""
 TUNED_REFERENCES: dict[str, dict[str, str]] = {
     "ring": {"tuned PI": "unjam:ring-tuned", "tuned gap PI": "unjam:ring-gap-tuned"},
     "ring-jammed": {"tuned gap PI": "unjam:ring-jammed-tuned"},
