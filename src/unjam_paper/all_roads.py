@@ -248,9 +248,9 @@ def all_roads_table(parts: Sequence[str], folder: Path) -> pd.DataFrame:
     labels = {driver: label for label, driver in FAMILY_DRIVERS.items()}
     rows = []
     for name, road in roads.items():
-        best: str = labels.get(road["best"], road["best"])
+        best: str = road["best"]
         gains = {label: format_difference(road["gains"][label], 2) for label in SINGLE_CONTROLLERS}
-        rows.append({"road": name, "best expert": best.removeprefix(PACKAGED_PREFIX), **gains})
+        rows.append({"road": name, "best expert": labels.get(best, best).removeprefix(PACKAGED_PREFIX), **gains})
     gainful = [road for road in roads.values() if road["has_potential_gain"]]
     for name, averaged in (("mean", [*roads.values()]), ("mean, roads with a potential gain", gainful)):
         means = {label: _mean_gain(road["by_seed"][label] for road in averaged) for label in SINGLE_CONTROLLERS}

@@ -6,6 +6,7 @@ data. Here it is either a driver with other parameters than the paper's IDM (`ot
 that the base is the truth.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import product
@@ -84,15 +85,16 @@ class DataSplit(NamedTuple):
 def four_regime_fits() -> list[FourRegimeFit]:
     """Return all fits of the study, the most important first."""
     unseen, both = get_args(SplitKind)[:1], FIGURE_6_NETWORKS
+    plan: list[tuple[int, Sequence[SplitKind], Sequence[float], Sequence[str], str, bool]] = [
+        (FIT_REPEATS, unseen, TRAINING_SIZES, both, "other", False),
+        (FEWER_REPEATS, unseen, TRAINING_SIZES[:1], both, "other", True),
+        (FEWER_REPEATS, unseen, TRAINING_SIZES[:2], both, "same", False),
+        (FEWER_REPEATS, ("rows", "released"), LEAKING_SIZES, both, "other", False),
+        (1, get_args(SplitKind), (*LEAKING_SIZES, 1.0), (NEAREST_ROW,), "other", False),
+    ]
     return [
         FourRegimeFit(driver, network, size, repeat, split, is_long)
-        for repeats, splits, sizes, networks, driver, is_long in (
-            (FIT_REPEATS, unseen, TRAINING_SIZES, both, "other", False),
-            (FEWER_REPEATS, unseen, TRAINING_SIZES[:1], both, "other", True),
-            (FEWER_REPEATS, unseen, TRAINING_SIZES[:2], both, "same", False),
-            (FEWER_REPEATS, ("rows", "released"), LEAKING_SIZES, both, "other", False),
-            (1, get_args(SplitKind), (*LEAKING_SIZES, 1.0), (NEAREST_ROW,), "other", False),
-        )
+        for repeats, splits, sizes, networks, driver, is_long in plan
         for repeat, split, size, network in product(range(repeats), splits, sizes, networks)
     ]
 

@@ -101,7 +101,8 @@ def test_only_missing_drivers_run_and_the_best_can_change(tmp_path: Path, monkey
     monkeypatch.setattr(all_roads, "controller_digest", lambda driver: files.get(driver, ""))
 
     road: dict[str, Any] = {"best": HUMAN_LABEL, "expert_files": {}, "driver_files": {}, "rows": {}}
-    monkeypatch.setattr(all_roads, "FAMILY_EXPERTS", experts := {"rings": ("pi",)})
+    experts: dict[str, tuple[str, ...]] = {}
+    monkeypatch.setattr(all_roads, "FAMILY_EXPERTS", experts)
     drivers, name = {"PI": "pi"}, "ring-22-grown"
 
     def resume(names: tuple[str, ...]) -> None:
