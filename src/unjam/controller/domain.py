@@ -93,7 +93,6 @@ def step_mismatch(driver: Driver, road: dict[str, Any]) -> str:
 
 
 def _time_steps(recipe: Any) -> Iterator[float]:
-    """Yield each time step in the recipe of a driver [s]."""
     if isinstance(recipe, dict):
         for name, part in recipe.items():
             yield from [part] if name == "time_step" else _time_steps(part)

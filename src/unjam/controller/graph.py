@@ -70,10 +70,7 @@ def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
 
 
 def check_graph(part: bytes, driver: Driver) -> None:
-    """Raise `InputError` unless a graph has the inputs and outputs of a controller, and only arithmetic between them.
-
-    Raise `MissingPartError` if onnx is not installed.
-    """
+    """Raise `InputError` unless a graph has the inputs and outputs of a controller and only arithmetic between them."""
     onnx = require_package("onnx")
     try:
         model = onnx.load_model_from_string(part)
@@ -114,7 +111,6 @@ def _check_fields(message: Any) -> None:
 
 
 def _check_node(node: Any, types: Any) -> None:
-    """Raise `InputError` unless a node is an allowed operator with allowed attributes."""
     if node.domain or node.op_type not in ALLOWED_OPERATORS:
         operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
         raise InputError(f"graph: operator {operator!r} is not allowed; allowed: arithmetic")
@@ -136,11 +132,8 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
     """Return the accelerations of a checked graph for consecutive `states` [m/s2].
 
     It begins with the initial memory of its `driver`; all arrays have the shape (T,). It runs for `rows` CAVs with the
-    same observation at once.
-
-    Raises:
-        InputError: onnxruntime refuses it, or CAVs with the same observation get different answers.
-        MissingPartError: onnxruntime is not installed.
+    same observation at once. Raise `InputError` if onnxruntime refuses it, or CAVs with the same observation get
+    different answers, `MissingPartError` if onnxruntime is not installed.
     """
     runtime = require_package("onnxruntime")
     options = runtime.SessionOptions()

@@ -1,6 +1,7 @@
 """The manifest of a `.unjam` file: its schema, and the description of a driver to which it is compared."""
 
 from dataclasses import field
+from inspect import signature
 from math import nan
 from typing import Annotated, Any
 
@@ -18,11 +19,6 @@ from unjam.tree import leaves
 
 MANIFEST_FORMAT = 4
 """version of the schema, the only one that is read"""
-PROVENANCE_ENTRIES = (
-    *("summary", "scenario", "time_step", "action_limit", "expert", "versions"),
-    *("run", "iteration", "environment_steps", "metrics", "tuning"),
-)
-"""entries that only the maker can know: origin and measured results of a controller"""
 JsonObject = dict[str, Any]
 _StrictPositive = Annotated[StrictFloat, Field(gt=0)]
 
@@ -51,6 +47,10 @@ class Manifest:
     environment_steps: StrictInt | None = None
     metrics: JsonObject | None = None
     tuning: JsonObject = field(default_factory=dict)
+
+
+PROVENANCE_ENTRIES = tuple(each.name for each in signature(Manifest).parameters.values() if each.default != each.empty)
+"""optional entries, which only the maker can know: origin and measured results of a controller"""
 
 
 def read_manifest(name: str, part: bytes) -> JsonObject:
@@ -88,12 +88,9 @@ def first_difference(
 ) -> tuple[str, Any, Any] | None:
     """Return the first place at which two JSON documents differ, and both values; None if they are equal.
 
-    A Boolean is not a number, and null is not a missing entry, which is `...`. Integers are compared exactly.
-
-    Args:
-        tolerance: allowed deviation of floats, relative for those above 1.
-        allows_missing: whether `expected` may omit entries of `actual`.
-        name: place of both within a larger document.
+    A Boolean is not a number, and null is not a missing entry, which is `...`. Integers are compared exactly, floats
+    with a `tolerance`, relative for those above 1. With `allows_missing`, `expected` may omit entries of `actual`;
+    `name` is the place of both within a larger document.
     """
     if isinstance(expected, dict) and isinstance(actual, dict):
         keys = expected.keys() if allows_missing else expected.keys() | actual.keys()
@@ -113,13 +110,10 @@ def first_difference(
 def driver_interface(driver: Driver, action_limit: float | None = None) -> JsonObject:
     """Return the interface of a controller beyond the recipe of its driver, as JSON.
 
-    `action_limit` is that of its road [m/s2], for drivers without their own limits.
-
-    Returns:
-        `observation`: inputs in each control step, in order, in SI units; `networks`: inputs of each network, in
-        order, by the prefix of its weights: each number is divided by its scale; `memory`: its entries for each CAV,
-        with their initial values, null for NaN; `action`: the acceleration with its bounds; `action_repeat`: control
-        steps for which a residual is repeated.
+    `observation`: inputs in each control step, in order, in SI units; `networks`: inputs of each network, in order, by
+    the prefix of its weights: each number is divided by its scale; `memory`: its entries for each CAV, with their
+    initial values, null for NaN; `action`: the acceleration with its bounds; `action_repeat`: control steps for which
+    a residual is repeated. `action_limit` is that of its road [m/s2], for drivers without their own limits.
     """
     low, high = driver.limits or (None if action_limit is None else -action_limit, action_limit)
     return {

@@ -54,13 +54,9 @@ class PartCheck:
 def verify_controller_file(path: Path | str, signer: Path | str | None = None) -> list[PartCheck]:
     """Return the results for each part of a `.unjam` file or a run folder; only trusted code runs.
 
-    Args:
-        path: the file, or the folder.
-        signer: file of the public key of the required signature; None allows any key, and no signature.
-
-    Raises:
-        InputError: the first error, in one line; also for code that is not trusted.
-        MissingPartError: a part could not be checked, because a package is not installed.
+    `signer` is the file of the public key of the required signature; None allows any key, and no signature. Raise
+    `InputError` for the first error, in one line, also for code that is not trusted, and `MissingPartError` if a part
+    could not be checked, because a package is not installed.
     """
     checks = check_parts(read_controller(path), signer)
     require_complete(checks)
@@ -99,12 +95,8 @@ def check_parts(controller: Controller, signer: Path | str | None = None) -> lis
 
 def _describe_archive(controller: Controller) -> PartCheck:
     """Describe the parts of the archive; their hashes were compared while it was read."""
-    parts = {
-        name: part
-        for name, part in controller.parts.items()
-        if name not in (archive.MANIFEST_PART, archive.SIGNATURE_PART)
-    }
-    sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in parts.items())
+    hidden = archive.MANIFEST_PART, archive.SIGNATURE_PART
+    sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in controller.parts.items() if name not in hidden)
     return PartCheck("parts", "checked", f"{sizes}: each has the SHA-256 that the manifest names")
 
 
@@ -126,7 +118,6 @@ def _check_signer(actual: str | None, signer: Path | str | None) -> PartCheck:
 
 
 def _check_recipe(controller: Controller) -> PartCheck:
-    """Compare the recipe in the manifest with that of the driver that was built from it."""
     stated, actual = controller.manifest["driver"], _json_roundtrip(driver_recipe(controller.driver)[0])
     _require_same("manifest", first_difference(stated, actual, allows_missing=True, name="driver"))
     defaults = "; missing parameters have the defaults of this version" if first_difference(stated, actual) else ""
@@ -153,7 +144,6 @@ def _describe_weights(controller: Controller) -> PartCheck:
 
 
 def _check_interface(controller: Controller) -> PartCheck:
-    """Compare the description of the driver in the manifest with that of the built driver."""
     actual = _json_roundtrip(driver_interface(controller.driver, controller.manifest.get("action_limit")))
     stated = {name: controller.manifest[name] for name in actual}
     _require_same("manifest", first_difference(stated, actual))
@@ -175,7 +165,6 @@ def _describe_provenance(controller: Controller) -> list[PartCheck]:
 
 
 def _check_sample(controller: Controller) -> PartCheck:
-    """Compare the driver with the recorded sample."""
     if archive.SAMPLE_PART not in controller.parts:
         reason = "run folders and `unjam tune` record none, `unjam export` does"
         return PartCheck("sample", "absent", f"no recorded accelerations to repeat; {reason}")
@@ -217,7 +206,6 @@ def _random_states(part: bytes, states: LocalState) -> LocalState:
 
 
 def _check_certificate(controller: Controller) -> PartCheck:
-    """Repeat the simulations of the certificate, and compare it number by number."""
     if archive.CERTIFICATE_PART not in controller.parts:
         return PartCheck("certificate", "absent", "no worst cases were simulated; `unjam certify` does it")
     stated = parse_json(controller.parts[archive.CERTIFICATE_PART])  # before the simulations, in case it is damaged
@@ -238,7 +226,6 @@ def _action_limit(controller: Controller) -> float:
 
 
 def _json_roundtrip(value: Any) -> Any:
-    """Return a document as it is after writing and reading."""
     return json.loads(to_json(value))
 
 

@@ -328,24 +328,18 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
         strategies = (approaches, JAM_TAIL_STRATEGY), (near, BOTTLENECK_STRATEGY), (leaves > 0.0, JAM_HEAD_STRATEGY)
         for holds, strategy in strategies:
             factors = [xp.where(holds, speed * 0.0 + new, old) for new, old in zip(strategy, factors, strict=True)]
-        return self._idm_acceleration(state, *factors), {"mean_speed": mean, "leaves_jam": leaves}
-
-    def _idm_acceleration(
-        self, state: LocalState, time_headway_factor: Array, acceleration_factor: Array, deceleration_factor: Array
-    ) -> Array:
-        speed = state.speed
-        xp, allowed = namespace(speed), state.allowed_speed
         parameters = IDMArrays(
-            desired_speed=speed * 0.0 + self.desired_speed if allowed is None else allowed,
-            time_headway=self.time_headway * time_headway_factor,
-            max_acceleration=self.max_acceleration * acceleration_factor,
-            comfortable_deceleration=self.comfortable_deceleration * deceleration_factor,
+            desired_speed=speed * 0.0 + self.desired_speed if state.allowed_speed is None else state.allowed_speed,
+            time_headway=self.time_headway * factors[0],
+            max_acceleration=self.max_acceleration * factors[1],
+            comfortable_deceleration=self.comfortable_deceleration * factors[2],
             exponent=self.exponent,
             minimum_gap=self.minimum_gap,
         )
         gap = clamp_min(state.leader_gap, MIN_IDM_GAP)
         gap = xp.where(gap < MAX_OBSERVED_GAP, gap, gap * 0.0 + NO_LEADER_GAP)
-        return idm_acceleration(speed, state.leader_speed, gap, parameters)
+        acceleration = idm_acceleration(speed, state.leader_speed, gap, parameters)
+        return acceleration, {"mean_speed": mean, "leaves_jam": leaves}
 
     def memory_features(self, memory: Memory) -> Array:
         """Return the mean own speed, scaled, and whether it leaves a jam, shape (n, 2)."""

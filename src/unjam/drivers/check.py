@@ -21,10 +21,8 @@ def check_driver(
 
     It drives `rows` vehicles for `steps` random steps, drawn from `seed`. Accelerations must be finite and of shape
     (rows,), n rows at once must equal n single calls to 1e-12, the same call must give the same answer, and neither
-    state nor memory may be changed. With `optional_fields` the state has all fields that motorways provide.
-
-    Raises:
-        InputError: one line that names the violation and its step.
+    state nor memory may be changed. With `optional_fields` the state has all fields that motorways provide. Raise
+    `InputError` with one line that names the violation and its step.
     """
     driver = as_driver(driver)
     generator, optional_fields = np.random.default_rng(seed), optional_fields or bool(driver.required_fields)

@@ -51,9 +51,9 @@ class Network:
         The result for torch tensors is a tensor of their precision, on their device.
         """
         if isinstance(observation, tuple):
-            return self.authority * math.tanh(self._outputs_on_arrays(observation, self._residual_weights))
+            return self.authority * math.tanh(self._hidden_units_of_arrays(observation).dot(self._residual_weights))
         if isinstance(observation, np.ndarray):
-            return self.authority * np.tanh(self._outputs_on_arrays(observation, self._residual_weights))
+            return self.authority * np.tanh(self._hidden_units_of_arrays(observation).dot(self._residual_weights))
         return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
 
     def explore(self, observation: Any, noise: Any) -> Any:
@@ -69,7 +69,7 @@ class Network:
         if not self.squashes_noise:
             return self(observation) + self.exploration_std * noise
         if isinstance(observation, (tuple, np.ndarray)):
-            mean, log_std = self._outputs_on_arrays(observation, self._last_weights[:, :2]).T
+            mean, log_std = self._hidden_units_of_arrays(observation).dot(self._last_weights[:, :2]).T
         else:
             mean, log_std = self._outputs_on_tensors(observation).T
         xp = np if isinstance(observation, tuple) else namespace(observation)
@@ -93,9 +93,6 @@ class Network:
         if isinstance(observation, (tuple, np.ndarray)):
             return self._hidden_units_of_arrays(observation)
         return append_ones(self._hidden_units_of_tensors(observation))
-
-    def _outputs_on_arrays(self, observation: Any, last_weights: Floats) -> Any:
-        return self._hidden_units_of_arrays(observation).dot(last_weights)
 
     def _hidden_units_of_arrays(self, observation: Any) -> Floats:
         """Return the last hidden layer, with an additional unit that is always 1."""
@@ -134,7 +131,6 @@ def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...
 
 
 def _as_tensors_like(tensor: Any, layer: tuple[Floats, Floats]) -> Any:
-    """Return weight and bias as tensors of the precision and on the device of `tensor`."""
     return (namespace(tensor).as_tensor(part, dtype=tensor.dtype, device=tensor.device) for part in layer)
 
 

@@ -121,7 +121,6 @@ def _quantity_feature(
     road_requirement: Literal["", "loop", "coordinate"] = "",
     required_fields: tuple[str, ...] = (),
 ) -> Feature:
-    """Return the feature of one quantity, divided by its scale."""
     scale = description.scale
     return Feature(lambda inputs: as_column(value(inputs) / scale), (description,), road_requirement, required_fields)
 

@@ -71,7 +71,6 @@ class PISaturation(FormulaDriver):
         return acceleration, {**window, "command": command}
 
     def _acceleration_and_command(self, mean: Array, state: LocalState, last_command: Array) -> tuple[Array, Array]:
-        """Return the acceleration and the commanded speed for a mean speed and the last command."""
         xp = namespace(state.speed)
         command = xp.where(xp.isnan(last_command), state.speed, last_command)
         gap_share = (state.leader_gap - self.gap_lower) / (self.gap_upper - self.gap_lower)

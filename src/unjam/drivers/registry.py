@@ -67,8 +67,6 @@ def driver_from_name(text: str, time_step: float) -> Driver:
 
 @dataclass(frozen=True, config=STRICT)
 class _ResidualRecipe:
-    """The recipe of a residual driver, without its weights."""
-
     kind: Literal["residual"]
     expert: dict[str, Any]
     action_limit: Positive
@@ -175,7 +173,6 @@ def user_code_recipes(recipe: Any) -> list[Recipe]:
 
 
 def _iterate_recipes(recipe: Any) -> Iterator[Recipe]:
-    """Yield a recipe and all recipes within it."""
     if isinstance(recipe, dict):
         if "kind" in recipe:
             yield recipe

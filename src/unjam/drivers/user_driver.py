@@ -162,7 +162,6 @@ class FileDriver(FileReference, UserDriver):
     implementation: Any = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Load it; raise `InputError` if the file does not have the given hash."""
         object.__setattr__(self, "path", self.path.resolve())
         code = self.read_code()
         if self.sha256 and self.sha256 != code.sha256:

@@ -112,7 +112,6 @@ class MixedDriver(CompositeDriver):
     drivers: tuple[Driver, ...]
 
     def __post_init__(self) -> None:
-        """Raise `InputError` if one of them is the simulator itself."""
         if any(driver.is_native for driver in self.drivers):
             raise InputError("driver: 'human' is not allowed among several; 'idm' drives like a human driver")
 

@@ -106,13 +106,8 @@ def aggregate_passages(
 ) -> tuple[Floats, Floats]:
     """Return the flow [veh/h] and the mean speed [m/s] that each detector would have measured.
 
-    Args:
-        measurements: place and time of each interval.
-        loops: numbers of its loops: one, or one in each lane of an edge, where a vehicle is counted once.
-        passages: of vehicles over the loops.
-
-    Returns:
-        Two arrays in the order of `measurements`; the speed is NaN without a passage of known speed.
+    Both arrays have the order of `measurements`; the speed is NaN without a passage of known speed. `loops` has the
+    numbers of the loops of each measurement: one, or one in each lane of an edge, where a vehicle is counted once.
     """
     by_loop: defaultdict[int, list[DetectorPassage]] = defaultdict(list)
     for passage in passages:

@@ -36,12 +36,14 @@ def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> s
     required, has_lanes = row.get("required_time_gap") or DEFAULT_REQUIRED_TIME_GAP, row.get("has_lanes", False)
     time_gap, human_braking = row["min_time_gap"], row[HARD_BRAKING_METRIC]
     min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
+    short, cut_in = (row[name] if has_lanes else 0.0 for name in ("share_short_time_gap", "cut_in_max_braking"))
     baseline = "not driven" if baseline_braking is None else f"{baseline_braking:.0f}"
     checks = [
         (row["status"] == "collision", f"{row['collisions']:.0f} vehicles in contact"),
         ((contacts := row.get("contacts", 0)) > 0, f"{contacts} CAVs in contact"),
         (time_gap < min_time_gap - FEASIBILITY_TOLERANCE, f"time gap {time_gap:.2f} s (limit {required:g} s)"),
-        *(_lane_checks(row, required) if has_lanes else ()),
+        (short > MAX_SHORT_TIME_GAP_SHARE, f"time gap below {required:g} s in {100 * short:.2g} % of the time"),
+        (cut_in > MAX_CUT_IN_BRAKING + FEASIBILITY_TOLERANCE, f"brakes with {cut_in:.1f} m/s2 after a cut-in"),
         (row["cav_min_ttc"] < MIN_FEASIBLE_TTC - FEASIBILITY_TOLERANCE, f"{row['cav_min_ttc']:.2f} s to a collision"),
         (
             row["cav_max_braking"] > MAX_FEASIBLE_BRAKING + FEASIBILITY_TOLERANCE,
@@ -55,14 +57,6 @@ def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> s
         ),
     ]
     return next((reason for fails, reason in checks if fails), FEASIBLE)
-
-
-def _lane_checks(row: dict[str, Any], required_time_gap: float) -> tuple[tuple[bool, str], ...]:
-    """Return the additional checks on roads where other vehicles may cut in."""
-    short, braking = row["share_short_time_gap"], row["cut_in_max_braking"]
-    short_text = f"time gap below {required_time_gap:g} s in {100 * short:.2g} % of the time"
-    hard = braking > MAX_CUT_IN_BRAKING + FEASIBILITY_TOLERANCE
-    return (short > MAX_SHORT_TIME_GAP_SHARE, short_text), (hard, f"brakes with {braking:.1f} m/s2 after a cut-in")
 
 
 def feasibility_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:

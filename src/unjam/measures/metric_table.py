@@ -34,7 +34,6 @@ class TableCell:
     """CI, or the range if there is none; with the number of episodes if it is not of all"""
 
     def __str__(self) -> str:
-        """Return both, on one line."""
         return f"{self.mean} {self.interval}".strip()
 
 

@@ -37,7 +37,6 @@ def _steady_state(values: Floats) -> Floats:
 
 
 def _mean_over_cavs(episode: Episode, function: Callable[[Trajectory], Any]) -> float:
-    """Return the mean over the CAVs; NaN without any."""
     values = [function(trajectory) for trajectory in episode.trajectories]
     return float(np.mean(values)) if values else nan
 

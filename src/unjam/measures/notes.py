@@ -68,7 +68,6 @@ def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
 
 
 def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return a note for each driver with more than a few vehicles in the insertion backlog at the end."""
     notes = []
     for label, rows in rows_by_driver.items():
         complete = [row for row in rows if row["status"] == "completed"]

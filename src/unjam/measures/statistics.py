@@ -53,14 +53,10 @@ def estimate(
 ) -> Estimate:
     """Return the mean of independent `values` and its CI, Student's t; values that are not finite are left out.
 
-    Fewer than `MIN_INTERVAL_VALUES` values have no CI; equal values have one of no width.
-
-    Args:
-        values: independent of each other.
-        confidence: coverage of the CI.
-        trim: share left out at either end, 0.25 for the interquartile mean; the CI is then that of the trimmed
-            mean by winsorized variance: Tukey and McLaughlin 1963, Sankhya A 25.
-        bounds: smallest and largest possible mean; the CI is clipped there.
+    Fewer than `MIN_INTERVAL_VALUES` values have no CI; equal values have one of no width. `confidence` is the coverage
+    of the CI; it is clipped at `bounds`, the smallest and largest possible mean. `trim` is the share left out at either
+    end, 0.25 for the interquartile mean; the CI is then that of the trimmed mean by winsorized variance: Tukey and
+    McLaughlin 1963, Sankhya A 25.
     """
     finite = np.array([value for value in values if np.isfinite(value)], float)
     if not len(finite):

@@ -16,9 +16,16 @@ from unjam.files import atomic_write, check_parent_folder
 from unjam.measures.effect import MAX_FLOW_LOSS, MIN_VERDICT_SEEDS, format_percent
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.statistics import Estimate, format_difference
-from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, data_uri, new_figure
+from unjam.reports.figures import (
+    LINE_COLORS,
+    PLOT_STYLE,
+    TEXT_COLOR,
+    data_uri,
+    has_lane_maps,
+    new_figure,
+    space_time_figure,
+)
 from unjam.reports.html import render_template
-from unjam.reports.lanes import has_lane_maps, space_time_figure
 from unjam.reports.results import original_command, read_results, replace_null
 
 ASSESSMENT_FILE, ASSESSMENT_PAGE = "assessment.json", "assessment.html"
@@ -35,9 +42,7 @@ HUMAN_BASELINE_LABEL = "human baseline"
 def write_assessment(folder: Path, target: Path) -> Path:
     """Write the page of a folder of `unjam assess`; return its path.
 
-    Raises:
-        InputError: the folder contains no assessment.
-        DiskError: the page cannot be written, or its folder does not exist.
+    Raise `InputError` if the folder contains no assessment, `DiskError` if the page cannot be written.
     """
     check_parent_folder(target)
     atomic_write(target, render_assessment(folder))
@@ -149,7 +154,6 @@ def _evaluated_options(assessment: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _tuning_row(option: dict[str, Any]) -> dict[str, Any]:
-    """Return the row of an option on the tuning seeds."""
     effect = option["effect"]
     return {
         "label": _option_label(option),

@@ -19,7 +19,6 @@ from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder
 from unjam.measures.metric_table import metric_table, table_headings
 from unjam.measures.statistics import metric_estimate
 from unjam.reports import figures, summary
-from unjam.reports.lanes import has_lane_maps, space_time_figure
 from unjam.reports.model import error_figure, example_figure, model_section, rollout_figure, wave_figure
 from unjam.reports.results import PlotEpisode, Results, damaged_results_error, original_command, read_results
 from unjam.reports.video import split_lines
@@ -40,9 +39,7 @@ REPLAY_STEP = 0.5
 def write_report_page(folders: Sequence[Path], target: Path) -> Path:
     """Write the report of one folder of results, or a comparison of several; return its path.
 
-    Raises:
-        InputError: a folder contains no results.
-        DiskError: the page cannot be written, or its folder does not exist.
+    Raise `InputError` if a folder contains no results, `DiskError` if the page cannot be written.
     """
     check_parent_folder(target)
     results = [read_results(folder) for folder in folders]
@@ -101,7 +98,7 @@ def render_report(results: Sequence[Results]) -> str:
         figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, panels).items()},
         panels=panels,
         road_values=list(dict.fromkeys(roads)),
-        has_lane_maps=has_lane_maps(panels),
+        has_lane_maps=figures.has_lane_maps(panels),
         baseline_differences=summary.baseline_differences(columns),
         episodes_csv=summary.episodes_as_csv(columns),
         model=model_section(single) if single else None,
@@ -117,10 +114,9 @@ def render_report(results: Sequence[Results]) -> str:
 
 
 def _report_figures(sources: Sequence[tuple[str, Results]], panels: Sequence[PlotEpisode]) -> dict[str, Figure]:
-    """Return the available figures by name."""
     found: dict[str, Figure] = {}
     if panels:
-        found |= {"space_time": space_time_figure(panels), "time_series": figures.time_series_figure(panels)}
+        found |= {"space_time": figures.space_time_figure(panels), "time_series": figures.time_series_figure(panels)}
     results = [result for _, result in sources]
     if runs := {name: result.progress for name, result in sources if result.progress}:
         found["learning_curve"] = figures.learning_curve_figure(runs, _reference_returns(results))

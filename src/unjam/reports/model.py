@@ -9,8 +9,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, TEXT_COLOR, new_figure
-from unjam.reports.lanes import space_time_figure
+from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, TEXT_COLOR, new_figure, space_time_figure
 from unjam.reports.results import PlotEpisode, Results
 
 PREDICTED_QUANTITIES = {
@@ -180,7 +179,6 @@ def _base_label(facts: dict[str, Any]) -> str:
 
 
 def _wave_caption(facts: dict[str, Any]) -> str:
-    """Return the caption of `wave_figure`."""
     left, start = "an episode in the environment that no network was trained on", "from its start"
     cavs = "CAVs repeat their recorded accelerations, but noise"
     if facts.get("lane_names"):

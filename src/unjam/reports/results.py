@@ -123,11 +123,7 @@ class Results:
 
 
 def read_results(folder: Path) -> Results:
-    """Return the content of a folder of results.
-
-    Raises:
-        InputError: it is not such a folder, or not finished.
-    """
+    """Return the content of a folder of results; raise `InputError` if it is none, or not finished."""
     for name in (EVALUATION_FILE, PLOT_EPISODES_FILE):
         if not (folder / name).is_file():
             hint = resume_hint(folder) if (folder / "config.toml").exists() else ""

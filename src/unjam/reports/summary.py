@@ -126,7 +126,6 @@ def _effect_text(effect: Effect, verdict: str) -> str:
 
 
 def _drive_finding(result: Results) -> str:
-    """Return the effect of each driver, or without a human baseline the mean speed."""
     scenario, effects = result.metadata["scenario"], effects_by_driver(result.rows)
     if effects:
         count, verdicts = max(map(_pair_count, effects.values())), feasibility_by_driver(result.rows)

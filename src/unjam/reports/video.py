@@ -116,10 +116,8 @@ def episode_scenes(episode: Episode, steps: Sequence[int]) -> Iterator[RoadScene
 def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) -> None:
     """Write a video of an episode, `pace` times as fast as real time; .gif, .webp, or .mp4 by the file's name.
 
-    Raises:
-        InputError: another file format.
-        DiskError: its folder does not exist, or the disk is full: a previous file is unchanged.
-        MissingPartError: .mp4 without imageio-ffmpeg.
+    Raise `InputError` for another file format, `DiskError` if its folder does not exist or the disk is full (a previous
+    file is unchanged), and `MissingPartError` for .mp4 without imageio-ffmpeg.
     """
     check_video_format(path)
     check_parent_folder(path)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from tests.reports.open_roads import ramp_episode, user_episode
 from unjam.measures.metrics import measure
+from unjam.reports.figures import lane_map_figure
 from unjam.reports.html import replay_data
-from unjam.reports.lanes import lane_map_figure
 from unjam.reports.results import pack_episode, to_plot_episode, unpack_episode
 from unjam.worlds import episode_reward
 from unjam.worlds.episode_reward import episode_reward_terms
