@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from unjam.learners.sac import SquashedResidualPolicy
+from unjam.learners.sac_td3 import SquashedResidualPolicy
 
 from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
