@@ -1,6 +1,4 @@
-"""Do the pinned kernels compute what they did, whatever the shell says? If not, and rightly so:
-python -m tests.kernels.bless.
-"""
+"""Tests that the pinned kernels give the committed results; python -m tests.kernels.bless accepts others."""
 
 import json
 import os
@@ -26,14 +24,14 @@ UNPINNED = {
     "MKL_CBWR": "AVX",
 }
 """other kernels, which every processor with AVX2 has as well, and another core"""
-OF = {
+AFFECTED_KINDS = {
     "OPENBLAS_CORETYPE": {"numpy products"},
     "OPENBLAS_NUM_THREADS": {"numpy products"},
     "NPY_DISABLE_CPU_FEATURES": {"numpy functions", "numpy sums"},
-    "ATEN_CPU_CAPABILITY": {"torch functions", "torch sums", "torch products", "torch beginnings", "torch steps"},
-    "MKL_CBWR": {"torch functions", "torch products", "torch beginnings", "torch steps"},
+    "ATEN_CPU_CAPABILITY": {"torch functions", "torch sums", "torch products", "torch initialization", "torch steps"},
+    "MKL_CBWR": {"torch functions", "torch products", "torch initialization", "torch steps"},
 }
-"""what each may change"""
+"""kinds of operations that each variable may change"""
 
 needs_avx2 = pytest.mark.skipif(
     not kernels.has_pinned_kernels(), reason=f"not pinned: {kernels.kernel_info()['unpinned_reason']}"
@@ -41,9 +39,9 @@ needs_avx2 = pytest.mark.skipif(
 
 
 def run(program: str, **variables: str) -> dict[str, Any]:
-    """The JSON that a program prints last, in a process of its own with these variables."""
+    """Return the JSON that a program prints last, in its own process with these variables."""
     inherited = {name: value for name, value in os.environ.items() if name not in kernels.KERNEL_SETTINGS}
-    ran = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", program],
         cwd=ROOT,
         env={**inherited, **variables},
@@ -52,8 +50,8 @@ def run(program: str, **variables: str) -> dict[str, Any]:
         timeout=120,
         check=True,
     )
-    assert "Warning" not in ran.stderr
-    return json.loads(ran.stdout.splitlines()[-1])
+    assert "Warning" not in completed.stderr
+    return json.loads(completed.stdout.splitlines()[-1])
 
 
 OPERATIONS = "import unjam, json; from tests.kernels import operations; print(json.dumps(operations.hashes()))"
@@ -62,21 +60,21 @@ STATE = "import {first}, json; import unjam; from unjam.kernels import kernel_in
 
 @pytest.mark.long
 @needs_avx2
-def test_the_bits_are_the_committed_ones_whatever_the_environment() -> None:
+def test_results_equal_the_committed_ones_in_any_environment() -> None:
     assert run(OPERATIONS, **UNPINNED) == GOLDEN["operations"]
 
 
 @pytest.mark.long
 @needs_avx2
 @pytest.mark.parametrize("variable", UNPINNED)
-def test_each_variable_matters_and_changes_nothing_else(variable: str) -> None:
+def test_each_variable_changes_only_its_kinds(variable: str) -> None:
     varied = {**kernels.kernel_settings(), variable: UNPINNED[variable], kernels.KERNELS_VARIABLE: "native"}
     found = run(OPERATIONS, **varied)
-    moved = {kind for kind, value in found.items() if value != GOLDEN["operations"][kind]}
-    assert moved <= OF[variable]
+    changed_kinds = {kind for kind, value in found.items() if value != GOLDEN["operations"][kind]}
+    assert changed_kinds <= AFFECTED_KINDS[variable]
     intel, cores = kernels.processor_info()["vendor_id"] == "GenuineIntel", os.cpu_count() or 1
-    there = {"MKL_CBWR": intel, "OPENBLAS_NUM_THREADS": cores > 1}  # MKL knows others as COMPATIBLE alone
-    assert moved or not there.get(variable, True)
+    has_effect = {"MKL_CBWR": intel, "OPENBLAS_NUM_THREADS": cores > 1}  # on others MKL has only COMPATIBLE
+    assert changed_kinds or not has_effect.get(variable, True)
 
 
 @needs_avx2
@@ -84,7 +82,7 @@ def test_trainings_of_all_learners_end_with_the_committed_bits() -> None:
     program = (
         "import json, sys; from tests.kernels import trainings; "
         "found = trainings.hashes(list(trainings.LEARNERS)); "
-        "assert 'torch._dynamo' not in sys.modules, 'seconds, for nothing'; "
+        "assert 'torch._dynamo' not in sys.modules, 'its import takes seconds'; "
         "print(json.dumps(found))"
     )
     assert run(program, **UNPINNED) == GOLDEN["trainings"]
@@ -134,15 +132,15 @@ from unjam.kernels import has_pinned_kernels
 from unjam.parameters import build_dataclass
 assert not has_pinned_kernels()
 values, folder = json.loads({given!r})
-rows, judged = [], []
+rows, evaluated = [], []
 config = build_dataclass(RunConfig, values, "")
 
-def first_alone(row):
+def stop_after_first(row):
     rows.append(row)
     return False
 
-result = unjam.train(config, folder, on_iteration=first_alone, progress=lambda *each: judged.append(each))
-print(json.dumps([[row["iteration"] for row in rows], len(judged) > 0, result.gain.count]))
+result = unjam.train(config, folder, on_iteration=stop_after_first, progress=lambda *each: evaluated.append(each))
+print(json.dumps([[row["iteration"] for row in rows], len(evaluated) > 0, result.gain.count]))
 """
 REFUSED = """
 try:
@@ -163,9 +161,9 @@ def test_errors_of_the_pinned_process_are_reported(tmp_path: Path) -> None:
 
 @needs_avx2
 @pytest.mark.slow
-def test_a_program_that_imported_numpy_first_trains_in_a_pinned_process(tmp_path: Path) -> None:
+def test_program_that_imported_numpy_first_trains_in_a_pinned_process(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     given = json.dumps([asdict(small_config(steps=900)), str(folder)])
-    iterations, judged, count = run(LATE.format(given=given))
-    assert (iterations, judged, count) == ([1], True, 2)
+    iterations, has_evaluated, count = run(LATE.format(given=given))
+    assert (iterations, has_evaluated, count) == ([1], True, 2)
     assert json.loads((folder / "manifest.json").read_text())["kernels"]["pinned"]

@@ -3,7 +3,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from tests.following.made_up import idm_driver
+from tests.following.synthetic_pairs import idm_driver
 from unjam.following.calibration import CalibrationSettings, calibrate_groups, calibrate_idm, gap_objective
 from unjam.following.pairs import Pair, make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
@@ -12,30 +12,30 @@ QUICK = CalibrationSettings(generations=40)
 DRIVER = IDMParameters(time_headway=0.9, max_acceleration=1.4, comfortable_deceleration=2.0, minimum_gap=2.5)
 
 
-def test_the_true_parameters_have_no_error() -> None:
+def test_true_parameters_have_no_error() -> None:
     objective = gap_objective(make_segments([idm_driver(DRIVER)]), (-4.0, 2.0), "trajectory")
     true = [30.0, 0.9, 1.4, 2.0, 2.5, 0.0]
-    found = objective(np.array([true, [30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T)
-    assert found[0] < 1e-9
-    assert found[1] > 1.0
+    result = objective(np.array([true, [30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T)
+    assert result[0] < 1e-9
+    assert result[1] > 1.0
 
 
-def test_the_headway_of_a_driver_is_found() -> None:
+def test_calibration_finds_the_time_headway() -> None:
     pairs = [idm_driver(DRIVER, seed=seed) for seed in range(3)]
-    found = calibrate_idm(pairs, QUICK)
-    assert found.gap_error < 0.2
-    assert found.parameters.time_headway == pytest.approx(0.9, abs=0.15)
-    assert found.collisions == 0
-    assert found.seconds == pytest.approx(120.0)
+    result = calibrate_idm(pairs, QUICK)
+    assert result.gap_error < 0.2
+    assert result.parameters.time_headway == pytest.approx(0.9, abs=0.15)
+    assert result.collisions == 0
+    assert result.seconds == pytest.approx(120.0)
 
 
-def test_the_result_depends_on_the_seed_alone() -> None:
+def test_same_seed_gives_the_same_result() -> None:
     pairs = [idm_driver(DRIVER, seconds=10.0)]
     settings = CalibrationSettings(generations=3)
     assert calibrate_idm(pairs, settings) == calibrate_idm(pairs, settings)
 
 
-def test_a_parameter_at_the_end_of_what_is_searched_is_named() -> None:
+def test_parameter_at_a_bound_is_named() -> None:
     settings = CalibrationSettings(generations=20, time_headway=(1.5, 3.0))
     assert "time_headway" in calibrate_idm([idm_driver(DRIVER)], settings).parameters_at_bounds
 
@@ -44,51 +44,53 @@ HEADWAYS = (0.8, 1.6, 1.15)
 
 
 def groups() -> list[list[Pair]]:
-    """Drivers who differ in their headway alone; the second with two trajectories."""
-    made = [[idm_driver(IDMParameters(time_headway=headway), f"{headway}")] for headway in HEADWAYS]
-    made[1].append(idm_driver(IDMParameters(time_headway=HEADWAYS[1]), "1.6", seed=4, seconds=20.0))
-    return made
+    """Return drivers that differ in their time headway alone; the second has two trajectories."""
+    drivers = [[idm_driver(IDMParameters(time_headway=headway), f"{headway}")] for headway in HEADWAYS]
+    drivers[1].append(idm_driver(IDMParameters(time_headway=HEADWAYS[1]), "1.6", seed=4, seconds=20.0))
+    return drivers
 
 
 @pytest.mark.parametrize("weighting", ["trajectory", "sample"])
-def test_each_driver_gets_its_own_headway_and_what_is_typical(weighting: Literal["trajectory", "sample"]) -> None:
-    told: list[int] = []
+def test_each_driver_gets_its_own_headway_and_the_typical_other_parameters(
+    weighting: Literal["trajectory", "sample"],
+) -> None:
+    progress: list[int] = []
     settings = CalibrationSettings(weighting=weighting)
-    found = calibrate_groups(groups(), PAPER_IDM, ("time_headway",), settings, told.append)
-    assert [one.parameters.time_headway for one in found] == pytest.approx(HEADWAYS, abs=5e-3)
-    assert all(one.parameters.minimum_gap == PAPER_IDM.minimum_gap for one in found)
-    assert all(one.gap_error < 0.05 for one in found)
-    assert [one.seconds for one in found] == pytest.approx([40.0, 60.0, 40.0])
-    assert told == [3]
+    result = calibrate_groups(groups(), PAPER_IDM, ("time_headway",), settings, progress.append)
+    assert [one.parameters.time_headway for one in result] == pytest.approx(HEADWAYS, abs=5e-3)
+    assert all(one.parameters.minimum_gap == PAPER_IDM.minimum_gap for one in result)
+    assert all(one.gap_error < 0.05 for one in result)
+    assert [one.seconds for one in result] == pytest.approx([40.0, 60.0, 40.0])
+    assert progress == [3]
 
 
 @pytest.mark.long
-def test_who_drives_beside_whom_does_not_matter() -> None:
-    together = calibrate_groups(groups(), PAPER_IDM, ("time_headway",))
-    alone = [calibrate_groups([group], PAPER_IDM, ("time_headway",))[0] for group in groups()]
-    for one, other in zip(together, alone, strict=True):
+def test_groups_do_not_influence_each_other() -> None:
+    joint = calibrate_groups(groups(), PAPER_IDM, ("time_headway",))
+    separate = [calibrate_groups([group], PAPER_IDM, ("time_headway",))[0] for group in groups()]
+    for one, other in zip(joint, separate, strict=True):
         assert one.parameters.time_headway == pytest.approx(other.parameters.time_headway, abs=2e-3)
 
 
-def test_several_own_parameters_are_searched_for_one_driver_after_the_other() -> None:
-    told: list[int] = []
+def test_several_individual_parameters_are_calibrated_driver_by_driver() -> None:
+    progress: list[int] = []
     settings = CalibrationSettings(generations=5)
-    found = calibrate_groups(groups()[:2], PAPER_IDM, ("time_headway", "minimum_gap"), settings, told.append)
-    assert all(one.parameters.max_acceleration == PAPER_IDM.max_acceleration for one in found)
-    assert found[0].parameters.time_headway < found[1].parameters.time_headway
-    assert told == [1, 2]
+    result = calibrate_groups(groups()[:2], PAPER_IDM, ("time_headway", "minimum_gap"), settings, progress.append)
+    assert all(one.parameters.max_acceleration == PAPER_IDM.max_acceleration for one in result)
+    assert result[0].parameters.time_headway < result[1].parameters.time_headway
+    assert progress == [1, 2]
 
 
-def test_a_headway_beyond_what_is_searched_is_named() -> None:
+def test_headway_beyond_the_bounds_is_named() -> None:
     settings = CalibrationSettings(time_headway=(1.0, 3.0))
-    (found,) = calibrate_groups(groups()[:1], PAPER_IDM, ("time_headway",), settings)
-    assert (found.parameters.time_headway, found.parameters_at_bounds) == (1.0, ("time_headway",))
+    (result,) = calibrate_groups(groups()[:1], PAPER_IDM, ("time_headway",), settings)
+    assert (result.parameters.time_headway, result.parameters_at_bounds) == (1.0, ("time_headway",))
 
 
 @pytest.mark.parametrize("weighting", ["trajectory", "sample"])
-def test_a_short_rest_of_a_long_trajectory_weighs_little(weighting: Literal["trajectory", "sample"]) -> None:
+def test_short_last_segment_of_a_trajectory_has_little_weight(weighting: Literal["trajectory", "sample"]) -> None:
     whole = idm_driver(DRIVER, seconds=20.0)
-    wrong = np.array([[30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T
-    cut = [make_segments([whole], seconds) for seconds in (20.0, 19.8)]
-    errors = [gap_objective(each, (-4.0, 2.0), weighting)(wrong)[0] for each in cut]
+    candidates = np.array([[30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T
+    segments = [make_segments([whole], seconds) for seconds in (20.0, 19.8)]
+    errors = [gap_objective(each, (-4.0, 2.0), weighting)(candidates)[0] for each in segments]
     assert errors[1] == pytest.approx(errors[0], rel=0.02)

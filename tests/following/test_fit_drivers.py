@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.following.made_up import idm_driver
+from tests.following.synthetic_pairs import idm_driver
 from tests.paper.test_field_data import table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings, MultiStepSettings
@@ -24,42 +24,44 @@ def pairs() -> list[Pair]:
 
 
 @pytest.mark.long
-def test_every_driver_has_its_headway_and_what_suits_all(pairs: list[Pair]) -> None:
-    told: list[tuple[int, int]] = []
-    found = fit_drivers(pairs, FitDriversSettings(calibration=QUICK), lambda *done: told.append(done))
-    headways = [one.time_headway for one in found.drivers]
+def test_each_driver_has_its_headway_and_the_common_parameters(pairs: list[Pair]) -> None:
+    progress: list[tuple[int, int]] = []
+    population = fit_drivers(pairs, FitDriversSettings(calibration=QUICK), lambda *done: progress.append(done))
+    headways = [one.time_headway for one in population.drivers]
     assert headways == sorted(headways)
-    assert all(one.max_acceleration == found.typical.max_acceleration for one in found.drivers)
-    assert [detail["name"] for detail in found.details] == [pair.driver for pair in pairs]
-    assert all(detail["gap_error"] < found.metadata["fit"]["common"]["gap_error"] for detail in found.details)
-    assert found.residual is None
-    assert told[-1] == (5, 5)
-    assert headways[0] < found.typical.time_headway < headways[-1]
+    assert all(one.max_acceleration == population.typical.max_acceleration for one in population.drivers)
+    assert [detail["name"] for detail in population.details] == [pair.driver for pair in pairs]
+    assert all(detail["gap_error"] < population.metadata["fit"]["common"]["gap_error"] for detail in population.details)
+    assert population.residual is None
+    assert progress[-1] == (5, 5)
+    assert headways[0] < population.typical.time_headway < headways[-1]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_typical_headway_is_one_that_suits_all(seed: int) -> None:
-    people = [
+def test_typical_headway_is_in_the_middle(seed: int) -> None:
+    pairs = [
         idm_driver(IDMParameters(time_headway=headway), f"{headway}", number, seconds=20.0)
         for number, headway in enumerate((1.0, 1.4, 1.8))
     ]
     quick = CalibrationSettings(generations=25, candidates=3, seed=seed)
-    found = fit_drivers(people, FitDriversSettings(calibration=quick, rounds=2))
-    assert 1.1 < found.typical.time_headway < 1.7
+    population = fit_drivers(pairs, FitDriversSettings(calibration=quick, rounds=2))
+    assert 1.1 < population.typical.time_headway < 1.7
 
 
 @pytest.mark.long
-def test_a_residual_is_kept_where_it_is_better(pairs: list[Pair]) -> None:
-    steps = MultiStepSettings(hidden=(4,), segment_seconds=5.0, batch_size=8, gradient_steps=2, validation_interval=1)
-    settings = FitDriversSettings(calibration=CalibrationSettings(generations=2), residual=True, multi_step=steps)
-    found = fit_drivers(pairs, settings)
-    fit = found.metadata["fit"]
+def test_residual_is_used_only_if_it_is_better(pairs: list[Pair]) -> None:
+    multi_step = MultiStepSettings(
+        hidden=(4,), segment_seconds=5.0, batch_size=8, gradient_steps=2, validation_interval=1
+    )
+    settings = FitDriversSettings(calibration=CalibrationSettings(generations=2), residual=True, multi_step=multi_step)
+    population = fit_drivers(pairs, settings)
+    fit = population.metadata["fit"]
     assert fit["residual_is_better"] == (min(fit["residual_gap_errors"]) < fit["residual_gap_errors"][0])
-    assert (found.residual is not None) == fit["residual_is_better"]
+    assert (population.residual is not None) == fit["residual_is_better"]
 
 
-def test_what_cannot_be_fitted(pairs: list[Pair]) -> None:
+def test_unsupported_data_and_settings_are_refused(pairs: list[Pair]) -> None:
     with pytest.raises(InputError, match=r"drivers: 2 is not allowed; allowed: >= 5 for a residual"):
         fit_drivers(pairs[:2], FitDriversSettings(residual=True))
     with pytest.raises(InputError, match="individual: 'exponent' is not allowed"):
@@ -74,38 +76,38 @@ def data(tmp_path: Path) -> Path:
     return Path(table(tmp_path / "data.parquet", [{"kind": kind} for kind in ("human", "human", "ACC")]))
 
 
-def test_speeds_in_another_unit_than_gaps_are_doubted() -> None:
+def test_speeds_in_another_unit_than_gaps_give_a_warning() -> None:
     pair = idm_driver(IDMParameters(time_headway=1.3))
     assert unit_warnings([pair]) == []
-    kilometres = replace(pair, speed=3.6 * pair.speed, leader_speed=3.6 * pair.leader_speed)
-    (line,) = unit_warnings([kilometres])
+    in_kmh = replace(pair, speed=3.6 * pair.speed, leader_speed=3.6 * pair.leader_speed)
+    (line,) = unit_warnings([in_kmh])
     assert line.startswith("warning: gaps change 0.28 times as fast as the speeds imply")
 
 
 @pytest.mark.long
-def test_a_file_becomes_a_population(data: Path) -> None:
-    found = fit_drivers_from_files([data], CHANGES)
-    assert len(found.population.drivers) == 3
-    assert found.notes == ["data.parquet: 3 trajectories with 723 of 723 rows"]
-    assert found.population.metadata["data"] == ["data.parquet"]
-    assert "one IDM for all" in found.report_lines()[0]
-    assert found.facts()["drivers"] == 3
+def test_file_is_fitted_to_a_population(data: Path) -> None:
+    fit = fit_drivers_from_files([data], CHANGES)
+    assert len(fit.population.drivers) == 3
+    assert fit.notes == ["data.parquet: 3 trajectories with 723 of 723 rows"]
+    assert fit.population.metadata["data"] == ["data.parquet"]
+    assert "one IDM for all" in fit.report_lines()[0]
+    assert fit.facts()["drivers"] == 3
 
 
 @pytest.mark.long
-def test_a_population_names_no_folder_of_the_machine(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_population_names_no_folder_of_the_machine(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["unjam", "fit-drivers", str(data)])
     command = fit_drivers_from_files([data], CHANGES).population.metadata["manifest"]["command"]
     assert command == ["unjam", "fit-drivers", "data.parquet"]
 
 
 @pytest.mark.long
-def test_trajectories_can_be_chosen(data: Path) -> None:
+def test_filters_select_trajectories(data: Path) -> None:
     assert len(fit_drivers_from_files([data], CHANGES, filters={"kind": "human"}).population.drivers) == 2
 
 
 @pytest.mark.long
-def test_drivers_of_several_files_are_told_apart(data: Path, tmp_path: Path) -> None:
+def test_drivers_of_several_files_have_different_names(data: Path, tmp_path: Path) -> None:
     other = Path(table(tmp_path / "other.parquet", [{}]))
     names = [one["name"] for one in fit_drivers_from_files([data, other], CHANGES).population.details]
     assert names == ["data-0", "data-1", "data-2", "other-0"]
@@ -120,18 +122,18 @@ def test_drivers_of_several_files_are_told_apart(data: Path, tmp_path: Path) -> 
         ({}, {"out": Path("drivers.toml")}, "out: 'drivers.toml' is not allowed"),
     ],
 )
-def test_wrong_input_is_one_line(data: Path, changes: dict, more: dict, words: str) -> None:
+def test_invalid_input_is_refused(data: Path, changes: dict, more: dict, words: str) -> None:
     with pytest.raises(InputError, match=words):
         fit_drivers_from_files([data], {**CHANGES, **changes}, **more)
 
 
-def test_nothing_is_calibrated_that_cannot_be_written(data: Path, tmp_path: Path) -> None:
+def test_missing_output_folder_is_refused_before_the_calibration(data: Path, tmp_path: Path) -> None:
     with pytest.raises(DiskError):
         fit_drivers_from_files([data], CHANGES, out=tmp_path / "gone" / "drivers.json")
 
 
 @pytest.mark.long
-def test_files_of_the_same_name_have_different_people(data: Path, tmp_path: Path) -> None:
+def test_drivers_of_files_with_the_same_name_have_different_names(data: Path, tmp_path: Path) -> None:
     days = [tmp_path / day / data.name for day in ("monday", "tuesday")]
     for day in days:
         day.parent.mkdir()

@@ -7,11 +7,11 @@ from unjam.following.pairs import following_samples
 from unjam.parameters import build_dataclass
 
 
-def test_there_are_as_many_rows_as_in_the_paper() -> None:
+def test_default_row_count_is_that_of_the_paper() -> None:
     assert len(following_samples(make_four_regimes(FourRegimesSettings()))) == 262_630
 
 
-def test_the_same_seed_gives_the_same_set() -> None:
+def test_same_seed_gives_the_same_data() -> None:
     settings = FourRegimesSettings(rows=3000)
     for one, other in zip(make_four_regimes(settings), make_four_regimes(settings), strict=True):
         np.testing.assert_array_equal(one.speed, other.speed)
@@ -35,6 +35,6 @@ def test_leaders_keep_their_speed_and_followers_move_by_euler_steps() -> None:
         np.testing.assert_allclose(np.diff(pair.gap), (pair.leader_speed[1:] - pair.speed[1:]) * pair.step)
 
 
-def test_nobody_starts_faster_than_it_wants_to_be() -> None:
+def test_initial_speed_above_the_desired_speed_is_refused() -> None:
     with pytest.raises(InputError, match=r"speed: 40.0 m/s is not allowed"):
         build_dataclass(FourRegimesSettings, {"speed": (5.0, 40.0)}, "regimes")

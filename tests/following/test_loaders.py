@@ -17,10 +17,10 @@ MOMENTS = 30
 
 
 def table(path: Path, **changes: object) -> Path:
-    """A plain table of two pairs, the second of which begins later."""
+    """Write a plain table of two pairs, the second of which starts later."""
     parts = []
-    for pair, begin in (("one", 0.0), ("two", 100.0)):
-        times = begin + 0.1 * np.arange(MOMENTS)
+    for pair, start in (("one", 0.0), ("two", 100.0)):
+        times = start + 0.1 * np.arange(MOMENTS)
         gap = GAP + (LEADER - SPEED) * 0.1 * np.arange(MOMENTS)
         parts.append(pd.DataFrame({"pair": pair, "time": times, "speed": SPEED, "leader_speed": LEADER, "gap": gap}))
     frame = pd.concat(parts, ignore_index=True).assign(**changes)
@@ -29,7 +29,7 @@ def table(path: Path, **changes: object) -> Path:
 
 
 def ngsim(path: Path, feet: float = METERS_PER_FOOT, **changes: object) -> Path:
-    """Two vehicles, the second behind the first, in the public format: feet and milliseconds."""
+    """Write two vehicles, the second behind the first, in the public format: feet and milliseconds."""
     rows = []
     for vehicle, preceding, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
         for moment in range(MOMENTS):
@@ -51,7 +51,7 @@ def ngsim(path: Path, feet: float = METERS_PER_FOOT, **changes: object) -> Path:
 
 
 def reconstructed(path: Path, header: bool) -> Path:
-    """The same in metres, as the reconstructed files have it."""
+    """Write the same in meters, as in the reconstructed files."""
     rows = []
     for vehicle, leader, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
         for frame in range(MOMENTS):
@@ -63,7 +63,7 @@ def reconstructed(path: Path, header: bool) -> Path:
 
 
 def openacc(path: Path) -> Path:
-    """A platoon of three, whose third driver is a machine."""
+    """Write a platoon of three vehicles, of which the third is driven by ACC."""
     times = 0.1 * np.arange(MOMENTS)
     gap = GAP + (LEADER - SPEED) * times
     frame = pd.DataFrame({"Time": times, "Speed1": LEADER, "Speed2": SPEED, "Speed3": SPEED})
@@ -74,7 +74,7 @@ def openacc(path: Path) -> Path:
 
 
 def highd(path: Path, sign: int = 1) -> Path:
-    """One behind another as highD has them: the left end of a box, whichever way it drives."""
+    """Write two vehicles as in highD: x is the left end of a vehicle, whatever its direction."""
     rows = []
     for vehicle, leader, rear, speed in ((1, 0, 100.0, LEADER), (2, 1, 100.0 - GAP - 5.0, SPEED)):
         for frame in range(MOMENTS):
@@ -96,49 +96,49 @@ def test_highd_is_read_on_both_carriageways(tmp_path: Path, sign: int) -> None:
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_who_stands_on_highd_stands_where_it_was(tmp_path: Path, sign: int) -> None:
+def test_standing_vehicle_on_highd_keeps_its_position(tmp_path: Path, sign: int) -> None:
     path = highd(tmp_path / "01_tracks.csv", sign)
     table = pd.read_csv(path)
     leader, half = table["id"] == 1, MOMENTS // 2
-    stands = leader & (table["frame"] >= half)
-    table.loc[stands, "x"] = table.loc[leader & (table["frame"] == half), "x"].item()
-    table.loc[stands, "xVelocity"] = 0.0
+    is_standing = leader & (table["frame"] >= half)
+    table.loc[is_standing, "x"] = table.loc[leader & (table["frame"] == half), "x"].item()
+    table.loc[is_standing, "xVelocity"] = 0.0
     table.to_csv(path, index=False)
     (pair,) = read_pairs(path, options=replace(SHORT, min_seconds=1.0)).pairs
     assert np.abs(np.diff(pair.gap)).max() < 0.04 * max(SPEED, LEADER) + 1e-6
 
 
-def test_what_sumo_wrote_is_read_with_the_gaps_that_there_were(tmp_path: Path) -> None:
+def test_fcd_output_of_sumo_has_consistent_gaps(tmp_path: Path) -> None:
     flow = '<flow id="f" type="van" route="along" begin="0" end="20" period="4"/>'
     options = ["--fcd-output", "fcd.csv", "--fcd-output.max-leader-distance", "200"]
     command = [sumo_program("sumo"), "-c", str(straight(tmp_path, flow)), *options]
     subprocess.run(command, cwd=tmp_path, capture_output=True, check=True)
-    found = read_pairs(tmp_path / "fcd.csv")
-    assert {pair.driver for pair in found.pairs} == {f"f.{number}" for number in range(1, 5)}
-    for pair in found.pairs:
-        driven = np.cumsum(pair.leader_speed - pair.speed)[1:] * pair.step
-        np.testing.assert_allclose(pair.gap[1:] - pair.gap[0], driven, atol=0.6)
+    result = read_pairs(tmp_path / "fcd.csv")
+    assert {pair.driver for pair in result.pairs} == {f"f.{number}" for number in range(1, 5)}
+    for pair in result.pairs:
+        gap_changes = np.cumsum(pair.leader_speed - pair.speed)[1:] * pair.step
+        np.testing.assert_allclose(pair.gap[1:] - pair.gap[0], gap_changes, atol=0.6)
         assert pair.gap.min() > 20
-    whole = pd.read_csv(tmp_path / "fcd.csv", sep=";")
-    whole.drop(columns="vehicle_leaderSpeed").to_csv(tmp_path / "without.csv", sep=";", index=False)
+    frame = pd.read_csv(tmp_path / "fcd.csv", sep=";")
+    frame.drop(columns="vehicle_leaderSpeed").to_csv(tmp_path / "without.csv", sep=";", index=False)
     with pytest.raises(InputError, match="no column 'vehicle_leaderSpeed'"):
         read_pairs(tmp_path / "without.csv")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_plain_table(tmp_path: Path, suffix: str) -> None:
-    found = read_pairs(table(tmp_path / f"t{suffix}", kind="human", driver="me"), options=SHORT)
-    assert [pair.name for pair in found.pairs] == ["one", "two"]
-    pair = found.pairs[0]
+def test_plain_table_is_read(tmp_path: Path, suffix: str) -> None:
+    result = read_pairs(table(tmp_path / f"t{suffix}", kind="human", driver="me"), options=SHORT)
+    assert [pair.name for pair in result.pairs] == ["one", "two"]
+    pair = result.pairs[0]
     assert (pair.step, pair.kind, pair.driver) == (0.1, "human", "me")
     assert (pair.speed[0], pair.leader_speed[0], pair.gap[0]) == (SPEED, LEADER, GAP)
-    assert found.summary_lines() == ["2 trajectories with 60 of 60 rows"]
+    assert result.summary_lines() == ["2 trajectories with 60 of 60 rows"]
 
 
 @pytest.mark.parametrize(
     "make", [ngsim, lambda path: reconstructed(path, True), lambda path: reconstructed(path, False), openacc]
 )
-def test_public_formats_say_the_same_in_si_units(tmp_path: Path, make) -> None:
+def test_public_formats_are_converted_to_si_units(tmp_path: Path, make) -> None:
     pair = read_pairs(make(tmp_path / "data.csv"), options=SHORT).pairs[0]
     assert len(pair.speed) == MOMENTS
     assert pair.step == 0.1
@@ -147,41 +147,41 @@ def test_public_formats_say_the_same_in_si_units(tmp_path: Path, make) -> None:
     np.testing.assert_allclose(pair.gap, GAP + (LEADER - SPEED) * 0.1 * np.arange(MOMENTS), atol=1e-6)
 
 
-def test_who_has_nobody_ahead_is_counted(tmp_path: Path) -> None:
-    found = read_pairs(ngsim(tmp_path / "data.csv"), options=SHORT)
-    assert found.summary_lines() == [
+def test_rows_without_leader_are_counted(tmp_path: Path) -> None:
+    result = read_pairs(ngsim(tmp_path / "data.csv"), options=SHORT)
+    assert result.summary_lines() == [
         "1 trajectories with 30 of 60 rows",
         "skipped: 30 rows: no leader, or leader not recorded",
     ]
 
 
-def test_metres_are_not_taken_for_feet(tmp_path: Path) -> None:
+def test_meters_in_a_format_in_feet_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a median vehicle length of 1\.5 m is not allowed"):
         read_pairs(ngsim(tmp_path / "data.csv", feet=1.0), options=SHORT)
 
 
-def test_openacc_names_its_drivers(tmp_path: Path) -> None:
-    found = read_pairs(openacc(tmp_path / "platoon.csv"), options=SHORT)
-    assert [(pair.driver, pair.kind) for pair in found.pairs] == [("Tesla(Model3)", "Human"), ("BMW(X5)", "ACC")]
+def test_openacc_drivers_have_the_names_of_their_vehicles(tmp_path: Path) -> None:
+    result = read_pairs(openacc(tmp_path / "platoon.csv"), options=SHORT)
+    assert [(pair.driver, pair.kind) for pair in result.pairs] == [("Tesla(Model3)", "Human"), ("BMW(X5)", "ACC")]
 
 
-def test_who_takes_over_is_another_driver_and_a_bad_gap_cuts_its_own_follower_alone(tmp_path: Path) -> None:
+def test_change_of_kind_is_another_driver_and_a_bad_gap_ends_only_its_own_pair(tmp_path: Path) -> None:
     path = openacc(tmp_path / "platoon.csv")
     lines = path.read_text().splitlines()
     frame = pd.read_csv(path, skiprows=3)
     frame.loc[MOMENTS // 2 :, "Driver2"] = "ACC"
     frame.loc[MOMENTS // 2, "IVS2"] = np.nan
     path.write_text("\n".join([*lines[:3], frame.to_csv(index=False)]))
-    found = read_pairs(path, options=replace(SHORT, drop_bad_rows=True))
-    behind = [(pair.driver, len(pair.speed)) for pair in found.pairs if pair.driver.startswith("Tesla")]
+    result = read_pairs(path, options=replace(SHORT, drop_bad_rows=True))
+    trajectories = [(pair.driver, len(pair.speed)) for pair in result.pairs if pair.driver.startswith("Tesla")]
     half = MOMENTS // 2
-    assert behind == [("Tesla(Model3)-ACC", MOMENTS - half), ("Tesla(Model3)-Human", half)]
-    third = [len(pair.speed) for pair in found.pairs if pair.driver == "BMW(X5)"]
+    assert trajectories == [("Tesla(Model3)-ACC", MOMENTS - half), ("Tesla(Model3)-Human", half)]
+    third = [len(pair.speed) for pair in result.pairs if pair.driver == "BMW(X5)"]
     assert sorted(third) == [MOMENTS - half - 1, half]
-    assert len(found.bad_rows) == 1
+    assert len(result.bad_rows) == 1
 
 
-def spoilt(path: Path, row: int, column: str, value: object) -> Path:
+def table_with_bad_value(path: Path, row: int, column: str, value: object) -> Path:
     frame = pd.read_csv(table(path)).astype({column: object})
     frame.loc[row, column] = value
     frame.to_csv(path, index=False)
@@ -197,27 +197,27 @@ def spoilt(path: Path, row: int, column: str, value: object) -> Path:
         ("time", 0.3, r"line 7: time: 0.3 occurs twice in its pair"),
     ],
 )
-def test_a_bad_row_is_refused_by_its_line(tmp_path: Path, column: str, value: object, words: str) -> None:
+def test_bad_row_is_refused_with_its_line(tmp_path: Path, column: str, value: object, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        read_pairs(spoilt(tmp_path / "t.csv", 5, column, value), options=SHORT)
+        read_pairs(table_with_bad_value(tmp_path / "t.csv", 5, column, value), options=SHORT)
 
 
-def test_a_bad_row_may_be_cut_out_and_is_told(tmp_path: Path) -> None:
-    path = spoilt(tmp_path / "t.csv", 12, "gap", "")
-    found = read_pairs(path, options=ReadOptions(drop_bad_rows=True, min_seconds=1.0))
-    assert [len(pair.speed) for pair in found.pairs] == [12, 17, 30]
-    assert len({pair.name for pair in found.pairs}) == 3
-    assert found.bad_rows == {14: "gap: nan is not allowed; allowed: 0 to 1000"}
-    assert "dropped: line 14: gap: nan is not allowed; allowed: 0 to 1000" in found.summary_lines()
+def test_bad_row_can_be_dropped_and_is_reported(tmp_path: Path) -> None:
+    path = table_with_bad_value(tmp_path / "t.csv", 12, "gap", "")
+    result = read_pairs(path, options=ReadOptions(drop_bad_rows=True, min_seconds=1.0))
+    assert [len(pair.speed) for pair in result.pairs] == [12, 17, 30]
+    assert len({pair.name for pair in result.pairs}) == 3
+    assert result.bad_rows == {14: "gap: nan is not allowed; allowed: 0 to 1000"}
+    assert "dropped: line 14: gap: nan is not allowed; allowed: 0 to 1000" in result.summary_lines()
 
 
 def test_short_trajectories_are_counted(tmp_path: Path) -> None:
     path = table(tmp_path / "t.csv")
     frame = pd.read_csv(path)
     frame.drop(index=[40]).to_csv(path, index=False)
-    found = read_pairs(path, options=ReadOptions(min_seconds=1.5))
-    assert [len(pair.speed) for pair in found.pairs] == [30, 19]
-    assert found.skipped_rows == {"trajectories shorter than 1.5 s": 10}
+    result = read_pairs(path, options=ReadOptions(min_seconds=1.5))
+    assert [len(pair.speed) for pair in result.pairs] == [30, 19]
+    assert result.skipped_rows == {"trajectories shorter than 1.5 s": 10}
 
 
 @pytest.mark.parametrize(
@@ -228,36 +228,36 @@ def test_short_trajectories_are_counted(tmp_path: Path) -> None:
         (lambda path: openacc(path / "t.csv"), "no column 'pair'; it has: Time"),
     ],
 )
-def test_what_cannot_be_read(tmp_path: Path, make, words: str) -> None:
+def test_unreadable_files_are_refused(tmp_path: Path, make, words: str) -> None:
     with pytest.raises(InputError, match=words):
         read_pairs(make(tmp_path), "table", SHORT)
 
 
-def test_a_table_without_anything_long_enough(tmp_path: Path) -> None:
+def test_table_with_only_short_trajectories_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no trajectory lasts 20 s"):
         read_pairs(table(tmp_path / "t.csv"))
 
 
-def test_columns_may_name_the_driver(tmp_path: Path) -> None:
+def test_driver_columns_name_the_driver(tmp_path: Path) -> None:
     path = table(tmp_path / "t.csv", period=400, follower=5)
     pairs = read_pairs(path, options=ReadOptions(min_seconds=1.0, driver_columns=("period", "follower"))).pairs
     assert {pair.driver for pair in pairs} == {"400-5"}
 
 
-def test_an_unknown_format(tmp_path: Path) -> None:
+def test_unknown_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format: 'ind' is not allowed"):
         read_pairs(table(tmp_path / "t.csv"), "ind")
 
 
-def test_a_number_that_is_given_anew_later_is_another_driver(tmp_path: Path) -> None:
+def test_reused_vehicle_number_is_another_driver(tmp_path: Path) -> None:
     first = pd.read_csv(ngsim(tmp_path / "first.csv"))
-    later = first.assign(Global_Time=first["Global_Time"] + 15 * 60 * 1000)
-    pd.concat([later, first]).to_csv(tmp_path / "both.csv", index=False)
-    found = read_pairs(tmp_path / "both.csv", options=SHORT).pairs
-    assert sorted(pair.driver for pair in found) == ["i-80-8", "i-80-8-2"]
+    reused = first.assign(Global_Time=first["Global_Time"] + 15 * 60 * 1000)
+    pd.concat([reused, first]).to_csv(tmp_path / "both.csv", index=False)
+    result = read_pairs(tmp_path / "both.csv", options=SHORT).pairs
+    assert sorted(pair.driver for pair in result) == ["i-80-8", "i-80-8-2"]
 
 
-def test_who_has_no_name_is_by_himself(tmp_path: Path) -> None:
+def test_pair_without_driver_name_is_its_own_driver(tmp_path: Path) -> None:
     drivers = ["anna"] * MOMENTS + [None] * MOMENTS
-    found = read_pairs(table(tmp_path / "data.csv", driver=drivers, kind=None), options=SHORT)
-    assert [(pair.driver, pair.kind) for pair in found.pairs] == [("anna", ""), ("two", "")]
+    result = read_pairs(table(tmp_path / "data.csv", driver=drivers, kind=None), options=SHORT)
+    assert [(pair.driver, pair.kind) for pair in result.pairs] == [("anna", ""), ("two", "")]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.following.made_up import follower, idm_driver
+from tests.following.synthetic_pairs import follower, idm_driver
 from unjam.following.networks import (
     CalibratedPairs,
     FollowingNetwork,
@@ -26,7 +26,7 @@ def rows() -> FollowingSamples:
     return following_samples([idm_driver(driver, seed=seed) for seed in range(3)])
 
 
-def test_the_papers_network_has_two_layers_of_128() -> None:
+def test_default_settings_are_those_of_the_paper() -> None:
     settings = NetworkSettings()
     assert (settings.hidden, settings.learning_rate, settings.batch_size, settings.epochs) == (
         (128, 128),
@@ -36,91 +36,95 @@ def test_the_papers_network_has_two_layers_of_128() -> None:
     )
 
 
-def test_its_numpy_twin_answers_the_same(rows: FollowingSamples) -> None:
+def test_numpy_network_equals_the_torch_network(rows: FollowingSamples) -> None:
     network = FollowingNetwork(SETTINGS, rows, seed=1)
-    seen = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
+    inputs = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
     with torch.no_grad():
-        wanted = network(torch.as_tensor(seen, dtype=torch.float32)).numpy()
-    np.testing.assert_allclose(batched_network(network.to_numpy_network())(seen), wanted, atol=1e-4)
-    stacked = seen[:20].reshape(4, 5, 3)
-    np.testing.assert_allclose(batched_network(network.to_numpy_network())(stacked).ravel(), wanted[:20], atol=1e-4)
+        expected = network(torch.as_tensor(inputs, dtype=torch.float32)).numpy()
+    np.testing.assert_allclose(batched_network(network.to_numpy_network())(inputs), expected, atol=1e-4)
+    stacked = inputs[:20].reshape(4, 5, 3)
+    np.testing.assert_allclose(batched_network(network.to_numpy_network())(stacked).ravel(), expected[:20], atol=1e-4)
 
 
-def test_a_new_residual_may_be_zero(rows: FollowingSamples) -> None:
+def test_network_with_zero_init_is_zero(rows: FollowingSamples) -> None:
     network = FollowingNetwork(SETTINGS, rows, seed=1, zero_init=True)
     assert not network(torch.ones(4, 3)).any()
 
 
 @pytest.mark.parametrize("base", [None, idm_function(PAPER_IDM)])
-def test_it_learns(rows: FollowingSamples, base: None) -> None:
+def test_fit_reduces_the_validation_error(rows: FollowingSamples, base: None) -> None:
     network, losses = fit_one_step(rows, rows, base, SETTINGS, seed=0)
     assert min(losses.validation) < 0.2 * losses.validation[0]
-    seen = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
-    known = base(rows.speed, rows.leader_speed, rows.gap) if base else 0.0
-    error = np.square(batched_network(network.to_numpy_network())(seen) + known - rows.acceleration).mean()
+    inputs = residual_inputs(rows.speed, rows.leader_speed, rows.gap)
+    base_acceleration = base(rows.speed, rows.leader_speed, rows.gap) if base else 0.0
+    error = np.square(
+        batched_network(network.to_numpy_network())(inputs) + base_acceleration - rows.acceleration
+    ).mean()
     assert error == pytest.approx(min(losses.validation), rel=1e-2)
 
 
-def test_the_same_seed_gives_the_same_network(rows: FollowingSamples) -> None:
+def test_same_seed_gives_the_same_losses(rows: FollowingSamples) -> None:
     short = NetworkSettings(hidden=(8,), epochs=2)
     one, other = (fit_one_step(rows, rows, None, short, seed=3)[1] for _ in range(2))
     assert one == other
 
 
-def test_without_progress_it_ends(rows: FollowingSamples) -> None:
+def test_fit_ends_without_improvement(rows: FollowingSamples) -> None:
     settings = NetworkSettings(hidden=(4,), learning_rate=1e-12, epochs=50, patience=2)
-    still = FollowingSamples(rows.speed, rows.leader_speed, rows.gap, np.zeros(len(rows)))
-    _, losses = fit_one_step(still, rows, None, settings, seed=0)
+    at_rest = FollowingSamples(rows.speed, rows.leader_speed, rows.gap, np.zeros(len(rows)))
+    _, losses = fit_one_step(at_rest, rows, None, settings, seed=0)
     assert len(losses.training) < 50
 
 
 LIMITS: AccelerationBounds = (-4.0, 2.0)
-DRIVING = MultiStepSettings(
+MULTI_STEP = MultiStepSettings(
     hidden=(8,), segment_seconds=6.0, batch_size=16, gradient_steps=30, learning_rate=2e-2, validation_interval=10
 )
 
 
-def eager(speed: np.ndarray, leader_speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """The paper's IDM, but half a m/s2 keener."""
+def aggressive_idm(speed: np.ndarray, leader_speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """Return the acceleration of the paper's IDM plus 0.5 m/s2."""
     return idm_function(PAPER_IDM)(speed, leader_speed, gap) + 0.5
 
 
-def known(seeds: range) -> CalibratedPairs:
-    pairs = [follower(eager, f"{seed}", 20.0, seed=seed) for seed in seeds]
+def calibrated_pairs(seeds: range) -> CalibratedPairs:
+    pairs = [follower(aggressive_idm, f"{seed}", 20.0, seed=seed) for seed in seeds]
     return CalibratedPairs(pairs, [PAPER_IDM] * len(pairs))
 
 
 @pytest.mark.long
-def test_a_residual_learns_what_the_base_lacks_when_it_drives() -> None:
-    fitted = fit_multi_step(known(range(4)), known(range(4, 6)), LIMITS, DRIVING, seed=0)
-    assert min(fitted.validation_errors) < 0.5 * fitted.validation_errors[0]
-    others = known(range(6, 8))
-    stretches = make_segments(others.pairs)
-    base = others.model(stretches.pair_index, LIMITS)
-    alone = simulate_open_loop(base, stretches)
-    learned = simulate_open_loop(
-        add_residual(base, batched_network(fitted.network.to_numpy_network()), LIMITS), stretches
+def test_multi_step_residual_reduces_the_gap_error() -> None:
+    fit = fit_multi_step(calibrated_pairs(range(4)), calibrated_pairs(range(4, 6)), LIMITS, MULTI_STEP, seed=0)
+    assert min(fit.validation_errors) < 0.5 * fit.validation_errors[0]
+    unseen = calibrated_pairs(range(6, 8))
+    segments = make_segments(unseen.pairs)
+    base = unseen.model(segments.pair_index, LIMITS)
+    without_residual = simulate_open_loop(base, segments)
+    with_residual = simulate_open_loop(
+        add_residual(base, batched_network(fit.network.to_numpy_network()), LIMITS), segments
     )
-    assert (learned.gap_mse < alone.gap_mse).all()
+    assert (with_residual.gap_mse < without_residual.gap_mse).all()
 
 
-def test_where_nothing_is_left_nothing_is_learned() -> None:
+def test_exact_base_keeps_a_zero_residual() -> None:
     pairs = [follower(idm_function(PAPER_IDM), f"{seed}", 12.0, seed=seed) for seed in range(3)]
-    perfect = CalibratedPairs(pairs, [PAPER_IDM] * 3)
+    exact = CalibratedPairs(pairs, [PAPER_IDM] * 3)
     settings = MultiStepSettings(
         hidden=(4,), segment_seconds=3.0, batch_size=4, gradient_steps=2, validation_interval=1
     )
-    fitted = fit_multi_step(perfect, perfect, LIMITS, settings, seed=0)
-    assert fitted.validation_errors[0] == pytest.approx(0.0, abs=1e-9)
-    assert not fitted.network.to_numpy_network()(np.ones((2, 3))).any()
+    fit = fit_multi_step(exact, exact, LIMITS, settings, seed=0)
+    assert fit.validation_errors[0] == pytest.approx(0.0, abs=1e-9)
+    assert not fit.network.to_numpy_network()(np.ones((2, 3))).any()
 
 
-def test_the_same_seed_gives_the_same_fit() -> None:
+def test_same_seed_gives_the_same_validation_errors() -> None:
     settings = MultiStepSettings(
         hidden=(4,), segment_seconds=3.0, batch_size=4, gradient_steps=2, validation_interval=1
     )
     one, other = (
-        fit_multi_step(known(range(2)), known(range(2, 3)), LIMITS, settings, seed=1).validation_errors
+        fit_multi_step(
+            calibrated_pairs(range(2)), calibrated_pairs(range(2, 3)), LIMITS, settings, seed=1
+        ).validation_errors
         for _ in range(2)
     )
     assert one == other

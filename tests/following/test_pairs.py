@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.following.made_up import idm_driver
+from tests.following.synthetic_pairs import idm_driver
 from unjam.errors import InputError
 from unjam.following.pairs import Pair, following_samples, make_segments, pairs_in_splits, split_by_driver
 from unjam.physics.idm import PAPER_IDM
@@ -14,31 +14,31 @@ def pairs_of(count: int, drivers: int) -> list[Pair]:
     return [Pair(f"{number}", f"{number % drivers}", 0.1, zeros, zeros, zeros) for number in range(count)]
 
 
-def test_the_leaders_path_gives_back_the_recorded_gap() -> None:
+def test_leader_path_minus_follower_path_is_the_recorded_gap() -> None:
     pair = idm_driver(PAPER_IDM)
-    way = np.r_[0.0, np.cumsum(pair.speed[1:] * pair.step)]
-    np.testing.assert_allclose(pair.leader_path - way, pair.gap)
+    path = np.r_[0.0, np.cumsum(pair.speed[1:] * pair.step)]
+    np.testing.assert_allclose(pair.leader_path - path, pair.gap)
 
 
-def test_rows_are_all_moments_with_a_next_one() -> None:
+def test_samples_are_all_moments_but_the_last_of_each_pair() -> None:
     pairs = [idm_driver(PAPER_IDM, seconds=3.0), idm_driver(PAPER_IDM, seconds=5.0)]
-    rows = following_samples(pairs)
-    assert len(rows) == 30 + 50
-    assert rows.acceleration[30] == pytest.approx((pairs[1].speed[1] - pairs[1].speed[0]) / 0.1)
+    samples = following_samples(pairs)
+    assert len(samples) == 30 + 50
+    assert samples.acceleration[30] == pytest.approx((pairs[1].speed[1] - pairs[1].speed[0]) / 0.1)
 
 
 @given(seconds=st.sampled_from([1.0, 2.5, 7.0, None]), lengths=st.lists(st.floats(0.5, 9.0), min_size=1, max_size=4))
-def test_stretches_hold_every_step_once(seconds: float | None, lengths: list[float]) -> None:
+def test_segments_contain_every_step_once(seconds: float | None, lengths: list[float]) -> None:
     pairs = [idm_driver(PAPER_IDM, seconds=length) for length in lengths]
-    stretches = make_segments(pairs, seconds)
-    assert stretches.is_present[1:].sum() == sum(len(pair.speed) - 1 for pair in pairs)
+    segments = make_segments(pairs, seconds)
+    assert segments.is_present[1:].sum() == sum(len(pair.speed) - 1 for pair in pairs)
     for number, pair in enumerate(pairs):
-        own = np.flatnonzero(stretches.pair_index == number)
-        driven = [stretches.speed[1:, one][stretches.is_present[1:, one]] for one in own]
-        np.testing.assert_array_equal(np.concatenate(driven), pair.speed[1:])
+        own = np.flatnonzero(segments.pair_index == number)
+        speeds = [segments.speed[1:, index][segments.is_present[1:, index]] for index in own]
+        np.testing.assert_array_equal(np.concatenate(speeds), pair.speed[1:])
 
 
-def test_stretches_want_one_time_step() -> None:
+def test_segments_require_equal_time_steps() -> None:
     zeros = np.zeros(3)
     pairs = [Pair(str(step), "", step, zeros, zeros, zeros) for step in (0.1, 0.2)]
     with pytest.raises(InputError, match="time step"):
@@ -46,12 +46,12 @@ def test_stretches_want_one_time_step() -> None:
 
 
 @given(count=st.integers(5, 40), drivers=st.integers(3, 40), seed=st.integers(0, 9))
-def test_a_driver_is_in_one_part_of_a_split(count: int, drivers: int, seed: int) -> None:
-    chosen = split_by_driver(pairs_of(count, drivers), (0.6, 0.2, 0.2), seed)
-    assert len(chosen) == count
-    assert len({(pair.driver, pair.split) for pair in chosen}) == len({pair.driver for pair in chosen})
+def test_each_driver_is_in_one_part_of_a_split(count: int, drivers: int, seed: int) -> None:
+    split = split_by_driver(pairs_of(count, drivers), (0.6, 0.2, 0.2), seed)
+    assert len(split) == count
+    assert len({(pair.driver, pair.split) for pair in split}) == len({pair.driver for pair in split})
 
 
 def test_parts_of_a_split_have_their_shares() -> None:
-    chosen = split_by_driver(pairs_of(100, 100), (0.7, 0.1, 0.2), 0)
-    assert [len(pairs_in_splits(chosen, name)) for name in ("train", "validation", "test")] == [70, 10, 20]
+    split = split_by_driver(pairs_of(100, 100), (0.7, 0.1, 0.2), 0)
+    assert [len(pairs_in_splits(split, name)) for name in ("train", "validation", "test")] == [70, 10, 20]

@@ -1,4 +1,4 @@
-"""Takes what the pinned kernels compute today as what they must.
+"""Store the present results of the pinned kernels as the expected ones.
 
 Run: python -m tests.kernels.bless
 """
@@ -8,8 +8,8 @@ from pathlib import Path
 
 from tests.kernels import operations, trainings
 
-PLACE = Path(__file__).with_name("hashes.json")
+HASHES_FILE = Path(__file__).with_name("hashes.json")
 
 if __name__ == "__main__":
     found = {"operations": operations.hashes(), "trainings": trainings.hashes(list(trainings.LEARNERS))}
-    PLACE.write_text(json.dumps(found, indent=1) + "\n")
+    HASHES_FILE.write_text(json.dumps(found, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""The arithmetic that trainings are made of, on fixed numbers: a short hash of the bits of each kind.
+"""The arithmetic of trainings on fixed numbers: a short hash of the bits of each kind.
 
 Run: python -m tests.kernels.operations; prints one JSON object. It also runs under an emulator of another
 processor: qemu-x86_64 -cpu EPYC python -m tests.kernels.operations.
@@ -17,21 +17,21 @@ from torch import nn
 from unjam.adam import Adam
 
 ROWS = (1, 3, 16, 64, 300, 2000)
-"""of the products: a look of one CAV, a batch, an iteration"""
+"""of the products: one CAV, a batch, an iteration"""
 SIZES = ((9, 64, 64, 1), (11, 32, 32, 6), (6, 8, 1))
 """of the networks: inputs, hidden layers, outputs"""
 LENGTHS = (1, 7, 64, 5000)
-"""of what functions are taken of"""
+"""of the arguments of functions"""
 
 
 def numbers(*shape: int, low: float = -1.0, high: float = 1.0) -> np.ndarray:
-    """Return numbers that depend on their shape alone; made without a function of any library of kernels."""
+    """Return numbers that depend on their shape alone, without using a function of a kernel library."""
     generator = np.random.default_rng([20, *shape])
     return low + (high - low) * generator.random(shape)
 
 
 def numpy_products() -> list[np.ndarray]:
-    """Products as the network in the workers makes them: rows by a matrix, a row by a matrix, a vector."""
+    """Return products as in the network of workers: rows by a matrix, a row by a matrix, a vector."""
     found = []
     for sizes, rows in itertools.product(SIZES, ROWS[:5]):
         hidden = numbers(rows, sizes[0])
@@ -61,7 +61,7 @@ def numpy_sums() -> list[np.ndarray]:
 
 
 def plain_functions() -> list[np.ndarray]:
-    """What plain Python takes from the C library."""
+    """Return functions that plain Python takes from the C library."""
     values = numbers(200, low=-5.0, high=5.0).tolist()
     functions = (math.exp, math.sin, math.cos, math.tanh, math.tan, math.atan, math.erf)
     return [np.array([function(value) for value in values]) for function in functions] + [
@@ -91,7 +91,7 @@ def torch_sums() -> list[torch.Tensor]:
 
 
 def torch_products() -> list[torch.Tensor]:
-    """Products of the learners' networks and of their gradients, plain and of the whole ensemble at once."""
+    """Return products of the learners' networks and of their gradients, plain and of the whole ensemble at once."""
     found = []
     for sizes, rows in itertools.product(SIZES, ROWS):
         hidden = torch.as_tensor(numbers(rows, sizes[0])).float()
@@ -113,8 +113,8 @@ def torch_products() -> list[torch.Tensor]:
     return found
 
 
-def torch_beginnings() -> list[torch.Tensor]:
-    """What networks begin with: random numbers, and the orthogonal weights that LAPACK makes of them."""
+def torch_initialization() -> list[torch.Tensor]:
+    """Return what initializes networks: random numbers, and orthogonal weights from LAPACK."""
     generator = torch.Generator().manual_seed(20)
     found = [torch.randn(count, generator=generator) for count in (5, 16, 4096)]
     for rows, columns in ((64, 9), (64, 64), (8, 6), (1, 64)):
@@ -124,7 +124,7 @@ def torch_beginnings() -> list[torch.Tensor]:
 
 
 def torch_steps() -> list[torch.Tensor]:
-    """Twenty steps of Adam, as all trainings use it: fused. The other one takes square roots from MKL."""
+    """Return the result of 20 steps of fused Adam, as in trainings; other variants take square roots from MKL."""
     parameter = torch.as_tensor(numbers(64, 9)).float().requires_grad_()
     optimizer = Adam([parameter], lr=1e-3, fused=True)
     for step in range(20):
@@ -141,7 +141,7 @@ KINDS = {
     "torch functions": torch_functions,
     "torch sums": torch_sums,
     "torch products": torch_products,
-    "torch beginnings": torch_beginnings,
+    "torch initialization": torch_initialization,
     "torch steps": torch_steps,
 }
 

@@ -1,4 +1,4 @@
-"""Three tiny trainings, one of each learner: the hash of what each has learned.
+"""Tiny trainings, one of each learner, and the hash of what each has learned.
 
 Run: python -m tests.kernels.trainings [LEARNER ...]; prints one JSON object.
 """
@@ -32,12 +32,12 @@ def hashes(learners: list[str]) -> dict[str, str]:
     """Return the hash of all that each learner has learned, its learned model included."""
     torch.set_num_threads(1)  # as a training does
     found = {}
-    with tempfile.TemporaryDirectory() as place, WorkerPool(1) as workers:
+    with tempfile.TemporaryDirectory() as folder, WorkerPool(1) as workers:
         for learner in learners:
             config = small_config(
                 agent=learner, policy__hidden=[32, 32], evaluation__validation_interval=0, **LEARNERS[learner]
             )
-            run = learn_with(workers, Path(place) / learner, config)
+            run = learn_with(workers, Path(folder) / learner, config)
             total = hashlib.sha256()
             tensors = run.training.state()[1].items()
             for name, tensor in sorted(

@@ -27,7 +27,7 @@ from unjam.learners.settings import (
     TRPOSettings,
 )
 
-torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
+torch.set_num_threads(1)  # more threads are slower with small matrices
 
 every_learner = pytest.mark.parametrize("agent", AGENT_NAMES)
 
@@ -52,9 +52,9 @@ def test_other_random_numbers_do_not_change_training(agent: str) -> None:
 
 
 @every_learner
-@pytest.mark.parametrize("hold", [1, 5])
-def test_environment_steps_count_control_steps_and_not_actions(agent: str, hold: int) -> None:
-    task = Toy(agent=agent, hold=hold, episodes=3)
+@pytest.mark.parametrize("action_repeat", [1, 5])
+def test_environment_steps_count_control_steps_and_not_actions(agent: str, action_repeat: int) -> None:
+    task = Toy(agent=agent, action_repeat=action_repeat, episodes=3)
     task.run(2 * 3 * CONTROL_STEPS)
     assert [entry.environment_steps for entry in task.iterations] == [300, 600]
     assert [entry.number for entry in task.iterations] == [1, 2]
@@ -75,10 +75,10 @@ def test_training_ends_with_the_iteration_that_reaches_the_budget(agent: str) ->
 def test_each_iteration_drives_the_newest_policy(agent: str) -> None:
     task = Toy(agent=agent).learn(2)
     rows = np.random.default_rng(0).uniform(size=(5, INPUTS))
-    found = [network(rows) for network in (*task.networks, task.learner.network())]
-    assert (found[0] == 0.0).all()
-    assert not np.array_equal(found[1], found[0])
-    assert not np.array_equal(found[2], found[1])
+    residuals = [network(rows) for network in (*task.networks, task.learner.network())]
+    assert (residuals[0] == 0.0).all()
+    assert not np.array_equal(residuals[1], residuals[0])
+    assert not np.array_equal(residuals[2], residuals[1])
 
 
 @every_learner
@@ -93,48 +93,48 @@ def test_iteration_has_the_values_of_progress(agent: str) -> None:
 
 
 @every_learner
-@pytest.mark.parametrize("sees_road", [True, False])
-def test_only_the_critic_gets_the_drawn_values(agent: str, sees_road: bool) -> None:
-    policy = PolicySettings(hidden=(8,), privileged_critic=sees_road)
+@pytest.mark.parametrize("is_privileged", [True, False])
+def test_only_the_critic_gets_the_drawn_values(agent: str, is_privileged: bool) -> None:
+    policy = PolicySettings(hidden=(8,), privileged_critic=is_privileged)
     task = Toy(policy, agent=agent, episodes=2)
     rows = environment_experience(task.training, task.collect(task.learner.network(), 1))
-    assert rows.observations.shape == (2 * CONTROL_STEPS, INPUTS + sees_road)
-    if sees_road:
+    assert rows.observations.shape == (2 * CONTROL_STEPS, INPUTS + is_privileged)
+    if is_privileged:
         assert set(rows.observations[:, INPUTS]) == {-1.0, 1.0}
-    assert task.learner.sb3.observation_space.shape == (INPUTS + sees_road,)
+    assert task.learner.sb3.observation_space.shape == (INPUTS + is_privileged,)
     assert task.learner.network().input_size == INPUTS
 
 
 def test_return_after_exit_is_discounted_by_action_to_the_last_one() -> None:
     reward = np.arange(1.0, 12.0)
-    task = Toy(hold=2)
+    task = Toy(action_repeat=2)
     (episode,) = task.collect(task.learner.network(), 1)[0][:1]
     (stays,) = episode.trajectories
-    left = replace(stays, residual=np.zeros(4), applied_acceleration=np.zeros(4), action_repeat=2)
-    whole = replace(episode, speeds=np.zeros((12, 1)), reward_terms={"one": reward})
+    leaves = replace(stays, residual=np.zeros(4), applied_acceleration=np.zeros(4), action_repeat=2)
+    complete = replace(episode, speeds=np.zeros((12, 1)), reward_terms={"one": reward})
     expected = 0.9 * (5.0 + 6.0) + 0.9**2 * (7.0 + 8.0) + 0.9**3 * (9.0 + 10.0) + 0.9**4 * 11.0
-    assert return_after_exit(whole, left, 0.9, 11) == pytest.approx(expected)
-    assert return_after_exit(whole, replace(left, terminated=True), 0.9, 11) is None
-    assert return_after_exit(replace(whole, speeds=np.zeros((5, 1))), left, 0.9, 4) is None
-    assert return_after_exit(whole, left, 0.9, 12) is None  # broken off
-    ended = (replace(whole, speeds=np.full((12, 1), np.nan)), replace(whole, status="collision"))
-    assert [return_after_exit(each, left, 0.9, 12) for each in ended] == [pytest.approx(expected)] * 2
-    alone, more = make_experience([left], [()]), make_experience([left], [()], [expected])
-    assert more.rewards[-1] - alone.rewards[-1] == pytest.approx(expected)
-    assert (alone.terminated.tolist(), more.terminated.tolist()) == ([False], [True])
+    assert return_after_exit(complete, leaves, 0.9, 11) == pytest.approx(expected)
+    assert return_after_exit(complete, replace(leaves, terminated=True), 0.9, 11) is None
+    assert return_after_exit(replace(complete, speeds=np.zeros((5, 1))), leaves, 0.9, 4) is None
+    assert return_after_exit(complete, leaves, 0.9, 12) is None  # truncated
+    ended = (replace(complete, speeds=np.full((12, 1), np.nan)), replace(complete, status="collision"))
+    assert [return_after_exit(each, leaves, 0.9, 12) for each in ended] == [pytest.approx(expected)] * 2
+    without_return, with_return = make_experience([leaves], [()]), make_experience([leaves], [()], [expected])
+    assert with_return.rewards[-1] - without_return.rewards[-1] == pytest.approx(expected)
+    assert (without_return.terminated.tolist(), with_return.terminated.tolist()) == ([False], [True])
 
 
 def test_each_iteration_of_each_run_has_its_own_random_numbers() -> None:
-    drawn = {}
+    numbers = {}
     for run, iteration in [(0, 1), (0, 2), (1, 1), (1, 2)]:
         seed_iteration(run, iteration)
-        drawn[run, iteration] = (float(torch.rand(1)), float(np.random.rand()))
+        numbers[run, iteration] = (float(torch.rand(1)), float(np.random.rand()))
         seed_iteration(run, iteration)
-        assert (float(torch.rand(1)), float(np.random.rand())) == drawn[run, iteration]
+        assert (float(torch.rand(1)), float(np.random.rand())) == numbers[run, iteration]
     for part in (0, 1):  # of several updates of an iteration
         seed_iteration(1, 2, part)
-        drawn[2, part] = (float(torch.rand(1)), float(np.random.rand()))
-    assert len(set(drawn.values())) == 6
+        numbers[2, part] = (float(torch.rand(1)), float(np.random.rand()))
+    assert len(set(numbers.values())) == 6
 
 
 @every_learner
@@ -163,8 +163,8 @@ def test_non_finite_parameter_is_named_in_the_same_iteration(agent: str) -> None
 @pytest.mark.parametrize("agent", ["trpo", "ppo"])
 def test_vanished_exploration_raises_error(agent: str, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Toy(agent=agent)
-    spread = dict(task.learner.sb3.policy.named_parameters())["log_std"]
-    monkeypatch.setattr(task.learner, "learn", lambda update: spread.data.fill_(-200.0))
+    log_std = dict(task.learner.sb3.policy.named_parameters())["log_std"]
+    monkeypatch.setattr(task.learner, "learn", lambda update: log_std.data.fill_(-200.0))
     with pytest.raises(UnjamError, match="learner: exploration has ended in iteration 1: a smaller step"):
         task.learn(1)
 
@@ -197,15 +197,15 @@ TO_LEARN: dict[str, LearnerSettings] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("target", "hold"), [(constant_target, 1), pytest.param(sloped_target, 5, marks=pytest.mark.slow)]
+    ("target", "action_repeat"), [(constant_target, 1), pytest.param(sloped_target, 5, marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize(
     "agent", [pytest.param(name, marks=pytest.mark.slow) if name == "ppo" else name for name in AGENT_NAMES]
 )
-def test_learner_reaches_the_target(agent: str, target: Target, hold: int) -> None:
+def test_learner_reaches_the_target(agent: str, target: Target, action_repeat: int) -> None:
     policy = PolicySettings(hidden=(16,), exploration_std=0.2)
-    episodes = 8 if hold == 1 else 20
-    task = Toy(policy, TO_LEARN[agent], agent, target=target, hold=hold, episodes=episodes)
+    episodes = 8 if action_repeat == 1 else 20
+    task = Toy(policy, TO_LEARN[agent], agent, target=target, action_repeat=action_repeat, episodes=episodes)
     task.learn(12 if agent in ("sac", "td3") else 30)
     observations = np.random.default_rng(9).uniform(-1.0, 1.0, size=(500, INPUTS))
     at_start = np.abs(task.networks[0](observations) - target(observations)).mean()

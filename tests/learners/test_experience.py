@@ -26,24 +26,24 @@ from unjam.worlds.record import Trajectory
 INPUTS = 3
 
 
-def make_trajectory(seed: int, control_steps: int, hold: int = 1, terminated: bool = False) -> Trajectory:
-    """A trajectory of random numbers, its residual held as a driver holds it."""
+def make_trajectory(seed: int, control_steps: int, action_repeat: int = 1, terminated: bool = False) -> Trajectory:
+    """Return a trajectory of random numbers with repeated residuals."""
     generator = np.random.default_rng(seed)
-    choices = -(-control_steps // hold)
-    nothing = np.zeros(control_steps)
+    action_count = -(-control_steps // action_repeat)
+    zeros = np.zeros(control_steps)
     return Trajectory(
         vehicle="cav_0",
         start_step=0,
         states=LocalState(*[np.zeros(control_steps + 1)] * len(COMMON_FIELDS)),
-        observations=generator.normal(size=(choices + 1, INPUTS)),
-        expert_acceleration=nothing,
-        residual=np.repeat(generator.normal(size=choices), hold)[:control_steps],
-        applied_acceleration=nothing,
-        filter_braking=nothing,
-        shield_braking=nothing,
+        observations=generator.normal(size=(action_count + 1, INPUTS)),
+        expert_acceleration=zeros,
+        residual=np.repeat(generator.normal(size=action_count), action_repeat)[:control_steps],
+        applied_acceleration=zeros,
+        filter_braking=zeros,
+        shield_braking=zeros,
         reward_terms={"one": generator.normal(size=control_steps), "other": generator.uniform(size=control_steps)},
         initial_memory={},
-        action_repeat=hold,
+        action_repeat=action_repeat,
         terminated=terminated,
     )
 
@@ -74,7 +74,7 @@ def value(policy: ResidualPolicy, row: np.ndarray) -> float:
 
 
 def action_rewards(trajectory: Trajectory) -> list[float]:
-    """The rewards from one action of the network to the next."""
+    """Return the rewards from one action of the network to the next."""
     rewards = [
         float(trajectory.reward_terms["one"][t] + trajectory.reward_terms["other"][t])
         for t in range(len(trajectory.residual))
@@ -88,7 +88,7 @@ def action_rewards(trajectory: Trajectory) -> list[float]:
 def explicit_advantages(
     policy: ResidualPolicy, trajectory: Trajectory, gamma: float, gae_lambda: float
 ) -> tuple[list[float], list[float]]:
-    """Generalised advantage estimation and its returns, from the definition: a sum over all later errors."""
+    """Return generalized advantage estimates and returns, from the definition: a sum over all later errors."""
     rewards = action_rewards(trajectory)
     values = [value(policy, row) for row in trajectory.observations]
     if trajectory.terminated:
@@ -104,36 +104,36 @@ def explicit_advantages(
 @settings(max_examples=40)
 @given(
     shapes=st.lists(st.tuples(st.integers(1, 23), st.booleans()), min_size=1, max_size=4),
-    hold=st.integers(1, 5),
+    action_repeat=st.integers(1, 5),
     gamma=st.floats(0.5, 0.999),
     gae_lambda=st.floats(0.0, 1.0),
 )
 def test_advantages_and_returns_are_computed_per_trajectory(
-    shapes: list[tuple[int, bool]], hold: int, gamma: float, gae_lambda: float
+    shapes: list[tuple[int, bool]], action_repeat: int, gamma: float, gae_lambda: float
 ) -> None:
     policy = random_policy()
     trajectories = [
-        make_trajectory(seed, control_steps, hold, terminated)
+        make_trajectory(seed, control_steps, action_repeat, terminated)
         for seed, (control_steps, terminated) in enumerate(shapes)
     ]
     buffer = fill(policy, trajectories, gamma=gamma, gae_lambda=gae_lambda)
-    written = [explicit_advantages(policy, entry, gamma, gae_lambda) for entry in trajectories]
-    advantages = [number for found, _ in written for number in found]
-    returns = [number for _, found in written for number in found]
+    expected = [explicit_advantages(policy, entry, gamma, gae_lambda) for entry in trajectories]
+    advantages = [number for found, _ in expected for number in found]
+    returns = [number for _, found in expected for number in found]
     np.testing.assert_allclose(buffer.advantages[:, 0], advantages, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(buffer.returns[:, 0], returns, rtol=1e-4, atol=1e-4)
 
 
 def test_only_truncated_trajectories_are_bootstrapped() -> None:
     policy = random_policy()
-    cut, ended = make_trajectory(0, 6), make_trajectory(0, 6, terminated=True)
+    truncated, ended = make_trajectory(0, 6), make_trajectory(0, 6, terminated=True)
     last = {
         name: fill(policy, [entry], gae_lambda=1.0).returns[-1, 0]
-        for name, entry in {"cut": cut, "ended": ended}.items()
+        for name, entry in {"cut": truncated, "ended": ended}.items()
     }
-    beyond = 0.9 * value(policy, cut.observations[-1])
-    assert abs(beyond) > 0.5
-    assert last["cut"] - last["ended"] == pytest.approx(beyond, rel=1e-5)
+    bootstrap = 0.9 * value(policy, truncated.observations[-1])
+    assert abs(bootstrap) > 0.5
+    assert last["cut"] - last["ended"] == pytest.approx(bootstrap, rel=1e-5)
     assert last["ended"] == pytest.approx(action_rewards(ended)[-1], rel=1e-5)
 
 
@@ -151,16 +151,16 @@ def test_episodes_start_where_trajectories_start() -> None:
 
 
 def test_rows_are_actions_in_order() -> None:
-    first, second = make_trajectory(0, 7, hold=3), make_trajectory(1, 4, hold=3)
+    first, second = make_trajectory(0, 7, action_repeat=3), make_trajectory(1, 4, action_repeat=3)
     buffer = fill(random_policy(), [first, second])
     observations = np.concatenate([first.observations[:3], second.observations[:2]])
     np.testing.assert_array_equal(buffer.observations[:, 0], observations.astype(np.float32))
-    chosen = [*first.residual[[0, 3, 6]], *second.residual[[0, 3]]]
-    np.testing.assert_array_equal(buffer.actions[:, 0, 0], np.array(chosen, np.float32))
+    actions = [*first.residual[[0, 3, 6]], *second.residual[[0, 3]]]
+    np.testing.assert_array_equal(buffer.actions[:, 0, 0], np.array(actions, np.float32))
 
 
 def test_rewards_of_a_held_residual_are_summed() -> None:
-    trajectory = make_trajectory(0, 8, hold=3, terminated=True)
+    trajectory = make_trajectory(0, 8, action_repeat=3, terminated=True)
     buffer = fill(random_policy(), [trajectory])
     np.testing.assert_allclose(buffer.rewards[:, 0], action_rewards(trajectory), rtol=1e-6)
     assert len(buffer.rewards) == 3
@@ -182,7 +182,7 @@ def test_bootstrap_value_uses_the_critic_inputs_of_the_trajectory() -> None:
 
 
 def test_joined_experience_has_the_rows_of_all_parts() -> None:
-    trajectories = [make_trajectory(seed, 3 + seed, hold=2, terminated=seed == 1) for seed in range(4)]
+    trajectories = [make_trajectory(seed, 3 + seed, action_repeat=2, terminated=seed == 1) for seed in range(4)]
     extra = [(float(seed),) for seed in range(4)]
     parts = [make_experience(trajectories[:1], extra[:1]), make_experience(trajectories[1:], extra[1:])]
     joined, expected = join_experience(parts), make_experience(trajectories, extra)
@@ -192,7 +192,7 @@ def test_joined_experience_has_the_rows_of_all_parts() -> None:
 
 
 def test_next_observations_stay_within_their_trajectory() -> None:
-    trajectories = [make_trajectory(0, 5, hold=2), make_trajectory(1, 1), make_trajectory(2, 3)]
+    trajectories = [make_trajectory(0, 5, action_repeat=2), make_trajectory(1, 1), make_trajectory(2, 3)]
     rows = make_experience(trajectories, [()] * 3)
     expected = np.concatenate([trajectory.observations[1:] for trajectory in trajectories])
     np.testing.assert_array_equal(rows.next_observations, expected.astype(np.float32))
@@ -206,7 +206,7 @@ def test_number_of_critic_inputs_must_match_trajectories() -> None:
 
 def test_the_ratio_before_the_first_update_is_exactly_one() -> None:
     policy = random_policy()
-    buffer = fill(policy, [make_trajectory(seed, 997, hold=3) for seed in range(3)])
+    buffer = fill(policy, [make_trajectory(seed, 997, action_repeat=3) for seed in range(3)])
     observations, actions, before = (
         torch.as_tensor(rows[:, 0]) for rows in (buffer.observations, buffer.actions, buffer.log_probs)
     )
@@ -218,7 +218,7 @@ def test_the_ratio_before_the_first_update_is_exactly_one() -> None:
 
 def test_the_ratio_is_one_in_the_shuffled_order_of_the_update() -> None:
     policy = random_policy()
-    buffer = fill(policy, [make_trajectory(seed, 997, hold=3) for seed in range(3)])
+    buffer = fill(policy, [make_trajectory(seed, 997, action_repeat=3) for seed in range(3)])
     (rows,) = buffer.get(batch_size=None)
     with torch.no_grad():
         _, log_probs, _ = policy.evaluate_actions(rows.observations, rows.actions)
@@ -240,21 +240,23 @@ def test_rollout_buffer_is_resized_for_each_iteration() -> None:
 
 @given(
     shapes=st.lists(st.tuples(st.integers(1, 12), st.booleans()), min_size=1, max_size=3),
-    hold=st.integers(1, 4),
+    action_repeat=st.integers(1, 4),
     gamma=st.floats(0.1, 0.99),
 )
-def test_discounted_returns_equal_explicit_sums(shapes: list[tuple[int, bool]], hold: int, gamma: float) -> None:
+def test_discounted_returns_equal_explicit_sums(
+    shapes: list[tuple[int, bool]], action_repeat: int, gamma: float
+) -> None:
     trajectories = [
-        make_trajectory(seed, control_steps, hold, terminated)
+        make_trajectory(seed, control_steps, action_repeat, terminated)
         for seed, (control_steps, terminated) in enumerate(shapes)
     ]
     expected = []
     for trajectory in trajectories:
         rewards = action_rewards(trajectory)
-        after = 0.0 if trajectory.terminated else sum(rewards) / len(rewards) / (1.0 - gamma)
+        later_return = 0.0 if trajectory.terminated else sum(rewards) / len(rewards) / (1.0 - gamma)
         for t in range(len(rewards)):
-            within = sum(gamma ** (later - t) * rewards[later] for later in range(t, len(rewards)))
-            expected.append(within + gamma ** (len(rewards) - t) * after)
+            earlier = sum(gamma ** (later - t) * rewards[later] for later in range(t, len(rewards)))
+            expected.append(earlier + gamma ** (len(rewards) - t) * later_return)
     np.testing.assert_allclose(
         discounted_returns(make_experience(trajectories, [()] * len(trajectories)), gamma),
         expected,
@@ -275,25 +277,27 @@ def replay_buffer(size: int) -> ReplayBuffer:
 
 
 def test_replay_buffer_equals_that_of_sb3_row_by_row() -> None:
-    ours, theirs = replay_buffer(20), replay_buffer(20)
+    buffer, sb3_buffer = replay_buffer(20), replay_buffer(20)
     for iteration in range(4):
         trajectories = [
-            make_trajectory(10 * iteration + seed, 7 + seed, hold=2, terminated=seed == 1) for seed in range(2)
+            make_trajectory(10 * iteration + seed, 7 + seed, action_repeat=2, terminated=seed == 1) for seed in range(2)
         ]
         extra = [(0.5,), (-0.5,)]
         rows = make_experience(trajectories, extra)
-        add_to_replay_buffer(ours, rows, 2.0, rows.rewards)
+        add_to_replay_buffer(buffer, rows, 2.0, rows.rewards)
         for trajectory, more in zip(trajectories, extra, strict=True):
-            seen = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
+            observations = [np.append(row, more).astype(np.float32) for row in trajectory.observations]
             residuals, rewards = trajectory.actions_and_rewards
-            for choice, (residual, reward) in enumerate(zip(residuals, rewards, strict=True)):
-                done = trajectory.terminated and choice == len(rewards) - 1
+            for action_index, (residual, reward) in enumerate(zip(residuals, rewards, strict=True)):
+                done = trajectory.terminated and action_index == len(rewards) - 1
                 action = np.array([np.float32(residual) / np.float32(2.0)])
-                theirs.add(seen[choice], seen[choice + 1], action, reward, np.array(done), [{}])
-        assert (ours.pos, ours.full) == (theirs.pos, theirs.full)
+                sb3_buffer.add(
+                    observations[action_index], observations[action_index + 1], action, reward, np.array(done), [{}]
+                )
+        assert (buffer.pos, buffer.full) == (sb3_buffer.pos, sb3_buffer.full)
         for name in ("observations", "next_observations", "actions", "rewards", "dones"):
-            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
-    assert ours.full
+            np.testing.assert_array_equal(getattr(buffer, name), getattr(sb3_buffer, name))
+    assert buffer.full
 
 
 def test_full_replay_buffer_has_the_newest_rows() -> None:
@@ -307,25 +311,25 @@ def test_full_replay_buffer_has_the_newest_rows() -> None:
     shapes=st.lists(st.tuples(st.integers(1, 12), st.booleans()), min_size=1, max_size=3),
     gamma=st.floats(0.1, 0.99),
     offset=st.floats(-20.0, 20.0),
-    after=st.floats(-50.0, 50.0),
+    later_return=st.floats(-50.0, 50.0),
 )
 def test_shifted_rewards_shift_all_values_equally(
-    shapes: list[tuple[int, bool]], gamma: float, offset: float, after: float
+    shapes: list[tuple[int, bool]], gamma: float, offset: float, later_return: float
 ) -> None:
     rows = make_experience(
         [make_trajectory(seed, size, 1, terminated) for seed, (size, terminated) in enumerate(shapes)],
         [()] * len(shapes),
     )
 
-    def worth(rewards: np.ndarray, beyond: float) -> np.ndarray:
-        """What follows each row, where a trajectory that was cut is worth `beyond` after its end."""
+    def values_from(rewards: np.ndarray, bootstrap: float) -> np.ndarray:
+        """Return the discounted rewards from each row on, with `bootstrap` after the end of a truncated trajectory."""
         found = np.empty(len(rewards))
         for first, last, terminated in zip(rows.starts, rows.last_rows, rows.terminated, strict=True):
-            later = 0.0 if terminated else beyond
+            later = 0.0 if terminated else bootstrap
             for row in range(last, first - 1, -1):
                 later = found[row] = rewards[row] + gamma * later
         return found
 
     missing = offset / (1.0 - gamma)
-    shifted = worth(shift_rewards(rows, offset, gamma), after - missing)
-    np.testing.assert_allclose(shifted, worth(rows.rewards, after) - missing, rtol=1e-9, atol=1e-6)
+    shifted = values_from(shift_rewards(rows, offset, gamma), later_return - missing)
+    np.testing.assert_allclose(shifted, values_from(rows.rewards, later_return) - missing, rtol=1e-9, atol=1e-6)

@@ -15,13 +15,13 @@ from tests.learners.toy_task import QUICK, Toy, same
 from unjam.learners.learner import policy_distance
 from unjam.learners.settings import AGENT_NAMES, LearnerSettings, PolicySettings, SACSettings
 
-torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
+torch.set_num_threads(1)  # more threads are slower with small matrices
 
 every_learner = pytest.mark.parametrize("agent", AGENT_NAMES)
 WRAPPED = SACSettings(
     learning_starts=0, gradient_steps_per_step=0.01, batch_size=16, buffer_size=900, learn_temperature=True
 )
-"""with a replay buffer that is full, and begins anew, in the third iteration of 400 rows"""
+"""with a replay buffer that is full, and overwrites its oldest rows, in the third iteration of 400 rows"""
 
 
 @pytest.mark.parametrize(
@@ -40,9 +40,9 @@ def test_restored_learner_continues_bit_identically(
     policy = PolicySettings(hidden=(8, 8), learn_exploration_std=learned)
 
     def new() -> Toy:
-        return Toy(policy, settings, agent, hold=2)
+        return Toy(policy, settings, agent, action_repeat=2)
 
-    through = new().learn(4)
+    uninterrupted = new().learn(4)
     counters, tensors = new().learn(before).training.state()
     # As a checkpoint does it, and in a process that has drawn other numbers since.
     counters, tensors = json.loads(json.dumps(counters)), load(save(tensors))
@@ -51,23 +51,23 @@ def test_restored_learner_continues_bit_identically(
     resumed = new()
     resumed.training.restore(counters, tensors)
     resumed.learn(4)
-    assert same(resumed.parameters(), through.parameters())
-    assert resumed.training.state()[0] == through.training.state()[0]
-    assert [entry.log for entry in resumed.iterations] == [entry.log for entry in through.iterations[before:]]
+    assert same(resumed.parameters(), uninterrupted.parameters())
+    assert resumed.training.state()[0] == uninterrupted.training.state()[0]
+    assert [entry.log for entry in resumed.iterations] == [entry.log for entry in uninterrupted.iterations[before:]]
     assert [entry.number for entry in resumed.iterations] == [1, 2, 3, 4][before:]
     assert resumed.iterations[-1].environment_steps == 3200
 
 
 @every_learner
 def test_restored_learner_has_the_stored_state(agent: str) -> None:
-    kept = Toy(agent=agent).learn(2).training.state()
+    stored = Toy(agent=agent).learn(2).training.state()
     other = Toy(agent=agent, seed=5)
-    assert not same(other.parameters(), kept[1])
-    other.training.restore(*kept)
+    assert not same(other.parameters(), stored[1])
+    other.training.restore(*stored)
     counters, tensors = other.training.state()
-    assert counters == kept[0]
+    assert counters == stored[0]
     assert {"iteration": 2, "environment_steps": 1600}.items() <= counters.items()
-    assert same(tensors, kept[1])
+    assert same(tensors, stored[1])
 
 
 def test_state_includes_the_momenta_of_the_critic() -> None:
@@ -85,7 +85,7 @@ def test_state_of_sac_includes_all_that_it_learns_from(learned: bool) -> None:
     expected = {"policy", "actor.optimizer", "critic.optimizer", "replay"}
     assert parts == expected | ({"log_ent_coef", "ent_coef_optimizer"} if learned else set())
     assert any(name.startswith("policy/critic_target.") for name in tensors)
-    assert len(tensors["replay/rewards"]) == 800  # and not the 200,000 that there is room for
+    assert len(tensors["replay/rewards"]) == 800  # and not the capacity of 200,000
 
 
 def test_full_replay_buffer_is_stored_completely() -> None:
@@ -149,5 +149,5 @@ def test_policy_distance_is_zero_for_equal_and_one_for_distant_policies(mean: fl
 
 @given(means, stds, means, stds)
 def test_policy_distance_is_symmetric(m: float, s: float, n: float, t: float) -> None:
-    there, back = policy_distance(of(m, s), of(n, t)), policy_distance(of(n, t), of(m, s))
-    torch.testing.assert_close(there, back, atol=1e-6, rtol=0)
+    forward, backward = policy_distance(of(m, s), of(n, t)), policy_distance(of(n, t), of(m, s))
+    torch.testing.assert_close(forward, backward, atol=1e-6, rtol=0)

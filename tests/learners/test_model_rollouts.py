@@ -84,14 +84,14 @@ def shared() -> Iterator[Simulation]:
 @pytest.mark.long
 @every_learner
 def test_model_rows_change_learning_without_environment_steps(agent: str, shared: Simulation) -> None:
-    alone, with_model = (Trained(shared, agent, model).learn(2) for model in (None, MODEL))
+    model_free, with_model = (Trained(shared, agent, model).learn(2) for model in (None, MODEL))
     assert [entry.environment_steps for entry in with_model.iterations] == [
-        entry.environment_steps for entry in alone.iterations
+        entry.environment_steps for entry in model_free.iterations
     ]
-    assert with_model.episodes_run == alone.episodes_run == 4
-    assert [entry.model_steps for entry in alone.iterations] == [0, 0]
+    assert with_model.episodes_run == model_free.episodes_run == 4
+    assert [entry.model_steps for entry in model_free.iterations] == [0, 0]
     assert with_model.iterations[-1].model_steps >= 2 * 2 * RING.horizon
-    assert not same(policy_of(alone), policy_of(with_model))
+    assert not same(policy_of(model_free), policy_of(with_model))
 
 
 def policy_of(trained: Trained) -> dict[str, torch.Tensor]:
@@ -117,7 +117,7 @@ def test_resumed_learner_has_the_same_model_and_data(agent: str, update: str, sh
 def test_the_ratio_is_exactly_one_before_each_update(agent: str, shared: Simulation) -> None:
     trained = Trained(shared, agent, replace(MODEL, update_mode="sequential", model_updates=2))
     learner = trained.learner
-    seen: list[Update] = []
+    updates: list[Update] = []
 
     def learn(update: Update) -> None:
         learner.fill_buffer(
@@ -127,24 +127,24 @@ def test_the_ratio_is_exactly_one_before_each_update(agent: str, shared: Simulat
         observations, actions = (torch.as_tensor(part[:, 0]) for part in (buffer.observations, buffer.actions))
         _, log_prob, _ = learner.sb3.policy.evaluate_actions(observations, actions)
         np.testing.assert_array_equal(log_prob.detach().numpy(), buffer.log_probs[:, 0])
-        seen.append(update)
+        updates.append(update)
 
     learner.learn = learn
     trained.learn(1)
-    assert len(seen) == 3
+    assert len(updates) == 3
 
 
-def rollouts_of(rewards: np.ndarray, made: list[int], terminated: list[bool]) -> RolloutBatch:
-    rows, choices = rewards.shape
+def rollouts_of(rewards: np.ndarray, lengths: list[int], terminated: list[bool]) -> RolloutBatch:
+    rows, action_count = rewards.shape
     generator = torch.Generator().manual_seed(0)
     return RolloutBatch(
-        observations=torch.randn((rows, choices + 1, INPUTS), generator=generator),
-        actions=torch.randn((rows, choices), generator=generator),
+        observations=torch.randn((rows, action_count + 1, INPUTS), generator=generator),
+        actions=torch.randn((rows, action_count), generator=generator),
         rewards=torch.as_tensor(rewards),
-        lengths=torch.tensor(made),
+        lengths=torch.tensor(lengths),
         terminated=torch.tensor(terminated),
         drawn_values=torch.linspace(-1, 1, rows)[:, None],
-        control_steps=sum(made),
+        control_steps=sum(lengths),
         clipped_share={},
     )
 
@@ -176,12 +176,12 @@ def test_truncated_rollouts_are_bootstrapped(shared: Simulation) -> None:
 
 
 @pytest.mark.parametrize(
-    ("begin", "episodes_begun"), [("newest", {2, 3}), ("all", {0, 1, 2, 3}), ("first", {0, 1, 2, 3})]
+    ("rollout_starts", "start_episodes"), [("newest", {2, 3}), ("all", {0, 1, 2, 3}), ("first", {0, 1, 2, 3})]
 )
 def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
-    shared: Simulation, begin: Any, episodes_begun: set[int], monkeypatch: pytest.MonkeyPatch
+    shared: Simulation, rollout_starts: Any, start_episodes: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rollouts = RowRollouts(replace(MODEL, model_ratio=3.0, rollout_starts=begin), TASK, POLICY, 0)
+    rollouts = RowRollouts(replace(MODEL, model_ratio=3.0, rollout_starts=rollout_starts), TASK, POLICY, 0)
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, 10)
     for iteration in (1, 2):
@@ -203,8 +203,8 @@ def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
     (batch,) = batches
     assert rollouts.k_star == 30
     assert batch.rewards.numel() == 3 * 240 / 10
-    assert set(plans[0].starts[:, 0]) == episodes_begun
-    assert (set(plans[0].starts[:, 1]) == {0}) == (begin == "first")
+    assert set(plans[0].starts[:, 0]) == start_episodes
+    assert (set(plans[0].starts[:, 1]) == {0}) == (rollout_starts == "first")
 
 
 def test_k_star_of_zero_gives_no_model_rows(shared: Simulation) -> None:
@@ -216,11 +216,11 @@ def test_k_star_of_zero_gives_no_model_rows(shared: Simulation) -> None:
 def test_real_ratio_mixes_environment_and_model_rows() -> None:
     sac: Any = start_training([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
     buffer = sac.buffer
-    actual, model = (
+    environment, model = (
         rollout_experience(rollouts, rollouts.drawn_values.numpy())
         for rollouts in (rollouts_of(np.full((4, 3), reward), [3] * 4, [False] * 4) for reward in (1.0, 2.0))
     )
-    sac.add_rows(buffer, actual)
+    sac.add_rows(buffer, environment)
     assert set(buffer.sample(8).rewards.numpy().ravel()) == {np.float32(0.1)}
     sac.add_rows(buffer.new_model_buffer(12), model)
     buffer.real_ratio = 0.25

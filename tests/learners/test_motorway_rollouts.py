@@ -40,81 +40,81 @@ FACTORY = ExperienceFactory(
 
 
 @pytest.fixture(scope="module")
-def actual() -> list[Episode]:
+def batch_episodes() -> list[Episode]:
     return run_batch([EpisodeTask(ROAD, EXPERT, (seed,)) for seed in range(4)], allow_statistical=True)
 
 
 @pytest.fixture(scope="module")
-def in_sumo() -> list[Episode]:
+def sumo_episodes() -> list[Episode]:
     return [run_episode(ROAD, EXPERT, (seed,)) for seed in range(4)]
 
 
 @pytest.fixture
-def often(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_sample_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(motorway_model, "MAX_SAMPLE_INTERVAL", 10)
 
 
-def again(errs: bool, beyond: float = 0.0, seed: int = 9) -> Episode:
+def replay(has_errors: bool, correction: float = 0.0, seed: int = 9) -> Episode:
     def learned(speed: Floats, leader_speed: Floats, gap: Floats, known: Floats) -> Floats:
-        return np.full(len(speed), beyond)
+        return np.full(len(speed), correction)
 
-    about = ReplayOptions([((seed,), (8,))], ROAD.horizon, errs, learned if beyond else None)
-    world = MotorwayBatch(ROAD, [(0,)], replay=about)
+    options = ReplayOptions([((seed,), (8,))], ROAD.horizon, has_errors, learned if correction else None)
+    world = MotorwayBatch(ROAD, [(0,)], replay=options)
     world.measured_fields = EXPERT.measured_fields
     (episode,) = finish_drive(DriveLoop(world, EXPERT))
     return episode
 
 
 @pytest.mark.slow
-def test_rollouts_have_the_same_vehicles_with_new_driver_errors(actual: list[Episode]) -> None:
-    one, other = again(True), again(True, seed=10)
+def test_rollouts_have_the_same_vehicles_with_new_driver_errors(batch_episodes: list[Episode]) -> None:
+    one, other = replay(True), replay(True, seed=10)
     for episode in (one, other):
-        assert set(episode.vehicle_ids[:40]) == set(actual[0].vehicle_ids[:40])
-        assert episode.cav_ids[:3] == actual[0].cav_ids[:3]
+        assert set(episode.vehicle_ids[:40]) == set(batch_episodes[0].vehicle_ids[:40])
+        assert episode.cav_ids[:3] == batch_episodes[0].cav_ids[:3]
     moments = min(len(each.speeds) for each in (one, other)) // 2
     assert np.nanmean(one.speeds[:moments]) == pytest.approx(np.nanmean(other.speeds[:moments]), rel=0.05)
     assert np.nanmean(one.speeds) != np.nanmean(other.speeds)
-    np.testing.assert_array_equal(again(False).speeds, again(False, seed=10).speeds)
+    np.testing.assert_array_equal(replay(False).speeds, replay(False, seed=10).speeds)
 
 
 @pytest.mark.slow
 def test_correction_changes_speeds_per_control_step() -> None:
-    calm, pushed = again(False), again(False, beyond=-0.05)
-    assert np.nanmean(pushed.speeds[40:]) < np.nanmean(calm.speeds[40:]) - 0.2
-    assert np.nanmean(again(False, beyond=1e-9).speeds) == pytest.approx(np.nanmean(calm.speeds), rel=1e-6)
+    without, with_correction = replay(False), replay(False, correction=-0.05)
+    assert np.nanmean(with_correction.speeds[40:]) < np.nanmean(without.speeds[40:]) - 0.2
+    assert np.nanmean(replay(False, correction=1e-9).speeds) == pytest.approx(np.nanmean(without.speeds), rel=1e-6)
 
 
-@pytest.mark.usefixtures("often")
-def test_base_step_differs_from_the_record_by_perception_errors(actual: list[Episode]) -> None:
-    kept = motorway_samples(actual[0], 0, ROAD)
-    wrong = kept.human_rows.next_speed - kept.human_rows.base_speed
-    assert len(wrong) > 200
-    change = float((kept.human_rows.next_speed - kept.human_rows.speed).std())
-    assert float(np.median(np.abs(wrong))) < 0.4 * change
-    assert 0.3 < kept.noise_variance / float(np.square(wrong).mean()) < 1.5
+@pytest.mark.usefixtures("short_sample_interval")
+def test_base_step_differs_from_the_record_by_perception_errors(batch_episodes: list[Episode]) -> None:
+    samples = motorway_samples(batch_episodes[0], 0, ROAD)
+    errors = samples.human_rows.next_speed - samples.human_rows.base_speed
+    assert len(errors) > 200
+    change = float((samples.human_rows.next_speed - samples.human_rows.speed).std())
+    assert float(np.median(np.abs(errors))) < 0.4 * change
+    assert 0.3 < samples.noise_variance / float(np.square(errors).mean()) < 1.5
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("often")
+@pytest.mark.usefixtures("short_sample_interval")
 def test_base_predicts_drivers_without_errors_except_for_their_memory() -> None:
-    kept = motorway_samples(replace(again(False), seed=(0,), trajectories=()), 0, ROAD)
-    wrong = np.abs(kept.human_rows.next_speed - kept.human_rows.base_speed)
+    samples = motorway_samples(replace(replay(False), seed=(0,), trajectories=()), 0, ROAD)
+    errors = np.abs(samples.human_rows.next_speed - samples.human_rows.base_speed)
     # What they remember of lane changes, and when they last began to start, is not in the record.
-    assert float(np.median(wrong)) < 1e-3
-    assert float(np.quantile(wrong, 0.9)) < 0.2
+    assert float(np.median(errors)) < 1e-3
+    assert float(np.quantile(errors, 0.9)) < 0.2
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("often")
-def test_rollouts_have_the_set_ratio_in_antithetic_pairs(actual: list[Episode]) -> None:
+@pytest.mark.usefixtures("short_sample_interval")
+def test_rollouts_have_the_set_ratio_in_antithetic_pairs(batch_episodes: list[Episode]) -> None:
     task = Task(ROAD, EXPERT)
     model_rollouts = MotorwayRollouts(replace(MODEL, model_ratio=2.0), task, POLICY, 0)
-    model_rollouts.learn(actual, 1)
+    model_rollouts.learn(batch_episodes, 1)
     assert model_rollouts.k_star == 160
     network = replace(network_of(0.05, POLICY), episode_noise=True)
     found = model_rollouts.roll_out(network, 1, 0, 1, FACTORY)
     assert found is not None
-    assert model_rollouts.model_steps == 2 * len(actual) * 160
+    assert model_rollouts.model_steps == 2 * len(batch_episodes) * 160
     assert model_rollouts.facts["return_model"] == pytest.approx(model_rollouts.facts["return_environment"], rel=0.1)
     assert model_rollouts.facts["crash_share"] == 0.0
     facts, tensors = model_rollouts.state()
@@ -127,16 +127,16 @@ def test_rollouts_have_the_set_ratio_in_antithetic_pairs(actual: list[Episode]) 
     np.testing.assert_array_equal(repeated.rewards, found.rewards)
     driver = full_policy(task, POLICY, network)
     seeds = [((1,), (2,)), ((1,), (2,))]
-    one, mirrored = model_rollouts.simulate(driver, model_rollouts.samples[:1] * 2, 20, None, seeds, [1.0, -1.0])
-    first, second = one.trajectories[0], mirrored.trajectories[0]
-    calm = network(first.observations[:1])
-    assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * calm[0])
+    one, antithetic = model_rollouts.simulate(driver, model_rollouts.samples[:1] * 2, 20, None, seeds, [1.0, -1.0])
+    first, second = one.trajectories[0], antithetic.trajectories[0]
+    without = network(first.observations[:1])
+    assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * without[0])
 
 
-@pytest.mark.usefixtures("often")
-def test_shorter_rollouts_are_more_and_none_without_cavs(actual: list[Episode]) -> None:
+@pytest.mark.usefixtures("short_sample_interval")
+def test_shorter_rollouts_are_more_and_none_without_cavs(batch_episodes: list[Episode]) -> None:
     model_rollouts = MotorwayRollouts(replace(MODEL, k_max=80), Task(ROAD, EXPERT), POLICY, 0)
-    model_rollouts.learn(actual[:2], 1)
+    model_rollouts.learn(batch_episodes[:2], 1)
     network = replace(network_of(0.05, POLICY), episode_noise=True)
     assert model_rollouts.roll_out(network, 1, 0, 1, FACTORY) is not None
     assert model_rollouts.model_steps == 2 * 160
@@ -144,47 +144,49 @@ def test_shorter_rollouts_are_more_and_none_without_cavs(actual: list[Episode]) 
     assert model_rollouts.roll_out(network, 2, 0, 64, FACTORY) is None
 
 
-def test_antithetic_pairs_are_held_out_together(actual: list[Episode], monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = list[NDArray[np.int64]]()
-    monkeypatch.setattr(motorway_model, "fit_human_model", lambda model, rows, *_, **__: seen.append(rows.episode))
-    kept = [motorway_samples(actual[0], number, ROAD, "idm") for number in (6, 7, 8)]
-    for twins, numbers in ((1, {6, 7, 8}), (2, {3, 4})):
-        motorway_model.fit_motorway_model(RoadModel(MODEL, (0,)), kept, MODEL, (0,), twins)
-        assert set(seen[-1].tolist()) == numbers
+def test_antithetic_pairs_are_held_out_together(batch_episodes: list[Episode], monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted_numbers = list[NDArray[np.int64]]()
+    monkeypatch.setattr(
+        motorway_model, "fit_human_model", lambda model, rows, *_, **__: fitted_numbers.append(rows.episode)
+    )
+    samples = [motorway_samples(batch_episodes[0], number, ROAD, "idm") for number in (6, 7, 8)]
+    for group_size, numbers in ((1, {6, 7, 8}), (2, {3, 4})):
+        motorway_model.fit_motorway_model(RoadModel(MODEL, (0,)), samples, MODEL, (0,), group_size)
+        assert set(fitted_numbers[-1].tolist()) == numbers
 
 
 def test_base_none_predicts_constant_speed() -> None:
     model = RoadModel(replace(MODEL, base="none"), (0,))
     model.noise.fill_(0.3)
     speed, known = np.linspace(5.0, 25.0, 4000), np.linspace(25.0, 5.0, 4000)
-    calm, noisy = (
+    without, noisy = (
         learned_correction(model, torch_generator((0,), "cpu"), ROAD.steps_per_control_step, noise)
         for noise in (False, True)
     )
-    assert calm is not None
+    assert without is not None
     assert noisy is not None
-    np.testing.assert_allclose(known + calm(speed, speed, speed, known), speed, atol=1e-12)
+    np.testing.assert_allclose(known + without(speed, speed, speed, known), speed, atol=1e-12)
     per_step = (known + noisy(speed, speed, speed, known) - speed) / ROAD.steps_per_control_step
     assert per_step.std() * ROAD.steps_per_control_step**0.5 == pytest.approx(0.3, rel=0.05)
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("often")
-def test_networks_are_used_only_if_the_base_is_wrong(actual: list[Episode]) -> None:
+@pytest.mark.usefixtures("short_sample_interval")
+def test_networks_are_used_only_if_the_base_is_wrong(batch_episodes: list[Episode]) -> None:
     others = {"time_headways": (1.6, 1.6), "accelerations": (0.73, 0.73), "decelerations": (1.67, 1.67)}
     for humans, learned in (({}, []), (others, ["speed"])):
         model_rollouts = MotorwayRollouts(replace(MODEL, epochs=60), Task(ROAD, EXPERT), POLICY, 0)
         model_rollouts.scenario = replace(ROAD, **humans)
-        model_rollouts.learn(actual, 1)
+        model_rollouts.learn(batch_episodes, 1)
         assert model_rollouts.facts["learned_targets"] == learned
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("often")
-def test_networks_without_base_learn_car_following(actual: list[Episode]) -> None:
+@pytest.mark.usefixtures("short_sample_interval")
+def test_networks_without_base_learn_car_following(batch_episodes: list[Episode]) -> None:
     settings = replace(MODEL, base="none", epochs=60)
     model_rollouts = MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
-    model_rollouts.learn(actual, 1)
+    model_rollouts.learn(batch_episodes, 1)
     step = model_rollouts.facts["one_step"]["speed"]
     assert model_rollouts.facts["learned_targets"] == ["speed"]
     assert step["base"] == pytest.approx(step["change"], rel=0.05)  # the base: nothing changes
@@ -206,20 +208,20 @@ def test_unsupported_settings_are_refused(settings: ModelSettings, words: str) -
 
 @pytest.mark.long
 def test_base_predicts_drivers_in_sumo_as_well_as_in_the_batch(
-    actual: list[Episode], in_sumo: list[Episode], often: None
+    batch_episodes: list[Episode], sumo_episodes: list[Episode], short_sample_interval: None
 ) -> None:
     squares, counts, noises = list[float](), list[int](), list[float]()
-    for episodes in (actual, in_sumo):
-        kept = [motorway_samples(episode, 0, ROAD) for episode in episodes]
-        wrong = np.concatenate([one.human_rows.next_speed - one.human_rows.base_speed for one in kept])
-        squares.append(float(np.square(wrong).mean()))
-        counts.append(len(wrong))
-        noises.append(float(np.mean([one.noise_variance for one in kept])))
+    for episodes in (batch_episodes, sumo_episodes):
+        samples = [motorway_samples(episode, 0, ROAD) for episode in episodes]
+        errors = np.concatenate([one.human_rows.next_speed - one.human_rows.base_speed for one in samples])
+        squares.append(float(np.square(errors).mean()))
+        counts.append(len(errors))
+        noises.append(float(np.mean([one.noise_variance for one in samples])))
     assert counts[1] == pytest.approx(counts[0], rel=0.2)
     assert noises[1] == pytest.approx(noises[0], rel=0.2)
     assert squares[1] < 1.3 * squares[0]
 
 
-def test_record_that_skips_steps_is_refused(in_sumo: list[Episode]) -> None:
+def test_record_that_skips_steps_is_refused(sumo_episodes: list[Episode]) -> None:
     with pytest.raises(InputError, match="skips steps"):
-        motorway_samples(replace(in_sumo[0], snapshot_stride=2), 0, ROAD)
+        motorway_samples(replace(sumo_episodes[0], snapshot_stride=2), 0, ROAD)

@@ -31,7 +31,7 @@ CONTROL_STEPS = 100
 RING = Ring(length=(220, 240), vehicles=20, cavs=2, horizon=400, warmup=0)
 EIGHT = FigureEight(cavs=2, horizon=400)
 """with vehicles that must yield"""
-WRONG = replace(RING, sensors=Sensors(0.5, 0.5, dropout=0.1), safety=SafetyFilter(gap_error=0.5, speed_error=0.5))
+INEXACT = replace(RING, sensors=Sensors(0.5, 0.5, dropout=0.1), safety=SafetyFilter(gap_error=0.5, speed_error=0.5))
 POLICY = PolicySettings(hidden=(8,))
 MODEL = ModelSettings(kind="road", k_max=CONTROL_STEPS, model_ratio=1.0)
 
@@ -76,16 +76,19 @@ def test_rollouts_without_noise_equal_the_recording(road: LoopScenario) -> None:
     model_rollouts, episodes = learned_rollouts(replace(road, noise=0.0), network_of(0.0))
     humans = base_human_model("idm", road)
     memory = ReplayDriver(np.zeros((0, 2))).initial_memory(2)
-    for recording, decision in ((0, 0), (2, 130), (4, 20), (6, 290)):  # each with its neighbour, two CAVs
-        did = [
-            model_rollouts.data.recordings[row].applied_acceleration[decision:] for row in (recording, recording + 1)
+    for recording, start_step in ((0, 0), (2, 130), (4, 20), (6, 290)):  # each with the next one, two CAVs
+        accelerations = [
+            model_rollouts.data.recordings[row].applied_acceleration[start_step:] for row in (recording, recording + 1)
         ]
         (found,) = model_rollouts.simulate(
-            *(ReplayDriver(np.stack(did, 1)), memory, np.array([[recording, decision]])), CONTROL_STEPS, humans, (1,)
+            *(ReplayDriver(np.stack(accelerations, 1)), memory, np.array([[recording, start_step]])),
+            CONTROL_STEPS,
+            humans,
+            (1,),
         )
-        actual, during = episodes[recording // 2], slice(decision, decision + CONTROL_STEPS + 1)
-        np.testing.assert_allclose(found.speeds, actual.speeds[during], atol=1e-6)
-        np.testing.assert_allclose(found.gaps, actual.gaps[during], atol=1e-5)
+        episode, window = episodes[recording // 2], slice(start_step, start_step + CONTROL_STEPS + 1)
+        np.testing.assert_allclose(found.speeds, episode.speeds[window], atol=1e-6)
+        np.testing.assert_allclose(found.gaps, episode.gaps[window], atol=1e-5)
 
 
 def test_rollouts_continue_with_the_recorded_memory() -> None:
@@ -94,17 +97,17 @@ def test_rollouts_continue_with_the_recorded_memory() -> None:
     model_rollouts.k_star = CONTROL_STEPS
     found = model_rollouts.roll_out(network, 1, 0, 1, experience_factory(RING))
     assert found is not None
-    actual = [each.actions_and_rewards[1] for episode in episodes for each in episode.trajectories]
-    same = 0
+    recorded = [each.actions_and_rewards[1] for episode in episodes for each in episode.trajectories]
+    equal_count = 0
     for rewards in found.rewards.reshape(-1, CONTROL_STEPS // 10):
-        windows = [one[at : at + 10] for one in actual for at in range(len(one) - 9)]
-        same += min(np.abs(window - rewards).max() for window in windows) < 1e-6
-    # A quarter begins so late that the record ends before.
-    assert same > 0.5 * len(found.starts)
+        windows = [one[at : at + 10] for one in recorded for at in range(len(one) - 9)]
+        equal_count += min(np.abs(window - rewards).max() for window in windows) < 1e-6
+    # A quarter starts so late that the recording ends earlier.
+    assert equal_count > 0.5 * len(found.starts)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("road", [RING, WRONG, EIGHT], ids=["exact sensors", "wrong sensors", "a figure eight"])
+@pytest.mark.parametrize("road", [RING, INEXACT, EIGHT], ids=["exact sensors", "wrong sensors", "a figure eight"])
 def test_rollouts_with_noise_have_the_returns_of_the_road(road: LoopScenario) -> None:
     model_rollouts, _ = learned_rollouts(road, network_of(0.05))
     found = model_rollouts.roll_out(network_of(0.05), 1, 0, 1, experience_factory(road))
@@ -118,9 +121,9 @@ def test_rollouts_with_noise_have_the_returns_of_the_road(road: LoopScenario) ->
 
 
 def test_each_rollout_has_its_own_sensor_errors() -> None:
-    model_rollouts, _ = learned_rollouts(replace(WRONG, noise=0.0), network_of(0.0))
-    twice, humans = np.array([[0, 0], [0, 0]]), base_human_model("idm", RING)
-    one, other = model_rollouts.simulate(IDM(), {}, twice, CONTROL_STEPS, humans, (1,))
+    model_rollouts, _ = learned_rollouts(replace(INEXACT, noise=0.0), network_of(0.0))
+    starts, humans = np.array([[0, 0], [0, 0]]), base_human_model("idm", RING)
+    one, other = model_rollouts.simulate(IDM(), {}, starts, CONTROL_STEPS, humans, (1,))
     assert np.abs(one.speeds - other.speeds).max() > 0.01
 
 
@@ -138,8 +141,8 @@ def test_state_and_restore_keep_samples_and_noise(road: LoopScenario) -> None:
     facts, tensors = one.state()
     other.restore(json.loads(json.dumps(facts)), tensors)
     assert len(other.samples) == 4
-    for restored, kept in zip(other.samples, one.samples, strict=True):
-        np.testing.assert_array_equal(restored.speeds, kept.speeds)
-        assert restored.size == kept.size
-        np.testing.assert_equal(restored.crossing_memory, kept.crossing_memory)
+    for restored, stored in zip(other.samples, one.samples, strict=True):
+        np.testing.assert_array_equal(restored.speeds, stored.speeds)
+        assert restored.size == stored.size
+        np.testing.assert_equal(restored.crossing_memory, stored.crossing_memory)
     assert float(other.model.noise) == float(one.model.noise) > 0.0

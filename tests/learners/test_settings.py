@@ -87,8 +87,10 @@ def test_lists_become_tuples() -> None:
 
 
 @pytest.mark.parametrize(
-    ("hold", "control_step", "control_steps"),
+    ("action_repeat", "control_step", "control_steps"),
     [(1.0, 0.1, 10), (1.0, 1.0, 1), (1.0, 0.2, 5), (0.0, 0.1, 1), (0.5, 1.0, 1), (0.3, 0.1, 3)],
 )
-def test_action_repeat_depends_on_the_control_step(hold: float, control_step: float, control_steps: int) -> None:
-    assert PolicySettings(action_duration=hold).action_repeat(control_step) == control_steps
+def test_action_repeat_depends_on_the_control_step(
+    action_repeat: float, control_step: float, control_steps: int
+) -> None:
+    assert PolicySettings(action_duration=action_repeat).action_repeat(control_step) == control_steps

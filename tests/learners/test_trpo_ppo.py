@@ -19,8 +19,8 @@ from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
-torch.set_num_threads(1)  # more would fight for the cores over matrices of this size
-fresh = partial(make_policy, ResidualPolicy)
+torch.set_num_threads(1)  # more threads are slower with small matrices
+new_policy = partial(make_policy, ResidualPolicy)
 
 
 def mean_of(policy: ResidualPolicy, rows: np.ndarray) -> np.ndarray:
@@ -35,46 +35,48 @@ def value_of(policy: ResidualPolicy, rows: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_residual_of_a_new_policy_is_exactly_zero(seed: int) -> None:
-    policy, rows = fresh(seed=seed), random_rows(200, 5, seed)
+    policy, rows = new_policy(seed=seed), random_rows(200, 5, seed)
     assert (mean_of(policy, rows) == 0.0).all()
     assert (policy.network()(rows.astype(float)) == 0.0).all()
 
 
 def test_policy_without_zero_init_has_random_residuals() -> None:
     rows = random_rows(200, 5, 0)
-    assert mean_of(fresh(PolicySettings(zero_init=False)), rows).std() > 0.01
+    assert mean_of(new_policy(PolicySettings(zero_init=False)), rows).std() > 0.01
 
 
-@pytest.mark.parametrize("hold", [1, 10])
+@pytest.mark.parametrize("action_repeat", [1, 10])
 @pytest.mark.parametrize("cavs", [1, 3])
-def test_new_policy_drives_exactly_as_its_expert(hold: int, cavs: int, simulation: Simulation) -> None:
+def test_new_policy_drives_exactly_as_its_expert(action_repeat: int, cavs: int, simulation: Simulation) -> None:
     ring = Ring(length=(230, 230), horizon=200, warmup=100, cavs=cavs)
     expert, parts = PISaturation(), PolicySettings().inputs
-    network = fresh(inputs=observation_size(parts, expert)).network()
-    driver = ResidualDriver(expert, network, ring.action_limit, parts, hold)
-    alone = run_episode(ring, expert, (3,), simulation=simulation)
-    together = run_episode(ring, driver, (3,), simulation=simulation)
-    np.testing.assert_array_equal(together.speeds, alone.speeds)
-    np.testing.assert_array_equal(together.positions, alone.positions)
-    for ours, theirs in zip(together.trajectories, alone.trajectories, strict=True):
-        np.testing.assert_array_equal(ours.applied_acceleration, theirs.applied_acceleration)
-        assert (ours.residual == 0.0).all()
-    assert np.abs(alone.trajectories[0].applied_acceleration).max() > 0.1
+    network = new_policy(inputs=observation_size(parts, expert)).network()
+    driver = ResidualDriver(expert, network, ring.action_limit, parts, action_repeat)
+    expert_episode = run_episode(ring, expert, (3,), simulation=simulation)
+    residual_episode = run_episode(ring, driver, (3,), simulation=simulation)
+    np.testing.assert_array_equal(residual_episode.speeds, expert_episode.speeds)
+    np.testing.assert_array_equal(residual_episode.positions, expert_episode.positions)
+    for residual_trajectory, expert_trajectory in zip(
+        residual_episode.trajectories, expert_episode.trajectories, strict=True
+    ):
+        np.testing.assert_array_equal(residual_trajectory.applied_acceleration, expert_trajectory.applied_acceleration)
+        assert (residual_trajectory.residual == 0.0).all()
+    assert np.abs(expert_episode.trajectories[0].applied_acceleration).max() > 0.1
 
 
 @of_any_size
 def test_numpy_network_equals_the_torch_policy(
     seed: int, inputs: int, hidden: list[int], authority: float, rows: int
 ) -> None:
-    policy = fresh(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
+    policy = new_policy(PolicySettings(hidden=tuple(hidden), authority=authority), inputs, critic_inputs=2)
     shake(policy, seed)
-    seen = random_rows(rows, inputs + 2, seed)
-    found = policy.network()(seen[:, :inputs].astype(float))
-    np.testing.assert_allclose(found, mean_of(policy, seen), rtol=0, atol=1e-6)
+    observations = random_rows(rows, inputs + 2, seed)
+    found = policy.network()(observations[:, :inputs].astype(float))
+    np.testing.assert_allclose(found, mean_of(policy, observations), rtol=0, atol=1e-6)
 
 
 def test_numpy_network_keeps_its_weights_while_the_policy_learns() -> None:
-    policy = fresh()
+    policy = new_policy()
     shake(policy, 1)
     network, rows = policy.network(), random_rows(10, 5).astype(float)
     before = network(rows)
@@ -84,7 +86,7 @@ def test_numpy_network_keeps_its_weights_while_the_policy_learns() -> None:
 
 
 def test_actor_and_critic_have_separate_learning_rates() -> None:
-    policy = fresh(critic_inputs=2)
+    policy = new_policy(critic_inputs=2)
     policy.set_learning_rates(actor=0.1, critic=0.2)
     rates = {id(parameter): group["lr"] for group in policy.optimizer.param_groups for parameter in group["params"]}
     for name, parameter in policy.named_parameters():
@@ -94,7 +96,7 @@ def test_actor_and_critic_have_separate_learning_rates() -> None:
 
 @pytest.mark.parametrize(("authority", "action_limit"), [(1.0, 1.0), (0.3, 1.0), (0.5, 2.0)])
 def test_the_mean_reaches_its_authority_and_never_exceeds_it(authority: float, action_limit: float) -> None:
-    policy = fresh(PolicySettings(authority=authority), action_limit=action_limit)
+    policy = new_policy(PolicySettings(authority=authority), action_limit=action_limit)
     shake(policy, 3, scale=30.0)
     rows, bound = random_rows(300, 5), authority * action_limit
     for found in (mean_of(policy, rows), policy.network()(rows.astype(float))):
@@ -105,7 +107,7 @@ def test_the_mean_reaches_its_authority_and_never_exceeds_it(authority: float, a
 
 
 def test_privileged_inputs_change_the_value_and_not_the_residual() -> None:
-    policy = fresh(critic_inputs=2)
+    policy = new_policy(critic_inputs=2)
     shake(policy, 4)
     rows = random_rows(50, 7)
     other = rows.copy()
@@ -115,7 +117,7 @@ def test_privileged_inputs_change_the_value_and_not_the_residual() -> None:
 
 
 def test_critic_uses_the_inputs_of_the_actor() -> None:
-    policy = fresh(critic_inputs=2)
+    policy = new_policy(critic_inputs=2)
     shake(policy, 5)
     rows = random_rows(50, 7)
     other = rows.copy()
@@ -126,7 +128,7 @@ def test_critic_uses_the_inputs_of_the_actor() -> None:
 @pytest.mark.parametrize("learned", [True, False])
 def test_initial_exploration_has_the_set_standard_deviation(learned: bool) -> None:
     settings = PolicySettings(exploration_std=0.25, learn_exploration_std=learned)
-    policy = fresh(settings, action_limit=2.0)
+    policy = new_policy(settings, action_limit=2.0)
     assert policy.network().exploration_std == pytest.approx(0.5, rel=1e-6)
     torch.manual_seed(0)
     drawn = policy.get_distribution(torch.zeros(20_000, 5)).sample().detach()
@@ -134,7 +136,7 @@ def test_initial_exploration_has_the_set_standard_deviation(learned: bool) -> No
 
 
 def test_episode_noise_of_the_network_has_the_deviation_of_the_policy() -> None:
-    policy = fresh(PolicySettings(exploration_std=0.1, exploration="per_episode"), action_limit=2.0)
+    policy = new_policy(PolicySettings(exploration_std=0.1, exploration="per_episode"), action_limit=2.0)
     shake(policy, 3)
     network, rows = policy.network(), random_rows(6, 5)
     assert network.exploration_std == pytest.approx(0.2, rel=1e-6)
@@ -148,7 +150,7 @@ def test_episode_noise_of_the_network_has_the_deviation_of_the_policy() -> None:
 
 
 def test_episode_noise_explores_with_zero_hidden_units() -> None:
-    policy = fresh(PolicySettings(exploration_std=0.1, exploration="per_episode"), action_limit=2.0)
+    policy = new_policy(PolicySettings(exploration_std=0.1, exploration="per_episode"), action_limit=2.0)
     with torch.no_grad():
         at_rest = cast(Normal, policy.get_distribution(torch.zeros(1, 5)).distribution)
     assert float(at_rest.stddev) == pytest.approx(0.2, rel=1e-4)
@@ -159,21 +161,21 @@ def test_episode_noise_explores_with_zero_hidden_units() -> None:
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_log_std_is_a_parameter_only_if_learned(learned: bool) -> None:
-    policy = fresh(PolicySettings(learn_exploration_std=learned))
+    policy = new_policy(PolicySettings(learn_exploration_std=learned))
     assert ("log_std" in dict(policy.named_parameters())) is learned
-    optimised = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
-    assert (id(policy.log_std) in optimised) is learned
+    optimized = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
+    assert (id(policy.log_std) in optimized) is learned
     assert "log_std" in policy.state_dict()
 
 
 def test_optimizer_has_every_parameter_of_the_policy() -> None:
-    policy = fresh(critic_inputs=1)
-    optimised = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
-    assert optimised == {id(parameter) for parameter in policy.parameters()}
+    policy = new_policy(critic_inputs=1)
+    optimized = {id(parameter) for group in policy.optimizer.param_groups for parameter in group["params"]}
+    assert optimized == {id(parameter) for parameter in policy.parameters()}
 
 
 def test_value_has_the_set_scale() -> None:
-    policy, rows = fresh(), random_rows(20, 5)
+    policy, rows = new_policy(), random_rows(20, 5)
     before = value_of(policy, rows)
     policy.scale_value(150.0, 20.0)
     np.testing.assert_allclose(value_of(policy, rows), 150.0 + 20.0 * before, rtol=1e-6)
@@ -181,7 +183,7 @@ def test_value_has_the_set_scale() -> None:
 
 
 def test_value_scale_is_stored_with_the_weights_and_not_learned() -> None:
-    policy, other = fresh(seed=1), fresh(seed=2)
+    policy, other = new_policy(seed=1), new_policy(seed=2)
     policy.scale_value(150.0, 20.0)
     other.load_state_dict(policy.state_dict())
     rows = random_rows(20, 5)
@@ -203,8 +205,8 @@ def test_each_update_stays_within_the_trust_region() -> None:
     for iteration, before, after in zip(task.iterations, networks[:-1], networks[1:], strict=True):
         observations = np.concatenate([e.trajectories[0].observations[:-1] for e in iteration.episodes[0]])
         old, new = before.exploration_std, after.exploration_std
-        moved = (after(observations) - before(observations)) ** 2
-        divergence = float(np.mean(np.log(old / new) + (new**2 + moved) / (2 * old**2) - 0.5))
+        largest_changes = (after(observations) - before(observations)) ** 2
+        divergence = float(np.mean(np.log(old / new) + (new**2 + largest_changes) / (2 * old**2) - 0.5))
         assert 0.2 * 0.02 < divergence <= 0.02 * 1.001
         assert divergence == pytest.approx(iteration.log["kl_divergence_loss"], rel=0.01)
 
@@ -223,13 +225,13 @@ def same_mean(one: Network, other: Network) -> bool:
     return bool(np.array_equal(one(rows), other(rows)))
 
 
-@pytest.mark.parametrize("normalise", [True, False])
-def test_value_scale_comes_from_the_first_iteration(normalise: bool) -> None:
-    policy = PolicySettings(hidden=(8,), normalize_value=normalise)
+@pytest.mark.parametrize("normalize", [True, False])
+def test_value_scale_comes_from_the_first_iteration(normalize: bool) -> None:
+    policy = PolicySettings(hidden=(8,), normalize_value=normalize)
     task = Toy(policy).learn(3)
     trajectories = [episode.trajectories[0] for episode in task.iterations[0].episodes[0]]
     returns = discounted_returns(make_experience(trajectories, [()] * len(trajectories)), 0.99)
-    expected = [returns.mean(), returns.std()] if normalise else [0.0, 1.0]
+    expected = [returns.mean(), returns.std()] if normalize else [0.0, 1.0]
     assert task.parameters()["policy/value_net.scale"].tolist() == pytest.approx(expected, rel=1e-5)
 
 
@@ -253,15 +255,19 @@ def test_settings_reach_the_learner() -> None:
 
 
 def test_weight_decay_of_the_critic_does_not_change_the_actor() -> None:
-    def actor(value_l2: float) -> dict[str, Any]:
+    def actor(weight_decay: float) -> dict[str, Any]:
         found = (
-            Toy(settings=TRPOSettings(critic_weight_decay=value_l2, critic_learning_rate=0.01)).learn(1).parameters()
+            Toy(settings=TRPOSettings(critic_weight_decay=weight_decay, critic_learning_rate=0.01))
+            .learn(1)
+            .parameters()
         )
         return {name: tensor for name, tensor in found.items() if "value" not in name and "policy/" in name}
 
-    def critic(value_l2: float) -> torch.Tensor:
+    def critic(weight_decay: float) -> torch.Tensor:
         found = (
-            Toy(settings=TRPOSettings(critic_weight_decay=value_l2, critic_learning_rate=0.01)).learn(1).parameters()
+            Toy(settings=TRPOSettings(critic_weight_decay=weight_decay, critic_learning_rate=0.01))
+            .learn(1)
+            .parameters()
         )
         return found["policy/value_net.linear.weight"]
 
@@ -288,7 +294,7 @@ def test_each_epoch_of_ppo_has_the_set_number_of_minibatches(minibatches: int, s
 
 
 def test_actor_and_critic_of_ppo_learn_at_separate_rates() -> None:
-    def moved(actor_rate: float, critic_rate: float) -> dict[bool, float]:
+    def largest_changes(actor_rate: float, critic_rate: float) -> dict[bool, float]:
         settings = PPOSettings(epochs=5, actor_learning_rate=actor_rate, critic_learning_rate=critic_rate)
         task = Toy(settings=settings, agent="ppo")
         before = task.parameters()
@@ -300,5 +306,5 @@ def test_actor_and_critic_of_ppo_learn_at_separate_rates() -> None:
                 found[critic] = max(found[critic], float((after[name] - tensor).abs().max()))
         return found
 
-    assert moved(1e-12, 1e-2)[False] < 1e-8 < 1e-3 < moved(1e-12, 1e-2)[True]
-    assert moved(1e-2, 1e-12)[True] < 1e-8 < 1e-3 < moved(1e-2, 1e-12)[False]
+    assert largest_changes(1e-12, 1e-2)[False] < 1e-8 < 1e-3 < largest_changes(1e-12, 1e-2)[True]
+    assert largest_changes(1e-2, 1e-12)[True] < 1e-8 < 1e-3 < largest_changes(1e-2, 1e-12)[False]

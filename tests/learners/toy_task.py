@@ -1,4 +1,4 @@
-"""A task without a road, quick to learn: be at the target, which the observation tells. And policies."""
+"""A task without a road that is quick to learn, its target being a function of the observation; and policies."""
 
 import math
 from collections.abc import Callable
@@ -40,7 +40,7 @@ of_any_size = given(
     authority=st.floats(0.1, 2.0),
     rows=st.integers(1, 40),
 )
-"""gives a test policies of any size, and as many rows for them to see"""
+"""parameters of policies of any size, and a number of rows"""
 
 
 def constant_target(observations: np.ndarray) -> np.ndarray:
@@ -51,28 +51,28 @@ def sloped_target(observations: np.ndarray) -> np.ndarray:
     return 0.5 * observations[:, 0]
 
 
-def episode_of(network: Network, seed: tuple[int, ...], hold: int, target: Target) -> Episode:
-    """An episode in which a residual is held for `hold` control steps."""
+def episode_of(network: Network, seed: tuple[int, ...], action_repeat: int, target: Target) -> Episode:
+    """Return an episode in which each residual is repeated."""
     generator = np.random.default_rng(seed)
-    choices = CONTROL_STEPS // hold
-    observations = generator.uniform(-1.0, 1.0, size=(choices + 1, INPUTS))
-    chosen = network.explore(observations[:-1], generator.normal(size=choices))
-    residual = np.repeat(chosen, hold)
-    wanted = np.repeat(target(observations[:-1]), hold)
-    nothing = np.zeros(CONTROL_STEPS)
+    action_count = CONTROL_STEPS // action_repeat
+    observations = generator.uniform(-1.0, 1.0, size=(action_count + 1, INPUTS))
+    residuals = network.explore(observations[:-1], generator.normal(size=action_count))
+    residual = np.repeat(residuals, action_repeat)
+    targets = np.repeat(target(observations[:-1]), action_repeat)
+    zeros = np.zeros(CONTROL_STEPS)
     trajectory = Trajectory(
         vehicle="cav_0",
         start_step=0,
         states=LocalState(*[np.zeros(CONTROL_STEPS + 1)] * len(COMMON_FIELDS)),
         observations=observations,
-        expert_acceleration=nothing,
+        expert_acceleration=zeros,
         residual=residual,
         applied_acceleration=residual,
-        filter_braking=nothing,
-        shield_braking=nothing,
-        reward_terms={"near": -((residual - wanted) ** 2)},
+        filter_braking=zeros,
+        shield_braking=zeros,
+        reward_terms={"near": -((residual - targets) ** 2)},
         initial_memory={},
-        action_repeat=hold,
+        action_repeat=action_repeat,
         terminated=False,
     )
     drawn = {"length": LENGTHS[seed[-1] % 2]}
@@ -90,7 +90,7 @@ class Toy:
     seed: int = 0
     target: Target = constant_target
     episodes: int = 8
-    hold: int = 1
+    action_repeat: int = 1
     iterations: list[Iteration] = field(default_factory=list)
     networks: list[Network] = field(default_factory=list)
 
@@ -103,7 +103,7 @@ class Toy:
         self.networks.append(network)
         return [
             [
-                episode_of(network, (self.seed, iteration, index), self.hold, self.target)
+                episode_of(network, (self.seed, iteration, index), self.action_repeat, self.target)
                 for index in range(self.episodes)
             ]
         ]

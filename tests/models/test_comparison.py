@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import random_network
-from tests.models.toy_dynamics import RING, ToyDynamics, actual_data
+from tests.models.toy_dynamics import RING, ToyDynamics, environment_data
 from unjam.drivers import IDM, ResidualDriver
 from unjam.models.comparison import (
     mean_returns,
@@ -21,17 +21,17 @@ DRIVER = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
 SETTINGS = ModelSettings(members=3, hidden=(32,), epochs=20, batch_size=128, learning_rate=1e-2)
 
 
-def alone() -> RowModel:
+def new_model() -> RowModel:
     return RowModel(SETTINGS, 1, (1,))
 
 
-def known_ahead(world: ToyDynamics) -> EnvironmentData:
-    return actual_data(world, DRIVER, 30, 60)
+def recorded_data(world: ToyDynamics) -> EnvironmentData:
+    return environment_data(world, DRIVER, 30, 60)
 
 
 def test_exact_model_has_no_open_loop_error() -> None:
-    data = known_ahead(ToyDynamics(leader=0.0))
-    found = open_loop_errors(alone(), data, data.start_indices(40), 40, RING)
+    data = recorded_data(ToyDynamics(leader=0.0))
+    found = open_loop_errors(new_model(), data, data.start_indices(40), 40, RING)
     for name in STATE_FIELDS:
         assert found.error[name].shape == found.spread[name].shape == (40,)
         assert found.error[name].max() < 1e-3, name
@@ -40,27 +40,27 @@ def test_exact_model_has_no_open_loop_error() -> None:
 
 
 def test_open_loop_errors_of_the_base_equal_explicit_sums() -> None:
-    """The base believes that the leader keeps its speed."""
-    data = known_ahead(ToyDynamics())
-    choices = data.start_indices(30)
-    found = open_loop_errors(alone(), data, choices, 30, RING)
+    """The base assumes that the leader keeps its speed."""
+    data = recorded_data(ToyDynamics())
+    start_indices = data.start_indices(30)
+    found = open_loop_errors(new_model(), data, start_indices, 30, RING)
     for step in (1, 10, 30):
-        off, moved = [], []
-        for place, at in choices:
-            speeds = data.recordings[place].states.leader_speed
-            off.append(speeds[at + step] - speeds[at])
-            gaps = data.recordings[place].states.leader_gap
-            moved.append(gaps[at + step] - gaps[at])
-        assert found.error["leader_speed"][step - 1] == pytest.approx(np.sqrt(np.mean(np.square(off))), abs=1e-5)
-        assert found.change["leader_gap"][step - 1] == pytest.approx(np.sqrt(np.mean(np.square(moved))))
+        errors, changes = [], []
+        for index, at in start_indices:
+            speeds = data.recordings[index].states.leader_speed
+            errors.append(speeds[at + step] - speeds[at])
+            gaps = data.recordings[index].states.leader_gap
+            changes.append(gaps[at + step] - gaps[at])
+        assert found.error["leader_speed"][step - 1] == pytest.approx(np.sqrt(np.mean(np.square(errors))), abs=1e-5)
+        assert found.change["leader_gap"][step - 1] == pytest.approx(np.sqrt(np.mean(np.square(changes))))
 
 
 def test_fit_reduces_open_loop_errors() -> None:
-    data = known_ahead(ToyDynamics())
-    choices, model = data.start_indices(30), alone()
-    before = open_loop_errors(model, data, choices, 30, RING)
+    data = recorded_data(ToyDynamics())
+    start_indices, model = data.start_indices(30), new_model()
+    before = open_loop_errors(model, data, start_indices, 30, RING)
     fit_row_model(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
-    after = open_loop_errors(model, data, choices, 30, RING)
+    after = open_loop_errors(model, data, start_indices, 30, RING)
     for name in ("leader_speed", "leader_gap"):
         assert after.error[name][-1] < 0.6 * before.error[name][-1]
         assert 0.0 < after.spread[name][-1] < 2 * after.error[name][-1]
@@ -68,35 +68,38 @@ def test_fit_reduces_open_loop_errors() -> None:
 
 
 def test_each_member_replays_separately_from_recorded_states() -> None:
-    data = known_ahead(ToyDynamics())
-    model = alone()
+    data = recorded_data(ToyDynamics())
+    model = new_model()
     fit_row_model(model, data.transitions(0.2), SETTINGS, RING, "", (2,))
-    choices = data.start_indices(30)[:5]
-    actual, predicted = recorded_states(data, choices, 30), replay_accelerations(model, data, choices, 30, RING)
+    start_indices = data.start_indices(30)[:5]
+    recorded, predicted = (
+        recorded_states(data, start_indices, 30),
+        replay_accelerations(model, data, start_indices, 30, RING),
+    )
     for name in STATE_FIELDS:
         assert predicted[name].shape == (3, 5, 30)
-        assert actual[name].shape == (5, 31)
-        np.testing.assert_array_equal(actual[name][:, 0], getattr(data.states_at(choices), name))
+        assert recorded[name].shape == (5, 31)
+        np.testing.assert_array_equal(recorded[name][:, 0], getattr(data.states_at(start_indices), name))
     assert np.ptp(predicted["leader_speed"], axis=0)[:, -1].min() > 0.0
     np.testing.assert_allclose(
         predicted["leader_speed"][1, :1],
-        replay_accelerations(model, data, choices[:1], 30, RING)["leader_speed"][1],
+        replay_accelerations(model, data, start_indices[:1], 30, RING)["leader_speed"][1],
         rtol=1e-4,
     )
 
 
 def test_one_step_errors_equal_those_of_the_fit() -> None:
-    data, model = known_ahead(ToyDynamics()), alone()
-    actual = data.transitions(0.2)
-    found = fit_row_model(model, actual, SETTINGS, RING, "", (2,))
-    errors = one_step_errors(model, actual.select(np.flatnonzero(actual.is_holdout)), RING, "")
+    data, model = recorded_data(ToyDynamics()), new_model()
+    recorded = data.transitions(0.2)
+    found = fit_row_model(model, recorded, SETTINGS, RING, "", (2,))
+    errors = one_step_errors(model, recorded.select(np.flatnonzero(recorded.is_holdout)), RING, "")
     assert errors.model.shape == (3, found.holdout_rows, 6)
     for name, error in errors.rmse_by_target().items():
         assert error == pytest.approx(found.one_step[name], rel=1e-6, abs=1e-9), name
 
 
 def test_new_model_has_the_errors_of_its_base() -> None:
-    errors = one_step_errors(alone(), known_ahead(ToyDynamics()).transitions(0.2), RING, "")
+    errors = one_step_errors(new_model(), recorded_data(ToyDynamics()).transitions(0.2), RING, "")
     for member in errors.model:
         np.testing.assert_array_equal(member, errors.base)
 
@@ -114,7 +117,7 @@ def returns_of(driver: ResidualDriver, world: ToyDynamics, data: EnvironmentData
 
 def test_exact_dynamics_have_the_returns_of_the_environment() -> None:
     world = ToyDynamics()
-    data = actual_data(world, DRIVER, 6, 60, explore=False)
+    data = environment_data(world, DRIVER, 6, 60, explore=False)
     quiet = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
     object.__setattr__(quiet.network, "exploration_std", 0.0)
     model, environment = returns_of(quiet, world, data)
@@ -124,7 +127,7 @@ def test_exact_dynamics_have_the_returns_of_the_environment() -> None:
 
 
 def test_higher_model_reward_gives_a_higher_return() -> None:
-    data = actual_data(ToyDynamics(), DRIVER, 6, 60)
+    data = environment_data(ToyDynamics(), DRIVER, 6, 60)
     exact, environment = returns_of(DRIVER, ToyDynamics(), data)
     higher, same_environment = returns_of(DRIVER, ToyDynamics(bonus=5.0), data)
     assert same_environment == environment

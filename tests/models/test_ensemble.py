@@ -11,8 +11,8 @@ from unjam.models.settings import ModelSettings
 SETTINGS = ModelSettings(members=3, hidden=(16, 8))
 
 
-def shaken(seed: int = 0) -> RowModel:
-    """A model whose networks answer something."""
+def random_model(seed: int = 0) -> RowModel:
+    """Return a model with random weights."""
     model = RowModel(SETTINGS, 1, (seed,))
     generator = torch_generator((seed, 1), "cpu")
     with torch.no_grad():
@@ -22,7 +22,7 @@ def shaken(seed: int = 0) -> RowModel:
     return model
 
 
-def some_inputs(rows: int) -> torch.Tensor:
+def random_inputs(rows: int) -> torch.Tensor:
     state = random_state(np.random.default_rng(1), rows).map(lambda v: torch.tensor(v).float())
     return model_inputs(state, torch.linspace(-1, 1, rows), torch.full((rows, 1), 0.4))
 
@@ -37,19 +37,19 @@ def test_model_inputs_are_state_acceleration_and_drawn_values() -> None:
 def test_a_new_model_adds_nothing_to_its_base() -> None:
     model = RowModel(SETTINGS, 1, (1,))
     model.output_mask.fill_(1.0)
-    found = predict(model.layers(), some_inputs(9), torch.tensor([0, 1, 2]))
+    found = predict(model.layers(), random_inputs(9), torch.tensor([0, 1, 2]))
     assert_close(found, torch.zeros(9, len(TARGET_NAMES)))
 
 
 def test_initial_networks_differ_and_depend_on_the_seed_alone() -> None:
-    one, again, other = (RowModel(SETTINGS, 1, (seed,)) for seed in (1, 1, 2))
-    assert torch.equal(one.weights[0], again.weights[0])
+    one, same, other = (RowModel(SETTINGS, 1, (seed,)) for seed in (1, 1, 2))
+    assert torch.equal(one.weights[0], same.weights[0])
     assert not torch.equal(one.weights[0], other.weights[0])
     assert not torch.equal(one.weights[0][0], one.weights[0][1])
 
 
 def test_normalization_keeps_predictions() -> None:
-    model, inputs = shaken(), some_inputs(50)
+    model, inputs = random_model(), random_inputs(50)
     members = torch.tensor([2, 0])
     before = predict(model.layers(), inputs, members)
     generator = torch_generator((3,), "cpu")
@@ -61,22 +61,22 @@ def test_normalization_keeps_predictions() -> None:
 
 
 def test_each_block_of_rows_uses_its_member() -> None:
-    model, inputs = shaken(), some_inputs(10)
+    model, inputs = random_model(), random_inputs(10)
     found = predict(model.layers(), inputs, torch.tensor([2, 0, 1]))  # blocks of four rows, but for the last
-    every = model(inputs.expand(3, -1, -1)).detach()
+    member_outputs = model(inputs.expand(3, -1, -1)).detach()
     for rows, member in ((slice(0, 4), 2), (slice(4, 8), 0), (slice(8, 10), 1)):
-        assert_close(found[rows], every[member, rows])
+        assert_close(found[rows], member_outputs[member, rows])
 
 
 def test_prediction_of_many_rows_equals_single_rows() -> None:
-    layers, inputs = shaken().layers(), some_inputs(7)
-    together = predict(layers, inputs, torch.tensor([1]))
+    layers, inputs = random_model().layers(), random_inputs(7)
+    joint = predict(layers, inputs, torch.tensor([1]))
     for row in range(7):
-        assert_close(predict(layers, inputs[row : row + 1], torch.tensor([1]))[0], together[row])
+        assert_close(predict(layers, inputs[row : row + 1], torch.tensor([1]))[0], joint[row])
 
 
 def test_masked_outputs_are_zero() -> None:
-    model, inputs = shaken(), some_inputs(5)
+    model, inputs = random_model(), random_inputs(5)
     before = predict(model.layers(), inputs, torch.tensor([0]))
     model.output_mask[1] = 0.0
     found = predict(model.layers(), inputs, torch.tensor([0]))
@@ -93,11 +93,11 @@ def test_members_are_drawn_uniformly() -> None:
 
 
 def test_state_dict_restores_the_model() -> None:
-    model = shaken(1)
-    model.set_normalization(some_inputs(20).double(), torch.rand((20, 6), dtype=torch.float64))
+    model = random_model(1)
+    model.set_normalization(random_inputs(20).double(), torch.rand((20, 6), dtype=torch.float64))
     other = RowModel(SETTINGS, 1, (9,))
     other.load_state_dict(model.state_dict())
     members = torch.tensor([0, 1, 2])
     assert torch.equal(
-        predict(other.layers(), some_inputs(9), members), predict(model.layers(), some_inputs(9), members)
+        predict(other.layers(), random_inputs(9), members), predict(model.layers(), random_inputs(9), members)
     )

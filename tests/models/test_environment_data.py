@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.conftest import random_network
-from tests.models.toy_dynamics import ToyDynamics, actual_data
+from tests.models.toy_dynamics import ToyDynamics, environment_data
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.local_state import COMMON_FIELDS
@@ -19,23 +19,23 @@ from unjam.worlds.record import Episode, Trajectory
 RING = Ring()
 
 
-def trajectory(number: int, control_steps: int, hold: int = 1, terminated: bool = False) -> Trajectory:
-    """A trajectory in which every number tells where it comes from."""
+def trajectory(number: int, control_steps: int, action_repeat: int = 1, terminated: bool = False) -> Trajectory:
+    """Return a trajectory in which every number identifies its source."""
     steps = np.arange(control_steps + 1, dtype=np.float64) + 1000.0 * number
-    nothing = np.zeros(control_steps)
+    zeros = np.zeros(control_steps)
     return Trajectory(
         vehicle="cav_0",
         start_step=0,
         states=LocalState(*(steps + 0.1 * field for field in range(len(COMMON_FIELDS)))),
         observations=np.zeros((1, 0)),
-        expert_acceleration=nothing,
-        residual=nothing,
+        expert_acceleration=zeros,
+        residual=zeros,
         applied_acceleration=steps[:-1] / 1e6,
-        filter_braking=nothing,
-        shield_braking=nothing,
-        reward_terms={"one": steps[:-1], "two": nothing + 1},
+        filter_braking=zeros,
+        shield_braking=zeros,
+        reward_terms={"one": steps[:-1], "two": zeros + 1},
         initial_memory={"number": np.array(float(number))},
-        action_repeat=hold,
+        action_repeat=action_repeat,
         terminated=terminated,
     )
 
@@ -44,9 +44,9 @@ def episode(*trajectories: Trajectory, length: float = 245.0, status: str = "com
     return Episode(seed=(1,), status=status, drawn_values={"length": length}, trajectories=trajectories)
 
 
-def filled(*control_steps: int, rows: int = 10**6, hold: int = 1) -> EnvironmentData:
+def filled(*control_steps: int, rows: int = 10**6, action_repeat: int = 1) -> EnvironmentData:
     data = EnvironmentData(rows)
-    data.add([episode(trajectory(number, count, hold)) for number, count in enumerate(control_steps)], RING)
+    data.add([episode(trajectory(number, count, action_repeat)) for number, count in enumerate(control_steps)], RING)
     return data
 
 
@@ -75,21 +75,21 @@ def test_failed_episodes_are_not_stored() -> None:
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=12), st.integers(1, 60))
 def test_newest_episodes_are_stored_completely(control_steps: list[int], rows: int) -> None:
     data = filled(*control_steps, rows=rows)
-    kept = [recording.episode for recording in data.recordings]
-    assert kept == list(range(len(control_steps)))[-len(kept) :]
-    assert len(data) == sum(control_steps[-len(kept) :])
+    stored = [recording.episode for recording in data.recordings]
+    assert stored == list(range(len(control_steps)))[-len(stored) :]
+    assert len(data) == sum(control_steps[-len(stored) :])
     assert len(data) >= min(rows, sum(control_steps))
-    assert len(data) - control_steps[kept[0]] < rows  # without the oldest there would be too few
+    assert len(data) - control_steps[stored[0]] < rows  # without the oldest there would be too few
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.5])
 def test_holdout_share_holds_from_the_first_episode_on(share: float) -> None:
-    held = np.array([is_holdout_episode(number, share) for number in range(1000)])
-    assert held[0]
+    is_held_out = np.array([is_holdout_episode(number, share) for number in range(1000)])
+    assert is_held_out[0]
     for first in range(0, 900, 90):
-        assert held[first : first + 100].mean() == pytest.approx(share, abs=0.02)
+        assert is_held_out[first : first + 100].mean() == pytest.approx(share, abs=0.02)
     for parts in (2, 4, 5, 8):  # episodes take turns over as many parts of the road's range
-        assert all(held[part::parts].any() for part in range(parts))
+        assert all(is_held_out[part::parts].any() for part in range(parts))
 
 
 def test_holdout_episode_stays_complete_and_held_out() -> None:
@@ -116,7 +116,7 @@ def test_transitions_without_data_raise_error() -> None:
 
 
 def test_start_indices_are_due_actions_with_enough_steps_left() -> None:
-    data = filled(7, 3, hold=3)
+    data = filled(7, 3, action_repeat=3)
     assert data.start_indices().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0]]
     assert data.start_indices(3).tolist() == [[0, 0], [0, 3], [1, 0]]
     assert data.start_indices(8).tolist() == []
@@ -127,20 +127,20 @@ def test_start_indices_are_due_actions_with_enough_steps_left() -> None:
 
 def test_pack_and_unpack_restore_data() -> None:
     driver = ResidualDriver(PISaturation(window=2.0), random_network(), 1.0, action_repeat=4)
-    data = actual_data(ToyDynamics(), driver, 2, 30)
-    again = unpack(EnvironmentData, *pack(data))
-    assert fingerprint(tuple(again.recordings)) == fingerprint(tuple(data.recordings))
-    assert (again.capacity, again.episode_count) == (data.capacity, data.episode_count)
-    assert again.recordings[0].initial_memory.keys() == {"window", "total", "count", "command"}
+    data = environment_data(ToyDynamics(), driver, 2, 30)
+    restored = unpack(EnvironmentData, *pack(data))
+    assert fingerprint(tuple(restored.recordings)) == fingerprint(tuple(data.recordings))
+    assert (restored.capacity, restored.episode_count) == (data.capacity, data.episode_count)
+    assert restored.recordings[0].initial_memory.keys() == {"window", "total", "count", "command"}
 
 
 def test_select_takes_rows_of_each_column() -> None:
-    actual = actual_data(ToyDynamics(), ResidualDriver(IDM(), random_network(), 1.0), 2, 30).transitions(0.2)
+    transitions = environment_data(ToyDynamics(), ResidualDriver(IDM(), random_network(), 1.0), 2, 30).transitions(0.2)
     rows = np.array([7, 3, 41])
-    found = actual.select(rows)
-    for name, values in actual._asdict().items():
+    found = transitions.select(rows)
+    for name, values in transitions._asdict().items():
         pairs = [(values, getattr(found, name))]
         if isinstance(values, LocalState):
             pairs = list(zip(values[:7], getattr(found, name)[:7], strict=True))
-        for all_of_them, chosen in pairs:
-            np.testing.assert_array_equal(chosen, all_of_them[rows])
+        for column, selected in pairs:
+            np.testing.assert_array_equal(selected, column[rows])

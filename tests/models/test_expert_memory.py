@@ -22,17 +22,17 @@ from unjam.worlds.sumo.simulation import Simulation
 RING = Ring(length=(60, 70), vehicles=5, cavs=2, horizon=90)
 
 
-def watch(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> list[Memory]:
-    """Write down the memories with which a driver acts from now on."""
+def record_memories(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> list[Memory]:
+    """Record the memories with which a driver acts from now on."""
     memories: list[Memory] = []
     kind, act = type(driver), type(driver).act
 
-    def watched(self: Driver, state: LocalState, memory: Memory) -> tuple:
+    def recorded_act(self: Driver, state: LocalState, memory: Memory) -> tuple:
         if self is driver:
             memories.append(map_leaves(np.array, memory))
         return act(self, state, memory)
 
-    monkeypatch.setattr(kind, "act", watched)
+    monkeypatch.setattr(kind, "act", recorded_act)
     return memories
 
 
@@ -49,23 +49,23 @@ def experts(my_drivers: Path) -> list[Driver]:
 def test_memory_equals_that_of_the_actual_drive(
     number: int, warmup: int, my_drivers: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two episodes with two CAVs each, driven with exploration; every choice of all four trajectories."""
+    """Two episodes with two CAVs each, driven with exploration; random starts in all four trajectories."""
     expert = experts(my_drivers)[number]
     driver = ResidualDriver(expert, random_network(), 1.0, action_repeat=3)
     ring, data, memories = replace(RING, warmup=warmup), EnvironmentData(1000), []
     for seed in range(2):
         with monkeypatch.context() as patch:
-            seen = watch(expert, patch)
+            recorded = record_memories(expert, patch)
             data.add([run_episode(ring, driver, (seed,), explore=True, simulation=simulation)], ring)
-        memories += [seen, seen]
-    choices = np.random.default_rng(0).permutation(data.start_indices())[:40]
-    found = reconstruct_memory(expert, data.recordings, choices)
-    for row, (place, decision) in enumerate(choices):
-        really = memories[place][decision]
-        flat, expected = dict(leaves(found)), dict(leaves(really))
-        assert flat.keys() == expected.keys()
+        memories += [recorded, recorded]
+    start_indices = np.random.default_rng(0).permutation(data.start_indices())[:40]
+    found = reconstruct_memory(expert, data.recordings, start_indices)
+    for row, (index, step) in enumerate(start_indices):
+        expected_memory = memories[index][step]
+        leaves_found, expected = dict(leaves(found)), dict(leaves(expected_memory))
+        assert leaves_found.keys() == expected.keys()
         for key, values in expected.items():
-            np.testing.assert_allclose(flat[key][row], values[place % 2], atol=1e-10)
+            np.testing.assert_allclose(leaves_found[key][row], values[index % 2], atol=1e-10)
 
 
 def test_memory_has_no_later_or_foreign_states() -> None:
@@ -76,13 +76,13 @@ def test_memory_has_no_later_or_foreign_states() -> None:
     with Simulation() as simulation:
         episodes = [run_episode(RING, driver, (seed,), simulation=simulation) for seed in range(3)]
     data.add(episodes, RING)
-    choices = data.start_indices()
-    found = reconstruct_memory(expert, data.recordings, choices)
-    for row, (place, decision) in enumerate(choices):
-        speeds = data.recordings[place].states.speed[:decision]
-        assert found["count"][row] == decision
-        np.testing.assert_array_equal(found["window"][row, :decision], speeds)
-        assert not found["window"][row, decision:].any()
+    start_indices = data.start_indices()
+    found = reconstruct_memory(expert, data.recordings, start_indices)
+    for row, (index, step) in enumerate(start_indices):
+        speeds = data.recordings[index].states.speed[:step]
+        assert found["count"][row] == step
+        np.testing.assert_array_equal(found["window"][row, :step], speeds)
+        assert not found["window"][row, step:].any()
 
 
 def test_driver_without_memory_has_empty_memory() -> None:
@@ -96,25 +96,25 @@ def test_built_in_drivers_take_tensors_without_adapter(my_drivers: Path) -> None
     pi = PISaturation()
     assert tensor_driver(pi, "cpu") is pi
     assert isinstance(tensor_driver(FileDriver(my_drivers, "Keeper"), "cpu"), NumPyDriverAdapter)
-    on_a_users = ResidualDriver(FileDriver(my_drivers, "Keeper"), random_network(), 1.0)
-    assert isinstance(tensor_driver(on_a_users, "cpu"), NumPyDriverAdapter)
+    user_expert = ResidualDriver(FileDriver(my_drivers, "Keeper"), random_network(), 1.0)
+    assert isinstance(tensor_driver(user_expert, "cpu"), NumPyDriverAdapter)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_tensor_driver_equals_array_driver(number: int, my_drivers: Path) -> None:
     expert = experts(my_drivers)[number]
-    on_world = tensor_driver(expert, "cpu")
+    on_tensors = tensor_driver(expert, "cpu")
     generator = np.random.default_rng(1)
     memory = expert.initial_memory(4)
-    tensors = tensor_memory(on_world, memory, "cpu")
+    tensors = tensor_memory(on_tensors, memory, "cpu")
     for _ in range(50):
         state = random_state(generator, 4)
         expected, memory = expert.act(state, memory)
-        in_world = state.map(lambda values: torch.tensor(values, dtype=torch.float32))
-        found, tensors = on_world.act(in_world, tensors)
+        tensor_state = state.map(lambda values: torch.tensor(values, dtype=torch.float32))
+        found, tensors = on_tensors.act(tensor_state, tensors)
         assert found.dtype == torch.float32
         np.testing.assert_allclose(found.numpy(), expected, atol=1e-4)
-        features = on_world.memory_features(tensors)
+        features = on_tensors.memory_features(tensors)
         expected_features = expert.memory_features(memory)
         assert (features is None) == (expected_features is None)
         if features is not None and expected_features is not None:

@@ -24,8 +24,8 @@ from unjam.worlds.worker_pool import EpisodeTask
 
 
 def test_one_step_errors_are_root_mean_squares() -> None:
-    wanted, predicted = np.array([3.0, -4.0]), np.array([[3.0, -4.0], [3.0, -2.0]])
-    columns = (np.repeat(each[..., None], 6, -1) for each in (wanted, predicted, np.array([1.0, 3.0])))
+    errors, predicted = np.array([3.0, -4.0]), np.array([[3.0, -4.0], [3.0, -2.0]])
+    columns = (np.repeat(each[..., None], 6, -1) for each in (errors, predicted, np.array([1.0, 3.0])))
     found = OneStepErrors(*columns).rmse_by_target()
     assert found == dict.fromkeys(TARGET_NAMES, OneStepRMSE(math.sqrt(12.5), 1.0, 1.0))
 
@@ -80,22 +80,24 @@ def transitions_of(scenario: Scenario, episodes: list[Episode]) -> Transitions:
 def test_recorded_noise_follows_from_the_driven_distance() -> None:
     ring = Ring(vehicles=6, length=(120, 120), horizon=400, noise=0.3)
     episodes = run_batch([EpisodeTask(ring, PISaturation(), (seed,)) for seed in range(6)])
-    actual = transitions_of(ring, episodes)
-    noise = recorded_noise(actual, ring)
+    transitions = transitions_of(ring, episodes)
+    noise = recorded_noise(transitions, ring)
     assert noise is not None
-    moves = np.minimum(actual.next_states.leader_speed, actual.next_states.follower_speed) > 0.5
+    is_moving = np.minimum(transitions.next_states.leader_speed, transitions.next_states.follower_speed) > 0.5
     sigma = ring.noise_per_step * ring.simulation_step
-    np.testing.assert_allclose(noise[moves].std(0), sigma, rtol=0.06)
-    # The follower's own leader is the CAV, so that the IDM knows what he meant to do.
-    meant = base_step("idm", ring, actual.states, actual.acceleration).follower_speed
-    np.testing.assert_allclose((meant + noise[:, 1])[moves], actual.next_states.follower_speed[moves], atol=1e-9)
+    np.testing.assert_allclose(noise[is_moving].std(0), sigma, rtol=0.06)
+    # The follower's own leader is the CAV, so that the IDM gives the intended speed.
+    intended = base_step("idm", ring, transitions.states, transitions.acceleration).follower_speed
+    np.testing.assert_allclose(
+        (intended + noise[:, 1])[is_moving], transitions.next_states.follower_speed[is_moving], atol=1e-9
+    )
 
 
 def test_variance_of_unknown_noise_is_subtracted_from_the_error() -> None:
     eight = FigureEight(horizon=300)
-    actual = transitions_of(eight, [run_episode(eight, PISaturation(), (seed,)) for seed in range(4)])
-    assert recorded_noise(actual, eight) is None
+    transitions = transitions_of(eight, [run_episode(eight, PISaturation(), (seed,)) for seed in range(4)])
+    assert recorded_noise(transitions, eight) is None
     settings = ModelSettings(members=1, epochs=1)
-    model = RowModel(settings, actual.drawn_values.shape[1], (0,))
-    errors = fit_row_model(model, actual, settings, eight, "", (1,)).errors
+    model = RowModel(settings, transitions.drawn_values.shape[1], (0,))
+    errors = fit_row_model(model, transitions, settings, eight, "", (1,)).errors
     assert 0.0 < errors["transitions"] <= 1.0

@@ -33,7 +33,7 @@ def episodes() -> list[Episode]:
 
 
 @pytest.fixture(scope="module")
-def eights() -> list[Episode]:
+def figure_eights() -> list[Episode]:
     tasks = [EpisodeTask(EIGHT, PISaturation(), (seed,)) for seed in range(10)]
     return run_batch(tasks, allow_statistical=True)
 
@@ -41,8 +41,8 @@ def eights() -> list[Episode]:
 def fitted(episodes: list[Episode], road: LoopScenario = RING, **changes: Any) -> tuple[RoadModel, ModelFit]:
     settings = ModelSettings(kind="road", **changes)
     model = RoadModel(settings, (0,))
-    kept = [road_samples(episode, number, road) for number, episode in enumerate(episodes)]
-    return model, fit_road_model(model, kept, settings, road, (1,))
+    samples = [road_samples(episode, number, road) for number, episode in enumerate(episodes)]
+    return model, fit_road_model(model, samples, settings, road, (1,))
 
 
 def test_exact_base_leaves_only_noise(episodes: list[Episode]) -> None:
@@ -65,8 +65,8 @@ def test_networks_learn_what_the_base_lacks(episodes: list[Episode], base: str) 
 
 
 @pytest.mark.long
-def test_right_of_way_and_noise_are_no_model_error_on_a_figure_eight(eights: list[Episode]) -> None:
-    model, found = fitted(eights, EIGHT)
+def test_right_of_way_and_noise_are_no_model_error_on_a_figure_eight(figure_eights: list[Episode]) -> None:
+    model, found = fitted(figure_eights, EIGHT)
     sigma = EIGHT.noise_per_step * EIGHT.simulation_step
     assert found.one_step["speed"].base == pytest.approx(sigma, rel=0.05)
     assert found.errors["unexplained_variance"] < 0.02
@@ -74,8 +74,8 @@ def test_right_of_way_and_noise_are_no_model_error_on_a_figure_eight(eights: lis
 
 
 @pytest.mark.long
-def test_networks_learn_what_the_base_lacks_on_a_figure_eight(eights: list[Episode]) -> None:
-    _, found = fitted(eights, EIGHT, base="none", epochs=20)
+def test_networks_learn_what_the_base_lacks_on_a_figure_eight(figure_eights: list[Episode]) -> None:
+    _, found = fitted(figure_eights, EIGHT, base="none", epochs=20)
     sigma, step = EIGHT.noise_per_step * EIGHT.simulation_step, found.one_step["speed"]
     assert found.learned_targets == ("speed",)
     assert step.base > 2 * sigma
@@ -88,13 +88,13 @@ def test_part_of_too_few_episodes_is_held_out(episodes: list[Episode]) -> None:
 
 def test_samples_are_recorded_states_and_next_states(episodes: list[Episode]) -> None:
     episode = episodes[3]
-    kept = road_samples(episode, 7, RING)
-    assert (kept.episode, kept.interval, kept.is_human.sum()) == (7, 1, 7)
-    np.testing.assert_array_equal(kept.next_speeds, episode.speeds[1:])
-    drivers = kept.is_human > 0
-    noise = (kept.next_speeds - kept.intended_speeds)[:, drivers][kept.intended_speeds[:, drivers] > 0.5]
+    samples = road_samples(episode, 7, RING)
+    assert (samples.episode, samples.interval, samples.is_human.sum()) == (7, 1, 7)
+    np.testing.assert_array_equal(samples.next_speeds, episode.speeds[1:])
+    drivers = samples.is_human > 0
+    noise = (samples.next_speeds - samples.intended_speeds)[:, drivers][samples.intended_speeds[:, drivers] > 0.5]
     assert abs(noise.mean()) < 0.002
-    assert np.abs((kept.next_speeds - kept.intended_speeds)[:, ~drivers]).max() < 1e-9
+    assert np.abs((samples.next_speeds - samples.intended_speeds)[:, ~drivers]).max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -108,9 +108,9 @@ def test_unsupported_roads_are_refused(road: Any, why: str) -> None:
 
 def test_learned_human_model_on_tensors_equals_arrays(episodes: list[Episode]) -> None:
     model, _ = fitted(episodes, base="none", epochs=5)
-    seen = [np.array([[3.0, 9.0], [0.0, 25.0]]), np.array([[4.0, 2.0], [1.0, 20.0]])]
-    seen.append(np.array([[5.0, 12.0], [2.0, 30.0]]))
+    inputs = [np.array([[3.0, 9.0], [0.0, 25.0]]), np.array([[4.0, 2.0], [1.0, 20.0]])]
+    inputs.append(np.array([[5.0, 12.0], [2.0, 30.0]]))
     on_arrays, on_tensors = (learned_human_model(model, RING, torch_generator((1,), "cpu")) for _ in range(2))
-    found = on_tensors(*map(torch.from_numpy, seen))
-    assert torch.equal(found, torch.from_numpy(on_arrays(*seen)))
-    assert not torch.equal(found, base_human_model("none", RING)(*map(torch.from_numpy, seen)))
+    found = on_tensors(*map(torch.from_numpy, inputs))
+    assert torch.equal(found, torch.from_numpy(on_arrays(*inputs)))
+    assert not torch.equal(found, base_human_model("none", RING)(*map(torch.from_numpy, inputs)))

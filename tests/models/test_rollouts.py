@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from tests.conftest import random_network
-from tests.models.toy_dynamics import RING, ToyDynamics, actual_data
+from tests.models.toy_dynamics import RING, ToyDynamics, environment_data
 from unjam.drivers import IDM, Constant, Driver, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.user_driver import FileDriver
@@ -34,9 +34,9 @@ from unjam.models.settings import ModelSettings
 PARTS: tuple[FeatureName, ...] = ("local", "expert_acceleration", "expert_memory")
 
 
-def residual_driver(expert: Driver, hold: int = 1, limit: float = 1.0) -> ResidualDriver:
+def residual_driver(expert: Driver, action_repeat: int = 1, limit: float = 1.0) -> ResidualDriver:
     network = random_network(observation_size(PARTS, expert))
-    return ResidualDriver(expert, network, limit, PARTS, hold)
+    return ResidualDriver(expert, network, limit, PARTS, action_repeat)
 
 
 @given(
@@ -64,8 +64,10 @@ def test_return_bound_is_the_sum_of_its_three_terms(
     power = 1.0
     for _ in range(k):
         power *= gamma
-    far = sum(gamma**step for step in range(40_000)) if gamma < 0.99 else 1 / (1 - gamma)
-    expected = 2 * largest * (gamma * power * eps_pi * far * far + power * eps_pi * far + k * eps_m * far)
+    horizon = sum(gamma**step for step in range(40_000)) if gamma < 0.99 else 1 / (1 - gamma)
+    expected = (
+        2 * largest * (gamma * power * eps_pi * horizon * horizon + power * eps_pi * horizon + k * eps_m * horizon)
+    )
     assert return_bound(eps_pi, eps_m, k, gamma, largest) == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
@@ -78,74 +80,74 @@ def experts(my_drivers: Path) -> list[Driver]:
 
 
 def value(observations: np.ndarray) -> np.ndarray:
-    """Some value function."""
+    """Return values of a linear function."""
     return 3.0 + observations @ np.linspace(-1, 1, observations.shape[-1])
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
-@pytest.mark.parametrize("hold", [1, 4])
-def test_rollouts_with_true_dynamics_equal_recordings(number: int, hold: int, my_drivers: Path) -> None:
-    """From any actual row: the same observations, residuals, rewards, and value targets."""
-    world, gamma, control_steps = ToyDynamics(), 0.97, 41
-    driver = residual_driver(experts(my_drivers)[number], hold)
-    data = actual_data(world, driver, 3, 120, explore=False)
-    choices = data.start_indices(min_control_steps=control_steps)
-    found = roll_out(driver, world, prepare_starts(data, choices, driver.expert, "cpu"), control_steps, None)
-    made = control_steps // hold
-    assert found.rewards.shape == (len(choices), made)
+@pytest.mark.parametrize("action_repeat", [1, 4])
+def test_rollouts_with_true_dynamics_equal_recordings(number: int, action_repeat: int, my_drivers: Path) -> None:
+    """From any recorded state: the same observations, residuals, rewards, and value targets."""
+    dynamics, gamma, control_steps = ToyDynamics(), 0.97, 41
+    driver = residual_driver(experts(my_drivers)[number], action_repeat)
+    data = environment_data(dynamics, driver, 3, 120, explore=False)
+    start_indices = data.start_indices(min_control_steps=control_steps)
+    found = roll_out(driver, dynamics, prepare_starts(data, start_indices, driver.expert, "cpu"), control_steps, None)
+    action_count = control_steps // action_repeat
+    assert found.rewards.shape == (len(start_indices), action_count)
     assert not found.terminated.any()
-    drives = [replay(driver, data, place) for place in range(3)]
-    for row, (place, at) in enumerate(choices):
-        recording, driven = data.recordings[place], drives[place]
-        seen = driven[0][at : at + made * hold + 1 : hold]
-        np.testing.assert_allclose(found.observations[row].numpy(), seen, atol=2e-4)
-        residuals = driven[1][at : at + made * hold : hold]
+    replays = [replay(driver, data, index) for index in range(3)]
+    for row, (index, at) in enumerate(start_indices):
+        recording, replayed = data.recordings[index], replays[index]
+        observations = replayed[0][at : at + action_count * action_repeat + 1 : action_repeat]
+        np.testing.assert_allclose(found.observations[row].numpy(), observations, atol=2e-4)
+        residuals = replayed[1][at : at + action_count * action_repeat : action_repeat]
         np.testing.assert_allclose(found.actions[row].numpy(), residuals, atol=2e-4)
-        rewards = recording.reward[at : at + made * hold].reshape(made, hold).sum(1)
+        rewards = recording.reward[at : at + action_count * action_repeat].reshape(action_count, action_repeat).sum(1)
         np.testing.assert_allclose(found.rewards[row].numpy(), rewards, atol=1e-3)
-        powers = gamma ** np.arange(made + 1)
+        powers = gamma ** np.arange(action_count + 1)
         target = powers @ np.append(found.rewards[row], value(found.observations[row, -1:].numpy()))
-        assert target == pytest.approx(powers @ np.append(rewards, value(seen[-1:])), abs=5e-3)
+        assert target == pytest.approx(powers @ np.append(rewards, value(observations[-1:])), abs=5e-3)
 
 
-def replay(driver: ResidualDriver, data: EnvironmentData, place: int) -> tuple[np.ndarray, np.ndarray]:
+def replay(driver: ResidualDriver, data: EnvironmentData, index: int) -> tuple[np.ndarray, np.ndarray]:
     """The observation of the network in every control step of a recording, and its residual."""
-    recording = data.recordings[place]
-    memory, seen, residuals = driver.initial_memory(1), [], []
+    recording = data.recordings[index]
+    memory, observations, residuals = driver.initial_memory(1), [], []
     for step in range(len(recording.states.speed)):
         state = recording.states.select(slice(step, step + 1))
-        seen.append(driver.observation(state, memory)[0])
+        observations.append(driver.observation(state, memory)[0])
         decision = driver.decide(state, memory)
         residuals.append(decision.residual[0])
         memory = decision.memory
-    return np.array(seen), np.array(residuals)
+    return np.array(observations), np.array(residuals)
 
 
 def crash_course(limit: float = 1.0) -> tuple[ResidualDriver, EnvironmentData]:
     """A driver that does not brake, behind vehicles that do."""
-    gentle = actual_data(ToyDynamics(), residual_driver(IDM(), 2), 4, 60)
+    gentle = environment_data(ToyDynamics(), residual_driver(IDM(), 2), 4, 60)
     return residual_driver(Constant(1.0), 2, limit), gentle
 
 
 def test_a_crash_ends_a_row_and_its_rewards() -> None:
     driver, data = crash_course()
-    choices = data.start_indices()
-    found = roll_out(driver, ToyDynamics(), prepare_starts(data, choices, driver.expert, "cpu"), 300, None)
+    start_indices = data.start_indices()
+    found = roll_out(driver, ToyDynamics(), prepare_starts(data, start_indices, driver.expert, "cpu"), 300, None)
     assert found.terminated.all()
     assert found.lengths.max() < 150
-    for row in range(len(choices)):
-        made = int(found.lengths[row])
-        assert made > 0
-        assert (found.rewards[row, made:] == 0.0).all()
-        assert found.rewards[row, :made].abs().sum() > 0.0
-    one = choices[:1]
+    for row in range(len(start_indices)):
+        action_count = int(found.lengths[row])
+        assert action_count > 0
+        assert (found.rewards[row, action_count:] == 0.0).all()
+        assert found.rewards[row, :action_count].abs().sum() > 0.0
+    one = start_indices[:1]
     alone = roll_out(driver, ToyDynamics(), prepare_starts(data, one, driver.expert, "cpu"), 300, None)
     assert alone.control_steps in (2 * int(alone.lengths[0]), 2 * int(alone.lengths[0]) - 1)
     assert_close(alone.rewards[0], found.rewards[0])
 
 
-class Bounded(ToyDynamics):
-    """Says that a bound was enforced: the first always, the second never, the third in the first step."""
+class ClippingDynamics(ToyDynamics):
+    """Report the first quantity as always clipped, the second never, the third in the first step."""
 
     steps = 0
 
@@ -159,7 +161,7 @@ class Bounded(ToyDynamics):
 def test_clipped_share_counts_steps_before_the_crash() -> None:
     driver, data = crash_course()
     starts = prepare_starts(data, data.start_indices()[:50], driver.expert, "cpu")
-    found = roll_out(driver, Bounded(), starts, 300, None)
+    found = roll_out(driver, ClippingDynamics(), starts, 300, None)
     assert found.control_steps < 50 * 300
     assert found.clipped_share == pytest.approx(
         dict(zip(CLIPPED_QUANTITIES, [1.0, 0.0, 50 / found.control_steps], strict=True)), rel=1e-5
@@ -169,7 +171,7 @@ def test_clipped_share_counts_steps_before_the_crash() -> None:
 @pytest.fixture(scope="module")
 def noisy() -> tuple[ResidualDriver, EnvironmentData, RowModel]:
     driver = residual_driver(PISaturation(window=1.5), 5)
-    data = actual_data(ToyDynamics(), driver, 3, 60)
+    data = environment_data(ToyDynamics(), driver, 3, 60)
     model = RowModel(ModelSettings(members=2, hidden=(8,)), 1, (1,))
     model.noise.normal_(0, 0.01, generator=torch_generator((4,), "cpu"))
     model.reward_range.copy_(torch.tensor([-1.0, 1.0]))
@@ -179,8 +181,8 @@ def noisy() -> tuple[ResidualDriver, EnvironmentData, RowModel]:
 def run(noisy: tuple[ResidualDriver, EnvironmentData, RowModel], seed: int) -> RolloutBatch:
     driver, data, model = noisy
     generator = torch_generator((seed,), "cpu")
-    choices = draw_starts(data, 200, 1, (seed,))
-    starts = prepare_starts(data, choices, driver.expert, "cpu")
+    start_indices = draw_starts(data, 200, 1, (seed,))
+    starts = prepare_starts(data, start_indices, driver.expert, "cpu")
     return roll_out(driver, ModelDynamics(model, RING, "", generator), starts, 23, generator)
 
 
@@ -224,7 +226,7 @@ def test_rollout_without_steps_has_only_the_start(noisy: tuple[ResidualDriver, E
 
 
 def test_starts_are_actions_with_enough_steps_left() -> None:
-    data = actual_data(ToyDynamics(), residual_driver(IDM(), 4), 3, 50)
+    data = environment_data(ToyDynamics(), residual_driver(IDM(), 4), 3, 50)
     found = draw_starts(data, 500, 20, (1,))
     assert found.shape == (500, 2)
     assert set(found[:, 1].tolist()) == set(range(0, 31, 4))
@@ -234,7 +236,7 @@ def test_starts_are_actions_with_enough_steps_left() -> None:
 
 
 def test_non_finite_values_raise_error() -> None:
-    driver, data = residual_driver(IDM()), actual_data(ToyDynamics(), residual_driver(IDM()), 1, 10)
+    driver, data = residual_driver(IDM()), environment_data(ToyDynamics(), residual_driver(IDM()), 1, 10)
     starts = prepare_starts(data, data.start_indices(), driver.expert, "cpu")
     with pytest.raises(UnjamError, match="model rollout: rewards are not finite"):
         roll_out(driver, ToyDynamics(bonus=inf), starts, 3, None)
@@ -244,13 +246,13 @@ def test_action_limit_clips_expert_and_sum() -> None:
     driver, data = crash_course(limit=0.25)
     commands: list[torch.Tensor] = []
 
-    class Watching(ToyDynamics):
+    class RecordingDynamics(ToyDynamics):
         def step(self, state: LocalState, acceleration: torch.Tensor, drawn_values: torch.Tensor) -> ModelTransition:
             commands.append(acceleration)
             return super().step(state, acceleration, drawn_values)
 
     strong = replace(driver, expert=IDM(), network=random_network(6))
-    roll_out(strong, Watching(), prepare_starts(data, data.start_indices(), IDM(), "cpu"), 20, None)
+    roll_out(strong, RecordingDynamics(), prepare_starts(data, data.start_indices(), IDM(), "cpu"), 20, None)
     assert torch.stack(commands).abs().max() == 0.25
     assert torch.stack(commands).unique().numel() > 10
 
@@ -261,9 +263,9 @@ def test_rollouts_on_gpu_equal_cpu(noisy: tuple[ResidualDriver, EnvironmentData,
     found = []
     for device in ("cpu", "cuda"):
         generator = torch_generator((1,), device)
-        world = ModelDynamics(model.to(device), RING, "", generator, add_noise=False)
+        dynamics = ModelDynamics(model.to(device), RING, "", generator, add_noise=False)
         found.append(
-            roll_out(driver, world, prepare_starts(data, data.start_indices(), driver.expert, device), 20, None)
+            roll_out(driver, dynamics, prepare_starts(data, data.start_indices(), driver.expert, device), 20, None)
         )
     model.to("cpu")
     assert_close(found[1].rewards.cpu(), found[0].rewards, atol=1e-3, rtol=1e-3)

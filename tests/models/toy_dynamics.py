@@ -1,4 +1,4 @@
-"""A little car-following world whose dynamics are known: the truth that models are compared with."""
+"""Car-following dynamics that are known exactly, with which models are compared."""
 
 from typing import Any
 
@@ -30,18 +30,22 @@ class ToyDynamics(ModelDynamics):
         self.bonus = bonus
 
     def step(self, state: LocalState, acceleration: Array, drawn_values: Array) -> ModelTransition:
-        """Move all three by 0.1 s; the reward has a share that no seen speed tells."""
+        """Move all three by 0.1 s; a part of the reward does not depend on speeds."""
         step = 0.1
-        behind = state._replace(speed=state.follower_speed, leader_speed=state.speed, leader_gap=state.follower_gap)
-        following, _ = IDM().act(behind, {})
-        push = self.leader * (0.4 * (5.0 - state.leader_speed) + 0.1 * (12.0 - state.leader_gap)).clip(-1, 1)
+        follower_state = state._replace(
+            speed=state.follower_speed, leader_speed=state.speed, leader_gap=state.follower_gap
+        )
+        follower_acceleration, _ = IDM().act(follower_state, {})
+        leader_acceleration = self.leader * (0.4 * (5.0 - state.leader_speed) + 0.1 * (12.0 - state.leader_gap)).clip(
+            -1, 1
+        )
         speed = (state.speed + step * acceleration).clip(0.0, None)
-        follower_speed = (state.follower_speed + step * following).clip(0.0, None)
-        leader_speed = (state.leader_speed + step * push).clip(0.0, None)
+        follower_speed = (state.follower_speed + step * follower_acceleration).clip(0.0, None)
+        leader_speed = (state.leader_speed + step * leader_acceleration).clip(0.0, None)
         leader_gap = state.leader_gap + step * (leader_speed - speed)
         follower_gap = state.follower_gap + step * (speed - follower_speed)
         crashed = (leader_gap <= 0.0) | (follower_gap <= 0.0)
-        reached = LocalState(
+        next_state = LocalState(
             speed=speed,
             leader_speed=leader_speed,
             leader_gap=leader_gap,
@@ -51,12 +55,12 @@ class ToyDynamics(ModelDynamics):
             loop_length=state.loop_length,
         )
         speeds = stack_columns((speed, leader_speed, follower_speed))
-        headways = as_column(leader_gap / speed.clip(1e-3, None))
-        terms = released_reward(Outcome(speeds, as_column(acceleration), headways, crashed, 0.0 * acceleration))
+        time_gaps = as_column(leader_gap / speed.clip(1e-3, None))
+        terms = released_reward(Outcome(speeds, as_column(acceleration), time_gaps, crashed, 0.0 * acceleration))
         reward = sum(terms.values()) + self.bonus * 0.1 * (state.leader_gap / 20.0) * ~crashed
         xp = namespace(speed)
-        nothing = xp.zeros_like(speed)
-        return ModelTransition(reached, reward, crashed, xp.stack([nothing, nothing, nothing]))
+        zeros = xp.zeros_like(speed)
+        return ModelTransition(next_state, reward, crashed, xp.stack([zeros, zeros, zeros]))
 
 
 def drive(
@@ -69,23 +73,23 @@ def drive(
     )
     state = state._replace(leader_speed=state.speed + 0.1, follower_speed=state.speed * 0.9)
     memory = driver.initial_memory(1)
-    began = map_leaves(lambda values: np.array(values[0]), memory[EXPERT_KEY])
-    states, applied, rewards, crashed = [state], [], [], False
-    while len(applied) < control_steps and not crashed:
+    initial_memory = map_leaves(lambda values: np.array(values[0]), memory[EXPERT_KEY])
+    states, accelerations, rewards, crashed = [state], [], [], False
+    while len(accelerations) < control_steps and not crashed:
         noise = generator.standard_normal(1)
         decision = driver.decide(state, memory, (lambda: noise) if explore else None)  # noqa: B023
         memory = decision.memory
         step = world.step(state, decision.command.acceleration, np.zeros((1, 0)))
         state, crashed = step.state, bool(step.crashed[0])
         states.append(state)
-        applied.append(decision.command.acceleration[0])
+        accelerations.append(decision.command.acceleration[0])
         rewards.append(step.reward[0])
     return recording(
         states=states[0].map(lambda *values: np.concatenate(values), *states[1:]),
-        applied=np.array(applied),
+        accelerations=np.array(accelerations),
         reward=np.array(rewards),
-        memory=began,
-        hold=driver.action_repeat,
+        memory=initial_memory,
+        action_repeat=driver.action_repeat,
         terminated=crashed,
         drawn=np.array([0.3]),
         episode=episode,
@@ -94,18 +98,30 @@ def drive(
 
 def recording(
     states: LocalState,
-    applied: np.ndarray,
+    accelerations: np.ndarray,
     reward: np.ndarray,
     memory: dict[str, Any] | None = None,
-    hold: int = 1,
+    action_repeat: int = 1,
     terminated: bool = False,
     drawn: np.ndarray | None = None,
     episode: int = 0,
 ) -> Recording:
     """Return a recording without observations and decisions of a driver."""
-    nothing = np.zeros_like(applied)
+    zeros = np.zeros_like(accelerations)
     return Recording(
-        *("cav", 0, states, np.zeros((1, 0)), applied, nothing, applied, nothing, nothing, memory or {}, hold),
+        *(
+            "cav",
+            0,
+            states,
+            np.zeros((1, 0)),
+            accelerations,
+            zeros,
+            accelerations,
+            zeros,
+            zeros,
+            memory or {},
+            action_repeat,
+        ),
         terminated=terminated,
         reward_terms={"reward": reward},
         drawn_values=np.zeros(0) if drawn is None else drawn,
@@ -113,7 +129,7 @@ def recording(
     )
 
 
-def actual_data(
+def environment_data(
     world: ToyDynamics, driver: ResidualDriver, episodes: int, control_steps: int, explore: bool = True
 ) -> EnvironmentData:
     """Return the data of some episodes, one trajectory each."""

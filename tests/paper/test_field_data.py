@@ -4,7 +4,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.following.made_up import idm_driver
+from tests.following.synthetic_pairs import idm_driver
 from unjam.following.calibration import CalibrationSettings
 from unjam.following.networks import MultiStepSettings, NetworkSettings
 from unjam.physics.idm import IDMParameters

@@ -34,23 +34,21 @@ def test_reference_values_closing_in_and_falling_back() -> None:
 
 
 @given(speeds, st.floats(-3.0, 0.99))
-def test_with_the_desired_speed_for_an_acceleration_a_free_driver_accelerates_so(
-    speed: float, acceleration: float
-) -> None:
-    wanted = desired_speed_from_acceleration(acceleration, speed + 0.1)
-    driver = IDMParameters(desired_speed=wanted)
+def test_desired_speed_from_acceleration_inverts_free_acceleration(speed: float, acceleration: float) -> None:
+    desired_speed = desired_speed_from_acceleration(acceleration, speed + 0.1)
+    driver = IDMParameters(desired_speed=desired_speed)
     assert idm_acceleration(speed + 0.1, speed + 0.1, 1e9, driver) == pytest.approx(acceleration, abs=1e-9)
 
 
 @given(speeds, speeds, gaps)
 def test_agrees_with_a_second_implementation(speed: float, leader: float, gap: float) -> None:
-    wanted = 2 + max(0.0, speed * 1 + speed * (speed - leader) / (2 * (1 * 1.5) ** 0.5))
-    expected = 1 * (1 - (speed / 30) ** 4 - (wanted / gap) ** 2)
+    desired = 2 + max(0.0, speed * 1 + speed * (speed - leader) / (2 * (1 * 1.5) ** 0.5))
+    expected = 1 * (1 - (speed / 30) ** 4 - (desired / gap) ** 2)
     assert idm_acceleration(speed, leader, gap) == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
 @given(speeds)
-def test_nobody_accelerates_in_equilibrium(speed: float) -> None:
+def test_acceleration_is_zero_in_equilibrium(speed: float) -> None:
     assert idm_acceleration(speed, speed, equilibrium_gap(speed)) == pytest.approx(0.0, abs=1e-9)
 
 
@@ -59,7 +57,7 @@ def test_equilibrium_speed_inverts_equilibrium_gap(gap: float) -> None:
     assert equilibrium_gap(equilibrium_speed(gap)) == pytest.approx(gap, rel=1e-9)
 
 
-def test_ring_limits_are_the_papers() -> None:
+def test_equilibrium_speeds_of_rings_are_those_of_the_paper() -> None:
     found = [equilibrium_speed(length / 22 - 5) for length in range(220, 280, 10)]
     np.testing.assert_allclose(found, [3.000, 3.454, 3.908, 4.362, 4.816, 5.269], atol=5e-4)
     assert np.mean([equilibrium_speed(length / 22 - 5) for length in range(220, 271)]) == pytest.approx(4.135, abs=5e-4)
@@ -75,7 +73,7 @@ def test_no_equilibrium_gap_beyond_the_desired_speed(speed: float) -> None:
         equilibrium_gap(speed)
 
 
-def test_one_definition_for_numpy_torch_and_numbers() -> None:
+def test_arrays_tensors_and_floats_agree() -> None:
     generator = np.random.default_rng(0)
     speed, leader, gap = (generator.uniform(0, 15, 50), generator.uniform(0, 15, 50), generator.uniform(1, 60, 50))
     arrays = idm_acceleration(speed, leader, gap)
@@ -98,7 +96,7 @@ def test_parameters_must_be_positive(name: str) -> None:
         build_dataclass(IDMParameters, {name: 0.0}, "idm")
 
 
-def test_equals_sumos_own_idm_in_every_step(simulation: Simulation) -> None:
+def test_equals_the_idm_of_sumo_in_every_step(simulation: Simulation) -> None:
     """All-human traffic without noise, with a start-up and its shock wave; one step ahead, to 1e-12."""
     ring = Ring(length=(230, 230))
     road = ring.draw(np.random.default_rng(0))

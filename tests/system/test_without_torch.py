@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.following.made_up import write_table
+from tests.following.synthetic_pairs import write_table
 from tests.system.conftest import PLAIN
 from tests.worlds.sumo.user_networks import straight
 from unjam.errors import TRAIN_PACKAGES

@@ -1,4 +1,4 @@
-"""Drivers that are made up: what tests calibrate on."""
+"""Synthetic pairs of leader and follower, on which tests calibrate."""
 
 from pathlib import Path
 
@@ -21,15 +21,15 @@ def follower(
     seed: int = 0,
     split: str = "",
 ) -> Pair:
-    """How `driver` follows a leader whose speed goes up and down."""
+    """Return the trajectory of `driver` behind a leader whose speed oscillates."""
     times = np.arange(round(seconds / STEP) + 1) * STEP
     phase = np.random.default_rng(seed).uniform(0, 6)
     leader_speed = 8.0 + 3.0 * np.sin(0.25 * times + phase) + np.sin(0.9 * times)
     leader_path = gap + np.r_[0.0, np.cumsum(leader_speed[1:]) * STEP]
     leader = (leader_speed[:, None], leader_path[:, None])
-    driven = list(follow_leader(driver, (np.array([speed]), np.array([gap])), leader, STEP))
+    states = list(follow_leader(driver, (np.array([speed]), np.array([gap])), leader, STEP))
     speeds, gaps = (
-        np.concatenate([[first], *rows]) for first, rows in zip((speed, gap), zip(*driven, strict=True), strict=True)
+        np.concatenate([[first], *rows]) for first, rows in zip((speed, gap), zip(*states, strict=True), strict=True)
     )
     return Pair(name, name, STEP, speeds, leader_speed, gaps, "human", split)
 
@@ -37,13 +37,13 @@ def follower(
 def idm_driver(
     parameters: IDMParameters, name: str = "0", seed: int = 0, seconds: float = 40.0, split: str = ""
 ) -> Pair:
-    """How an IDM follows, from its own equilibrium gap on."""
+    """Return the trajectory of an IDM that starts with its equilibrium gap."""
     gap = equilibrium_gap(8.0, parameters)
     return follower(idm_function(parameters), name, seconds, 8.0, gap, seed, split)
 
 
 def write_table(path: Path, drivers: int = 3) -> None:
-    """Write a CSV file of trajectories as a user has them, of drivers who differ in their headway."""
+    """Write a CSV file of trajectories as a user has them, of drivers that differ in their time headway."""
     parts = []
     for number in range(drivers):
         pair = idm_driver(IDMParameters(time_headway=0.9 + 0.1 * number), seed=number, seconds=20.0)
