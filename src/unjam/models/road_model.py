@@ -40,8 +40,12 @@ from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
-from unjam.worlds.batch.figure_eight.crossing import CrossingMemory
-from unjam.worlds.batch.figure_eight.movement import commanded_speed, crossing_memories, may_follow_commands
+from unjam.worlds.batch.figure_eight.crossing import (
+    CrossingMemory,
+    commanded_speed,
+    crossing_memories,
+    may_follow_commands,
+)
 from unjam.worlds.batch.human_idm import HumanSpeedModel, human_idm_speed
 from unjam.worlds.batch.on_ramp.traffic import LearnedCorrection
 from unjam.worlds.batch.support import statistically_unsupported_reason

@@ -7,7 +7,7 @@ from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.batch.figure_eight.movement import FigureEightMovement
+from unjam.worlds.batch.figure_eight.crossing import FigureEightMovement
 from unjam.worlds.batch.leaders import Leader
 from unjam.worlds.closed_road import NOISE_BLOCK_STEPS
 from unjam.worlds.episode import run_episode

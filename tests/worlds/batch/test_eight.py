@@ -16,8 +16,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.road import ClosedRoad
 from unjam.training.config import RunConfig
-from unjam.worlds.batch.figure_eight.geometry import figure_eight_contacts
-from unjam.worlds.batch.figure_eight.movement import FigureEightMovement, crossing_memories
+from unjam.worlds.batch.figure_eight.crossing import FigureEightMovement, crossing_memories, figure_eight_contacts
 from unjam.worlds.batch.run import WARM_UP_CACHE, run_batch
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import run_episode

@@ -28,8 +28,7 @@ from unjam.worlds.batch.on_ramp.eidm import (
     eidm_speed_bounds,
     finalize_eidm_speed,
 )
-from unjam.worlds.batch.on_ramp.lane_change_context import MotorwayGeometry
-from unjam.worlds.batch.on_ramp.lane_changes import change_lanes
+from unjam.worlds.batch.on_ramp.lane_changes import MotorwayGeometry, change_lanes
 from unjam.worlds.batch.on_ramp.traffic import BatchMotorways
 from unjam.worlds.batch.on_ramp.vehicles import (
     NO_ADVICE,

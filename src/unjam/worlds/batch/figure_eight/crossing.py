@@ -1,23 +1,28 @@
-"""SUMO's right of way where figure eights cross themselves, for W roads at once.
+"""Movement of all vehicles of W figure eights: human drivers are commanded, and SUMO's right of way limits all.
 
-Arrays have shape (vehicles, W). Sources: SUMO's MSVehicle (`planMoveInternal`, `checkLinkLeader`,
+Arrays have shape (vehicles, W) or (W,). Sources: SUMO's MSVehicle (`planMoveInternal`, `checkLinkLeader`,
 `adaptToJunctionLeader`, `processLinkApproaches`, `isLeader`) and MSLink (`opened`, `blockedByFoe`,
 `computeFoeArrivalTimeBraking`, `getLeaderInfo`). A foe is a vehicle on the other direction, as in SUMO.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import partial
+from math import pi
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, square_root
-from unjam.scenarios.figure_eight import CROSSING_LINK
+from unjam.drivers.car_following import MIN_IDM_GAP
+from unjam.physics.arrays import Array, Floats, clamp_max, clamp_min, namespace, square_root
+from unjam.physics.idm import idm_acceleration
+from unjam.physics.kinematics import gap_on_loop
+from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK, figure_eight_radius, lane_lengths
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import SUMO_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.worlds.batch.figure_eight.car_following import HALTING_SPEED, CarFollowingModels, speed_after_distance
-from unjam.worlds.batch.figure_eight.geometry import CrossingSide, make_figure_eights
-from unjam.worlds.batch.human_idm import STANDSTILL_ACCELERATION, SUMO_MIN_GAP
-from unjam.worlds.batch.leaders import FREE_GAP, Leader
+from unjam.worlds.batch.human_idm import STANDSTILL_ACCELERATION, SUMO_MIN_GAP, HumanSpeedModel
+from unjam.worlds.batch.leaders import CONTACT_GAP, FREE_GAP, Leader
 from unjam.worlds.batch.noise import ArrayFactory
 
 FOE_VISIBILITY_DISTANCE = 4.5
@@ -36,6 +41,12 @@ CONFLICT_AREA_START = CROSSING_LINK / 2.0 - CROSSED_LANE_WIDTH / 2.0
 """distance from the start of the crossing to the crossed lane [m]"""
 STOPPING_FOE_DELAY = 30.0
 """additional arrival time of foes that can stop before the crossing [s]"""
+LANE_LENGTH_DIGITS = 6
+"""decimal places of lane lengths in SUMO's networks [m]"""
+CAR_WIDTH = 1.8
+"""[m]"""
+COMMANDED_SPEED_TOLERANCE = 1e-9
+"""[m/s]"""
 
 
 class CrossingMemory(NamedTuple):
@@ -47,17 +58,15 @@ class CrossingMemory(NamedTuple):
     """when each vehicle entered the crossing that it is on or was on last, in steps from now (at most 0)"""
 
 
-class _Motion(NamedTuple):
-    """The vehicles in a step, and their speed limits without the crossing."""
+class _CrossingSide(NamedTuple):
+    """One of the two directions across the crossing; shapes (W,)."""
 
-    speed: Array
-    leader: Leader
-    free_speed: Array
-    """maximum speed without other vehicles [m/s]"""
-    follow_speed: Array
-    """maximum speed behind the leader [m/s]"""
-    look_ahead: Array
-    """distance up to which vehicles look ahead [m]"""
+    start: Array
+    """position where the crossing starts [m]"""
+    lane_length: Array
+    """of the lane before it [m]"""
+    approach_distance: Array
+    """distance before it from which SUMO registers approaching vehicles [m]"""
 
 
 class _Vehicle(NamedTuple):
@@ -93,47 +102,95 @@ def _last_vehicle(speed: Array, distance_past: Array) -> _Vehicle:
     return _Vehicle(distance_past[index, columns], speed[index, columns], index)
 
 
-class Crossing:
-    """The right of way of W figure eights, with its memory."""
+def commanded_speed(speed: Array, leader_speed: Array, gap: Array, parameters: Any, step: float) -> Array:
+    """Return the commanded speeds of human drivers without noise, not clipped at 0; see `human_idm_speed`."""
+    return speed + idm_acceleration(speed, leader_speed, clamp_min(gap, MIN_IDM_GAP), parameters) * step
 
-    def __init__(self, scenario: Scenario, roads: Sequence[ClosedRoad], to_array: ArrayFactory) -> None:
-        """Take roads that cross themselves once, the direction with the right of way first."""
-        self.models = CarFollowingModels(scenario, len(roads[0].vehicle_ids), [], to_array)
-        """SUMO's car-following models of the vehicles"""
-        self._figure_eights = make_figure_eights(roads, to_array)
-        self._sumo_loop_length = self._figure_eights.loop_length
+
+class FigureEightMovement:
+    """Commands the IDM with noise to human drivers, except on the crossing, and applies the right of way."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        roads: Sequence[ClosedRoad],
+        cav_indices: list[int],
+        to_array: ArrayFactory,
+        human_model: HumanSpeedModel | None = None,
+    ) -> None:
+        """Take roads that cross themselves once, the direction with the right of way first.
+
+        Humans drive the CAVs, which have these indices, until `hand_over`. `human_model` replaces the road's IDM.
+        """
+        idm = partial(commanded_speed, parameters=scenario.humans, step=scenario.simulation_step)
+        self._human_model, self._cav_indices = human_model or idm, cav_indices
+        self._models, self._models_with_cavs = (
+            CarFollowingModels(scenario, len(roads[0].vehicle_ids), cavs, to_array) for cavs in ([], cav_indices)
+        )
         self._crossings = to_array(np.transpose([road.crossings for road in roads], (1, 2, 0)))
         self._loop_length = to_array(np.array([road.loop_length for road in roads]))
         self._step, self._impatience = scenario.simulation_step, scenario.impatience
         self._to_array, self._columns = to_array, np.arange(len(roads))
         zeros = to_array(np.zeros((len(roads[0].vehicle_ids), len(roads))))
         self.memory = CrossingMemory(zeros, zeros)
+        radius = np.array([road.drawn_values["radius"] for road in roads])
+        exact_arc = 1.5 * pi * radius
+        arc = exact_arc.round(LANE_LENGTH_DIGITS)
+        before = 2 * radius + CROSSING_LINK + 2 * INNER_LINK
+        self._sides = [  # the direction with the right of way first
+            _CrossingSide(*map(to_array, (start, radius, radius + link + arc)))
+            for start, link in ((radius, OUTER_LINK), (before + arc + radius, INNER_LINK))
+        ]
+        self._sumo_loop_length = to_array(2 * (2 * radius + CROSSING_LINK + INNER_LINK + OUTER_LINK + arc))
+        is_behind_arc = np.stack([road.start_positions for road in roads], 1) >= before + exact_arc
+        self._position_offset = to_array(np.where(is_behind_arc, arc - exact_arc, 0.0))
+        """SUMO's position of each vehicle minus that on the exact road [m]"""
 
-    def is_on_crossing(self, position: Array) -> Array:
+    def hand_over(self) -> None:
+        """Hand the CAVs over to their driver."""
+        self._models = self._models_with_cavs
+
+    def move(self, speed: Array, position: Array, leader: Leader, noise: Array, cav_speeds: Array) -> Array:
+        """Return the speeds after a step [m/s], shape (vehicles, W).
+
+        `noise` is added to each speed; `cav_speeds` are commands, shape (CAVs, W), or None if the CAVs are human.
+        """
+        commanded = clamp_min(self._human_model(speed, *leader) + noise, 0.0)
+        is_commanded = ~self._is_on_crossing(position)
+        if cav_speeds is not None:
+            commanded[self._cav_indices], is_commanded[self._cav_indices] = cav_speeds, True
+        return self._next_speeds(speed, position, leader, commanded, is_commanded)
+
+    def distances_past(self, position: Array) -> list[Array]:
+        """Return the distance of each vehicle past the start of the crossing, on both sides, wrapped to one lap [m]."""
+        sumo_position = position + self._position_offset
+        return [(sumo_position - side.start) % self._sumo_loop_length for side in self._sides]
+
+    def _is_on_crossing(self, position: Array) -> Array:
         """Return which vehicles are on the crossing, where SUMO itself drives human-driven vehicles."""
         place = position % self._loop_length
         (major_start, major_end), (minor_start, minor_end) = self._crossings
         return ((major_start <= place) & (place < major_end)) | ((minor_start <= place) & (place < minor_end))
 
-    def next_speeds(
+    def _next_speeds(
         self, speed: Array, position: Array, leader: Leader, commanded_speed: Array, is_commanded: Array
     ) -> Array:
         """Return the speeds after a step [m/s], and update the memory; arguments as of `leaders`, and commands."""
-        xp, models = namespace(speed), self.models
+        xp, models = namespace(speed), self._models
         free_speed = xp.where(is_commanded, models.clip_speed(speed, commanded_speed), models.max_speed(speed))
         look_ahead = models.look_ahead_distance(speed)
-        distances_past, (major_side, minor_side, *_) = self._figure_eights.distances_past(position), self._figure_eights
+        distances_past, (major_side, minor_side) = self.distances_past(position), self._sides
         is_visible = leader.gap <= self._visible_distance(look_ahead, distances_past)
         leader_speed = xp.where(is_visible, leader.speed, models.speed_limit)
         follow_speed = models.follow_speed(speed, leader_speed, xp.where(is_visible, leader.gap, FREE_GAP))
-        motion = _Motion(speed, leader, free_speed, follow_speed, look_ahead)
+        motion = speed, leader, free_speed, follow_speed, look_ahead
         major_last, minor_last = (_last_vehicle(speed, each) for each in distances_past)
         safe = xp.minimum(free_speed, follow_speed)
         for distance_past, foe in zip(distances_past, (minor_last, major_last), strict=True):
             safe = self._speed_on_crossing(speed, safe, distance_past, foe)
         to_major, to_minor = (self._sumo_loop_length - each for each in distances_past)
-        major = self._approach(motion, major_side, MAJOR_STOP_DISTANCE, to_major, major_last, minor_last)
-        minor = self._approach(motion, minor_side, MINOR_STOP_DISTANCE, to_minor, minor_last, major_last)
+        major = self._approach(*motion, major_side, MAJOR_STOP_DISTANCE, to_major, major_last, minor_last)
+        minor = self._approach(*motion, minor_side, MINOR_STOP_DISTANCE, to_minor, minor_last, major_last)
         safe = xp.where(major.is_approaching, major.go_speed, safe)
         safe = xp.where(minor.is_approaching, minor.stop_speed, safe)
         first = minor.distance.argmin(0), self._columns
@@ -149,18 +206,14 @@ class Crossing:
         uncommanded = uncommanded * (uncommanded > STANDSTILL_ACCELERATION * self._step)
         commanded = models.clip_speed(speed, xp.minimum(commanded_speed, safe))
         next_speed = xp.where(is_commanded, commanded, uncommanded)
-        self._update_memory(speed, next_speed, distances_past)
+        self.update_memory(speed, next_speed, distances_past)
         return next_speed
-
-    def record_step(self, speed: Array, next_speed: Array, position: Array) -> None:
-        """Update the memory after a recorded step; arguments as of `next_speeds`."""
-        self._update_memory(speed, next_speed, self._figure_eights.distances_past(position))
 
     def _visible_distance(self, look_ahead: Array, distances_past: list[Array]) -> Array:
         """Return the distance up to which leaders are visible: the end of the last lane that SUMO looks at [m]."""
         xp = namespace(look_ahead)
         visible = look_ahead + self._sumo_loop_length
-        for side, distance_past in zip(self._figure_eights[:2], distances_past, strict=True):
+        for side, distance_past in zip(self._sides, distances_past, strict=True):
             distance = self._sumo_loop_length - distance_past
             after = CROSSING_LINK + side.lane_length
             looks_past = (distance <= side.lane_length) | (distance <= look_ahead)
@@ -170,11 +223,23 @@ class Crossing:
         return xp.where(visible <= look_ahead, look_ahead + self._sumo_loop_length, visible)
 
     def _approach(
-        self, motion: _Motion, side: CrossingSide, stop_distance: float, distance: Array, last: _Vehicle, foe: _Vehicle
+        self,
+        speed: Array,
+        leader: Leader,
+        free_speed: Array,
+        follow_speed: Array,
+        look_ahead: Array,
+        side: _CrossingSide,
+        stop_distance: float,
+        distance: Array,
+        last: _Vehicle,
+        foe: _Vehicle,
     ) -> _Approach:
-        """Return the plans of all vehicles for one side, `last` being the last vehicle past its start."""
-        speed, leader, free_speed, follow_speed, look_ahead = motion
-        xp, models, speed_limit = namespace(speed), self.models, self.models.speed_limit
+        """Return the plans of all vehicles for one side, `last` being the last vehicle past its start.
+
+        `free_speed` is the maximum speed without other vehicles, `follow_speed` that behind the leader [m/s].
+        """
+        xp, models, speed_limit = namespace(speed), self._models, self._models.speed_limit
         is_approaching, is_on_lane = distance <= side.approach_distance, distance <= side.lane_length
         front = xp.where(is_on_lane, -distance, self._sumo_loop_length - distance)
         rearmost = front.argmin(0)
@@ -212,7 +277,7 @@ class Crossing:
 
     def _speed_behind_foe(self, speed: Array, distance: Array, foe: _Vehicle) -> Array:
         """Return the maximum speed of vehicles that must let a foe on the crossing pass [m/s]."""
-        xp, models, minimum_gap = namespace(speed), self.models, self.models.minimum_gap
+        xp, models, minimum_gap = namespace(speed), self._models, self._models.minimum_gap
         rear = CONFLICT_AREA_START - (foe.front - VEHICLE_LENGTH)
         to_area = distance + CONFLICT_AREA_START
         gap = to_area - rear - CROSSED_LANE_WIDTH
@@ -244,7 +309,7 @@ class Crossing:
         self, speed: Array, major: _Approach, minor: _Approach, first: tuple[Array, Array]
     ) -> tuple[Array, Array]:
         """Return whether the first yielding vehicle may enter, and whether it can still stop, (W,) each."""
-        xp, models = namespace(speed), self.models
+        xp, models = namespace(speed), self._models
         distance, arrival, leave = minor.distance[first], minor.arrival_time[first], minor.leave_time[first]
         can_brake = (distance > models.brake_gap(speed)[first]) | (models.min_speed(speed)[first] == 0.0)
         impatience = clamp_max(self._impatience + self.memory.waiting_time[first] / IMPATIENCE_TIME, 1.0)
@@ -261,7 +326,7 @@ class Crossing:
         xp, step = namespace(arrival_time), self._step
         start = xp.ceil(arrival_time / step) * step
         is_same_step = xp.floor(arrival_time / step) == xp.floor(major.arrival_time / step)
-        braking = clamp_min(self.models.braking * impatience, 1e-6)
+        braking = clamp_min(self._models.braking * impatience, 1e-6)
         duration = major.arrival_time - start
         speed_drop = duration * braking
         lost_distance = duration * speed_drop / 2.0
@@ -272,7 +337,8 @@ class Crossing:
         delay = xp.where(can_stop, STOPPING_FOE_DELAY, (final_speed - 0.5 * root) / braking)
         return xp.where(is_same_step, 0.0, delay)
 
-    def _update_memory(self, speed: Array, next_speed: Array, distances_past: list[Array]) -> None:
+    def update_memory(self, speed: Array, next_speed: Array, distances_past: list[Array]) -> None:
+        """Update the memory after a step, before which the vehicles had these `distances_past` the crossing."""
         xp, step = namespace(speed), self._step
         waits = (next_speed <= HALTING_SPEED) & (next_speed - speed <= MAX_WAITING_ACCELERATION * step)
         waiting_time, entry_step = (self.memory.waiting_time + step) * waits, self.memory.entry_step - 1.0
@@ -284,3 +350,52 @@ class Crossing:
     def restore_memory(self, memories: Sequence[CrossingMemory]) -> None:
         """Continue from the memories of the roads, shape (vehicles,) each."""
         self.memory = CrossingMemory(*(self._to_array(np.stack(each, 1)) for each in zip(*memories, strict=True)))
+
+
+def crossing_memories(scenario: Scenario, road: ClosedRoad, speeds: Floats, positions: Floats) -> CrossingMemory:
+    """Return the memory of the right of way at each step of an episode; all have the shape (steps, vehicles)."""
+    movement = FigureEightMovement(scenario, [road], [], np.asarray)
+    memories = [movement.memory]
+    for speed, next_speed, position in zip(speeds, speeds[1:], positions, strict=False):
+        movement.update_memory(speed[:, None], next_speed[:, None], movement.distances_past(position[:, None]))
+        memories.append(movement.memory)
+    return CrossingMemory(*(np.concatenate(each, 1).T for each in zip(*memories, strict=True)))
+
+
+def may_follow_commands(
+    scenario: Scenario,
+    road: ClosedRoad,
+    cav_indices: list[int],
+    memories: CrossingMemory,
+    motion: tuple[Floats, Floats],
+    commanded_speeds: Floats,
+) -> NDArray[np.bool_]:
+    """Return whether the right of way lets vehicles follow their commands; all have the shape (moments, vehicles).
+
+    `memories` are those of `crossing_memories`; `motion` is speeds [m/s] and positions [m].
+    """
+    speed, position, commanded = (each.T for each in (*motion, commanded_speeds))
+    roads = [road] * len(commanded_speeds)
+    movement = FigureEightMovement(scenario, roads, cav_indices, np.asarray, lambda *_: commanded)
+    movement.hand_over()
+    movement.restore_memory([CrossingMemory(*each) for each in zip(*memories, strict=True)])
+    gap = gap_on_loop(position, np.roll(position, -1, 0), road.loop_length, VEHICLE_LENGTH)
+    leader = Leader(np.roll(speed, -1, 0), gap)
+    moved = movement.move(speed, position, leader, 0.0, commanded[cav_indices])
+    return (np.abs(moved - commanded) < COMMANDED_SPEED_TOLERANCE).T
+
+
+def figure_eight_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
+    """Return which vehicles touch the leader on the same lane, or overlap on the crossing; see `ring_contacts`."""
+    xp, place = namespace(position), position % loop_length
+    lengths, touches = lane_lengths(figure_eight_radius(loop_length)), gap < CONTACT_GAP
+    if bool(touches.any()):
+        lane, end = 0.0 * place, 0.0
+        for length in lengths[:-1]:
+            end = end + length
+            lane = lane + (place > end)
+        touches = touches & (lane == xp.concatenate([lane[1:], lane[:1]]))
+    low, high = CROSSING_LINK / 2 - CAR_WIDTH / 2, CROSSING_LINK / 2 + CAR_WIDTH / 2 + VEHICLE_LENGTH
+    fronts = ((place - start) % loop_length for start in (lengths[0], sum(lengths[:7])))
+    first, second = ((front > low) & (front < high) for front in fronts)
+    return touches | ((first | second) & (first.any(0) & second.any(0)))

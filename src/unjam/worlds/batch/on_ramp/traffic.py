@@ -15,8 +15,7 @@ from unjam.scenarios.road import MotorwayRoad, VehicleType
 from unjam.scenarios.scenario import CruiseControl
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal
 from unjam.worlds.batch.on_ramp import eidm
-from unjam.worlds.batch.on_ramp.lane_change_context import MotorwayGeometry
-from unjam.worlds.batch.on_ramp.lane_changes import change_lanes
+from unjam.worlds.batch.on_ramp.lane_changes import MotorwayGeometry, change_lanes
 from unjam.worlds.batch.on_ramp.vehicles import (
     ADVICE_FIELDS,
     NO_ADVICE,

@@ -21,9 +21,7 @@ from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import MIN_TIME_GAP_SPEED
-from unjam.worlds.batch.figure_eight.crossing import CrossingMemory
-from unjam.worlds.batch.figure_eight.geometry import figure_eight_contacts
-from unjam.worlds.batch.figure_eight.movement import FigureEightMovement
+from unjam.worlds.batch.figure_eight.crossing import CrossingMemory, FigureEightMovement, figure_eight_contacts
 from unjam.worlds.batch.human_idm import HumanSpeedModel, human_idm_speed, human_parameters, human_ring_speed
 from unjam.worlds.batch.leaders import CONTACT_GAP, Leader, ring_contacts
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, QuickNoise, SeededNoise
