@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from unjam.learners.sac_td3 import SquashedResidualPolicy
 
 from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
@@ -23,6 +22,7 @@ from unjam.drivers.registry import driver_from_name
 from unjam.drivers.user_driver import FileDriver
 from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import InputError, MissingPartError
+from unjam.learners.sac_td3 import SquashedResidualPolicy
 from unjam.learners.settings import PolicySettings
 from unjam.learners.trpo_ppo import ResidualPolicy
 from unjam.scenarios import Ring, make_scenario
