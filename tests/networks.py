@@ -24,10 +24,10 @@ from unjam.manifest import manifest
 from unjam.scenarios import make_scenario
 from unjam.sumo_files import read_sumo_files
 from unjam.tree import pack, unpack
+from unjam.worlds.record import Trips
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.outputs import read_trips, trip_options
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.trips import Trips
 
 ONE = "--one"
 ANY_CLASS: dict[str, str] = defaultdict(lambda: "passenger")

@@ -15,8 +15,8 @@ from unjam.measures.metrics import METRICS, measure
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import Audit, FollowingStatistics, following_statistics
 from unjam.worlds.closed_road import loop_neighbors, loop_state
-from unjam.worlds.episode_reward import episode_reward_terms
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode
+from unjam.worlds.reward import episode_reward_terms
 
 LENGTH = 200.0
 LIMIT = 8.0

@@ -21,8 +21,7 @@ from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
-from unjam.worlds.episode_reward import validate_reward_terms
-from unjam.worlds.reward import Outcome, make_reward, time_gap
+from unjam.worlds.reward import Outcome, make_reward, time_gap, validate_reward_terms
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.backends import Backend
 from unjam.worlds.sumo.sandboxed import open_simulation

@@ -9,10 +9,8 @@ import numpy as np
 
 from unjam.measures.feasibility import feasibility
 from unjam.worlds.audit import BRAKING_THRESHOLDS, OVERRIDE_TOLERANCE, BrakingStatistics
-from unjam.worlds.episode_reward import MAX_REWARD_CELLS, episode_reward_terms
-from unjam.worlds.record import Episode, Floats, Trajectory
-from unjam.worlds.reward import eq16_reward
-from unjam.worlds.trips import VEHICLE_GROUPS
+from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats, Trajectory
+from unjam.worlds.reward import MAX_REWARD_CELLS, episode_reward_terms, eq16_reward
 
 STEADY_STATE_STEPS = 1000
 """control steps at the end of an episode that count as steady state; of a shorter episode, its second half"""

@@ -14,9 +14,8 @@ from unjam.errors import EpisodeError, InputError, NoCavError, SumoInputError, U
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork
 from unjam.worlds.drive import drive_world
-from unjam.worlds.episode_reward import episode_reward_terms
 from unjam.worlds.record import Episode
-from unjam.worlds.reward import Reward, make_reward
+from unjam.worlds.reward import Reward, episode_reward_terms, make_reward
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.sandboxed import open_simulation
 from unjam.worlds.sumo.simulation import Simulation

@@ -1,13 +1,16 @@
 """Rewards as sums of named terms, used both in the environment and in the learned model."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from sys import float_info
 from typing import NamedTuple
 
+import numpy as np
+
 from unjam.drivers.user_driver import FileReference, is_file_reference
-from unjam.errors import invalid_value, unknown_name
+from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import split_parameters
-from unjam.physics.arrays import Array, clamp_min, namespace, square_root
+from unjam.physics.arrays import Array, Floats, clamp_min, namespace, square_root
+from unjam.worlds.record import Trajectory
 
 DESIRED_SPEED = 30.0
 """v_des of Eq. 16 [m/s]"""
@@ -25,6 +28,8 @@ MIN_CRASH_BACKLOG = 200
 """minimum number of vehicles that a crash stops, as more would enter: about 160 (3,700 veh/h for 154 s) drive there"""
 STANDSTILL_SPEED = 1e-3
 """lower limit of the speed in time gaps [m/s]"""
+MAX_REWARD_CELLS = 4_000_000
+"""control steps times vehicles in one call of a reward function: hours of traffic need not be in memory at once"""
 
 
 class Outcome(NamedTuple):
@@ -194,3 +199,54 @@ def _user_reward(name: str) -> Reward:
         return terms if isinstance(terms, dict) else {"reward": terms}
 
     return user_reward
+
+
+def episode_reward_terms(
+    reward: Reward, speeds: Floats, trajectories: Sequence[Trajectory], has_crashed: bool, backlog: Floats
+) -> dict[str, Floats]:
+    """Return the terms of a reward in a whole episode, each of shape (T,); raise `InputError` if one is invalid.
+
+    Speeds are those of all vehicles, shape (T + 1, N), trajectories those of CAVs. `has_crashed`: a collision ended the
+    last control step. The insertion backlog has shape (T + 1,), or (0,) if there is none.
+    """
+    steps, rows = len(speeds) - 1, max(1, MAX_REWARD_CELLS // max(1, speeds.shape[1]))
+    parts = [slice(start, min(start + rows, steps)) for start in range(0, max(steps, 1), rows)]
+    terms = [
+        validate_reward_terms(
+            reward(_step_outcomes(speeds, trajectories, has_crashed and part.stop == steps, backlog, part)), part
+        )
+        for part in parts
+    ]
+    return {name: np.concatenate([each[name] for each in terms]) for name in terms[0]}
+
+
+def _step_outcomes(
+    speeds: Floats, trajectories: Sequence[Trajectory], has_crashed: bool, backlog: Floats, step_range: slice
+) -> Outcome:
+    first, end = step_range.start, step_range.stop
+    size = end - first
+    cavs = [each for each in trajectories if each.step_slice.start < end and first < each.step_slice.stop]
+    accelerations, time_gaps = (np.full((size, len(cavs)), np.nan) for _ in range(2))
+    for column, cav in enumerate(cavs):
+        start, stop = max(cav.start_step, first), min(cav.step_slice.stop, end)
+        rows, steps = slice(start - first, stop - first), slice(start - cav.start_step, stop - cav.start_step)
+        accelerations[rows, column] = cav.applied_acceleration[steps]
+        after = slice(steps.start + 1, steps.stop + 1)
+        time_gaps[rows, column] = time_gap(cav.states.leader_gap[after], cav.states.speed[after])
+    crashed = np.zeros(size, bool)
+    crashed[-1:] = has_crashed
+    waiting = backlog[1:][step_range] if len(backlog) else np.zeros(size)
+    # Column-major: the rounding of sums over vehicles depends on the order in memory.
+    return Outcome(np.asfortranarray(speeds[1:][step_range]), accelerations, time_gaps, crashed, waiting)
+
+
+def validate_reward_terms(terms: dict[str, Floats], step_range: slice) -> dict[str, Floats]:
+    """Return a reward's terms; raise `InputError` unless each is finite and has one value per control step."""
+    rows = step_range.stop - step_range.start
+    for name, values in terms.items():
+        if np.shape(values) != (rows,):
+            raise InputError(f"reward: term {name!r} has shape {np.shape(values)}; allowed: ({rows},)")
+        if not np.isfinite(values).all():
+            row = int(np.argmax(~np.isfinite(values)))
+            raise InputError(f"reward: step {step_range.start + row}: term {name!r} is {values[row]}; allowed: finite")
+    return {name: np.asarray(values, np.float64) for name, values in terms.items()}

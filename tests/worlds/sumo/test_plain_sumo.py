@@ -17,11 +17,10 @@ from unjam.drivers import Human
 from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, Trips
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.outputs import read_trips, trip_options
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.trips import Trips
 
 TYPES = """<vType id="car" sigma="0.6"/><vType id="truck" vClass="truck" accel="0.8" maxSpeed="22"/>
 <vType id="bus" vClass="bus" personCapacity="40"/>

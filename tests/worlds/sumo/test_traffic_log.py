@@ -14,12 +14,11 @@ from unjam.measures.metrics import measure
 from unjam.reports.figures import lane_map_figure
 from unjam.reports.html import replay_data
 from unjam.reports.results import pack_episode, to_plot_episode, unpack_episode
-from unjam.worlds import episode_reward
-from unjam.worlds.episode_reward import episode_reward_terms
+from unjam.worlds import reward
 from unjam.worlds.record import Episode
-from unjam.worlds.reward import REWARDS, make_reward
-from unjam.worlds.sumo import traffic_log
-from unjam.worlds.sumo.traffic_log import TrafficLog
+from unjam.worlds.reward import REWARDS, episode_reward_terms, make_reward
+from unjam.worlds.sumo import open_log
+from unjam.worlds.sumo.open_log import TrafficLog
 
 Stays = list[tuple[int, int]]
 """of each vehicle its first moment, and how many more it stays"""
@@ -29,10 +28,10 @@ Stays = list[tuple[int, int]]
 def small() -> Iterator[None]:
     """Limits that a minute of traffic is beyond."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(traffic_log, "MAX_UNSHARED_CELLS", 1000)
-        patch.setattr(traffic_log, "MAX_SNAPSHOT_VEHICLES", 1500)
-        patch.setattr(traffic_log, "SHARED_COLUMN_FRAMES", 20)
-        patch.setattr(episode_reward, "MAX_REWARD_CELLS", 500)
+        patch.setattr(open_log, "MAX_UNSHARED_CELLS", 1000)
+        patch.setattr(open_log, "MAX_SNAPSHOT_VEHICLES", 1500)
+        patch.setattr(open_log, "SHARED_COLUMN_FRAMES", 20)
+        patch.setattr(reward, "MAX_REWARD_CELLS", 500)
         yield
 
 
@@ -50,8 +49,8 @@ def thinned(whole: Episode, small: None) -> Episode:
 def test_every_speed_is_in_a_column_of_its_group(stays: Stays, most: int) -> None:
     moments = max((first + more for first, more in stays), default=0) + 1
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(traffic_log, "MAX_UNSHARED_CELLS", 0)
-        patch.setattr(traffic_log, "MAX_SNAPSHOT_VEHICLES", most)
+        patch.setattr(open_log, "MAX_UNSHARED_CELLS", 0)
+        patch.setattr(open_log, "MAX_SNAPSHOT_VEHICLES", most)
         log = TrafficLog()
         for time in range(moments):
             there = [number for number, (first, more) in enumerate(stays) if first <= time <= first + more]
@@ -119,11 +118,11 @@ def test_figures_of_thinned_snapshots_show_the_remaining_moments(whole: Episode,
 
 
 def test_a_reward_computed_in_parts_is_the_same(whole: Episode, small: None) -> None:
-    assert whole.speeds.size > episode_reward.MAX_REWARD_CELLS
+    assert whole.speeds.size > reward.MAX_REWARD_CELLS
     seen = (whole.speeds, whole.trajectories, False, whole.backlog)
     parts = {name: episode_reward_terms(make_reward(f"{name}:time_gap=1,comfort=1"), *seen) for name in REWARDS}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(episode_reward, "MAX_REWARD_CELLS", 10**9)
+        patch.setattr(reward, "MAX_REWARD_CELLS", 10**9)
         at_once = {name: episode_reward_terms(make_reward(f"{name}:time_gap=1,comfort=1"), *seen) for name in REWARDS}
     for name, terms in at_once.items():
         assert terms.keys() == parts[name].keys()

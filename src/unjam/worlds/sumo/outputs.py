@@ -7,9 +7,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from unjam.worlds.record import SumoWarning
+from unjam.worlds.record import SumoWarning, Trips
 from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
-from unjam.worlds.trips import Trips
 
 NOT_ARRIVED = -1.0
 TRIP_TIME_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival"

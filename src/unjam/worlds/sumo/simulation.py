@@ -1,36 +1,50 @@
-"""A SUMO simulation: start, read, command, step."""
+"""A SUMO simulation: start, read, command, step; and how vehicles carry out commands."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from itertools import starmap
 from pathlib import Path
 from tempfile import gettempdir
 from threading import Lock
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, SumoInputError, invalid_value
 from unjam.processes import PrivateFolder, capture_stderr
+from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import file_stamp, write_harmless_copy
-from unjam.worlds.record import SumoWarning
+from unjam.worlds.record import SumoWarning, Trips
 from unjam.worlds.sumo.backends import Backend, Libsumo, NeighborStates, Traci, sumo_function
-from unjam.worlds.sumo.control import VehicleControl
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.networks import UNCONTROLLED_LINK_STATES, NetworkLane, last_error_message, sumo_program
 from unjam.worlds.sumo.outputs import MAX_EXAMPLES_OPTION, read_trips, read_warnings, trip_options
-from unjam.worlds.trips import Trips
 
 MIN_CONTACT_OVERLAP = 0.01
 """overlap that is not a rounding error [m]"""
+SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
+"""SUMO's speed mode for each kind of actuation: bit 0 is the check for a safe speed"""
+SAFE_SPEED_BIT = 1
+"""the bit that stays without right of way: surprised vehicles still stop"""
+ACCELERATION_LIMIT_BITS = 2 | 4
+"""bits by which vehicles keep the acceleration and deceleration limits of their type"""
 _consume = deque(maxlen=0).extend
 """exhausts an iterator in C: a loop would take as long as the calls"""
 
 
-class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
+class VehicleLimits(NamedTuple):
+    """Maximum acceleration, comfortable deceleration and maximum deceleration of a vehicle [m/s2]."""
+
+    acceleration: float
+    deceleration: float
+    emergency_deceleration: float
+
+
+class Simulation(AbstractContextManager["Simulation"]):
     """One SUMO simulation, loaded again for each episode.
 
     libsumo holds one simulation per process and silently replaces the first by a second. So this class
@@ -69,13 +83,26 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
     def _bind(self) -> None:
         self._sumo: Any = self._library.functions
         call = partial(sumo_function, self._sumo)
-        self._get_speed = call("vehicle", "getSpeed")
-        self._get_distance = call("vehicle", "getDistance")
+        self._get_speed, self._get_lane = call("vehicle", "getSpeed"), call("vehicle", "getLaneID")
         self._get_lane_position = call("vehicle", "getLanePosition")
-        self._get_lane = call("vehicle", "getLaneID")
-        self._get_fuel = call("vehicle", "getFuelConsumption")
-        self._set_speed = call("vehicle", "setSpeed")
-        self._set_previous_speed = call("vehicle", "setPreviousSpeed")
+        self._set_speed, self._set_previous_speed = call("vehicle", "setSpeed"), call("vehicle", "setPreviousSpeed")
+
+        def call_for_each(name: str) -> Callable[[Sequence[str]], list[float]]:
+            function = call("vehicle", name)
+            return lambda ids: list(map(function, ids))
+
+        self.speeds = call_for_each("getSpeed")
+        """speeds of vehicles [m/s]"""
+        self.lane_offsets = call_for_each("getLanePosition")
+        """positions of vehicles along their lanes [m]"""
+        self.distances = call_for_each("getDistance")
+        """distances that vehicles have driven since their entry [m]"""
+        self.allowed_speeds = call_for_each("getAllowedSpeed")
+        """speeds that the road allows to vehicles [m/s]"""
+        self.fuel = call_for_each("getFuelConsumption")
+        """fuel rates of vehicles in the last step [mg/s], by their emission class"""
+        self.now: Callable[[], float] = call("simulation", "getTime")
+        """SUMO's time [s]"""
         self.max_speed: Callable[[str], float] = call("vehicle", "getMaxSpeed")
         """maximum speed of a vehicle, whatever the road allows [m/s]"""
         self.set_max_speed: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
@@ -96,10 +123,6 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
         self.vehicles_on_loop: Callable[[str], Sequence[Any]] = call("inductionloop", "getVehicleData")
         """vehicles on a loop in the last step: (name, length, entry time, exit time or -1, type)"""
         self.pending_vehicles: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
-
-    def now(self) -> float:
-        """Return SUMO's time [s]."""
-        return float(self._sumo.simulation.getTime())
 
     def has_refused(self) -> bool:
         """Return whether a step of this episode has failed: SUMO refuses later content of a file."""
@@ -154,14 +177,6 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
             self._harmless_copies[path] = stamps, copy
         return str(copy)
 
-    def speeds(self, ids: Sequence[str]) -> list[float]:
-        """Return the vehicles' speeds [m/s]."""
-        return list(map(self._get_speed, ids))
-
-    def lane_offsets(self, ids: Sequence[str]) -> list[float]:
-        """Return the vehicles' positions along their lanes [m]."""
-        return list(map(self._get_lane_position, ids))
-
     def poses(self, ids: Sequence[str]) -> NDArray[np.float64]:
         """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""
         vehicle = self._sumo.vehicle
@@ -201,10 +216,6 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
         """Return the vehicles' desired speeds over the speed limit, and their maximum speeds [m/s]."""
         return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.max_speed, ids), strict=True))
 
-    def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
-        """Return the speeds that the road allows to the vehicles [m/s]."""
-        return [self._sumo.vehicle.getAllowedSpeed(name) for name in ids]
-
     def neighbors(self, name: str, max_distance: float) -> NeighborStates:
         """Return a vehicle's neighbors as SUMO sees them.
 
@@ -232,14 +243,6 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
         """Return SUMO's number of teleports since its start."""
         return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
 
-    def distances(self, ids: Sequence[str]) -> list[float]:
-        """Return the distances that the vehicles have driven since their entry [m]."""
-        return list(map(self._get_distance, ids))
-
-    def fuel(self, ids: Sequence[str]) -> list[float]:
-        """Return the vehicles' fuel rates in the last step [mg/s], by their emission class."""
-        return list(map(self._get_fuel, ids))
-
     def command_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Command the vehicles' speeds after the next step [m/s]: plain floats."""
         _consume(starmap(self._set_speed, zip(ids, speeds, strict=True)))
@@ -247,6 +250,59 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
     def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Replace the vehicles' current speeds [m/s], plain floats: this adds noise."""
         _consume(map(self._set_previous_speed, ids, speeds))
+
+    def command_humans(self, ids: Iterable[str], right_of_way: bool, has_acceleration_limits: bool) -> None:
+        """Set which of SUMO's checks apply to commanded human-driven vehicles; their speed is always safe."""
+        mode = _speed_mode("flow", right_of_way) | (ACCELERATION_LIMIT_BITS if has_acceleration_limits else 0)
+        for name in ids:
+            self._sumo.vehicle.setSpeedMode(name, mode)
+
+    def change_type(self, name: str, kind: str, is_modified_later: bool = False) -> None:
+        """Change the type of a vehicle without changing its speed factor, which SUMO would draw again.
+
+        SUMO also draws it again when a property of the vehicle itself changes for the first time. With
+        `is_modified_later`, this change is made here.
+        """
+        vehicle = self._sumo.vehicle
+        factor = vehicle.getSpeedFactor(name)
+        vehicle.setType(name, kind)
+        if is_modified_later:
+            vehicle.setMaxSpeed(name, vehicle.getMaxSpeed(name))
+        vehicle.setSpeedFactor(name, factor)
+
+    def type_of(self, name: str) -> str:
+        """Return a vehicle's type, without the suffix that SUMO adds when properties of one vehicle change."""
+        return self._sumo.vehicle.getTypeID(name).removesuffix(f"@{name}")
+
+    def type_limits(self, kind: str) -> VehicleLimits:
+        """Return the acceleration limits of a vehicle type."""
+        types = self._sumo.vehicletype
+        return VehicleLimits(types.getAccel(kind), types.getDecel(kind), types.getEmergencyDecel(kind))
+
+    def limit_braking(self, kind: str, max_braking: float) -> None:
+        """Limit the braking of a vehicle type [m/s2]."""
+        types = self._sumo.vehicletype
+        for set_limit in (types.setDecel, types.setEmergencyDecel, types.setApparentDecel):
+            set_limit(kind, max_braking)
+
+    def take_control(
+        self,
+        ids: Iterable[str],
+        actuation: Actuation,
+        right_of_way: bool = True,
+        type_template: str = "cav",
+        parameters: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        """Make vehicles CAVs, which obey `command_speeds`, with or without right of way.
+
+        Their new type is `type_template`, in which `{}` stands for the old one. `parameters` are further parameters of
+        the vehicles, by SUMO's names.
+        """
+        for name in ids:
+            self.change_type(name, type_template.format(self.type_of(name)), actuation == "cruise")
+            self._sumo.vehicle.setSpeedMode(name, _speed_mode(actuation, right_of_way))
+            for key, value in parameters.items():
+                self._sumo.vehicle.setParameter(name, key, value)
 
     def end_with_trips(self, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
         """End the episode, so that SUMO writes its last records, and return the trips as `read_trips` does."""
@@ -271,3 +327,7 @@ class Simulation(VehicleControl, AbstractContextManager["Simulation"]):
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+def _speed_mode(actuation: Actuation, right_of_way: bool) -> int:
+    return SPEED_MODES[actuation] if right_of_way else SPEED_MODES[actuation] & SAFE_SPEED_BIT

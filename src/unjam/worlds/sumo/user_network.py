@@ -17,11 +17,11 @@ from unjam.drivers.safety import FollowingState
 from unjam.scenarios.road import UserNetworkRoad
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.backends import NeighborStates
-from unjam.worlds.sumo.control import VehicleLimits
 from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, CAV_TYPE_TEMPLATE, vehicle_class_by_type
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
 from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.sections import RoadsideService
+from unjam.worlds.sumo.simulation import VehicleLimits
 from unjam.worlds.world import DriverLog
 
 SAFETY_FILTER_RANGE = 400.0
