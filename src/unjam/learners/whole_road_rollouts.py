@@ -1,4 +1,4 @@
-"""Model rollouts on whole roads: closed ones drive on from recorded states, on-ramps are driven again."""
+"""Model rollouts on whole roads: closed roads continue from recorded states, on-ramps are replayed from the start."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
