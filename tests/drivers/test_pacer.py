@@ -7,12 +7,12 @@ from unjam.drivers import LocalState, Pacer
 from unjam.drivers.road_experts import TUNED_PACERS
 
 
-def state(gap: float, place: float = 0.0, loop: float = 450.0, speed: float = 0.0) -> LocalState:
-    values = (speed, 0.0, gap, 0.0, 5.0, place * loop, loop)
+def state(gap: float, lap_fraction: float = 0.0, loop: float = 450.0, speed: float = 0.0) -> LocalState:
+    values = (speed, 0.0, gap, 0.0, 5.0, lap_fraction * loop, loop)
     return LocalState(*(np.array([value]) for value in values))
 
 
-def wanted(driver: Pacer, *states: LocalState) -> float:
+def commanded_speed(driver: Pacer, *states: LocalState) -> float:
     memory = driver.initial_memory(1)
     acceleration = np.zeros(1)
     for entry in states:
@@ -20,61 +20,65 @@ def wanted(driver: Pacer, *states: LocalState) -> float:
     return float(acceleration[0] * driver.time_constant + states[-1].speed[0])
 
 
-def at(harmonics: tuple[float, ...], place: float) -> float:
+def pace_at(harmonics: tuple[float, ...], lap_fraction: float) -> float:
     mean, a1, b1, a2, b2 = harmonics
-    x = 2 * pi * place
+    x = 2 * pi * lap_fraction
     return mean + a1 * np.cos(x) + b1 * np.sin(x) + a2 * np.cos(2 * x) + b2 * np.sin(2 * x)
 
 
 def test_drives_slowly_until_the_road_ahead_is_free() -> None:
-    assert wanted(Pacer(), state(gap=0.39 * 450)) == pytest.approx(2.0)
+    assert commanded_speed(Pacer(), state(gap=0.39 * 450)) == pytest.approx(2.0)
 
 
 def test_then_drives_a_lap_in_its_time() -> None:
-    assert wanted(Pacer(lap_time=70), state(gap=0.41 * 450)) == pytest.approx(450 / 70)
+    assert commanded_speed(Pacer(lap_time=70), state(gap=0.41 * 450)) == pytest.approx(450 / 70)
 
 
 def test_keeps_its_pace_once_all_have_gathered() -> None:
-    assert wanted(Pacer(lap_time=70), state(gap=200.0), state(gap=10.0)) == pytest.approx(450 / 70)
+    assert commanded_speed(Pacer(lap_time=70), state(gap=200.0), state(gap=10.0)) == pytest.approx(450 / 70)
 
 
-@pytest.mark.parametrize("place", [0.0, 0.1, 0.25, 0.7])
-def test_pace_varies_over_the_lap_as_its_harmonics_say(place: float) -> None:
+@pytest.mark.parametrize("lap_fraction", [0.0, 0.1, 0.25, 0.7])
+def test_pace_varies_over_the_lap_as_its_harmonics_say(lap_fraction: float) -> None:
     harmonics = (7.0, -0.8, 0.7, -1.3, 0.2)
-    found = wanted(Pacer(harmonics=harmonics), state(gap=200.0, place=place))
-    assert found == pytest.approx(at(harmonics, place))
+    found = commanded_speed(Pacer(harmonics=harmonics), state(gap=200.0, lap_fraction=lap_fraction))
+    assert found == pytest.approx(pace_at(harmonics, lap_fraction))
 
 
 @pytest.mark.parametrize(("gap", "faster"), [(270.0, 0.9), (225.0, 0.0), (180.0, -0.9)])
 def test_drives_faster_where_more_of_the_lap_is_free(gap: float, faster: float) -> None:
     pacer = Pacer(lap_time=70, gap_gain=0.02, target_gap=0.5)
-    assert wanted(pacer, state(gap=gap)) == pytest.approx(450 / 70 + faster)
+    assert commanded_speed(pacer, state(gap=gap)) == pytest.approx(450 / 70 + faster)
 
 
 def test_never_stands_still_however_little_is_free() -> None:
     pacer = Pacer(lap_time=70, gap_gain=1.0, target_gap=0.9)
-    assert wanted(pacer, state(gap=200.0)) == pytest.approx(1.0)
+    assert commanded_speed(pacer, state(gap=200.0)) == pytest.approx(1.0)
 
 
 def test_waits_anew_when_the_queue_is_broken() -> None:
     pacer = Pacer(lap_time=70, gathering_gap=0.5, regathering_gap=0.4)
     together, longer, broken = (state(gap=share * 450) for share in (0.55, 0.45, 0.35))
-    assert wanted(pacer, together, longer) == pytest.approx(450 / 70)
-    assert wanted(pacer, together, broken) == pytest.approx(2.0)
-    assert wanted(pacer, together, broken, longer) == pytest.approx(2.0)
-    assert wanted(pacer, together, broken, together) == pytest.approx(450 / 70)
+    assert commanded_speed(pacer, together, longer) == pytest.approx(450 / 70)
+    assert commanded_speed(pacer, together, broken) == pytest.approx(2.0)
+    assert commanded_speed(pacer, together, broken, longer) == pytest.approx(2.0)
+    assert commanded_speed(pacer, together, broken, together) == pytest.approx(450 / 70)
 
 
 @pytest.mark.parametrize("lap", TUNED_PACERS)
 def test_varying_is_the_pacer_that_was_tuned_for_the_nearest_lap(lap: float) -> None:
-    here = state(gap=0.52 * lap, place=0.3, loop=lap + 2.0)
-    assert wanted(Pacer(use_tuned=True), here) == pytest.approx(wanted(Pacer(**TUNED_PACERS[lap]), here))
+    here = state(gap=0.52 * lap, lap_fraction=0.3, loop=lap + 2.0)
+    assert commanded_speed(Pacer(use_tuned=True), here) == pytest.approx(
+        commanded_speed(Pacer(**TUNED_PACERS[lap]), here)
+    )
 
 
 def test_varying_rows_are_each_led_at_the_pace_of_their_own_lap() -> None:
     laps = list(TUNED_PACERS)
-    one_by_one = [wanted(Pacer(use_tuned=True), state(gap=0.55 * lap, place=0.2, loop=lap)) for lap in laps]
-    first, *others = (state(gap=0.55 * lap, place=0.2, loop=lap) for lap in laps)
+    one_by_one = [
+        commanded_speed(Pacer(use_tuned=True), state(gap=0.55 * lap, lap_fraction=0.2, loop=lap)) for lap in laps
+    ]
+    first, *others = (state(gap=0.55 * lap, lap_fraction=0.2, loop=lap) for lap in laps)
     rows = first.map(lambda *columns: np.concatenate(columns), *others)
     pacer = Pacer(use_tuned=True)
     acceleration, memory = pacer.act(rows, pacer.initial_memory(len(laps)))

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from tests.measures.test_feasibility import FEASIBLE_ROW
 from unjam.measures.effect import (
     MIN_VERDICT_SEEDS,
     Effect,
@@ -17,13 +18,7 @@ from unjam.measures.effect import (
 from unjam.measures.statistics import Estimate, estimate
 
 USUAL: dict[str, Any] = {
-    "status": "completed",
-    "required_time_gap": 1.0,
-    "collisions": 0.0,
-    "min_time_gap": 0.95,
-    "cav_min_ttc": 1.5,
-    "cav_max_braking": 5.0,
-    "override_share": 0.0,
+    **FEASIBLE_ROW,
     "mean_speed": 20.0,
     "travel_time": 100.0,
     "delay": 40.0,

@@ -6,7 +6,7 @@ import pytest
 
 from unjam.measures.feasibility import FEASIBLE, feasibility, feasibility_by_driver, overall_feasibility
 
-GOOD: dict[str, Any] = {
+FEASIBLE_ROW: dict[str, Any] = {
     "status": "completed",
     "required_time_gap": 1.0,
     "collisions": 0.0,
@@ -16,7 +16,7 @@ GOOD: dict[str, Any] = {
     "override_share": 0.0,
     "human_braking_beyond_4_5": 0.0,
 }
-HUMAN = {**GOOD, "cav_max_braking": float("nan"), "human_braking_beyond_4_5": 20.0}
+HUMAN = {**FEASIBLE_ROW, "cav_max_braking": float("nan"), "human_braking_beyond_4_5": 20.0}
 
 
 @pytest.mark.parametrize(
@@ -37,30 +37,31 @@ HUMAN = {**GOOD, "cav_max_braking": float("nan"), "human_braking_beyond_4_5": 20
     ],
 )
 def test_verdict_is_the_first_violated_limit(changes: dict[str, Any], verdict: str) -> None:
-    assert feasibility({**GOOD, **changes}) == verdict
+    assert feasibility({**FEASIBLE_ROW, **changes}) == verdict
 
 
 def test_hard_human_braking_counts_only_above_the_baseline() -> None:
-    row = {**GOOD, "human_braking_beyond_4_5": 15.0}
+    row = {**FEASIBLE_ROW, "human_braking_beyond_4_5": 15.0}
     text = "human drivers brake beyond 4.5 m/s2 15 times in a million vehicle-steps"
     assert feasibility(row) == f"{text} (without CAVs: not driven)"
     assert overall_feasibility([row, row], [HUMAN]) == FEASIBLE
-    assert overall_feasibility([row, {**GOOD, "human_braking_beyond_4_5": 40.0}], [HUMAN]).startswith(
+    assert overall_feasibility([row, {**FEASIBLE_ROW, "human_braking_beyond_4_5": 40.0}], [HUMAN]).startswith(
         "human drivers brake"
     )
 
 
 def test_overall_verdict_counts_the_violating_episodes() -> None:
-    assert overall_feasibility([GOOD, {**GOOD, "min_time_gap": 0.3}, GOOD]) == "time gap 0.30 s (limit 1 s) (1 of 3)"
+    rows = [FEASIBLE_ROW, {**FEASIBLE_ROW, "min_time_gap": 0.3}, FEASIBLE_ROW]
+    assert overall_feasibility(rows) == "time gap 0.30 s (limit 1 s) (1 of 3)"
 
 
 def test_compared_results_use_their_own_baselines() -> None:
     rows = {"many: human": [HUMAN], "few: human": [{**HUMAN, "human_braking_beyond_4_5": 10.0}]}
-    driven = [{**GOOD, "human_braking_beyond_4_5": 15.0}]
+    driven = [{**FEASIBLE_ROW, "human_braking_beyond_4_5": 15.0}]
     found = feasibility_by_driver({**rows, "many: pi": driven, "few: pi": driven})
     assert found["many: pi"] == FEASIBLE
     assert found["few: pi"].endswith("(without CAVs: 10)")
 
 
 def test_human_baseline_has_no_verdict() -> None:
-    assert feasibility_by_driver({"human": [HUMAN], "pi": [GOOD]}) == {"human": "", "pi": FEASIBLE}
+    assert feasibility_by_driver({"human": [HUMAN], "pi": [FEASIBLE_ROW]}) == {"human": "", "pi": FEASIBLE}

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from tests.measures.test_feasibility import FEASIBLE_ROW
 from unjam.measures.gain import (
     MAX_GAIN,
     MIN_GAIN,
@@ -17,19 +18,12 @@ from unjam.measures.gain import (
 from unjam.measures.statistics import estimate
 
 CLOSED: dict[str, Any] = {
-    "status": "completed",
-    "required_time_gap": 1.0,
-    "collisions": 0.0,
-    "min_time_gap": 1.1,
-    "cav_min_ttc": 1.5,
-    "cav_max_braking": 3.0,
-    "override_share": 0.0,
+    **FEASIBLE_ROW,
     "mean_speed": 3.5,
     "speed_limit_ratio": 0.7,
     "travel_time": nan,
     "delay": nan,
     "outflow_veh_per_h": 1000.0,
-    "human_braking_beyond_4_5": 0.0,
 }
 
 

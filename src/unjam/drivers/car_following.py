@@ -102,14 +102,10 @@ class BCM(FormulaDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the bilateral acceleration."""
-        speed = state.speed
-        between = (state.leader_speed - speed) - (speed - state.follower_speed)
-        acceleration = (
-            self.gap_gain * (state.leader_gap - state.follower_gap)
-            + self.speed_gain * between
-            + self.desired_speed_gain * (self.desired_speed - speed)
-        )
-        return acceleration, memory
+        gaps = state.leader_gap - state.follower_gap
+        speeds = (state.leader_speed - state.speed) - (state.speed - state.follower_speed)
+        free = self.desired_speed_gain * (self.desired_speed - state.speed)
+        return self.gap_gain * gaps + self.speed_gain * speeds + free, memory
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -224,12 +220,9 @@ class FollowerStopper(FormulaDriver):
         window = slide_window(memory, state.leader_speed)
         mean = window_mean_speed(window)
         desired = mean if self.desired_speed is None else mean * 0.0 + self.desired_speed
-
         closing = xp.minimum(state.leader_speed - state.speed, state.speed * 0.0)
-        stop, follow, free = (
-            gap + closing**2 / (2.0 * deceleration)
-            for gap, deceleration in zip(self.gaps, self.decelerations, strict=True)
-        )
+        regions = zip(self.gaps, self.decelerations, strict=True)
+        stop, follow, free = (gap + closing**2 / (2.0 * deceleration) for gap, deceleration in regions)
         gap = state.leader_gap
         leading = xp.minimum(state.leader_speed, desired)
         slowing = leading * clip((gap - stop) / (follow - stop), 0.0, 1.0)

@@ -126,8 +126,6 @@ class PIFromGap(PISaturation):
         window = slide_window(memory, state.speed)
         weight = clip(1.0 - memory["steps"] * (self.time_step / self.fade_time), 0.0, 1.0)
         mean = window_mean_speed(window)
-        acceleration, command = self._acceleration_and_command(
-            mean + weight * (initial - mean), state, memory["command"]
-        )
-        fading = {"initial_speed": initial, "steps": memory["steps"] + 1.0}
-        return acceleration, {**window, "command": command, **fading}
+        mean = mean + weight * (initial - mean)
+        acceleration, command = self._acceleration_and_command(mean, state, memory["command"])
+        return acceleration, {**window, "command": command, "initial_speed": initial, "steps": memory["steps"] + 1.0}
