@@ -44,7 +44,7 @@ def test_an_acc_that_restores_its_gap_after_cut_ins_is_feasible(
 def follow(gaps: list[float], speeds: list[float]) -> FollowingStatistics:
     """Return how a batch sees the CAV on the second of two roads, behind a leader at 20 m/s, step by step."""
     roads = [OnRamp().draw(np.random.default_rng(1))] * 2
-    log = MotorwayLog(roads, entry_count=2, simulation_step=0.5, control_step=1.0, planned_duration=100.0)
+    log = MotorwayLog(roads, OnRamp())
     length = roads[0].vehicle_length
     for gap, speed in zip(gaps, speeds, strict=True):
         column = np.array([0.0, 0.0])

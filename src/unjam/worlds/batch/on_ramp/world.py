@@ -65,8 +65,7 @@ class MotorwayBatch:
         settings = replay and replay.correction, scenario.steps_per_control_step
         step, to_array = scenario.simulation_step, lambda values: values.astype(dtype)
         self._traffic = BatchMotorways(self.roads, step, self._draw_errors, to_array, *settings)
-        entry_count = max(len(road.entries) for road in self.roads)
-        self._is_cav = np.zeros((len(seeds), entry_count), bool)
+        self._is_cav = np.zeros((len(seeds), max(len(road.entries) for road in self.roads)), bool)
         for number, road in enumerate(self.roads):
             self._is_cav[number, : len(road.entries)] = [entry.name in road.cav_ids for entry in road.entries]
         first = self.roads[0]
@@ -80,8 +79,7 @@ class MotorwayBatch:
         self._is_controlled, self._has_time_gap_commands = False, False
         self._episode_noise: Floats | None = None
         """per-episode exploration noise of each road"""
-        duration = scenario.horizon * scenario.control_step
-        self._log = MotorwayLog(self.roads, entry_count, step, scenario.control_step, duration)
+        self._log = MotorwayLog(self.roads, scenario)
 
     def _draw_errors(self, shape: tuple[int, ...]) -> Floats:
         """Return noise for the errors of all drivers in this step, which each road draws itself."""
@@ -120,8 +118,7 @@ class MotorwayBatch:
 
     def advance(self, command: Command | None) -> None:
         """Simulate one control step with the same command throughout; None: the CAVs stay human."""
-        scenario, traffic, before = self.scenario, self._traffic, self._local_state.speed
-        accelerations = None
+        scenario, traffic, accelerations = self.scenario, self._traffic, None
         if self._is_controlled:
             accelerations = batch_commanded_accelerations(command, self.limits, self.cav_count, self.control_steps)
             self._set_time_gaps(command)
@@ -136,10 +133,6 @@ class MotorwayBatch:
             self._log.record_step(vehicles, leader_rows, arrived, cav_rows)
         self.control_steps += 1
         self._update_cavs()
-        after = before.copy()
-        remaining = slice(len(before)) if self.remaining_rows is None else self.remaining_rows
-        after[remaining] = self._local_state.speed[: len(after[remaining])]
-        self._log.record_accelerations((after - before) / scenario.control_step)
 
     def _set_time_gaps(self, command: Command | None) -> None:
         """Set the time gaps of the CAVs' ACCs from the first command of one on, by default that of the scenario."""
@@ -236,4 +229,4 @@ class MotorwayBatch:
 
     def record(self, driver_log: DriverLog) -> tuple[Episode, ...]:
         """Return the record of each road since the start, without rewards."""
-        return self._log.make_episodes(driver_log, self._seeds, NUMBERS_PER_ROAD)
+        return self._log.make_episodes(driver_log, self._seeds)
