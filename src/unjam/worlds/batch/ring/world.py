@@ -7,6 +7,7 @@ the first CAV of every ring, then of the second one, and so on.
 
 from collections.abc import Collection, Sequence
 from functools import reduce
+from itertools import product
 from typing import cast
 
 import numpy as np
@@ -14,19 +15,19 @@ import numpy as np
 from unjam.drivers.command import Command, batch_commanded_accelerations
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import CAVActuation, FollowingState
+from unjam.drivers.sensors import SensorReadings
 from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
 from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
-from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import MIN_TIME_GAP_SPEED
 from unjam.worlds.batch.figure_eight.crossing import CrossingMemory, FigureEightMovement, figure_eight_contacts
 from unjam.worlds.batch.human_idm import HumanSpeedModel, human_idm_speed, human_parameters, human_ring_speed
 from unjam.worlds.batch.leaders import CONTACT_GAP, Leader, ring_contacts
-from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, QuickNoise, SeededNoise
+from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, QuickNoise, SeededNoise, WorldSeeds
 from unjam.worlds.batch.ring.record import RingLog, RingResults, as_numpy
-from unjam.worlds.batch.ring.sensors import RingReadings
 from unjam.worlds.batch.ring.warm_up import WarmUpState
 from unjam.worlds.batch.support import check_batch_scenarios
 from unjam.worlds.closed_road import MAX_RECALL_SECONDS
@@ -112,8 +113,7 @@ class RingBatch:
     def _reset_log(self) -> None:
         start = as_numpy(self._position), [self._speed[:-1]], self._find_contacts
         self._log = RingLog(self._scenarios, self.roads, self._seeds, *start)
-        zeros = self._loop_lengths * 0.0
-        cav_zeros = self._cav_loop_lengths.reshape(self._shape) * 0.0
+        zeros, cav_zeros = self._loop_lengths * 0.0, self._cav_loop_lengths.reshape(self._shape) * 0.0
         self._is_running, self._has_crashed, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
         self._reward_sums, self._mean_speed_sums = dict[str, Array](), zeros
         self._min_time_gap, self._max_braking = cav_zeros + np.inf, cav_zeros
@@ -145,7 +145,6 @@ class RingBatch:
         return history
 
     def _drive_warm_up(self) -> LocalState | None:
-        """Simulate the warm-up and return the same as `start`."""
         scenario, states = self.scenario, list[LocalState]()
         max_count = round(MAX_RECALL_SECONDS / scenario.control_step)
         for remaining in range(scenario.warmup, 0, -1):
@@ -172,7 +171,6 @@ class RingBatch:
         return states
 
     def _restore(self, states: Sequence[WarmUpState]) -> LocalState | None:
-        """Continue from the states of the rings, and return the same as `start`."""
         *motion, noise, histories, memories = zip(*states, strict=True)
         arrays = (self._to_array(np.stack(each, -1)) for each in motion)
         self._speed, self._position, self._gap, self._has_crashed = arrays
@@ -190,12 +188,12 @@ class RingBatch:
 
     def local_state(self) -> LocalState:
         """Return what the CAVs observe now: arrays of shape (CAVs * W,)."""
-        state = self._exact_state()  # parts of which belong to the world
-        state = state.as_read_only() if isinstance(state.speed, np.ndarray) else state
+        state = self._exact_state()
+        if isinstance(state.speed, np.ndarray):  # parts of which belong to the world
+            state = state.as_read_only()
         return self._readings.read_for_drivers(self.control_steps, state)
 
     def _exact_state(self) -> LocalState:
-        """Return the readings of exact sensors of the CAVs."""
         loop, position = self._cav_loop_lengths, self._rows_of(self._position, self._cav_indices)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
         distances = [(start - position) % loop for start in self._crossing_starts]
@@ -210,10 +208,8 @@ class RingBatch:
         )
 
     def _following_state(self) -> FollowingState:
-        """Return the exact inputs of the CAVs' safety filters."""
-        speed, own = self._speed, self._cav_indices
-        leader_speed = self._rows_of(speed, self._leader_indices)
-        return FollowingState(self._rows_of(speed, own), leader_speed, self._rows_of(self._gap, own))
+        own, leader_speed = self._cav_indices, self._rows_of(self._speed, self._leader_indices)
+        return FollowingState(self._rows_of(self._speed, own), leader_speed, self._rows_of(self._gap, own))
 
     def _rows_of(self, values: Array, indices: list[int]) -> Array:
         """Return the values of some vehicles of all rings, shape (CAVs * W,)."""
@@ -295,7 +291,6 @@ class RingBatch:
         return moved, moved
 
     def _update_min_time_gap(self, state: FollowingState) -> Array:
-        """Return the minimum of the time gaps so far and those now, shape (CAVs, W)."""
         speed, gap = (each.reshape(self._shape) for each in (state.speed, state.gap))
         xp, is_counted = namespace(speed), (speed > MIN_TIME_GAP_SPEED) * (self._is_running > 0)
         time_gaps = xp.minimum(self._min_time_gap, gap / clamp_min(speed, MIN_TIME_GAP_SPEED))
@@ -320,3 +315,39 @@ class RingBatch:
             max_braking=as_numpy(self._max_braking).max(0),
             episodes=self._log.make_episodes(steps, crashed, driver_log, rate) if self._keep_record else (),
         )
+
+
+class RingReadings:
+    """Readings of W rings; each ring has its own generators and calls them in the same order as SUMO's worlds."""
+
+    def __init__(self, scenario: Scenario, cav_ids: Sequence[str], seeds: WorldSeeds, to_array: ArrayFactory) -> None:
+        sensors, braking = scenario.sensors, scenario.safety.leader_braking
+        self._ring_readings = [
+            SensorReadings(sensors, braking, scenario.simulation_step, seed)
+            for *_, seed in (() if sensors.is_exact else seeds)
+        ]
+        self._cav_ids, self._to_array, self._shape = cav_ids, to_array, (len(cav_ids), len(seeds))
+        self._cached_readings: tuple[int, LocalState] | None = None
+
+    def read_for_drivers(self, step_index: int, true_state: LocalState) -> LocalState:
+        """Return the drivers' readings of the true state, the same for all calls in a control step."""
+        if not self._ring_readings:
+            return true_state
+        if self._cached_readings is None or self._cached_readings[0] != step_index:
+            true = true_state.map(lambda values: as_numpy(values).reshape(self._shape))
+            first, *others = (
+                readings.read_for_driver(self._cav_ids, true.select(np.s_[:, ring]))
+                for ring, readings in enumerate(self._ring_readings)
+            )
+            read = first.map(lambda *values: self._to_array(np.stack(values, 1).reshape(-1)), *others)
+            self._cached_readings = step_index, read
+        return self._cached_readings[1]
+
+    def read_for_filters(self, true_state: FollowingState) -> FollowingState:
+        """Return the safety filters' readings of the true state, for one call in each simulation step."""
+        if not self._ring_readings:
+            return true_state
+        cavs = product(self._cav_ids, self._ring_readings)
+        rows = np.stack([as_numpy(values) for values in true_state], 1).tolist()
+        read = [ring.read_for_filter(name, FollowingState(*row)) for (name, ring), row in zip(cavs, rows, strict=True)]
+        return FollowingState(*self._to_array(np.array(read).T))
