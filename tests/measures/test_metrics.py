@@ -322,7 +322,7 @@ def test_failed_episode_has_a_reason_and_no_metrics() -> None:
 def test_row_has_facts_drawn_values_and_every_metric() -> None:
     row = measure(episode_of(steady(4.0), seed=(7, 1)))
     about = {
-        "seed",
+        *("seed", "sumo_seed"),
         "status",
         "reason",
         "error",

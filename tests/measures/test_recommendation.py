@@ -99,8 +99,24 @@ def test_without_tested_controllers_nothing_is_recommended_or_plotted() -> None:
     worse = AccResult(0.1, replace(GOOD, travel_time=between(1.0, 2.0)))
     assert assessment_headline([], [worse, ACC_CHANGES_NOTHING]) == (
         "No controller is recommended on this road: none was tested, or all were rejected before the test. "
-        "ACC vehicles alone lengthen travel time."
+        "ACC vehicles alone lengthen travel time: +1.5 [+1.0, +2.0] s (+1.5 %) at 10 %."
     )
+
+
+def test_few_test_seeds_show_nothing_of_acc_vehicles() -> None:
+    few = AccResult(0.1, replace(GOOD, travel_time=replace(between(1.0, 2.0), count=MIN_VERDICT_SEEDS - 1)))
+    assert assessment_headline([], [few]).endswith(" ACC vehicles alone have fewer than 10 test seeds.")
+    assert "is not shown to differ (9 test seeds are too few)" in few.summary
+
+
+def test_infeasible_acc_vehicles_are_reported() -> None:
+    braking = AccResult(0.1, replace(GOOD, feasibility="brakes with 7.0 m/s2"))
+    assert braking.summary.endswith(" They are infeasible themselves: brakes with 7.0 m/s2.")
+
+
+def test_controller_that_changes_nothing_is_reported() -> None:
+    idle = replace(HELPS, difference_to_acc=between(0.0, 0.0))
+    assert idle.reasons == ["it never intervened: all travel times are those of ACC vehicles alone"]
 
 
 def test_missing_verdict_has_interval_width_and_missing_seeds() -> None:

@@ -89,6 +89,10 @@ def drive_command(
                 seeds = f"{count} paired seed{'' if count == 1 else 's'}"
                 console.print(f"{label} compared with human drivers, {seeds}: {effect.summary}", soft_wrap=True)
         print_notes(result.notes)
+        if scenario.endswith(".sumocfg"):
+            first = next(iter(result.rows.values()))[0]
+            command = f"sumo -c {scenario} --seed {first['sumo_seed']}"
+            print_notes([f"plain SUMO has the traffic of seed {first['seed']} without CAVs: {command}"])
         if result.report is not None:
             err_console.print(f"report: {result.report}")
         suggest_after_drive(scenario, driver, changes, reward)

@@ -9,6 +9,7 @@ below 0.5 % is no gain and no harm.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite, nan
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -129,10 +130,8 @@ def effect_of(
     seeds = {str(row["seed"]) for row in rows}
     baseline = [row for row in baseline if str(row["seed"]) in seeds]
     ran, baseline_ran = ([row for row in each if row["status"] != "failed"] for each in (rows, baseline))
-    differences = (
-        paired_difference(rows, baseline, name, confidence)
-        for name in (TIME_METRIC, FLOW_METRIC, FUEL_METRIC, HARD_BRAKING_METRIC)
-    )
+    metrics = TIME_METRIC, FLOW_METRIC, FUEL_METRIC, HARD_BRAKING_METRIC
+    differences = (paired_difference(rows, baseline, name, confidence) for name in metrics)
     teleports, baseline_teleports = (sum(row.get("teleports", 0) for row in each) for each in (rows, baseline))
     return Effect(
         *differences,
@@ -239,17 +238,26 @@ class AccResult:
     """additional test seeds that a verdict needs"""
 
     @property
+    def has_enough_seeds(self) -> bool:
+        """Whether the CI has enough seeds for a finding."""
+        return self.effect.travel_time.count >= MIN_VERDICT_SEEDS
+
+    @property
     def summary(self) -> str:
         """The finding as text."""
         time = self.effect.travel_time
         change = "is longer" if time.low > 0 else "is shorter" if time.high < 0 else "is not shown to differ"
-        if self.effect.is_too_small:
+        if not self.has_enough_seeds:
+            change = f"is not shown to differ ({time.count} test seeds are too few)"
+        elif self.effect.is_too_small:
             change = f"differs by {TOO_SMALL},"
         text = (
             f"ACC vehicles alone at a penetration rate of {format_percent(self.penetration_rate)}: travel time "
             f"{change} compared with the human baseline. "
             f"Differences: {self.effect.summary}{_missing_seeds_text(self.missing_seeds, time, 2)}."
         )
+        if self.effect.feasibility != FEASIBLE:
+            text += f" They are infeasible themselves: {self.effect.feasibility or 'no CAV drove'}."
         if self.property_effect is None:
             return text
         return f"{text} The properties set for CAVs change {_seconds(self.property_effect)} of travel time."
@@ -272,7 +280,9 @@ class ControllerResult:
         """Reasons against a recommendation."""
         change, reasons = self.difference_to_acc, rejection_reasons(self.effect)
         acc = "with ACC vehicles alone at this penetration rate"
-        if is_too_small(change, self.effect.baseline_travel_time):
+        if change.low == change.high == 0.0:
+            reasons.append("it never intervened: all travel times are those of ACC vehicles alone")
+        elif is_too_small(change, self.effect.baseline_travel_time):
             reasons.append(f"travel time differs from that {acc} by {TOO_SMALL}: {_seconds(change)}")
         elif not change.high < 0:
             relation = "longer than" if change.low > 0 else "not shown to be shorter than"
@@ -342,23 +352,27 @@ def assessment_headline(
         first = f"{NO_RECOMMENDATION} so far: for some of them there is no verdict yet."
     else:
         first = f"{NO_RECOMMENDATION}: none passes the rule."
-    gains = [each for each in acc_results if each.effect.travel_time.high < 0 and not each.effect.is_too_small]
-    if gains:
-        most = min(gains, key=lambda each: each.effect.relative_travel_time)
-        time, change = _seconds(most.effect.travel_time), 100 * most.effect.relative_travel_time
-        second = f"shorten travel time: {time} ({change:+.1f} %) at {format_percent(most.penetration_rate)}"
-    elif any(each.effect.is_longer for each in acc_results):
-        second = "lengthen travel time"
-    elif acc_results and all(each.effect.is_too_small for each in acc_results):
-        second = f"change travel time by {TOO_SMALL}"
-    else:
-        second = "are not shown to shorten travel time"
+    second = _acc_finding([each for each in acc_results if each.has_enough_seeds])
     if best is None:
         travel_time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
         if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
             within = max(1, ceil(100 * delay_share))
             return f"Nothing to gain here: the human baseline is within {within} % of free flow. {first}"
     return f"{first} ACC vehicles alone {second}."
+
+
+def _acc_finding(results: Sequence[AccResult]) -> str:
+    """Return the end of a sentence on ACC vehicles alone: their largest gain, else their largest loss."""
+    key = attrgetter("effect.relative_travel_time")
+    gains = [each for each in results if each.effect.travel_time.high < 0 and not each.effect.is_too_small]
+    losses = [each for each in results if each.effect.is_longer]
+    if gains or losses:
+        verb, most = ("shorten", min(gains, key=key)) if gains else ("lengthen", max(losses, key=key))
+        time, change = _seconds(most.effect.travel_time), 100 * most.effect.relative_travel_time
+        return f"{verb} travel time: {time} ({change:+.1f} %) at {format_percent(most.penetration_rate)}"
+    if results and all(each.effect.is_too_small for each in results):
+        return f"change travel time by {TOO_SMALL}"
+    return "are not shown to shorten travel time" if results else f"have fewer than {MIN_VERDICT_SEEDS} test seeds"
 
 
 def format_percent(share: float) -> str:

@@ -18,7 +18,7 @@ MIN_FEASIBLE_TTC = 1.0
 """[s]"""
 MAX_FEASIBLE_BRAKING = 6.0
 """[m/s2]"""
-FEASIBILITY_TOLERANCE = 1e-6
+TOLERANCE = 1e-6
 
 FEASIBLE = "feasible"
 HARD_BRAKING_METRIC = "human_braking_beyond_4_5"
@@ -33,30 +33,34 @@ def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> s
     """
     if row["status"] == "failed" or isnan(row["cav_max_braking"]):
         return ""
+    return next((reason for _, _, reason in _violations(row, baseline_braking)), FEASIBLE)
+
+
+def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tuple[int, float, str]]:
+    """Return the number of each violated limit, a value that is larger in worse violations, and the reason."""
     required, has_lanes = row.get("required_time_gap") or DEFAULT_REQUIRED_TIME_GAP, row.get("has_lanes", False)
     time_gap, human_braking = row["min_time_gap"], row[HARD_BRAKING_METRIC]
     min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
     short, cut_in = (row[name] if has_lanes else 0.0 for name in ("share_short_time_gap", "cut_in_max_braking"))
-    baseline = "not driven" if baseline_braking is None else f"{baseline_braking:.0f}"
-    checks = [
-        (row["status"] == "collision", f"{row['collisions']:.0f} vehicles in contact"),
-        ((contacts := row.get("contacts", 0)) > 0, f"{contacts} CAVs in contact"),
-        (time_gap < min_time_gap - FEASIBILITY_TOLERANCE, f"time gap {time_gap:.2f} s (limit {required:g} s)"),
-        (short > MAX_SHORT_TIME_GAP_SHARE, f"time gap below {required:g} s in {100 * short:.2g} % of the time"),
-        (cut_in > MAX_CUT_IN_BRAKING + FEASIBILITY_TOLERANCE, f"brakes with {cut_in:.1f} m/s2 after a cut-in"),
-        (row["cav_min_ttc"] < MIN_FEASIBLE_TTC - FEASIBILITY_TOLERANCE, f"{row['cav_min_ttc']:.2f} s to a collision"),
+    baseline = "not compared" if baseline_braking is None else f"{baseline_braking:.0f}"
+    collided, contacts, braking = row["status"] == "collision", float(row.get("contacts", 0)), row["cav_max_braking"]
+    checks = (  # value, largest allowed value, reason
+        (collided * (1.0 + row["collisions"]), 0.0, f"{row['collisions']:.0f} vehicles in contact"),
+        (contacts, 0.0, f"{contacts:.0f} CAVs in contact"),
+        (-time_gap, TOLERANCE - min_time_gap, f"time gap {time_gap:.2f} s (limit {min_time_gap:g} s)"),
+        (short, MAX_SHORT_TIME_GAP_SHARE, f"time gap below {required:g} s in {100 * short:.2g} % of the time"),
+        (cut_in, TOLERANCE + MAX_CUT_IN_BRAKING, f"brakes with {cut_in:.1f} m/s2 after a cut-in"),
+        (-row["cav_min_ttc"], TOLERANCE - MIN_FEASIBLE_TTC, f"{row['cav_min_ttc']:.2f} s to a collision"),
+        (braking, TOLERANCE + MAX_FEASIBLE_BRAKING, f"brakes with {braking:.1f} m/s2"),
+        (row["override_share"], 0.0, f"SUMO overrides {100 * row['override_share']:.2g} % of its commands"),
         (
-            row["cav_max_braking"] > MAX_FEASIBLE_BRAKING + FEASIBILITY_TOLERANCE,
-            f"brakes with {row['cav_max_braking']:.1f} m/s2",
-        ),
-        (row["override_share"] > 0, f"SUMO overrides {100 * row['override_share']:.2g} % of its commands"),
-        (
-            human_braking > (baseline_braking or 0.0),
+            human_braking,
+            baseline_braking or 0.0,
             f"human drivers brake beyond 4.5 m/s2 {human_braking:.0f} times in a million vehicle-steps "
             f"(without CAVs: {baseline})",
         ),
-    ]
-    return next((reason for fails, reason in checks if fails), FEASIBLE)
+    )
+    return [(number, value, reason) for number, (value, limit, reason) in enumerate(checks) if value > limit]
 
 
 def feasibility_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
@@ -73,15 +77,19 @@ def baseline_rows(label: str, rows_by_driver: dict[str, list[dict[str, Any]]]) -
 
 
 def overall_feasibility(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]] = ()) -> str:
-    """Return one verdict on all episodes of a driver: the first reason against any of them, and how many violate.
+    """Return one verdict on all episodes of a driver, and how many violate a limit.
 
-    `baseline` has the rows of human-only traffic on the same road: a driver is not blamed for braking that
-    human drivers do without CAVs.
+    The reason is the first limit that any episode violates, with the value of the worst. `baseline` has the rows of
+    human-only traffic on the same road: a driver is not blamed for braking that human drivers do without CAVs.
     """
     alone = [row[HARD_BRAKING_METRIC] for row in baseline if row["status"] == "completed"]
-    verdicts = [feasibility({**row, HARD_BRAKING_METRIC: 0.0}) for row in rows]
-    if violations := [verdict for verdict in verdicts if verdict not in ("", FEASIBLE)]:
-        return f"{violations[0]} ({len(violations)} of {len(verdicts)})"
+    own_rows = [{**row, HARD_BRAKING_METRIC: 0.0} for row in rows]
+    verdicts = list(map(feasibility, own_rows))
+    violating = [row for row, verdict in zip(own_rows, verdicts, strict=True) if verdict not in ("", FEASIBLE)]
+    if violating:
+        worst = [min(_violations(row, None), key=lambda each: each[0]) for row in violating]
+        _, _, reason = min(worst, key=lambda each: (each[0], -each[1]))
+        return f"{reason} ({len(violating)} of {len(rows)})"
     pairs = zip(rows, verdicts, strict=True)
     completed = [row for row, verdict in pairs if verdict and row["status"] == "completed"]
     if not completed:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from unjam.measures.feasibility import feasibility
+from unjam.scenarios.scenario import sumo_seed
 from unjam.worlds.audit import BRAKING_THRESHOLDS, OVERRIDE_TOLERANCE, BrakingStatistics
 from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats, Trajectory
 from unjam.worlds.reward import MAX_REWARD_CELLS, episode_reward_terms, eq16_reward
@@ -421,12 +422,13 @@ METRICS: dict[str, Metric] = {
 
 
 def measure(episode: Episode) -> dict[str, Any]:
-    """Return the row of an episode: seed, status, steps, drawn values, every metric by name, the verdict.
+    """Return the row of an episode: its seed and SUMO's, status, steps, drawn values, every metric, the verdict.
 
     The metrics of a failed episode are NaN; its row has the reason.
     """
     row = {
         "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),
+        "sumo_seed": sumo_seed(episode.seed),
         **{name: getattr(episode, name) for name in ("status", "reason", "error", "teleports", "contacts")},
         "steps": episode.control_steps,
         "warnings": [asdict(each) for each in episode.warnings],

@@ -107,6 +107,16 @@ def whole_milliseconds(step: float) -> float:
     return step
 
 
+def sumo_seed(seed: Sequence[int]) -> int:
+    """Return the value of SUMO's option `--seed` in the episode of a seed."""
+    return int(_spawn_seeds(seed)[3].generate_state(1)[0]) % 2**31
+
+
+def _spawn_seeds(seed: Sequence[int]) -> list[np.random.SeedSequence]:
+    """Return the seeds of road, noise, exploration, simulator and sensors."""
+    return np.random.SeedSequence(list(seed)).spawn(5)
+
+
 @dataclass(frozen=True, config=STRICT)
 class Scenario:
     """The settings that all scenarios share; each kind of road adds its own."""
@@ -276,7 +286,7 @@ class Scenario:
 
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
         """Return the road of an episode's seed, and the seeds of noise, exploration, simulator and sensors."""
-        road, *others = np.random.SeedSequence(list(seed)).spawn(5)
+        road, *others = _spawn_seeds(seed)
         return self.draw(np.random.default_rng(road)), others
 
     def possible_cav_ids(self) -> tuple[str, ...]:

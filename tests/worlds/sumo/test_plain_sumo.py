@@ -16,6 +16,7 @@ from tests.worlds.sumo.user_networks import game, straight
 from unjam.drivers import Human
 from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import sumo_seed
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Trips
 from unjam.worlds.sumo.networks import sumo_program
@@ -61,17 +62,7 @@ def trips_of_plain_sumo(path: Path, seed: int, end: float) -> Trips:
 def human_baseline(path: Path, simulation: Simulation, **changes: float) -> tuple[Episode, int]:
     """Return the human baseline, and the seed that SUMO had."""
     scenario = make_scenario(str(path), {"penetration_rate": 0.2, **changes})
-    seeds = []
-    original = simulation.load
-
-    def load(files: object, step: float, seed: int) -> None:
-        seeds.append(seed)
-        original(files, step, seed)  # pyright: ignore[reportArgumentType]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "load", load)
-        episode = run_episode(scenario, Human(), 5, simulation=simulation)
-    return episode, seeds[0]
+    return run_episode(scenario, Human(), 5, simulation=simulation), sumo_seed((5,))
 
 
 def check_same_trips(found: Trips, plain: Trips) -> None:

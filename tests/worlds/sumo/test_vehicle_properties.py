@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.user_networks import SPARSE, network
+from tests.worlds.sumo.user_networks import SPARSE, network, straight
 from unjam.controller import make_driver
 from unjam.drivers import Constant, Human
 from unjam.drivers.command import Command
@@ -168,3 +168,11 @@ def test_brakes_are_those_of_the_filter_or_of_the_vehicle_if_these_are_weaker(
     limits = {kind: simulation.type_limits(f"cav_of_{kind}") for kind in ("own", "car")}
     assert (limits["own"].acceleration, limits["own"].emergency_deceleration) == (0.5, 3.0)
     assert (limits["car"].acceleration, limits["car"].emergency_deceleration) == (2.6, 6.0)
+
+
+def test_cars_parked_beside_the_road_have_no_allowed_speed(tmp_path: Path, simulation: Simulation) -> None:
+    stop = '<stop lane="road_0" endPos="300" duration="30" parking="true"/>'
+    cars = f'<vehicle id="parked" type="car" route="along" depart="0">{stop}</vehicle>'
+    path = straight(tmp_path, cars + '<vehicle id="other" type="car" route="along" depart="2"/>')
+    episode = run_episode(make_scenario(str(path), {"penetration_rate": 0.5}), Human(), 1, record_details=True, simulation=simulation)
+    assert episode.limit_speed == pytest.approx(20.0)

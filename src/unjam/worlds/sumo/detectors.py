@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from math import nan
 from typing import NamedTuple
 
+from unjam.scenarios.scenario import sumo_seed
 from unjam.scenarios.user_network import UserNetwork
-from unjam.worlds.sumo.inputs import sumo_inputs, sumo_random_seed
+from unjam.worlds.sumo.inputs import sumo_inputs
 from unjam.worlds.sumo.networks import xml_document
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -32,13 +33,13 @@ def load_with_loops(
     simulation: Simulation, scenario: UserNetwork, seed: Sequence[int], loops: Sequence[InductionLoop]
 ) -> None:
     """Load human-only traffic of a road and seed, with induction loops; raise `EpisodeError` if SUMO refuses it."""
-    road, (_, _, sumo_seed, _) = scenario.draw_from_seed(seed)
+    road, _ = scenario.draw_from_seed(seed)
     elements = [
         {"id": loop_name(number), "lane": loop.lane, "pos": loop.position, "period": 3600, "file": "NUL"}
         for number, loop in enumerate(loops)
     ]
     inputs = sumo_inputs(scenario, road)._replace(traffic_xml=xml_document("additional", "inductionLoop", elements))
-    simulation.load(inputs, scenario.simulation_step, sumo_random_seed(sumo_seed))
+    simulation.load(inputs, scenario.simulation_step, sumo_seed(seed))
 
 
 def loop_name(number: int) -> str:

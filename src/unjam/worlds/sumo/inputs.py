@@ -5,8 +5,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, UNLIMITED_ACCELERATION, VEHICLE_LENGTH, Scenario
@@ -53,11 +51,6 @@ def sumo_inputs(scenario: Scenario, road: Road) -> SumoInputs:
     patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
     network = {"--net-file": (network_path(road),)}
     return SumoInputs((*patience, *COLLISION_OPTIONS), network, _traffic_xml(scenario, road), "--route-files")
-
-
-def sumo_random_seed(seed: np.random.SeedSequence) -> int:
-    """Return the value of SUMO's option `--seed`."""
-    return int(seed.generate_state(1)[0]) % 2**31
 
 
 def _user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs:

@@ -205,7 +205,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
             slower = [name for name, speed in moved.items() if speed < commanded[name]]
             # A CAV at the allowed speed is not overridden.
             for name, allowed in zip(slower, self._simulation.allowed_speeds(slower), strict=True):
-                added = (min(commanded[name], allowed) - moved[name]) / scenario.simulation_step
+                added = (float(np.fmin(commanded[name], allowed)) - moved[name]) / scenario.simulation_step
                 shield[name] = max(shield[name], added)
             if self.has_crashed or self.stop_reason:
                 break

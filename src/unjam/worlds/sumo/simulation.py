@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from itertools import starmap
+from math import nan
 from pathlib import Path
 from tempfile import gettempdir
 from threading import Lock
@@ -85,6 +86,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         call = partial(sumo_function, self._sumo)
         self._get_speed, self._get_lane = call("vehicle", "getSpeed"), call("vehicle", "getLaneID")
         self._get_lane_position = call("vehicle", "getLanePosition")
+        self._get_allowed_speed = call("vehicle", "getAllowedSpeed")
         self._set_speed, self._set_previous_speed = call("vehicle", "setSpeed"), call("vehicle", "setPreviousSpeed")
 
         def call_for_each(name: str) -> Callable[[Sequence[str]], list[float]]:
@@ -97,8 +99,6 @@ class Simulation(AbstractContextManager["Simulation"]):
         """positions of vehicles along their lanes [m]"""
         self.distances = call_for_each("getDistance")
         """distances that vehicles have driven since their entry [m]"""
-        self.allowed_speeds = call_for_each("getAllowedSpeed")
-        """speeds that the road allows to vehicles [m/s]"""
         self.fuel = call_for_each("getFuelConsumption")
         """fuel rates of vehicles in the last step [mg/s], by their emission class"""
         self.now: Callable[[], float] = call("simulation", "getTime")
@@ -176,6 +176,10 @@ class Simulation(AbstractContextManager["Simulation"]):
             write_harmless_copy(path, copy)
             self._harmless_copies[path] = stamps, copy
         return str(copy)
+
+    def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
+        """Return the speeds that the road allows to vehicles [m/s]; NaN for one that is parked beside the road."""
+        return [speed if speed >= 0.0 else nan for speed in map(self._get_allowed_speed, ids)]
 
     def poses(self, ids: Sequence[str]) -> NDArray[np.float64]:
         """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""

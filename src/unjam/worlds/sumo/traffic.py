@@ -14,9 +14,9 @@ from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import OpenRoad, Road
-from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.scenario import Scenario, sumo_seed
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.inputs import sumo_inputs, sumo_random_seed
+from unjam.worlds.sumo.inputs import sumo_inputs
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.world import ProgressCallback, World
 
@@ -69,7 +69,7 @@ class Traffic(World[Episode], Generic[RoadT]):
     ) -> None:
         """Put the vehicles on the road; nothing moves yet."""
         self.seed = seed.entropy
-        noise_seed, exploration_seed, sumo_seed, sensor_seed = seed.children
+        noise_seed, exploration_seed, _, sensor_seed = seed.children
         self.scenario, self.road = scenario, road
         self.limits = scenario.acceleration_limits
         self.has_crashed = False
@@ -93,7 +93,7 @@ class Traffic(World[Episode], Generic[RoadT]):
         self._exploration_generator = np.random.default_rng(exploration_seed)
         self._episode_noise: Floats | None = None
         self._simulation = simulation
-        simulation.load(sumo_inputs(scenario, road), step, sumo_random_seed(sumo_seed))
+        simulation.load(sumo_inputs(scenario, road), step, sumo_seed(self.seed))
 
     def _warm_up(self, simulate: Callable[[], None], on_progress: ProgressCallback | None) -> None:
         """Simulate human-only traffic; raise `EpisodeError` if there is a collision."""

@@ -129,7 +129,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         if self.scenario.actuation == "cruise":  # SUMO limits the speed itself, and takes set speeds for allowed ones
             return speeds, safe
         allowed = self._simulation.allowed_speeds(list(speeds))
-        return dict(zip(speeds, map(min, speeds.values(), allowed), strict=True)), safe
+        return dict(zip(speeds, np.fmin([*speeds.values()], allowed).tolist(), strict=True)), safe
 
     def _tracked_leaders(self, names: Sequence[str]) -> list[TrackedLeader]:
         speeds = zip(self._simulation.speeds(names), map(self._neighbors, names), strict=True)
@@ -174,8 +174,8 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         allowed = self._simulation.allowed_speeds(
             [name for name in names if name not in self._uncapped_max_speeds] or names
         )
-        self._allowed_speed_sum += sum(allowed)
-        self._allowed_speed_count += len(allowed)
+        self._allowed_speed_sum += np.nansum(allowed)
+        self._allowed_speed_count += np.count_nonzero(np.isfinite(allowed))
         rows: list[tuple[float, ...]] = []
         for name, position in self._lane_positions(names):
             edge, _, lane = name.rpartition("_")  # empty for a teleported vehicle
