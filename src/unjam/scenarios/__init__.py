@@ -35,10 +35,8 @@ SCENARIO_KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp
 def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     """Return the scenario `name`, or that of a .sumocfg file, with `changes` to its parameters.
 
-    A dot in a name leads into a group of parameters: `{"safety.time_gap": 1.5}`.
-
-    Raises:
-        InputError: unknown scenario or parameter, or a value out of range.
+    A dot in a name leads into a group of parameters: `{"safety.time_gap": 1.5}`. Raise `InputError` for an unknown
+    scenario or parameter, or a value out of range.
     """
     changes = nest_keys(changes or {})
     if name.endswith(".sumocfg"):
@@ -48,21 +46,16 @@ def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
     scenario = SCENARIOS[name]
     if not changes:
         return scenario
-    if changes.get("population"):
-        changes = {**_population_changes(str(changes["population"])), **changes}
+    if file := changes.get("population"):  # typical parameters, and what computes the motion, follow from it
+        population = read_population(str(file))
+        commanded = {"human_control": "commanded"} if population.residual else {}
+        changes = {"humans": asdict(population.typical), **commanded, **changes}
     return build_dataclass(type(scenario), merge_changes(asdict(scenario), changes), f"scenario {name}")
 
 
 def example_scenario(name: str) -> Scenario:
     """Return a scenario as it is listed and sampled: a user network has some CAVs."""
     return make_scenario(name, {"penetration_rate": EXAMPLE_PENETRATION_RATE} if name.endswith(".sumocfg") else None)
-
-
-def _population_changes(file: str) -> dict[str, Any]:
-    """Return the settings that follow from a population: typical parameters, and what computes the motion."""
-    population = read_population(file)
-    commanded = {"human_control": "commanded"} if population.residual else {}
-    return {"humans": asdict(population.typical), **commanded}
 
 
 def scenario_recipe(scenario: Scenario) -> dict[str, Any]:

@@ -33,7 +33,6 @@ RAMP_ANGLE = pi / 4
 PLATOON_SIZE = 30
 """number of vehicles after which each one drives like the one before it"""
 HIGHWAY_BRANCH, RAMP_BRANCH = 0, 1
-"""the branches"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -79,7 +78,7 @@ class Merge(Scenario):
         most = int((MERGE_HIGHWAY_LENGTH + MERGE_INFLOW_LENGTH) / spacing)
         if self.standing_vehicles > most:
             raise ValueError(f"standing_vehicles: {self.standing_vehicles} is not allowed; allowed: <= {most}")
-        early = len(self._first_half_times())
+        early = len(self._entry_times(self.inflow)) // 2
         if self.cavs is not None and self.cavs > early:
             raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= {early}, the vehicles of the first half")
         if self.human_control == "native":
@@ -123,15 +122,11 @@ class Merge(Scenario):
         seconds = self.warmup * self.simulation_step + self.horizon * self.control_step
         return [index * 3600.0 / flow for index in range(int(seconds * flow / 3600.0))]
 
-    def _first_half_times(self) -> list[float]:
-        times = self._entry_times(self.inflow)
-        return times[: len(times) // 2]
-
     def _draw_cavs(self, generator: np.random.Generator) -> set[int]:
         """Return the numbers of the highway's vehicles that are CAVs."""
         count = len(self._entry_times(self.inflow))
         if self.cavs is not None:
-            return set(generator.choice(len(self._first_half_times()), self.cavs, replace=False).tolist())
+            return set(generator.choice(count // 2, self.cavs, replace=False).tolist())
         if self.cav_spacing == "even":
             numbers = np.arange(count * self.penetration_rate) / max(self.penetration_rate, 1e-9)
             return set(numbers.astype(int).tolist())
@@ -162,8 +157,7 @@ class Merge(Scenario):
 def _free_flow_speed(flow: float, length: float, humans: IDMParameters, step: float) -> float:
     """Return the mean speed over `length` of human drivers that enter one after the other in free flow [m/s]."""
     delay = round(3600.0 / flow / step)
-    leader: list[tuple[float, float]] = []
-    own: list[tuple[float, float]] = []
+    leader, own = list[tuple[float, float]](), list[tuple[float, float]]()
     for _ in range(PLATOON_SIZE):
         own = [(0.0, HIGHWAY_ENTRY_SPEED)]
         while own[-1][0] < length:

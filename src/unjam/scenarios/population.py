@@ -68,15 +68,12 @@ class Population:
 
     def parameter_statistics(self) -> dict[str, dict[str, float]]:
         """Return mean, standard deviation and quartiles of each parameter."""
-        columns = {name: np.array([getattr(driver, name) for driver in self.drivers]) for name in IDM_PARAMETER_NAMES}
-        return {
-            name: {
-                "mean": float(values.mean()),
-                "std": float(values.std()),
-                "quartiles": np.quantile(values, [0.25, 0.5, 0.75]).tolist(),
-            }
-            for name, values in columns.items()
-        }
+        statistics = {}
+        for name in IDM_PARAMETER_NAMES:
+            values = np.array([getattr(driver, name) for driver in self.drivers])
+            quartiles = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
+            statistics[name] = {"mean": float(values.mean()), "std": float(values.std()), "quartiles": quartiles}
+        return statistics
 
 
 def residual_inputs(speed: Array, leader_speed: Array, gap: Array) -> Array:
@@ -124,8 +121,7 @@ def write_population(path: Path, population: Population) -> None:
 def population_file(name: Path | str) -> Path:
     """Return the file of a population: names such as `unjam:ngsim` are part of the package, others are paths.
 
-    Raises:
-        InputError: the package has no population of that name.
+    Raise `InputError` if the package has no population of that name.
     """
     if not str(name).startswith(PACKAGED_PREFIX):
         return Path(name)
@@ -136,11 +132,7 @@ def population_file(name: Path | str) -> Path:
 
 
 def read_population(name: Path | str) -> Population:
-    """Return the population of a file, or a packaged one.
-
-    Raises:
-        InputError: the file is missing, damaged or not a population.
-    """
+    """Return the population of a file, or a packaged one; raise `InputError` if it is missing, damaged, or none."""
     path = population_file(name)
     if not os.path.exists(path):
         raise InputError(f"population: {str(path)!r} does not exist")

@@ -137,14 +137,13 @@ class UserNetwork(Scenario):
     def check_vehicles(self, has_entered: bool | None = None, warnings: Sequence[str] = ()) -> None:
         """Raise `InputError` if no vehicle enters, according to the first departure or to an episode.
 
-        Args:
-            has_entered: whether a vehicle was on the road in a complete episode; None: no episode was driven yet.
-            warnings: SUMO's warnings in it.
+        `has_entered`: whether a vehicle was on the road in a complete episode, with SUMO's `warnings`; None: no episode
+        was driven yet.
         """
         files = read_sumo_files(Path(self.file))
-        begin = self._begin(files)
+        begin, first = self._begin(files), files.first_departure
         end = self._end(begin)
-        first, none = files.first_departure, f"no vehicle entered before {_format_time(end)}"
+        none = f"no vehicle entered before {_format_time(end)}"
         if has_entered or (has_entered is None and (first is None or first < end)):
             return
         if first is None or begin <= first < end:
@@ -184,11 +183,7 @@ class UserNetwork(Scenario):
         return notes
 
     def possible_cav_ids(self) -> tuple[str, ...]:
-        """Return names for the maximum number of CAVs; only SUMO knows the ids of the vehicles.
-
-        Raises:
-            InputError: no maximum is set.
-        """
+        """Return names for the maximum number of CAVs: only SUMO knows the ids. Raise `InputError` if there is none."""
         if self.cavs is None:
             raise InputError("cavs: None is not allowed here on a user network; allowed: a maximum number")
         return tuple(f"cav_{number}" for number in range(self.cavs))
@@ -208,8 +203,7 @@ class UserNetwork(Scenario):
 def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
     """Return the scenario of a .sumocfg file, with its step, begin and end unless `changes` has others.
 
-    Raises:
-        InputError: one line about what is missing or broken, before SUMO starts.
+    Raise `InputError` with one line about what is missing or broken, before SUMO starts.
     """
     files = read_sumo_files(Path(file).resolve())
     _log_once(*notes_on_files(files, MAX_LOGGED_NAMES))
@@ -242,15 +236,9 @@ def _format_time(time: float) -> str:
 
 def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[str]:
     """Return the differences between an episode and what plain SUMO would make of the files, one line each."""
-    names_by_reason = {
-        "left out because they only write or listen": files.dropped_items,
-        "replaced by values of unjam": files.replaced_options,
-    }
-    return [
-        f"{files.path.name}: {reason}: {_shorten_list(names, max_names)}"
-        for reason, names in names_by_reason.items()
-        if names
-    ]
+    dropped, replaced = (_shorten_list(names, max_names) for names in (files.dropped_items, files.replaced_options))
+    notes = [f"{files.path.name}: left out because they only write or listen: {dropped}"] if dropped else []
+    return notes + ([f"{files.path.name}: replaced by values of unjam: {replaced}"] if replaced else [])
 
 
 def _shorten_list(names: Sequence[str], max_names: int) -> str:

@@ -120,8 +120,7 @@ _answers: dict[str, dict[str, Any]] = {}
 def read_sumo_files(path: Path) -> SumoFiles:
     """Return the content of a .sumocfg file and of the files that it names; read again if one has changed.
 
-    Raises:
-        InputError: a file is missing, broken or too large, the network has no version, or there are no vehicles.
+    Raise `InputError` if a file is missing, broken or too large, the network has no version, or there are no vehicles.
     """
     if path in _read_files:
         stamps, files = _read_files[path]
@@ -138,19 +137,15 @@ def answer_of(path: str) -> dict[str, Any] | None:
 def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
     """Store and return the content of a .sumocfg file from the reader's answer, made in any process.
 
-    Raises:
-        InputError: SUMO has no such option, or it changes the traffic and cannot be passed on.
+    Raise `InputError` as `classify_option` does.
     """
     path, fields = Path(file), dict(answer)
     stamps = {Path(source): (time, size) for source, (time, size) in fields.pop("stamps").items()}
+    fields |= {name: tuple(map(Path, fields[name])) for name in ("additional_files", "route_files", "weight_files")}
     fields["network"], fields["sources"] = Path(fields["network"]), tuple(stamps)
-    for name in ("additional_files", "route_files", "weight_files"):
-        fields[name] = tuple(map(Path, fields[name]))
-    fields["copy_sources"] = {
-        Path(copied): tuple(map(Path, sources)) for copied, sources in fields["copy_sources"].items()
-    }
-    fields["used_types"] = frozenset(fields["used_types"])
-    options: dict[str, str] = fields["options"]
+    copies = fields["copy_sources"].items()
+    fields["copy_sources"] = {Path(copied): tuple(map(Path, sources)) for copied, sources in copies}
+    fields["used_types"], options = frozenset(fields["used_types"]), fields["options"]
     kinds = {name: classify_option(path.name, name, value) for name, value in options.items()}
     fields["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
     dropped = [f"option {name}" for name in options if kinds[name] == "dropped"]
@@ -164,8 +159,7 @@ def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
 def classify_option(file: str, name: str, value: str) -> Literal["passed", "ignored", "replaced", "dropped"]:
     """Return how unjam treats an option of a configuration.
 
-    Raises:
-        InputError: SUMO has no such option, or it changes the traffic and cannot be passed on.
+    Raise `InputError` if SUMO has no such option, or it changes the traffic and cannot be passed on.
     """
     if is_passed_option(name):
         return "passed"
@@ -184,22 +178,15 @@ def classify_option(file: str, name: str, value: str) -> Literal["passed", "igno
 
 
 def read_lanes(path: Path) -> list[LaneShape]:
-    """Return all lanes of a network file.
-
-    Raises:
-        InputError: the file is broken or too large.
-    """
-    lanes = _run_reader("lanes", path)
-    return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in lanes]
+    """Return all lanes of a network file; raise `InputError` if it is broken or too large."""
+    return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in _run_reader("lanes", path)]
 
 
 def write_harmless_copy(path: Path, copy: Path, types: Path | None = None) -> None:
     """Write a copy of a SUMO file without elements that make SUMO write a file, listen, or read another file.
 
-    Vehicle types get the attributes that a JSON file `types` has for them, by id.
-
-    Raises:
-        InputError: the file is broken or too large.
+    Vehicle types get the attributes that a JSON file `types` has for them, by id. Raise `InputError` if the file is
+    broken or too large.
     """
     _run_reader("copy", path, copy, *([types] if types else []))
 

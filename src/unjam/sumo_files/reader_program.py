@@ -65,16 +65,10 @@ CAR_FOLLOWING_MODELS = (
 """car-following models that older files name in an element of their own"""
 TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")
 """SUMO's words for true"""
-_LaneShape = tuple[str, float, list[tuple[float, float]]]
-"""edge, length [m] and center line [(x, y), m]"""
 
 
 def _read_configuration(path: Path) -> dict[str, Any]:
-    """Return the content of a .sumocfg file and of the files that it names as JSON, the fields of `SumoFiles`.
-
-    Raises:
-        BrokenFileError: a file is missing or broken, the network has no version, or there are no vehicles.
-    """
+    """Return the content of a .sumocfg file and of the files that it names as JSON, the fields of `SumoFiles`."""
     check_file_exists(path)
     stamps = {path: file_stamp(path)}
     options = _read_options(path)
@@ -123,11 +117,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
 
 
 def _read_options(path: Path) -> dict[str, str]:
-    """Return the options of a configuration that have a value, by SUMO's main names.
-
-    Raises:
-        BrokenFileError: an option is set twice, or has a text instead of a value.
-    """
+    """Return the options of a configuration that have a value, by SUMO's main names."""
     options: dict[str, str] = {}
 
     def add_option(tag: str, attributes: XmlAttributes) -> None:
@@ -161,9 +151,9 @@ def _substitute_variables(text: str) -> str:
     return re.sub(r"\$\{(.+?)\}", lambda match: os.environ.get(match[1], ""), home)
 
 
-def _read_lanes(path: Path) -> list[_LaneShape]:
-    """Return all lanes of a network file."""
-    lanes: list[_LaneShape] = []
+def _read_lanes(path: Path) -> list[tuple[str, float, list[tuple[float, float]]]]:
+    """Return edge, length [m] and center line [(x, y), m] of all lanes of a network file."""
+    lanes: list[tuple[str, float, list[tuple[float, float]]]] = []
 
     def add_lane(attributes: XmlAttributes) -> None:
         edge, length, shape = (attributes.get(name, "") for name in ("id", "length", "shape"))

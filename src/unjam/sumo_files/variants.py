@@ -17,18 +17,12 @@ TypeChanges = Mapping[str, Mapping[str, str]]
 def write_variant(files: SumoFiles, types: TypeChanges, scale: float, path: Path) -> Path:
     """Write a variant of a network's files into the folder of `path`, the configuration last; return `path`.
 
-    The network file itself stays where it is. Options and elements that write, listen or read other files are left
-    out, as in unjam's own episodes.
+    The network file itself stays where it is, and none of the network's files is changed. Options and elements that
+    write, listen or read other files are left out, as in unjam's own episodes. `types` are attributes to set in vehicle
+    types, by id; `scale` is a factor on the number of vehicles, in addition to that of the configuration.
 
-    Args:
-        files: the network; none of its files is changed.
-        types: attributes to set in vehicle types, by id.
-        scale: factor on the number of vehicles, in addition to that of the configuration.
-        path: of the new configuration.
-
-    Raises:
-        InputError: a file is broken or too large, or the configuration's scale is not a number.
-        DiskError: the disk is full or cannot be written.
+    Raise `InputError` if a file is broken or too large, or the configuration's scale is not a number, and `DiskError`
+    if the disk is full or cannot be written.
     """
     folder, before = path.parent, files.options.get("scale", "1")
     try:
