@@ -18,7 +18,7 @@ from unjam.measures.detectors import (
     geh,
     read_detectors,
 )
-from unjam.worlds.sumo.detectors import DetectorPassage
+from unjam.worlds.sumo.simulation import DetectorPassage
 
 HEAD = "edge,position,begin,end,flow_veh_per_h,speed"
 

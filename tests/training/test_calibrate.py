@@ -20,8 +20,8 @@ from unjam.training.search_space import NumericRange
 from unjam.training.seeds import make_test_seeds
 from unjam.training.trial_log import REQUEST_FILE, TRIALS_FILE
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.detector_pool import DetectorPool
-from unjam.worlds.sumo.detectors import DetectorPassage
+from unjam.worlds.sumo.detectors import DetectorPool
+from unjam.worlds.sumo.simulation import DetectorPassage
 
 INTERVAL = 60
 END = 240

@@ -129,7 +129,7 @@ def calibrate_command(
     from unjam.training.corridor import load_corridor, parse_factor_space
     from unjam.training.run_folder import lock_new_folder
     from unjam.training.trial_log import REQUEST_FILE
-    from unjam.worlds.sumo.detector_pool import DetectorPool
+    from unjam.worlds.sumo.detectors import DetectorPool
 
     space = parse_factor_space(vary or [])
     corridor = load_corridor(scenario, detectors, begin, end)

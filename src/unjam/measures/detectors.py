@@ -11,7 +11,7 @@ import numpy as np
 
 from unjam.errors import InputError, invalid_value
 from unjam.physics.arrays import Floats
-from unjam.worlds.sumo.detectors import DetectorPassage
+from unjam.worlds.sumo.simulation import DetectorPassage
 
 DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """columns of a file of measurements, in addition to `edge` or `lane`"""

@@ -25,7 +25,7 @@ from unjam.training.search import import_optuna
 from unjam.training.search_space import SearchSpace, suggest_values
 from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.training.trial_log import TrialLog
-from unjam.worlds.sumo.detector_pool import DetectorPool
+from unjam.worlds.sumo.detectors import DetectorPool
 
 CALIBRATED_NETWORK_FILE, CALIBRATION_FILE = "calibrated.sumocfg", "calibration.json"
 CALIBRATION_FINALISTS = 3

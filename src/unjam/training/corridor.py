@@ -13,8 +13,8 @@ from unjam.scenarios.user_network import ROAD_CLASSES, UserNetwork, load_user_ne
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.training.assess import ZERO_PENETRATION_RATE
 from unjam.training.search_space import NumericRange, SearchSpace, parse_search_space
-from unjam.worlds.sumo.detectors import InductionLoop
 from unjam.worlds.sumo.networks import network_geometry
+from unjam.worlds.sumo.simulation import InductionLoop
 
 FLOW_FACTOR = "flow"
 """factor on the number of vehicles, of all types"""

@@ -9,9 +9,8 @@ import pytest
 from tests.worlds.sumo.user_networks import game, straight
 from unjam.errors import EpisodeError, LostWorkerError
 from unjam.scenarios.user_network import UserNetwork, load_user_network
-from unjam.worlds.sumo.detector_pool import MAX_DETECTOR_ATTEMPTS, DetectorPool
-from unjam.worlds.sumo.detectors import DetectorPassage, InductionLoop, load_with_loops, loop_name, passages
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.detectors import MAX_DETECTOR_ATTEMPTS, DetectorPool, load_with_loops
+from unjam.worlds.sumo.simulation import DetectorPassage, InductionLoop, Simulation, loop_name
 
 STEADY = (
     '<vType id="steady" speedFactor="0.5" speedDev="0" sigma="0"/>'
@@ -58,7 +57,7 @@ def test_a_lane_change_on_a_loop_has_no_speed_as_with_sumos_own_detectors(tmp_pa
     ramp = load_user_network(str(game(tmp_path, "ramp")), {"penetration_rate": 1e-12})
     with Simulation() as simulation:
         load_with_loops(simulation, ramp, (1,), loops)
-        passed = passages(simulation, loops, 250)
+        passed = simulation.passages(loops, 250)
         loops_of_sumo = simulation._sumo.inductionloop
         own = [loops_of_sumo.getIntervalMeanSpeed(loop_name(number)) for number in range(len(loops))]
     speeds = [np.array([one.speed for one in passed if one.loop == number]) for number in range(len(loops))]

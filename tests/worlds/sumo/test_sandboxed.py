@@ -44,9 +44,9 @@ def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, simulation: S
 
 def test_a_sandboxed_simulation_returns_the_same_results(road: Scenario, simulation: Simulation) -> None:
     methods = [name for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
-    methods += ["speeds", "lane_offsets", "distances", "allowed_speeds", "fuel", "now"]
+    methods += ["speeds", "lane_offsets", "distances", "fuel", "now"]
     others = {"load", "step", "close", "command_speeds", "replace_speeds", "command_humans", "limit_braking"}
-    others |= {"take_control", "change_type", "end_with_trips", "is_in_contact", "teleport_count", "finish"}
+    others |= {"take_control", "change_type", "end_with_trips", "is_in_contact", "teleport_count", "finish", "passages"}
     answers = []
     with SandboxedSimulation() as apart:
         for each in (simulation, apart):

@@ -1,32 +1,20 @@
-"""Induction loops on a road: which vehicles pass, when, and at which speed."""
+"""Induction loops on a user's network: which vehicles pass in human-only traffic, when, and at which speed."""
 
+import queue
 from collections.abc import Sequence
-from math import nan
-from typing import NamedTuple
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, suppress
 
+from unjam.errors import EpisodeError, LostWorkerError
 from unjam.scenarios.scenario import sumo_seed
 from unjam.scenarios.user_network import UserNetwork
 from unjam.worlds.sumo.inputs import sumo_inputs
 from unjam.worlds.sumo.networks import xml_document
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.sandboxed import SandboxedSimulation
+from unjam.worlds.sumo.simulation import DetectorPassage, InductionLoop, Simulation, loop_name
 
-
-class InductionLoop(NamedTuple):
-    """An induction loop at a position along a lane [m]."""
-
-    lane: str
-    position: float
-
-
-class DetectorPassage(NamedTuple):
-    """A vehicle that drove over a loop."""
-
-    loop: int
-    vehicle: str
-    time: float
-    """at which its front bumper reached the loop [s]"""
-    speed: float
-    """mean speed above the loop [m/s]; NaN if it changed lanes before its rear had passed"""
+MAX_DETECTOR_ATTEMPTS = 3
+"""processes that may be lost in the same simulation"""
 
 
 def load_with_loops(
@@ -42,38 +30,60 @@ def load_with_loops(
     simulation.load(inputs, scenario.simulation_step, sumo_seed(seed))
 
 
-def loop_name(number: int) -> str:
-    """Return the name of a loop in SUMO."""
-    return f"unjam_loop_{number}"
+class DetectorPool(AbstractContextManager["DetectorPool"]):
+    """A fixed number of sandboxed SUMO processes, started when first needed.
 
-
-def passages(simulation: Simulation, loops: Sequence[InductionLoop], steps: int) -> list[DetectorPassage]:
-    """Simulate a number of steps, or until no vehicle is expected, and return the passages.
-
-    A vehicle that leaves a loop by changing lanes counts without a speed, as with SUMO's own detectors
-    (https://sumo.dlr.de/docs/Simulation/Output/Induction_Loops_Detectors_(E1).html).
+    The passages depend only on scenario, seed and loops, not on the number of processes.
     """
-    found: dict[tuple[int, str, float], DetectorPassage] = {}
-    for _ in range(steps):
-        simulation.step()
-        for number, loop in enumerate(loops):
-            for vehicle, length, entry_time, exit_time, _ in simulation.vehicles_on_loop(loop_name(number)):
-                key = number, vehicle, entry_time
-                if exit_time > entry_time and key not in found:  # -1 while the vehicle is on the loop
-                    has_passed = _has_passed(simulation, vehicle, length, loop)
-                    speed = length / (exit_time - entry_time) if has_passed else nan
-                    found[key] = DetectorPassage(*key, speed)
-        if not simulation.expects_vehicles():
-            break
-    return list(found.values())
 
+    def __init__(self, count: int = 1) -> None:
+        self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-detectors")
+        self._idle_simulations: queue.SimpleQueue[SandboxedSimulation | None] = queue.SimpleQueue()
+        self._open_simulations: set[SandboxedSimulation] = set()
+        for _ in range(count):
+            self._idle_simulations.put(None)
 
-def _has_passed(simulation: Simulation, vehicle: str, length: float, loop: InductionLoop) -> bool:
-    """Return whether a vehicle that has just left a loop passed it completely, without a lane change."""
-    if vehicle in simulation.arrived_vehicles():
-        return True
-    if vehicle in simulation.teleporting_vehicles():
-        return False
-    ((lane, position),) = simulation.lane_positions([vehicle])
-    is_same_edge = lane.rpartition("_")[0] == loop.lane.rpartition("_")[0]
-    return not is_same_edge or position - length >= loop.position
+    def run(
+        self, scenario: UserNetwork, seeds: Sequence[tuple[int, ...]], loops: Sequence[InductionLoop]
+    ) -> list[list[DetectorPassage]]:
+        """Return the passages of each seed; raise `EpisodeError` if SUMO cannot run one or is lost repeatedly."""
+
+        def run_one(seed: tuple[int, ...]) -> list[DetectorPassage]:
+            for _ in range(MAX_DETECTOR_ATTEMPTS - 1):
+                with suppress(LostWorkerError):
+                    return self._run_one(scenario, seed, loops)
+            return self._run_one(scenario, seed, loops)
+
+        return list(self._thread_pool.map(run_one, seeds))
+
+    def _run_one(
+        self, scenario: UserNetwork, seed: tuple[int, ...], loops: Sequence[InductionLoop]
+    ) -> list[DetectorPassage]:
+        simulation = self._idle_simulations.get()
+        try:
+            if simulation is None:
+                simulation = SandboxedSimulation()
+                self._open_simulations.add(simulation)
+            load_with_loops(simulation, scenario, seed, loops)  # pyright: ignore[reportArgumentType]
+            steps = scenario.horizon * scenario.steps_per_control_step
+            return simulation.passages(loops, steps)
+        except EpisodeError:
+            if simulation is not None:  # the process may be lost: the next run starts another one
+                simulation.close()
+                self._open_simulations.discard(simulation)
+            simulation = None
+            raise
+        finally:
+            self._idle_simulations.put(simulation)
+
+    def close(self) -> None:
+        """End all processes; may be called twice."""
+        self._thread_pool.shutdown(wait=False, cancel_futures=True)
+        for simulation in list(self._open_simulations):  # a thread that waits for one gets a LostWorkerError
+            simulation.close()
+        self._thread_pool.shutdown()
+        for simulation in list(self._open_simulations):
+            simulation.close()
+
+    def __exit__(self, *error: object) -> None:
+        self.close()

@@ -27,7 +27,6 @@ from unjam.scenarios.user_network import UserNetwork
 from unjam.tree import pack, unpack
 from unjam.worlds.messages import read_message, write_message
 from unjam.worlds.sumo.backends import InUseError
-from unjam.worlds.sumo.detectors import InductionLoop, passages
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -162,9 +161,6 @@ def serve_simulation() -> None:
 
 
 def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
-    if name == passages.__name__:  # a message for each step would take as long as the steps
-        loops, steps = arguments
-        return passages(simulation, [InductionLoop(*each) for each in loops], steps)
     if name == "load":
         fields, *others = arguments
         existing = {option: tuple(map(Path, paths)) for option, paths in fields["existing_files"].items()}

@@ -45,6 +45,29 @@ class VehicleLimits(NamedTuple):
     emergency_deceleration: float
 
 
+class InductionLoop(NamedTuple):
+    """An induction loop at a position along a lane [m]."""
+
+    lane: str
+    position: float
+
+
+class DetectorPassage(NamedTuple):
+    """A vehicle that drove over a loop."""
+
+    loop: int
+    vehicle: str
+    time: float
+    """at which its front bumper reached the loop [s]"""
+    speed: float
+    """mean speed above the loop [m/s]; NaN if it changed lanes before its rear had passed"""
+
+
+def loop_name(number: int) -> str:
+    """Return the name of an induction loop in SUMO."""
+    return f"unjam_loop_{number}"
+
+
 class Simulation(AbstractContextManager["Simulation"]):
     """One SUMO simulation, loaded again for each episode.
 
@@ -120,8 +143,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         self.reinserted_vehicles: Callable[[], Sequence[str]] = call("simulation", "getEndingTeleportIDList")
         self.colliding_vehicles: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
         """vehicles that collided in the last step"""
-        self.vehicles_on_loop: Callable[[str], Sequence[Any]] = call("inductionloop", "getVehicleData")
-        """vehicles on a loop in the last step: (name, length, entry time, exit time or -1, type)"""
+        self._vehicles_on_loop = call("inductionloop", "getVehicleData")
         self.pending_vehicles: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
 
     def has_refused(self) -> bool:
@@ -180,6 +202,11 @@ class Simulation(AbstractContextManager["Simulation"]):
     def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
         """Return the speeds that the road allows to vehicles [m/s]; NaN for one that is parked beside the road."""
         return [speed if speed >= 0.0 else nan for speed in map(self._get_allowed_speed, ids)]
+
+    def uncapped_speeds(self, ids: Sequence[str]) -> list[float]:
+        """Return lane limit times speed factor of vehicles [m/s], whatever their maximum speed; NaN beside the road."""
+        limit, factor, lanes = self._sumo.lane.getMaxSpeed, self._sumo.vehicle.getSpeedFactor, map(self._get_lane, ids)
+        return [limit(lane) * factor(name) if lane else nan for name, lane in zip(ids, lanes, strict=True)]
 
     def poses(self, ids: Sequence[str]) -> NDArray[np.float64]:
         """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""
@@ -307,6 +334,36 @@ class Simulation(AbstractContextManager["Simulation"]):
             self._sumo.vehicle.setSpeedMode(name, _speed_mode(actuation, right_of_way))
             for key, value in parameters.items():
                 self._sumo.vehicle.setParameter(name, key, value)
+
+    def passages(self, loops: Sequence[InductionLoop], steps: int) -> list[DetectorPassage]:
+        """Simulate a number of steps, or until no vehicle is expected, and return the passages over these loops.
+
+        A vehicle that leaves a loop by changing lanes counts without a speed, as with SUMO's own detectors
+        (https://sumo.dlr.de/docs/Simulation/Output/Induction_Loops_Detectors_(E1).html).
+        """
+        found: dict[tuple[int, str, float], DetectorPassage] = {}
+        for _ in range(steps):
+            self.step()
+            for number, loop in enumerate(loops):
+                for vehicle, length, entry_time, exit_time, _ in self._vehicles_on_loop(loop_name(number)):
+                    key = number, vehicle, entry_time
+                    if exit_time > entry_time and key not in found:  # -1 while the vehicle is on the loop
+                        has_passed = self._has_passed(vehicle, length, *loop)
+                        speed = length / (exit_time - entry_time) if has_passed else nan
+                        found[key] = DetectorPassage(*key, speed)
+            if not self.expects_vehicles():
+                break
+        return list(found.values())
+
+    def _has_passed(self, vehicle: str, length: float, loop_lane: str, loop_position: float) -> bool:
+        """Return whether a vehicle that has just left a loop passed it completely, without a lane change."""
+        if vehicle in self.arrived_vehicles():
+            return True
+        if vehicle in self.teleporting_vehicles():
+            return False
+        ((lane, position),) = self.lane_positions([vehicle])
+        is_same_edge = lane.rpartition("_")[0] == loop_lane.rpartition("_")[0]
+        return not is_same_edge or position - length >= loop_position
 
     def end_with_trips(self, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
         """End the episode, so that SUMO writes its last records, and return the trips as `read_trips` does."""
