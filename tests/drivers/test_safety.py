@@ -62,16 +62,16 @@ class Pursuit:
         self.safety, self.actuator, self.step, self.generator = safety, actuator, step, generator
         ahead = FollowingState(*generator.uniform(0.0, [[35.0], [35.0], [150.0]], (3, rows)))
         start = ActuatorState(np.zeros(rows)) if actuator is None else actuator.initial_state(ahead.speed, step)
-        free = safety.max_acceleration(ahead, step, actuator, start) > -min(safety.braking, safety.time_gap_braking)
+        actuation = None if actuator is None else (actuator, start)
+        free = safety.max_acceleration(ahead, step, actuation) > -min(safety.braking, safety.time_gap_braking)
         self.ahead = FollowingState(*(values[free] for values in ahead))
         self.underway = ActuatorState(start.acceleration[free], tuple(each[free] for each in start.pending))
 
     def go(self, leader: Any, wanted: Any) -> np.ndarray:
         """Make one step in which leaders accelerate with `leader`; return the cars' accelerations."""
         step, sensed = self.step, self.readings.read_for_filter("all", self.ahead)
-        told = self.safety.limit(
-            np.broadcast_to(wanted, self.ahead.speed.shape), sensed, step, self.actuator, self.underway
-        )
+        actuation = None if self.actuator is None else (self.actuator, self.underway)
+        told = self.safety.limit(np.broadcast_to(wanted, self.ahead.speed.shape), sensed, step, actuation)
         assert (told >= np.minimum(wanted, -self.safety.braking)).all()
         if self.actuator is not None:
             self.underway = self.actuator.apply_command(told, self.ahead.speed, self.underway, step)
@@ -169,8 +169,8 @@ def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
 
 @given(SPEEDS, SPEEDS, st.floats(-3.0, 3.0))
 def test_with_nobody_ahead_a_car_does_what_it_wants(speed: float, nobody: float, wanted: float) -> None:
-    for actuator, underway in ((None, None), (Actuator(lag=0.3), ActuatorState(0.0))):
-        free = SafetyFilter().limit(wanted, FollowingState(speed, nobody, inf), 0.1, actuator, underway)
+    for actuation in (None, (Actuator(lag=0.3), ActuatorState(0.0))):
+        free = SafetyFilter().limit(wanted, FollowingState(speed, nobody, inf), 0.1, actuation)
         assert free == wanted
 
 

@@ -62,13 +62,8 @@ def controller_bytes(driver: Driver, metadata: dict[str, Any], parts: dict[str, 
     `metadata` has the `PROVENANCE_ENTRIES` of the manifest; its `action_limit` [m/s2] is that of the road.
     """
     recipe, arrays = driver_recipe(driver)
-    manifest = {
-        "format": MANIFEST_FORMAT,
-        "unjam": __version__,
-        "driver": recipe,
-        **driver_interface(driver, metadata.get("action_limit")),
-        **metadata,
-    }
+    manifest = {"format": MANIFEST_FORMAT, "unjam": __version__, "driver": recipe}
+    manifest |= driver_interface(driver, metadata.get("action_limit")) | metadata
     return _pack_with_hashes(manifest, {WEIGHTS_PART: save(arrays), **(parts or {})})
 
 

@@ -71,7 +71,7 @@ def commanded_accelerations(command: Command | None, limits: Limits, names: Sequ
     context = f"driver: step {step}"
     values = answer_as_array([found] if is_float else found, rows, context)
     if not all(map(isfinite, values.tolist())):  # faster than NumPy for few vehicles
-        _raise_not_finite(values, names, context, "acceleration", "finite")
+        _raise_not_finite(values, names, f"{context}: acceleration", "finite")
     return limits.clip(values).tolist()
 
 
@@ -85,12 +85,10 @@ def commanded_time_gaps(command: Command | None, min_time_gap: float, names: Seq
     context = f"driver: step {step}"
     found = np.fmax(answer_as_array(command.time_gap, len(names), context, "time gap"), min_time_gap)  # drops NaN
     if not np.isfinite(found).all():
-        _raise_not_finite(found, names, context, "time gap", "finite, or NaN")
+        _raise_not_finite(found, names, f"{context}: time gap", "finite, or NaN")
     return found.tolist()
 
 
-def _raise_not_finite(
-    values: NDArray[np.float64], names: Sequence[str], context: str, quantity: str, allowed: str
-) -> None:
+def _raise_not_finite(values: NDArray[np.float64], names: Sequence[str], quantity: str, allowed: str) -> None:
     row = int(np.isfinite(values).argmin())
-    raise InputError(f"{context}: {quantity} of {names[row]} is {values[row]}; allowed: {allowed}")
+    raise InputError(f"{quantity} of {names[row]} is {values[row]}; allowed: {allowed}")

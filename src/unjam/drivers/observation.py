@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import Annotated, Literal, NamedTuple
+from operator import attrgetter
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator
@@ -16,6 +17,7 @@ from pydantic import AfterValidator
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.local_state import (
     ADJACENT_POSITIONS,
+    COMMON_FIELDS,
     ROAD_SECTION_LENGTH,
     SECTIONS_AHEAD,
     SPEED_SCALE,
@@ -115,14 +117,15 @@ def _adjacent_lane_features(state: LocalState) -> Array:
     return namespace(speeds).concatenate((speeds, state.adjacent_gaps / GAP_SCALE), -1)
 
 
-def _quantity_feature(
-    description: ScaledInput,
-    value: Callable[[FeatureInputs], Array],
-    road_requirement: Literal["", "loop", "coordinate"] = "",
-    required_fields: tuple[str, ...] = (),
+def _field_feature(
+    field: str, description: ScaledInput, value: Callable[[LocalState], Array] | None = None, **options: Any
 ) -> Feature:
-    scale = description.scale
-    return Feature(lambda inputs: as_column(value(inputs) / scale), (description,), road_requirement, required_fields)
+    """Return the feature of a field of `LocalState`, or of a `value` that depends on it, divided by its scale."""
+    compute, scale = value or attrgetter(field), description.scale
+    required = () if field in COMMON_FIELDS else (field,)
+    return Feature(
+        lambda inputs: as_column(compute(inputs.state) / scale), (description,), required_fields=required, **options
+    )
 
 
 FEATURES: dict[str, Feature] = {
@@ -136,30 +139,28 @@ FEATURES: dict[str, Feature] = {
             ScaledInput("follower gap", GAP_SCALE, "m"),
         ),
     ),
-    "expert_acceleration": _quantity_feature(
-        ScaledInput("expert acceleration", 1.0, "m/s2"), lambda inputs: inputs.expert_acceleration
+    "expert_acceleration": Feature(
+        lambda inputs: as_column(inputs.expert_acceleration), (ScaledInput("expert acceleration", 1.0, "m/s2"),)
     ),
     "expert_memory": Feature(lambda inputs: inputs.expert.memory_features(inputs.memory), None),
-    "loop_length": _quantity_feature(
-        ScaledInput("loop length", 250.0, "m"), lambda inputs: inputs.state.loop_length, "loop"
-    ),
+    "loop_length": _field_feature("loop_length", ScaledInput("loop length", 250.0, "m"), road_requirement="loop"),
     "lap_position": Feature(
         lambda inputs: lap_position(inputs.state),
         (ScaledInput("cosine of lap position", 1.0, ""), ScaledInput("sine of lap position", 1.0, "")),
         road_requirement="loop",
     ),
-    "route_position": _quantity_feature(
-        ScaledInput("route position", 100.0, "m"), lambda inputs: inputs.state.route_position, "coordinate"
+    "route_position": _field_feature(
+        "route_position", ScaledInput("route position", 100.0, "m"), road_requirement="coordinate"
     ),
-    "allowed_speed": _quantity_feature(
+    "allowed_speed": _field_feature(
+        "allowed_speed",
         ScaledInput("allowed speed - own speed", SPEED_SCALE, "m/s"),
-        lambda inputs: inputs.state.allowed_speed - inputs.state.speed,
-        required_fields=("allowed_speed",),
+        lambda state: state.allowed_speed - state.speed,
     ),
-    "distance_to_merge": _quantity_feature(
+    "distance_to_merge": _field_feature(
+        "distance_to_merge",
         ScaledInput("distance to merge", MERGE_DISTANCE_SCALE, "m"),
-        lambda inputs: clip(inputs.state.distance_to_merge, -MERGE_DISTANCE_SCALE, 2.0 * MERGE_DISTANCE_SCALE),
-        required_fields=("distance_to_merge",),
+        lambda state: clip(state.distance_to_merge, -MERGE_DISTANCE_SCALE, 2.0 * MERGE_DISTANCE_SCALE),
     ),
     "merge_proximity": Feature(
         lambda inputs: merge_proximity(inputs.state),
@@ -169,11 +170,7 @@ FEATURES: dict[str, Feature] = {
     ),
     "lane_speeds": _section_speed_feature("lane_speeds", "in own lane"),
     "road_speeds": _section_speed_feature("road_speeds", "on all lanes"),
-    "penetration_rate": _quantity_feature(
-        ScaledInput("penetration rate", 1.0, ""),
-        lambda inputs: inputs.state.penetration_rate,
-        required_fields=("penetration_rate",),
-    ),
+    "penetration_rate": _field_feature("penetration_rate", ScaledInput("penetration rate", 1.0, "")),
     "adjacent_lanes": Feature(
         lambda inputs: _adjacent_lane_features(inputs.state),
         (

@@ -241,11 +241,7 @@ class JamAhead(FormulaDriver):
     name: ClassVar[str] = "jam-ahead"
     accepts_floats: ClassVar[bool] = False
     required_fields: ClassVar[tuple[str, ...]] = (
-        "allowed_speed",
-        "distance_to_merge",
-        "lane_speeds",
-        "road_speeds",
-        "penetration_rate",
+        *("allowed_speed", "distance_to_merge", "lane_speeds", "road_speeds", "penetration_rate"),
     )
 
     first_section: SectionIndex = 0

@@ -120,32 +120,28 @@ class SafetyFilter:
         acceleration: Array,
         state: FollowingState,
         step: float,
-        actuator: Actuator | None = None,
-        actuator_state: ActuatorState | None = None,
+        actuation: tuple[Actuator, ActuatorState] | None = None,
     ) -> Array:
         """Return the allowed part of a desired acceleration [m/s2], of its shape.
 
-        The command holds for one `step` of simulation [s]. Without an `actuator` the vehicle responds at once; with
-        one, `actuator_state` is its current state.
+        The command holds for one `step` of simulation [s]. Without `actuation`, an actuator and its current state, the
+        vehicle responds at once.
         """
         if not self.active:
             return acceleration
-        if type(acceleration) is float and actuator_state is None and self._is_clearly_safe(acceleration, state, step):
+        if type(acceleration) is float and actuation is None and self._is_clearly_safe(acceleration, state, step):
             return acceleration
-        return clamp_max(acceleration, self.max_acceleration(state, step, actuator, actuator_state))
+        return clamp_max(acceleration, self.max_acceleration(state, step, actuation))
 
     def max_acceleration(
-        self,
-        state: FollowingState,
-        step: float,
-        actuator: Actuator | None = None,
-        actuator_state: ActuatorState | None = None,
+        self, state: FollowingState, step: float, actuation: tuple[Actuator, ActuatorState] | None = None
     ) -> Array:
         """Return the highest acceleration that may be commanded; maximum braking if none may."""
         leader = clamp_min(state.leader_speed - self.speed_error, 0.0)
         gap = clamp_max(state.gap, MAX_LEADER_GAP) - (self.gap_error + self.standstill_gap)
         speed, delay_steps = state.speed, 0
-        if actuator is not None and actuator_state is not None:
+        if actuation is not None:
+            actuator, actuator_state = actuation
             standing = actuator.equivalent_speed(0.0 * speed, ActuatorState(0.0 * speed), self.braking, step)
             speed = actuator.equivalent_speed(speed, actuator_state, self.braking, step)
             for command in actuator_state.pending:
@@ -208,6 +204,6 @@ class CAVActuation:
             command = self._limit(acceleration, state, self._step)
             return command, command
         actuator_state = self._states.get(name) or self._actuator.initial_state(state.speed, self._step)
-        command = self._limit(acceleration, state, self._step, self._actuator, actuator_state)
+        command = self._limit(acceleration, state, self._step, (self._actuator, actuator_state))
         self._states[name] = self._actuator.apply_command(command, state.speed, actuator_state, self._step)
         return command, self._states[name].acceleration

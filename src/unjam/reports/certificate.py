@@ -17,16 +17,12 @@ DOMAIN_QUANTITIES = (("own speed", "speed", "m/s"), ("leader speed", "leader_spe
 
 def write_certificate_page(name: str, driver: FilteredDriver, certificate: dict[str, Any], target: Path) -> None:
     """Write the page of a controller; `certificate` is that of its file."""
-    worst, strings = certificate["worst_cases"], certificate["string_stability"]
+    worst, strings, comfort = (certificate[key] for key in ("worst_cases", "string_stability", "comfort"))
     cards = [
         ("Min gap", f"{worst['min_gap']:.2f} m", "in all tests"),
         ("Min time gap", f"{worst['min_time_gap']:.2f} s", "while the leader brakes hard"),
         ("Max braking", f"{worst['max_braking']:.1f} m/s²", "in all tests"),
-        (
-            "Ride comfort",
-            f"{certificate['comfort']['rms_acceleration']:.2f} m/s²",
-            "r.m.s.; below 0.315 is comfortable",
-        ),
+        ("Ride comfort", f"{comfort['rms_acceleration']:.2f} m/s²", "r.m.s.; below 0.315 is comfortable"),
     ]
     text = render_template(
         "certificate.html",

@@ -183,10 +183,8 @@ def _wave_caption(facts: dict[str, Any]) -> str:
     cavs = "CAVs repeat their recorded accelerations, but noise"
     if facts.get("lane_names"):
         left += ", with its traffic demand"
-        start, cavs = (
-            "with the same demand",
-            "Only the expert drives the CAVs, and the perception error of human drivers",
-        )
+        start = "with the same demand"
+        cavs = "Only the expert drives the CAVs, and the perception error of human drivers"
     return (
         f"Left: {left}; then rollouts {start}, with the learned model and with the base model alone. {cavs} is drawn "
         "again: waves are as frequent and as fast, but occur at other times."

@@ -92,9 +92,8 @@ def unpack_episode(arrays: dict[str, Any]) -> dict[str, Any]:
         packed = arrays.get(name)
         if packed is not None and len(packed) == is_present.sum():
             unpacked[name] = np.full((*is_present.shape, *packed.shape[1:]), np.nan, np.float32)
-            unpacked[name][is_present] = (
-                np.where(packed == NO_LANE, np.nan, packed) if name == "lane_indices" else packed
-            )
+            values = np.where(packed == NO_LANE, np.nan, packed) if name == "lane_indices" else packed
+            unpacked[name][is_present] = values
     return unpacked
 
 

@@ -224,9 +224,8 @@ def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
             is_marked = (gain.low > 0 or gain.high < 0) and gain.count == pairs
             is_better = (gain.mean > 0) == (name in HIGHER_IS_BETTER)
             mark = ("better" if is_better else "worse") if is_marked else ""
-            cells.append(
-                {"text": str(estimate_cell(gain, metric.digits, pairs, "+")), "mark": mark, "count": gain.count}
-            )
+            text = str(estimate_cell(gain, metric.digits, pairs, "+"))
+            cells.append({"text": text, "mark": mark, "count": gain.count})
         if any(cell["count"] for cell in cells):
             rows.append({"label": metric.label, "unit": metric.unit, "cells": cells})
     return {"names": [column.name for column, _ in compared], "rows": rows}
