@@ -18,9 +18,7 @@ UPSTREAM_LENGTH, MERGING_LENGTH, DOWNSTREAM_LENGTH, RAMP_LENGTH = 2000.0, 300.0,
 """lengths of the motorway upstream of the merging section, of that section, downstream of it, and of the ramp [m]"""
 MOTORWAY_LENGTH = UPSTREAM_LENGTH + MERGING_LENGTH + DOWNSTREAM_LENGTH
 """[m]"""
-MOTORWAY_SPEED_LIMIT, RAMP_SPEED_LIMIT = 27.78, 22.22
-"""[m/s]"""
-RAMP_ENTRY_SPEED = 15.0
+MOTORWAY_SPEED_LIMIT, RAMP_SPEED_LIMIT, RAMP_ENTRY_SPEED = 27.78, 22.22, 15.0
 """[m/s]"""
 MIN_RAMP_HEADWAY = 2.0
 """smallest time between two vehicles that want to enter the ramp [s]"""

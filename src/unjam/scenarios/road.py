@@ -154,14 +154,15 @@ class VehicleType(NamedTuple):
 
 
 class EdgeLane(NamedTuple):
-    """A lane of an edge; the lanes of consecutive edges with the same `lane_index` form one lane of the road."""
+    """A lane of an edge, from its start along the main road [m] on; speed limit [m/s].
+
+    The lanes of consecutive edges with the same `lane_index` form one lane of the road.
+    """
 
     name: str
     lane_index: int
     start: float
-    """along the main road [m]"""
     speed_limit: float
-    """[m/s]"""
     is_merging: bool = False
     """whether it is part of the merging section, where no vehicle is commanded"""
 

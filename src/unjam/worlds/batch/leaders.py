@@ -28,12 +28,10 @@ HumanParameters = IDMParameters | IDMArrays
 
 
 class Leader(NamedTuple):
-    """Leaders of drivers; arrays of shape (vehicles, W)."""
+    """Leaders of drivers: speed [m/s] and gap [m], arrays of shape (vehicles, W)."""
 
     speed: Array
-    """[m/s]"""
     gap: Array
-    """[m]"""
 
 
 def leaders(

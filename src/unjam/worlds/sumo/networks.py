@@ -38,14 +38,12 @@ _intact_networks: dict[Path, tuple[int, int]] = {}
 
 
 class NetworkLane(NamedTuple):
-    """A lane of a network outside of junctions."""
+    """A lane of a network outside of junctions; length [m], speed limit [m/s]."""
 
     name: str
     edge: str
     length: float
-    """[m]"""
     speed_limit: float
-    """[m/s]"""
     successors: tuple[str, ...]
     has_stop_line: bool = False
     """whether vehicles may have to wait at its end: at a signal, a stop sign, or to yield"""
@@ -97,12 +95,9 @@ def network_file(network: RoadNetwork) -> Path:
         {"id": name, "x": f"{x:.6f}", "y": f"{y:.6f}", "type": "priority" if has_priority else None, "radius": radius}
         for name, x, y, has_priority, radius in network.nodes
     ]
-    files = {
-        ("--node-files", "road.nod.xml"): xml_document("nodes", "node", nodes),
-        ("--edge-files", "road.edg.xml"): xml_document(
-            "edges", "edge", (_edge_attributes(edge, network.speed_limit) for edge in network.edges)
-        ),
-    }
+    edges = [_edge_attributes(edge, network.speed_limit) for edge in network.edges]
+    files = {("--node-files", "road.nod.xml"): xml_document("nodes", "node", nodes)}
+    files["--edge-files", "road.edg.xml"] = xml_document("edges", "edge", edges)
     if network.connections:
         names = "from", "to", "fromLane", "toLane"
         connections = [dict[str, Any](zip(names, each, strict=True)) for each in network.connections]
@@ -136,12 +131,11 @@ def network_path(road: Road) -> Path:
 
 
 class NetworkGeometry(NamedTuple):
-    """Geometry of a network file, for figures and services."""
+    """Geometry of a network file, for figures and services; lengths [m]."""
 
     lane_lines: Floats
     """center lines of all lanes: rows (x, y) [m], a row of NaN between two lines"""
     edge_lengths: dict[str, float]
-    """[m]"""
     lane_counts: dict[str, int]
 
 
@@ -153,11 +147,8 @@ def network_geometry(path: Path) -> NetworkGeometry:
 @lru_cache(8)
 def _read_geometry(path: Path, stamp: tuple[int, int]) -> NetworkGeometry:
     lanes = read_lanes(path)
-    rows: list[tuple[float, float]] = []
-    for _, _, points in lanes:
-        rows += [*points, (float("nan"), float("nan"))]
-    lengths = {edge: length for edge, length, _ in lanes}
-    counts = Counter(edge for edge, _, _ in lanes)
+    rows = [point for _, _, points in lanes for point in (*points, (float("nan"), float("nan")))]
+    lengths, counts = {edge: length for edge, length, _ in lanes}, Counter(edge for edge, _, _ in lanes)
     return NetworkGeometry(np.array(rows, np.float64).reshape(-1, 2), lengths, dict(counts))
 
 

@@ -35,7 +35,7 @@ IMPATIENCE_TIME = 300.0
 """waiting time in which impatience grows by one [s]"""
 MAX_WAITING_ACCELERATION = 0.5 * SUMO_ACCELERATION
 """acceleration up to which a slow vehicle counts as waiting [m/s2]"""
-CROSSED_LANE_WIDTH = 3.2
+CROSSED_LANE_WIDTH, CAR_WIDTH = 3.2, 1.8
 """[m]"""
 CONFLICT_AREA_START = CROSSING_LINK / 2.0 - CROSSED_LANE_WIDTH / 2.0
 """distance from the start of the crossing to the crossed lane [m]"""
@@ -43,8 +43,6 @@ STOPPING_FOE_DELAY = 30.0
 """additional arrival time of foes that can stop before the crossing [s]"""
 LANE_LENGTH_DIGITS = 6
 """decimal places of lane lengths in SUMO's networks [m]"""
-CAR_WIDTH = 1.8
-"""[m]"""
 COMMANDED_SPEED_TOLERANCE = 1e-9
 """[m/s]"""
 

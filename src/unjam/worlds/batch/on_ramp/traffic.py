@@ -50,7 +50,7 @@ class InsertionQueue:
 
     def __init__(self, roads: Sequence[MotorwayRoad], to_array: ArrayFactory) -> None:
         self._roads, self._to_array = roads, to_array
-        shape = 1 + max(lane.lane_index for lane in roads[0].edge_lanes), len(roads)
+        shape = len(roads[0].lane_names), len(roads)
         self._entry_times = np.full((*shape, 1 + max(len(road.entries) for road in roads)), np.inf)
         self._entry_numbers = np.zeros(self._entry_times.shape, np.intp)
         counts = np.zeros(shape, np.intp)
@@ -107,8 +107,8 @@ class InsertionQueue:
 
 def driver_columns(vehicle_type: VehicleType) -> tuple[float, ...]:
     """Return the parameters of a driver in the order of `MotorwayVehicles`, from `time_headway` to `is_eidm`."""
-    kind, limits = vehicle_type, (vehicle_type.acceleration, vehicle_type.deceleration)
-    return kind.time_headway, *limits, kind.minimum_gap, kind.speed_factor, kind.model == "EIDM"
+    model, *parameters = vehicle_type
+    return *parameters, model == "EIDM"
 
 
 def make_vehicles(*columns: np.ndarray) -> MotorwayVehicles:
@@ -124,18 +124,9 @@ def make_vehicles(*columns: np.ndarray) -> MotorwayVehicles:
 
 def enable_acc(vehicles: MotorwayVehicles, rows: np.ndarray, cruise_control: CruiseControl) -> MotorwayVehicles:
     """Return the vehicles with some of them driven by their ACC instead of human drivers."""
-    acc = cruise_control
-    gaps = {"time_headway": acc.time_gap, "minimum_gap": acc.minimum_gap}
-    limits = {"max_acceleration": acc.acceleration, "braking": acc.deceleration}
+    gaps = {"time_headway": cruise_control.time_gap, "minimum_gap": cruise_control.minimum_gap}
+    limits = {"max_acceleration": cruise_control.acceleration, "braking": cruise_control.deceleration}
     return vehicles.replace_rows(rows, is_eidm=False, **gaps, **limits)
-
-
-def empty_vehicles(to_array: ArrayFactory) -> MotorwayVehicles:
-    """Return the vehicles of empty roads."""
-    empty = to_array(np.zeros(0))
-    integers = namespace(empty).zeros(0, dtype=namespace(empty).int64)
-    columns = dict.fromkeys(MotorwayVehicles._fields, empty) | {"is_eidm": empty > 0.0}
-    return MotorwayVehicles(**columns | dict.fromkeys(("road", "entry", "lane"), integers))
 
 
 class BatchMotorways:
@@ -156,7 +147,11 @@ class BatchMotorways:
         limits, lane_count = (first.limit_speed, RAMP_SPEED_LIMIT), len(first.lane_names) - 1
         lengths = UPSTREAM_LENGTH, merge_end, merge_end + DOWNSTREAM_LENGTH
         self.geometry = MotorwayGeometry(*lengths, *limits, lane_count, first.vehicle_length)
-        self.vehicles, self.time = empty_vehicles(to_array), 0.0
+        empty = to_array(np.zeros(0))
+        integers = namespace(empty).zeros(0, dtype=namespace(empty).int64)
+        columns = dict.fromkeys(MotorwayVehicles._fields, empty) | {"is_eidm": empty > 0.0}
+        columns |= dict.fromkeys(("road", "entry", "lane"), integers)
+        self.vehicles, self.time = MotorwayVehicles(**columns), 0.0
         self._cached_neighbors: tuple[Array, LaneNeighbors] | None = None
         self.insertion_queue = InsertionQueue(roads, to_array)
         self._step, self._draw = step, draw
@@ -181,7 +176,6 @@ class BatchMotorways:
         return moved.select(has_left)
 
     def _moved_vehicles(self) -> MotorwayVehicles:
-        """Return the vehicles after a step without lane changes."""
         vehicles, geometry, step = self.vehicles, self.geometry, self._step
         xp, speed, position = namespace(vehicles.speed), vehicles.speed, vehicles.position
         if not len(speed):
@@ -249,7 +243,6 @@ class BatchMotorways:
     def _final_speeds(
         self, vehicles: MotorwayVehicles, safe_speed: Array, effective_gap: Array, leader_speed: Array
     ) -> tuple[Array, Array]:
-        """Return the speeds after this step, and the times of the last start."""
         step, speed, drivers, xp = self._step, vehicles.speed, vehicles.drivers, namespace(vehicles.speed)
         lowest, desired, highest = eidm.eidm_speed_bounds(
             speed, safe_speed, effective_gap, leader_speed, drivers.parameters, drivers.errors, step

@@ -71,7 +71,8 @@ class MotorwayBatch:
         first = self.roads[0]
         self._road_sections = RoadSections(len(first.lane_names), first.length, len(seeds))
         self._messages = RoadsideMessages(first.roadside, scenario.control_step, self._human_generators[0])
-        self.limits, self.control_steps, self.entered_count = scenario.acceleration_limits, 0, 0
+        self.limits, self.control_steps = scenario.acceleration_limits, 0
+        self.entered_count, self.cav_count = 0, 0
         self._cav_numbers: NDArray[np.intp] = np.zeros(0, np.intp)
         """road and entry of each CAV as one number, in order of entry"""
         self._cav_entry_counts = np.zeros(len(seeds))
@@ -96,11 +97,6 @@ class MotorwayBatch:
         """Start with empty roads, without a history."""
         self._is_controlled = is_controlled
         self._update_cavs()
-
-    @property
-    def cav_count(self) -> int:
-        """Number of CAVs on the roads now."""
-        return len(self._cav_numbers)
 
     @property
     def cav_roads(self) -> NDArray[np.intp]:
@@ -165,7 +161,7 @@ class MotorwayBatch:
         new = new[np.argsort(numbers[new], kind="stable")]
         self.remaining_rows = np.flatnonzero(remains).tolist() if len(new) or not remains.all() else None
         self._cav_numbers = np.concatenate([self._cav_numbers[remains], numbers[new]])
-        self.entered_count += len(new)
+        self.entered_count, self.cav_count = self.entered_count + len(new), len(self._cav_numbers)
         if self._is_controlled and len(new):
             vehicles = traffic.vehicles = enable_acc(vehicles, new, self.scenario.cruise)
         self._cav_entry_counts += np.bincount(vehicles.road[new], minlength=len(self.roads))
@@ -181,7 +177,6 @@ class MotorwayBatch:
         self._log.record_control_step(vehicles, gaps, backlog, self._cav_numbers, self._local_state)
 
     def _exact_state(self) -> LocalState:
-        """Return the readings of exact sensors of the CAVs."""
         traffic, vehicles, road = self._traffic, self._traffic.vehicles, self.roads[0]
         rows, neighbors, geometry = find_rows(self._cav_numbers, vehicles), traffic.neighbors, traffic.geometry
         roads, _, lane, position, speed = (each[rows] for each in vehicles[:5])

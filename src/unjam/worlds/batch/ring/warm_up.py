@@ -32,11 +32,6 @@ class WarmUpState(NamedTuple):
     crossing_memory: CrossingMemory | None = None
     """of a figure eight; None on rings"""
 
-    @property
-    def cav_count(self) -> int:
-        """Number of CAVs with a history, at least one."""
-        return 1 if self.history is None else len(self.history.speed)
-
 
 class WarmUpCache(dict[WarmUpKey, WarmUpState]):
     """The newest warm-up states."""
@@ -48,10 +43,11 @@ class WarmUpCache(dict[WarmUpKey, WarmUpState]):
         if all(key in self for key in keys):
             return [self[key] for key in keys]
         known = {**self, **warm_up([key for key in dict.fromkeys([*keys, *upcoming]) if key not in self])}
-        remaining_cavs = sum(state.cav_count for state in known.values())
+        counts = [1 if state.history is None else len(state.history.speed) for state in known.values()]
+        remaining_cavs = sum(counts)
         self.clear()
-        for key, state in known.items():
+        for (key, state), count in zip(known.items(), counts, strict=True):
             if remaining_cavs <= MAX_CACHED_CAVS:
                 self[key] = state
-            remaining_cavs -= state.cav_count
+            remaining_cavs -= count
         return [known[key] for key in keys]
