@@ -9,7 +9,7 @@ import re
 from importlib.resources import files
 from pathlib import Path
 
-from unjam.controller.file import SUFFIX, controller_bytes, load_controller, sha256_of
+from unjam.controller.file import SUFFIX, controller_bytes, controller_file, load_controller, sha256_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.drivers.user_driver import is_file_reference
@@ -58,11 +58,8 @@ def make_expert(name: str, time_step: float) -> Driver:
 
 def controller_path(driver_name: str) -> Path | None:
     """Return the file of the controller with a driver's name; None if the driver is none."""
-    path = Path(driver_name)
-    if driver_name.startswith(PACKAGED_PREFIX):
-        path = packaged_file(driver_name.removeprefix(PACKAGED_PREFIX))
-    elif os.path.isdir(driver_name):
-        path = path / f"controller{SUFFIX}"
+    is_packaged = driver_name.startswith(PACKAGED_PREFIX)
+    path = packaged_file(driver_name.removeprefix(PACKAGED_PREFIX)) if is_packaged else controller_file(driver_name)
     return path if path.suffix == SUFFIX and os.path.isfile(path) else None
 
 

@@ -134,8 +134,7 @@ def read_controller(path: Path | str) -> Controller:
 
 def controller_file(path: Path | str) -> Path:
     """Return the file of a controller: that in a run folder, or the path itself."""
-    path = Path(path)
-    return path / f"controller{SUFFIX}" if path.is_dir() else path
+    return Path(path, f"controller{SUFFIX}") if os.path.isdir(path) else Path(path)
 
 
 def sha256_of(part: bytes) -> str:

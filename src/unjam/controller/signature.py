@@ -27,8 +27,7 @@ try:
         load_pem_public_key,
     )
 except ImportError:
-    _MISSING_PACKAGE = "cryptography is not installed; signatures need it"
-    raise MissingPartError(f"{_MISSING_PACKAGE}: pip install cryptography") from None
+    raise MissingPartError("cryptography is not installed; signatures need it: pip install cryptography") from None
 
 PRIVATE_KEY_DESCRIPTION = "an Ed25519 private key in PEM without a password, as `unjam keys` writes it"
 PUBLIC_KEY_DESCRIPTION = "an Ed25519 public key in PEM, as `unjam keys` writes it"

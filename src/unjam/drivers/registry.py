@@ -18,15 +18,7 @@ from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.user_driver import FileDriver, FileReference, is_file_reference
-from unjam.drivers.wrappers import (
-    INNER_KEY,
-    FilteredDriver,
-    HistoryDriver,
-    ImpairedDriver,
-    MixedDriver,
-    QueueFallback,
-    RoadTypeSwitch,
-)
+from unjam.drivers.wrappers import COMPOSITE_CLASSES, INNER_KEY, MixedDriver
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, build_dataclass, split_parameters
 from unjam.tree import Arrays
@@ -35,7 +27,6 @@ _DRIVER_CLASSES = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
     *(Pacer, JamAbsorber, Cruise, JamAhead, GapMaker, AdaptiveACC, Constant),
 )
-_COMPOSITE_CLASSES = ImpairedDriver, FilteredDriver, HistoryDriver, RoadTypeSwitch, QueueFallback
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _DRIVER_CLASSES}
 
 InnerDriverBuilder = Callable[[Any, str], Driver]
@@ -150,7 +141,7 @@ RECIPE_BUILDERS: dict[str, Callable[[Recipe, Arrays, InnerDriverBuilder], Driver
     "mixed": lambda recipe, weights, build_inner: MixedDriver(
         tuple(build_inner(part, str(number)) for number, part in enumerate(recipe["drivers"]))
     ),
-    **{kind.kind: partial(_build_composite, kind) for kind in _COMPOSITE_CLASSES},
+    **{kind.kind: partial(_build_composite, kind) for kind in COMPOSITE_CLASSES},
 }
 """functions that build a driver, by the kind of its recipe"""
 

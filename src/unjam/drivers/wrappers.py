@@ -423,3 +423,7 @@ class RoadTypeSwitch(CompositeDriver):
             return "loop"
         rate = rate if isinstance(rate, float) else float(rate[0])
         return "shared_loop" if rate >= MIN_SHARED_PENETRATION_RATE else "loop"
+
+
+COMPOSITE_CLASSES = ImpairedDriver, FilteredDriver, HistoryDriver, RoadTypeSwitch, QueueFallback
+"""composite drivers whose recipe has their fields"""

@@ -16,15 +16,7 @@ from unjam.files import atomic_write, check_parent_folder
 from unjam.measures.effect import MAX_FLOW_LOSS, MIN_VERDICT_SEEDS, format_percent
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.statistics import Estimate, format_difference
-from unjam.reports.figures import (
-    LINE_COLORS,
-    PLOT_STYLE,
-    TEXT_COLOR,
-    data_uri,
-    has_lane_maps,
-    new_figure,
-    space_time_figure,
-)
+from unjam.reports import figures
 from unjam.reports.html import render_template
 from unjam.reports.results import original_command, read_results, replace_null
 
@@ -69,10 +61,10 @@ def render_assessment(folder: Path) -> str:
         columns=[HUMAN_BASELINE_LABEL, *map(_option_label, _evaluated_options(assessment))],
         result_rows=_result_rows(assessment),
         candidate_rows=[_tuning_row(each) for each in assessment["candidates"]],
-        effect_figure=data_uri(effect_figure(assessment)),
-        space_time=data_uri(space_time_figure(panels)) if panels else "",
+        effect_figure=figures.data_uri(effect_figure(assessment)),
+        space_time=figures.data_uri(figures.space_time_figure(panels)) if panels else "",
         panels=[panel.driver for panel in panels],
-        has_lane_maps=has_lane_maps(panels),
+        has_lane_maps=figures.has_lane_maps(panels),
         percent=format_percent,
         breakable=breakable_label,
         max_flow_loss=MAX_FLOW_LOSS,
@@ -168,7 +160,7 @@ def _tuning_row(option: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-@rc_context(PLOT_STYLE)
+@rc_context(figures.PLOT_STYLE)
 def effect_figure(assessment: dict[str, Any]) -> Figure:
     """Draw the effect of each driver at each penetration rate, in percent of the human baseline.
 
@@ -176,18 +168,18 @@ def effect_figure(assessment: dict[str, Any]) -> Figure:
     """
     drivers = list(dict.fromkeys([*(each["driver"] for each in assessment["acc_results"]), *assessment["drivers"]]))
     rates = assessment["penetration_rates"]
-    figure = new_figure(4.0)
+    figure = figures.new_figure(4.0)
     panels = figure.subplots(1, 2)
     quantities = (("travel_time", "baseline_travel_time", "travel time"), ("flow", "baseline_flow", "flow"))
     for axes, (field, baseline, label) in zip(panels, quantities, strict=True):
-        axes.axhline(0, color=TEXT_COLOR, lw=0.9)
+        axes.axhline(0, color=figures.TEXT_COLOR, lw=0.9)
         groups = (("candidates", 0.35, 4, 0.0), ("acc_results", 1.0, 6, 0.06), ("controller_results", 1.0, 6, 0.06))
         for group, alpha, size, shift in groups:
             for option in assessment[group]:
                 number, effect = drivers.index(option["driver"]), option["effect"]
                 x = rates.index(option["penetration_rate"]) + 0.7 * ((number + 0.5) / len(drivers) - 0.5) + shift
                 scale = 100.0 / effect[baseline] if effect[baseline] else nan  # no vehicle left in so short a time
-                style = {"color": LINE_COLORS[(number + 1) % len(LINE_COLORS)], "alpha": alpha}
+                style = {"color": figures.LINE_COLORS[(number + 1) % len(figures.LINE_COLORS)], "alpha": alpha}
                 axes.plot([x] * 2, [scale * effect[field].low, scale * effect[field].high], lw=1.6, **style)
                 axes.plot(x, scale * effect[field].mean, "o", ms=size, **style)
         axes.set_ylabel(f"{label} compared with human baseline [%]")
@@ -195,6 +187,6 @@ def effect_figure(assessment: dict[str, Any]) -> Figure:
         axes.set(xlim=(-0.5, len(rates) - 0.5), xlabel="penetration rate")
         axes.grid(False, axis="x")
     for number, name in enumerate(drivers):
-        panels[0].plot([], [], "o-", color=LINE_COLORS[(number + 1) % len(LINE_COLORS)], label=name)
+        panels[0].plot([], [], "o-", color=figures.LINE_COLORS[(number + 1) % len(figures.LINE_COLORS)], label=name)
     figure.legend(loc="outside upper left", ncols=4)
     return figure
