@@ -292,3 +292,16 @@ def test_differences_from_plain_sumo_are_noted(tmp_path: Path) -> None:
         "road.sumocfg: replaced by values of unjam: seed, max-depart-delay",
     ]
     assert make_scenario("ring").notes == []
+
+
+def test_traffic_that_sumo_makes_otherwise_is_noted(tmp_path: Path) -> None:
+    shares = '<device.rerouting.probability value="0.5"/><device.fcd.probability value="0.5"/><threads value="2"/>'
+    network = '<net version="1.20"><edge id="a"><lane id="a_0" allow="bicycle"/></edge></net>'
+    path = configuration(tmp_path, shares, network=network)
+    assert load_user_network(str(path), {"penetration_rate": 0.5}).notes[:4] == [
+        "road.sumocfg: left out because they only write or listen: option device.fcd.probability",
+        "road.sumocfg: replaced by values of unjam: threads",
+        "road.sumocfg: without the devices left out, SUMO equips other vehicles with the rest",
+        "road.sumocfg: has bicycle lanes, where SUMO repeats an episode only in a new process: travel times of equal "
+        "seeds differ by about 0.1 %",
+    ]

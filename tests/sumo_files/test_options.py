@@ -18,7 +18,7 @@ ONLY_REPORTS = {"configuration", "output", "report", "traci_server", "gui_only"}
 NO_EFFECT = {
     *("device.rerouting.output", "device.rerouting.threads", "device.taxi.dispatch-algorithm.output"),
     *("device.taxi.idle-algorithm.output", "device.toc.file", "emissions.volumetric-fuel"),
-    *("load-state.offset", "load-state.remove-vehicles", "threads"),
+    *("load-state.offset", "load-state.remove-vehicles"),
 }
 """options of other groups that change none either, or none without another option"""
 DEVICES_THAT_WRITE = ("ssm", "example", "fcd", "tripinfo", "vehroute", "btreceiver", "btsender", "fcd-replay")
@@ -62,7 +62,7 @@ def test_every_option_of_sumo_is_passed_or_refused_unless_it_changes_no_vehicle(
         else:
             assert found in ("passed", "replaced", "refused"), name
     assert fates["refused"] == {*REFUSED_OPTIONS}
-    assert fates["replaced"] == {"seed", "random", "max-depart-delay"}
+    assert fates["replaced"] == {"seed", "random", "max-depart-delay", "threads"}
 
 
 def test_synonyms_of_an_option_are_treated_alike(options: dict[str, tuple[str, str, list[str]]]) -> None:

@@ -140,6 +140,25 @@ def test_included_files_are_read_wherever_they_are_included(tmp_path: Path) -> N
     assert [each.tag for each in copied.iter()][1:] == ["routes", "vType", "x", "vehicle"]
 
 
+def test_elements_for_vehicle_types_apply_to_their_cavs(tmp_path: Path) -> None:
+    rerouter = '<rerouter id="r" edges="a" vTypes="car bus"/>'
+    routes = f'<routes>{rerouter}<vTypeDistribution id="m" vTypes="car"/><vehicle id="v" type="m"/></routes>'
+    path = configuration(tmp_path, routes=routes)
+    assert list(read_sumo_files(path).copy_sources) == [tmp_path / "road.rou.xml"]
+    write_harmless_copy(tmp_path / "road.rou.xml", tmp_path / "copy.xml")
+    lists = [each.get("vTypes") for each in ElementTree.parse(tmp_path / "copy.xml").iter() if each.get("vTypes")]
+    assert lists == ["car bus cav_of_car cav_of_bus", "car"]
+
+
+@pytest.mark.parametrize(
+    ("key", "stays"), [("logan_street_0", True), ("profile", True), ("file", False), ("device.ssm.range", False)]
+)
+def test_parameters_that_write_are_left_out(key: str, stays: bool, tmp_path: Path) -> None:
+    light = f'<tlLogic id="t" type="actuated"><param key="{key}" value="d1"/></tlLogic>'
+    path = configuration(tmp_path, routes=f'<routes>{light}<vehicle id="v"/></routes>')
+    assert (read_sumo_files(path).dropped_items == ()) == stays
+
+
 @pytest.mark.long
 def test_a_large_file_takes_no_memory_and_needs_no_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sumo_files, "MAX_READER_MEMORY", 100 * 2**20)

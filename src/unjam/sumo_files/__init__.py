@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 from unjam import sandbox
 from unjam.child_processes import child_environment, python_command
 from unjam.errors import InputError, invalid_value, spelling_hint
-from unjam.sumo_files.reader import FILE_ATTRIBUTES, FILE_PARAMETER_PARTS, file_stamp
+from unjam.sumo_files.reader import FILE_ATTRIBUTES, file_stamp
 
 READER_PROGRAM = Path(__file__).with_name("reader_program.py")
 MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120
@@ -41,7 +41,7 @@ _IGNORED = """
 step-length no-step-log no-warnings aggregate-warnings verbose start duration-log.disable duration-log.statistics
 xml-validation xml-validation.net xml-validation.routes gui-settings-file quit-on-end delay precision step-log.period
 print-options human-readable-time registry-viewport aggregate-warnings language log.timestamps log.processid help
-version threads device.rerouting.threads emissions.volumetric-fuel load-state.offset load-state.remove-vehicles
+version device.rerouting.threads emissions.volumetric-fuel load-state.offset load-state.remove-vehicles
 configuration-file configuration c game game.mode breakpoints edgedata-files data-files alternative-net-file
 selection-file demo disable-textures window-size window-pos tracker-interval gui-testing gui-testing-debug
 suppress-warnings no-duration-log
@@ -52,7 +52,7 @@ PASSED_OPTION_PREFIXES = tuple(_PASSED_PREFIXES.split())
 """beginnings of the names of other such options"""
 IGNORED_OPTIONS = {*_IGNORED.split(), *"vtgdHWXVQGSDTBmN?"}
 """options that unjam decides itself, or that change nothing: not reported if they are left out"""
-REPLACED_OPTIONS = ("seed", "random", "max-depart-delay")
+REPLACED_OPTIONS = ("seed", "random", "max-depart-delay", "threads")
 """options that change the traffic, and that unjam replaces by its own values"""
 OUTPUT_OPTIONS = re.compile(
     r"output|^(write-|save-|netstate|ndump|dump-|summary$|tripinfo$|personinfo$|vehroutes|personroutes$)"
@@ -109,6 +109,7 @@ class SumoFiles(NamedTuple):
     """nested `<param>` elements of the types: values by key, by the type's id"""
     used_types: frozenset[str]
     """types that vehicles have"""
+    has_bicycle_lanes: bool
 
 
 _read_files: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
@@ -194,11 +195,6 @@ def write_harmless_copy(path: Path, copy: Path, types: Path | None = None) -> No
 def is_harmless_attribute(name: str) -> bool:
     """Return whether an attribute of a vehicle type is harmless: it names no file."""
     return name not in FILE_ATTRIBUTES and not name.endswith("File")
-
-
-def is_harmless_parameter(key: str) -> bool:
-    """Return whether a `<param>` of a vehicle type is harmless: it makes SUMO write no file."""
-    return not any(word in key.lower() for word in FILE_PARAMETER_PARTS)
 
 
 def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, *extra_paths: Path) -> Any:

@@ -4,6 +4,7 @@ It needs only Python's standard library: `reader_program.py` runs it in a separa
 """
 
 import os
+import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -28,6 +29,12 @@ FILE_ATTRIBUTES = ("file", "output", "dest", "href")
 FILE_PARAMETER_PARTS = ("file", "output", "log", "ssm", "tripinfo")
 """parts of the names of parameters of vehicles and traffic lights that name files, write one themselves, or keep trips
 out of the records from which delays are read"""
+LANE_NAME = re.compile(r"_\d+$")
+"""end of the name of a lane: such a key of a traffic light's parameter names the detector of a lane"""
+CAV_TYPE_TEMPLATE = "cav_of_{}"
+"""name of the type of the CAVs that replace vehicles of a type"""
+TYPE_LIST, TYPE_LIST_DEFINITIONS = "vTypes", ("vTypeDistribution", "personTrip")
+"""attribute by which rerouters, calibrators and detectors select vehicles, and elements in which it creates vehicles"""
 TYPE_ELEMENTS = "vType", "vTypeDistribution"
 CHECKED_ELEMENTS = {*OUTPUT_ELEMENTS, *TYPE_ELEMENTS, "include", "param"}
 """elements that are checked whatever attributes they have"""
@@ -204,13 +211,17 @@ class XmlReader:
 
     def _filter_attributes(self, tag: str, attributes: XmlAttributes) -> XmlAttributes | None:
         """Return the harmless attributes of an element; None if the element itself is harmful."""
-        key = attributes.get("key", "").lower().replace("profile", "")
-        if tag in OUTPUT_ELEMENTS or (tag == "param" and any(word in key for word in FILE_PARAMETER_PARTS)):
+        if tag in OUTPUT_ELEMENTS or (tag == "param" and not is_harmless_parameter(attributes.get("key", ""))):
             self._record_dropped(tag if tag != "param" else f"parameter {attributes['key']}")
             return None
         harmless = dict(attributes)
         for name in attributes:
-            if name not in FILE_ATTRIBUTES and not name.endswith("File"):
+            if name == TYPE_LIST:
+                if tag not in TYPE_LIST_DEFINITIONS:  # a CAV counts as the vehicle that it replaces
+                    types = attributes[name].split()
+                    harmless[name] = " ".join([*types, *map(CAV_TYPE_TEMPLATE.format, types)])
+                    self.needs_copy = True
+            elif name not in FILE_ATTRIBUTES and not name.endswith("File"):
                 self._harmless_names.add(name)
             elif name == "file" and tag.endswith(DETECTOR_SUFFIXES):
                 if harmless[name] != NULL_FILE:
@@ -225,6 +236,12 @@ class XmlReader:
     def _record_dropped(self, name: str) -> None:
         self.dropped_items.add(name)
         self.needs_copy = True
+
+
+def is_harmless_parameter(key: str) -> bool:
+    """Return whether a `<param>` is harmless: it makes SUMO write no file, and removes no trip from the records."""
+    name = key.lower().replace("profile", "")
+    return bool(LANE_NAME.search(key)) or not any(word in name for word in FILE_PARAMETER_PARTS)
 
 
 def parse_xml(path: Path, parser: Any, chunks: Iterable[bytes]) -> None:

@@ -110,6 +110,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
         "calibrated_until": demand.last_end if demand.calibrates else 0.0,
         "step": _read_seconds(path, options, "step-length", 1.0) or 1.0,
         "used_types": sorted(demand.used_types()),
+        "has_bicycle_lanes": demand.has_bicycle_lanes,
         "types": demand.types,
         "type_parameters": demand.type_parameters,
         "stamps": {str(file): stamps[file] for file in [path, *files, *sorted(stamps.keys() - {path, *files})]},
@@ -195,7 +196,7 @@ def _check_network(path: Path, reader: "XmlReader") -> None:
 
 
 class _Demand:
-    """The vehicle types that files define, and the vehicles that they create."""
+    """The vehicle types that files define, the vehicles that they create, and whether there are bicycle lanes."""
 
     def __init__(self) -> None:
         self.types: dict[str, XmlAttributes] = {}
@@ -205,6 +206,7 @@ class _Demand:
         """types and distributions that vehicles have"""
         self.first_departure: float | None = inf
         """departure of the first vehicle [s]; None: unknown"""
+        self.has_bicycle_lanes = False
         self.calibrates = False
         """whether there is a calibrator: SUMO's number of expected vehicles excludes those that it will add"""
         self.last_end = 0.0
@@ -223,6 +225,7 @@ class _Demand:
             **dict.fromkeys(("person", "personFlow"), self._on_person),
             "personTrip": self._on_person_trip,
             "calibrator": self._on_calibrator,
+            "lane": self._on_lane,
             "vType": self._on_type,
             "/vType": self._on_type_end,
             "vTypeDistribution": self._on_distribution,
@@ -247,6 +250,9 @@ class _Demand:
         modes = attributes.get("modes", "").replace(",", " ").split()
         default_types = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
         self.used_names |= set(attributes.get("vTypes", "").split()) or default_types
+
+    def _on_lane(self, attributes: XmlAttributes) -> None:
+        self.has_bicycle_lanes |= attributes.get("allow") == "bicycle"
 
     def _on_calibrator(self, attributes: XmlAttributes) -> None:
         self.calibrates = True

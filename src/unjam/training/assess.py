@@ -40,6 +40,7 @@ from unjam.training.selection import (
     compare_on_test_seeds,
     format_duration,
     min_episodes,
+    min_verdict_episodes,
     select_controllers,
 )
 from unjam.worlds.episode import can_drive
@@ -209,6 +210,10 @@ def assess(
         f"an episode of the human baseline took {duration}; all {request.episodes} episodes on {workers.count} "
         f"workers may take {total}" + (f", but at most {request.minutes:g} min" if request.minutes else "")
     )
+    counts = len(request.penetration_rates), len(request.drivers), request.has_acc_properties
+    needed = min_verdict_episodes(*counts) + PLOT_EPISODE_COUNT
+    if request.episodes < needed:
+        on_message(f"{request.episodes} episodes may be too few for a verdict; enough are {needed}")
     selection = select_controllers(request.options, run_options, budget, on_message)
     selection_episodes = budget.used_episodes - 1
     rates, precision = request.penetration_rates, request.precision

@@ -10,7 +10,7 @@ from tests.worlds.sumo.user_networks import SPARSE, network, straight
 from unjam.controller import make_driver
 from unjam.drivers import Constant, Human
 from unjam.drivers.command import Command
-from unjam.drivers.driver import Driver
+from unjam.drivers.user_driver import DriverLike
 from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.worlds.episode import run_episode
@@ -24,9 +24,9 @@ LAW = 'carFollowModel="IDM" tau="1.1" minGap="2"'
 ACCS = {**ACC_SETTINGS, "penetration_rate": 1.0, "end": 60.0}
 
 
-def drive(simulation: Simulation, file: str, driver: Driver, **changes: Any) -> Episode:
+def drive(simulation: Simulation, file: str, driver: DriverLike, **changes: Any) -> Episode:
     scenario = make_scenario(file, {**ACCS, **changes})
-    return run_episode(scenario, driver, (3,), simulation=simulation)
+    return run_episode(scenario, driver, (3,), record_details=True, simulation=simulation)
 
 
 BUS_STOPS = (
@@ -40,6 +40,12 @@ PASSENGERS = (
     '<personFlow id="p" begin="0" end="2" number="50"><walk from="road" busStop="s1" departPos="190"/>'
     '<ride busStop="s2" lines="L"/></personFlow>'
 )
+CALIBRATOR = (
+    f'<vType id="own" {LAW}/><route id="again" edges="road"/>'
+    '<calibrator id="c" edge="road" pos="300" freq="20" vTypes="own">'
+    '<flow begin="0" end="50" vehsPerHour="900" route="again" type="own" speed="20"/></calibrator>'
+)
+"""counts vehicles of a type, and adds those that are missing"""
 
 
 @pytest.mark.parametrize(
@@ -69,8 +75,21 @@ PASSENGERS = (
             "",
             "",
         ),
+        (SPARSE, CALIBRATOR, ""),
     ],
-    ids=["drawn", "distribution", "vehicle", "truck", "limits", "action step", "lateral", "bus", "nested", "mix"],
+    ids=[
+        "drawn",
+        "distribution",
+        "vehicle",
+        "truck",
+        "limits",
+        "action",
+        "lateral",
+        "bus",
+        "nested",
+        "mix",
+        "calibrator",
+    ],
 )
 def test_acc_vehicles_with_the_model_of_their_vehicles_change_nothing(
     demand: str, more: str, options: str, tmp_path: Path, simulation: Simulation
@@ -132,7 +151,15 @@ def test_commands_cannot_exceed_the_limits_of_the_vehicle(
         np.testing.assert_allclose(trip.applied_acceleration[:10], possible)
 
 
-@pytest.mark.parametrize(("vehicle", "most"), [(TRUCK, 0.5), (CAR, 2.6)])
+@pytest.mark.parametrize(
+    ("vehicle", "most"),
+    [
+        (TRUCK, 0.5),
+        (CAR, 2.6),
+        ('<vType id="own" carFollowModel="W99" accel="1"/>', 2.0),
+        ('<vType id="own" carFollowModel="W99" cc8="3"/>', 3.0),
+    ],
+)
 def test_a_set_speed_makes_a_vehicle_accelerate_as_commanded_within_its_limits(
     vehicle: str, most: float, tmp_path: Path, simulation: Simulation
 ) -> None:
@@ -170,9 +197,23 @@ def test_brakes_are_those_of_the_filter_or_of_the_vehicle_if_these_are_weaker(
     assert (limits["car"].acceleration, limits["car"].emergency_deceleration) == (2.6, 6.0)
 
 
+def test_set_speed_caps_count_as_delay(tmp_path: Path, simulation: Simulation) -> None:
+    file = network(tmp_path, CAR + SPARSE)
+    free = drive(simulation, file, make_driver("cruise", 0.1), end=150.0)
+    slow = drive(simulation, file, lambda state: 0.5 * (10.0 - state.speed), end=150.0)
+    compared = free.trips.has_arrived & slow.trips.has_arrived
+    assert compared.sum() > 3
+    difference = slow.trips.travel_time - free.trips.travel_time
+    assert difference[compared].min() > 5.0
+    np.testing.assert_allclose((slow.trips.delay - free.trips.delay)[compared], difference[compared], atol=0.3)
+    assert slow.limit_speed == pytest.approx(free.limit_speed, rel=0.15)
+
+
 def test_cars_parked_beside_the_road_have_no_allowed_speed(tmp_path: Path, simulation: Simulation) -> None:
     stop = '<stop lane="road_0" endPos="300" duration="30" parking="true"/>'
     cars = f'<vehicle id="parked" type="car" route="along" depart="0">{stop}</vehicle>'
     path = straight(tmp_path, cars + '<vehicle id="other" type="car" route="along" depart="2"/>')
-    episode = run_episode(make_scenario(str(path), {"penetration_rate": 0.5}), Human(), 1, record_details=True, simulation=simulation)
+    episode = run_episode(
+        make_scenario(str(path), {"penetration_rate": 0.5}), Human(), 1, record_details=True, simulation=simulation
+    )
     assert episode.limit_speed == pytest.approx(20.0)

@@ -9,13 +9,14 @@ from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, UNLIMITED_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.scenarios.user_network import PASSENGER_CLASS
-from unjam.sumo_files import is_harmless_attribute, is_harmless_parameter
+from unjam.sumo_files import is_harmless_attribute
+from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE, is_harmless_parameter
 from unjam.worlds.sumo.networks import XMLAttributes, network_path, xml_element
 
 SUMO_CAV_COLOR = "215,38,61"
 """red, in SUMO's window"""
-CAV_TYPE_TEMPLATE = "cav_of_{}"
-"""vehicle type of a CAV that replaces a vehicle of the type `{}`"""
+W99_ACCELERATION = 2.0
+"""SUMO's default of `cc8`, the acceleration from a standstill of its model W99 [m/s2]"""
 CALIBRATED_TYPE_TEMPLATE = "{}_of_driver_{}"
 """vehicle type of a car of the type `{}` with the calibrated driver of this number"""
 CAR_FOLLOWING_ATTRIBUTES = {"carFollowModel", "tau", "minGap", "sigma", "delta", "stepping"}
@@ -137,6 +138,8 @@ def _type_variant_xml(
 ) -> str:
     keys = filter(is_harmless_attribute, attributes.keys() - CAR_FOLLOWING_ATTRIBUTES)
     others = {key: attributes[key] for key in sorted(keys)}
+    if attributes.get("carFollowModel") == "W99":  # which accelerates by its own parameter
+        others["accel"] = attributes.get("cc8", W99_ACCELERATION)
     element = xml_element("vType", **{**others, "speedFactor": 1.0, "speedDev": 0.0, **car_following, "id": name})
     nested = "".join(
         xml_element("param", key=key, value=parameters[key]) for key in parameters if is_harmless_parameter(key)

@@ -11,8 +11,8 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import RoadSections, RoadsideMessages
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.road import MotorwayRoad
+from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 from unjam.worlds.record import Floats
-from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
 from unjam.worlds.sumo.open_road import neighbor_state
 

@@ -5,9 +5,6 @@ driver stays in their own process. Started as `python -m unjam.worlds.sumo.sandb
 """
 
 import os
-import signal
-import subprocess
-import sys
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -16,16 +13,15 @@ from contextlib import AbstractContextManager
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, get_type_hints
+from typing import IO, Any, get_type_hints
 
-from unjam.child_processes import child_environment, python_command
 from unjam.errors import LostWorkerError, as_unjam_error, error_from_name
-from unjam.processes import PrivateFolder, exit_with_parent, remove_stale_private_folders
+from unjam.processes import PrivateFolder, remove_stale_private_folders
 from unjam.sandbox import confine_process, limit_resources
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork
-from unjam.tree import pack, unpack
-from unjam.worlds.messages import read_message, write_message
+from unjam.tree import Arrays, pack, unpack
+from unjam.worlds.messages import answer_requests, read_message, start_child, write_message
 from unjam.worlds.sumo.backends import InUseError
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.simulation import Simulation
@@ -78,14 +74,7 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         self._folder = PrivateFolder()
         with _process_starter_lock:
             starter = _process_starter(os.getpid())
-        start = starter.submit(
-            subprocess.Popen[bytes],
-            python_command("-m", "unjam.worlds.sumo.sandboxed"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=child_environment(TMPDIR=self._folder.name),
-            start_new_session=True,  # this process handles an interrupt in the terminal
-        )
+        start = starter.submit(start_child, "unjam.worlds.sumo.sandboxed", TMPDIR=self._folder.name)
         self._process = start.result()
         self.episode_lock = Lock()
 
@@ -140,24 +129,13 @@ def _return_type(name: str) -> Any:
     return get_type_hints(method).get("return", Any) if method else Any
 
 
-def serve_simulation() -> None:
-    """Carry out the calls from standard input until it is closed."""
-    exit_with_parent(signal.SIGKILL)
-    output = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # SUMO may print: not into the answers
-    enter_sandbox()
-    with Simulation(owns_stdout=True) as simulation:
-        while True:
-            try:
-                request, _ = read_message(sys.stdin.buffer)
-            except EOFError:
-                return
-            try:
-                answer, arrays = pack(_execute(simulation, request["call"], request["arguments"]))
-                write_message(output, {"answer": answer}, arrays)
-            except Exception as error:
-                unjam_error = as_unjam_error(error)
-                write_message(output, {"error": [type(unjam_error).__name__, str(unjam_error)]})
+def _answer_request(simulation: Simulation, request: dict[str, Any], arrays: Arrays, output: IO[bytes]) -> None:
+    try:
+        answer, arrays = pack(_execute(simulation, request["call"], request["arguments"]))
+        write_message(output, {"answer": answer}, arrays)
+    except Exception as error:
+        unjam_error = as_unjam_error(error)
+        write_message(output, {"error": [type(unjam_error).__name__, str(unjam_error)]})
 
 
 def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
@@ -171,4 +149,6 @@ def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
 
 
 if __name__ == "__main__":
-    serve_simulation()
+    enter_sandbox()
+    with Simulation(owns_stdout=True) as own_simulation:
+        answer_requests(partial(_answer_request, own_simulation))

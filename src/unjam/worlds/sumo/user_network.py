@@ -15,9 +15,10 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import RoadsideMessages
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.road import UserNetworkRoad
+from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.backends import NeighborStates
-from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, CAV_TYPE_TEMPLATE, vehicle_class_by_type
+from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, vehicle_class_by_type
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
 from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.sections import RoadsideService
@@ -42,6 +43,8 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         self._contact_cavs = set[str]()
         self._entered_vehicle_count, self._selected_cav_count = 0, 0
         self._limits_of_vehicle: dict[str, VehicleLimits] = {}
+        self._hidden_time_loss: dict[str, float] = {}
+        """time that vehicles lost by set-speed caps [s], which SUMO takes for their desired speed"""
         self._roadside_service = None
         step = self.scenario.control_step
         if "lane_speeds" in self.measured_fields:
@@ -107,6 +110,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         for name in [name for name in names if name not in self._limits_of_vehicle]:
             kind = simulation.type_of(name)
             limits = simulation.type_limits(kind.removeprefix(CAV_TYPE_TEMPLATE.format("")))
+            limits = limits._replace(acceleration=simulation.type_limits(kind).acceleration)
             self._limits_of_vehicle[name] = limits
             if self.scenario.actuation in ("shielded", "raw"):
                 simulation.limit_braking(kind, min(limits.emergency_deceleration, self.scenario.cav_max_braking))
@@ -171,9 +175,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         unknown = np.full(len(names), np.nan)
         if not self.record_details:
             return {"positions": unknown, "gaps": unknown}
-        allowed = self._simulation.allowed_speeds(
-            [name for name in names if name not in self._uncapped_max_speeds] or names
-        )
+        allowed = self._allowed_speeds(names)
         self._allowed_speed_sum += np.nansum(allowed)
         self._allowed_speed_count += np.count_nonzero(np.isfinite(allowed))
         rows: list[tuple[float, ...]] = []
@@ -182,6 +184,28 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
             rows.append((self._edge_numbers.setdefault(edge, len(self._edge_numbers)), float(lane or -1), position))
         edge, lane, position = np.array(rows, np.float64).reshape(-1, 3).T
         return {"edge": edge, "lane": lane, "lane_position": position, "gaps": unknown}
+
+    def _allowed_speeds(self, names: Sequence[str]) -> Floats:
+        """Return the speeds that the road allows to vehicles, whatever caps they have [m/s]; NaN beside the road."""
+        uncapped = [self._uncapped_max_speeds.get(name, np.nan) for name in names]
+        if np.isnan(uncapped).all():
+            return np.array(self._simulation.allowed_speeds(names), np.float64)
+        return np.where(
+            np.isnan(uncapped),
+            self._simulation.allowed_speeds(names),
+            np.fmin(uncapped, self._simulation.uncapped_speeds(names)),
+        )
+
+    def _simulate(self, cav_speeds: dict[str, float]) -> None:
+        super()._simulate(cav_speeds)
+        capped = [name for name in self._uncapped_max_speeds if name in self._vehicles.is_cav]
+        if not capped:
+            return
+        simulation, step = self._simulation, self.scenario.simulation_step
+        speeds, caps = np.array(simulation.speeds(capped)), np.array(simulation.allowed_speeds(capped))
+        losses = step * (speeds / caps - speeds / self._allowed_speeds(capped))
+        for name, loss in zip(capped, np.nan_to_num(losses).tolist(), strict=True):
+            self._hidden_time_loss[name] = self._hidden_time_loss.get(name, 0.0) + loss
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
         neighbors = [self._neighbors(name)[1:] for name in names]
@@ -208,6 +232,8 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         episode = super().record(driver_log)
         start = self.road.files.begin + self.scenario.warmup * self.scenario.simulation_step
         trips = self._simulation.end_with_trips(vehicle_class_by_type(self.road), start)
+        hidden = [self._hidden_time_loss.get(name, 0.0) for name in trips.vehicle_ids]
+        trips = replace(trips, time_loss=trips.time_loss + hidden)
         return replace(episode, trips=trips, contacts=len(self._contact_cavs))
 
     def _snapshot_fields(self, columns: NDArray[np.intp]) -> dict[str, Any]:
