@@ -179,7 +179,10 @@ def time_to_dissolve(episode: Episode) -> float:
 
 
 def collisions(episode: Episode) -> float:
-    """Vehicles that collided, on a user's network by its own settings; a collision of a CAV ends the episode."""
+    """Vehicles that collided, on a user's network by its own settings.
+
+    A collision of a CAV ends an episode on a built-in road, and on a user's network in training.
+    """
     return float(episode.collisions)
 
 
@@ -274,7 +277,7 @@ def cav_min_ttc(episode: Episode) -> float:
 
 def share_short_time_gap(episode: Episode) -> float:
     """Share of the CAV's time faster than 1 m/s with a time gap below one second."""
-    return episode.audit.following.share_short_time_gap
+    return episode.audit.following.share_short_time_gap if episode.cav_ids else nan
 
 
 def max_drac(episode: Episode) -> float:
@@ -282,7 +285,7 @@ def max_drac(episode: Episode) -> float:
 
     Almqvist, Hyden and Risser 1991.
     """
-    return episode.audit.following.max_required_braking
+    return episode.audit.following.max_required_braking if episode.cav_ids else nan
 
 
 def max_jerk(episode: Episode) -> float:
