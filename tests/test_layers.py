@@ -329,7 +329,7 @@ CHANGES_THE_PROCESS = {
     "following/networks": "in the command line",
     "unjam_paper/theory": "in the command line",
     "worlds/worker": "in a worker",
-    "worlds/sumo/sandboxed": "in a process that runs SUMO",
+    "worlds/messages": "in a worker, or in a process that runs SUMO",
     "cli/__init__": "in the command line",
     "cli/controllers": "in the command line",
 }

@@ -1,16 +1,51 @@
 """Messages between processes over pipes: frames of JSON and arrays. Nothing is ever unpickled."""
 
 import json
+import os
+import signal
 import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
 from typing import IO, Any
 
 import numpy as np
 
+from unjam.child_processes import child_environment, python_command
+from unjam.processes import exit_with_parent
 from unjam.tree import Arrays
 
 _LENGTHS = struct.Struct(">QQ")
 ARRAY_KINDS = "biuf"
 """kinds of arrays in messages: Booleans and numbers"""
+
+
+def start_child(module: str, stderr: IO[bytes] | None = None, **environment: str) -> subprocess.Popen[bytes]:
+    """Start `python -m module`, a process that answers requests, with changes to its environment."""
+    return subprocess.Popen(
+        python_command("-m", module),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=stderr,
+        env=child_environment(**environment),
+        start_new_session=True,  # the parent handles an interrupt in the terminal
+    )
+
+
+def open_answer_pipe() -> IO[bytes]:
+    """Return the pipe for the answers of this process, which from now on prints to its standard error."""
+    exit_with_parent(signal.SIGKILL)
+    output = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # SUMO and user code may print: not into the answers
+    return output
+
+
+def answer_requests(answer: Callable[[dict[str, Any], Arrays], None]) -> None:
+    """Call `answer` with each request from standard input until the parent closes it, or one of the pipes."""
+    with suppress(BrokenPipeError, EOFError):
+        while True:
+            answer(*read_message(sys.stdin.buffer))
 
 
 def write_message(pipe: IO[bytes], content: dict[str, Any], arrays: Arrays | None = None) -> None:

@@ -4,24 +4,21 @@ Started by `unjam.worlds.worker_pool` as `python -m unjam.worlds.worker`.
 """
 
 import gc
-import os
-import signal
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
-from functools import cache
-from typing import Any, BinaryIO
+from contextlib import ExitStack
+from functools import cache, partial
+from typing import IO, Any
 
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import as_unjam_error
-from unjam.processes import exit_with_parent
 from unjam.scenarios import scenario_from_recipe
 from unjam.scenarios.user_network import UserNetwork
 from unjam.sumo_files import take_answer
 from unjam.tree import Arrays, pack
 from unjam.worlds.episode import run_episode
-from unjam.worlds.messages import read_message, write_message
+from unjam.worlds.messages import answer_requests, open_answer_pipe, write_message
 from unjam.worlds.record import failed_episode
 from unjam.worlds.sumo.sandboxed import enter_sandbox
 from unjam.worlds.sumo.simulation import Simulation
@@ -30,21 +27,8 @@ PROGRESS_INTERVAL = 0.2
 """seconds between two reports of progress"""
 
 
-def run_worker() -> None:
-    """Answer requests from standard input until it is closed."""
-    exit_with_parent(signal.SIGKILL)
-    output = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # SUMO and user code may print: not into the answers
-    gc.freeze()  # the imported objects stay; searching them for garbage would cost time in every episode
-    # Both errors mean that the parent has closed the pipe or has ended.
-    with ExitStack() as stack, suppress(BrokenPipeError, EOFError):
-        open_simulation = cache(lambda: stack.enter_context(Simulation(owns_stdout=True)))
-        while True:
-            _answer_request(*read_message(sys.stdin.buffer), open_simulation, output)
-
-
 def _answer_request(
-    request: dict[str, Any], arrays: Arrays, open_simulation: Callable[[], Simulation], output: BinaryIO
+    open_simulation: Callable[[], Simulation], output: IO[bytes], request: dict[str, Any], arrays: Arrays
 ) -> None:
     """Run an episode and send its record. The record of hours of traffic does not stay in memory here."""
     last = time.monotonic()
@@ -76,4 +60,8 @@ def _answer_request(
 
 
 if __name__ == "__main__":
-    run_worker()
+    answer_pipe = open_answer_pipe()
+    gc.freeze()  # the imported objects stay; searching them for garbage would cost time in every episode
+    with ExitStack() as stack:
+        simulation = cache(lambda: stack.enter_context(Simulation(owns_stdout=True)))
+        answer_requests(partial(_answer_request, simulation, answer_pipe))

@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from unjam.child_processes import child_environment, python_command
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe
 from unjam.errors import EpisodeError, SumoInputError
@@ -20,7 +19,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork
 from unjam.sumo_files import MAX_READER_TIME, answer_of
 from unjam.tree import Arrays, unpack
-from unjam.worlds.messages import read_message, write_message
+from unjam.worlds.messages import read_message, start_child, write_message
 from unjam.worlds.record import Episode, failed_episode
 
 MAX_EPISODE_ATTEMPTS = 3
@@ -148,14 +147,8 @@ class _Worker:
         # BLAS threads would compete with the other workers for the cores.
         one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         self._error_file = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
-        process = subprocess.Popen(
-            python_command("-m", "unjam.worlds.worker"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._error_file,
-            env=child_environment(**one_thread, TMPDIR=self._temporary_folder),
-            start_new_session=True,  # the parent handles an interrupt in the terminal
-        )
+        environment = {**one_thread, "TMPDIR": self._temporary_folder}
+        process = start_child("unjam.worlds.worker", self._error_file, **environment)
         self._sent_files.clear()
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         threading.Thread(target=_forward_messages, args=(process, self._messages), daemon=True).start()

@@ -21,7 +21,7 @@ from unjam.sandbox import confine_process, limit_resources
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork
 from unjam.tree import Arrays, pack, unpack
-from unjam.worlds.messages import answer_requests, read_message, start_child, write_message
+from unjam.worlds.messages import answer_requests, open_answer_pipe, read_message, start_child, write_message
 from unjam.worlds.sumo.backends import InUseError
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.simulation import Simulation
@@ -129,7 +129,7 @@ def _return_type(name: str) -> Any:
     return get_type_hints(method).get("return", Any) if method else Any
 
 
-def _answer_request(simulation: Simulation, request: dict[str, Any], arrays: Arrays, output: IO[bytes]) -> None:
+def _answer_request(simulation: Simulation, output: IO[bytes], request: dict[str, Any], arrays: Arrays) -> None:
     try:
         answer, arrays = pack(_execute(simulation, request["call"], request["arguments"]))
         write_message(output, {"answer": answer}, arrays)
@@ -149,6 +149,7 @@ def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
 
 
 if __name__ == "__main__":
+    answer_pipe = open_answer_pipe()
     enter_sandbox()
     with Simulation(owns_stdout=True) as own_simulation:
-        answer_requests(partial(_answer_request, own_simulation))
+        answer_requests(partial(_answer_request, own_simulation, answer_pipe))
