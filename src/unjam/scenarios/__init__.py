@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from typing import Any
 
-from unjam.errors import unknown_name
+from unjam.errors import InputError, unknown_name
 from unjam.parameters import build_dataclass, merge_changes, nest_keys
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
@@ -59,7 +59,17 @@ def example_scenario(name: str) -> Scenario:
 
 
 def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
-    """Return a scenario as JSON; the inverse of `scenario_from_recipe`."""
+    """Return a scenario as JSON; the inverse of `scenario_from_recipe`.
+
+    Raise `InputError` for a class that `scenario_from_recipe` does not know, as a subclass of the user's.
+    """
+    kind = type(scenario)
+    if SCENARIO_KINDS.get(kind.title) is not kind:
+        known = ", ".join(each.__name__ for each in SCENARIO_KINDS.values())
+        raise InputError(
+            f"scenario: {kind.__name__} is not allowed in a file or another process; allowed: {known} themselves, and "
+            "any class with run_episode in one process"
+        )
     return {"kind": scenario.title, **asdict(scenario)}
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Sequence
 from typing import Any
 
+from unjam.errors import InputError
 from unjam.scenarios.road import ClosedRoad, MergeRoad, MotorwayRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.sumo.closed_road import ClosedTraffic
@@ -34,6 +35,9 @@ def make_traffic(
     recorded and, on roads with ends, positions (x, y). Optional fields of `LocalState` are measured if requested.
     """
     road, seeds = scenario.draw_from_seed(seed)
+    if type(road) not in TRAFFIC_CLASSES:
+        allowed = ", ".join(each.__name__ for each in TRAFFIC_CLASSES)
+        raise InputError(f"scenario: {type(road).__name__} is not allowed as the road of SUMO; allowed: {allowed}")
     traffic = TRAFFIC_CLASSES[type(road)](scenario, road, SeedTree(tuple(seed), seeds), simulation, record_details)
     traffic.measured_fields = measured_fields
     traffic.is_scalar = is_scalar and isinstance(traffic, ClosedTraffic) and traffic.cav_count == 1
