@@ -54,6 +54,7 @@ def test_no_subclass_becomes_its_base_class_in_a_file(kind: type[Scenario]) -> N
 @pytest.mark.parametrize("kind", [Ring, FigureEight, OnRamp])
 def test_no_subclass_is_simulated_in_a_batch(kind: type[Scenario]) -> None:
     scenario = subclass_of(kind)
-    assert unsupported_reason(scenario) and statistically_unsupported_reason(scenario)
+    assert unsupported_reason(scenario)
+    assert statistically_unsupported_reason(scenario)
     with pytest.raises(InputError, match=f"Other{kind.__name__} may have another road than {scenario.title}"):
         run_batch([EpisodeTask(scenario, Human(), (1,))], allow_statistical=True)
