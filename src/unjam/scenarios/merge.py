@@ -142,15 +142,11 @@ class Merge(Scenario):
         """Return the ids of all vehicles of the highway, as CAVs."""
         return tuple(f"cav_{index}" for index in range(len(self._entry_times(self.inflow))))
 
-    def facts(self) -> list[tuple[str, str]]:
-        """Return a description of the road for `unjam scenarios`."""
+    def _fact_values(self) -> tuple[str, str, str, str]:
         cavs = f"{self.cavs} CAV" if self.cavs is not None else f"{100 * self.penetration_rate:g} % CAV"
-        return [
-            ("road", "highway of 700 m with a ramp"),
-            ("vehicles", f"{self.inflow:g} + {self.ramp_flow:g} veh/h ({cavs})"),
-            ("limit", f"{self.limit_speed():.2f} m/s"),
-            ("limit is", "the mean speed of undisturbed traffic on the highway"),
-        ]
+        vehicles = f"{self.inflow:g} + {self.ramp_flow:g} veh/h ({cavs})"
+        reason = "the mean speed of undisturbed traffic on the highway"
+        return "highway of 700 m with a ramp", vehicles, f"{self.limit_speed():.2f} m/s", reason
 
 
 @lru_cache

@@ -208,17 +208,13 @@ class OnRamp(Scenario):
         most = int(self.max_duration / 3600.0 * 2.0 * flow)
         return tuple(f"vehicle_{number}" for number in range(most))
 
-    def facts(self) -> list[tuple[str, str]]:
-        """Return a description of the road for `unjam scenarios`."""
+    def _fact_values(self) -> tuple[str, str, str, str]:
         lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
+        road = f"motorway of {MOTORWAY_LENGTH / 1000:g} km, {lanes}, with a ramp"
         peak = f"{self.inflow:g} + {self.ramp_flow:g} veh/h from {self.peak[0]:g} to {self.peak[1]:g} s"
         off_peak = f"else {self.off_peak_inflow:g} + {self.off_peak_ramp_flow:g}"
-        return [
-            ("road", f"motorway of {MOTORWAY_LENGTH / 1000:g} km, {lanes}, with a ramp"),
-            ("vehicles", f"{peak}, {off_peak} ({100 * self.penetration_rate:g} % CAV)"),
-            ("limit", f"{MOTORWAY_SPEED_LIMIT:.2f} m/s"),
-            ("limit is", "the speed limit of the motorway"),
-        ]
+        vehicles = f"{peak}, {off_peak} ({100 * self.penetration_rate:g} % CAV)"
+        return road, vehicles, f"{MOTORWAY_SPEED_LIMIT:.2f} m/s", "the speed limit of the motorway"
 
 
 def _network(lanes: int) -> RoadNetwork:

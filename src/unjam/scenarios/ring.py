@@ -123,15 +123,11 @@ class LoopScenario(Scenario):
         """Return the ids of the CAVs, in their order along the road."""
         return tuple(name for name in self._vehicle_ids() if name.startswith("cav"))
 
-    def facts(self) -> list[tuple[str, str]]:
-        """Return a description of the road for `unjam scenarios`."""
+    def _fact_values(self) -> tuple[str, str, str, str]:
         ends = dict.fromkeys(self._size_range)
-        return [
-            ("road", self.description.format("-".join(map(str, ends)))),
-            ("vehicles", f"{self.vehicles} ({self.cavs} CAV)"),
-            ("limit", "-".join(f"{self.limit_speed(size):.2f}" for size in ends) + " m/s"),
-            ("limit is", self.limit_description),
-        ]
+        road = self.description.format("-".join(map(str, ends)))
+        speeds = "-".join(f"{self.limit_speed(size):.2f}" for size in ends)
+        return road, f"{self.vehicles} ({self.cavs} CAV)", f"{speeds} m/s", self.limit_description
 
     @property
     def _size_range(self) -> tuple[int, int]:

@@ -294,5 +294,8 @@ class Scenario:
         raise NotImplementedError
 
     def facts(self) -> list[tuple[str, str]]:
-        """Return a description of this road as (name, value) pairs."""
+        """Return a description of this road for `unjam scenarios`, as (name, value) pairs."""
+        return list(zip(("road", "vehicles", "limit", "limit is"), self._fact_values(), strict=True))
+
+    def _fact_values(self) -> tuple[str, str, str, str]:
         raise NotImplementedError

@@ -192,16 +192,12 @@ class UserNetwork(Scenario):
             raise InputError("cavs: None is not allowed here on a user network; allowed: a maximum number")
         return tuple(f"cav_{number}" for number in range(self.cavs))
 
-    def facts(self) -> list[tuple[str, str]]:
-        """Return a description of the road for `unjam scenarios`."""
+    def _fact_values(self) -> tuple[str, str, str, str]:
         classes, types = ", ".join(self.cav_classes), ", ".join(self.cav_types)
         share = f"{100 * self.penetration_rate:g} % CAV of {classes}" if self.penetration_rate else ""
-        return [
-            ("road", self.file),
-            ("vehicles", f"as its files say ({', '.join(filter(None, (share, types)))})"),
-            ("limit", "the speed limits of its roads"),
-            ("limit is", "the mean speed limit at the positions of the vehicles"),
-        ]
+        vehicles = f"as its files say ({', '.join(filter(None, (share, types)))})"
+        reason = "the mean speed limit at the positions of the vehicles"
+        return self.file, vehicles, "the speed limits of its roads", reason
 
 
 def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:

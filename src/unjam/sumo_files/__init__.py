@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 from unjam import sandbox
 from unjam.child_processes import child_environment, python_command
 from unjam.errors import InputError, invalid_value, spelling_hint
-from unjam.sumo_files.reader import FILE_ATTRIBUTES, file_stamp
+from unjam.sumo_files.reader import file_stamp
 
 READER_PROGRAM = Path(__file__).with_name("reader_program.py")
 MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120
@@ -190,11 +190,6 @@ def write_harmless_copy(path: Path, copy: Path, types: Path | None = None) -> No
     broken or too large.
     """
     _run_reader("copy", path, copy, *([types] if types else []))
-
-
-def is_harmless_attribute(name: str) -> bool:
-    """Return whether an attribute of a vehicle type is harmless: it names no file."""
-    return name not in FILE_ATTRIBUTES and not name.endswith("File")
 
 
 def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, *extra_paths: Path) -> Any:

@@ -221,7 +221,7 @@ class XmlReader:
                     types = attributes[name].split()
                     harmless[name] = " ".join([*types, *map(CAV_TYPE_TEMPLATE.format, types)])
                     self.needs_copy = True
-            elif name not in FILE_ATTRIBUTES and not name.endswith("File"):
+            elif is_harmless_attribute(name):
                 self._harmless_names.add(name)
             elif name == "file" and tag.endswith(DETECTOR_SUFFIXES):
                 if harmless[name] != NULL_FILE:
@@ -236,6 +236,11 @@ class XmlReader:
     def _record_dropped(self, name: str) -> None:
         self.dropped_items.add(name)
         self.needs_copy = True
+
+
+def is_harmless_attribute(name: str) -> bool:
+    """Return whether an attribute is harmless: it names no file."""
+    return name not in FILE_ATTRIBUTES and not name.endswith("File")
 
 
 def is_harmless_parameter(key: str) -> bool:

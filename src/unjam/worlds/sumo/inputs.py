@@ -9,8 +9,7 @@ from unjam.physics.idm import IDMParameters
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, UNLIMITED_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.scenarios.user_network import PASSENGER_CLASS
-from unjam.sumo_files import is_harmless_attribute
-from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE, is_harmless_parameter
+from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE, is_harmless_attribute, is_harmless_parameter
 from unjam.worlds.sumo.networks import XMLAttributes, network_path, xml_element
 
 SUMO_CAV_COLOR = "215,38,61"

@@ -1,7 +1,7 @@
 """The record of a batch of rings: sums of each ring, and whole episodes if they are kept."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,18 +45,10 @@ class RingLog:
     seeds: Sequence[Sequence[int]]
     start_positions: Floats
     """front bumpers at the start [m], shape (vehicles, W)"""
-    speeds: list[Array]
-    """with noise, from the start on; (vehicles, W) each"""
     find_contacts: Callable[[Array, Array, Array], Array]
     """from positions, gaps and the road's length [m] to the vehicles that touch another one"""
-    noise_free_speeds: list[Array] = field(default_factory=list)
-    """before noise, of each step; likewise"""
-    requested_accelerations: list[Array] = field(default_factory=list)
-    """of the drivers in each control step; (CAVs * W,) each"""
-    safe_accelerations: list[Array] = field(default_factory=list)
-    """after the safety filter in each step; likewise"""
-    commanded_speeds: list[Array] = field(default_factory=list)
-    """speeds that result from them; likewise"""
+    series: dict[str, list[Array]]
+    """the series of `ClosedRoadLog` by name; arrays of shape (vehicles, W) or (CAVs * W,) for each step"""
 
     def make_episodes(
         self, control_steps: Floats, has_crashed: Floats, driver_log: DriverLog, penetration_rate: float | None
@@ -70,9 +62,8 @@ class RingLog:
         last = None if last is None else as_numpy(last)
         driver_log = replace(driver_log, decisions=decisions, last_observation=last)
         vehicle_count, cav_count = len(self.start_positions), len(self.roads[0].cav_ids)
-        values = {name: self._stack(name, vehicle_count) for name in ("noise_free_speeds", "speeds")}
-        cav_names = ("requested_accelerations", "safe_accelerations", "commanded_speeds")
-        values |= {name: self._stack(name, cav_count) for name in cav_names}
+        row_counts = {"noise_free_speeds": vehicle_count, "speeds": vehicle_count}
+        values = {name: self._stack(each, row_counts.get(name, cav_count)) for name, each in self.series.items()}
         episodes = []
         ends = control_steps.astype(int), has_crashed.astype(bool)
         rings = zip(self.scenarios, self.roads, self.seeds, *ends, strict=True)
@@ -102,9 +93,8 @@ class RingLog:
             episodes.append(log.episode(motion, fields, driver_log, rows))
         return tuple(episodes)
 
-    def _stack(self, name: str, row_count: int) -> Floats:
+    def _stack(self, steps: list[Array], row_count: int) -> Floats:
         """Return the values of all steps, shape (steps, row_count, W)."""
-        steps = getattr(self, name)
         shape = len(steps), row_count, self.start_positions.shape[1]
         return np.stack([as_numpy(each) for each in steps]).reshape(shape) if steps else np.zeros(shape)
 

@@ -111,8 +111,10 @@ class RingBatch:
         self._gap = self._to_array(gap_on_loop(positions, np.roll(positions, -1, 0), loop_lengths, VEHICLE_LENGTH))
 
     def _reset_log(self) -> None:
-        start = as_numpy(self._position), [self._speed[:-1]], self._find_contacts
-        self._log = RingLog(self._scenarios, self.roads, self._seeds, *start)
+        cav_series = "requested_accelerations", "safe_accelerations", "commanded_speeds"
+        series = {"speeds": [self._speed[:-1]], **{name: [] for name in ("noise_free_speeds", *cav_series)}}
+        start, self._series = as_numpy(self._position), series
+        self._log = RingLog(self._scenarios, self.roads, self._seeds, start, self._find_contacts, series)
         zeros, cav_zeros = self._loop_lengths * 0.0, self._cav_loop_lengths.reshape(self._shape) * 0.0
         self._is_running, self._has_crashed, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
         self._reward_sums, self._mean_speed_sums = dict[str, Array](), zeros
@@ -222,7 +224,7 @@ class RingBatch:
         if self._is_controlled:
             requested = batch_commanded_accelerations(command, self.limits, self.cav_count, self.control_steps)
             if self._keep_record:
-                self._log.requested_accelerations.append(requested)
+                self._series["requested_accelerations"].append(requested)
         safe = [self._simulate(requested) for _ in range(scenario.steps_per_control_step)]
         self.control_steps += 1
         after, _, gap = self._following_state()
@@ -257,8 +259,8 @@ class RingBatch:
             safe, applied = self._actuation.apply("all", accelerations, self._readings.read_for_filters(state))
             commanded = next_speed(state.speed, applied, step)
             if self._keep_record:
-                self._log.safe_accelerations.append(safe)
-                self._log.commanded_speeds.append(commanded)
+                self._series["safe_accelerations"].append(safe)
+                self._series["commanded_speeds"].append(commanded)
         moved, speeds = self._next_speeds(speed[:-1], Leader(speed[1:], self._gap), commanded)
         xp = namespace(moved)
         leader_moved = xp.concatenate([moved[1:], moved[:1]])
@@ -269,8 +271,8 @@ class RingBatch:
             self._has_crashed = self._has_crashed | contacts.any(0)
         self._speed = xp.concatenate([speeds, speeds[:1]])
         if self._keep_record:
-            self._log.noise_free_speeds.append(moved)
-            self._log.speeds.append(speeds)
+            self._series["noise_free_speeds"].append(moved)
+            self._series["speeds"].append(speeds)
         braking = ((state.speed - self._rows_of(self._speed, self._cav_indices)) / step).reshape(self._shape)
         self._max_braking = xp.maximum(self._max_braking, braking * self._is_running)
         self._min_time_gap = self._update_min_time_gap(state)
