@@ -323,7 +323,6 @@ CHANGES_THE_PROCESS = {
     "training/random_state": "for the length of a training, under a lock, and restored",
     "learners/algorithm_1": "within training/random_state",
     "training/executors": "in the process of a training",
-    "training/batch_benchmark": "in the command line",
     "training/model_facts": "within training/random_state, or in the command line",
     "training/benchmark": "in the command line",
     "following/networks": "in the command line",

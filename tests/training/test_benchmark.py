@@ -7,9 +7,8 @@ import torch
 from unjam.drivers import PISaturation
 from unjam.drivers.check import check_driver
 from unjam.errors import MissingPartError
-from unjam.training import batch_benchmark, benchmark
-from unjam.training.batch_benchmark import benchmark_batches, make_benchmark_driver
-from unjam.training.benchmark import benchmark_episodes
+from unjam.training import benchmark
+from unjam.training.benchmark import benchmark_batches, benchmark_episodes, make_benchmark_driver
 
 RATES = ("sumo_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_step_steps_per_s")
 
@@ -21,7 +20,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark, "ROLLOUT_SIZES", {"long": (500, 20), "short": (50, 10)})
     monkeypatch.setattr(benchmark, "RING_SIZES", {22: 200, 66: 100})
     monkeypatch.setattr(benchmark, "BATCH_VEHICLES", 2200)
-    monkeypatch.setattr(batch_benchmark, "STEPS_PER_ROUND", 20)
+    monkeypatch.setattr(benchmark, "STEPS_PER_ROUND", 20)
 
 
 @pytest.fixture(autouse=True)
@@ -76,8 +75,8 @@ def test_benchmark_has_rates_and_ratios_and_restores_cores() -> None:
 
 
 def test_batches_are_measured_with_both_human_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_benchmark, "STEPS_PER_ROUND", 3)
-    monkeypatch.setattr(batch_benchmark, "BATCH_SIZES", {"cpu": (2, 5)})
+    monkeypatch.setattr(benchmark, "STEPS_PER_ROUND", 3)
+    monkeypatch.setattr(benchmark, "BATCH_SIZES", {"cpu": (2, 5)})
     messages: list[str] = []
     found = benchmark_batches("cpu", messages.append)
     assert found["device"] == "one core"

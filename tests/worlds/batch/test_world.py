@@ -25,7 +25,7 @@ from unjam.models.rollouts import to_device
 from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
-from unjam.training.batch_benchmark import make_benchmark_driver
+from unjam.training.benchmark import make_benchmark_driver
 from unjam.worlds.batch.noise import ArrayFactory, NoiseState
 from unjam.worlds.batch.ring.warm_up import WarmUpCache, WarmUpState
 from unjam.worlds.batch.ring.world import RingBatch
