@@ -14,8 +14,17 @@ from unjam.errors import InputError, LostWorkerError, UnjamError
 from unjam.measures.detectors import DETECTOR_COLUMNS, aggregate_passages, compute_agreement
 from unjam.scenarios.user_network import UserNetwork, load_user_network
 from unjam.sumo_files import read_sumo_files
-from unjam.training.calibrate import CALIBRATED_NETWORK_FILE, CALIBRATION_FILE, CalibrationResult, calibrate
-from unjam.training.corridor import FACTOR_RANGES, Corridor, load_corridor, parse_factor_space, scale_vehicle_types
+from unjam.training.calibrate import (
+    CALIBRATED_NETWORK_FILE,
+    CALIBRATION_FILE,
+    FACTOR_RANGES,
+    CalibrationResult,
+    Corridor,
+    calibrate,
+    load_corridor,
+    parse_factor_space,
+    scale_vehicle_types,
+)
 from unjam.training.search_space import NumericRange
 from unjam.training.seeds import make_test_seeds
 from unjam.training.trial_log import REQUEST_FILE, TRIALS_FILE

@@ -14,12 +14,13 @@ from tests.worlds.sumo.user_networks import straight
 from unjam.errors import InputError
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.training.export import ControllerStore
-from unjam.training.fingerprint import check_fingerprint, fingerprint
 from unjam.training.run_folder import (
     MANIFEST_FILE,
     append_lineage,
+    check_fingerprint,
     check_run_files,
     create_run_folder,
+    fingerprint,
     restore_newest_checkpoint,
     save_checkpoint,
 )

@@ -15,6 +15,7 @@ from unjam.training.config import load_config, to_toml
 from unjam.training.executors import CommandLine, LocalExecutor
 from unjam.training.search import (
     JOURNAL_FILE,
+    Journal,
     SearchTrial,
     check_search_space,
     describe_trial,
@@ -220,15 +221,14 @@ def test_foreign_stored_trial_is_refused(state: str, tmp_path: Path, trainings: 
 
 
 def test_truncated_journal_is_continued_without_links(tmp_path: Path) -> None:
-    journal = pytest.importorskip("unjam.training.journal").Journal
     path, entries = tmp_path / JOURNAL_FILE, [{"op_code": 0, "value": [float("nan")]}, {"op_code": 1}]
-    journal(path).append_logs(entries)
+    Journal(path).append_logs(entries)
     with path.open("a") as file:
         file.write('{"op_code": 2')
-    again = journal(path)
+    again = Journal(path)
     again.append_logs([{"op_code": 3}])
     assert [entry["op_code"] for entry in again.read_logs(0)] == [0, 1, 3]
-    assert [entry["op_code"] for entry in journal(path).read_logs(1)] == [1, 3]
+    assert [entry["op_code"] for entry in Journal(path).read_logs(1)] == [1, 3]
     assert [each.name for each in tmp_path.iterdir()] == [JOURNAL_FILE]
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from tests.pictures import empty_pictures
 from tests.training.test_run import STEPS, learn_with, outcome, small_config
@@ -21,7 +22,7 @@ from unjam.training.config import RunConfig
 from unjam.training.evaluate import gain_over_expert
 from unjam.training.run_folder import read_config
 from unjam.training.seeds import make_test_seeds
-from unjam.training.train import TrainResult, train
+from unjam.training.train import TrainResult, exclusive_random_state, train
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import WorkerPool
 
@@ -202,3 +203,24 @@ def test_gain_uses_the_expert_with_its_parameters() -> None:
     gain = gain_over_expert(config, rows)
     assert gain is not None
     assert gain.mean == pytest.approx(2.0)
+
+
+def test_training_restores_generators_and_threads() -> None:
+    torch.manual_seed(3)
+    np.random.seed(3)
+    threads, expected = torch.get_num_threads(), (torch.rand(2).tolist(), np.random.rand(2).tolist())
+    torch.manual_seed(3)
+    np.random.seed(3)
+    with exclusive_random_state():
+        torch.manual_seed(8)
+        np.random.seed(8)
+        torch.set_num_threads(threads + 1)
+    assert (torch.rand(2).tolist(), np.random.rand(2).tolist()) == expected
+    assert torch.get_num_threads() == threads
+
+
+def test_second_training_in_a_process_is_refused() -> None:
+    refused = pytest.raises(UnjamError, match="another training runs in this process")
+    for _ in range(2):
+        with exclusive_random_state(), refused, exclusive_random_state():
+            raise AssertionError

@@ -54,7 +54,7 @@ def train_command(
     - unjam train --resume runs/ring-001 --steps 2000000
     """
     from unjam.training.config import load_config
-    from unjam.training.run_folder import check_config, read_config
+    from unjam.training.run_folder import check_config, read_config, should_stop_early
 
     settings = dict(options.settings)
     if "out" in settings:
@@ -74,7 +74,6 @@ def train_command(
     from unjam.reports.results import read_progress, read_results
     from unjam.reports.summary import main_finding
     from unjam.training.config import planned_steps
-    from unjam.training.early_stopping import should_stop_early
     from unjam.training.tensorboard import tensorboard_writer
     from unjam.training.train import train
 

@@ -125,8 +125,7 @@ def calibrate_command(
     - unjam calibrate my.sumocfg --detectors detectors.csv --vary tau=0.7..1.6 --vary flow=0.8..1.2
     - unjam assess runs/calibrate-my-001/calibrated.sumocfg
     """
-    from unjam.training.calibrate import calibrate, calibration_document
-    from unjam.training.corridor import load_corridor, parse_factor_space
+    from unjam.training.calibrate import calibrate, calibration_document, load_corridor, parse_factor_space
     from unjam.training.run_folder import lock_new_folder
     from unjam.training.trial_log import REQUEST_FILE
     from unjam.worlds.sumo.detectors import DetectorPool

@@ -4,8 +4,9 @@ Each trial is a training in its own folder. Its objective is the validation retu
 a training; test seeds are not used.
 """
 
+import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unjam.errors import InputError, MissingPartError, UnjamError, invalid_value
-from unjam.files import atomic_write, to_json
+from unjam.files import append_line, atomic_write, read_json_lines, to_json
 from unjam.manifest import manifest
 from unjam.parameters import merge_changes, nest_keys
 from unjam.reports.results import read_progress, validation_gains
@@ -138,14 +139,12 @@ def _open_study(base: RunConfig, space: SearchSpace, folder: Path) -> "Study":
     optuna = import_optuna("search")
     from optuna.storages import JournalStorage
 
-    from unjam.training.journal import Journal
-
     if not (folder / SEARCH_CONFIG_FILE).is_file():
         make_new_folder(folder, ", or that of a search")
     elif read_config(folder, check_trust=False) != base:
         raise InputError(f"out: {str(folder)!r} has another configuration; allowed: a new folder")
     atomic_write(folder / SEARCH_CONFIG_FILE, to_toml(base))
-    storage = JournalStorage(Journal(folder / JOURNAL_FILE))
+    storage = JournalStorage(Journal(folder / JOURNAL_FILE))  # pyright: ignore[reportArgumentType]
     study = optuna.create_study(storage=storage, study_name="search", direction="maximize", load_if_exists=True)
     # A new sampler with the same seed would repeat earlier proposals.
     study.sampler = optuna.samplers.TPESampler(seed=base.seed + 1_000_003 * len(study.get_trials()))
@@ -154,6 +153,33 @@ def _open_study(base: RunConfig, space: SearchSpace, folder: Path) -> "Study":
         raise InputError(f"vary: {str(folder)!r} has other ranges; allowed: a new folder")
     study.set_user_attr("space", repr(space))
     return study
+
+
+class Journal:
+    """Optuna's log of a study, as `optuna.storages.journal.BaseJournalBackend`; the search's folder must be locked.
+
+    Optuna's own class follows symbolic links, and leaves one as its lock.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the file, which may be missing; an incomplete line of a crash is left out."""
+        self._path, self._lines = path, list(map(_json_line, read_json_lines(path)))
+        if path.is_file():
+            atomic_write(path, "".join(f"{line}\n" for line in self._lines))
+
+    def read_logs(self, log_number_from: int) -> Iterable[dict[str, Any]]:
+        """Return the entries of the log from a number on."""
+        return map(json.loads, self._lines[log_number_from:])
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """Add entries to the log; they are on the disk when this returns."""
+        lines = list(map(_json_line, logs))
+        append_line(self._path, "\n".join(lines))
+        self._lines += lines
+
+
+def _json_line(entry: dict[str, Any]) -> str:
+    return json.dumps(entry, separators=(",", ":"))
 
 
 def _propose_trials(study: "Study", space: SearchSpace, trials: int) -> Iterator[tuple[int, dict[str, Any]]]:

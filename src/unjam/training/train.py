@@ -1,8 +1,9 @@
 """Training: from a configuration to a run folder. `unjam train`, `unjam.train`."""
 
+import threading
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
@@ -10,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
+from unjam.errors import UnjamError
 from unjam.files import append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
 from unjam.learners.algorithm_1 import Iteration, TaskEpisodes, ValidationReturns, algorithm_1, start_training
@@ -24,24 +27,23 @@ from unjam.processes import lock_folder
 from unjam.reports.html import write_report_page
 from unjam.reports.results import read_progress
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
-from unjam.training.early_stopping import should_stop_early
 from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert, raise_failure
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
-from unjam.training.fingerprint import fingerprint
 from unjam.training.model_facts import no_facts_reason, write_model_facts
-from unjam.training.random_state import exclusive_random_state
 from unjam.training.run_folder import (
     PROGRESS_FILE,
     append_lineage,
     check_config,
     controller_origin,
     create_run_folder,
+    fingerprint,
     make_new_folder,
     read_config,
     restore_newest_checkpoint,
     resume_run_folder,
     save_checkpoint,
+    should_stop_early,
 )
 from unjam.training.seeds import VALIDATION_SEED
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
@@ -55,6 +57,7 @@ PROGRESS_METRICS = (
 )
 """metrics of progress: means over the episodes of an iteration"""
 PROGRESS_RETURNS = ("return_mean", "return_expert", "return_validation")
+_training_lock = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,28 @@ def train(
         for name, task in config.task_configs().items()
     }
     return TrainResult(folder, {}, None, results) if config.tasks else results[""]
+
+
+@contextmanager
+def exclusive_random_state() -> Iterator[None]:
+    """Lend the global generators of NumPy and torch to the block, with one thread for torch's operations.
+
+    Generators and threads are restored at the end. Raise `UnjamError` if another thread is in such a block.
+    """
+    if not _training_lock.acquire(blocking=False):
+        raise UnjamError("train: another training runs in this process; allowed: one, or a process for each")
+    try:
+        threads, numpy_state = torch.get_num_threads(), np.random.get_state()
+        gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+        with torch.random.fork_rng(gpus):
+            torch.set_num_threads(1)  # more threads would compete with the workers for the cores
+            try:
+                yield
+            finally:
+                torch.set_num_threads(threads)
+                np.random.set_state(numpy_state)
+    finally:
+        _training_lock.release()
 
 
 @exclusive_random_state()
