@@ -22,7 +22,7 @@ from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, new_figu
 from unjam.scenarios.ring import Ring
 from unjam.training.road_family import AGGRESSIVE_IDM, SHORT_WARM_UP
 from unjam.training.seeds import make_test_seeds
-from unjam.worlds.batch.leaders import Leader
+from unjam.worlds.batch.human_idm import Leader
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.drive import finish_drive

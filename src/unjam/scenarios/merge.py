@@ -123,7 +123,6 @@ class Merge(Scenario):
         return [index * 3600.0 / flow for index in range(int(seconds * flow / 3600.0))]
 
     def _draw_cavs(self, generator: np.random.Generator) -> set[int]:
-        """Return the numbers of the highway's vehicles that are CAVs."""
         count = len(self._entry_times(self.inflow))
         if self.cavs is not None:
             return set(generator.choice(count // 2, self.cavs, replace=False).tolist())

@@ -71,14 +71,9 @@ class CruiseControl:
         """Return the set speed with which the ACC accelerates as commanded on a free road [m/s].
 
         It is infinite where the command is the largest possible: the ACC then drives without a set-speed cap.
-
-        Args:
-            speed: own [m/s], shape (n,).
-            target_speed: speed to reach after a step [m/s], shape (n,).
-            max_acceleration: largest acceleration that can be commanded [m/s2].
-            step: of the simulation [s].
-            vehicle_limits: acceleration and comfortable deceleration of each vehicle [m/s2], shape (n,), for an ACC
-                without its own.
+        `target_speed` is to be reached after a `step` [s] of the simulation; `max_acceleration` is the largest that can
+        be commanded [m/s2]; `vehicle_limits` are acceleration and comfortable deceleration of each vehicle [m/s2], for
+        an ACC without its own. Arrays have shape (n,).
         """
         xp, command = namespace(speed), (target_speed - speed) / step
         vehicle_acceleration, vehicle_deceleration = vehicle_limits or (0.0, 0.0)

@@ -304,7 +304,6 @@ class _Demand:
 
 
 def _write_copy(path: Path, copy: Path, types: Path | None = None) -> None:
-    """Write a harmless copy of an XML file, with vehicle types changed as a JSON file says."""
     changes = json.loads(types.read_bytes()) if types else {}
     with open(copy, "w", encoding="utf-8") as out:
         XmlReader({}, out, changes).read(path)
@@ -318,7 +317,6 @@ READER_COMMANDS: dict[str, Callable[..., Any]] = {
 
 
 def _main(command: str, *paths: str) -> None:
-    """Print the result of a command, or the error, as JSON."""
     try:
         answer = {"result": READER_COMMANDS[command](*map(Path, paths))}
     except BrokenFileError as error:

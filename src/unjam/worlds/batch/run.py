@@ -70,14 +70,10 @@ def run_batch(
 ) -> list[Episode]:
     """Return the episodes of tasks, which are simulated at once; equal to `run_episode` in SUMO except for rounding.
 
-    Args:
-        tasks: differ at most in road length, seed and driver, and on motorways in exploration.
-        to_array: makes the arrays of the simulation.
-        upcoming: similar tasks that will follow; their warm-ups are simulated together with those of `tasks`.
-        allow_statistical: whether to allow scenarios with episodes that equal SUMO's only in distribution.
-
-    Raises:
-        InputError: the tasks differ in more, or `unjam.worlds.batch.support` says why they are not supported.
+    The tasks differ at most in road length, seed and driver, and on motorways in exploration; otherwise, or if
+    `unjam.worlds.batch.support` says why they are not supported, raise `InputError`. Warm-ups of `upcoming`, similar
+    tasks that will follow, are simulated together with theirs. `allow_statistical` allows scenarios with episodes that
+    equal SUMO's only in distribution.
     """
     first = tasks[0]
     if any(_shared_settings(task) != _shared_settings(first) for task in tasks):
@@ -95,9 +91,8 @@ def _run_at_once(
         check_can_drive(task.driver, task.scenario)
     if isinstance(first.scenario, OnRamp):
         support.check_batch_scenarios([task.scenario for task in tasks], allow_statistical)
-        if len(tasks) > 1 and any(
-            _depends_on_entry_order(task.driver) for task in tasks
-        ):  # which must be that of one road
+        depends = any(_depends_on_entry_order(task.driver) for task in tasks)
+        if len(tasks) > 1 and depends:  # the order must be that of one road
             return [episode for task in tasks for episode in _run_at_once([task], to_array, (), allow_statistical)]
         explore = [task.explore for task in tasks]
         motorways = MotorwayBatch(first.scenario, [task.seed for task in tasks], explore=explore)
@@ -157,7 +152,8 @@ def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
     """Return the states of rings after their warm-up, simulated in batches of `MAX_BATCH_ROADS`."""
     states: dict[_WarmUpKey, WarmUpState] = {}
-    for batch in (keys[first : first + MAX_BATCH_ROADS] for first in range(0, len(keys), MAX_BATCH_ROADS)):
+    for first in range(0, len(keys), MAX_BATCH_ROADS):
+        batch = keys[first : first + MAX_BATCH_ROADS]
         scenarios, seeds, (measured_fields, *_) = zip(*batch, strict=True)
         world = RingBatch(scenarios, seeds, keep_record=False, allow_statistical=True)
         world.measured_fields = measured_fields

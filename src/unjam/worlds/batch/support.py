@@ -9,7 +9,7 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import LoopScenario, Ring
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.batch.leaders import MIN_LOOK_AHEAD
+from unjam.worlds.batch.human_idm import MIN_LOOK_AHEAD
 
 MAX_SIMULATION_STEP = 0.37
 """longest simulation step that SUMO's IDM does not divide into several [s]"""

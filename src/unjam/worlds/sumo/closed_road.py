@@ -72,9 +72,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Run the warm-up, then hand the CAVs to the driver unless they stay human (`is_controlled` false).
 
-        Returns:
-            The CAVs' states in the last minute of the warm-up, one per control step, shape (CAVs, moments), oldest
-            first; None without a warm-up that may be remembered.
+        Return the CAVs' states in the last minute of the warm-up, one per control step, shape (CAVs, moments), oldest
+        first; None without a warm-up that may be remembered.
         """
         scenario, road, history = self.scenario, self.road, None
         self._penetration_rate = road.provided_penetration_rate(self.measured_fields)
@@ -118,7 +117,6 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             self._fuel.append(self._simulation.fuel(self.road.vehicle_ids))
 
     def _drive_cavs(self, accelerations: list[float]) -> None:
-        """Command the CAVs' speeds after this step, from their filtered accelerations."""
         speeds, positions, step = self.speeds, self._tracked_positions, self.scenario.simulation_step
         loop, last, apply_acceleration = self.road.loop_length, len(speeds) - 1, self._apply_acceleration
         safe, commanded = [], []
@@ -221,11 +219,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         )
 
     def speeds_and_positions(self) -> tuple[Floats, Floats]:
-        """Return speeds [m/s] and positions [m] in every simulation step since the start of the log.
-
-        Shape (vehicles, moments), including the start. Positions are SUMO's Euler steps with the recorded speeds,
-        checked against SUMO's own odometer.
-        """
+        """Return those of the log in every simulation step, after checking positions against SUMO's odometer."""
         speeds, positions = self._make_log().speeds_and_positions()
         self._check_odometer(self.road.vehicle_ids, self.road.start_positions, positions[:, -1])
         return speeds, positions

@@ -50,11 +50,6 @@ class ActiveVehicles:
         self.collided = set[str]()
         self.arrivals = self.teleports = 0
 
-    def reset_counts(self) -> None:
-        """Forget arrivals, teleports and collisions so far."""
-        self.arrivals = self.teleports = 0
-        self.collided.clear()
-
     def update(self, simulation: Simulation, is_cav: Callable[[str], bool]) -> tuple[list[str], Sequence[str]]:
         """Update after a simulation step, and return the names of vehicles that left and of those that entered.
 
@@ -175,7 +170,8 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._log = self._make_log()
         self._warm_up(lambda: self._simulate({}), on_progress)
         self._is_controlled = is_controlled
-        self._vehicles.reset_counts()
+        self._vehicles.arrivals = self._vehicles.teleports = 0
+        self._vehicles.collided.clear()
         self._log = self._make_log()
         self._log_moment()
 

@@ -10,8 +10,7 @@ from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, square_
 from unjam.physics.idm import IDMArrays, IDMParameters, fast_power, idm_acceleration
 from unjam.physics.kinematics import max_speed_to_stop, next_speed, stopping_distance
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, Scenario
-from unjam.worlds.batch.human_idm import EMERGENCY_BRAKING, SUMO_MIN_GAP, without_minimum_gap
-from unjam.worlds.batch.leaders import look_ahead_distance
+from unjam.worlds.batch.human_idm import EMERGENCY_BRAKING, SUMO_MIN_GAP, look_ahead_distance, without_minimum_gap
 from unjam.worlds.batch.noise import ArrayFactory
 
 COMMANDED_HUMAN_BRAKING = 4.5

@@ -21,8 +21,14 @@ from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK, 
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import SUMO_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.worlds.batch.figure_eight.car_following import HALTING_SPEED, CarFollowingModels, speed_after_distance
-from unjam.worlds.batch.human_idm import STANDSTILL_ACCELERATION, SUMO_MIN_GAP, HumanSpeedModel
-from unjam.worlds.batch.leaders import CONTACT_GAP, FREE_GAP, Leader
+from unjam.worlds.batch.human_idm import (
+    CONTACT_GAP,
+    FREE_GAP,
+    STANDSTILL_ACCELERATION,
+    SUMO_MIN_GAP,
+    HumanSpeedModel,
+    Leader,
+)
 from unjam.worlds.batch.noise import ArrayFactory
 
 FOE_VISIBILITY_DISTANCE = 4.5

@@ -16,7 +16,7 @@ from unjam.physics.arrays import Floats
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.road import MotorwayRoad
-from unjam.worlds.batch.leaders import CONTACT_GAP
+from unjam.worlds.batch.human_idm import CONTACT_GAP
 from unjam.worlds.batch.on_ramp.record import MotorwayLog
 from unjam.worlds.batch.on_ramp.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
 from unjam.worlds.batch.on_ramp.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers

@@ -10,7 +10,7 @@ from unjam.physics.arrays import Array
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.batch.leaders import CONTACT_GAP
+from unjam.worlds.batch.human_idm import CONTACT_GAP
 from unjam.worlds.closed_road import ClosedRoadLog
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.world import DriverLog

@@ -24,8 +24,15 @@ from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import MIN_TIME_GAP_SPEED
 from unjam.worlds.batch.figure_eight.crossing import CrossingMemory, FigureEightMovement, figure_eight_contacts
-from unjam.worlds.batch.human_idm import HumanSpeedModel, human_idm_speed, human_parameters, human_ring_speed
-from unjam.worlds.batch.leaders import CONTACT_GAP, Leader, ring_contacts
+from unjam.worlds.batch.human_idm import (
+    CONTACT_GAP,
+    HumanSpeedModel,
+    Leader,
+    human_idm_speed,
+    human_parameters,
+    human_ring_speed,
+    ring_contacts,
+)
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, QuickNoise, SeededNoise, WorldSeeds
 from unjam.worlds.batch.ring.record import RingLog, RingResults, as_numpy
 from unjam.worlds.batch.ring.warm_up import WarmUpState
@@ -39,7 +46,7 @@ class RingBatch:
     """W closed roads of one kind, each with its own seed; rings equal SUMO's except for rounding.
 
     With quick noise, human drivers follow only the vehicle ahead. In SUMO they also look at the last vehicle of the
-    next lanes, see `unjam.worlds.batch.leaders`.
+    next lanes, see `unjam.worlds.batch.human_idm`.
     """
 
     is_scalar, remaining_rows = False, None
@@ -130,9 +137,8 @@ class RingBatch:
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Run the warm-up, unless `warm_up_states` are set; then hand the CAVs over, unless they stay human.
 
-        Returns:
-            What the CAVs observed at the control steps of the last minute of the warm-up, NumPy arrays of shape
-            (CAVs * W, moments), oldest first; None without a warm-up that may be remembered.
+        Return what the CAVs observed at the control steps of the last minute of the warm-up, NumPy arrays of shape
+        (CAVs * W, moments), oldest first; None without a warm-up that may be remembered.
         """
         history = self._restore(self.warm_up_states) if self.warm_up_states else self._drive_warm_up()
         if bool(self._has_crashed.any()):
