@@ -63,7 +63,7 @@ def test_insertion_backlog_is_noted(backlog: float, noted: bool) -> None:
 
 
 def test_teleports_are_noted() -> None:
-    note = "human: SUMO teleported or removed 6 vehicles that had stood for its time-to-teleport or collided"
+    note = "human: SUMO teleported or removed 6 vehicles, which had waited longer than time-to-teleport or collided"
     assert episode_notes({"human": rows_of(2, teleports=3)}) == [note]
 
 

@@ -63,8 +63,12 @@ def check_baseline(rows: Sequence[dict[str, Any]], planned_episodes: int = 0) ->
 def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with teleports, which do not exist in real traffic."""
     counts = {label: sum(row["teleports"] for row in rows) for label, rows in rows_by_driver.items()}
-    why = "that had stood for its time-to-teleport or collided"
-    return [f"{label}: SUMO teleported or removed {count} vehicles {why}" for label, count in counts.items() if count]
+    return [
+        f"{label}: SUMO teleported or removed {count} vehicle{'' if count == 1 else 's'}, which had waited longer than "
+        "time-to-teleport or collided"
+        for label, count in counts.items()
+        if count
+    ]
 
 
 def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:

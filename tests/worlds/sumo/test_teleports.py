@@ -104,4 +104,4 @@ def test_teleports_are_reported(blocked: Path, tmp_path: Path) -> None:
         workers=1,
         out=tmp_path / "out",
     ).notes
-    assert re.fullmatch(r"human: SUMO teleported or removed \d+ vehicles that had stood .*", note)
+    assert re.fullmatch(r"human: SUMO teleported or removed \d+ vehicles?, which had waited .*", note)
