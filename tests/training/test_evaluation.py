@@ -1,6 +1,7 @@
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,13 @@ def learned(pool: WorkerPool, folder: Path, **changes: object) -> tuple[Path, Ru
     return folder, config
 
 
+def with_evaluation(config: RunConfig, baselines: Sequence[str] | None = None) -> RunConfig:
+    """The configuration with one test episode, and other baselines."""
+    settings = config.evaluation
+    baselines = settings.baselines if baselines is None else tuple(baselines)
+    return replace(config, evaluation=replace(settings, baselines=baselines, episodes=1))
+
+
 @pytest.fixture(scope="module")
 def run(pool: WorkerPool, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunConfig]:
     return learned(pool, tmp_path_factory.mktemp("runs") / "run")
@@ -39,7 +47,7 @@ def run(pool: WorkerPool, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
 
 def test_comparison_has_baselines_expert_and_trained_controller(run: tuple[Path, RunConfig]) -> None:
     folder, config = run
-    drivers = drivers_to_compare(config, folder, ["human", "pi:window=30"])
+    drivers = drivers_to_compare(with_evaluation(config, ["human", "pi:window=30"]), folder)
     assert next(iter(drivers)) == "human"
     assert list(drivers)[-2:] == ["pi", TRAINED_LABEL]
     assert len(drivers) == 4
@@ -53,7 +61,7 @@ def test_results_and_report_have_the_hash_of_the_controller(
     run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
 ) -> None:
     folder, config = run
-    evaluate_run(folder, config, pool, baselines=[], episodes=1, out=tmp_path)
+    evaluate_run(folder, with_evaluation(config, []), pool, out=tmp_path)
     sha256 = hashlib.sha256((folder / "controller.unjam").read_bytes()).hexdigest()
     found = read_results(tmp_path)
     assert found.metadata["controllers"] == {TRAINED_LABEL: sha256}
@@ -63,19 +71,24 @@ def test_results_and_report_have_the_hash_of_the_controller(
 
 def test_expert_among_the_baselines_is_compared_once(run: tuple[Path, RunConfig]) -> None:
     folder, config = run
-    assert list(drivers_to_compare(config, folder, ["pi", "human"])) == ["pi", "human", TRAINED_LABEL]
+    assert list(drivers_to_compare(with_evaluation(config, ["pi", "human"]), folder)) == ["pi", "human", TRAINED_LABEL]
 
 
 def test_packaged_baseline_has_its_short_name(run: tuple[Path, RunConfig]) -> None:
     folder, config = run
     name = "unjam:ring-jammed-tuned"
-    assert list(drivers_to_compare(config, folder, ["human", name])) == ["human", name, "pi", TRAINED_LABEL]
+    assert list(drivers_to_compare(with_evaluation(config, ["human", name]), folder)) == [
+        "human",
+        name,
+        "pi",
+        TRAINED_LABEL,
+    ]
 
 
 def test_baselines_with_different_parameters_are_all_compared(run: tuple[Path, RunConfig], my_drivers: Path) -> None:
     folder, config = run
     names = [f"{my_drivers}:Keeper:gain={gain}" for gain in (0.1, 0.2)]
-    assert len(drivers_to_compare(config, folder, names)) == 4
+    assert len(drivers_to_compare(with_evaluation(config, names), folder)) == 4
 
 
 def test_evaluation_uses_test_seeds_and_is_saved(run: tuple[Path, RunConfig], pool: WorkerPool) -> None:
@@ -95,15 +108,15 @@ def test_evaluation_uses_test_seeds_and_is_saved(run: tuple[Path, RunConfig], po
 
 def test_baselines_and_episodes_can_be_overridden(run: tuple[Path, RunConfig], pool: WorkerPool) -> None:
     folder, config = run
-    found = evaluate_run(folder, config, pool, baselines=["idm"], episodes=1)
+    found = evaluate_run(folder, with_evaluation(config, ["idm"]), pool)
     assert list(found.rows) == ["idm", "pi", TRAINED_LABEL]
     assert {len(rows) for rows in found.rows.values()} == {1}
-    assert list(evaluate_run(folder, config, pool, baselines=[], episodes=1).rows) == ["pi", TRAINED_LABEL]
+    assert list(evaluate_run(folder, with_evaluation(config, []), pool).rows) == ["pi", TRAINED_LABEL]
 
 
 def test_no_expert_is_compared_without_one(pool: WorkerPool, tmp_path: Path) -> None:
     folder, config = learned(pool, tmp_path / "run", expert="none")
-    found = evaluate_run(folder, config, pool, episodes=1)
+    found = evaluate_run(folder, with_evaluation(config), pool)
     assert list(found.rows) == ["human", TRAINED_LABEL]
     assert read_results(folder).metadata["expert"] == "none"
 
@@ -113,7 +126,7 @@ def test_trained_controller_can_be_the_next_expert(
 ) -> None:
     first, _ = run
     folder, config = learned(pool, tmp_path / "next", expert=str(first), policy__action_duration=3)
-    found = evaluate_run(folder, config, pool, episodes=1)
+    found = evaluate_run(folder, with_evaluation(config), pool)
     assert list(found.rows) == ["human", "pi + residual", TRAINED_LABEL]
     trained, expert = load_controller(folder), load_controller(first)
     assert isinstance(trained, ResidualDriver)
@@ -128,13 +141,13 @@ def test_baseline_with_the_description_of_the_expert_is_kept(
     first, _ = run
     second, _ = learned(pool, tmp_path / "second", seed=1)
     folder, config = learned(pool, tmp_path / "next", expert=str(first))
-    assert len(drivers_to_compare(config, folder, [str(second)])) == 3
+    assert len(drivers_to_compare(with_evaluation(config, [str(second)]), folder)) == 3
 
 
 def test_user_expert_and_reward_are_used(pool: WorkerPool, tmp_path: Path, my_drivers: Path) -> None:
     changes = {"expert": f"{my_drivers}:gentle", "reward": f"{my_drivers}:calm"}
     folder, config = learned(pool, tmp_path / "run", **changes)
-    found = evaluate_run(folder, config, pool, episodes=1)
+    found = evaluate_run(folder, with_evaluation(config), pool)
     assert list(found.rows) == ["human", "mine.py:gentle", TRAINED_LABEL]
     about = json.loads((folder / "evaluation.json").read_text())
     assert about["reward"] == f"{my_drivers}:calm"
@@ -149,7 +162,7 @@ def test_failed_baseline_is_reported_and_the_rest_is_saved(
 ) -> None:
     folder, config = run
     with pytest.raises(InputError, match="acceleration of cav_0 is nan"):
-        evaluate_run(folder, config, pool, baselines=[f"{my_drivers}:broken"], episodes=1)
+        evaluate_run(folder, with_evaluation(config, [f"{my_drivers}:broken"]), pool)
     rows = read_results(folder).rows
     assert [row["status"] for row in rows["mine.py:broken"]] == ["failed"]
     assert [row["status"] for row in rows[TRAINED_LABEL]] == ["completed"]

@@ -44,7 +44,9 @@ def evaluate_command(
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
     config = read_config(run)
     check_run_files(run, config)
-    config = replace(config, scenario_options={**config.scenario_options, **network_changes(humans=humans)})
+    evaluation = replace(config.evaluation, baselines=tuple(DRIVERS), episodes=episodes)
+    options = {**config.scenario_options, **network_changes(humans=humans)}
+    config = replace(config, scenario_options=options, evaluation=evaluation)
     if config.tasks:
         raise InputError(f"run: {str(run)!r} has several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
@@ -52,11 +54,11 @@ def evaluate_command(
     from unjam.reports.html import write_report_page  # loads matplotlib, so only after the checks
     from unjam.reports.summary import main_finding
 
-    total = evaluation_steps(config, run, list(DRIVERS), episodes)
+    total = evaluation_steps(config, run)
     target = out or run
     with lock_folder(target) if out is None else lock_new_folder(out):
         with ProgressReporter("evaluating", "steps", total) as progress, WorkerPool(workers) as pool:
-            evaluation = evaluate_run(run, config, pool, list(DRIVERS), episodes, progress.update, out)
+            evaluation = evaluate_run(run, config, pool, progress.update, out)
         page = write_report_page([target], target / "report.html")
     results = read_results(target)
     if json:

@@ -1,15 +1,15 @@
-"""Evaluation: several drivers on the same seeds, measured and saved for reports.
+"""Evaluation: several drivers on the same seeds, measured and saved for reports, or as tables and in a notebook.
 
 `unjam drive` takes any drivers and seeds; the controller of a run is compared with others on test seeds.
 """
 
 import os
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors.numpy import save
 
@@ -21,14 +21,16 @@ from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, error_from_name, invalid_value
 from unjam.files import atomic_write, make_folder, to_json
 from unjam.manifest import manifest
-from unjam.measures.metrics import measure
-from unjam.measures.notes import episode_notes
+from unjam.measures.effect import effects_by_driver
+from unjam.measures.feasibility import feasibility_by_driver
+from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_table, table_headings
+from unjam.measures.metrics import METRICS, measure
+from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
 from unjam.reports.results import EPISODE_ENTRIES, EVALUATION_FILE, pack_episode, to_plot_episode
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
-from unjam.training.drive_result import DriveResult, RowsByDriver, rows_to_frame
 from unjam.training.run_folder import lock_new_folder
 from unjam.training.seeds import TRAINING_SEED_LIMIT, make_test_seeds
 from unjam.worlds.episode import can_drive, run_episode
@@ -37,6 +39,10 @@ from unjam.worlds.reward import make_reward
 from unjam.worlds.sumo.sandboxed import open_simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
+if TYPE_CHECKING:  # imported late, so that commands start quickly
+    import pandas as pd
+
+EFFECT_ENTRIES = ("travel_time", "delay_reduction", "speed", "flow", "fuel", "hard_braking")
 MISSING_ACC_NOTE = "limits the ACC of a CAV, but CAVs have none: --set actuation=cruise --set safety.active=false"
 TRAINED_LABEL = "trained"
 """label of the trained controller in tables and figures"""
@@ -57,6 +63,108 @@ class Evaluation:
         return {
             label: {name: found.mean for name, found in summarize(rows).items()} for label, rows in self.rows.items()
         }
+
+
+@dataclass(frozen=True)
+class DriveResult:
+    """Episodes of one or several drivers on the same traffic."""
+
+    scenario: str
+    rows: RowsByDriver = field(repr=False)
+    """by driver: a row of metrics per episode"""
+    folder: Path | None = None
+    """folder of the results"""
+    report: Path | None = None
+    plot_episodes: dict[str, Episode] = field(default_factory=dict, repr=False)
+    """by driver: the episode for figures, the same seed for all"""
+    notes: list[str] = field(default_factory=list)
+    """caveats, as controllers on a road that they were not made for"""
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Mean of every metric over the episodes of the first driver."""
+        return {name: each.mean for name, each in self.summary(next(iter(self.rows))).items()}
+
+    def summary(self, driver: str) -> dict[str, Estimate]:
+        """Return the mean and 95 % CI of every metric for a driver."""
+        return summarize(self.rows[driver])
+
+    def table(self) -> "pd.DataFrame":
+        """Return a row per metric with the mean and both ends of the 95 % CI of each driver.
+
+        `result.table().loc["mean_speed", ("pi", "mean")]` is one number.
+        """
+        import pandas as pd
+
+        numbers = {
+            (label, part): [getattr(estimate, part) for estimate in self.summary(label).values()]
+            for label in self.rows
+            for part in ("mean", "low", "high")
+        }
+        frame = pd.DataFrame(numbers, index=pd.Index(METRICS, name="metric"))
+        return frame.rename_axis(columns=("driver", None))
+
+    def episodes(self) -> "pd.DataFrame":
+        """Return a row per episode and driver, with seed, status and every metric."""
+        return rows_to_frame(self.rows)
+
+    def _repr_html_(self) -> str:
+        """Return every metric with its CI, and the trajectories of all vehicles, for notebooks."""
+        import pandas as pd
+
+        from unjam.reports.figures import data_uri, space_time_figure
+
+        baseline = choose_baseline(self.rows)
+        cells = [
+            [f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)]
+            for row in metric_table(self.rows, baseline)
+        ]
+        headings = ["", *table_headings(self.rows, baseline)]
+        table = pd.DataFrame(cells, columns=headings).to_html(index=False, border=0)
+        if not self.plot_episodes:
+            return table
+        episodes = [to_plot_episode(label, each) for label, each in self.plot_episodes.items()]
+        attributes = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
+        return f'{table}<img {attributes} src="{data_uri(space_time_figure(episodes))}">'
+
+    def document(self) -> dict[str, Any]:
+        """Return the result as `unjam drive --json` prints it; with several drivers, a list of documents."""
+        verdicts, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
+        baseline, documents = choose_baseline(self.rows), list[dict[str, Any]]()
+        for driver, rows in self.rows.items():
+            summary, effect, differences = self.summary(driver), effects.get(driver), None
+            if baseline and driver != baseline:
+                paired = {name: paired_difference(rows, self.rows[baseline], name) for name in METRICS}
+                differences = {name: [each.mean, each.low, each.high] for name, each in paired.items()}
+            effects_by_entry = {name: getattr(effect, name) for name in EFFECT_ENTRIES} if effect else {}
+            documents.append(
+                {
+                    "scenario": self.scenario,
+                    "driver": driver,
+                    "feasibility": verdicts[driver],
+                    "episodes": rows,
+                    "mean": {name: summary[name].mean for name in METRICS},
+                    "ci95": {name: [summary[name].low, summary[name].high] for name in METRICS},
+                    "effect": {name: [each.mean, each.low, each.high] for name, each in effects_by_entry.items()}
+                    or None,
+                    "early_ends": count_early_ends(rows),
+                    "notes": self.notes,
+                    "folder": str(self.folder) if self.folder else None,
+                    "report": str(self.report) if self.report else None,
+                    "baseline": baseline or None,
+                    "difference_to_baseline": differences,
+                }
+            )
+        return documents[0] if len(documents) == 1 else {"scenario": self.scenario, "drivers": documents}
+
+
+def rows_to_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
+    """Return a row per episode and driver: `driver`, `seed` as text, `status`, and every metric."""
+    import pandas as pd
+
+    return pd.DataFrame(
+        [{"driver": label, **row, "seed": str(row["seed"])} for label, rows in rows_by_driver.items() for row in rows]
+    ).drop(columns="warnings", errors="ignore")
 
 
 def evaluate(
@@ -87,54 +195,36 @@ def evaluate_on_roads(
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
     settings: dict[str, Any] = {"reward": reward, "record_details": True, "stop_at_contact": False}
     tasks = [EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs]
+    remote = [number for number, task in enumerate(tasks) if is_serializable(task.driver)]
+    local = [number for number, task in enumerate(tasks) if not is_serializable(task.driver)]
 
-    def on_progress(task: int, steps: int) -> None:
+    def on_progress(number: int, steps: int) -> None:
         if progress is not None:
-            progress(pairs[task], steps)
+            progress(pairs[number], steps)
 
-    def measure_task(task: int, episode: Episode) -> tuple[dict[str, Any], Episode | None]:
-        _, index = pairs[task]
-        return measure(episode), episode if with_plots and index == 0 and episode.has_run else None
+    def measure_task(number: int, episode: Episode) -> tuple[dict[str, Any], Episode | None]:
+        is_plotted = with_plots and pairs[number][1] == 0 and episode.has_run
+        return measure(episode), episode if is_plotted else None
 
-    remote = [index for index, (label, _) in enumerate(pairs) if is_serializable(drivers[label][1])]
     measured = workers.run_and_map(
-        [tasks[index] for index in remote],
-        lambda number, episode: measure_task(remote[number], episode),
-        lambda number, steps: on_progress(remote[number], steps),
+        [tasks[number] for number in remote],
+        lambda index, episode: measure_task(remote[index], episode),
+        lambda index, steps: on_progress(remote[index], steps),
     )
     results = dict(zip(remote, measured, strict=True))
-    results |= _run_in_process(tasks, results.keys(), measure_task, on_progress)
+    with open_simulation(*(tasks[number].scenario for number in local)) if local else nullcontext() as simulation:
+        for number in local:
+            report = partial(on_progress, number)
+            episode = run_episode(**vars(tasks[number]), simulation=simulation, on_progress=report)
+            results[number] = measure_task(number, episode)
     rows: RowsByDriver = {label: [] for label in drivers}
     plot_episodes: dict[str, Episode] = {}
-    for index, (label, _) in enumerate(pairs):
-        row, episode = results[index]
+    for number, (label, _) in enumerate(pairs):
+        row, episode = results[number]
         rows[label].append(row)
         if episode is not None:
             plot_episodes[label] = episode
     return Evaluation(rows, plot_episodes)
-
-
-def _run_in_process(
-    tasks: Sequence[EpisodeTask],
-    finished: Container[int],
-    process: Callable[[int, Episode], Any],
-    on_progress: Callable[[int, int], None],
-) -> dict[int, Any]:
-    """Run the tasks that are not `finished` in this process; return the results of `process` by index."""
-    remaining = {index: task for index, task in enumerate(tasks) if index not in finished}
-    if not remaining:
-        return {}
-    results: dict[int, Any] = {}
-    with open_simulation(*(task.scenario for task in remaining.values())) as simulation:
-        for index, task in remaining.items():
-            episode = run_episode(
-                *(task.scenario, task.driver, task.seed, task.reward, task.explore, task.record_details),
-                simulation=simulation,
-                on_progress=partial(on_progress, index),
-                stop_at_contact=task.stop_at_contact,
-            )
-            results[index] = process(index, episode)
-    return results
 
 
 def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
@@ -168,12 +258,12 @@ def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, An
     atomic_write(folder / EVALUATION_FILE, to_json({**metadata, "rows": rows, "plot_episodes": entries}, indent=1))
 
 
-def drivers_to_compare(config: RunConfig, folder: Path, baselines: Sequence[str]) -> dict[str, Driver]:
+def drivers_to_compare(config: RunConfig, folder: Path) -> dict[str, Driver]:
     """Return the drivers to compare, by label: the baselines, the run's expert, its trained controller."""
     scenario = config.make_scenario()
     expert = {} if config.expert == "none" else {(made := config.make_expert()).describe(): made}
     drivers: dict[str, Driver] = {}
-    for name in baselines:
+    for name in config.evaluation.baselines:
         driver = make_driver(name, scenario.control_step)
         if can_drive(driver, scenario):
             # The description of a packaged driver has all tuned parameters: its name is shorter.
@@ -182,31 +272,24 @@ def drivers_to_compare(config: RunConfig, folder: Path, baselines: Sequence[str]
     return {**drivers, **expert, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)}
 
 
-def evaluation_steps(
-    config: RunConfig, folder: Path, baselines: Sequence[str] | None = None, episodes: int | None = None
-) -> int:
+def evaluation_steps(config: RunConfig, folder: Path) -> int:
     """Return the largest number of control steps of `evaluate_run`."""
-    settings = config.evaluation
-    drivers = drivers_to_compare(config, folder, settings.baselines if baselines is None else baselines)
-    return len(drivers) * (episodes or settings.episodes) * config.make_scenario().horizon
+    return len(drivers_to_compare(config, folder)) * config.evaluation.episodes * config.make_scenario().horizon
 
 
 def evaluate_run(
     folder: Path,
     config: RunConfig,
     workers: WorkerPool,
-    baselines: Sequence[str] | None = None,
-    episodes: int | None = None,
     progress: EvaluationProgress | None = None,
     out: Path | None = None,
 ) -> Evaluation:
     """Evaluate a run's controller and others on the same test seeds, and save the results in its folder or in `out`.
 
-    `baselines` and `episodes` are those of the configuration by default.
+    `config.evaluation` may be another than that of the run.
     """
-    scenario = config.make_scenario()
-    drivers = drivers_to_compare(config, folder, config.evaluation.baselines if baselines is None else baselines)
-    seeds = make_test_seeds(episodes or config.evaluation.episodes)
+    scenario, drivers = config.make_scenario(), drivers_to_compare(config, folder)
+    seeds = make_test_seeds(config.evaluation.episodes)
     evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress)
     metadata = {
         "scenario": Path(config.scenario).name,

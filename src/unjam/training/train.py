@@ -168,7 +168,7 @@ def train_in_process(
             rows: dict[str, RowsByDriver] = {}
             for name, task in config.task_configs().items():
                 task_progress = partial(_report_task_progress, progress, name) if progress else None
-                rows[name] = evaluate_run(folder / name, task, workers, progress=task_progress).rows
+                rows[name] = evaluate_run(folder / name, task, workers, task_progress).rows
         if not no_facts_reason(config):
             write_model_facts(folder, config)
         write_report_page([folder / name for name in rows], folder / "report.html")
