@@ -12,7 +12,7 @@ from pathlib import Path
 from unjam.controller.file import SUFFIX, controller_bytes, controller_file, load_controller, sha256_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import DRIVERS, driver_from_name
-from unjam.drivers.user_driver import is_file_reference
+from unjam.drivers.user_driver import DriverLike, as_driver, is_file_reference
 from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import invalid_value, unknown_name
 from unjam.files import PACKAGED_PREFIX
@@ -48,9 +48,12 @@ def make_driver(name: str, time_step: float) -> Driver:
     return driver_from_name(name, time_step)
 
 
-def make_expert(name: str, time_step: float) -> Driver:
-    """Return a driver to which a residual can be added; arguments and errors as `make_driver`, and no `human`."""
-    driver = make_driver(name, time_step)
+def make_expert(name: str | DriverLike, time_step: float) -> Driver:
+    """Return a driver to which a residual can be added, from a name of `make_driver`, or an object of this process.
+
+    Raise `InputError` as `make_driver`, and for `human`.
+    """
+    driver = make_driver(name, time_step) if isinstance(name, str) else as_driver(name, time_step)
     if driver.is_native:
         raise invalid_value("expert", name, "drivers outside of the simulator; 'idm' drives like a human driver")
     return driver

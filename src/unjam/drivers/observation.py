@@ -1,7 +1,7 @@
 """Inputs of networks: features by name, each a function of observation, expert acceleration and memory.
 
-A user's own feature is `path.py:name`, a function of a `LocalState` that returns an array of shape (n,) or
-(n, m), about unit size.
+A user's own feature is a function of a `LocalState` that returns an array of shape (n,) or (n, m), about unit size:
+`path.py:name`, or a function of this process, which `as_features` converts.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,8 +26,8 @@ from unjam.drivers.local_state import (
     lap_angle,
     state_of_ones,
 )
-from unjam.drivers.user_driver import FileReference, is_file_reference
-from unjam.errors import InputError, unknown_name
+from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference
+from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace, stack_columns
 from unjam.user_code import UserCode
 
@@ -63,6 +63,8 @@ class Feature:
     """fields of `LocalState` that it reads and that only some roads provide (`Scenario.provided_fields`)"""
     accepts_floats: bool = True
     """whether it takes plain numbers and tensors; otherwise it is called with NumPy arrays"""
+    reads_any_field: bool = False
+    """whether it may read any field of `LocalState`, because only the user's code determines which"""
 
 
 def local_observation(state: LocalState) -> Array:
@@ -192,13 +194,27 @@ def _check_feature_name(name: str) -> str:
 
 FeatureName = Annotated[str, AfterValidator(_check_feature_name)]
 """a key of FEATURES, or `path.py:name`"""
+FeatureLike = FeatureName | Feature | Callable[[LocalState], Any]
+"""the name of a feature, or a function of this process"""
 
 
-def feature(name: str) -> Feature:
+def as_features(features: Sequence[FeatureLike]) -> tuple[str | Feature, ...]:
+    """Return features, functions among them as `Feature`; raise `InputError` if it is no list, or one is invalid."""
+    if isinstance(features, str) or not isinstance(features, Sequence) or not features:
+        raise invalid_value("features", features, "a list of features, like ('local', 'expert_acceleration')")
+    return tuple(
+        each if isinstance(each, str | Feature) else _user_feature(UserFunction.from_object(each, "a LocalState"))
+        for each in features
+    )
+
+
+def feature(name: str | Feature) -> Feature:
     """Return a feature by name; raise `InputError` if there is none, or a user's file has no such function."""
+    if isinstance(name, Feature):
+        return name
     if name not in FEATURES and not is_file_reference(name):
         raise unknown_name("features", name, [*FEATURES, "path.py:name"])
-    return FEATURES[name] if name in FEATURES else _user_feature(name)
+    return FEATURES[name] if name in FEATURES else _file_feature(name)
 
 
 @cache
@@ -207,34 +223,37 @@ def _user_code(name: str) -> UserCode:
 
 
 @cache
-def _user_feature(name: str) -> Feature:
-    reference = FileReference.parse(name)
-    function = reference.load_function("a LocalState", _user_code(name))
+def _file_feature(name: str) -> Feature:
+    return _user_feature(FileReference.parse(name).load_function("a LocalState", _user_code(name)))
 
+
+def _user_feature(function: UserFunction) -> Feature:
     def compute(inputs: FeatureInputs) -> Array:
         like, state = inputs.state.speed, inputs.state
         is_numpy = isinstance(like, np.ndarray)
         if not is_numpy:  # tensors: users' functions take NumPy arrays only
             state = state.map(lambda values: values.double().cpu().numpy())
-        found = np.asarray(reference.call_user_code(function, state), np.float64)
+        found = np.asarray(function(state), np.float64)
         found = found[:, None] if found.ndim == 1 else found
         return found if is_numpy else namespace(like).as_tensor(found, dtype=like.dtype, device=like.device)
 
     found = compute(FeatureInputs(state_of_ones(LocalState._fields, np.ones), np.ones(1), Driver(), {}))
     if found.ndim != 2 or len(found) != 1:
-        raise InputError(f"{reference}: returns shape {found.shape} for one CAV; allowed: (n,) or (n, m) for n CAVs")
-    entries = (ScaledInput(f"{reference} {number}", 1.0, "") for number in range(found.shape[1]))
-    return Feature(compute, tuple(entries), accepts_floats=False)
+        allowed = "allowed: (n,) or (n, m) for n CAVs"
+        raise InputError(f"{function.label}: returns shape {found.shape} for one CAV; {allowed}")
+    entries = (ScaledInput(f"{function.label} {number}", 1.0, "") for number in range(found.shape[1]))
+    return Feature(compute, tuple(entries), accepts_floats=False, reads_any_field=True)
 
 
-def feature_fields(names: Sequence[str]) -> frozenset[str]:
+def feature_fields(names: Sequence[str | Feature]) -> frozenset[str]:
     """Return the fields of `LocalState` that features read; for a user's own feature all, as its code decides."""
-    if any(is_file_reference(name) for name in names):
+    features = [feature(name) for name in names]
+    if any(each.reads_any_field for each in features):
         return frozenset(LocalState._fields)
-    return frozenset(field for name in names for field in feature(name).required_fields)
+    return frozenset(field for each in features for field in each.required_fields)
 
 
-def compute_observation(names: Sequence[str], inputs: FeatureInputs) -> Array:
+def compute_observation(names: Sequence[str | Feature], inputs: FeatureInputs) -> Array:
     """Return the input of a network: the features concatenated, shape (n, inputs), no unit."""
     blocks = [block for name in names if (block := feature(name).compute(inputs)) is not None]
     if not blocks:
@@ -242,7 +261,7 @@ def compute_observation(names: Sequence[str], inputs: FeatureInputs) -> Array:
     return join_columns(blocks)
 
 
-def observation_inputs(names: Sequence[str], expert: Driver) -> tuple[ScaledInput, ...]:
+def observation_inputs(names: Sequence[str | Feature], expert: Driver) -> tuple[ScaledInput, ...]:
     """Return the descriptions of a network's inputs with this expert, in the order of `compute_observation`."""
     described = sum(len(feature(name).inputs or ()) for name in names)
     remaining = range(observation_size(names, expert) - described)
@@ -250,7 +269,7 @@ def observation_inputs(names: Sequence[str], expert: Driver) -> tuple[ScaledInpu
     return tuple(entry for name in names for entry in (feature(name).inputs or own))
 
 
-def observation_size(names: Sequence[str], expert: Driver) -> int:
+def observation_size(names: Sequence[str | Feature], expert: Driver) -> int:
     """Return the number of a network's inputs with this expert."""
     state = state_of_ones(LocalState._fields, np.ones)
     acceleration, memory = expert.act(state, expert.initial_memory(1))
@@ -263,7 +282,7 @@ def check_user_files(names: Sequence[str], files: Sequence[Recipe]) -> None:
     """Reload the user's own features if their code was not that in `files`; raise `InputError` if it still is not."""
     if any(file not in files for file in user_files(names)):
         _user_code.cache_clear()
-        _user_feature.cache_clear()
+        _file_feature.cache_clear()
     for file in user_files(names):
         if file not in files:
             allowed = "allowed: as it was when the driver was made"

@@ -1,10 +1,11 @@
-"""Drivers and functions in the user's own Python files, named `path.py:name`.
+"""The user's own drivers and functions: objects of this process, and names in Python files, `path.py:name`.
 
 Such a file is executed as code: use only files that you trust.
 """
 
 import inspect
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.processes import redirect_user_output
+from unjam.tree import map_leaves
 from unjam.trust import check_code_unchanged, remember_trusted
 from unjam.user_code import UserCode, read_code
 
@@ -30,6 +32,70 @@ _module_lock = RLock()
 def is_file_reference(text: str) -> bool:
     """Return whether `text` has the form `path.py:name`."""
     return ".py:" in text
+
+
+def object_label(candidate: Any) -> str:
+    """Return the name of a function or a class; for other objects that of their class."""
+    return getattr(candidate, "__name__", type(candidate).__name__)
+
+
+def object_reference(candidate: Any) -> str:
+    """Return `path.py:name` for a function or a class of a Python file; empty if it has no such name."""
+    module, name = sys.modules.get(getattr(candidate, "__module__", "")), getattr(candidate, "__qualname__", "")
+    path = getattr(module, "__file__", None) or ""
+    return f"{path}:{name}" if path.endswith(".py") and getattr(module, name, None) is candidate else ""
+
+
+@dataclass(frozen=True, eq=False)
+class UserFunction:
+    """A function of the user; if it fails, one line says where."""
+
+    function: Callable[..., Any]
+    label: str
+    """in messages: its name, or `path.py:name`"""
+    file: str = ""
+    """path of its code"""
+
+    @classmethod
+    def from_object(cls, candidate: Any, argument: str) -> "UserFunction":
+        """Return a function of this process, which takes `argument`; raise `InputError` if it is not a function."""
+        label = object_label(candidate)
+        if not callable(candidate) or inspect.isclass(candidate):
+            raise InputError(f"{label}: is not a function of {argument}")
+        code = getattr(candidate, "__code__", None) or getattr(type(candidate).__call__, "__code__", None)
+        return cls(_as_numpy_function(candidate), label, getattr(code, "co_filename", ""))
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Return the result of the function; raise `InputError` with its last executed line if it fails."""
+        return _call_user_code(self.label, self.file, self.function, *arguments)
+
+
+def _call_user_code(label: str, file: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return function(*arguments)
+    except (Exception, SystemExit) as error:
+        lines = [str(frame.lineno) for frame in extract_tb(error.__traceback__) if frame.filename == file]
+        line = f" (line {lines[-1]})" if lines else ""
+        raise InputError(f"{label}: {type(error).__name__}: {error}{line}") from error
+
+
+def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of a named tuple of arrays; a `torch.nn.Module` receives NumPy arrays as its own tensors."""
+    torch: Any = sys.modules.get("torch")  # it is imported where its modules exist; workers run without it
+    module: Any = function
+    if torch is None or not isinstance(module, torch.nn.Module):
+        return function
+
+    def call(rows: Any) -> Any:
+        if isinstance(rows[0], torch.Tensor):
+            return module(rows)
+        like = next(module.parameters(), torch.zeros(()))
+        tensors = (None if values is None else torch.tensor(values, device=like.device) for values in rows)
+        typed = (each.to(like.dtype) if each is not None and each.is_floating_point() else each for each in tensors)
+        with torch.no_grad():
+            return map_leaves(lambda tensor: tensor.cpu().numpy(), module(type(rows)(*typed)))
+
+    return call
 
 
 @dataclass(frozen=True)
@@ -87,22 +153,16 @@ class FileReference:
             raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public}")
         return getattr(module, self.name)
 
-    def load_function(self, argument: str, code: UserCode | None = None) -> Callable[..., Any]:
+    def load_function(self, argument: str, code: UserCode | None = None) -> UserFunction:
         """Return the function with the name, which takes `argument`; raise `InputError` if it is not a function."""
         found = self.load_object(code)
         if not callable(found) or inspect.isclass(found):
             raise InputError(f"{self}: is not a function of {argument}")
-        return found
+        return UserFunction(_as_numpy_function(found), str(self), str(self.path))
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return the result of the user's function; raise `InputError` with its last executed line if it fails."""
-        try:
-            return function(*arguments)
-        except (Exception, SystemExit) as error:
-            frames = extract_tb(error.__traceback__)
-            lines = [str(frame.lineno) for frame in frames if frame.filename == str(self.path)]
-            line = f" (line {lines[-1]})" if lines else ""
-            raise InputError(f"{self}: {type(error).__name__}: {error}{line}") from error
+        """Return the result of a function of the file; raise `InputError` with its last executed line if it fails."""
+        return _call_user_code(str(self), str(self.path), function, *arguments)
 
 
 class UserDriver(Driver):
@@ -172,13 +232,7 @@ class FileDriver(FileReference, UserDriver):
     def _build_implementation(self, code: UserCode) -> Any:
         found = self.load_object(code)
         if inspect.isclass(found):
-            arguments = dict(self.parameters)
-            if "time_step" in inspect.signature(found).parameters:
-                arguments.setdefault("time_step", self.time_step)
-            try:
-                found = found(**arguments)
-            except Exception as error:
-                raise InputError(f"{self}: {type(error).__name__} when made: {error}") from error
+            found = _instantiate(found, self.parameters, self.time_step, str(self))
         elif self.parameters:
             raise InputError(f"{self}: takes no parameters; only a class does")
         return as_implementation(found, str(self))
@@ -232,17 +286,28 @@ class DriverProtocol(Protocol):
 
 
 DriverLike = Driver | DriverProtocol | Callable[[LocalState], Any]
-"""a driver, an object with its two required methods, or a function of the state"""
+"""a driver, an object with its two required methods, a class of such objects, or a function of the state"""
 
 
-def as_driver(driver: DriverLike) -> Driver:
-    """Return any `DriverLike` as a `Driver`; raise `InputError` if it is a class, or not a driver."""
-    if isinstance(driver, Driver):
-        return driver
-    name = getattr(driver, "__name__", type(driver).__name__)
+def as_driver(driver: DriverLike, time_step: float = FileDriver.time_step) -> Driver:
+    """Return any `DriverLike` as a `Driver`; `time_step` is the control step of its road [s], an argument of classes.
+
+    Raise `InputError` if it is not a driver.
+    """
+    name = object_label(driver)
     if inspect.isclass(driver):
-        raise InputError(f"driver: {name} is a class; allowed: an instance of it, like {name}()")
-    return PythonDriver(as_implementation(driver, f"driver {name}"), name)
+        driver = _instantiate(driver, {}, time_step, f"driver {name}")
+    return driver if isinstance(driver, Driver) else PythonDriver(as_implementation(driver, f"driver {name}"), name)
+
+
+def _instantiate(kind: type[Any], parameters: dict[str, Any], time_step: float, label: str) -> Any:
+    """Return an object of a user's class; a parameter `time_step` gets the control step of the road [s]."""
+    try:
+        if "time_step" in inspect.signature(kind).parameters:
+            parameters = {"time_step": time_step, **parameters}
+        return kind(**parameters)
+    except Exception as error:
+        raise InputError(f"{label}: {type(error).__name__} when made: {error}") from error
 
 
 def as_implementation(candidate: Any, context: str) -> Any:
@@ -252,5 +317,5 @@ def as_implementation(candidate: Any, context: str) -> Any:
             raise InputError(f"{context}: has act() but no initial_memory(n)")
         return candidate
     if callable(candidate):
-        return FunctionDriver(candidate)
+        return FunctionDriver(_as_numpy_function(candidate))
     raise InputError(f"{context}: is neither a function nor a class with act(state, memory)")

@@ -14,14 +14,23 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.observation import FeatureInputs, FeatureName, compute_observation, feature_fields, observation_size
+from unjam.drivers.observation import (
+    Feature,
+    FeatureInputs,
+    FeatureLike,
+    as_features,
+    compute_observation,
+    feature_fields,
+    observation_size,
+)
+from unjam.drivers.user_driver import DriverLike
 from unjam.environments.threads import CopyableLock, synchronized
-from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
+from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, unknown_name
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
-from unjam.worlds.reward import Outcome, make_reward, time_gap, validate_reward_terms
+from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap, validate_reward_terms
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.backends import Backend
 from unjam.worlds.sumo.sandboxed import open_simulation
@@ -37,9 +46,9 @@ MAX_OBSERVATION = 50.0
 class ExternalDriver(Driver):
     """An expert with external additions to its accelerations: `actions`, set before each decision."""
 
-    def __init__(self, expert: Driver, features: Sequence[FeatureName], limits: Limits) -> None:
+    def __init__(self, expert: Driver, features: tuple[str | Feature, ...], limits: Limits) -> None:
         """Let `expert` drive within `limits`; `features` are the external observation."""
-        self.expert, self.features, self._limits = expert, tuple(features), limits
+        self.expert, self.features, self._limits = expert, features, limits
         self.actions: Any = np.zeros(0)
         """[m/s2], shape (CAVs,)"""
 
@@ -47,11 +56,6 @@ class ExternalDriver(Driver):
     def measured_fields(self) -> frozenset[str]:
         """Those of the expert and of the features."""
         return self.expert.measured_fields | feature_fields(self.features)
-
-    @property
-    def policy_inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The external observation, and the features of networks in the expert."""
-        return (*self.features, *self.expert.policy_inputs)
 
     def initial_memory(self, n: int) -> Memory:
         """Return that of the expert."""
@@ -101,19 +105,17 @@ class RoadStepper:
         self,
         scenario: str,
         changes: dict[str, Any],
-        reward: str = "",
-        expert: str = "",
-        features: Sequence[FeatureName] = ("local",),
+        reward: RewardLike = "",
+        expert: str | DriverLike = "",
+        features: Sequence[FeatureLike] = ("local",),
         backend: Backend = "libsumo",
     ) -> None:
         """Prepare a scenario, with arguments as `RoadEnv`; the first `reset` opens SUMO, as `backend`."""
         self.scenario = make_scenario(scenario, changes)
         self._reward = make_reward(reward or self.scenario.reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
-        self._driver = ExternalDriver(driver, features, self.scenario.acceleration_limits)
+        self._driver = ExternalDriver(driver, as_features(features), self.scenario.acceleration_limits)
         check_can_drive(driver, self.scenario)
-        if isinstance(features, str) or not features:
-            raise invalid_value("features", features, "a list of features, like ('local', 'expert_acceleration')")
         check_policy_inputs(self._driver.features, self.scenario, "features")
         self._backend: Backend = backend
         self._simulation: Simulation | None = None
@@ -246,9 +248,9 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     def __init__(
         self,
         scenario: str = "ring",
-        reward: str = "",
-        expert: str = "",
-        features: Sequence[FeatureName] = ("local",),
+        reward: RewardLike = "",
+        expert: str | DriverLike = "",
+        features: Sequence[FeatureLike] = ("local",),
         render_mode: str | None = None,
         **changes: Any,
     ) -> None:
@@ -256,9 +258,11 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
         Args:
             scenario: its name.
-            reward: a name or `path.py:name`; empty: that of the scenario.
-            expert: a driver to which actions are added, named as in `unjam drive --driver`.
-            features: names of the observed features, such as `local`, `expert_acceleration`, `expert_memory`.
+            reward: a name, `path.py:name`, or a function of an `Outcome`; empty: that of the scenario.
+            expert: a driver to which actions are added: a name as in `unjam drive --driver`, a driver, a class or an
+                object with `act` and `initial_memory`, or a function of a `LocalState`.
+            features: the observed features: names such as `local`, `expert_acceleration`, `expert_memory`, or
+                functions of a `LocalState`. Functions run in the process of the environment.
             render_mode: `rgb_array`, or `human` for SUMO's own window.
             changes: to the parameters of the scenario.
 

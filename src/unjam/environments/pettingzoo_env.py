@@ -8,10 +8,12 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from unjam.drivers.observation import FeatureName
+from unjam.drivers.observation import FeatureLike
+from unjam.drivers.user_driver import DriverLike
 from unjam.environments.gymnasium_env import RoadStepper
 from unjam.environments.threads import synchronized
 from unjam.errors import InputError
+from unjam.worlds.reward import RewardLike
 
 
 class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
@@ -27,9 +29,9 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
     def __init__(
         self,
         scenario: str = "ring",
-        reward: str = "",
-        expert: str = "",
-        features: Sequence[FeatureName] = ("local",),
+        reward: RewardLike = "",
+        expert: str | DriverLike = "",
+        features: Sequence[FeatureLike] = ("local",),
         **changes: Any,
     ) -> None:
         """Prepare the environment; the arguments are those of `RoadEnv`."""

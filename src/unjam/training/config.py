@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import observation_inputs
-from unjam.drivers.user_driver import is_file_reference
+from unjam.drivers.user_driver import is_file_reference, object_label, object_reference
 from unjam.drivers.wrappers import HistoryDriver
 from unjam.errors import InputError, invalid_value
 from unjam.learners.settings import AgentSettings, PolicySettings
@@ -218,12 +218,14 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
     """Return a configuration: the defaults, changed by a preset, a TOML file and `changes`, in this order.
 
     Keys of `changes` may have dots: `trpo.gamma`. Raise `InputError` for an unknown key or preset, a value out of
-    range, an unreadable file, and a file in a run folder that names untrusted Python code.
+    range, an unreadable file, a file in a run folder that names untrusted Python code, and functions, classes and
+    drivers: a training imports them in other processes, by `path.py:name`.
     """
     file_values = read_toml(file) if file is not None else {}
     if file is not None and _is_in_run_folder(file):  # other files are the user's own
         check_trusted_values(f"config file {file}", file_values)
     user_values = merge_changes(file_values, nest_keys(changes or {}))
+    _refuse_objects(user_values, "")
     scenario_name = str(user_values.get("scenario", RunConfig.scenario))
     scenario = SCENARIOS.get(scenario_name, Scenario)
     for name in user_values.keys() - {each.name for each in fields(RunConfig)}:
@@ -240,6 +242,21 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
         # The row model cannot represent the ACC of a CAV: the default is to have no model.
         values = merge_changes({"model": {"model_ratio": 0.0}}, values)
     return build_dataclass(RunConfig, values, "")
+
+
+def _refuse_objects(value: Any, name: str) -> None:
+    """Raise `InputError` if a value contains a function, a class or a driver of this process."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _refuse_objects(inner, f"{name}.{key}".strip("."))
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            _refuse_objects(inner, name)
+    elif callable(value) or callable(getattr(value, "act", None)):
+        reference = object_reference(value)
+        hint = f"; did you mean {reference!r}?" if reference else ""
+        reason = f"the Python object {object_label(value)} is not allowed, because other processes must import it"
+        raise InputError(f"{name}: {reason}; allowed: path.py:name{hint}")
 
 
 def _is_in_run_folder(file: Path) -> bool:

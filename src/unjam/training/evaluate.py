@@ -16,7 +16,7 @@ from safetensors.numpy import save
 from unjam.controller import PACKAGED_PREFIX, controller_hash, make_driver
 from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
-from unjam.drivers.registry import driver_names, is_serializable, unique_label
+from unjam.drivers.registry import driver_names, unique_label
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, error_from_name, invalid_value
 from unjam.files import atomic_write, make_folder, to_json
@@ -35,7 +35,7 @@ from unjam.training.run_folder import lock_new_folder
 from unjam.training.seeds import TRAINING_SEED_LIMIT, make_test_seeds
 from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.reward import make_reward
+from unjam.worlds.reward import RewardLike, make_reward, reward_label
 from unjam.worlds.sumo.sandboxed import open_simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -172,7 +172,7 @@ def evaluate(
     drivers: dict[str, Driver],
     seeds: Sequence[tuple[int, ...]],
     workers: WorkerPool,
-    reward: str = "",
+    reward: RewardLike = "",
     progress: EvaluationProgress | None = None,
 ) -> Evaluation:
     """Run every driver on every seed, and measure."""
@@ -184,7 +184,7 @@ def evaluate_on_roads(
     drivers: dict[str, tuple[Scenario, Driver]],
     seeds: Sequence[tuple[int, ...]],
     workers: WorkerPool,
-    reward: str = "",
+    reward: RewardLike = "",
     progress: EvaluationProgress | None = None,
     with_plots: bool = True,
 ) -> Evaluation:
@@ -195,8 +195,8 @@ def evaluate_on_roads(
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
     settings: dict[str, Any] = {"reward": reward, "record_details": True, "stop_at_contact": False}
     tasks = [EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs]
-    remote = [number for number, task in enumerate(tasks) if is_serializable(task.driver)]
-    local = [number for number, task in enumerate(tasks) if not is_serializable(task.driver)]
+    remote = [number for number, task in enumerate(tasks) if task.is_serializable]
+    local = [number for number, task in enumerate(tasks) if not task.is_serializable]
 
     def on_progress(number: int, steps: int) -> None:
         if progress is not None:
@@ -332,7 +332,7 @@ def drive(
     episodes: int = 5,
     seed: int = 0,
     scenario_options: dict[str, Any] | None = None,
-    reward: str = "",
+    reward: RewardLike = "",
     workers: int | None = None,
     out: Path | str | None = None,
     progress: Callable[[Any, int], None] | None = None,
@@ -343,12 +343,13 @@ def drive(
     Args:
         scenario: its name.
         driver: a name (`pi`), with parameters (`pi:window=30`), your own (`path.py:name`), a run folder, a `.unjam`
-            file; a driver, a function of the state or an object with `act` and `initial_memory`, which run in this
-            process; or a list of them, to be compared on the same traffic.
+            file; a driver, a function of the state, an object with `act` and `initial_memory` or a class of such
+            objects, which run in this process; or a list of them, to be compared on the same traffic.
         episodes: number for each driver; they have the seeds `seed`, `seed + 1`, ...
         seed: of the first episode.
         scenario_options: changes to the scenario, e.g. `{"length": 230}` or `{"length": (220, 270)}`.
-        reward: a name or `path.py:name`; empty: the scenario's own.
+        reward: a name or `path.py:name`; a function of an `Outcome`, with which all episodes run in this process;
+            empty: the scenario's own.
         workers: processes; all cores by default. The result does not depend on it.
         out: folder for the results and a report.html; None: nothing is written.
         progress: called repeatedly with ((driver, episode), control steps so far).
@@ -370,7 +371,7 @@ def drive(
         if isinstance(entry, str):
             drivers[entry] = make_driver(entry, road.control_step)
         else:
-            made = as_driver(entry)
+            made = as_driver(entry, road.control_step)
             drivers[unique_label(made, drivers)] = made
     if not drivers:
         raise invalid_value("driver", driver, driver_names())
@@ -388,7 +389,8 @@ def drive(
         ]
         has_results = any(row["status"] != "failed" for rows in evaluation.rows.values() for row in rows)
         if folder is not None and has_results:
-            metadata = {"scenario": Path(scenario).name, "reward": reward or road.reward, "manifest": manifest()}
+            name = reward_label(reward or road.reward)
+            metadata = {"scenario": Path(scenario).name, "reward": name, "manifest": manifest()}
             hashes = _controller_hashes({label: label for label in drivers})
             save_evaluation(folder, evaluation, {**metadata, "controllers": hashes, "notes": notes})
             from unjam.reports.html import write_report_page  # imported late: it draws

@@ -8,14 +8,14 @@ from typing import SupportsIndex
 import numpy as np
 
 from unjam.drivers.driver import Driver
-from unjam.drivers.observation import feature
+from unjam.drivers.observation import Feature, feature
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import EpisodeError, InputError, NoCavError, SumoInputError, UnjamError, as_unjam_error, invalid_value
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork
 from unjam.worlds.drive import drive_world
 from unjam.worlds.record import Episode
-from unjam.worlds.reward import Reward, episode_reward_terms, make_reward
+from unjam.worlds.reward import Reward, RewardLike, episode_reward_terms, make_reward
 from unjam.worlds.sumo import make_traffic
 from unjam.worlds.sumo.sandboxed import open_simulation
 from unjam.worlds.sumo.simulation import Simulation
@@ -40,7 +40,7 @@ def run_episode(
     scenario: Scenario,
     driver: DriverLike,
     seed: SupportsIndex | Sequence[int],
-    reward: str = "",
+    reward: RewardLike = "",
     explore: float = 0.0,
     record_details: bool = False,
     simulation: Simulation | None = None,
@@ -54,9 +54,10 @@ def run_episode(
 
     Args:
         scenario: road, traffic and horizon.
-        driver: of every CAV: a driver, an object with `act` and `initial_memory`, or a function of the state.
+        driver: of every CAV: a driver, an object with `act` and `initial_memory`, a class of them, or a function of the
+            state.
         seed: an integer or several; all random numbers come from them.
-        reward: name, or `path.py:name`; empty: the scenario's own.
+        reward: a name, `path.py:name`, or a function of an `Outcome`; empty: the scenario's own.
         explore: factor of a residual driver's exploration noise: 1, -1 for the opposite sign, or 0.
         record_details: whether fuel and, on roads with ends, positions (x, y) are recorded (10 % slower).
         simulation: an open simulation to reuse; without it, one is opened and closed. It runs in a sandboxed process
@@ -73,7 +74,7 @@ def run_episode(
             stepped or closed a simulation through libsumo meanwhile (`LostWorkerError`).
         UnjamError: another episode runs in `simulation`.
     """
-    driver, seed = as_driver(driver), as_seed(seed)
+    driver, seed = as_driver(driver, scenario.control_step), as_seed(seed)
     check_can_drive(driver, scenario)
     reward_function = make_reward(reward or scenario.reward)
     if simulation is None:
@@ -117,7 +118,7 @@ def check_can_drive(driver: Driver, scenario: Scenario) -> None:
     check_policy_inputs(driver.policy_inputs, scenario, "driver: its network's feature")
 
 
-def check_policy_inputs(features: Sequence[str], scenario: Scenario, context: str) -> None:
+def check_policy_inputs(features: Sequence[str | Feature], scenario: Scenario, context: str) -> None:
     """Raise `InputError` if features use fields that a scenario's road does not provide."""
     for name in features:
         requirement, fields = feature(name).road_requirement, feature(name).required_fields

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from sys import float_info
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from unjam.drivers.user_driver import FileReference, is_file_reference
+from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference, object_label
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import split_parameters
 from unjam.physics.arrays import Array, Floats, clamp_min, namespace, square_root
@@ -48,6 +48,8 @@ class Outcome(NamedTuple):
 
 Reward = Callable[[Outcome], dict[str, Array]]
 """A reward function: its terms by name, each of shape (rows,). The reward is their sum."""
+RewardLike = str | Callable[[Outcome], Any]
+"""the name of a reward, or a function of this process that returns its terms by name, or one array"""
 
 
 def _nan_mean(values: Array) -> Array:
@@ -158,18 +160,26 @@ REWARDS: dict[str, Reward] = {
 }
 
 
+def reward_label(reward: RewardLike) -> str:
+    """Return the name of a reward, for tables."""
+    return reward if isinstance(reward, str) else object_label(reward)
+
+
 def time_gap(gap: Array, speed: Array) -> Array:
     """Return gap over speed [s]; a very large number for a standing vehicle."""
     return gap / clamp_min(speed, STANDSTILL_SPEED)
 
 
-def make_reward(text: str) -> Reward:
+def make_reward(text: RewardLike) -> Reward:
     """Return the reward for a name, with weights of its terms, or for a user's function.
 
     `released:acceleration=2,time_gap=0.5` is the reward `released` with double weight of its term `acceleration`, plus
     half of the term `time_gap` of `REWARD_TERMS`. `path.py:name` is a function that takes an `Outcome` and returns
-    its terms by name, or one array. Raise `InputError` for unknown names and terms, and weights that are not numbers.
+    its terms by name, or one array; `text` may be such a function itself. Raise `InputError` for unknown names and
+    terms, and weights that are not numbers.
     """
+    if not isinstance(text, str):
+        return _user_reward(UserFunction.from_object(text, "an Outcome"))
     name, weights = split_parameters(text)
     for term, weight in weights.items():
         is_number = isinstance(weight, int | float) and not isinstance(weight, bool)
@@ -177,7 +187,7 @@ def make_reward(text: str) -> Reward:
             raise invalid_value(f"reward {name}: {term}", weight, "a number")
     if not is_file_reference(name) and name not in REWARDS:
         raise unknown_name("reward", name, [*REWARDS, "path.py:name"])
-    reward = REWARDS.get(name) or _user_reward(name)
+    reward = REWARDS.get(name) or _user_reward(FileReference.parse(name).load_function("an Outcome"))
 
     def weighted_reward(outcome: Outcome) -> dict[str, Array]:
         terms = dict(reward(outcome))
@@ -190,12 +200,9 @@ def make_reward(text: str) -> Reward:
     return weighted_reward if weights else reward
 
 
-def _user_reward(name: str) -> Reward:
-    reference = FileReference.parse(name)
-    function = reference.load_function("an Outcome")
-
+def _user_reward(function: UserFunction) -> Reward:
     def user_reward(outcome: Outcome) -> dict[str, Array]:
-        terms = reference.call_user_code(function, outcome)
+        terms = function(outcome)
         return terms if isinstance(terms, dict) else {"reward": terms}
 
     return user_reward

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from unjam.drivers.driver import Driver
-from unjam.drivers.registry import driver_recipe
+from unjam.drivers.registry import driver_recipe, is_serializable
 from unjam.errors import EpisodeError, SumoInputError
 from unjam.processes import PrivateFolder, remove_stale_private_folders
 from unjam.scenarios import scenario_recipe
@@ -21,6 +21,7 @@ from unjam.sumo_files import MAX_READER_TIME, answer_of
 from unjam.tree import Arrays, unpack
 from unjam.worlds.messages import read_message, start_child, write_message
 from unjam.worlds.record import Episode, failed_episode
+from unjam.worlds.reward import RewardLike
 
 MAX_EPISODE_ATTEMPTS = 3
 """attempts to run an episode before its row reports a failure"""
@@ -38,10 +39,16 @@ class EpisodeTask:
     scenario: Scenario
     driver: Driver
     seed: tuple[int, ...]
-    reward: str = ""
+    reward: RewardLike = ""
+    """a function only for episodes in this process"""
     explore: float = 0.0
     record_details: bool = False
     stop_at_contact: bool = True
+
+    @property
+    def is_serializable(self) -> bool:
+        """Whether another process can run it."""
+        return isinstance(self.reward, str) and is_serializable(self.driver)
 
     def message(self) -> Message:
         """Return the message that sends the task to a worker."""
