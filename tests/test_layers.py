@@ -322,7 +322,6 @@ CHANGES_THE_PROCESS = {
     "child_processes": "in the command line, and while Ray or multiprocessing starts processes",
     "training/train": "for the length of a training, under a lock, and restored",
     "learners/algorithm_1": "within training/train",
-    "training/executors": "in the process of a training",
     "training/model_facts": "within training/train, or in the command line",
     "training/benchmark": "in the command line",
     "following/networks": "in the command line",

@@ -1,14 +1,12 @@
 """Trainings in subprocesses: many command lines at once, on this machine or on a Ray cluster; or a single training.
 
 The single training is for a program that imported NumPy before unjam: see `unjam.kernels`. Its child, `python -m
-unjam.training.executors`, reads one line of JSON and writes lines: lists of a message kind and its values. After each
-row of progress it reads whether to continue.
+unjam.training.executors`, reads one message and writes several. After each row of progress it reads whether to
+continue.
 """
 
-import json
 import os
 import shlex
-import signal
 import subprocess
 import sys
 import threading
@@ -17,23 +15,24 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, Literal, NamedTuple
 
 from unjam.child_processes import child_environment, child_import_path, isolated_start, python_command
 from unjam.errors import MissingPartError, UnjamError, error_from_name
 from unjam.files import APPEND_FLAGS, atomic_write, make_folder, open_in_place
 from unjam.folders import PROTECTED_FOLDERS_VARIABLE
 from unjam.parameters import build_dataclass
-from unjam.processes import bind_to_parent, exit_with_parent
+from unjam.processes import bind_to_parent
 from unjam.trust import TRUST_CODE_OPTION, expecting_code, is_all_code_trusted
+from unjam.worlds.messages import open_answer_pipe, read_message, start_child, write_message
 
 if TYPE_CHECKING:  # the command line imports this module and must start quickly
     from unjam.training.config import RunConfig
     from unjam.training.evaluate import EvaluationProgress, RowsByDriver
 
 Executor = Literal["local", "ray"]
-EXECUTORS: tuple[Executor, ...] = ("local", "ray")
 MessageCallback = Callable[[str], None]
 """called with a line of progress"""
 IterationCallback = Callable[[dict[str, Any]], object]
@@ -185,29 +184,24 @@ def train_in_subprocess(
     progress: "EvaluationProgress | None",
 ) -> "dict[str, RowsByDriver]":
     """Train as `train_in_process` does, with the same errors, in a subprocess."""
-    child = subprocess.Popen(
-        python_command("-m", "unjam.training.executors"),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        encoding="utf-8",
-        env=child_environment(),
-    )
+    child = start_child("unjam.training.executors")
+    assert child.stdin is not None
+    assert child.stdout is not None
     try:
-        assert child.stdin is not None
-        assert child.stdout is not None
-        request = [asdict(config), os.fspath(folder), resume, child_import_path()]
-        print(json.dumps(request), file=child.stdin, flush=True)
-        for line in child.stdout:
-            match json.loads(line):
-                case ["row", row]:
+        write_message(
+            child.stdin, {"arguments": [asdict(config), os.fspath(folder), resume], "path": child_import_path()}
+        )
+        while (message := _next_message(child.stdout)) is not None:
+            match message:
+                case {"row": row}:
                     continues = on_iteration is None or on_iteration(row) is not False
                     with suppress(BrokenPipeError):  # it was killed: its exit code is reported below
-                        print(json.dumps(continues), file=child.stdin, flush=True)
-                case ["evaluated", driver, episode, steps] if progress is not None:
+                        write_message(child.stdin, {"continues": continues})
+                case {"evaluated": [driver, episode], "steps": steps} if progress is not None:
                     progress((driver, episode), steps)
-                case ["error", kind, text]:
+                case {"error": [kind, text]}:
                     raise error_from_name(kind, text)
-                case ["done", rows]:
+                case {"rows": rows}:
                     return rows
         raise UnjamError(f"training: its process ended with code {child.wait()}")
     finally:
@@ -215,36 +209,35 @@ def train_in_subprocess(
         child.wait()
 
 
+def _next_message(pipe: IO[bytes]) -> dict[str, Any] | None:
+    with suppress(EOFError):
+        return read_message(pipe)[0]
+    return None
+
+
 def train_from_stdin() -> None:
     """Train by the request on standard input, in the subprocess of `train_in_subprocess`."""
-    exit_with_parent(signal.SIGTERM)
-    messages = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what SUMO and user code print must not mix with the messages
-    values, folder, resume, path = json.loads(sys.stdin.readline())
+    send = partial(write_message, open_answer_pipe())
+    request, _ = read_message(sys.stdin.buffer)
     # User code may need the import path of the parent; at the end it hides no installed package.
-    sys.path.extend(each for each in path if each not in sys.path)
-
-    def send(*message: Any) -> None:
-        print(json.dumps(message), file=messages, flush=True)
+    sys.path.extend(each for each in request["path"] if each not in sys.path)
+    values, folder, resume = request["arguments"]
 
     def report_iteration(row: dict[str, Any]) -> bool:
-        send("row", row)
-        return json.loads(sys.stdin.readline())
+        send({"row": row})
+        return read_message(sys.stdin.buffer)[0]["continues"]
+
+    def report_evaluation(episode: tuple[str, int], steps: int) -> None:
+        send({"evaluated": episode, "steps": steps})
 
     try:
         from unjam.training.config import RunConfig
         from unjam.training.train import train_in_process
 
-        rows = train_in_process(
-            build_dataclass(RunConfig, values, ""),
-            Path(folder),
-            resume,
-            report_iteration,
-            lambda episode, steps: send("evaluated", *episode, steps),
-        )
-        send("done", rows)
+        config = build_dataclass(RunConfig, values, "")
+        send({"rows": train_in_process(config, Path(folder), resume, report_iteration, report_evaluation)})
     except UnjamError as error:
-        send("error", type(error).__name__, str(error))
+        send({"error": [type(error).__name__, str(error)]})
 
 
 if __name__ == "__main__":
