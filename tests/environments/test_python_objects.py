@@ -1,6 +1,7 @@
 """Functions, classes and torch modules of this process wherever `path.py:name` is allowed."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.errors import InputError
+from unjam.training.config import RunConfig
 from unjam.worlds.reward import Outcome
 
 SHORT: Any = {"horizon": 30, "cavs": 1}
@@ -189,3 +191,5 @@ def test_objects_without_a_file_are_refused_without_a_guess() -> None:
     for value in (PISaturation(), lambda state: state.speed, Speed()):
         with pytest.raises(InputError, match=r"^expert: .*allowed: path\.py:name$"):
             unjam.load_config(changes={"expert": value})
+        with pytest.raises(InputError, match=r"^expert: .*allowed: path\.py:name$"):
+            replace(RunConfig(), expert=value)

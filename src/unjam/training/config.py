@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tomli_w
 from pydantic import AfterValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
+from pydantic_core import ArgsKwargs
 
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
@@ -121,6 +122,12 @@ class RunConfig(AgentSettings):
     preset: str = ""
     """name of the preset that it started from, for the record"""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _check_no_objects(cls, values: Any) -> Any:
+        _refuse_objects(values.kwargs if isinstance(values, ArgsKwargs) else values, "")
+        return values
+
     @model_validator(mode="after")
     def _check_combinations(self) -> "RunConfig":
         policy, evaluation = self.policy, self.evaluation
@@ -218,14 +225,13 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
     """Return a configuration: the defaults, changed by a preset, a TOML file and `changes`, in this order.
 
     Keys of `changes` may have dots: `trpo.gamma`. Raise `InputError` for an unknown key or preset, a value out of
-    range, an unreadable file, a file in a run folder that names untrusted Python code, and functions, classes and
-    drivers: a training imports them in other processes, by `path.py:name`.
+    range, an unreadable file, a file in a run folder that names untrusted Python code, and a function, a class or a
+    driver, because a training imports them in other processes, by `path.py:name`.
     """
     file_values = read_toml(file) if file is not None else {}
     if file is not None and _is_in_run_folder(file):  # other files are the user's own
         check_trusted_values(f"config file {file}", file_values)
     user_values = merge_changes(file_values, nest_keys(changes or {}))
-    _refuse_objects(user_values, "")
     scenario_name = str(user_values.get("scenario", RunConfig.scenario))
     scenario = SCENARIOS.get(scenario_name, Scenario)
     for name in user_values.keys() - {each.name for each in fields(RunConfig)}:

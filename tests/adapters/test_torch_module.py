@@ -1,0 +1,84 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import unjam
+from unjam.adapters.torch_module import torch_driver
+from unjam.drivers.check import random_state
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.observation import local_observation
+from unjam.drivers.pi_saturation import PISaturation
+from unjam.errors import InputError
+
+SHORT: Any = {"horizon": 40, "cavs": 2}
+
+
+@pytest.fixture
+def network() -> torch.nn.Module:
+    torch.manual_seed(0)
+    return torch.nn.Sequential(torch.nn.Linear(5, 64), torch.nn.Tanh(), torch.nn.Dropout(), torch.nn.Linear(64, 1))
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_a_network_reads_features_and_returns_accelerations(network: torch.nn.Module, kind: torch.dtype) -> None:
+    network = network.to(kind)
+    driver = torch_driver(network, action_scale=2.0)
+    unjam.check_driver(driver)
+    state = random_state(np.random.default_rng(0), 6)
+    found, _ = driver.act(state, driver.initial_memory(6))
+    with torch.no_grad():
+        expected = 2.0 * network.eval()(torch.as_tensor(local_observation(state), dtype=kind))[:, 0].numpy()
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_a_network_is_added_to_an_expert_within_the_limit(network: torch.nn.Module) -> None:
+    driver = torch_driver(network, expert=PISaturation(), action_scale=100.0, action_limit=0.5)
+    state = random_state(np.random.default_rng(0), 50)
+    found, _ = driver.act(state, driver.initial_memory(50))
+    assert np.abs(found).max() == 0.5
+    assert driver.describe() == "pi + Sequential"
+
+
+def test_training_a_network_further_does_not_change_its_driver(network: torch.nn.Module) -> None:
+    driver = torch_driver(network)
+    state = random_state(np.random.default_rng(0), 3)
+    before, _ = driver.act(state, driver.initial_memory(3))
+    with torch.no_grad():
+        network[0].weight.zero_()  # pyright: ignore
+    np.testing.assert_array_equal(driver.act(state, driver.initial_memory(3))[0], before)
+    assert network.training
+
+
+def test_a_network_drives_in_this_process(network: torch.nn.Module) -> None:
+    driver = torch_driver(network)
+    found = unjam.drive("ring", driver, episodes=1, scenario_options=SHORT)
+    episode = unjam.run_episode(unjam.make_scenario("ring", SHORT), driver, 0)
+    assert float(episode.reward.sum()) == found.rows["Sequential"][0]["return"]
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        (torch.nn.Linear(6, 1), "Linear: RuntimeError: mat1 and mat2 shapes cannot be multiplied"),
+        (torch.nn.Linear(5, 3), r"policy: returns shape \(2, 3\) for 2 CAVs; allowed: \(2,\) or \(2, 1\)"),
+    ],
+)
+def test_a_network_that_does_not_fit_is_refused(module: torch.nn.Module, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        torch_driver(module)
+
+
+def test_single_precision_is_no_excuse_for_rows_that_influence_each_other() -> None:
+    class Mixes(torch.nn.Module):
+        def forward(self, observation: Any) -> Any:
+            return observation[:, :1] - observation[:, :1].mean()
+
+    with pytest.raises(InputError, match=r"alone and .* among 8 rows"):
+        unjam.check_driver(torch_driver(Mixes()))
+
+    def rounds(state: LocalState) -> Any:
+        return (0.1 * state.speed).astype(np.float32) + np.float32(1e-7 * len(state.speed))
+
+    unjam.check_driver(rounds)
