@@ -239,7 +239,8 @@ def write_network(
         if elements
     }
     run_netconvert(inputs, ["--no-turnarounds=true", *options], folder)
-    (folder / "road.rou.xml").write_text(element_document("routes", traffic))
+    routes = element_document("routes", traffic)
+    (folder / "road.rou.xml").write_text(routes)
     return write_configuration(folder, {})
 
 
