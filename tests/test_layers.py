@@ -31,7 +31,7 @@ EVERYWHERE = {
 """modules that every part may import: they import none of the layers"""
 ALLOWED = {
     "adapters": {"physics", "drivers"},
-    "controller": {"physics", "drivers", "worlds"},
+    "controller": {"adapters", "physics", "drivers", "worlds"},
     "following": {"physics", "drivers", "scenarios"},
     "reports": {"physics", "drivers", "scenarios", "worlds", "measures"},
     "learners": {"following"},
@@ -185,7 +185,8 @@ def test_nothing_is_evaluated_unpickled_or_given_to_a_shell() -> None:
         if isinstance(call.func, ast.Name):
             assert call.func.id not in ("eval", "exec", "compile", "execfile"), where
         assert name_of(call.func) not in ("system", "popen"), where
-        assert not ast.unparse(call.func).startswith("torch.load"), where
+        if ast.unparse(call.func).startswith("torch.load"):
+            assert "weights_only=True" in map(ast.unparse, call.keywords), where
         for keyword in call.keywords:
             if keyword.arg in ("shell", "allow_pickle"):
                 assert isinstance(keyword.value, ast.Constant), where

@@ -31,8 +31,8 @@ def make_driver(name: str, time_step: float) -> Driver:
 
     Args:
         name: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own (`path.py:name`), a run folder,
-            a `.unjam` file, or a packaged controller (`unjam:ring-best`); or several of them joined by `+`, which CAVs
-            use in turn.
+            a `.unjam` file, a `.zip` file of Stable-Baselines3 whose model observes `local`, or a packaged controller
+            (`unjam:ring-best`); or several of them joined by `+`, which CAVs use in turn.
         time_step: control step of the road [s].
     """
     is_path = os.path.exists(name) or os.path.exists(name.rpartition(":")[0])
@@ -42,6 +42,10 @@ def make_driver(name: str, time_step: float) -> Driver:
     if name.startswith(PACKAGED_PREFIX):
         return load_controller(packaged_file(name.removeprefix(PACKAGED_PREFIX)))
     is_folder = os.path.isdir(name)  # a folder is never a file with code, whatever its name
+    if name.endswith(".zip") and not is_folder:
+        from unjam.adapters.stable_baselines3_file import read_stable_baselines3
+
+        return read_stable_baselines3(name)
     is_named = name.partition(":")[0] in DRIVERS or (is_file_reference(name) and not is_folder)
     if not is_named and (name.endswith(SUFFIX) or is_folder):
         return load_controller(name)

@@ -64,6 +64,7 @@ def check_config(config: RunConfig) -> None:
         check_policy_inputs(task.policy.inputs, scenario, "policy.inputs")
         expert = task.make_expert()
         check_can_drive(expert, scenario)
+        driver_recipe(expert)  # workers build it
         observation_size(task.policy.inputs, expert)
         make_reward(task.reward or scenario.reward)
         for name in task.evaluation.baselines:

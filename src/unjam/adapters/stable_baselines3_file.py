@@ -1,0 +1,187 @@
+"""A file of a Stable-Baselines3 model as a driver, without unpickling: only its JSON and its weights are read.
+
+`PPO.load` and its siblings unpickle parts of the file, which can run any code. Here these parts are ignored, and the
+network is rebuilt from the names of its weights.
+"""
+
+import io
+import json
+import os
+import re
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.adapters.policy_driver import PolicyDriver, policy_driver
+from unjam.drivers.observation import FeatureLike
+from unjam.drivers.user_driver import DriverLike
+from unjam.errors import InputError, MissingPartError
+from unjam.physics.arrays import Floats
+
+DATA_PART, POLICY_PART = "data", "policy.pth"
+MAX_ARCHIVE_BYTES = 64 * 2**20
+"""maximum size of an archive, decompressed"""
+SAFE_TORCH = (2, 6)
+"""version of torch from which on reading weights cannot run code (CVE-2025-32434)"""
+ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"Tanh": np.tanh, "ReLU": lambda units: np.maximum(units, 0.0)}
+POLICY_PACKAGES = ("stable_baselines3.", "sb3_contrib.")
+HARMLESS_POLICY_OPTIONS = {
+    *("net_arch", "log_std_init", "ortho_init", "optimizer_class", "optimizer_kwargs", "share_features_extractor"),
+    *("n_critics", "n_quantiles", "clip_mean", "full_std", "use_expln", "normalize_images", ":type:", ":serialized:"),
+}
+"""options of policies that do not change their deterministic actions, or that the shapes of the weights show"""
+
+
+@dataclass(frozen=True)
+class _Actor:
+    """Names of the weights of an actor network; numbered layers come first."""
+
+    hidden: str
+    output: str
+    """empty if the last numbered layer is the output"""
+    others: tuple[str, ...]
+    """beginnings of the names of other weights, without which actions are the same"""
+    activation: str
+    """default activation"""
+    is_squashed: bool
+    """whether the output is the tanh of the last layer, scaled to the action space"""
+
+
+ACTORS = (
+    _Actor(
+        hidden="mlp_extractor.policy_net.",
+        output="action_net.",
+        others=("log_std", "mlp_extractor.value_net.", "value_net."),
+        activation="Tanh",
+        is_squashed=False,
+    ),
+    _Actor("actor.latent_pi.", "actor.mu.", ("actor.log_std.", "critic.", "critic_target."), "ReLU", is_squashed=True),
+    _Actor("actor.mu.", "", ("actor_target.", "critic.", "critic_target."), "ReLU", is_squashed=True),
+)
+"""actors of PPO, A2C and TRPO; of SAC and TQC; of TD3 and DDPG"""
+
+
+def read_stable_baselines3(
+    file: Path | str,
+    features: Sequence[FeatureLike] = ("local",),
+    expert: DriverLike | None = None,
+    action_scale: float = 1.0,
+) -> PolicyDriver:
+    """Return the model of a .zip file as a driver that runs in this process, without unpickling; float64.
+
+    Arguments as `stable_baselines3_driver`. The file does not contain the statistics of `VecNormalize`: a model that
+    was trained with them needs `stable_baselines3_driver`.
+
+    Raises:
+        InputError: the file is missing, damaged or no such model, or its policy is not an `MlpPolicy` of an algorithm
+            with continuous actions, without state-dependent exploration.
+        MissingPartError: the installed torch cannot read weights safely.
+    """
+    path = Path(file)
+    if not os.path.isfile(path):
+        raise InputError(f"driver: {str(path)!r} does not exist")
+    try:
+        parts = _read_parts(path.read_bytes(), (DATA_PART, POLICY_PART))
+        data = json.loads(parts[DATA_PART])
+        weights = _read_weights(parts[POLICY_PART])
+        observed, acted = (_read_box(data[f"{name}_space"]) for name in ("observation", "action"))
+        actor = _find_actor(weights)
+        activation = _read_activation(data, actor)
+        layers = _read_layers(weights, actor)
+        if acted[0].shape != (1,) or layers[-1][1].shape != (1,):
+            raise ValueError("its actions are not one number")
+    except (InputError, MissingPartError, ModuleNotFoundError):
+        raise
+    except Exception as error:  # damaged files cause any error, also in torch
+        line = " ".join(str(error).split())
+        hint = "allowed: an MlpPolicy of Stable-Baselines3 with a Box of one action; others as Python objects"
+        raise InputError(f"driver {path.name}: {type(error).__name__}: {line[:200]}; {hint}") from None
+    (low, high), bounds = acted, observed
+
+    def act(observations: Floats) -> Any:
+        units = observations.clip(*bounds)
+        for weight, bias in layers[:-1]:
+            units = activation(units @ weight.T + bias)
+        units = units @ layers[-1][0].T + layers[-1][1]
+        return low + 0.5 * (np.tanh(units) + 1.0) * (high - low) if actor.is_squashed else units.clip(low, high)
+
+    limit = action_scale * float(np.abs(acted).max())
+    return policy_driver(act, path.name, features, expert, action_scale, limit, layers[0][0].shape[1])
+
+
+def _read_parts(content: bytes, names: Sequence[str] = ()) -> dict[str, bytes]:
+    """Return parts of an archive; raise `ValueError` if it is too large."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if sum(part.file_size for part in archive.infolist()) > MAX_ARCHIVE_BYTES:
+            raise ValueError(f"larger than {MAX_ARCHIVE_BYTES} bytes")
+        return {name: archive.read(name) for name in names}
+
+
+def _read_weights(content: bytes) -> dict[str, Floats]:
+    import torch  # imported late: other parts of the package need no torch
+
+    if tuple(map(int, torch.__version__.split(".")[:2])) < SAFE_TORCH:
+        needed = ".".join(map(str, SAFE_TORCH))
+        raise MissingPartError(f"torch {torch.__version__} cannot read weights safely: pip install 'torch>={needed}'")
+    _read_parts(content)
+    tensors = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    weights: dict[str, Floats] = {}
+    for name, tensor in tensors.items():
+        if tensor.numel() * tensor.element_size() > len(content):
+            raise ValueError(f"weights {name} are larger than their file")
+        weights[name] = tensor.double().numpy()
+        if not np.isfinite(weights[name]).all():
+            raise ValueError(f"weights {name} are not finite")
+    return weights
+
+
+def _read_box(space: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and the highest values of a `Box` with one axis."""
+    if not space[":type:"].endswith(".Box'>"):
+        raise ValueError(f"{space[':type:']} is not a Box")
+    low, high = (np.array(space[name].strip("[]").split(), np.float64) for name in ("low", "high"))
+    if not [*low.shape] == [*high.shape] == space["_shape"]:
+        raise ValueError("a space does not have one axis")
+    return low, high
+
+
+def _find_actor(weights: dict[str, Floats]) -> _Actor:
+    for actor in ACTORS:
+        others = [name for name in weights if not name.startswith((actor.hidden, actor.output or actor.hidden))]
+        if len(others) < len(weights) and all(name.startswith(actor.others) for name in others):
+            return actor
+    raise ValueError("its weights are not those of an MlpPolicy with continuous actions")
+
+
+def _read_activation(data: dict[str, Any], actor: _Actor) -> Callable[[Floats], Floats]:
+    """Return the activation; raise `ValueError` if options change the actions in another way."""
+    options = dict(data["policy_kwargs"])
+    name = re.sub(r".*\.|'>", "", options.pop("activation_fn", actor.activation))
+    if not data["policy_class"]["__module__"].startswith(POLICY_PACKAGES):
+        raise ValueError("its policy class is not one of Stable-Baselines3")
+    if data.get("use_sde") or options.pop("use_sde", False):
+        raise ValueError("use_sde")
+    if unknown := options.keys() - HARMLESS_POLICY_OPTIONS:
+        raise ValueError(f"policy_kwargs {min(unknown)}")
+    if name not in ACTIVATIONS:
+        raise ValueError(f"activation {name}; known: {', '.join(ACTIVATIONS)}")
+    return ACTIVATIONS[name]
+
+
+def _read_layers(weights: dict[str, Floats], actor: _Actor) -> list[tuple[Floats, Floats]]:
+    """Return weight, shape (outputs, inputs), and bias of each layer."""
+    inner = [name.removeprefix(actor.hidden) for name in weights if name.startswith(actor.hidden)]
+    numbers = sorted({int(name.partition(".")[0]) for name in inner})
+    names = [*(f"{actor.hidden}{number}." for number in numbers), *filter(None, (actor.output,))]
+    if len(inner) != 2 * len(numbers):
+        raise ValueError("layers that are not linear")
+    layers = [(weights[f"{name}weight"], weights[f"{name}bias"]) for name in names]
+    sizes = [weight.shape[1] for weight, _ in layers[1:]]
+    if [len(bias) for _, bias in layers[:-1]] != sizes or any(w.shape[:1] != b.shape for w, b in layers):
+        raise ValueError("layers that do not fit together")
+    return layers

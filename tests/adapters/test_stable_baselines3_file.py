@@ -1,0 +1,148 @@
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from sb3_contrib import TQC, TRPO, RecurrentPPO
+from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+
+import unjam
+from tests.adapters.test_stable_baselines3 import Space
+from unjam.adapters.stable_baselines3 import stable_baselines3_driver
+from unjam.adapters.stable_baselines3_file import read_stable_baselines3
+from unjam.controller import make_driver
+from unjam.drivers.check import random_state
+from unjam.drivers.pi_saturation import PISaturation
+from unjam.errors import InputError
+
+
+def save(model: Any, folder: Path) -> Path:
+    model.save(folder / "model.zip")
+    return folder / "model.zip"
+
+
+def change(file: Path, **parts: Callable[[bytes], bytes]) -> None:
+    with zipfile.ZipFile(file) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in contents.items():
+            archive.writestr(name, parts.get(name.replace(".", "_"), bytes)(content))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options"),
+    [
+        *((each, {}) for each in (PPO, A2C, TRPO, SAC, TQC, TD3, DDPG)),
+        (PPO, {"net_arch": {"pi": [8], "vf": [4, 4]}, "activation_fn": torch.nn.ReLU}),
+        (SAC, {"net_arch": [8, 9, 10], "activation_fn": torch.nn.Tanh}),
+        (PPO, {"net_arch": []}),
+        (TD3, {"net_arch": []}),
+    ],
+)
+def test_a_file_drives_as_its_model(algorithm: Any, options: dict[str, Any], tmp_path: Path) -> None:
+    space = Space(action=spaces.Box(-0.7, 1.5, (1,), np.float32))
+    model = algorithm("MlpPolicy", space, policy_kwargs=options, seed=1, device="cpu")
+    read = read_stable_baselines3(save(model, tmp_path))
+    unjam.check_driver(read)
+    state = random_state(np.random.default_rng(0), 200)
+    expected, _ = stable_baselines3_driver(model).act(state, read.initial_memory(200))
+    np.testing.assert_allclose(read.act(state, read.initial_memory(200))[0], expected, atol=2e-6)
+
+
+def test_features_and_expert_are_given_in_python_and_local_features_by_name(tmp_path: Path) -> None:
+    with_expert = save(PPO("MlpPolicy", Space(6), seed=1, device="cpu"), tmp_path)
+    driver = read_stable_baselines3(with_expert, ("local", "expert_acceleration"), PISaturation())
+    assert driver.describe() == "pi + model.zip"
+    with pytest.raises(InputError, match=r"features: 5 numbers are not allowed; allowed: 6, the inputs of model\.zip"):
+        make_driver(str(with_expert), 0.1)
+    assert make_driver(str(save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)), 0.1).describe() == "model.zip"
+
+
+class Runs:
+    """An object that creates a file when it is unpickled."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.file,)
+
+
+def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
+    trap = tmp_path / "executed"
+    file = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)
+    content = io.BytesIO()
+    torch.save({"action_net.weight": Runs(trap)}, content)
+    change(file, policy_pth=lambda _: content.getvalue())
+    with pytest.raises(InputError, match=r"driver model\.zip: UnpicklingError: "):
+        read_stable_baselines3(file)
+    assert not trap.exists()
+    torch.load(io.BytesIO(content.getvalue()), weights_only=False)
+    assert trap.exists()  # the trap works
+
+
+def test_serialized_parts_of_the_data_are_not_read(tmp_path: Path) -> None:
+    file = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)
+
+    def spoil(content: bytes) -> bytes:
+        data = json.loads(content)
+        for entry in data.values():
+            if isinstance(entry, dict) and ":serialized:" in entry:
+                entry[":serialized:"] = "not a pickle"
+        return json.dumps(data).encode()
+
+    change(file, data=spoil)
+    unjam.check_driver(read_stable_baselines3(file))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: DQN("MlpPolicy", Space(action=spaces.Discrete(3)), device="cpu"), "Discrete.* is not a Box"),
+        (lambda: RecurrentPPO("MlpLstmPolicy", Space(), device="cpu"), "its weights are not those of an MlpPolicy"),
+        (lambda: PPO("MlpPolicy", Space(action=2), device="cpu"), "its actions are not one number"),
+        (lambda: PPO("MlpPolicy", Space(), use_sde=True, device="cpu"), "use_sde"),
+        (
+            lambda: PPO("MlpPolicy", Space(), policy_kwargs={"activation_fn": torch.nn.ELU}, device="cpu"),
+            "activation ELU; known: Tanh, ReLU",
+        ),
+        (
+            lambda: PPO("MlpPolicy", Space(), policy_kwargs={"squash_output": True}, use_sde=True, device="cpu"),
+            "use_sde",
+        ),
+    ],
+)
+def test_other_models_are_refused_in_one_line(make: Callable[[], Any], words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=rf"^driver model\.zip: ValueError: .*{words}.*; allowed: ") as error:
+        read_stable_baselines3(save(make(), tmp_path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"data": lambda content: b"{}"},
+        {"data": lambda content: b"not JSON"},
+        {"data": lambda content: content.replace(b'"[-1.]"', b'"[nothing]"')},
+        {"policy_pth": lambda content: b""},
+        {"policy_pth": lambda content: content[:-100]},
+        {"data": lambda content: b" " * 65 * 2**20},
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(parts: Any, tmp_path: Path) -> None:
+    file = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)
+    change(file, **parts)
+    with pytest.raises(InputError, match=r"^driver model\.zip: \w+: ") as error:
+        read_stable_baselines3(file)
+    assert "\n" not in str(error.value)
+    file.write_bytes(b"no archive")
+    with pytest.raises(InputError, match=r"driver model\.zip: BadZipFile: "):
+        read_stable_baselines3(file)
+    with pytest.raises(InputError, match=r"driver: '.*none\.zip' does not exist"):
+        make_driver(str(tmp_path / "none.zip"), 0.1)
