@@ -179,7 +179,7 @@ def follow(state: LocalState) -> Any:
 
 
 def test_functions_and_objects_are_drivers() -> None:
-    result = drive("ring", [follow, Follows(0.5), Follows(0.2), Stays(), "idm"], 2, scenario_options=ROAD, workers=1)
+    result = drive("ring", [follow, Follows(0.5), Follows(0.2), Stays, "idm"], 2, scenario_options=ROAD, workers=1)
     assert list(result.rows) == ["follow", "Follows", "Follows (2)", "Stays", "idm"]
     raise_failures(result)
     rows = {label: [row["return"] for row in rows] for label, rows in result.rows.items()}
@@ -240,7 +240,6 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
         {"driver": ["pi", "nobody"]},
         {"driver": "pi:speed=1"},
         {"driver": 3},
-        {"driver": [Stays]},
         {"driver": []},
         {"scenario_options": {"lenght": (120, 130)}},
         {"scenario_options": {"vehicles": 1}},
