@@ -150,7 +150,7 @@ except InputError as error:
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @needs_avx2
 def test_errors_of_the_pinned_process_are_reported(tmp_path: Path) -> None:
     (tmp_path / "something").touch()

@@ -294,6 +294,7 @@ def test_a_users_file_is_run_in_one_place() -> None:
     assert found == {"user_code.py"}
 
 
+@pytest.mark.long
 def test_python_children_start_in_one_way() -> None:
     """Another way could leave out what keeps the working folder off their import path."""
     for module, tree in MODULES.items():

@@ -70,6 +70,7 @@ def test_a_confined_program_reads_and_writes_only_into_its_folder(tmp_path: Path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["canary", "inside", "tries.py"]
 
 
+@pytest.mark.long
 @kept
 def test_a_worker_is_confined_only_for_user_networks(tmp_path: Path) -> None:
     (tmp_path / "driver.py").write_text(DRIVER)
@@ -84,6 +85,7 @@ def test_a_worker_is_confined_only_for_user_networks(tmp_path: Path) -> None:
             assert left.exists() == (found == 0.0)
 
 
+@pytest.mark.long
 def test_user_networks_are_read_under_a_smaller_memory_limit(tmp_path: Path) -> None:
     path = straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>')
     code = (

@@ -155,7 +155,7 @@ def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash
             verify_controller_file(file)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_counts_and_answers_of_a_certificate_are_compared_exactly(tmp_path: Path) -> None:
     file = written(tmp_path)
     for change in (
@@ -204,6 +204,7 @@ def test_a_controller_of_cars_that_obey_late_is_not_certified(tmp_path: Path) ->
         make_certificate(read_controller(file))
 
 
+@pytest.mark.long
 def test_a_damaged_certificate_is_one_line_and_costs_no_drive(tmp_path: Path) -> None:
     file = written(tmp_path)
     add_certificate(file, read_controller(file), make_certificate(read_controller(file)))

@@ -72,7 +72,7 @@ def test_the_jammed_rings_earns_more_than_its_expert_and_ends_the_wave_sooner_th
     assert paired_difference(found.rows["pi"], found.rows[trained], "time_to_dissolve").smallest > 5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_on_ramps_adds_to_its_expert_where_a_ramp_joins_and_drives_nowhere_else() -> None:
     expert, trained = "unjam:on-ramp-tuned", "unjam:on-ramp-best"
     road = {"peak": [0, 300], "horizon": 400, "penetration_rate": 0.05}

@@ -125,6 +125,7 @@ def test_what_is_signed_is_what_the_documentation_says(tmp_path: Path) -> None:
     assert said["fingerprint"] == hashlib.sha256(der).hexdigest()
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(
     name=st.sampled_from([WEIGHTS_PART, SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART]),
@@ -142,6 +143,7 @@ def test_a_part_that_was_changed_with_its_hash_is_forged(name: str, place: float
         assert str(caught.value) == FORGED
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
 def test_no_byte_of_a_signed_file_can_be_another(place: float, bits: int) -> None:
@@ -284,6 +286,7 @@ FOR_ANY_MESSAGE = BASE_Y.to_bytes(32, "little") + (1).to_bytes(32, "little")
 NOT_CANONICAL = [(y | sign << 255).to_bytes(32, "little") for y in range(PRIME, 2**255) for sign in (0, 1)]
 
 
+@pytest.mark.long
 def test_there_are_eight_points_of_small_order_in_fourteen_encodings() -> None:
     assert (len(small_order()), len(WEAK), len(NOT_CANONICAL)) == (8, 14, 38)
 

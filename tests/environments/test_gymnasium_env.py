@@ -167,6 +167,7 @@ def test_the_same_seed_starts_the_same_episode_and_later_ones_differ() -> None:
     environment.close()
 
 
+@pytest.mark.long
 def test_environments_of_one_process_do_not_disturb_each_other() -> None:
     alone, seen = RoadEnv(**SHORT), []
     alone.reset(seed=0)

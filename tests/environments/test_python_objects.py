@@ -158,6 +158,7 @@ def test_a_failing_reward_names_its_line() -> None:
         unjam.run_episode(unjam.make_scenario("ring", SHORT), PISaturation(), 0, reward=fail)
 
 
+@pytest.mark.long
 def test_drive_and_run_episode_take_functions_and_classes(file: Path, mine: dict[str, Any], tmp_path: Path) -> None:
     options: Any = {"episodes": 1, "scenario_options": SHORT}
     found = unjam.drive("ring", [mine["follow"], mine["Keeper"]], reward=mine["calm"], out=tmp_path / "out", **options)

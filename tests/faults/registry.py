@@ -21,10 +21,10 @@ FAULTS: dict[str, Fault] = {
         "configuration with a nonsensical value, an unknown name, a line twice, torn", configurations, 40, 200
     ),
     "results": Fault(
-        "folder of results damaged: torn, empty, missing, nested, a value gone or another", results, 20, 300
+        "folder of results damaged: torn, empty, missing, nested, a value gone or another", results, 10, 300
     ),
     "full disk": Fault("disk full after some bytes of a checkpoint", full_disks, quick=20, long=200),
-    "networks": Fault("network, demand or configuration of SUMO broken", networks, quick=12, long=500),
+    "networks": Fault("network, demand or configuration of SUMO broken", networks, quick=6, long=500),
     "hostile files": Fault(
         "network of others that wants SUMO to write, to listen or to read another file", hostile, 8, 200
     ),
@@ -36,7 +36,7 @@ FAULTS: dict[str, Fault] = {
         "run folder that names Python code, given to verify, drive, watch, assess, train, search, evaluate, "
         "export and certify",
         codes,
-        quick=16,
+        quick=8,
         long=300,
     ),
     "drivers that change": Fault(
@@ -68,7 +68,7 @@ FAULTS: dict[str, Fault] = {
         "command line with names too long, odd or no text, configurations without end, NUL, special files, "
         "weights that are none; with a closed output, in a removed folder, with few file descriptors",
         inputs,
-        quick=11,
+        quick=6,
         long=200,
     ),
     "replaced code": Fault(

@@ -104,7 +104,7 @@ def test_base_predicts_drivers_without_errors_except_for_their_memory() -> None:
     assert float(np.quantile(errors, 0.9)) < 0.2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_sample_interval")
 def test_rollouts_have_the_set_ratio_in_antithetic_pairs(batch_episodes: list[Episode]) -> None:
     task = Task(ROAD, EXPERT)

@@ -129,7 +129,7 @@ def test_no_set_speed_is_reduced_in_dense_free_flow_far_below_the_limit(
     assert travel_time(road, TESTED_CONTROLLER, 700.0, tmp_path, simulation) > 1.01 * acc
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_set_speeds_are_reduced_upstream_of_an_overloaded_ramp(tmp_path: Path, simulation: Simulation) -> None:
     road = OPEN_TEST_ROADS["on-ramp, overloaded"]
     acc, controller = (

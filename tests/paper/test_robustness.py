@@ -12,6 +12,7 @@ from unjam.scenarios.population import Population, write_population
 from unjam_paper import robustness
 
 
+@pytest.mark.long
 def test_human_drivers_are_simulated_on_the_ring_with_and_without_a_cav(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

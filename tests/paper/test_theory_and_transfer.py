@@ -114,6 +114,7 @@ def rows_of_run(folder: Path, seed: int) -> list[dict[str, Any]]:
     return read_rows(folder / "runs" / "small" / "with-model" / str(seed))["trained"]
 
 
+@pytest.mark.long
 def test_untrained_policies_are_compared_on_the_same_seeds(small_study: pytest.MonkeyPatch) -> None:
     rows = theory.untrained_rows(("small",), policies=2)
     assert [row["policy"] for row in rows] == ["expert + random", "random", "expert alone"]

@@ -362,6 +362,7 @@ def segments_of(axes: Axes) -> np.ndarray:
     return np.concatenate([np.array(lines.get_segments()).reshape(-1, 2, 2) for lines in lines_of(axes)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [1, 4, pytest.param(2, marks=pytest.mark.slow)])
 def test_trajectory_figure_of_the_merge_has_panels_of_highway_and_ramp(count: int) -> None:
     episodes = [plot_episode_of(merge_episode(), f"driver {number}") for number in range(count)]

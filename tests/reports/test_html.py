@@ -260,6 +260,7 @@ def save_driven(folder: Path, **episodes: Episode) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_replay_is_not_truncated_by_a_collision(tmp_path: Path) -> None:
     crashed, complete = driven(3.0, 0, steps=20), driven(3.0, 0, steps=60)
     for number, episodes in enumerate(({"a": crashed, "b": complete}, {"a": complete, "b": crashed})):

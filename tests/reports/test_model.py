@@ -212,6 +212,7 @@ def test_every_panel_has_a_title_and_lines_and_figures_are_reproducible(name: st
     assert data_uri(figure) == data_uri(draw())
 
 
+@pytest.mark.long
 def test_texts_of_panels_do_not_overlap() -> None:
     for draw, _ in FIGURES.values():
         figure = draw()

@@ -228,6 +228,7 @@ def test_replay_shows_the_vehicles_of_every_driver(open_page: Opener, driven: Pa
         assert red > 20, "the CAV has a red outline"
 
 
+@pytest.mark.long
 def test_play_starts_and_pause_stops_the_replay(open_page: Opener, driven: Path) -> None:
     visit = open_page(driven)
     page, button = visit.page, visit.page.locator(".play")
@@ -260,6 +261,7 @@ def test_replay_stops_at_its_end_and_restarts_from_the_beginning(open_page: Open
     assert visit.time() < SECONDS / 2
 
 
+@pytest.mark.long
 def test_replay_of_an_open_road_plays_the_whole_episode(open_page: Opener, merged: Path) -> None:
     visit = open_page(merged)
     means = visit.page.locator("figcaption small")
@@ -361,6 +363,7 @@ def metrics_in(report: Path) -> list[Metric]:
     return [metric for name, metric in METRICS.items() if any(row[name] is not None for row in rows)]
 
 
+@pytest.mark.long
 def test_table_has_all_metrics_of_all_drivers(open_page: Opener, trained: Path) -> None:
     table = open_page(trained).page.locator("section:has(h2:text-is('All metrics')) table")
     assert table.locator("thead th").all_inner_texts() == [
@@ -456,6 +459,7 @@ def test_zoom_centers_the_slowest_vehicle_and_dragging_moves_the_view(open_page:
     assert visit.canvases() == overview
 
 
+@pytest.mark.long
 def test_a_wide_table_has_a_hint_to_swipe(open_page: Opener, trained: Path) -> None:
     scroll = "document.querySelector('.scroll')"
     for size in (PHONE, LAPTOP):

@@ -34,6 +34,7 @@ def episode(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return plot_episode_of(user_episode(tmp_path_factory.mktemp("user")), "pi")
 
 
+@pytest.mark.long
 @given(hnp.arrays(np.bool_, (8, 12)), st.sets(st.integers(0, 11)), st.integers(1, 3))
 def test_vehicles_in_one_column_are_never_present_together(is_present: np.ndarray, cavs: set[int], gap: int) -> None:
     for vehicle in range(is_present.shape[1]):  # each vehicle enters once

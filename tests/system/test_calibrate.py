@@ -19,7 +19,7 @@ def files(tmp_path: Path) -> None:
     (tmp_path / "detectors.csv").write_text("\n".join(ROWS))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_calibrate_writes_a_network_for_other_commands(unjam: Run, tmp_path: Path) -> None:
     ran = unjam(*CALIBRATE, "--out", "result")

@@ -101,6 +101,7 @@ def test_drive_prints_a_table_and_the_path_of_a_report(unjam: Run, tmp_path: Pat
     assert (tmp_path / "mine" / "report.html").is_file()
 
 
+@pytest.mark.long
 def test_drive_counts_up_its_folders(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "runs" / "drive-ring-001").mkdir(parents=True)
     assert unjam("drive", "ring", "--driver", "pi", "-n", 1, *SMALL, pictures=False).returncode == 0
@@ -116,6 +117,7 @@ def test_drive_does_not_depend_on_the_number_of_workers(unjam: Run) -> None:
     assert one.stdout == two.stdout != ""
 
 
+@pytest.mark.long
 def test_drive_with_the_users_own_driver_and_reward(unjam: Run, my_drivers: Path) -> None:
     command = ("drive", "ring", "-d", "mine.py:gentle", "--reward", "mine.py:calm", "-n", 1, *SMALL, "--json")
     found = document(unjam(*command, pictures=False))
@@ -213,6 +215,7 @@ def test_an_interrupted_command_leaves_no_folder(
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
 
 
+@pytest.mark.long
 def test_a_failed_episode_does_not_stop_the_others(unjam: Run, my_drivers: Path) -> None:
     command = ("drive", "ring", "-d", "pi", "-d", "mine.py:broken", "-n", 1, *SMALL, "--json")
     ran = unjam(*command, pictures=False)
@@ -335,6 +338,7 @@ def test_every_command_has_help_with_an_example(command: str, unjam: Run) -> Non
     assert "--json" in ran.stdout
 
 
+@pytest.mark.long
 def test_shell_completion_knows_the_commands(unjam: Run) -> None:
     ran = unjam(
         environment={

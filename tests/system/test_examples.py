@@ -175,6 +175,7 @@ def free_port() -> int:
         return opened.getsockname()[1]
 
 
+@pytest.mark.long
 def test_the_client_drives_a_vehicle_of_a_running_sumo(tmp_path: Path) -> None:
     """What SUMO recorded is what the driver answers to what SUMO recorded."""
     road = straight(

@@ -140,8 +140,8 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("name", "here"), [pytest.param("script", "here", marks=pytest.mark.slow), ("notebook", "''")])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "here"), [("script", "here"), ("notebook", "''")])
 def test_children_of_a_program_import_nothing_from_its_folder(name: str, here: str, planted: Path) -> None:
     (planted / "program.py").write_text(SCRIPT.format(name=name, here=here))
     root = str(Path(__file__).parents[2])

@@ -70,7 +70,17 @@ CASES = {
     "verify": Case(["verify", "run"], "run", is_read_only=True),
     "runs remove": Case(["runs", "remove", "run", "--folder", ".", "--yes"], "run"),
 }
-SLOW = ("search", "tune", "calibrate", "assess", "certify", "fit-drivers", "watch, .mp4", "resume, several roads")
+SLOW = (
+    "search",
+    "tune",
+    "calibrate",
+    "assess",
+    "certify",
+    "fit-drivers",
+    "watch",
+    "watch, .mp4",
+    "resume, several roads",
+)
 BASE = {
     "search": [*SEARCH, "--trials", "1"],
     "tune": TUNE,

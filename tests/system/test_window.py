@@ -34,6 +34,7 @@ def display() -> Iterator[str]:
     server.wait(timeout=20)
 
 
+@pytest.mark.long
 @needs_display
 def test_watching_in_the_window_ends_after_the_episode(unjam: Run, display: str) -> None:
     done = unjam(*WATCH, "--pace", "1000", "--json", environment={"DISPLAY": display})

@@ -116,6 +116,7 @@ def test_rows_of_selection_and_test_are_stored_separately(asked: AssessmentReque
     assert [*read_results(folder).plot_episodes] == ["human", f"{found.driver}, 50 %"]
 
 
+@pytest.mark.long
 def test_document_equals_the_file_and_has_all_results(answer: Assessment) -> None:
     written = json.loads((answer.page.parent / "assessment.json").read_text())
     assert written == answer.document

@@ -118,6 +118,7 @@ def test_written_network_has_the_reported_agreement(asked: Corridor, done: tuple
     assert episode.status == "completed"
 
 
+@pytest.mark.long
 def test_interrupted_calibration_resumes(
     asked: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

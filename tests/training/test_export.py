@@ -124,6 +124,7 @@ def test_impossible_export_is_refused(
     assert not Path(to).exists()
 
 
+@pytest.mark.long
 def test_failed_verification_keeps_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     to = tmp_path / "pi.unjam"
     export_controller("pi", to, scenario="ring")

@@ -111,6 +111,7 @@ def outcome_of(folder: Path) -> tuple[Any, ...]:
     return outcome(folder)
 
 
+@pytest.mark.long
 def test_progress_covers_the_run_and_each_task(tmp_path: Path) -> None:
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", mixture())

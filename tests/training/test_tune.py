@@ -230,6 +230,7 @@ def test_changed_reward_file_is_refused(tmp_path: Path) -> None:
             tune(*arguments)
 
 
+@pytest.mark.long
 def test_finalists_are_different_and_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     driven: list[str] = []
     actual = tuning._run_drivers

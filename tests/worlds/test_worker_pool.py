@@ -302,6 +302,7 @@ def test_a_driver_that_exits_is_reported_with_its_exit_code(name: str, error: st
     assert words in failed.reason
 
 
+@pytest.mark.long
 def test_a_driver_that_hangs_is_ended(drivers: Path) -> None:
     hangs = FileDriver(drivers, "StaysBeforeItsFirstStep")
     with WorkerPool(1, timeout=2.0, max_attempts=1) as workers:
@@ -388,6 +389,7 @@ def test_what_a_driver_prints_does_not_disturb_the_answers(drivers: Path, worker
     assert fingerprint(talking) == fingerprint(silent)
 
 
+@pytest.mark.long
 def test_a_worker_with_an_unreadable_answer_counts_as_lost(drivers: Path) -> None:
     bad = EpisodeTask(SHORT, FileDriver(drivers, "writes_everywhere"), (0,))
     with WorkerPool(1, timeout=3.0, max_attempts=1) as workers, ThreadPoolExecutor(1) as thread:
@@ -409,6 +411,7 @@ def test_a_driver_that_is_not_serializable_is_refused_with_a_hint() -> None:
         workers.run([EpisodeTask(SHORT, Mine(), (0,))])
 
 
+@pytest.mark.long
 def test_closing_twice_leaves_no_process() -> None:
     workers = WorkerPool(2)
     workers.run([EpisodeTask(Ring(horizon=2000), IDM(), (seed,)) for seed in range(4)])

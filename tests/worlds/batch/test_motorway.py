@@ -411,6 +411,7 @@ def test_where_episodes_must_be_sumos_it_runs_in_sumo() -> None:
     assert not asked
 
 
+@pytest.mark.long
 def test_tensors_are_stepped_as_arrays_are() -> None:
     roads = [SHORT.draw(np.random.default_rng(number)) for number in range(2)]
     generator = np.random.default_rng(0)

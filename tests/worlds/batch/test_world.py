@@ -375,6 +375,7 @@ def test_rings_on_which_somebody_touched_within_a_decision_have_collided() -> No
     assert any(crashed)
 
 
+@pytest.mark.long
 def test_rings_of_many_kinds_come_back_in_their_order() -> None:
     pi, idm = (driver_from_name(name, 0.1) for name in ("pi", "idm"))
     asked = [

@@ -45,6 +45,7 @@ def test_passages_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> No
     assert found[0][0] == found[0][2] != found[0][1]
 
 
+@pytest.mark.long
 def test_other_simulations_continue_after_a_failed_one(tmp_path: Path) -> None:
     with DetectorPool(1) as counting:
         with pytest.raises(EpisodeError, match="SUMO cannot start"):

@@ -136,6 +136,7 @@ def test_dropped_items_are_reported_once_in_one_line(hostile: Path, caplog: pyte
     assert {"option remote-port", "file of e1Detector", "edgeData", "parameter device.ssm.file"} <= {*dropped}
 
 
+@pytest.mark.long
 def test_dropped_items_are_in_results_and_report(hostile: Path, tmp_path: Path) -> None:
     road, out = {"horizon": 20, "penetration_rate": 0.5}, tmp_path / "out"
     found = unjam.drive(str(hostile), ["human"], 1, scenario_options=road, workers=1, out=out)

@@ -127,6 +127,7 @@ def test_the_observed_penetration_rate_is_that_of_entered_vehicles(simulation: S
     assert share == pytest.approx([sum(name in traffic.road.cav_ids for name in came) / len(came)], abs=0.02)
 
 
+@pytest.mark.long
 def test_an_acc_keeps_the_commanded_time_gap_while_it_is_commanded(simulation: Simulation) -> None:
     def shortest(asked: float) -> float:
         """Return a short time headway of CAVs on a full road [s], and look that SUMO knows what was asked."""
@@ -199,6 +200,7 @@ def on_the_left(simulation: Simulation, **lanes: float) -> float:
     return left / upstream
 
 
+@pytest.mark.long
 def test_cavs_keep_right_and_overtake_as_configured(simulation: Simulation) -> None:
     as_people = on_the_left(simulation)
     assert on_the_left(simulation, keep_right=1.0, speed_gain=1.0) == as_people

@@ -16,6 +16,7 @@ from unjam.worlds.audit import OVERRIDE_TOLERANCE
 from unjam.worlds.episode import run_episode
 
 
+@pytest.mark.long
 def test_preventing_creeping_is_not_an_override() -> None:
     road = FAMILY["ring-66-grown-4-cavs"].make_scenario().stratum(1, 10)
     row = measure(run_episode(replace(road, horizon=620), PISaturation(), make_test_seeds(2)[1]))

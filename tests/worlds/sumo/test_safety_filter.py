@@ -34,6 +34,7 @@ def test_a_reckless_driver_has_no_contact_on_any_ring(
     assert row["min_time_gap"] > 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("late", [Actuator(), Actuator(lag=0.3, delay=0.2)], ids=["at once", "late"])
 def test_there_is_no_contact_with_noisy_sensors_and_missing_readings(late: Actuator, simulation: Simulation) -> None:
     sensors, knows = Sensors(0.5, 0.5, dropout=0.3), SafetyFilter(gap_error=0.5, speed_error=0.5)

@@ -77,6 +77,7 @@ BROKEN = (
 )
 
 
+@pytest.mark.long
 def test_only_an_error_of_the_first_task_ends_a_run(tmp_path: Path) -> None:
     for name, demand in (("good", BROKEN.partition("<trip")[0]), ("bad", BROKEN)):
         (tmp_path / name).mkdir()
