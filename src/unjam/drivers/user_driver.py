@@ -285,7 +285,7 @@ class DriverProtocol(Protocol):
         ...
 
 
-DriverLike = Driver | DriverProtocol | Callable[[LocalState], Any]
+DriverLike = Driver | DriverProtocol | type[Driver] | type[DriverProtocol] | Callable[[LocalState], Any]
 """a driver, an object with its two required methods, a class of such objects, or a function of the state"""
 
 

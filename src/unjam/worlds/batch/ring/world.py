@@ -38,7 +38,7 @@ from unjam.worlds.batch.ring.record import RingLog, RingResults, as_numpy
 from unjam.worlds.batch.ring.warm_up import WarmUpState
 from unjam.worlds.batch.support import check_batch_scenarios
 from unjam.worlds.closed_road import MAX_RECALL_SECONDS
-from unjam.worlds.reward import Outcome, make_reward, time_gap
+from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 
@@ -60,7 +60,7 @@ class RingBatch:
         scenarios: Sequence[LoopScenario],
         seeds: Sequence[Sequence[int]],
         to_array: ArrayFactory = np.asarray,
-        reward: str = "",
+        reward: RewardLike = "",
         keep_record: bool = True,
         draw: DrawNormal | None = None,
         human_model: HumanSpeedModel | None = None,
@@ -70,7 +70,7 @@ class RingBatch:
 
         Args:
             to_array: makes the arrays of the simulation, for instance NumPy's or torch's, in any precision.
-            reward: name; empty: that of the scenario.
+            reward: name, or a function; empty: that of the scenario.
             keep_record: whether to keep whole episodes, some 16 bytes for each vehicle and step in float64.
             draw: draws all noise; None: each road draws the same noise as SUMO's episode.
             human_model: of human drivers away from junctions, instead of SUMO's IDM.
