@@ -26,11 +26,15 @@ from unjam.training.presets import preset_scenarios, preset_values
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.simulation import Simulation
 
+SINGLE_ROADS = ("ring-best", "ring-jammed-best", "figure-eight-best")
+"""controllers that are verified in make test-all alone, as each takes seconds"""
 CERTIFIED = Path(__file__).parents[2] / "results/all-roads-controllers.zip"
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", packaged_names())
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SINGLE_ROADS)) for name in packaged_names()]
+)
 def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
     verify_controller_file(packaged_file(name))
     driver = make_driver(f"{PACKAGED_PREFIX}{name}", 0.1)

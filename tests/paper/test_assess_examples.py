@@ -25,7 +25,7 @@ def test_a_road_of_the_examples_carries_traffic(name: str, tmp_path: Path, simul
     assert not [note for note in scenario.notes if "max-depart-delay" in note]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -138,7 +138,7 @@ def test_set_speeds_are_reduced_upstream_of_an_overloaded_ramp(tmp_path: Path, s
     assert controller != acc
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_study_ends_by_itself_and_can_be_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     short = {name: OpenTestRoad((RoadSection(400, 1, 25),), (share,)) for name, share in (("a", 0.5), ("b", 0.6))}
     monkeypatch.setattr(do_no_harm, "OPEN_TEST_ROADS", short)

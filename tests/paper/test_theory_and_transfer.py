@@ -36,7 +36,7 @@ def test_training_time_is_measured_for_all_variants_in_turn(
     assert longest < axes.get_xlim()[1] < 1.2 * longest
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_controllers_are_evaluated_in_other_traffic(monkeypatch: pytest.MonkeyPatch, reproduced: Made) -> None:
     folder, _ = reproduced
     road = {

@@ -186,7 +186,7 @@ def test_on_ramp_model_has_waves_by_lane(world: str, tmp_path: Path) -> None:
     assert all("nan" not in cell for _, row in wave_rows(found) for cell in row)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("road", [{}, RAMP])
 def test_run_with_a_road_model_resumes_unchanged(road: dict[str, Any], tmp_path: Path) -> None:
     changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__members": 2, **road}

@@ -217,7 +217,7 @@ def test_unsupported_tasks_run_in_sumo(tmp_path: Path) -> None:
             np.testing.assert_allclose(found.speeds, actual.speeds, atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_regret_increases_the_episodes_of_a_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The short road can be driven far better than it is; a run that was stopped knows, too."""
 

@@ -58,7 +58,7 @@ def test_tuned_expert_is_written_and_not_worse(tmp_path: Path) -> None:
     assert len(written["trials"]) == 4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_trials_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     tried = []
     for count in (1, 2):
@@ -100,7 +100,7 @@ def test_interrupted_tuning_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).best == whole.best  # nobody drives
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_screened_scores_equal_those_of_sumo(tmp_path: Path, simulation: Simulation) -> None:
     steps = FINAL + 10 * TUNING_EPISODES * 60
     with WorkerPool(1) as workers:

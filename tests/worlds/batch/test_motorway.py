@@ -237,7 +237,7 @@ def about(episode: Episode) -> list[float]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["human", "jam-ahead"])
+@pytest.mark.parametrize("name", [pytest.param("human", marks=pytest.mark.slow), "jam-ahead"])
 def test_episodes_are_sumos_in_the_mean(name: str, driven: dict[str, list[Episode]], simulation: Simulation) -> None:
     ours = np.array([about(episode) for episode in driven[name]])
     theirs = np.array(
@@ -317,7 +317,7 @@ def test_what_a_cav_perceived_is_what_was_there(driven: dict[str, list[Episode]]
         assert np.isfinite(each.reward).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_cavs_that_hold_back_are_slower_upstream_than_those_that_never_do() -> None:
     crowded = replace(SHORT, penetration_rate=0.5, horizon=200)
 

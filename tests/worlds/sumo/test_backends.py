@@ -191,7 +191,7 @@ print(json.dumps([episode_speeds().tolist(), environment_rewards(), apart]))
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_libsumo_as_traci_changes_no_number(tmp_path: Path) -> None:
     """Users of other packages set the variable: `import traci` is libsumo then, and says so."""
 

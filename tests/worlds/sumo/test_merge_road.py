@@ -216,7 +216,7 @@ def human() -> list[Episode]:
     return episodes_of(Human(), range(2))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_from_standstill_human_traffic_stays_jammed_and_pi_makes_it_worse(human: list[Episode]) -> None:
     pi = episodes_of(PISaturation(), range(2))
     assert 8.5 < fleet_mean(human) < 13.5
