@@ -156,7 +156,7 @@ def remove_command(
 
 
 def _find_runs(names: Sequence[str], folder: Path) -> list[Any]:
-    from unjam.training.runs import read_run
+    from unjam.training.runs import find_run, read_run
 
-    runs = (read_run(folder / name if (folder / name).is_dir() else Path(name), name) for name in names)
+    runs = (read_run(find_run(name, folder), name) for name in names)
     return list({run.folder.resolve(): run for run in runs}.values())

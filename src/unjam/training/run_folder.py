@@ -40,7 +40,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork
 from unjam.sumo_files import read_sumo_files
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, read_toml, to_toml
-from unjam.worlds.episode import check_can_drive, check_policy_inputs, check_time_step
+from unjam.worlds.episode import check_can_drive, check_policy_inputs
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def check_config(config: RunConfig) -> None:
         observation_size(task.policy.inputs, expert)
         make_reward(task.reward or scenario.reward)
         for name in task.evaluation.baselines:
-            check_time_step(make_driver(name, scenario.control_step), scenario, name)
+            make_driver(name, scenario.control_step)
         if config.model.model_ratio > 0 and config.model.kind == "row":
             _check_row_model(task, scenario, expert)
         elif config.model.model_ratio > 0:

@@ -97,6 +97,11 @@ def _test_gain(folder: Path) -> Estimate | None:
     return paired_difference(rows[metadata["trained"]], expert, "return") if expert else None
 
 
+def find_run(name: str, root: Path) -> Path:
+    """Return the folder of a run by its name below `root`, or by its path."""
+    return root / name if (root / name).is_dir() else Path(name)
+
+
 def config_differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
     """Return the settings in which runs differ, with the value of each run; keys have dots."""
     settings = [flatten_keys(asdict(run.config)) for run in runs]

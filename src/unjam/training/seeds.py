@@ -4,8 +4,6 @@ A training draws its episodes from (its seed, iteration, episode), where its see
 seeds of the other families begin with their own number.
 """
 
-from functools import partial
-
 TRAINING_SEED_LIMIT = 1_000_000
 """seeds of trainings, and of `unjam drive --seed`, are smaller"""
 TEST_SEED = 1_000_039
@@ -18,11 +16,16 @@ SELECTION_SEED = 1_000_081
 """first number of selection seeds, which select a controller for a user's road"""
 
 
-def make_seeds(family: int, count: int, first: int = 0) -> list[tuple[int, ...]]:
-    """Return seeds of the family with this first number, from number `first` on."""
-    return [(family, index) for index in range(first, first + count)]
+def make_test_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
+    """Return test seeds, from number `first` on."""
+    return [(TEST_SEED, index) for index in range(first, first + count)]
 
 
-make_test_seeds = partial(make_seeds, TEST_SEED)
-selection_seeds = partial(make_seeds, SELECTION_SEED)
-tuning_seeds = partial(make_seeds, TUNING_SEED)
+def selection_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
+    """Return selection seeds, from number `first` on."""
+    return [(SELECTION_SEED, index) for index in range(first, first + count)]
+
+
+def tuning_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
+    """Return tuning seeds, from number `first` on."""
+    return [(TUNING_SEED, index) for index in range(first, first + count)]
