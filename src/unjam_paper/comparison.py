@@ -34,7 +34,7 @@ from unjam.measures.statistics import (
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure, trajectory_figure
 from unjam.reports.results import PlotEpisode, read_results, validation_gains
 from unjam.training.config import load_config
-from unjam.training.run_folder import has_converged
+from unjam.training.early_stopping import has_converged
 from unjam.worlds.record import Floats
 from unjam_paper.results_file import read_part, write_figure, write_part
 from unjam_paper.study import (

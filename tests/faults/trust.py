@@ -40,7 +40,8 @@ from unjam.errors import EpisodeError, InputError
 from unjam.processes import lock_folder
 from unjam.scenarios import Ring, make_scenario
 from unjam.training import run_folder
-from unjam.training.run_folder import CHECKPOINT_STATE_FILE, create_run_folder, fingerprint, restore_newest_checkpoint
+from unjam.training.fingerprint import fingerprint
+from unjam.training.run_folder import CHECKPOINT_STATE_FILE, create_run_folder, restore_newest_checkpoint
 from unjam.trust import check_trusted_values, expecting_code, remember_trusted
 from unjam.user_code import read_code
 from unjam.worlds.episode import run_episode

@@ -8,7 +8,7 @@ import pytest
 from tests.training.test_run import STEPS, controller_manifest, learn_with, outcome, small_config
 from unjam.errors import MissingPartError
 from unjam.reports.results import read_progress, validation_gains
-from unjam.training.run_folder import has_converged, is_out_of_patience
+from unjam.training.early_stopping import has_converged, is_out_of_patience
 from unjam.training.tensorboard import TENSORBOARD_FOLDER, tensorboard_writer
 from unjam.training.train import Trainer
 from unjam.worlds.worker_pool import WorkerPool

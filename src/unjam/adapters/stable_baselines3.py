@@ -36,8 +36,8 @@ def stable_baselines3_driver(
     and sum are limited to the action space.
 
     Args:
-        model: an algorithm or a policy with `predict` whose actions are a `Box` of one number. If it learns further,
-            the driver changes, too.
+        model: an algorithm or a policy with `predict` whose actions are a `Box` of one number. Further training
+            of it changes the driver, too.
         features: its observation in order: names such as `local`, or functions of a `LocalState`.
         expert: a driver to which the actions are added; None: the model drives alone.
         action_scale: acceleration for an action of one [m/s2].

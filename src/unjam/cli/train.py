@@ -54,7 +54,8 @@ def train_command(
     - unjam train --resume runs/ring-001 --steps 2000000
     """
     from unjam.training.config import load_config
-    from unjam.training.run_folder import check_config, read_config, should_stop_early
+    from unjam.training.early_stopping import should_stop_early
+    from unjam.training.run_folder import check_config, read_config
 
     settings = dict(options.settings)
     if "out" in settings:

@@ -31,8 +31,8 @@ def make_driver(name: str, time_step: float) -> Driver:
 
     Args:
         name: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own (`path.py:name`), a run folder,
-            a `.unjam` file, a `.zip` file of Stable-Baselines3 whose model observes `local`, or a packaged controller
-            (`unjam:ring-best`); or several of them joined by `+`, which CAVs use in turn.
+            a `.unjam` file, a `.zip` file of Stable-Baselines3 with a model that observes `local`, or a packaged
+            controller (`unjam:ring-best`); or several of them joined by `+`, which CAVs use in turn.
         time_step: control step of the road [s].
     """
     is_path = os.path.exists(name) or os.path.exists(name.rpartition(":")[0])

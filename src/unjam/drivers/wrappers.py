@@ -426,4 +426,4 @@ class RoadTypeSwitch(CompositeDriver):
 
 
 COMPOSITE_CLASSES = ImpairedDriver, FilteredDriver, HistoryDriver, RoadTypeSwitch, QueueFallback
-"""composite drivers whose recipe has their fields"""
+"""composite drivers with a recipe that contains their fields"""

@@ -1,23 +1,21 @@
-"""The folder of a run: its creation, resumption, early end, checkpoints, and the fingerprint of its training.
+"""The folder of a run: its creation, resumption and checkpoints.
 
 torch is only imported to read or write a checkpoint, so that errors are reported quickly. A checkpoint is written at
 the end of each iteration, as a whole, with a hash; the newest two are kept.
 """
 
 import json
-import logging
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unjam.controller import make_driver
-from unjam.controller.file import sha256_of, sha256_of_file
+from unjam.controller.file import sha256_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.drivers.registry import driver_recipe
-from unjam.drivers.user_driver import FileReference, is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
 from unjam.files import (
     INVALID_DATA_ERRORS,
@@ -29,24 +27,20 @@ from unjam.files import (
     to_json,
     write_folder,
 )
-from unjam.kernels import kernel_info
 from unjam.manifest import manifest, package_versions
-from unjam.parameters import build_dataclass, flatten_keys
+from unjam.parameters import build_dataclass
 from unjam.processes import LOCK_FILE, lock_folder
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
-from unjam.scenarios.population import population_file
 from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_network import UserNetwork
-from unjam.sumo_files import read_sumo_files
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, read_toml, to_toml
+from unjam.training.early_stopping import should_stop_early
+from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
     from unjam.learners.learner import Tensors
-
-_LOG = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 5
 """format of run folders and their checkpoints; other formats are refused"""
@@ -296,77 +290,3 @@ def _checkpoint_hash(state: dict[str, Any], data: bytes) -> str:
 
 def _checkpoint_folders(folder: Path) -> list[Path]:
     return sorted(place for place in folder.glob("*") if place.is_dir() and place.name.isdigit())
-
-
-def has_converged(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
-    """Return whether the last `evaluation.convergence_window` iterations were not better than those before."""
-    window = config.evaluation.convergence_window
-    if not window or len(progress) % window or len(progress) < 2 * window:
-        return False
-    returns = [row["return_mean"] for row in progress[-2 * window :]]
-    return sum(returns[window:]) <= sum(returns[:window])
-
-
-def is_out_of_patience(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
-    """Return whether `evaluation.patience` validations in a row had no new best return."""
-    interval = config.evaluation.validation_interval
-    scheduled = [row for row in progress if interval and row["iteration"] % interval == 0]  # without that at the end
-    returns = [value for row in scheduled if (value := row.get("return_validation")) is not None]
-    if not config.evaluation.patience or not returns:
-        return False
-    best = max(range(len(returns)), key=returns.__getitem__)
-    since = len(returns) - 1 - best if returns[best] > progress[0]["return_expert"] else len(returns)
-    return since >= config.evaluation.patience
-
-
-def should_stop_early(config: RunConfig, progress: Sequence[dict[str, Any]]) -> bool:
-    """Return whether a training ends before its steps are done."""
-    return is_out_of_patience(config, progress) or has_converged(config, progress)
-
-
-def fingerprint(config: RunConfig) -> dict[str, Any]:
-    """Return everything that the result of a training depends on, as JSON.
-
-    `settings` has all but steps and workers, by name; `files` the hashes of the experts and of the user's code and
-    networks; `packages` and `kernels` the numerical environment.
-    """
-    files: dict[str, str] = {}
-    for each, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):
-        recipe, arrays = driver_recipe(task.expert)
-        weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
-        files[f"expert {each.expert}"] = sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)
-        files |= file_hashes((each.reward, *each.policy.inputs), task.scenario)
-    settings = flatten_keys(asdict(replace(config, steps=1, workers=1)))
-    entries = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
-    return json.loads(to_json(entries))
-
-
-def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
-    """Raise `InputError` if a setting, the expert or a user file has changed; warn of other packages and kernels."""
-    for name, value in current["settings"].items():
-        if name in stored["settings"] and stored["settings"][name] != value:
-            raise invalid_value(f"resume: {name}", value, f"{stored['settings'][name]!r}, as in the checkpoint")
-    check_file_hashes(stored, current, "resume")
-    for part in ("packages", "kernels"):
-        if stored[part] != current[part]:
-            _LOG.warning("resume: other %s than in the checkpoint: the result may differ", part)
-
-
-def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:
-    """Raise `InputError` if the expert or a file of the user has changed."""
-    for name in sorted(stored["files"].keys() | current["files"].keys()):
-        if stored["files"].get(name) != current["files"].get(name):
-            raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
-
-
-def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
-    """Return hashes of the code that `names` refer to and of the files of scenarios, by path."""
-    codes = [FileReference.parse(name).read_code() for name in names if is_file_reference(name)]
-    paths = list[Path]()
-    for scenario in scenarios:
-        if isinstance(scenario, UserNetwork):
-            paths += read_sumo_files(Path(scenario.file)).sources
-        if scenario.population:
-            paths.append(population_file(scenario.population))
-    hashes = {str(code.path): code.sha256 for code in codes}
-    return hashes | {str(path): sha256_of_file(path) for path in paths}

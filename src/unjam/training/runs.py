@@ -14,7 +14,8 @@ from unjam.parameters import flatten_keys
 from unjam.processes import check_not_locked, is_locked
 from unjam.reports.results import EVALUATION_FILE, damaged_results_error, read_evaluation, read_progress
 from unjam.training.config import CONFIG_FILE, RunConfig
-from unjam.training.run_folder import MANIFEST_FILE, read_config, should_stop_early
+from unjam.training.early_stopping import should_stop_early
+from unjam.training.run_folder import MANIFEST_FILE, read_config
 
 RunState = Literal["running", "finished", "stopped", "damaged"]
 

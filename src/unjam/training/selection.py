@@ -112,16 +112,16 @@ class Selection:
 def min_episodes(rate_count: int, driver_count: int, with_unchanged_acc: bool = False) -> int:
     """Return the smallest budget with which every option runs and the selected ones are tested."""
     selection = 1 + rate_count * driver_count if driver_count > 1 else 0
-    return selection + MIN_TEST_SEEDS * _options_tested(rate_count, driver_count, with_unchanged_acc)
+    return selection + MIN_TEST_SEEDS * _episodes_per_test_seed(rate_count, driver_count, with_unchanged_acc)
 
 
 def min_verdict_episodes(rate_count: int, driver_count: int, with_unchanged_acc: bool = False) -> int:
     """Return a budget that is enough for the test seeds of a verdict, whatever selection uses."""
-    test = MIN_VERDICT_SEEDS * _options_tested(rate_count, driver_count, with_unchanged_acc)
-    return ceil(test / (1.0 - SELECTION_BUDGET_FRACTION)) if driver_count > 1 else test
+    test_episodes = MIN_VERDICT_SEEDS * _episodes_per_test_seed(rate_count, driver_count, with_unchanged_acc)
+    return ceil(test_episodes / (1.0 - SELECTION_BUDGET_FRACTION)) if driver_count > 1 else test_episodes
 
 
-def _options_tested(rate_count: int, driver_count: int, with_unchanged_acc: bool) -> int:
+def _episodes_per_test_seed(rate_count: int, driver_count: int, with_unchanged_acc: bool) -> int:
     """Return the number of episodes of each test seed."""
     return 1 + rate_count * (1 + bool(driver_count) + with_unchanged_acc)
 

@@ -26,7 +26,8 @@ from unjam.scenarios import scenario_recipe
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
-from unjam.training.run_folder import controller_origin, file_hashes
+from unjam.training.fingerprint import file_hashes
+from unjam.training.run_folder import controller_origin
 from unjam.training.search import import_optuna
 from unjam.training.search_space import SearchSpace, suggest_values
 from unjam.training.seeds import tuning_seeds

@@ -209,7 +209,7 @@ def test_set_speed_caps_count_as_delay(tmp_path: Path, simulation: Simulation) -
     assert slow.limit_speed == pytest.approx(free.limit_speed, rel=0.15)
 
 
-def test_cars_parked_beside_the_road_have_no_allowed_speed(tmp_path: Path, simulation: Simulation) -> None:
+def test_cars_parked_off_the_road_have_no_allowed_speed(tmp_path: Path, simulation: Simulation) -> None:
     stop = '<stop lane="road_0" endPos="300" duration="30" parking="true"/>'
     cars = f'<vehicle id="parked" type="car" route="along" depart="0">{stop}</vehicle>'
     path = straight(tmp_path, cars + '<vehicle id="other" type="car" route="along" depart="2"/>')

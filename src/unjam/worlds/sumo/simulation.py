@@ -200,11 +200,11 @@ class Simulation(AbstractContextManager["Simulation"]):
         return str(copy)
 
     def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
-        """Return the speeds that the road allows to vehicles [m/s]; NaN for one that is parked beside the road."""
+        """Return the speeds that the road allows to vehicles [m/s]; NaN for one that is parked off the road."""
         return [speed if speed >= 0.0 else nan for speed in map(self._get_allowed_speed, ids)]
 
     def uncapped_speeds(self, ids: Sequence[str]) -> list[float]:
-        """Return lane limit times speed factor of vehicles [m/s], whatever their maximum speed; NaN beside the road."""
+        """Return lane limit times speed factor of vehicles [m/s], whatever their maximum speed; NaN off the road."""
         limit, factor, lanes = self._sumo.lane.getMaxSpeed, self._sumo.vehicle.getSpeedFactor, map(self._get_lane, ids)
         return [limit(lane) * factor(name) if lane else nan for name, lane in zip(ids, lanes, strict=True)]
 

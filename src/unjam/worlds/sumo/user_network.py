@@ -186,15 +186,17 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return {"edge": edge, "lane": lane, "lane_position": position, "gaps": unknown}
 
     def _allowed_speeds(self, names: Sequence[str]) -> Floats:
-        """Return the speeds that the road allows to vehicles, whatever caps they have [m/s]; NaN beside the road."""
-        uncapped = [self._uncapped_max_speeds.get(name, np.nan) for name in names]
-        if np.isnan(uncapped).all():
-            return np.array(self._simulation.allowed_speeds(names), np.float64)
-        return np.where(
-            np.isnan(uncapped),
-            self._simulation.allowed_speeds(names),
-            np.fmin(uncapped, self._simulation.uncapped_speeds(names)),
-        )
+        """Return the speeds that the road allows to vehicles, whatever caps they have [m/s]; NaN off the road."""
+        allowed = np.array(self._simulation.allowed_speeds(names), np.float64)
+        rows = [row for row, name in enumerate(names) if name in self._uncapped_max_speeds]
+        if rows:
+            allowed[rows] = self._speeds_without_caps([names[row] for row in rows])
+        return allowed
+
+    def _speeds_without_caps(self, names: Sequence[str]) -> Floats:
+        """Return the speeds that the road would allow to capped vehicles without their caps [m/s]."""
+        max_speeds = [self._uncapped_max_speeds[name] for name in names]
+        return np.fmin(max_speeds, self._simulation.uncapped_speeds(names))
 
     def _simulate(self, cav_speeds: dict[str, float]) -> None:
         super()._simulate(cav_speeds)
@@ -203,7 +205,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
             return
         simulation, step = self._simulation, self.scenario.simulation_step
         speeds, caps = np.array(simulation.speeds(capped)), np.array(simulation.allowed_speeds(capped))
-        losses = step * (speeds / caps - speeds / self._allowed_speeds(capped))
+        losses = step * (speeds / caps - speeds / self._speeds_without_caps(capped))
         for name, loss in zip(capped, np.nan_to_num(losses).tolist(), strict=True):
             self._hidden_time_loss[name] = self._hidden_time_loss.get(name, 0.0) + loss
 

@@ -1,0 +1,72 @@
+"""The fingerprint of a training: its settings, and hashes of its code, networks and packages."""
+
+import json
+import logging
+from collections.abc import Iterable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from unjam.controller.file import sha256_of, sha256_of_file
+from unjam.drivers.registry import driver_recipe
+from unjam.drivers.user_driver import FileReference, is_file_reference
+from unjam.errors import InputError, invalid_value
+from unjam.files import to_json
+from unjam.kernels import kernel_info
+from unjam.manifest import package_versions
+from unjam.parameters import flatten_keys
+from unjam.scenarios.population import population_file
+from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.user_network import UserNetwork
+from unjam.sumo_files import read_sumo_files
+from unjam.training.config import RunConfig
+
+_LOG = logging.getLogger(__name__)
+
+
+def fingerprint(config: RunConfig) -> dict[str, Any]:
+    """Return everything that the result of a training depends on, as JSON.
+
+    `settings` has all but steps and workers, by name; `files` the hashes of the experts and of the user's code and
+    networks; `packages` and `kernels` the numerical environment.
+    """
+    files: dict[str, str] = {}
+    for each, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):
+        recipe, arrays = driver_recipe(task.expert)
+        weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
+        files[f"expert {each.expert}"] = sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)
+        files |= file_hashes((each.reward, *each.policy.inputs), task.scenario)
+    settings = flatten_keys(asdict(replace(config, steps=1, workers=1)))
+    entries = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
+    return json.loads(to_json(entries))
+
+
+def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
+    """Raise `InputError` if a setting, the expert or a user file has changed; warn of other packages and kernels."""
+    for name, value in current["settings"].items():
+        if name in stored["settings"] and stored["settings"][name] != value:
+            raise invalid_value(f"resume: {name}", value, f"{stored['settings'][name]!r}, as in the checkpoint")
+    check_file_hashes(stored, current, "resume")
+    for part in ("packages", "kernels"):
+        if stored[part] != current[part]:
+            _LOG.warning("resume: other %s than in the checkpoint: the result may differ", part)
+
+
+def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:
+    """Raise `InputError` if the expert or a file of the user has changed."""
+    for name in sorted(stored["files"].keys() | current["files"].keys()):
+        if stored["files"].get(name) != current["files"].get(name):
+            raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
+
+
+def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
+    """Return hashes of the code that `names` refer to and of the files of scenarios, by path."""
+    codes = [FileReference.parse(name).read_code() for name in names if is_file_reference(name)]
+    paths = list[Path]()
+    for scenario in scenarios:
+        if isinstance(scenario, UserNetwork):
+            paths += read_sumo_files(Path(scenario.file)).sources
+        if scenario.population:
+            paths.append(population_file(scenario.population))
+    hashes = {str(code.path): code.sha256 for code in codes}
+    return hashes | {str(path): sha256_of_file(path) for path in paths}
