@@ -9,6 +9,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 TORCH_INDEX ?=
+# What the commands of README.md need: no pettingzoo, no ray
+DEMO_EXTRAS := sign,train,tune,video
 BIN := $(VENV)/bin
 # Compiling all that is installed takes as long as installing it, and most of it is never imported
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt
@@ -76,7 +78,7 @@ define set_up
 endef
 
 $(VENV)/.installed: pyproject.toml constraints.txt
-	$(call set_up,train)
+	$(call set_up,$(DEMO_EXTRAS))
 
 # with what tests, checks and docs need
 $(VENV)/.installed-dev: pyproject.toml constraints.txt

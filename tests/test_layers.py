@@ -66,7 +66,7 @@ def imported(tree: ast.AST) -> Iterator[str]:
             yield node.module
             if node.module == "unjam":
                 yield from (f"unjam.{alias.name}" for alias in node.names if not alias.name.startswith("__"))
-        elif isinstance(node, ast.Call) and name_of(node.func) in ("import_module", "__import__"):
+        elif isinstance(node, ast.Call) and name_of(node.func) in ("import_module", "import_optional", "__import__"):
             yield from texts_of(node.args[0], tree)
 
 

@@ -74,7 +74,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'unjam' has no attribute {name!r}")
     try:
         return getattr(import_module(_LAZY_IMPORTS[name]), name)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         raise missing_package_error(error) from None
 
 

@@ -7,6 +7,8 @@ import errno
 import shlex
 from collections.abc import Iterable
 from difflib import get_close_matches
+from importlib import import_module
+from typing import Any
 
 
 class UnjamError(Exception):
@@ -31,15 +33,38 @@ class MissingPartError(UnjamError):
     exit_code = 3
 
 
-TRAIN_PACKAGES = "torch", "stable_baselines3", "sb3_contrib", "onnx", "onnxscript", "onnxruntime"
-"""packages of the extra `train`; driving, measuring and calibrating need none of them"""
+EXTRAS = {
+    **dict.fromkeys(("torch", "stable_baselines3", "sb3_contrib", "tensorboard"), "train"),
+    **dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "train"),
+    "optuna": "tune",
+    "imageio_ffmpeg": "video",
+    "cryptography": "sign",
+    "pettingzoo": "marl",
+    "ray": "ray",
+}
+"""extra of unjam that installs each optional package; `drive` and `assess` need none of them"""
 
 
-def missing_package_error(error: ModuleNotFoundError) -> MissingPartError:
-    """Return the error for a missing package of the extra `train`; raise the given error for any other."""
-    if error.name is None or error.name.partition(".")[0] not in TRAIN_PACKAGES:
+def missing_package_error(error: ImportError, name: str | None = None) -> MissingPartError:
+    """Return the error for a package of an extra that cannot be imported; raise the given error for any other package.
+
+    `name` is the package that was imported; None: the one that the error names.
+    """
+    package = (name or error.name or "").partition(".")[0]
+    if package not in EXTRAS:
         raise error
-    return MissingPartError(f"{error.name} is not installed; learning needs it: pip install 'unjam[train]'")
+    reason = f"cannot be imported ({' '.join(str(error).split())})"
+    if isinstance(error, ModuleNotFoundError):
+        reason = "is not installed"
+    return MissingPartError(f"{package} {reason}; install it: pip install 'unjam[{EXTRAS[package]}]'")
+
+
+def import_optional(name: str) -> Any:
+    """Return a package of an extra; raise `MissingPartError`, which names the extra, if it cannot be imported."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise missing_package_error(error, name) from None
 
 
 class DiskError(UnjamError):

@@ -41,7 +41,7 @@ def test_optional_parts_are_not_required(checks: dict[str, HealthCheck]) -> None
     assert {name for name, check in checks.items() if not check.is_required} == {
         *("traci", "display", "mp4 video (imageio-ffmpeg)", "reading foreign files"),
         "SUMO of the results",
-        *("torch", "stable-baselines3", "sb3-contrib"),
+        *("torch", "stable-baselines3", "sb3-contrib", "optuna", "cryptography"),
     }
 
 

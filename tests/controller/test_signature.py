@@ -492,4 +492,5 @@ def test_only_signatures_need_what_checks_them(tmp_path: Path) -> None:
 
     assert run(packaged_file("ring-best")).returncode == 0
     ran = run(tmp_path / "it.unjam")
-    assert "MissingPartError: cryptography is not installed; signatures need it" in ran.stderr
+    assert "MissingPartError: cryptography cannot be imported (gone)" in ran.stderr
+    assert "pip install 'unjam[sign]'" in ran.stderr

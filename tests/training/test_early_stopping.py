@@ -1,5 +1,6 @@
 """When a training ends before its steps, and where its numbers go while it runs."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,7 @@ def test_tensorboard_has_every_number_by_environment_step(tmp_path: Path) -> Non
 
 
 def test_missing_tensorboard_is_reported_before_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("unjam.training.tensorboard.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
     with pytest.raises(MissingPartError, match=r"pip install 'unjam\[train\]'"):
         tensorboard_writer(tmp_path)
     assert not list(tmp_path.iterdir())

@@ -249,7 +249,7 @@ def test_failure_of_all_trials_is_reported(tmp_path: Path, trainings: Trainings)
 
 def test_missing_optuna_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(MissingPartError, match="pip install optuna"):
+    with pytest.raises(MissingPartError, match=r"pip install 'unjam\[tune\]'"):
         search(BASE, SPACE, 2, tmp_path / "it", 1)
     assert not (tmp_path / "it").exists()
 

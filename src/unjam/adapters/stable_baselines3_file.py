@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from unjam.adapters.policy_driver import PolicyDriver, policy_driver
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.errors import InputError, MissingPartError
+from unjam.errors import InputError, MissingPartError, import_optional
 from unjam.physics.arrays import Floats
 
 DATA_PART, POLICY_PART = "data", "policy.pth"
@@ -80,7 +80,7 @@ def read_stable_baselines3(
     Raises:
         InputError: the file is missing, damaged or no such model, or its policy is not an `MlpPolicy` of an algorithm
             with continuous actions, without state-dependent exploration.
-        MissingPartError: the installed torch cannot read weights safely.
+        MissingPartError: torch is not installed, or cannot read weights safely.
     """
     path = Path(file)
     if not os.path.isfile(path):
@@ -95,7 +95,7 @@ def read_stable_baselines3(
         layers = _read_layers(weights, actor)
         if acted[0].shape != (1,) or layers[-1][1].shape != (1,):
             raise ValueError("its actions are not one number")
-    except (InputError, MissingPartError, ModuleNotFoundError):
+    except (InputError, MissingPartError):
         raise
     except Exception as error:  # damaged files cause any error, also in torch
         line = " ".join(str(error).split())
@@ -123,8 +123,7 @@ def _read_parts(content: bytes, names: Sequence[str] = ()) -> dict[str, bytes]:
 
 
 def _read_weights(content: bytes) -> dict[str, Floats]:
-    import torch  # imported late: other parts of the package need no torch
-
+    torch = import_optional("torch")  # imported late: other parts of the package need no torch
     if tuple(map(int, torch.__version__.split(".")[:2])) < SAFE_TORCH:
         needed = ".".join(map(str, SAFE_TORCH))
         raise MissingPartError(f"torch {torch.__version__} cannot read weights safely: pip install 'torch>={needed}'")

@@ -125,7 +125,7 @@ def _run_app() -> int:
         return _print_error("interrupted", code) if code == INTERRUPTED_EXIT_CODE else code
     except UnjamError as error:
         return _print_error(str(error), error.exit_code)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         missing = missing_package_error(error)
         return _print_error(str(missing), missing.exit_code)
     except OSError as error:

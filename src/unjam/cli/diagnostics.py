@@ -15,7 +15,7 @@ from typer import Option
 
 from unjam.cli.options import JsonOption
 from unjam.cli.output import console, err_console, new_table, print_json
-from unjam.errors import MissingPartError, UnjamError
+from unjam.errors import EXTRAS, MissingPartError, UnjamError
 from unjam.files import make_folder
 from unjam.processes import has_display, kernel_protections
 
@@ -67,10 +67,9 @@ def check_health() -> list[HealthCheck]:
     from unjam.worlds.sumo.networks import sumo_program
 
     python, sumo = platform.python_version(), f"pip install eclipse-sumo=={REFERENCE_SUMO_VERSION}"
-    train = f"only training needs it: pip install 'unjam[train]' --extra-index-url {TORCH_CPU_INDEX}"
     display = has_display()
     no_display = "for unjam watch without a display: --video FILE, or xvfb-run unjam watch ..."
-    ffmpeg = _package_check("imageio-ffmpeg", "pip install imageio-ffmpeg; .gif and .webp work without it", False)
+    torch = f" --extra-index-url {TORCH_CPU_INDEX}"
     return [
         HealthCheck("Python", sys.version_info >= (3, 11), python, "install Python 3.11 or newer"),
         _sumo_check("libsumo"),
@@ -78,11 +77,13 @@ def check_health() -> list[HealthCheck]:
         _sumo_check("traci", is_required=False),
         _reference_sumo_check(),
         _try_check("netconvert", lambda: sumo_program("netconvert"), sumo),
-        *(_package_check(name, train, is_required=False) for name in ("torch", "stable-baselines3", "sb3-contrib")),
+        *(_extra_check(name, "train and search", torch) for name in ("torch", "stable-baselines3", "sb3-contrib")),
+        _extra_check("optuna", "tune, search and calibrate"),
+        _extra_check("cryptography", "keys, sign and signed controllers"),
         _cache_check(),
         _sandbox_check(),
         HealthCheck("display", display, "available" if display else "none", no_display, is_required=False),
-        replace(ffmpeg, name="mp4 video (imageio-ffmpeg)"),
+        replace(_extra_check("imageio-ffmpeg", ".mp4"), name="mp4 video (imageio-ffmpeg)"),
         _try_check(
             "an episode in a worker", _run_test_episode, "see the message; unjam drive ring --driver pi shows more"
         ),
@@ -96,6 +97,12 @@ def _package_check(name: str, remedy: str, is_required: bool = True, prefix: str
     except PackageNotFoundError:
         return HealthCheck(name, False, "not installed", remedy, is_required)
     return HealthCheck(name, found.startswith(prefix), found, remedy, is_required)
+
+
+def _extra_check(name: str, users: str, options: str = "") -> HealthCheck:
+    """Check that a package of an extra is installed, which only `users` need."""
+    extra = EXTRAS[name.replace("-", "_")]
+    return _package_check(name, f"only needed for {users}: pip install 'unjam[{extra}]'{options}", is_required=False)
 
 
 def _sumo_check(name: str, is_required: bool = True) -> HealthCheck:

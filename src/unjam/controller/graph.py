@@ -4,7 +4,6 @@ An untrusted graph is only data if it is pure arithmetic: ONNX has loops, functi
 tensors in external files. Therefore anything that is not listed here is refused, at any depth.
 """
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from unjam.controller.file import ACTION_NAME
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
-from unjam.errors import InputError, MissingPartError, invalid_value
+from unjam.errors import InputError, import_optional, invalid_value
 from unjam.physics.arrays import Floats
 from unjam.tree import leaves
 
@@ -71,7 +70,7 @@ def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
 
 def check_graph(part: bytes, driver: Driver) -> None:
     """Raise `InputError` unless a graph has the inputs and outputs of a controller and only arithmetic between them."""
-    onnx = require_package("onnx")
+    onnx = import_optional("onnx")
     try:
         model = onnx.load_model_from_string(part)
     except Exception as error:  # protobuf has its own error classes
@@ -135,7 +134,7 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
     same observation at once. Raise `InputError` if onnxruntime refuses it, or CAVs with the same observation get
     different answers, `MissingPartError` if onnxruntime is not installed.
     """
-    runtime = require_package("onnxruntime")
+    runtime = import_optional("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
@@ -155,11 +154,3 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
     if not is_equal:
         raise InputError(f"graph: {rows} CAVs with the same observation get different answers")
     return answers
-
-
-def require_package(name: str) -> Any:
-    """Return a package that only graphs need; raise `MissingPartError` if it is not installed."""
-    try:
-        return import_module(name)
-    except ImportError:
-        raise MissingPartError(f"{name} is not installed; install it: pip install 'unjam[train]'") from None

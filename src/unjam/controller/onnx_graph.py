@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unjam.controller.graph import ONNX_OPSET, graph_names, require_package
+from unjam.controller.graph import ONNX_OPSET, graph_names
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState, state_of_ones
 from unjam.drivers.speed_history import CircularWindow
-from unjam.errors import InputError
+from unjam.errors import InputError, import_optional
 from unjam.tree import leaves, replace_leaves
 
 
@@ -44,7 +44,7 @@ class ControllerModule(nn.Module):
 
 def _float64_constant() -> Callable[..., Any]:
     """Return a function that adds a plain number to the graph: that of onnxscript would reduce it to float32."""
-    operators = require_package("onnxscript").opset20
+    operators = import_optional("onnxscript").opset20
     import onnx_ir  # a dependency of onnxscript
 
     def constant(value: float, dtype: int = onnx_ir.DataType.DOUBLE, **_: Any) -> Any:

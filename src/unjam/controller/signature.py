@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from unjam.errors import InputError, MissingPartError, invalid_value
+from unjam.errors import InputError, invalid_value, missing_package_error
 from unjam.files import check_parent_folder, remove, to_json, write_new_file
 
 try:
@@ -26,8 +26,8 @@ try:
         load_pem_private_key,
         load_pem_public_key,
     )
-except ImportError:
-    raise MissingPartError("cryptography is not installed; signatures need it: pip install cryptography") from None
+except ImportError as error:
+    raise missing_package_error(error, "cryptography") from None
 
 PRIVATE_KEY_DESCRIPTION = "an Ed25519 private key in PEM without a password, as `unjam keys` writes it"
 PUBLIC_KEY_DESCRIPTION = "an Ed25519 public key in PEM, as `unjam keys` writes it"

@@ -8,7 +8,7 @@ from textwrap import fill
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from unjam.errors import DiskError, MissingPartError, invalid_value
+from unjam.errors import DiskError, import_optional, invalid_value
 from unjam.files import atomic_write, check_parent_folder
 from unjam.processes import PrivateFolder
 from unjam.reports.figures import CAV_PLOT_COLOR, TEXT_COLOR, color_table
@@ -137,24 +137,18 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
 
 
 def check_video_format(path: Path) -> None:
-    """Raise `InputError` unless `write_video` supports the format of such a file."""
+    """Raise `InputError` unless `write_video` supports the format of such a file, `MissingPartError` without ffmpeg."""
     if path.suffix.lower() not in VIDEO_FORMATS:
         raise invalid_value("video", path.name, f"a name that ends in {', '.join(VIDEO_FORMATS)}")
+    if path.suffix.lower() == ".mp4":
+        import_optional("imageio_ffmpeg")
 
 
 def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise MissingPartError("video: .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg") from None
+    imageio_ffmpeg = import_optional("imageio_ffmpeg")
     with PrivateFolder() as private:  # ffmpeg itself writes the file: it follows links and hides errors
         video = Path(private, path.name)
-        writer = imageio_ffmpeg.write_frames(
-            str(video),
-            (FRAME_SIZE, FRAME_SIZE),
-            fps=rate,  # pyright: ignore[reportArgumentType]  ffmpeg also accepts fractions
-            ffmpeg_log_level="error",
-        )
+        writer = imageio_ffmpeg.write_frames(str(video), (FRAME_SIZE, FRAME_SIZE), fps=rate, ffmpeg_log_level="error")
         writer.send(None)
         try:
             for frame in frames:

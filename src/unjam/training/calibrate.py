@@ -261,7 +261,7 @@ def calibrate(
 
     Raise `UnjamError` if SUMO cannot simulate the original network, or if its process was lost repeatedly.
     """
-    original = dict.fromkeys(space, 1.0)
+    optuna, original = import_optuna(), dict.fromkeys(space, 1.0)
     log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})
     measurements = corridor.measurements
 
@@ -286,7 +286,7 @@ def calibrate(
                 log.add(first, text, (None, str(error)))
         return CalibrationTrial(factors, *log.verdicts[first, text])
 
-    optuna, results = import_optuna("calibrate"), list[CalibrationTrial]()
+    results: list[CalibrationTrial] = []
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed, multivariate=True))
     limits = {name: values.boundary_values for name, values in space.items()}
     study.enqueue_trial({name: min(max(1.0, low), high) for name, (low, high) in limits.items()})

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal, NamedTuple
 
 from unjam.child_processes import child_environment, child_import_path, isolated_start, python_command
-from unjam.errors import MissingPartError, UnjamError, error_from_name
+from unjam.errors import UnjamError, error_from_name, import_optional
 from unjam.files import APPEND_FLAGS, atomic_write, make_folder, open_in_place
 from unjam.folders import PROTECTED_FOLDERS_VARIABLE
 from unjam.parameters import build_dataclass
@@ -153,10 +153,7 @@ def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, 
 @contextmanager
 def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
     """Yield a function that runs a command line on the existing Ray cluster, or on one of this machine."""
-    try:
-        import ray  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise MissingPartError("executor: ray is not installed: pip install 'unjam[ray]'") from None
+    ray = import_optional("ray")
     with isolated_start(child_import_path()):
         try:
             ray.init(address="auto", log_to_driver=False)

@@ -15,7 +15,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError, invalid_value
+from unjam.errors import InputError, import_optional, invalid_value
 from unjam.files import atomic_write, check_parent_folder, make_folder
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarize
@@ -129,6 +129,7 @@ def export_controller(source: str | Path, out: str | Path, onnx: bool = False, s
     limit = max(-low, high)
     states, graph = _sample_states(road, driver), dict[str, bytes]()
     if onnx:
+        import_optional("torch")
         from unjam.controller.onnx_graph import onnx_graph  # imported late: torch.onnx is slow to import
 
         missing = [name for name in driver.input_fields if getattr(states, name) is None]

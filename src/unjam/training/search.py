@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unjam.errors import InputError, MissingPartError, UnjamError, invalid_value
+from unjam.errors import InputError, UnjamError, import_optional, invalid_value
 from unjam.files import append_line, atomic_write, read_json_lines, to_json
 from unjam.manifest import manifest
 from unjam.parameters import merge_changes, nest_keys
@@ -125,18 +125,15 @@ def _trial_command(base: RunConfig, folder: Path, number: int, values: dict[str,
     return training_command(config, _trial_folder(folder, number), config_file, log)
 
 
-def import_optuna(command: str) -> Any:
+def import_optuna() -> Any:
     """Return Optuna with only its warnings; raise `MissingPartError` if it is not installed."""
-    try:
-        import optuna
-    except ImportError:
-        raise MissingPartError(f"{command}: optuna is not installed: pip install optuna") from None
+    optuna = import_optional("optuna")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
 
 
 def _open_study(base: RunConfig, space: SearchSpace, folder: Path) -> "Study":
-    optuna = import_optuna("search")
+    optuna = import_optuna()
     from optuna.storages import JournalStorage
 
     if not (folder / SEARCH_CONFIG_FILE).is_file():

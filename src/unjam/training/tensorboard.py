@@ -1,11 +1,10 @@
 """Progress of a training for TensorBoard."""
 
 import secrets
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from unjam.errors import MissingPartError
+from unjam.errors import import_optional
 from unjam.files import make_folder
 from unjam.parameters import flatten_keys
 from unjam.training.executors import IterationCallback
@@ -19,8 +18,7 @@ def tensorboard_writer(folder: Path | str) -> IterationCallback:
 
     Each number has a curve over environment steps. Raise `MissingPartError` if TensorBoard is not installed.
     """
-    if find_spec("tensorboard") is None:  # otherwise the error would come after the first iteration
-        raise MissingPartError("tensorboard: it is not installed: pip install 'unjam[train]'")
+    import_optional("tensorboard")  # otherwise the error would come after the first iteration
     from torch.utils.tensorboard.writer import SummaryWriter
 
     place = Path(folder, TENSORBOARD_FOLDER)

@@ -123,6 +123,7 @@ def tune(
     request = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
     files = file_hashes([reward], *roads.values())
     request |= {"files": files} if files else {}
+    optuna = import_optuna()
     log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened)})
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
     trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)
@@ -143,7 +144,7 @@ def tune(
         scores |= {each: log.verdicts[first, each] for each in drivers if each not in scores}
         return [TuningTrial(each, values, *scores[each]) for each, values in zip(drivers, settings, strict=True)]
 
-    optuna, trials = import_optuna("tune"), list[TuningTrial]()
+    trials: list[TuningTrial] = []
     sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True)
     study = optuna.create_study(direction="maximize", sampler=sampler)
     has_motorways = any(isinstance(roads[road], OnRamp) for road in screened)  # many take as long as few
