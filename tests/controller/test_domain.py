@@ -3,16 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from unjam.controller import make_driver, packaged_file
-from unjam.controller.domain import (
-    controller_notes,
-    outside_domain_share,
-    road_description,
-    road_mismatch,
-    step_mismatch,
-)
+from unjam.controller import packaged_file
+from unjam.controller.domain import controller_notes, outside_domain_share, road_description, road_mismatch
 from unjam.controller.file import read_controller
-from unjam.drivers import IDM, LocalState
+from unjam.drivers import LocalState
 from unjam.scenarios import Ring, Scenario, make_scenario, scenario_recipe
 
 TRAINED = {"scenario": scenario_recipe(Ring())}
@@ -54,11 +48,3 @@ def test_only_controllers_on_another_road_get_a_note() -> None:
     road = scenario_recipe(make_scenario("figure-eight"))
     names = ["pi", "human", "unjam:figure-eight-tuned", "unjam:ring-tuned"]
     assert controller_notes(road, names, {}) == ["unjam:ring-tuned was tuned on the ring, not on the figure-eight"]
-
-
-def test_a_controller_that_counts_time_otherwise_gets_a_note() -> None:
-    loop = make_driver("unjam:best", 0.1).inner_drivers["loop"]
-    slow = scenario_recipe(make_scenario("ring-jammed", {"steps_per_control_step": 10}))
-    assert step_mismatch(loop, slow) == "was made for control steps of 0.1 s, and control steps here take 1 s"
-    assert step_mismatch(loop, scenario_recipe(make_scenario("ring-jammed"))) == ""
-    assert step_mismatch(IDM(), slow) == ""

@@ -23,7 +23,7 @@ def plot_episode_of(episode: Episode, driver: str) -> PlotEpisode:
 
 @cache
 def merge_episode(seconds: int = 100, driver: str = "pi") -> Episode:
-    drivers = {"pi": PISaturation(), "human": Human()}
+    drivers = {"pi": PISaturation(time_step=1.0), "human": Human()}
     return run_episode(Merge(penetration_rate=0.2, horizon=seconds), drivers[driver], (1,), record_details=True)
 
 
@@ -37,4 +37,4 @@ def ramp_episode(driver: str = "jam-ahead") -> Episode:
 def user_episode(folder: Path, seconds: int = 60) -> Episode:
     """Traffic on the network `ramp` of a SUMO game."""
     scenario = make_scenario(str(game(folder, "ramp")), {"penetration_rate": 0.3, "horizon": seconds * 5})
-    return run_episode(scenario, PISaturation(), (1,), record_details=True)
+    return run_episode(scenario, PISaturation(time_step=scenario.control_step), (1,), record_details=True)

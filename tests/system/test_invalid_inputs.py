@@ -36,6 +36,10 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     "unknown parameter of a driver": ("driver pi.ghost: unknown name", ["drive ring --driver pi:ghost=1"]),
     "text for a number": ("time_constant: 'fast'", ["drive ring --driver pi:time_constant=fast"]),
     "negative parameter": ("time_constant: -1", ["drive ring --driver pi:time_constant=-1"]),
+    "controller for another control step": (
+        "driver unjam:ring-tuned: time_step 0.1 s is not allowed on ring; allowed: 0.3 s, its control step",
+        ["drive ring --driver pi --driver unjam:ring-tuned --set steps_per_control_step=3"],
+    ),
     "no episodes": ("episodes", ["drive ring --driver pi --episodes 0"]),
     "text for a count": ("many", ["drive ring --driver pi --episodes many"]),
     "length that is not a number": ("length: '2x0'", ["drive ring --driver pi --length 2x0"]),

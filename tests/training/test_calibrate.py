@@ -112,9 +112,8 @@ def test_written_network_has_the_reported_agreement(asked: Corridor, done: tuple
         (passed,) = counting.run(asked.scenario(folder / CALIBRATED_NETWORK_FILE), make_test_seeds(1), asked.loops)
     flows, speeds = aggregate_passages(asked.measurements, asked.loop_numbers, passed)
     assert compute_agreement(asked.measurements, flows, speeds) == found.calibrated[0]
-    episode = run_episode(
-        load_user_network(str(folder / CALIBRATED_NETWORK_FILE), {"penetration_rate": 0.2}), PISaturation(), 1
-    )
+    road = load_user_network(str(folder / CALIBRATED_NETWORK_FILE), {"penetration_rate": 0.2})
+    episode = run_episode(road, PISaturation(time_step=road.control_step), 1)
     assert episode.status == "completed"
 
 

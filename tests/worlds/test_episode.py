@@ -31,7 +31,8 @@ def drives_badly(simulation: Simulation) -> None:
 
 def another_road(simulation: Simulation) -> None:
     ring = Ring(length=(130, 140), vehicles=11, cavs=3, warmup=77, horizon=50, simulation_step=0.2)
-    run_episode(ring, RESIDUAL, (9,), explore=True, record_details=True, simulation=simulation)
+    driver = replace(RESIDUAL, expert=PISaturation(time_step=0.2))
+    run_episode(ring, driver, (9,), explore=True, record_details=True, simulation=simulation)
 
 
 def stops_in_the_middle(simulation: Simulation) -> None:
@@ -61,7 +62,7 @@ def uses_up_random_numbers(simulation: Simulation) -> None:
     [
         (RING, PISaturation()),
         (replace(RING, warmup=120), RESIDUAL),
-        (replace(RING, cavs=2, steps_per_control_step=2), FollowerStopper()),
+        (replace(RING, cavs=2, steps_per_control_step=2), FollowerStopper(time_step=0.2)),
         (replace(RING, warmup=50, actuation="flow"), Human()),
     ],
 )
@@ -113,7 +114,7 @@ def test_records_have_a_row_for_each_control_step_and_one_for_the_end(
     warmup: int, held: int, hold: int, cavs: int, simulation: Simulation
 ) -> None:
     ring = replace(RING, horizon=60, warmup=warmup, steps_per_control_step=held, cavs=cavs)
-    driver = replace(RESIDUAL, action_repeat=hold)
+    driver = replace(RESIDUAL, expert=PISaturation(time_step=ring.control_step), action_repeat=hold)
     episode = run_episode(ring, driver, (0,), simulation=simulation)
     assert episode.control_steps == 60
     for array in (episode.speeds, episode.positions, episode.gaps):

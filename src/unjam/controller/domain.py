@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 from unjam.controller import PACKAGED_PREFIX, packaged_file
 from unjam.controller.certificate import OperatingDomain
 from unjam.controller.file import CERTIFICATE_PART, Controller, read_controller
-from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.files import UNREADABLE_ERRORS, parse_json
@@ -38,7 +37,7 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
         controller = _find_controller(name)
         if controller is None:
             continue
-        if mismatch := road_mismatch(controller.manifest, road) or step_mismatch(controller.driver, road):
+        if mismatch := road_mismatch(controller.manifest, road):
             notes.append(f"{name} {mismatch}")
         states = [each.states for each in episodes[name].trajectories] if name in episodes else []
         share = max((outside_domain_share(controller, each) for each in states), default=0.0)
@@ -77,28 +76,6 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     words = [f"{name} {_printable(now[name])} (there {_printable(before[name])})" for name in listed]
     more = [f"{len(differ) - len(listed)} more"] if len(differ) > len(listed) else []
     return f"was {made} on another {road['kind']}: {', '.join(words + more)}"
-
-
-def step_mismatch(driver: Driver, road: dict[str, Any]) -> str:
-    """Return that the control step of a driver differs from that of a scenario; empty if it does not.
-
-    `road` is the recipe of the scenario. For a `RoadTypeSwitch` the active driver is not known.
-    """
-    step, recipe = road["simulation_step"] * road["steps_per_control_step"], driver.recipe()
-    steps = set(_time_steps(recipe)) if recipe["kind"] != "road-type-switch" else set()
-    if not steps or any(abs(each - step) < 1e-9 for each in steps):
-        return ""
-    made = ", ".join(f"{each:g}" for each in sorted(steps))
-    return f"was made for control steps of {made} s, and control steps here take {step:g} s"
-
-
-def _time_steps(recipe: Any) -> Iterator[float]:
-    if isinstance(recipe, dict):
-        for name, part in recipe.items():
-            yield from [part] if name == "time_step" else _time_steps(part)
-    elif isinstance(recipe, list):
-        for part in recipe:
-            yield from _time_steps(part)
 
 
 def road_description(manifest: dict[str, Any]) -> str:

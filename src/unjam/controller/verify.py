@@ -15,11 +15,12 @@ import numpy as np
 
 from unjam.controller import file as archive
 from unjam.controller.certificate import make_certificate
-from unjam.controller.domain import road_description, step_mismatch
+from unjam.controller.domain import road_description
 from unjam.controller.file import Controller, Floats, read_controller, read_sample, replay_states, sha256_of
 from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.manifest import PROVENANCE_ENTRIES, driver_interface, first_difference, short_text
 from unjam.drivers.check import random_state
+from unjam.drivers.driver import other_time_steps
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
 from unjam.errors import InputError, MissingPartError
@@ -158,9 +159,10 @@ def _describe_provenance(controller: Controller) -> list[PartCheck]:
     names = f"{', '.join(stated)}, and unjam {short_text(manifest['unjam'])}"
     checks = [PartCheck("origin", "stated", f"{names}: the maker's statement: nothing in the file can prove it")]
     if road := road_description(manifest):
-        step = {"simulation_step": manifest.get("time_step", 0.0), "steps_per_control_step": 1}
-        mismatch = step_mismatch(controller.driver, step) if "time_step" in manifest else ""
-        checks.append(PartCheck("road", "stated", f"made for the {road}{mismatch and f'; the driver {mismatch}'}"))
+        step = manifest.get("time_step")
+        steps = [] if step is None else other_time_steps(controller.driver, step)
+        mismatch = f"; a part of the driver was made for a time_step of {steps[0]:g} s, not {step:g} s" if steps else ""
+        checks.append(PartCheck("road", "stated", f"made for the {road}{mismatch}"))
     return checks
 
 

@@ -1,7 +1,7 @@
 """The interface of drivers, which decide for their vehicles from observation and memory."""
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,6 +17,8 @@ Memory = dict[str, Any]
 contains another driver keeps the memory of that driver within its own."""
 Recipe = dict[str, Any]
 """Specification of a driver as JSON; the weights of its networks are stored separately as arrays."""
+STEP_TOLERANCE = 1e-9
+"""difference up to which control steps are equal [s]"""
 NoiseSampler = Callable[[], Array]
 """returns standard normal noise for one evaluation of a network, one number for each row"""
 
@@ -129,6 +131,17 @@ class Driver:
         """The fields of `LocalState` that a road must measure for it and for the drivers that it contains."""
         return frozenset(self.input_fields).union(*(inner.measured_fields for inner in self.inner_drivers.values()))
 
+    def active_drivers(self, is_closed: bool, provided_fields: Collection[str]) -> Iterable["Driver"]:
+        """Return the inner drivers that can drive on a road; arguments are properties of its `Scenario`."""
+        return self.inner_drivers.values()
+
+    def time_steps(self, is_closed: bool, provided_fields: Collection[str]) -> frozenset[float]:
+        """Return the control steps [s] that its formulas and those of its active drivers assume; empty: any step."""
+        own = getattr(self, "time_step", None)
+        inner = self.active_drivers(is_closed, provided_fields)
+        assumed = (driver.time_steps(is_closed, provided_fields) for driver in inner)
+        return frozenset(() if own is None else (own,)).union(*assumed)
+
     def describe(self) -> str:
         """Return its name and the parameters that differ from the defaults."""
         if not self.name:
@@ -155,6 +168,18 @@ class FormulaDriver(Driver):
 
     accepts_floats: ClassVar[bool] = True
     accepts_tensors: ClassVar[bool] = True
+
+
+def other_time_steps(
+    driver: Driver, step: float, is_closed: bool | None = None, provided_fields: Collection[str] = ()
+) -> list[float]:
+    """Return the control steps [s] that a driver assumes and that differ from `step`, in order.
+
+    The other arguments are those of `Driver.time_steps`; with None for `is_closed`, all roads are regarded.
+    """
+    kinds = (True, False) if is_closed is None else (is_closed,)
+    steps = frozenset[float]().union(*(driver.time_steps(kind, provided_fields) for kind in kinds))
+    return sorted(each for each in steps if abs(each - step) > STEP_TOLERANCE)
 
 
 def label_with_parameters(name: str, parameters: dict[str, Any]) -> str:

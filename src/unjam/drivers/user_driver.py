@@ -6,7 +6,7 @@ Such a file is executed as code: use only files that you trust.
 import inspect
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import RLock
@@ -175,6 +175,13 @@ class UserDriver(Driver):
         """All fields, because only the user's code determines which it reads."""
         return frozenset(LocalState._fields)
 
+    def time_steps(self, is_closed: bool, provided_fields: Collection[str]) -> frozenset[float]:
+        """Return the attribute `time_step` of the user's driver; those of a `Driver` as it returns them."""
+        if isinstance(self.implementation, Driver):
+            return self.implementation.time_steps(is_closed, provided_fields)
+        own = getattr(self.implementation, "time_step", None)
+        return frozenset({float(own)} if isinstance(own, int | float) else ())
+
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return the result of the user's function."""
         return function(*arguments)
@@ -236,6 +243,12 @@ class FileDriver(FileReference, UserDriver):
         elif self.parameters:
             raise InputError(f"{self}: takes no parameters; only a class does")
         return as_implementation(found, str(self))
+
+    def time_steps(self, is_closed: bool, provided_fields: Collection[str]) -> frozenset[float]:
+        """Return those of the user's driver; of a class without this attribute the argument that it received."""
+        stored = super().time_steps(is_closed, provided_fields)
+        is_argument = not stored and _takes_time_step(type(self.implementation))
+        return frozenset({self.parameters.get("time_step", self.time_step)}) if is_argument else stored
 
     def describe(self) -> str:
         """Return the names of file and driver, and the given parameters."""
@@ -303,11 +316,15 @@ def as_driver(driver: DriverLike, time_step: float = FileDriver.time_step) -> Dr
 def _instantiate(kind: type[Any], parameters: dict[str, Any], time_step: float, label: str) -> Any:
     """Return an object of a user's class; a parameter `time_step` gets the control step of the road [s]."""
     try:
-        if "time_step" in inspect.signature(kind).parameters:
+        if _takes_time_step(kind):
             parameters = {"time_step": time_step, **parameters}
         return kind(**parameters)
     except Exception as error:
         raise InputError(f"{label}: {type(error).__name__} when made: {error}") from error
+
+
+def _takes_time_step(kind: type[Any]) -> bool:
+    return "time_step" in inspect.signature(kind).parameters
 
 
 def as_implementation(candidate: Any, context: str) -> Any:

@@ -1,6 +1,6 @@
 """Drivers that contain other drivers: mixtures and switches, impaired sensing, the safety filter, history features."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property
 from itertools import chain
@@ -394,6 +394,12 @@ class RoadTypeSwitch(CompositeDriver):
         """Whether those of closed roads take plain numbers, which no other road uses."""
         closed = (self.crossing_loop, self.loop, self.shared_loop or self.loop)
         return all(driver.accepts_floats for driver in closed)
+
+    def active_drivers(self, is_closed: bool, provided_fields: Collection[str]) -> Iterable[Driver]:
+        """Return the driver of an open road, or all drivers of closed roads."""
+        if is_closed:
+            return self.crossing_loop, self.loop, self.shared_loop or self.loop
+        return (self.motorway if "lane_speeds" in provided_fields else self.open_road,)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration by the driver for this road type, and the new memory."""

@@ -43,7 +43,7 @@ from unjam.training.selection import (
     min_verdict_episodes,
     select_controllers,
 )
-from unjam.worlds.episode import can_drive
+from unjam.worlds.episode import can_drive, check_time_step
 from unjam.worlds.worker_pool import WorkerPool
 
 DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
@@ -138,6 +138,7 @@ def make_request(
         if driver.is_native or not can_drive(driver, road):
             allowed = "the human baseline is always included" if driver.is_native else "one that needs no closed road"
             raise invalid_value("driver", name, allowed)
+        check_time_step(driver, road, name)
     request = AssessmentRequest(file, road, controllers, rates, episodes, minutes, precision)
     minimum = min_episodes(len(rates), len(controllers), request.has_acc_properties) + PLOT_EPISODE_COUNT
     if episodes < minimum:

@@ -33,7 +33,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.run_folder import lock_new_folder
 from unjam.training.seeds import TRAINING_SEED_LIMIT, make_test_seeds
-from unjam.worlds.episode import can_drive, run_episode
+from unjam.worlds.episode import can_drive, check_time_step, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import RewardLike, make_reward, reward_label
 from unjam.worlds.sumo.sandboxed import open_simulation
@@ -373,6 +373,8 @@ def drive(
         else:
             made = as_driver(entry, road.control_step)
             drivers[unique_label(made, drivers)] = made
+    for name, one in drivers.items():
+        check_time_step(one, road, name)
     if not drivers:
         raise invalid_value("driver", driver, driver_names())
     make_reward(reward or road.reward)

@@ -36,7 +36,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, read_toml, to_toml
 from unjam.training.early_stopping import should_stop_early
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
-from unjam.worlds.episode import check_can_drive, check_policy_inputs
+from unjam.worlds.episode import check_can_drive, check_policy_inputs, check_time_step
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def check_config(config: RunConfig) -> None:
         observation_size(task.policy.inputs, expert)
         make_reward(task.reward or scenario.reward)
         for name in task.evaluation.baselines:
-            make_driver(name, scenario.control_step)
+            check_time_step(make_driver(name, scenario.control_step), scenario, name)
         if config.model.model_ratio > 0 and config.model.kind == "row":
             _check_row_model(task, scenario, expert)
         elif config.model.model_ratio > 0:

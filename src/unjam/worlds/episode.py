@@ -7,7 +7,7 @@ from typing import SupportsIndex
 
 import numpy as np
 
-from unjam.drivers.driver import Driver
+from unjam.drivers.driver import Driver, other_time_steps
 from unjam.drivers.observation import Feature, feature
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import EpisodeError, InputError, NoCavError, SumoInputError, UnjamError, as_unjam_error, invalid_value
@@ -34,6 +34,9 @@ class Task:
     """share of the environment steps, relative to the weights of the other tasks"""
     name: str = ""
     """in progress reports, tables and folders; empty for a single task"""
+
+    def __post_init__(self) -> None:
+        check_time_step(self.expert, self.scenario)
 
 
 def run_episode(
@@ -116,6 +119,17 @@ def check_can_drive(driver: Driver, scenario: Scenario) -> None:
     if not can_drive(driver, scenario):
         raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
     check_policy_inputs(driver.policy_inputs, scenario, "driver: its network's feature")
+    check_time_step(driver, scenario)
+
+
+def check_time_step(driver: Driver, scenario: Scenario, label: str = "") -> None:
+    """Raise `InputError` if the formulas of a driver assume another control step than a scenario has."""
+    step = scenario.control_step
+    others = other_time_steps(driver, step, scenario.is_closed, scenario.provided_fields)
+    if others:
+        context = f"driver {label}" if label else "driver"
+        found = f"time_step {others[0]:g} s is not allowed on {scenario.title}"
+        raise InputError(f"{context}: {found}; allowed: {step:g} s, its control step")
 
 
 def check_policy_inputs(features: Sequence[str | Feature], scenario: Scenario, context: str) -> None:

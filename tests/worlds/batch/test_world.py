@@ -331,7 +331,7 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
 def test_what_would_not_be_exact_is_refused(scenario: Any, why: str) -> None:
     assert why in unsupported_reason(scenario)
     with pytest.raises(InputError, match="batch: "):
-        run_batch(tasks(scenario, driver_from_name("pi", 0.1), (1,)))
+        run_batch(tasks(scenario, driver_from_name("pi", scenario.control_step), (1,)))
 
 
 def test_rings_differ_in_their_lengths_alone() -> None:

@@ -157,7 +157,7 @@ def test_backlog_and_arrivals_agree_with_the_demand_and_with_sumo(simulation: Si
 
 
 def test_outflow_and_backlog_metrics_are_these_counts(simulation: Simulation) -> None:
-    episode = run_episode(Merge(horizon=120), PISaturation(), (1,), simulation=simulation)
+    episode = run_episode(Merge(horizon=120), PISaturation(time_step=1.0), (1,), simulation=simulation)
     row = measure(episode)
     last = episode.speeds[-1]
     left = np.isnan(last).sum()
@@ -180,7 +180,9 @@ def test_positions_that_differ_from_sumos_odometer_are_an_error(
 
 
 def test_snapshots_of_a_merge(simulation: Simulation) -> None:
-    episode = run_episode(Merge(horizon=60), PISaturation(), (1,), record_details=True, simulation=simulation)
+    episode = run_episode(
+        Merge(horizon=60), PISaturation(time_step=1.0), (1,), record_details=True, simulation=simulation
+    )
     assert len(episode.branches) == len(episode.vehicle_ids)
     for name, branch in zip(episode.vehicle_ids, episode.branches, strict=True):
         assert branch == ("ramp" if re.match("human_r", name) else "highway")
@@ -218,7 +220,7 @@ def human() -> list[Episode]:
 
 @pytest.mark.slow
 def test_from_standstill_human_traffic_stays_jammed_and_pi_makes_it_worse(human: list[Episode]) -> None:
-    pi = episodes_of(PISaturation(), range(2))
+    pi = episodes_of(PISaturation(time_step=1.0), range(2))
     assert 8.5 < fleet_mean(human) < 13.5
     assert fleet_mean(pi) < fleet_mean(human)
     assert all(episode.backlog[-1] > 5 for episode in [*human, *pi])
@@ -244,4 +246,4 @@ def test_twenty_seeds_agree_with_flow() -> None:
     human = episodes_of(Human(), range(20))
     assert fleet_mean(human) == pytest.approx(11.0, rel=0.05)
     assert fleet_mean(episodes_of(Human(), range(20), standing_vehicles=0)) == pytest.approx(19.9, rel=0.03)
-    assert fleet_mean(episodes_of(PISaturation(), range(20))) < fleet_mean(human)
+    assert fleet_mean(episodes_of(PISaturation(time_step=1.0), range(20))) < fleet_mean(human)

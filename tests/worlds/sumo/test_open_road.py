@@ -115,7 +115,7 @@ def test_commands_are_carried_out_unless_the_shield_brakes(counted: Episode) -> 
 
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(simulation: Simulation) -> None:
-    residual = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=3)
+    residual = ResidualDriver(PISaturation(time_step=1.0), random_network(), 1.0, action_repeat=3)
     tasks = [
         EpisodeTask(MERGE, residual, (2,), explore=True),
         EpisodeTask(replace(MERGE, warmup=100), Counting(), (5, 1)),
@@ -177,7 +177,7 @@ def test_a_residual_driver_counts_its_actions_from_each_entry(hold: int, simulat
 
 
 def test_a_trip_can_be_replayed_from_its_trajectory(simulation: Simulation) -> None:
-    driver = ResidualDriver(PISaturation(), random_network(), 1.0)
+    driver = ResidualDriver(PISaturation(time_step=1.0), random_network(), 1.0)
     episode = run_episode(MERGE, driver, (2,), simulation=simulation)
     for trajectory in episode.trajectories:
         memory = {name: values[None] for name, values in trajectory.initial_memory.items()}
@@ -204,7 +204,9 @@ def test_a_driver_without_memory_drives_all_cavs(simulation: Simulation) -> None
         np.testing.assert_allclose(trajectory.applied_acceleration, wanted, atol=1e-12)
 
 
-@pytest.mark.parametrize("driver", [IDM(), ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=2)])
+@pytest.mark.parametrize(
+    "driver", [IDM(), ResidualDriver(PISaturation(time_step=1.0), random_network(), 1.0, action_repeat=2)]
+)
 def test_time_continues_while_no_cav_is_on_the_road(driver: Driver, simulation: Simulation) -> None:
     lonely = Merge(cavs=1, standing_vehicles=0, horizon=150)
     episode = run_episode(lonely, driver, (3,), explore=True, simulation=simulation)
