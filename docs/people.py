@@ -80,8 +80,8 @@ def field(data: str, test: str, models: Sequence[str] = tuple(MODELS)) -> pd.Dat
         table.append(
             {
                 "": MODELS[model],
-                "gap error in open loop [m]": _cell(found, "gap"),
-                "speed error in open loop [m/s]": f"{found['speed'].mean():.2f}",
+                "error of the simulated gap [m]": _cell(found, "gap"),
+                "error of the simulated speed [m/s]": f"{found['speed'].mean():.2f}",
                 "end in a collision": f"{100 * found['collision_share'].mean():.0f} %",
                 "one step [m/s²]": f"{found['one_step'].mean():.3f}",
             }

@@ -1,8 +1,8 @@
-"""Car-following models on field data: errors one step ahead, and in open loop behind a recorded leader.
+"""Car-following models on field data: errors one step ahead, and in a simulation behind the recorded leader.
 
-The data are files of the user: the reconstructed NGSIM I-80 data as leader-follower pairs with a published split, and
-OpenACC's AstaZero platoons, as plain tables (`unjam.following.loaders`). AstaZero has no published split; here one day
-or platoon is for training and another for testing.
+The user supplies the data as plain tables (`unjam.following.loaders`): the reconstructed NGSIM I-80 data as
+leader-follower pairs with a published split, and the AstaZero platoons of OpenACC. AstaZero has no published split;
+here one day or platoon is for training and another for testing.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,26 +18,33 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from unjam.following.calibration import CALIBRATED_PARAMETERS, CalibrationSettings, calibrate_groups, calibrate_idm
-from unjam.following.loaders import ReadOptions, read_pairs
+from unjam.following.leader_replay import (
+    AccelerationBounds,
+    DriverModel,
+    add_residual,
+    as_driver_model,
+    idm_function,
+    individual_idm,
+    one_step_error,
+    simulate_followers,
+)
+from unjam.following.loaders import ReadOptions, read_trajectories
 from unjam.following.networks import (
-    CalibratedPairs,
+    CalibratedTrajectories,
     MultiStepSettings,
     NetworkSettings,
     batched_network,
     fit_multi_step,
     fit_one_step,
 )
-from unjam.following.open_loop import (
-    AccelerationBounds,
-    DriverModel,
-    add_residual,
-    fixed_driver,
-    idm_function,
-    individual_idm,
-    one_step_error,
-    simulate_open_loop,
+from unjam.following.trajectories import (
+    FollowingTrajectory,
+    Segments,
+    following_samples,
+    make_segments,
+    select_splits,
+    split_by_driver,
 )
-from unjam.following.pairs import Pair, Segments, following_samples, make_segments, pairs_in_splits, split_by_driver
 from unjam.physics.idm import PAPER_IDM, stack_idm_parameters
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam_paper.results_file import measure_parts, write_figure, write_part
@@ -45,15 +52,15 @@ from unjam_paper.study import Table, study_manifest
 
 ACCELERATION_LIMITS: AccelerationBounds = (-4.0, 2.0)
 TRAINING_SEED_COUNTS, ROW_STRIDES = {"ngsim": 3, "astazero": 1}, {"ngsim": 1, "astazero": 5}
-"""trainings of each network, and stride of the training rows one step ahead: neighboring rows hardly differ"""
+"""number of trainings of each network, and stride of its training samples, because neighboring samples hardly differ"""
 MAX_SEGMENT_SECONDS = 120.0
-"""maximum length of an open-loop segment [s]"""
+"""maximum duration of a simulated segment [s]"""
 ONE_STEP_SETTINGS = NetworkSettings(learning_rate=1e-3, epochs=40, patience=8)
 MULTI_STEP_SETTINGS = MultiStepSettings()
 BOOTSTRAP_DRAWS = 2000
 PAPER_IDM_MODELS = {"paper's IDM": None, "paper's IDM, clipped": ACCELERATION_LIMITS}
 KNOWLEDGE_MODELS = {"knowledge, paper's IDM": None, "knowledge, paper's IDM clipped": ACCELERATION_LIMITS}
-"""the paper's IDM within these limits, alone and as the base of a network"""
+"""limits of the acceleration of the paper's IDM, alone and as the base of a network [m/s2]; None: no limits"""
 FIELD_CALIBRATION = CalibrationSettings(limits=ACCELERATION_LIMITS, segment_seconds=MAX_SEGMENT_SECONDS)
 WEIGHTED_MODEL = "IDM, initial headway weighted"
 CALIBRATED_MODELS = {
@@ -68,7 +75,7 @@ PERSONAL_MODELS = {
     "IDM, personal time headway": ("time_headway",),
     "IDM, all parameters personal": CALIBRATED_PARAMETERS,
 }
-"""parameters of each driver that are calibrated on the first half of its test trajectory, and tested on the second"""
+"""parameters that are calibrated to the first half of a driver's test trajectory; the second half is the test"""
 PUBLISHED_GAP_ERROR = 3.64
 """gap error of a calibrated IDM on the published test pairs of NGSIM [m]"""
 MODEL_LABELS = {
@@ -85,18 +92,18 @@ MODEL_LABELS = {
 """models of the figure, from top to bottom"""
 TEST_SET_LABELS = {"test": "the 20 published test pairs", "other drivers": "218 other drivers"}
 ERROR_AXIS_LIMITS = {"gap": (2.0, 12.0), "one_step": (0.4, 1.9)}
-"""larger errors are written at the edge of the figure [m, m/s2]"""
+"""limits of the axes of the figure [m, m/s2]; larger errors are written as numbers at its edge"""
 
 
 @dataclass(frozen=True)
 class FieldData:
-    """A data set, split into training and test pairs."""
+    """A data set, split into training and test trajectories."""
 
-    training: list[Pair]
-    test: dict[str, list[Pair]]
+    training: list[FollowingTrajectory]
+    test: dict[str, list[FollowingTrajectory]]
     """test sets by name; the main one is `test`"""
     max_segment: float | None = MAX_SEGMENT_SECONDS
-    """maximum length of an open-loop segment [s]: an AstaZero drive lasts twenty minutes; None: no limit"""
+    """maximum duration of a simulated segment [s]: an AstaZero drive lasts twenty minutes; None: no limit"""
 
 
 @dataclass(frozen=True)
@@ -106,27 +113,29 @@ class FieldFit:
     data_set: str
     """a name in `FIELD_DATA_LOADERS`"""
     file: str
+    """path of the data"""
     model: str
+    """name of the model"""
     seed: int = 0
 
     @property
     def name(self) -> str:
-        """The name of its part."""
+        """Name of the file with the result."""
         plain = self.model.replace(", ", "-").replace(" + ", "-").replace(" ", "-").replace("'", "")
         return f"{self.data_set}-{plain}-{self.seed}"
 
 
 def _load_ngsim(path: Path) -> FieldData:
-    pairs = read_pairs(path, "table", ReadOptions(driver_columns=("period", "follower"))).pairs
-    tests = {"test": pairs_in_splits(pairs, "paper_test"), "other drivers": pairs_in_splits(pairs, "extra")}
-    return FieldData(pairs_in_splits(pairs, "paper_train"), tests, max_segment=None)
+    trajectories = read_trajectories(path, "table", ReadOptions(driver_columns=("period", "follower"))).trajectories
+    tests = {"test": select_splits(trajectories, "paper_test"), "other drivers": select_splits(trajectories, "extra")}
+    return FieldData(select_splits(trajectories, "paper_train"), tests, max_segment=None)
 
 
 def _load_astazero(path: Path, split: tuple[str, tuple[str, ...], tuple[str, ...]]) -> FieldData:
     kind, *runs = split
     reading = ReadOptions(driver_columns=("run", "follower"), kind_columns=("acc", "setting"))
-    pairs = [pair for pair in read_pairs(path, "table", reading).pairs if pair.kind == kind]
-    training, test = ([pair for pair in pairs if pair.driver.startswith(names)] for names in runs)
+    trajectories = [each for each in read_trajectories(path, "table", reading).trajectories if each.kind == kind]
+    training, test = ([each for each in trajectories if each.driver.startswith(names)] for names in runs)
     return FieldData(training, {"test": test})
 
 
@@ -138,7 +147,7 @@ ASTAZERO_SPLITS = {
         ("050719_platoon1-", "050719_platoon2-"),
     ),
 }
-"""kind of the pairs, training runs and test runs: platoons of ten and of three vehicles, or those of two days"""
+"""kind of driver, training runs and test runs: platoons of ten and of three vehicles, or the platoons of two days"""
 FIELD_DATA_LOADERS: dict[str, Callable[[Path], FieldData]] = {
     "ngsim": _load_ngsim,
     **{f"astazero-{name}": partial(_load_astazero, split=split) for name, split in ASTAZERO_SPLITS.items()},
@@ -152,7 +161,7 @@ def load_field_data(name: str, file: str) -> FieldData:
 
 
 def field_fits(files: dict[str, str]) -> list[FieldFit]:
-    """Return the fits of all models to all data sets; `files` are those of `ngsim` and `astazero`."""
+    """Return the fits of all models to all data sets; `files` has the paths of `ngsim` and `astazero`."""
     fits = []
     for data in FIELD_DATA_LOADERS:
         source = data.partition("-")[0]
@@ -165,25 +174,30 @@ def field_fits(files: dict[str, str]) -> list[FieldFit]:
 
 
 def evaluate_fit(fit: FieldFit) -> dict[str, Any]:
-    """Return the errors of a model on each test set, by trajectory."""
+    """Fit a model, and return its errors on each test set by trajectory."""
     data = load_field_data(fit.data_set, fit.file)
     own = fit.model in PERSONAL_MODELS
     model, facts = _fit_personal_idm(data, PERSONAL_MODELS[fit.model]) if own else _fit_model(fit, data)
     tests = {**({} if own else data.test), "second halves": split_halves(data.test["test"])[1]}
-    found = {name: trajectory_errors(model, make_segments(pairs, data.max_segment)) for name, pairs in tests.items()}
+    found = {
+        name: trajectory_errors(model, make_segments(trajectories, data.max_segment))
+        for name, trajectories in tests.items()
+    }
     return {"data_set": fit.data_set, "model": fit.model, "seed": fit.seed, **facts, "tests": found}
 
 
-def split_halves(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Pair]]:
+def split_halves(
+    trajectories: Sequence[FollowingTrajectory],
+) -> tuple[list[FollowingTrajectory], list[FollowingTrajectory]]:
     """Return the first and the second halves of trajectories."""
-    first = [pair.part(0, len(pair.speed) // 2) for pair in pairs]
-    return first, [pair.part(len(pair.speed) // 2, len(pair.speed)) for pair in pairs]
+    first = [each.part(0, len(each.speed) // 2) for each in trajectories]
+    return first, [each.part(len(each.speed) // 2, len(each.speed)) for each in trajectories]
 
 
 def trajectory_errors(model: DriverModel, segments: Segments) -> dict[str, list[float]]:
-    """Return the errors of each trajectory, from which the confidence intervals are computed."""
-    simulated = simulate_open_loop(model, segments)
-    owned = [segments.pair_index == owner for owner in np.unique(segments.pair_index)]
+    """Return the number of samples, the mean squared errors and the share of collisions of each trajectory."""
+    simulated = simulate_followers(model, segments)
+    owned = [segments.trajectory_index == owner for owner in np.unique(segments.trajectory_index)]
 
     def by_owner(values: np.ndarray) -> list[float]:
         return [float(np.average(values[own], weights=simulated.sample_counts[own])) for own in owned]
@@ -200,18 +214,18 @@ def trajectory_errors(model: DriverModel, segments: Segments) -> dict[str, list[
 def _fit_model(fit: FieldFit, data: FieldData) -> tuple[DriverModel, dict[str, Any]]:
     """Return a model fitted to the training data, and facts about the fit."""
     if fit.model in PAPER_IDM_MODELS:
-        return fixed_driver(idm_function(PAPER_IDM, PAPER_IDM_MODELS[fit.model])), {}
+        return as_driver_model(idm_function(PAPER_IDM, PAPER_IDM_MODELS[fit.model])), {}
     if fit.model in CALIBRATED_MODELS:
         found = calibrate_idm(data.training, CALIBRATED_MODELS[fit.model])
         return found.model(ACCELERATION_LIMITS), {"calibrated": asdict(found)}
     chosen = split_by_driver(data.training, (0.8, 0.2, 0.0), seed=0)
-    learn, validation = pairs_in_splits(chosen, "train"), pairs_in_splits(chosen, "validation")
+    learn, validation = select_splits(chosen, "train"), select_splits(chosen, "validation")
     if fit.model in MULTI_STEP_MODELS:
-        # The base must not use the validation pairs, which decide whether a residual is better than none.
+        # The base must not be calibrated to the validation trajectories, which decide whether a residual is used.
         found = calibrate_idm(learn, CALIBRATED_MODELS[fit.model.removesuffix(MULTI_STEP_SUFFIX)])
         learning, checking = (
-            CalibratedPairs(pairs, [found.parameters] * len(pairs), found.initial_headway_weight)
-            for pairs in (learn, validation)
+            CalibratedTrajectories(trajectories, [found.parameters] * len(trajectories), found.initial_headway_weight)
+            for trajectories in (learn, validation)
         )
         fitted = fit_multi_step(learning, checking, ACCELERATION_LIMITS, MULTI_STEP_SETTINGS, fit.seed)
         best = int(np.argmin(fitted.validation_errors)) * MULTI_STEP_SETTINGS.validation_interval
@@ -222,25 +236,25 @@ def _fit_model(fit: FieldFit, data: FieldData) -> tuple[DriverModel, dict[str, A
     if fit.model == "knowledge, IDM":
         base = idm_function(calibrate_idm(learn).parameters, ACCELERATION_LIMITS)
     stride = ROW_STRIDES[fit.data_set.partition("-")[0]]
-    samples = (following_samples(pairs) for pairs in (learn, validation))
+    samples = (following_samples(trajectories) for trajectories in (learn, validation))
     rows, checking = (each.select(np.arange(0, len(each), stride)) for each in samples)
     network, losses = fit_one_step(rows, checking, base, ONE_STEP_SETTINGS, fit.seed)
-    model = add_residual(fixed_driver(base) if base else None, batched_network(network.to_numpy_network()))
+    model = add_residual(as_driver_model(base) if base else None, batched_network(network.to_numpy_network()))
     return model, {"epochs": len(losses.training)}
 
 
 def _fit_personal_idm(data: FieldData, personal_parameters: Sequence[str]) -> tuple[DriverModel, dict[str, Any]]:
-    """Return IDMs with some parameters calibrated on the first half of each test trajectory."""
+    """Return IDMs with some parameters calibrated to the first half of each test trajectory, and their parameters."""
     first, second = split_halves(data.test["test"])
     typical = calibrate_idm(data.training, CALIBRATED_MODELS["IDM"]).parameters
-    found = calibrate_groups([[pair] for pair in first], typical, personal_parameters, CALIBRATED_MODELS["IDM"])
-    rows = [found[number].parameters for number in make_segments(second, data.max_segment).pair_index]
+    found = calibrate_groups([[each] for each in first], typical, personal_parameters, CALIBRATED_MODELS["IDM"])
+    rows = [found[number].parameters for number in make_segments(second, data.max_segment).trajectory_index]
     model = individual_idm(stack_idm_parameters(rows), 0.0, ACCELERATION_LIMITS)
     return model, {"calibrated": [asdict(one) for one in found]}
 
 
 def run_field_study(folder: Path, ngsim: Path, astazero: Path, workers: int = 2) -> None:
-    """Measure the parts that are missing in `folder/parts`, and write `field.json` and `field.png`."""
+    """Measure the fits that are missing in `folder/parts`, and write `field.json` and `field.png`."""
     about = study_manifest(folder)
     fits = field_fits({"ngsim": str(ngsim), "astazero": str(astazero)})
     rows = field_rows(measure_parts(folder / "parts", {fit.name: (evaluate_fit, (fit,)) for fit in fits}, workers))
@@ -274,7 +288,7 @@ def _bootstrap_errors(square_errors: dict[str, list[float]]) -> dict[str, Any]:
 
 @rc_context(PLOT_STYLE)
 def field_figure(rows: Table) -> Figure:
-    """Return the errors on NGSIM: of the gap in open loop and of one step."""
+    """Draw the errors on NGSIM: of the simulated gap, and of the acceleration one step ahead."""
     figure = new_figure(4.2, width=11)
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     styles = zip(TEST_SET_LABELS.items(), (LINE_COLORS[2], LINE_COLORS[0]), (0.14, -0.14), strict=True)
@@ -285,7 +299,9 @@ def field_figure(rows: Table) -> Figure:
     left.axvline(PUBLISHED_GAP_ERROR, color=TEXT_COLOR, lw=0.9, ls=":")
     left.annotate("published", (PUBLISHED_GAP_ERROR + 0.1, len(MODEL_LABELS) - 0.45), fontsize=8, color=TEXT_COLOR)
     left.set_yticks(range(len(MODEL_LABELS)), list(MODEL_LABELS.values())[::-1])
-    left.set(xlim=ERROR_AXIS_LIMITS["gap"], ylim=(-0.6, len(MODEL_LABELS) - 0.2), xlabel="gap error in open loop [m]")
+    left.set(
+        xlim=ERROR_AXIS_LIMITS["gap"], ylim=(-0.6, len(MODEL_LABELS) - 0.2), xlabel="error of the simulated gap [m]"
+    )
     right.set(xlim=ERROR_AXIS_LIMITS["one_step"], xlabel="error of the acceleration, one step [m/s²]")
     left.plot([], [], "o", ms=4.5, color=TEXT_COLOR, mfc="white", label="some collide")
     left.legend(loc="lower right")

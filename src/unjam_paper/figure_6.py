@@ -22,9 +22,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from unjam.following.four_regimes import MIN_REGIME_GAP, FourRegimesSettings, make_four_regimes
+from unjam.following.leader_replay import add_residual, as_driver_model, idm_function
 from unjam.following.networks import NetworkSettings, batched_network, fit_one_step
-from unjam.following.open_loop import add_residual, fixed_driver, idm_function
-from unjam.following.pairs import SPLITS, Floats, FollowingSamples, following_samples, pairs_in_splits, split_by_driver
+from unjam.following.trajectories import (
+    SPLITS,
+    Floats,
+    FollowingSamples,
+    following_samples,
+    select_splits,
+    split_by_driver,
+)
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
@@ -102,11 +109,11 @@ def four_regime_fits() -> list[FourRegimeFit]:
 @cache
 def split_rows(driver: str, split: SplitKind) -> DataSplit:
     """Return the rows for training, validation and test, always the same."""
-    pairs = make_four_regimes(DATA_SETTINGS[driver])
+    trajectories = make_four_regimes(DATA_SETTINGS[driver])
     if split == "trajectories":
-        chosen = split_by_driver(pairs, SPLIT_SHARES, seed=0)
-        return DataSplit(*(following_samples(pairs_in_splits(chosen, name)) for name in SPLITS), overlap=0.0)
-    rows, generator = following_samples(pairs), np.random.default_rng(0)
+        chosen = split_by_driver(trajectories, SPLIT_SHARES, seed=0)
+        return DataSplit(*(following_samples(select_splits(chosen, name)) for name in SPLITS), overlap=0.0)
+    rows, generator = following_samples(trajectories), np.random.default_rng(0)
     borders = np.round(np.cumsum(SPLIT_SHARES)[:-1] * len(rows)).astype(int)
     training, validation, test = np.split(generator.permutation(len(rows)), borders)
     if split == "released":
@@ -150,11 +157,11 @@ def average_acceleration(rows: FollowingSamples, settings: FourRegimesSettings) 
 
     gap = clamp_min(rows.gap, MIN_REGIME_GAP)
     idm = idm_acceleration(rows.speed, rows.leader_speed, gap, settings.driver)
-    least = -rows.speed / settings.step
-    if settings.noise == 0:
+    least = -rows.speed / settings.time_step
+    if settings.acceleration_noise == 0:
         return np.maximum(idm, least)
-    above = (idm - least) / settings.noise
-    return least + settings.noise * (norm.pdf(above) + above * norm.cdf(above))
+    above = (idm - least) / settings.acceleration_noise
+    return least + settings.acceleration_noise * (norm.pdf(above) + above * norm.cdf(above))
 
 
 def _predict_learned(fit: FourRegimeFit, training: FollowingSamples, rows: DataSplit) -> tuple[Floats, dict[str, Any]]:
@@ -163,7 +170,7 @@ def _predict_learned(fit: FourRegimeFit, training: FollowingSamples, rows: DataS
         training = training.select(np.tile(np.arange(len(training)), LONG_PASS_REPEATS))
     chosen = np.random.default_rng(0).permutation(len(rows.validation))[:MAX_VALIDATION_ROWS]
     network, losses = fit_one_step(training, rows.validation.select(chosen), base, NetworkSettings(), fit.repeat)
-    model = add_residual(fixed_driver(base) if base else None, batched_network(network.to_numpy_network()))
+    model = add_residual(as_driver_model(base) if base else None, batched_network(network.to_numpy_network()))
     predicted = model(rows.test.speed[:1], rows.test.gap[:1])(*rows.test.inputs)
     facts = {"training_loss": losses.training, "validation_loss": losses.validation}
     return predicted, {"epochs": len(losses.training), **facts}

@@ -3,9 +3,9 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from tests.following.synthetic_pairs import idm_driver
+from tests.following.synthetic_trajectories import idm_driver
 from unjam.following.calibration import CalibrationSettings, calibrate_groups, calibrate_idm, gap_objective
-from unjam.following.pairs import Pair, make_segments
+from unjam.following.trajectories import FollowingTrajectory, make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 
 QUICK = CalibrationSettings(generations=40)
@@ -21,8 +21,8 @@ def test_true_parameters_have_no_error() -> None:
 
 
 def test_calibration_finds_the_time_headway() -> None:
-    pairs = [idm_driver(DRIVER, seed=seed) for seed in range(3)]
-    result = calibrate_idm(pairs, QUICK)
+    trajectories = [idm_driver(DRIVER, seed=seed) for seed in range(3)]
+    result = calibrate_idm(trajectories, QUICK)
     assert result.gap_error < 0.2
     assert result.parameters.time_headway == pytest.approx(0.9, abs=0.15)
     assert result.collisions == 0
@@ -30,9 +30,9 @@ def test_calibration_finds_the_time_headway() -> None:
 
 
 def test_same_seed_gives_the_same_result() -> None:
-    pairs = [idm_driver(DRIVER, seconds=10.0)]
+    trajectories = [idm_driver(DRIVER, seconds=10.0)]
     settings = CalibrationSettings(generations=3)
-    assert calibrate_idm(pairs, settings) == calibrate_idm(pairs, settings)
+    assert calibrate_idm(trajectories, settings) == calibrate_idm(trajectories, settings)
 
 
 def test_parameter_at_a_bound_is_named() -> None:
@@ -43,7 +43,7 @@ def test_parameter_at_a_bound_is_named() -> None:
 HEADWAYS = (0.8, 1.6, 1.15)
 
 
-def groups() -> list[list[Pair]]:
+def groups() -> list[list[FollowingTrajectory]]:
     """Return drivers that differ in their time headway alone; the second has two trajectories."""
     drivers = [[idm_driver(IDMParameters(time_headway=headway), f"{headway}")] for headway in HEADWAYS]
     drivers[1].append(idm_driver(IDMParameters(time_headway=HEADWAYS[1]), "1.6", seed=4, seconds=20.0))

@@ -5,7 +5,7 @@ import pytest
 
 from unjam.drivers import LocalState, PISaturation
 from unjam.following.calibration import calibrate_human_drivers
-from unjam.following.pairs import pairs_behind_cavs
+from unjam.following.trajectories import trajectories_behind_cavs
 from unjam.models.environment_data import EnvironmentData, Recording
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
@@ -31,20 +31,20 @@ def test_calibration_finds_the_parameters_of_human_drivers(data: EnvironmentData
     assert (calibrated.desired_speed, calibrated.minimum_gap) == (30.0, 2.0)
 
 
-def test_pairs_are_those_of_the_followers(data: EnvironmentData) -> None:
-    pairs = pairs_behind_cavs(states_of(data), RING.control_step)
-    assert len(pairs) == 2
+def test_trajectories_are_those_of_the_followers(data: EnvironmentData) -> None:
+    trajectories = trajectories_behind_cavs(states_of(data), RING.control_step)
+    assert len(trajectories) == 2
     states = data.recordings[0].states
-    np.testing.assert_array_equal(pairs[0].leader_speed, states.speed[: len(pairs[0].speed)])
-    np.testing.assert_array_equal(pairs[0].gap, states.follower_gap[: len(pairs[0].speed)])
+    np.testing.assert_array_equal(trajectories[0].leader_speed, states.speed[: len(trajectories[0].speed)])
+    np.testing.assert_array_equal(trajectories[0].gap, states.follower_gap[: len(trajectories[0].speed)])
 
 
-def test_another_follower_starts_another_pair(data: EnvironmentData) -> None:
+def test_another_follower_starts_another_trajectory(data: EnvironmentData) -> None:
     recording = data.recordings[0]
     gap = np.array(recording.states.follower_gap, np.float64)
     gap[400:] += 30.0
-    pairs = pairs_behind_cavs([with_follower_gap(recording, gap)], RING.control_step)
-    assert [len(pair.speed) for pair in pairs] == [400, 501]
+    trajectories = trajectories_behind_cavs([with_follower_gap(recording, gap)], RING.control_step)
+    assert [len(each.speed) for each in trajectories] == [400, 501]
 
 
 def test_hard_braking_within_a_control_step_is_not_taken_for_another_follower() -> None:
@@ -54,14 +54,14 @@ def test_hard_braking_within_a_control_step_is_not_taken_for_another_follower() 
     gap = 20.0 + np.concatenate([[0.0], np.cumsum(20.0 - follower_speeds[1:]) * 0.2])
     leader_speed, missing = np.full(26, 20.0), np.full(26, np.nan)
     states = LocalState(leader_speed, leader_speed, leader_speed, follower_speeds[::5], gap[::5], missing, missing)
-    assert [len(pair.speed) for pair in pairs_behind_cavs([states], 1.0, 5)] == [26]
-    assert pairs_behind_cavs([states], 1.0) == []
+    assert [len(each.speed) for each in trajectories_behind_cavs([states], 1.0, 5)] == [26]
+    assert trajectories_behind_cavs([states], 1.0) == []
 
 
 def test_without_followers_the_parameters_of_the_scenario_remain(data: EnvironmentData) -> None:
     recording = data.recordings[0]
     without_follower = with_follower_gap(recording, np.array(recording.states.loop_length, np.float64))
-    assert pairs_behind_cavs([without_follower], RING.control_step) == []
+    assert trajectories_behind_cavs([without_follower], RING.control_step) == []
     assert calibrate_human_drivers([without_follower], RING) == RING.humans
 
 

@@ -3,12 +3,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.following.synthetic_pairs import idm_driver
+from tests.following.synthetic_trajectories import idm_driver
 from tests.paper.test_field_data import table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings, MultiStepSettings
 from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files, unit_warnings
-from unjam.following.pairs import Pair
+from unjam.following.trajectories import FollowingTrajectory
 from unjam.physics.idm import IDMParameters
 
 HEADWAYS = (0.9, 1.1, 1.3, 1.5, 1.7)
@@ -16,7 +16,7 @@ QUICK = CalibrationSettings(generations=15)
 
 
 @pytest.fixture(scope="module")
-def pairs() -> list[Pair]:
+def trajectories() -> list[FollowingTrajectory]:
     return [
         idm_driver(IDMParameters(time_headway=headway), f"driver {headway}", seed, seconds=25.0)
         for seed, headway in enumerate(HEADWAYS)
@@ -24,13 +24,13 @@ def pairs() -> list[Pair]:
 
 
 @pytest.mark.long
-def test_each_driver_has_its_headway_and_the_common_parameters(pairs: list[Pair]) -> None:
+def test_each_driver_has_its_headway_and_the_common_parameters(trajectories: list[FollowingTrajectory]) -> None:
     progress: list[tuple[int, int]] = []
-    population = fit_drivers(pairs, FitDriversSettings(calibration=QUICK), lambda *done: progress.append(done))
+    population = fit_drivers(trajectories, FitDriversSettings(calibration=QUICK), lambda *done: progress.append(done))
     headways = [one.time_headway for one in population.drivers]
     assert headways == sorted(headways)
     assert all(one.max_acceleration == population.typical.max_acceleration for one in population.drivers)
-    assert [detail["name"] for detail in population.details] == [pair.driver for pair in pairs]
+    assert [detail["name"] for detail in population.details] == [each.driver for each in trajectories]
     assert all(detail["gap_error"] < population.metadata["fit"]["common"]["gap_error"] for detail in population.details)
     assert population.residual is None
     assert progress[-1] == (5, 5)
@@ -40,32 +40,32 @@ def test_each_driver_has_its_headway_and_the_common_parameters(pairs: list[Pair]
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 def test_typical_headway_is_in_the_middle(seed: int) -> None:
-    pairs = [
+    trajectories = [
         idm_driver(IDMParameters(time_headway=headway), f"{headway}", number, seconds=20.0)
         for number, headway in enumerate((1.0, 1.4, 1.8))
     ]
     quick = CalibrationSettings(generations=25, candidates=3, seed=seed)
-    population = fit_drivers(pairs, FitDriversSettings(calibration=quick, rounds=2))
+    population = fit_drivers(trajectories, FitDriversSettings(calibration=quick, rounds=2))
     assert 1.1 < population.typical.time_headway < 1.7
 
 
 @pytest.mark.long
-def test_residual_is_used_only_if_it_is_better(pairs: list[Pair]) -> None:
+def test_residual_is_used_only_if_it_is_better(trajectories: list[FollowingTrajectory]) -> None:
     multi_step = MultiStepSettings(
         hidden=(4,), segment_seconds=5.0, batch_size=8, gradient_steps=2, validation_interval=1
     )
     settings = FitDriversSettings(calibration=CalibrationSettings(generations=2), residual=True, multi_step=multi_step)
-    population = fit_drivers(pairs, settings)
+    population = fit_drivers(trajectories, settings)
     fit = population.metadata["fit"]
     assert fit["residual_is_better"] == (min(fit["residual_gap_errors"]) < fit["residual_gap_errors"][0])
     assert (population.residual is not None) == fit["residual_is_better"]
 
 
-def test_unsupported_data_and_settings_are_refused(pairs: list[Pair]) -> None:
+def test_unsupported_data_and_settings_are_refused(trajectories: list[FollowingTrajectory]) -> None:
     with pytest.raises(InputError, match=r"drivers: 2 is not allowed; allowed: >= 5 for a residual"):
-        fit_drivers(pairs[:2], FitDriversSettings(residual=True))
+        fit_drivers(trajectories[:2], FitDriversSettings(residual=True))
     with pytest.raises(InputError, match="individual: 'exponent' is not allowed"):
-        fit_drivers(pairs, FitDriversSettings(individual=("exponent",)))
+        fit_drivers(trajectories, FitDriversSettings(individual=("exponent",)))
 
 
 CHANGES = {"calibration.generations": 2, "residual": False}
@@ -77,9 +77,9 @@ def data(tmp_path: Path) -> Path:
 
 
 def test_speeds_in_another_unit_than_gaps_give_a_warning() -> None:
-    pair = idm_driver(IDMParameters(time_headway=1.3))
-    assert unit_warnings([pair]) == []
-    in_kmh = replace(pair, speed=3.6 * pair.speed, leader_speed=3.6 * pair.leader_speed)
+    trajectory = idm_driver(IDMParameters(time_headway=1.3))
+    assert unit_warnings([trajectory]) == []
+    in_kmh = replace(trajectory, speed=3.6 * trajectory.speed, leader_speed=3.6 * trajectory.leader_speed)
     (line,) = unit_warnings([in_kmh])
     assert line.startswith("warning: gaps change 0.28 times as fast as the speeds imply")
 

@@ -8,20 +8,20 @@ import pytest
 
 from tests.worlds.sumo.user_networks import straight
 from unjam.errors import InputError
-from unjam.following.loaders import METERS_PER_FOOT, ReadOptions, read_pairs
+from unjam.following.loaders import METERS_PER_FOOT, ReadOptions, read_trajectories
 from unjam.worlds.sumo.networks import sumo_program
 
 SHORT = ReadOptions(min_seconds=1.0)
 SPEED, LEADER, GAP = 10.0, 12.0, 20.0
-MOMENTS = 30
+SAMPLES = 30
 
 
 def table(path: Path, **changes: object) -> Path:
     """Write a plain table of two pairs, the second of which starts later."""
     parts = []
     for pair, start in (("one", 0.0), ("two", 100.0)):
-        times = start + 0.1 * np.arange(MOMENTS)
-        gap = GAP + (LEADER - SPEED) * 0.1 * np.arange(MOMENTS)
+        times = start + 0.1 * np.arange(SAMPLES)
+        gap = GAP + (LEADER - SPEED) * 0.1 * np.arange(SAMPLES)
         parts.append(pd.DataFrame({"pair": pair, "time": times, "speed": SPEED, "leader_speed": LEADER, "gap": gap}))
     frame = pd.concat(parts, ignore_index=True).assign(**changes)
     frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_csv(path, index=False)
@@ -32,13 +32,13 @@ def ngsim(path: Path, feet: float = METERS_PER_FOOT, **changes: object) -> Path:
     """Write two vehicles, the second behind the first, in the public format: feet and milliseconds."""
     rows = []
     for vehicle, preceding, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
-        for moment in range(MOMENTS):
+        for sample in range(SAMPLES):
             rows.append(
                 {
                     "Vehicle_ID": vehicle,
-                    "Frame_ID": moment,
-                    "Global_Time": 1118846980200 + 100 * moment,
-                    "Local_Y": (front + speed * 0.1 * moment) / feet,
+                    "Frame_ID": sample,
+                    "Global_Time": 1118846980200 + 100 * sample,
+                    "Local_Y": (front + speed * 0.1 * sample) / feet,
                     "v_Length": 5.0 / feet,
                     "v_Vel": speed / feet,
                     "Lane_ID": 2,
@@ -54,7 +54,7 @@ def reconstructed(path: Path, header: bool) -> Path:
     """Write the same in meters, as in the reconstructed files."""
     rows = []
     for vehicle, leader, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
-        for frame in range(MOMENTS):
+        for frame in range(SAMPLES):
             rows.append([vehicle, frame, 2, front + speed * 0.1 * frame, speed, 0.0, 5.0, 2, 0, leader])
     names = ["Vehicle_ID", "Frame_ID", "Lane_ID", "LocalY", "Mean_Speed", "Mean_Accel", "Vehicle_length"]
     names += ["Vehicle_Class_ID", "Follower_ID", "Leader_ID"]
@@ -64,7 +64,7 @@ def reconstructed(path: Path, header: bool) -> Path:
 
 def openacc(path: Path) -> Path:
     """Write a platoon of three vehicles, of which the third is driven by ACC."""
-    times = 0.1 * np.arange(MOMENTS)
+    times = 0.1 * np.arange(SAMPLES)
     gap = GAP + (LEADER - SPEED) * times
     frame = pd.DataFrame({"Time": times, "Speed1": LEADER, "Speed2": SPEED, "Speed3": SPEED})
     frame = frame.assign(IVS1=gap, IVS2=15.0, Driver1="Human", Driver2="Human", Driver3="ACC")
@@ -77,7 +77,7 @@ def highd(path: Path, sign: int = 1) -> Path:
     """Write two vehicles as in highD: x is the left end of a vehicle, whatever its direction."""
     rows = []
     for vehicle, leader, rear, speed in ((1, 0, 100.0, LEADER), (2, 1, 100.0 - GAP - 5.0, SPEED)):
-        for frame in range(MOMENTS):
+        for frame in range(SAMPLES):
             start = rear + speed * frame / 25.0
             left = start if sign > 0 else 400.0 - start - 5.0
             row = {"frame": frame, "id": vehicle, "x": left, "y": 8.0, "width": 5.0, "height": 2.0}
@@ -88,24 +88,24 @@ def highd(path: Path, sign: int = 1) -> Path:
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_highd_is_read_on_both_carriageways(tmp_path: Path, sign: int) -> None:
-    (pair,) = read_pairs(highd(tmp_path / "01_tracks.csv", sign), options=replace(SHORT, min_seconds=1.0)).pairs
-    assert pair.step == 0.04
-    np.testing.assert_allclose(pair.speed, SPEED)
-    np.testing.assert_allclose(pair.leader_speed, LEADER)
-    np.testing.assert_allclose(pair.gap, GAP + (LEADER - SPEED) * 0.04 * np.arange(MOMENTS), atol=1e-6)
+    (trajectory,) = read_trajectories(highd(tmp_path / "01_tracks.csv", sign), options=SHORT).trajectories
+    assert trajectory.time_step == 0.04
+    np.testing.assert_allclose(trajectory.speed, SPEED)
+    np.testing.assert_allclose(trajectory.leader_speed, LEADER)
+    np.testing.assert_allclose(trajectory.gap, GAP + (LEADER - SPEED) * 0.04 * np.arange(SAMPLES), atol=1e-6)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_standing_vehicle_on_highd_keeps_its_position(tmp_path: Path, sign: int) -> None:
     path = highd(tmp_path / "01_tracks.csv", sign)
     table = pd.read_csv(path)
-    leader, half = table["id"] == 1, MOMENTS // 2
+    leader, half = table["id"] == 1, SAMPLES // 2
     is_standing = leader & (table["frame"] >= half)
     table.loc[is_standing, "x"] = table.loc[leader & (table["frame"] == half), "x"].item()
     table.loc[is_standing, "xVelocity"] = 0.0
     table.to_csv(path, index=False)
-    (pair,) = read_pairs(path, options=replace(SHORT, min_seconds=1.0)).pairs
-    assert np.abs(np.diff(pair.gap)).max() < 0.04 * max(SPEED, LEADER) + 1e-6
+    (trajectory,) = read_trajectories(path, options=SHORT).trajectories
+    assert np.abs(np.diff(trajectory.gap)).max() < 0.04 * max(SPEED, LEADER) + 1e-6
 
 
 def test_fcd_output_of_sumo_has_consistent_gaps(tmp_path: Path) -> None:
@@ -113,25 +113,25 @@ def test_fcd_output_of_sumo_has_consistent_gaps(tmp_path: Path) -> None:
     options = ["--fcd-output", "fcd.csv", "--fcd-output.max-leader-distance", "200"]
     command = [sumo_program("sumo"), "-c", str(straight(tmp_path, flow)), *options]
     subprocess.run(command, cwd=tmp_path, capture_output=True, check=True)
-    result = read_pairs(tmp_path / "fcd.csv")
-    assert {pair.driver for pair in result.pairs} == {f"f.{number}" for number in range(1, 5)}
-    for pair in result.pairs:
-        gap_changes = np.cumsum(pair.leader_speed - pair.speed)[1:] * pair.step
-        np.testing.assert_allclose(pair.gap[1:] - pair.gap[0], gap_changes, atol=0.6)
-        assert pair.gap.min() > 20
+    result = read_trajectories(tmp_path / "fcd.csv")
+    assert {each.driver for each in result.trajectories} == {f"f.{number}" for number in range(1, 5)}
+    for trajectory in result.trajectories:
+        gap_changes = np.cumsum(trajectory.leader_speed - trajectory.speed)[1:] * trajectory.time_step
+        np.testing.assert_allclose(trajectory.gap[1:] - trajectory.gap[0], gap_changes, atol=0.6)
+        assert trajectory.gap.min() > 20
     frame = pd.read_csv(tmp_path / "fcd.csv", sep=";")
     frame.drop(columns="vehicle_leaderSpeed").to_csv(tmp_path / "without.csv", sep=";", index=False)
     with pytest.raises(InputError, match="no column 'vehicle_leaderSpeed'"):
-        read_pairs(tmp_path / "without.csv")
+        read_trajectories(tmp_path / "without.csv")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_plain_table_is_read(tmp_path: Path, suffix: str) -> None:
-    result = read_pairs(table(tmp_path / f"t{suffix}", kind="human", driver="me"), options=SHORT)
-    assert [pair.name for pair in result.pairs] == ["one", "two"]
-    pair = result.pairs[0]
-    assert (pair.step, pair.kind, pair.driver) == (0.1, "human", "me")
-    assert (pair.speed[0], pair.leader_speed[0], pair.gap[0]) == (SPEED, LEADER, GAP)
+    result = read_trajectories(table(tmp_path / f"t{suffix}", kind="human", driver="me"), options=SHORT)
+    assert [each.name for each in result.trajectories] == ["one", "two"]
+    trajectory = result.trajectories[0]
+    assert (trajectory.time_step, trajectory.kind, trajectory.driver) == (0.1, "human", "me")
+    assert (trajectory.speed[0], trajectory.leader_speed[0], trajectory.gap[0]) == (SPEED, LEADER, GAP)
     assert result.summary_lines() == ["2 trajectories with 60 of 60 rows"]
 
 
@@ -139,16 +139,16 @@ def test_plain_table_is_read(tmp_path: Path, suffix: str) -> None:
     "make", [ngsim, lambda path: reconstructed(path, True), lambda path: reconstructed(path, False), openacc]
 )
 def test_public_formats_are_converted_to_si_units(tmp_path: Path, make) -> None:
-    pair = read_pairs(make(tmp_path / "data.csv"), options=SHORT).pairs[0]
-    assert len(pair.speed) == MOMENTS
-    assert pair.step == 0.1
-    np.testing.assert_allclose(pair.speed, SPEED)
-    np.testing.assert_allclose(pair.leader_speed, LEADER)
-    np.testing.assert_allclose(pair.gap, GAP + (LEADER - SPEED) * 0.1 * np.arange(MOMENTS), atol=1e-6)
+    trajectory = read_trajectories(make(tmp_path / "data.csv"), options=SHORT).trajectories[0]
+    assert len(trajectory.speed) == SAMPLES
+    assert trajectory.time_step == 0.1
+    np.testing.assert_allclose(trajectory.speed, SPEED)
+    np.testing.assert_allclose(trajectory.leader_speed, LEADER)
+    np.testing.assert_allclose(trajectory.gap, GAP + (LEADER - SPEED) * 0.1 * np.arange(SAMPLES), atol=1e-6)
 
 
 def test_rows_without_leader_are_counted(tmp_path: Path) -> None:
-    result = read_pairs(ngsim(tmp_path / "data.csv"), options=SHORT)
+    result = read_trajectories(ngsim(tmp_path / "data.csv"), options=SHORT)
     assert result.summary_lines() == [
         "1 trajectories with 30 of 60 rows",
         "skipped: 30 rows: no leader, or leader not recorded",
@@ -157,27 +157,30 @@ def test_rows_without_leader_are_counted(tmp_path: Path) -> None:
 
 def test_meters_in_a_format_in_feet_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a median vehicle length of 1\.5 m is not allowed"):
-        read_pairs(ngsim(tmp_path / "data.csv", feet=1.0), options=SHORT)
+        read_trajectories(ngsim(tmp_path / "data.csv", feet=1.0), options=SHORT)
 
 
 def test_openacc_drivers_have_the_names_of_their_vehicles(tmp_path: Path) -> None:
-    result = read_pairs(openacc(tmp_path / "platoon.csv"), options=SHORT)
-    assert [(pair.driver, pair.kind) for pair in result.pairs] == [("Tesla(Model3)", "Human"), ("BMW(X5)", "ACC")]
+    result = read_trajectories(openacc(tmp_path / "platoon.csv"), options=SHORT)
+    assert [(each.driver, each.kind) for each in result.trajectories] == [
+        ("Tesla(Model3)", "Human"),
+        ("BMW(X5)", "ACC"),
+    ]
 
 
 def test_change_of_kind_is_another_driver_and_a_bad_gap_ends_only_its_own_pair(tmp_path: Path) -> None:
     path = openacc(tmp_path / "platoon.csv")
     lines = path.read_text().splitlines()
     frame = pd.read_csv(path, skiprows=3)
-    frame.loc[MOMENTS // 2 :, "Driver2"] = "ACC"
-    frame.loc[MOMENTS // 2, "IVS2"] = np.nan
+    frame.loc[SAMPLES // 2 :, "Driver2"] = "ACC"
+    frame.loc[SAMPLES // 2, "IVS2"] = np.nan
     path.write_text("\n".join([*lines[:3], frame.to_csv(index=False)]))
-    result = read_pairs(path, options=replace(SHORT, drop_bad_rows=True))
-    trajectories = [(pair.driver, len(pair.speed)) for pair in result.pairs if pair.driver.startswith("Tesla")]
-    half = MOMENTS // 2
-    assert trajectories == [("Tesla(Model3)-ACC", MOMENTS - half), ("Tesla(Model3)-Human", half)]
-    third = [len(pair.speed) for pair in result.pairs if pair.driver == "BMW(X5)"]
-    assert sorted(third) == [MOMENTS - half - 1, half]
+    result = read_trajectories(path, options=replace(SHORT, drop_bad_rows=True))
+    trajectories = [(each.driver, len(each.speed)) for each in result.trajectories if each.driver.startswith("Tesla")]
+    half = SAMPLES // 2
+    assert trajectories == [("Tesla(Model3)-ACC", SAMPLES - half), ("Tesla(Model3)-Human", half)]
+    third = [len(each.speed) for each in result.trajectories if each.driver == "BMW(X5)"]
+    assert sorted(third) == [SAMPLES - half - 1, half]
     assert len(result.bad_rows) == 1
 
 
@@ -199,14 +202,14 @@ def table_with_bad_value(path: Path, row: int, column: str, value: object) -> Pa
 )
 def test_bad_row_is_refused_with_its_line(tmp_path: Path, column: str, value: object, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        read_pairs(table_with_bad_value(tmp_path / "t.csv", 5, column, value), options=SHORT)
+        read_trajectories(table_with_bad_value(tmp_path / "t.csv", 5, column, value), options=SHORT)
 
 
 def test_bad_row_can_be_dropped_and_is_reported(tmp_path: Path) -> None:
     path = table_with_bad_value(tmp_path / "t.csv", 12, "gap", "")
-    result = read_pairs(path, options=ReadOptions(drop_bad_rows=True, min_seconds=1.0))
-    assert [len(pair.speed) for pair in result.pairs] == [12, 17, 30]
-    assert len({pair.name for pair in result.pairs}) == 3
+    result = read_trajectories(path, options=ReadOptions(drop_bad_rows=True, min_seconds=1.0))
+    assert [len(each.speed) for each in result.trajectories] == [12, 17, 30]
+    assert len({each.name for each in result.trajectories}) == 3
     assert result.bad_rows == {14: "gap: nan is not allowed; allowed: 0 to 1000"}
     assert "dropped: line 14: gap: nan is not allowed; allowed: 0 to 1000" in result.summary_lines()
 
@@ -215,8 +218,8 @@ def test_short_trajectories_are_counted(tmp_path: Path) -> None:
     path = table(tmp_path / "t.csv")
     frame = pd.read_csv(path)
     frame.drop(index=[40]).to_csv(path, index=False)
-    result = read_pairs(path, options=ReadOptions(min_seconds=1.5))
-    assert [len(pair.speed) for pair in result.pairs] == [30, 19]
+    result = read_trajectories(path, options=ReadOptions(min_seconds=1.5))
+    assert [len(each.speed) for each in result.trajectories] == [30, 19]
     assert result.skipped_rows == {"trajectories shorter than 1.5 s": 10}
 
 
@@ -230,34 +233,36 @@ def test_short_trajectories_are_counted(tmp_path: Path) -> None:
 )
 def test_unreadable_files_are_refused(tmp_path: Path, make, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        read_pairs(make(tmp_path), "table", SHORT)
+        read_trajectories(make(tmp_path), "table", SHORT)
 
 
 def test_table_with_only_short_trajectories_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no trajectory lasts 20 s"):
-        read_pairs(table(tmp_path / "t.csv"))
+        read_trajectories(table(tmp_path / "t.csv"))
 
 
 def test_driver_columns_name_the_driver(tmp_path: Path) -> None:
     path = table(tmp_path / "t.csv", period=400, follower=5)
-    pairs = read_pairs(path, options=ReadOptions(min_seconds=1.0, driver_columns=("period", "follower"))).pairs
-    assert {pair.driver for pair in pairs} == {"400-5"}
+    trajectories = read_trajectories(
+        path, options=ReadOptions(min_seconds=1.0, driver_columns=("period", "follower"))
+    ).trajectories
+    assert {each.driver for each in trajectories} == {"400-5"}
 
 
 def test_unknown_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format: 'ind' is not allowed"):
-        read_pairs(table(tmp_path / "t.csv"), "ind")
+        read_trajectories(table(tmp_path / "t.csv"), "ind")
 
 
 def test_reused_vehicle_number_is_another_driver(tmp_path: Path) -> None:
     first = pd.read_csv(ngsim(tmp_path / "first.csv"))
     reused = first.assign(Global_Time=first["Global_Time"] + 15 * 60 * 1000)
     pd.concat([reused, first]).to_csv(tmp_path / "both.csv", index=False)
-    result = read_pairs(tmp_path / "both.csv", options=SHORT).pairs
-    assert sorted(pair.driver for pair in result) == ["i-80-8", "i-80-8-2"]
+    result = read_trajectories(tmp_path / "both.csv", options=SHORT).trajectories
+    assert sorted(each.driver for each in result) == ["i-80-8", "i-80-8-2"]
 
 
 def test_pair_without_driver_name_is_its_own_driver(tmp_path: Path) -> None:
-    drivers = ["anna"] * MOMENTS + [None] * MOMENTS
-    result = read_pairs(table(tmp_path / "data.csv", driver=drivers, kind=None), options=SHORT)
-    assert [(pair.driver, pair.kind) for pair in result.pairs] == [("anna", ""), ("two", "")]
+    drivers = ["anna"] * SAMPLES + [None] * SAMPLES
+    result = read_trajectories(table(tmp_path / "data.csv", driver=drivers, kind=None), options=SHORT)
+    assert [(each.driver, each.kind) for each in result.trajectories] == [("anna", ""), ("two", "")]

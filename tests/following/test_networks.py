@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.following.synthetic_pairs import follower, idm_driver
+from tests.following.synthetic_trajectories import follower, idm_driver
+from unjam.following.leader_replay import AccelerationBounds, add_residual, idm_function, simulate_followers
 from unjam.following.networks import (
-    CalibratedPairs,
+    CalibratedTrajectories,
     FollowingNetwork,
     MultiStepSettings,
     NetworkSettings,
@@ -12,8 +13,7 @@ from unjam.following.networks import (
     fit_multi_step,
     fit_one_step,
 )
-from unjam.following.open_loop import AccelerationBounds, add_residual, idm_function, simulate_open_loop
-from unjam.following.pairs import FollowingSamples, following_samples, make_segments
+from unjam.following.trajectories import FollowingSamples, following_samples, make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios.population import residual_inputs
 
@@ -87,28 +87,30 @@ def aggressive_idm(speed: np.ndarray, leader_speed: np.ndarray, gap: np.ndarray)
     return idm_function(PAPER_IDM)(speed, leader_speed, gap) + 0.5
 
 
-def calibrated_pairs(seeds: range) -> CalibratedPairs:
-    pairs = [follower(aggressive_idm, f"{seed}", 20.0, seed=seed) for seed in seeds]
-    return CalibratedPairs(pairs, [PAPER_IDM] * len(pairs))
+def calibrated_trajectories(seeds: range) -> CalibratedTrajectories:
+    trajectories = [follower(aggressive_idm, f"{seed}", 20.0, seed=seed) for seed in seeds]
+    return CalibratedTrajectories(trajectories, [PAPER_IDM] * len(trajectories))
 
 
 @pytest.mark.long
 def test_multi_step_residual_reduces_the_gap_error() -> None:
-    fit = fit_multi_step(calibrated_pairs(range(4)), calibrated_pairs(range(4, 6)), LIMITS, MULTI_STEP, seed=0)
+    fit = fit_multi_step(
+        calibrated_trajectories(range(4)), calibrated_trajectories(range(4, 6)), LIMITS, MULTI_STEP, seed=0
+    )
     assert min(fit.validation_errors) < 0.5 * fit.validation_errors[0]
-    unseen = calibrated_pairs(range(6, 8))
-    segments = make_segments(unseen.pairs)
-    base = unseen.model(segments.pair_index, LIMITS)
-    without_residual = simulate_open_loop(base, segments)
-    with_residual = simulate_open_loop(
+    unseen = calibrated_trajectories(range(6, 8))
+    segments = make_segments(unseen.trajectories)
+    base = unseen.model(segments.trajectory_index, LIMITS)
+    without_residual = simulate_followers(base, segments)
+    with_residual = simulate_followers(
         add_residual(base, batched_network(fit.network.to_numpy_network()), LIMITS), segments
     )
     assert (with_residual.gap_mse < without_residual.gap_mse).all()
 
 
 def test_exact_base_keeps_a_zero_residual() -> None:
-    pairs = [follower(idm_function(PAPER_IDM), f"{seed}", 12.0, seed=seed) for seed in range(3)]
-    exact = CalibratedPairs(pairs, [PAPER_IDM] * 3)
+    trajectories = [follower(idm_function(PAPER_IDM), f"{seed}", 12.0, seed=seed) for seed in range(3)]
+    exact = CalibratedTrajectories(trajectories, [PAPER_IDM] * 3)
     settings = MultiStepSettings(
         hidden=(4,), segment_seconds=3.0, batch_size=4, gradient_steps=2, validation_interval=1
     )
@@ -123,7 +125,7 @@ def test_same_seed_gives_the_same_validation_errors() -> None:
     )
     one, other = (
         fit_multi_step(
-            calibrated_pairs(range(2)), calibrated_pairs(range(2, 3)), LIMITS, settings, seed=1
+            calibrated_trajectories(range(2)), calibrated_trajectories(range(2, 3)), LIMITS, settings, seed=1
         ).validation_errors
         for _ in range(2)
     )

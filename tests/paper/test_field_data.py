@@ -4,7 +4,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.following.synthetic_pairs import idm_driver
+from tests.following.synthetic_trajectories import idm_driver
 from unjam.following.calibration import CalibrationSettings
 from unjam.following.networks import MultiStepSettings, NetworkSettings
 from unjam.physics.idm import IDMParameters
@@ -16,9 +16,9 @@ def table(path: Path, groups: list[dict[str, object]]) -> str:
     """A file with a synthetic driver for each group of columns."""
     parts = []
     for number, columns in enumerate(groups):
-        pair = idm_driver(IDMParameters(time_headway=0.9 + 0.05 * number), seed=number, seconds=24.0)
-        times = [0.1 * step for step in range(len(pair.speed))]
-        numbers = {"t": times, "v_foll": pair.speed, "v_lead": pair.leader_speed, "gap": pair.gap}
+        trajectory = idm_driver(IDMParameters(time_headway=0.9 + 0.05 * number), seed=number, seconds=24.0)
+        times = [0.1 * step for step in range(len(trajectory.speed))]
+        numbers = {"t": times, "v_foll": trajectory.speed, "v_lead": trajectory.leader_speed, "gap": trajectory.gap}
         parts.append(pd.DataFrame({"pair": number, **numbers}).assign(**columns))
     pd.concat(parts).to_parquet(path)
     return str(path)
@@ -46,17 +46,17 @@ def astazero(tmp_path: Path) -> str:
 
 def test_test_pairs_are_not_used_for_training(ngsim: str, astazero: str) -> None:
     found = load_field_data("ngsim", ngsim)
-    assert (len(found.training), {name: len(pairs) for name, pairs in found.test.items()}) == (
+    assert (len(found.training), {name: len(trajectories) for name, trajectories in found.test.items()}) == (
         5,
         {"test": 2, "other drivers": 1},
     )
     for name in FIELD_DATA_LOADERS:
         data = load_field_data(name, ngsim if name == "ngsim" else astazero)
-        training = {pair.name for pair in data.training}
+        training = {each.name for each in data.training}
         assert training
-        for pairs in data.test.values():
-            assert pairs
-            assert not training & {pair.name for pair in pairs}
+        for trajectories in data.test.values():
+            assert trajectories
+            assert not training & {each.name for each in trajectories}
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from unjam.following.four_regimes import FourRegimesSettings
 from unjam.following.networks import NetworkSettings
-from unjam.following.pairs import FollowingSamples
+from unjam.following.trajectories import FollowingSamples
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_speed
 from unjam_paper import figure_6
@@ -26,7 +26,9 @@ from unjam_paper.study import StudyFolder
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    settings = {name: FourRegimesSettings(rows=6000, driver=one.driver) for name, one in figure_6.DATA_SETTINGS.items()}
+    settings = {
+        name: FourRegimesSettings(samples=6000, driver=one.driver) for name, one in figure_6.DATA_SETTINGS.items()
+    }
     monkeypatch.setattr(figure_6, "DATA_SETTINGS", settings)
     monkeypatch.setattr(figure_6, "NetworkSettings", lambda: NetworkSettings(hidden=(4,), epochs=2))
     split_rows.cache_clear()
@@ -65,9 +67,9 @@ def test_a_fit_has_an_error_with_and_without_noise(small: None, network: str) ->
 def test_noise_can_only_start_a_standing_vehicle(speed: float) -> None:
     count, settings = 200_000, FourRegimesSettings()
     rows = FollowingSamples(*(np.full(count, value) for value in (speed, 0.0, 2.0 + speed * 5, 0.0)))
-    noise = np.random.default_rng(0).normal(0.0, settings.noise, count)
+    noise = np.random.default_rng(0).normal(0.0, settings.acceleration_noise, count)
     accelerations = idm_acceleration(rows.speed, rows.leader_speed, rows.gap, settings.driver) + noise
-    drawn = (next_speed(rows.speed, accelerations, settings.step) - rows.speed) / settings.step
+    drawn = (next_speed(rows.speed, accelerations, settings.time_step) - rows.speed) / settings.time_step
     assert average_acceleration(rows, settings)[0] == pytest.approx(drawn.mean(), abs=2e-3)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.following.synthetic_pairs import write_table
+from tests.following.synthetic_trajectories import write_table
 from tests.system.conftest import ROOT, Run
 from tests.worlds.sumo.user_networks import straight
 

@@ -1,1 +1,1 @@
-"""Car following of human drivers: data, calibration, networks, and open-loop tests."""
+"""Car following of human drivers: recorded trajectories, calibration, networks, simulation behind recorded leaders."""

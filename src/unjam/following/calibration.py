@@ -1,8 +1,8 @@
-"""Calibration of the IDM on recorded drivers: the parameters whose simulated gap is closest to the recorded one.
+"""Calibration of the IDM to recorded drivers: the parameters whose simulated gaps are closest to the recorded ones.
 
-Parameters are calibrated for all drivers together, or individually on top of common ones. A least-squares fit of single
-accelerations would degenerate to a model that hardly reacts; a fit of the simulated gap must drive. Source of the
-method: Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
+All drivers get the same parameters, or some parameters are individual. The error is that of the gap in a simulation
+behind the recorded leader. A least-squares fit of single accelerations would give a model that hardly reacts to its
+leader. Source of the method: Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -16,84 +16,88 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.local_state import LocalState
-from unjam.following.open_loop import (
+from unjam.following.leader_replay import (
     AccelerationBounds,
     DriverModel,
     follow_leader,
     individual_idm,
     replace_parameters,
-    simulate_open_loop,
+    simulate_followers,
 )
-from unjam.following.pairs import Floats, Pair, Segments, make_segments, pairs_behind_cavs
+from unjam.following.trajectories import Floats, FollowingTrajectory, Segments, make_segments, trajectories_behind_cavs
 from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt
 from unjam.physics.idm import IDMArrays, IDMParameters
 from unjam.scenarios.scenario import Scenario
 
 ParameterRange = tuple[Positive, Positive]
+"""smallest and largest value that the search tries"""
 HiddenSizes = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
 
 
 @checked_dataclass(frozen=True, config=STRICT)
 class CalibrationSettings:
-    """Ranges and budget of the search; the exponent stays 4."""
+    """Ranges and budget of the search; the exponent of the IDM is always 4."""
 
     desired_speed: ParameterRange = (5.0, 40.0)
-    """v0 [m/s]"""
+    """range of the desired speed v0 [m/s]"""
     time_headway: ParameterRange = (0.1, 4.0)
-    """T [s]"""
+    """range of the time headway T [s]"""
     max_acceleration: ParameterRange = (0.1, 4.0)
-    """a [m/s2]"""
+    """range of the maximum acceleration a [m/s2]"""
     comfortable_deceleration: ParameterRange = (0.1, 6.0)
-    """b [m/s2]"""
+    """range of the comfortable deceleration b [m/s2]"""
     minimum_gap: ParameterRange = (0.5, 6.0)
-    """s0 [m]"""
+    """range of the minimum gap s0 [m]"""
     initial_headway_weight: tuple[NonNegative, NonNegative] = (0.0, 0.0)
-    """weight of the time headway at which a driver takes over, see `individual_idm`"""
+    """range of the weight of the initial time headway, see `individual_idm`"""
     weighting: Literal["trajectory", "sample"] = "trajectory"
-    """mean of the trajectories' RMS errors, or RMS over all samples, which few drivers with very large gaps dominate"""
+    """objective: the mean of the RMS gap errors of the trajectories, or the RMS gap error over all samples, which a few
+    drivers with very large gaps dominate"""
     limits: AccelerationBounds = (-4.0, 2.0)
-    """of the acceleration [m/s2]; without them the IDM brakes arbitrarily hard when a gap is nearly used up"""
+    """limits of the acceleration [m/s2]; without them the IDM brakes arbitrarily hard at very small gaps"""
     segment_seconds: Positive = 120.0
-    """duration of the segments into which trajectories are cut, each starting with the recorded gap [s]"""
+    """duration of the segments into which trajectories are cut [s]; each starts with its recorded speed and gap"""
     candidates: PositiveInt = 8
-    """sets of parameters that are tried at once, for each parameter"""
+    """population size of the differential evolution, as a multiple of the number of parameters"""
     generations: PositiveInt = 100
-    """maximum number of generations of differential evolution"""
+    """maximum number of generations of the differential evolution"""
     tolerance: Positive = 1e-3
-    """spread of the candidates' errors, relative to their mean, at which the search ends"""
+    """standard deviation of the candidates' errors, relative to their mean, at which the search ends"""
     seed: NonNegativeInt = 0
+    """seed of the differential evolution"""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
 class MultiStepSettings:
-    """A network that learns a residual from simulated driving."""
+    """Settings of a network that learns a residual from simulation behind recorded leaders, see `fit_multi_step`."""
 
     hidden: HiddenSizes = (32, 32)
     """sizes of the hidden layers"""
     authority: Positive = 2.0
-    """largest residual [m/s2]"""
+    """largest magnitude of the residual [m/s2]"""
     segment_seconds: Positive = 30.0
     """duration of the simulated segments [s]"""
     batch_size: PositiveInt = 64
-    """segments in a gradient step"""
+    """number of segments in a gradient step"""
     gradient_steps: PositiveInt = 120
+    """number of gradient steps"""
     learning_rate: Positive = 1e-3
-    """initial learning rate of Adam, which falls to zero as a cosine"""
+    """initial learning rate of Adam, which decreases to zero on a cosine schedule"""
     speed_weight: NonNegative = 2.0
-    """weight of a speed error of 1 m/s relative to a gap error of 1 m"""
+    """weight of a speed error of 1 m/s, relative to a gap error of 1 m"""
     residual_weight: NonNegative = 0.1
-    """weight of the squared residual, so that the base drives where there are no data"""
+    """weight of the squared residual in the loss; it keeps the residual small where there are no data"""
     validation_interval: PositiveInt = 20
-    """gradient steps between two validations, which select the weights"""
+    """gradient steps between two validations; the weights with the smallest validation error are kept"""
 
 
 CALIBRATED_PARAMETERS = ("desired_speed", "time_headway", "max_acceleration", "comfortable_deceleration", "minimum_gap")
 CALIBRATION_GRID_SIZE = 32
-"""grid values of a single parameter"""
+"""number of grid values with which the search for a single parameter starts"""
 CALIBRATION_TOLERANCE = 1e-3
-"""to which the best grid value is refined, in the parameter's unit"""
+"""absolute tolerance of the search for a single parameter, in the unit of the parameter"""
 CAV_FOLLOWER_SETTINGS = CalibrationSettings(candidates=4, generations=40)
-"""for human drivers behind the CAVs of a training"""
+"""settings of `calibrate_human_drivers`"""
 
 
 @dataclass(frozen=True)
@@ -102,39 +106,41 @@ class CalibratedIDM:
 
     parameters: IDMParameters
     initial_headway_weight: float
-    """of `individual_idm`"""
+    """weight of the initial time headway, see `individual_idm`"""
     gap_error: float
     """root mean squared error of the simulated gap [m]"""
     speed_error: float
-    """of the simulated speed [m/s]"""
+    """root mean squared error of the simulated speed [m/s]"""
     collisions: int
-    """segments in which the model used up the gap"""
+    """number of segments in which the simulated gap became zero"""
     seconds: float
     """duration of the data [s]"""
     parameters_at_bounds: tuple[str, ...]
-    """parameters at the bounds of the search, which the data do not determine"""
+    """parameters at a bound of their range: the data do not determine them"""
 
     def model(self, limits: AccelerationBounds) -> DriverModel:
-        """Return it as a driver."""
+        """Return the driver model with these parameters, with its acceleration within `limits` [m/s2]."""
         return individual_idm(self.parameters, self.initial_headway_weight, limits)
 
 
 def calibrate_idm(
-    pairs: Sequence[Pair], settings: CalibrationSettings | None = None, headway_factors: Sequence[float] | None = None
+    trajectories: Sequence[FollowingTrajectory],
+    settings: CalibrationSettings | None = None,
+    headway_factors: Sequence[float] | None = None,
 ) -> CalibratedIDM:
-    """Return the parameters of one IDM for all `pairs`.
+    """Return the IDM parameters with the smallest error of the simulated gaps of all `trajectories`.
 
-    The search is differential evolution over the error of the simulated gap, with all candidates and segments simulated
-    at once. `headway_factors` are known factors of the time headway, one for each trajectory.
+    The search is differential evolution; all candidates and segments are simulated at once. `headway_factors` has a
+    known factor of the time headway for each trajectory.
 
     Raises:
-        InputError: the pairs have different time steps.
+        InputError: the trajectories have different time steps.
     """
     from scipy.optimize import differential_evolution  # takes half a second, which --help need not wait for
 
     settings = settings or CalibrationSettings()
-    segments = make_segments(pairs, settings.segment_seconds)
-    factors = 1.0 if headway_factors is None else np.array(headway_factors)[segments.pair_index]
+    segments = make_segments(trajectories, settings.segment_seconds)
+    factors = 1.0 if headway_factors is None else np.array(headway_factors)[segments.trajectory_index]
     result = differential_evolution(
         gap_objective(segments, settings.limits, settings.weighting, factors),
         bounds=[getattr(settings, name) for name in (*CALIBRATED_PARAMETERS, "initial_headway_weight")],
@@ -149,10 +155,10 @@ def calibrate_idm(
     *values, weight = map(float, result.x)
     parameters = IDMParameters(**dict(zip(CALIBRATED_PARAMETERS, values, strict=True)))
     individual = replace_parameters(parameters, time_headway=parameters.time_headway * factors)
-    simulated = simulate_open_loop(individual_idm(individual, weight, settings.limits), segments)
+    simulated = simulate_followers(individual_idm(individual, weight, settings.limits), segments)
     shares = simulated.sample_counts / simulated.sample_counts.sum()
     gap_error, speed_error = (float(np.sqrt((mse * shares).sum())) for mse in (simulated.gap_mse, simulated.speed_mse))
-    collisions, seconds = int(simulated.has_collided.sum()), sum(pair.seconds for pair in pairs)
+    collisions, seconds = int(simulated.has_collided.sum()), sum(each.seconds for each in trajectories)
     names = CALIBRATED_PARAMETERS
     at_bounds = [name for name in names if is_at_bound(getattr(parameters, name), getattr(settings, name))]
     return CalibratedIDM(parameters, weight, gap_error, speed_error, collisions, seconds, tuple(at_bounds))
@@ -161,7 +167,7 @@ def calibrate_idm(
 def gap_objective(
     segments: Segments, limits: AccelerationBounds, weighting: str, headway_factors: Floats | float = 1.0
 ) -> Callable[[Floats], Floats]:
-    """Return the error of the simulated gap [m] as a function of S candidates, shape (6, S) -> (S,)."""
+    """Return the objective of the search: it maps S candidates, shape (6, S), to their gap errors [m], shape (S,)."""
     counts, (first, weights) = segments.sample_counts, _trajectory_weights(segments)
 
     def objective(candidates: Floats) -> Floats:
@@ -176,39 +182,42 @@ def gap_objective(
 
 
 def gap_mean_squares(segments: Segments, model: DriverModel, candidate_count: int = 1) -> Floats:
-    """Return `gap_mse` of `simulate_open_loop` for many candidates at once [m2], shape (candidates, n)."""
+    """Return `SimulatedFollowers.gap_mse` for several candidates at once [m2], shape (candidates, n)."""
     total = np.zeros((candidate_count, len(segments.sample_counts)))
     speed, gap = (np.broadcast_to(values, total.shape) for values in segments.start)
-    states = follow_leader(model(speed, gap), (speed, gap), segments.leader, segments.step)
-    for moment, (_, gap) in enumerate(states, 1):
-        total += np.square(gap - segments.gap[moment]) * segments.is_present[moment]
+    states = follow_leader(model(speed, gap), (speed, gap), segments.leader, segments.time_step)
+    for index, (_, gap) in enumerate(states, 1):
+        total += np.square(gap - segments.gap[index]) * segments.is_present[index]
     return total / segments.sample_counts
 
 
 def _trajectory_weights(segments: Segments) -> tuple[NDArray[np.intp], Floats]:
-    """Return the first segment of each trajectory, and the share of each segment in its trajectory."""
-    pair_index, counts = segments.pair_index, segments.sample_counts
-    return np.flatnonzero(np.diff(pair_index, prepend=-1)), counts / np.bincount(pair_index, counts)[pair_index]
+    """Return the index of each trajectory's first segment, and each segment's share of its trajectory's samples."""
+    trajectory_index, counts = segments.trajectory_index, segments.sample_counts
+    return np.flatnonzero(np.diff(trajectory_index, prepend=-1)), counts / np.bincount(trajectory_index, counts)[
+        trajectory_index
+    ]
 
 
 def is_at_bound(value: float, bounds: ParameterRange) -> bool:
-    """Return whether a value lies at a bound of the search, so that the data do not determine it."""
+    """Return whether a value is at a bound of its range: within 1 % of the width of the range."""
     low, high = bounds
     return low < high and min(value - low, high - value) < 0.01 * (high - low)
 
 
 def calibrate_groups(
-    groups: Sequence[Sequence[Pair]],
+    groups: Sequence[Sequence[FollowingTrajectory]],
     typical: IDMParameters,
     individual: Sequence[str],
     settings: CalibrationSettings | None = None,
     on_progress: Callable[[int], object] = lambda done: None,
 ) -> list[CalibratedIDM]:
-    """Return a calibration of each group of pairs, for instance of each driver.
+    """Calibrate parameters for each group of trajectories, for instance for each driver.
 
-    Only the parameters `individual` are searched, the others are those of `typical`: a minute of driving reveals the
-    distance that a driver keeps, but not the desired speed on an empty road. A single parameter is searched for all
-    groups at once, several for one group after the other, a second each. `on_progress` receives the number of groups.
+    Only the parameters named in `individual` are searched; the others are those of `typical`. A minute of driving
+    determines the distance that a driver keeps, but not the desired speed on a free road. A single parameter is
+    searched for all groups at once. Several parameters are searched for one group after the other, which takes a second
+    for each group. `on_progress` is called with the number of finished groups.
     """
     settings = settings or CalibrationSettings()
     calibrated: list[CalibratedIDM] = []
@@ -217,17 +226,17 @@ def calibrate_groups(
         on_progress(len(calibrated))
         return calibrated
     fixed = {name: (getattr(typical, name),) * 2 for name in CALIBRATED_PARAMETERS if name not in individual}
-    for pairs in groups:
-        calibrated.append(calibrate_idm(pairs, replace(settings, **fixed)))
+    for trajectories in groups:
+        calibrated.append(calibrate_idm(trajectories, replace(settings, **fixed)))
         on_progress(len(calibrated))
     return calibrated
 
 
 def _calibrate_one_parameter(
-    groups: Sequence[Sequence[Pair]], typical: IDMParameters, name: str, settings: CalibrationSettings
+    groups: Sequence[Sequence[FollowingTrajectory]], typical: IDMParameters, name: str, settings: CalibrationSettings
 ) -> list[CalibratedIDM]:
     segments = make_segments(list(chain.from_iterable(groups)), settings.segment_seconds)
-    group = np.repeat(np.arange(len(groups)), [len(pairs) for pairs in groups])[segments.pair_index]
+    group = np.repeat(np.arange(len(groups)), [len(trajectories) for trajectories in groups])[segments.trajectory_index]
 
     def model(values: Floats) -> DriverModel:
         return individual_idm(replace_parameters(typical, **{name: values[group]}), 0.0, settings.limits)
@@ -238,22 +247,22 @@ def _calibrate_one_parameter(
 
     bounds = getattr(settings, name)
     values = _minimize_on_grid(errors, np.linspace(bounds[0], bounds[1], CALIBRATION_GRID_SIZE), len(groups))
-    simulated = simulate_open_loop(model(values), segments)
+    simulated = simulate_followers(model(values), segments)
     gap_errors = _group_errors(simulated.gap_mse, segments, group, "sample").tolist()
     speed_errors = _group_errors(simulated.speed_mse, segments, group, "sample").tolist()
     collisions = np.bincount(group, simulated.has_collided, len(groups)).astype(int).tolist()
     calibrated = []
-    for value, pairs, gap_error, speed_error, crashes in zip(
+    for value, trajectories, gap_error, speed_error, crashes in zip(
         values.tolist(), groups, gap_errors, speed_errors, collisions, strict=True
     ):
         parameters, at_bounds = replace(typical, **{name: value}), (name,) if is_at_bound(value, bounds) else ()
-        seconds = sum(pair.seconds for pair in pairs)
+        seconds = sum(each.seconds for each in trajectories)
         calibrated.append(CalibratedIDM(parameters, 0.0, gap_error, speed_error, crashes, seconds, at_bounds))
     return calibrated
 
 
 def _minimize_on_grid(errors: Callable[[Floats], Floats], grid: Floats, group_count: int) -> Floats:
-    """Return the value with the least error of each group: the best of a grid, refined between its neighbors."""
+    """Return the value with the smallest error for each group: the best grid value, refined between its neighbors."""
     from scipy.optimize import elementwise  # slow to import, see above
 
     grid_errors = np.stack([errors(np.full(group_count, value)) for value in grid])
@@ -276,7 +285,10 @@ def _minimize_on_grid(errors: Callable[[Floats], Floats], grid: Floats, group_co
 
 
 def _group_errors(mean_squares: Floats, segments: Segments, group: NDArray[np.int64], weighting: str) -> Floats:
-    """Return the error of each group from the mean squared errors of its segments, with a weighting of the settings."""
+    """Return the error of each group from the mean squared errors of its segments.
+
+    `weighting` is one of `CalibrationSettings.weighting`.
+    """
     if weighting == "trajectory":
         first, weights = _trajectory_weights(segments)
         errors, group = np.sqrt(np.add.reduceat(mean_squares * weights, first)), group[first]
@@ -286,13 +298,16 @@ def _group_errors(mean_squares: Floats, segments: Segments, group: NDArray[np.in
 
 
 def calibrate_human_drivers(recordings: Iterable[LocalState], scenario: Scenario) -> IDMParameters:
-    """Return the IDM parameters of human drivers, see `pairs_behind_cavs`; those of the scenario without data.
+    """Calibrate the IDM to the followers of CAVs, see `trajectories_behind_cavs`.
 
-    Desired speed and minimum gap always stay those of the scenario, because slow traffic does not reveal them.
+    Desired speed and minimum gap are those of the scenario, because slow traffic does not determine them. Without a
+    follower all parameters are those of the scenario.
     """
-    pairs = pairs_behind_cavs(recordings, scenario.control_step, scenario.steps_per_control_step)
+    trajectories = trajectories_behind_cavs(recordings, scenario.control_step, scenario.steps_per_control_step)
     known = scenario.humans
-    if not pairs:
+    if not trajectories:
         return known
     fixed = {name: (getattr(known, name),) * 2 for name in ("desired_speed", "minimum_gap")}
-    return replace(calibrate_idm(pairs, replace(CAV_FOLLOWER_SETTINGS, **fixed)).parameters, exponent=known.exponent)
+    return replace(
+        calibrate_idm(trajectories, replace(CAV_FOLLOWER_SETTINGS, **fixed)).parameters, exponent=known.exponent
+    )

@@ -1,4 +1,4 @@
-"""Calibration of a population from trajectories: individual IDMs and a common residual (`unjam fit-drivers`)."""
+"""Calibration of a population of human drivers to recorded trajectories (`unjam fit-drivers`)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, field, replace
@@ -21,24 +21,24 @@ from unjam.following.calibration import (
     calibrate_groups,
     calibrate_idm,
 )
-from unjam.following.loaders import ReadOptions, read_pairs
-from unjam.following.pairs import Pair, pairs_in_splits, split_by_driver
+from unjam.following.loaders import ReadOptions, read_trajectories
+from unjam.following.trajectories import FollowingTrajectory, select_splits, split_by_driver
 from unjam.manifest import manifest
 from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclass, nest_keys
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population
 
 DriverProgress = Callable[[int, int], object]
-"""called with the number of finished drivers, and that of all drivers"""
+"""called with the number of finished drivers and the number of all drivers"""
 RESIDUAL_VALIDATION_SHARE = 0.2
-"""share of the drivers that validate a residual"""
+"""share of the drivers whose trajectories validate a residual"""
 MIN_RESIDUAL_DRIVERS = 5
-"""minimum number of drivers for a residual: one of them validates it"""
+"""minimum number of drivers for a residual, so that at least one of them validates it"""
 UNIT_RATIO_LIMITS = (0.5, 2.0)
-"""ratio of gap changes and speed differences with equal units, which is one except for noise"""
+"""smallest and largest plausible ratio of gap changes to integrated speed differences; without noise it is one"""
 MIN_SUSPICIOUS_PARAMETERS = 3
-"""number of parameters at bounds that suggests wrong units or data"""
-PAIR_FILTERS = ("kind", "split", "driver")
+"""number of parameters at a bound from which on a warning suspects wrong units or data"""
+FILTER_FIELDS = ("kind", "split", "driver")
 """fields by which trajectories can be selected"""
 
 
@@ -47,15 +47,19 @@ class FitDriversSettings:
     """Settings for the calibration of a population."""
 
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
+    """settings of each calibration of the IDM"""
     individual: Annotated[tuple[str, ...], Field(min_length=1)] = ("time_headway",)
-    """IDM parameters of each driver; the others are common. On NGSIM, with half a minute of each driver, individual
-    headways predict the other half better than one IDM for all, and five individual parameters much worse"""
+    """names of the IDM parameters that are individual; the others are the same for all drivers. On NGSIM, calibrated to
+    half a minute of each driver, individual time headways predict the other half better than one IDM for all drivers;
+    five individual parameters predict it much worse"""
     rounds: PositiveInt = 3
-    """alternations between common and individual parameters"""
+    """number of rounds; each calibrates the common parameters, then the individual ones"""
     residual: bool = False
-    """whether a network learns, from simulated driving, what all drivers have in common beyond their IDMs"""
+    """whether a network learns an acceleration that is added to the IDM of every driver"""
     multi_step: MultiStepSettings = field(default_factory=MultiStepSettings)
+    """settings of this network"""
     seed: NonNegativeInt = 0
+    """seed of the residual, and of its validation drivers"""
 
 
 @plain_dataclass(frozen=True)
@@ -64,7 +68,7 @@ class FittedDrivers:
 
     population: Population
     notes: list[str]
-    """summary of the files"""
+    """summary of each file, and warnings about its units"""
 
     def facts(self) -> dict[str, Any]:
         """Return the main facts for JSON."""
@@ -73,7 +77,7 @@ class FittedDrivers:
         return facts | {key: value for key, value in population.metadata["fit"].items() if key != "settings"}
 
     def report_lines(self) -> list[str]:
-        """Return how close the drivers come to the recorded gaps."""
+        """Return the lines of a report: errors of the simulated gaps, warnings, and the use of the residual."""
         fit, details = self.population.metadata["fit"], self.population.details
         errors, seconds = np.array([[each["gap_error"], each["seconds"]] for each in details]).T
         individual_error = np.sqrt(np.average(np.square(errors), weights=seconds))
@@ -81,16 +85,16 @@ class FittedDrivers:
         lines = [f"root mean squared error of the simulated gap: {comparison}"]
         at_bounds = fit["common"]["parameters_at_bounds"]
         if len(at_bounds) >= MIN_SUSPICIOUS_PARAMETERS:
-            share = f"{len(at_bounds)} of {len(CALIBRATED_PARAMETERS)} parameters are at the bounds of the search"
-            question = "not plausible for human drivers; are speeds in m/s and gaps in m?"
-            lines.append(f"warning: {share} ({', '.join(at_bounds)}): {question}")
+            count = f"{len(at_bounds)} of {len(CALIBRATED_PARAMETERS)} parameters are at a bound of their range"
+            reason = "this is not plausible for human drivers; are speeds in m/s and gaps in m?"
+            lines.append(f"warning: {count} ({', '.join(at_bounds)}): {reason}")
         collisions = sum(each["collisions"] > 0 for each in details)
         if collisions:
-            lines.append(f"{collisions} drivers use up their gap in the simulation")
+            lines.append(f"{collisions} drivers collide with their leader in the simulation")
         if "residual_gap_errors" in fit:
             before, best = fit["residual_gap_errors"][0], min(fit["residual_gap_errors"])
-            decision = "used" if fit["residual_is_better"] else "not used, because it is not better"
-            lines.append(f"residual: {decision}: {before:.2f} m without, {best:.2f} m with it, on validation drivers")
+            use = "used" if fit["residual_is_better"] else "not used, because it is not better"
+            lines.append(f"residual: {use}: {before:.2f} m without, {best:.2f} m with it, on validation drivers")
         return lines
 
 
@@ -104,13 +108,16 @@ def fit_drivers_from_files(
     out: Path | None = None,
     on_progress: DriverProgress = lambda *done: None,
 ) -> FittedDrivers:
-    """Return the population of the drivers in files.
+    """Calibrate a population to the trajectories in files.
 
     Args:
-        overrides: of `FitDriversSettings`; keys may have dots.
-        format: of the files, see `read_pairs`; options of reading are those of `ReadOptions`.
-        filters: values of `kind`, `split` or `driver` that select trajectories.
-        out: future file of the population, which is checked before the calibration.
+        overrides: values of `FitDriversSettings` by name; names of nested settings contain dots.
+        format: format of the files, see `read_trajectories`.
+        drop_bad_rows: see `ReadOptions`.
+        driver_columns: see `ReadOptions`.
+        filters: values of `kind`, `split` or `driver`; only trajectories with all these values are used.
+        out: file to which the caller will write the population; its name and folder are checked first.
+        on_progress: called after each driver.
 
     Raises:
         InputError: a file, a row or a setting is wrong, or no trajectory is selected.
@@ -121,21 +128,25 @@ def fit_drivers_from_files(
             raise invalid_value("out", str(out), "a .json file")
         check_parent_folder(out)
     settings = build_dataclass(FitDriversSettings, nest_keys(overrides), "")
-    pairs: list[Pair] = []
+    trajectories: list[FollowingTrajectory] = []
     notes = []
     for file, prefix in zip(files, _name_prefixes(files), strict=True):
-        result = read_pairs(file, format, ReadOptions(drop_bad_rows=drop_bad_rows, driver_columns=driver_columns))
+        result = read_trajectories(
+            file, format, ReadOptions(drop_bad_rows=drop_bad_rows, driver_columns=driver_columns)
+        )
         notes += [f"{file.name}: {line}" for line in result.summary_lines()]
-        pairs += [replace(pair, name=prefix + pair.name, driver=prefix + pair.driver) for pair in result.pairs]
+        trajectories += [
+            replace(each, name=prefix + each.name, driver=prefix + each.driver) for each in result.trajectories
+        ]
     for name, value in (filters or {}).items():
-        if name not in PAIR_FILTERS:
-            raise unknown_name("select", name, PAIR_FILTERS)
-        known = ", ".join(sorted({str(getattr(pair, name)) for pair in pairs} - {""})) or "none"
-        pairs = [pair for pair in pairs if getattr(pair, name) == value]
-        if not pairs:
+        if name not in FILTER_FIELDS:
+            raise unknown_name("select", name, FILTER_FIELDS)
+        known = ", ".join(sorted({str(getattr(each, name)) for each in trajectories} - {""})) or "none"
+        trajectories = [each for each in trajectories if getattr(each, name) == value]
+        if not trajectories:
             raise InputError(f"select: no trajectory has the {name} {value!r}; available: {known}")
-    notes += unit_warnings(pairs)
-    population = fit_drivers(pairs, settings, on_progress)
+    notes += unit_warnings(trajectories)
+    population = fit_drivers(trajectories, settings, on_progress)
     origin = manifest()
     # Populations are published: they do not name folders of this machine.
     origin["command"] = [Path(word).name if "/" in word else word for word in origin["command"]]
@@ -144,7 +155,7 @@ def fit_drivers_from_files(
 
 
 def _name_prefixes(files: Sequence[Path]) -> list[str]:
-    """Return the prefixes of the drivers' names in each file, as drivers of different files are different."""
+    """Return a prefix for the names of drivers in each file, because drivers in different files are different."""
     for number, file in enumerate(files):
         if file.resolve() in [other.resolve() for other in files[:number]]:
             raise invalid_value("data", str(file), "each file once")
@@ -154,11 +165,11 @@ def _name_prefixes(files: Sequence[Path]) -> list[str]:
     return [f"{stem}-" for stem in stems] if len(files) > 1 else [""]
 
 
-def unit_warnings(pairs: Sequence[Pair]) -> list[str]:
-    """Return a warning if changes of gaps do not match the speeds, so that their units differ."""
-    differences = [pair.leader_speed - pair.speed for pair in pairs]
+def unit_warnings(trajectories: Sequence[FollowingTrajectory]) -> list[str]:
+    """Return a warning if the changes of the gaps do not agree with the speeds: then their units are not m and m/s."""
+    differences = [each.leader_speed - each.speed for each in trajectories]
     closing = np.concatenate([(each[1:] + each[:-1]) / 2.0 for each in differences])
-    change = np.concatenate([np.diff(pair.gap) / pair.step for pair in pairs])
+    change = np.concatenate([np.diff(each.gap) / each.time_step for each in trajectories])
     ratio = float(closing @ change / max(closing @ closing, 1e-9))
     low, high = UNIT_RATIO_LIMITS
     if low <= ratio <= high or not closing.any():
@@ -168,12 +179,14 @@ def unit_warnings(pairs: Sequence[Pair]) -> list[str]:
 
 
 def fit_drivers(
-    pairs: Sequence[Pair], settings: FitDriversSettings | None = None, on_progress: DriverProgress = lambda *done: None
+    trajectories: Sequence[FollowingTrajectory],
+    settings: FitDriversSettings | None = None,
+    on_progress: DriverProgress = lambda *done: None,
 ) -> Population:
-    """Return the population of all drivers in `pairs`.
+    """Calibrate a population with a driver for each driver of `trajectories`.
 
-    The parameters minimize the error of the gap that is simulated behind the recorded leader. A residual learns from
-    simulated driving; it is left out unless it improves the gaps of drivers that it did not learn from.
+    The parameters minimize the error of the gap that is simulated behind the recorded leader. A residual is used only
+    if it reduces this error for validation drivers.
 
     Raises:
         InputError: there are too few drivers for a residual, or the time steps differ.
@@ -182,13 +195,15 @@ def fit_drivers(
     for name in settings.individual:
         if name not in CALIBRATED_PARAMETERS:
             raise unknown_name("individual", name, CALIBRATED_PARAMETERS)
-    names = list(dict.fromkeys(pair.driver for pair in pairs))
+    names = list(dict.fromkeys(each.driver for each in trajectories))
     if settings.residual and len(names) < MIN_RESIDUAL_DRIVERS:
         raise invalid_value("drivers", len(names), f">= {MIN_RESIDUAL_DRIVERS} for a residual")
-    calibration = replace(settings.calibration, initial_headway_weight=(0.0, 0.0))  # headways are individual
-    common = calibrate_idm(pairs, calibration)
-    typical, calibrated = _calibrate_in_rounds(pairs, names, replace(settings, calibration=calibration), on_progress)
-    residual, facts = _fit_residual(pairs, calibrated, settings) if settings.residual else (None, {})
+    calibration = replace(settings.calibration, initial_headway_weight=(0.0, 0.0))  # drivers have their own headways
+    common = calibrate_idm(trajectories, calibration)
+    typical, calibrated = _calibrate_in_rounds(
+        trajectories, names, replace(settings, calibration=calibration), on_progress
+    )
+    residual, facts = _fit_residual(trajectories, calibrated, settings) if settings.residual else (None, {})
     return Population(
         typical=typical,
         drivers=tuple(each.parameters for each in calibrated.values()),
@@ -200,41 +215,46 @@ def fit_drivers(
 
 
 def _calibrate_in_rounds(
-    pairs: Sequence[Pair], names: Sequence[str], settings: FitDriversSettings, on_progress: DriverProgress
+    trajectories: Sequence[FollowingTrajectory],
+    names: Sequence[str],
+    settings: FitDriversSettings,
+    on_progress: DriverProgress,
 ) -> tuple[IDMParameters, dict[str, CalibratedIDM]]:
-    """Return the common IDM and that of each driver, which are calibrated in turn.
+    """Return the common IDM and the IDM of each driver, by name; both are calibrated in turn.
 
-    One IDM for drivers with different distances is too soft, because it must not react to individual gaps. Therefore
-    the common parameters are calibrated with individual headways, and only then the common headway.
+    One IDM that is calibrated to drivers with different time headways reacts too weakly. Therefore the common
+    parameters are calibrated with individual time headways, and the common time headway is calibrated at the end.
     """
-    groups = [[pair for pair in pairs if pair.driver == name] for name in names]
+    groups = [[each for each in trajectories if each.driver == name] for name in names]
     has_own_headways = "time_headway" in settings.individual
     weights = (0.0, 1.0 if has_own_headways else 0.0)
-    typical = calibrate_idm(pairs, replace(settings.calibration, initial_headway_weight=weights)).parameters
+    typical = calibrate_idm(trajectories, replace(settings.calibration, initial_headway_weight=weights)).parameters
     calibrated: dict[str, CalibratedIDM] = {}
     for number in range(settings.rounds):
         if number:
-            factors = [calibrated[pair.driver].parameters.time_headway / typical.time_headway for pair in pairs]
-            typical = calibrate_idm(pairs, settings.calibration, factors).parameters
-        search = typical, settings.individual, settings.calibration
-        own = calibrate_groups(groups, *search, lambda done: on_progress(done, len(names)))
+            factors = [calibrated[each.driver].parameters.time_headway / typical.time_headway for each in trajectories]
+            typical = calibrate_idm(trajectories, settings.calibration, factors).parameters
+        arguments = typical, settings.individual, settings.calibration
+        own = calibrate_groups(groups, *arguments, lambda done: on_progress(done, len(names)))
         calibrated = dict(zip(names, own, strict=True))
-    if has_own_headways:  # the common headway was arbitrary until now, a unit of the individual ones
-        (one,) = calibrate_groups([pairs], typical, ["time_headway"], settings.calibration)
+    if has_own_headways:  # until now only the products of common headway and factors mattered
+        (one,) = calibrate_groups([trajectories], typical, ["time_headway"], settings.calibration)
         typical = one.parameters
     return typical, calibrated
 
 
 def _fit_residual(
-    pairs: Sequence[Pair], calibrated: dict[str, CalibratedIDM], settings: FitDriversSettings
+    trajectories: Sequence[FollowingTrajectory], calibrated: dict[str, CalibratedIDM], settings: FitDriversSettings
 ) -> tuple[Network | None, dict[str, Any]]:
-    """Return the residual, or None if it does not improve the gaps, and its errors."""
-    from unjam.following.networks import CalibratedPairs, fit_multi_step  # imports torch, which IDMs do not need
+    """Return the residual, or None if it does not reduce the gap errors; and facts about the fit."""
+    from unjam.following.networks import CalibratedTrajectories, fit_multi_step  # imports torch, which IDMs do not need
 
-    split = split_by_driver(pairs, (1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0), settings.seed)
-    parts = [pairs_in_splits(split, name) for name in ("train", "validation")]
-    drivers = [[calibrated[pair.driver].parameters for pair in part] for part in parts]
-    training, validation = map(CalibratedPairs, parts, drivers)
+    split = split_by_driver(
+        trajectories, (1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0), settings.seed
+    )
+    parts = [select_splits(split, name) for name in ("train", "validation")]
+    drivers = [[calibrated[each.driver].parameters for each in part] for part in parts]
+    training, validation = map(CalibratedTrajectories, parts, drivers)
     fit = fit_multi_step(training, validation, settings.calibration.limits, settings.multi_step, settings.seed)
     is_better = min(fit.validation_errors) < fit.validation_errors[0]
     facts = {"residual_gap_errors": fit.validation_errors, "residual_is_better": is_better}

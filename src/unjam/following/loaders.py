@@ -1,105 +1,149 @@
-"""Reads car-following data: plain tables, NGSIM, highD, OpenACC and SUMO's FCD output; reports skipped rows."""
+"""Read car-following trajectories from files: plain tables, NGSIM, highD, OpenACC and SUMO's FCD output."""
 
 import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from unjam.errors import InputError, unknown_name
-from unjam.following.pairs import Pair, ReadOptions, ReadResult
+from unjam.following.trajectories import FollowingTrajectory
 
-PAIR_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
-"""required columns: [s], [m/s], [m/s], [m]"""
+TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
+"""required columns of a plain table; `pair` identifies follower and leader, the others are in s, m/s, m/s and m"""
 OPTIONAL_COLUMNS = ("driver", "kind", "split")
+"""optional columns of a plain table, as the fields of `FollowingTrajectory`"""
 COLUMN_ALIASES = {"t": "time", "v_foll": "speed", "v_lead": "leader_speed"}
 """alternative column names of plain tables"""
 VALUE_LIMITS = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.0)}
-"""possible values on roads; others have wrong units or are errors"""
+"""smallest and largest allowed value of a column [m/s, m/s, m]; other values are errors, or have another unit"""
 TIME_STEP_TOLERANCE = 0.01
-"""relative tolerance of the time step"""
+"""largest relative difference between the interval of two rows and the time step of the file"""
 METERS_PER_FOOT = 0.3048
 MEDIAN_LENGTH_LIMITS = (3.0, 8.0)
-"""plausible median length of vehicles [m]"""
+"""smallest and largest plausible median of the vehicle lengths in a file [m]"""
 VEHICLE_COLUMNS = ("vehicle", "time", "front", "length", "speed", "lane", "leader")
-"""columns of a table of single vehicles"""
+"""columns of a table with a row for each vehicle and time; `leader` is the number of the vehicle ahead"""
 NGSIM_COLUMNS = ("vehicle_id", "global_time", "local_y", "v_length", "v_vel", "lane_id", "preceding")
-"""the same of the public NGSIM file (US DOT), in lower case"""
+"""names of `VEHICLE_COLUMNS` in the public NGSIM file (US DOT), in lower case"""
 RECONSTRUCTED_COLUMNS = ("vehicleid", "frameid", "localy", "vehiclelength", "meanspeed", "laneid", "leaderid")
-"""the same of the reconstructed NGSIM I-80 (Montanino and Punzo 2015), only letters"""
+"""names of `VEHICLE_COLUMNS` in the reconstructed NGSIM I-80 data (Montanino and Punzo 2015), without underscores"""
 HIGHD_COLUMNS = ("id", "frame", "x", "width", "xVelocity", "laneId", "precedingId")
-"""the same of the tracks of highD (Krajewski et al. 2018)"""
+"""names of `VEHICLE_COLUMNS` in the tracks of highD (Krajewski et al. 2018)"""
 HIGHD_FRAME_RATE = 25.0
-"""[1/s]"""
+"""frames per second of highD [1/s]"""
 MAX_VEHICLE_ABSENCE = 60.0
-"""absence after which a vehicle number belongs to another vehicle [s]"""
+"""longest absence of a vehicle number [s]; after a longer one the number belongs to another vehicle"""
 FCD_COLUMNS = ("timestep_time", "vehicle_speed", "vehicle_leaderSpeed", "vehicle_leaderGap")
-"""`PAIR_COLUMNS[1:]` of SUMO's FCD output as CSV, which has leaders with --fcd-output.max-leader-distance"""
+"""names of `TABLE_COLUMNS[1:]` in SUMO's FCD output as CSV, which contains leaders with the option
+--fcd-output.max-leader-distance"""
 RECONSTRUCTED_COLUMN_ORDER = (
     *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
     *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
 )
-"""columns of its files, which have no header"""
+"""columns of the reconstructed NGSIM files, which have no header, in their order"""
+MAX_LISTED_ROWS = 5
+"""maximum number of bad rows that a message lists"""
 
 
-def read_pairs(path: Path, format: str = "", options: ReadOptions | None = None) -> ReadResult:
+@dataclass(frozen=True)
+class ReadOptions:
+    """Options for reading a file."""
+
+    drop_bad_rows: bool = False
+    """whether to drop bad rows, each of which ends a trajectory, instead of refusing the file"""
+    min_seconds: float = 20.0
+    """minimum duration of a trajectory [s]; shorter ones are skipped and counted"""
+    driver_columns: tuple[str, ...] = ()
+    """columns of a plain table that together identify the driver, if it has no column `driver`"""
+    kind_columns: tuple[str, ...] = ()
+    """columns of a plain table that together are the kind of driver, if it has no column `kind`"""
+
+
+@dataclass(frozen=True)
+class ReadResult:
+    """The trajectories in a file, and a record of the rows that are not used."""
+
+    trajectories: list[FollowingTrajectory] = field(repr=False)
+    rows: int
+    """number of rows in the file"""
+    bad_rows: dict[int, str]
+    """reason why a row was dropped, by its line in the file; the header is line 1"""
+    skipped_rows: dict[str, int]
+    """number of valid rows that are not used, by reason"""
+
+    def summary_lines(self) -> list[str]:
+        """Return the lines of a summary: rows that are used, skipped and dropped."""
+        used = sum(len(each.speed) for each in self.trajectories)
+        lines = [f"{len(self.trajectories)} trajectories with {used:,} of {self.rows:,} rows"]
+        lines += [f"skipped: {count:,} rows: {reason}" for reason, count in self.skipped_rows.items() if count]
+        dropped = [f"dropped: line {line}: {reason}" for line, reason in self.bad_rows.items()]
+        more = len(dropped) - MAX_LISTED_ROWS
+        return [*lines, *dropped[:MAX_LISTED_ROWS], *([f"dropped: {more} more bad rows"] if more > 0 else [])]
+
+
+def read_trajectories(path: Path, format: str = "", options: ReadOptions | None = None) -> ReadResult:
     """Return the trajectories of a .parquet or .csv file.
 
-    `format` is a name in `PAIR_FORMATS`; empty: detected from the columns.
+    `format` is a name in `FILE_FORMATS`; empty: it is detected from the columns.
 
     Raises:
         InputError: the file is missing or has another format, its units are wrong, or a row is bad.
     """
-    if format and format not in PAIR_FORMATS:
-        raise unknown_name("format", format, PAIR_FORMATS)
-    frame = _read_frame(path)
-    return PAIR_FORMATS[format or _detect_format(frame)](frame, path, options or ReadOptions())
+    if format and format not in FILE_FORMATS:
+        raise unknown_name("format", format, FILE_FORMATS)
+    frame = _read_file(path)
+    return FILE_FORMATS[format or _detect_format(frame)](frame, path, options or ReadOptions())
 
 
-def _read_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a plain table with `PAIR_COLUMNS` and any of `OPTIONAL_COLUMNS`."""
+def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
+    """Return the trajectories of a plain table with `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`."""
     frame = frame.rename(columns={other: name for other, name in COLUMN_ALIASES.items() if name not in frame})
-    _check_columns(frame, PAIR_COLUMNS, path)
+    _check_columns(frame, TABLE_COLUMNS, path)
     for name, columns in (("driver", options.driver_columns), ("kind", options.kind_columns)):
         if columns and name not in frame:
             _check_columns(frame, columns, path)
             frame[name] = _join_columns(frame, columns)
-    return _split_trajectories(_to_numeric(frame, PAIR_COLUMNS[1:]), path, options)
+    return _split_trajectories(_to_numeric(frame, TABLE_COLUMNS[1:]), path, options)
 
 
-def _read_ngsim(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
+def _convert_ngsim(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of the public NGSIM file, which is in feet and milliseconds."""
     frame = frame.rename(columns=str.lower)
     site = frame["location"].astype(str) if "location" in frame else ""
     vehicles = _select_columns(frame, NGSIM_COLUMNS, VEHICLE_COLUMNS, path)
     lengths = {name: vehicles[name] * METERS_PER_FOOT for name in ("front", "speed", "length")}
     vehicles = vehicles.assign(site=site, time=vehicles["time"] / 1000.0, **lengths)
-    return _pairs_from_vehicles(vehicles, path, options)
+    return _trajectories_from_vehicles(vehicles, path, options)
 
 
-def _read_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of the reconstructed NGSIM I-80, in meters and tenths of a second."""
+def _convert_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
+    """Return the trajectories of the reconstructed NGSIM I-80 data, which are in meters and tenths of a second."""
     vehicles = _select_columns(frame.rename(columns=_alphanumeric), RECONSTRUCTED_COLUMNS, VEHICLE_COLUMNS, path)
     vehicles = vehicles.assign(site=path.stem, time=vehicles["time"] / 10.0)
-    return _pairs_from_vehicles(vehicles, path, options)
+    return _trajectories_from_vehicles(vehicles, path, options)
 
 
-def _read_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a file of highD, where x is a vehicle's left end, and decreases in one direction."""
+def _convert_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
+    """Return the trajectories of a highD file.
+
+    Its x is the left end of a vehicle, and decreases over time for one direction of travel.
+    """
     vehicles = _select_columns(frame, HIGHD_COLUMNS, VEHICLE_COLUMNS, path)
     # The direction is that of the whole lane, because a standing vehicle has none.
     is_forward = vehicles.groupby("lane")["speed"].transform("sum").to_numpy() >= 0
     front = (vehicles["front"] + vehicles["length"]).where(is_forward, -vehicles["front"])
     motion = {"front": front, "speed": vehicles["speed"].abs(), "time": vehicles["time"] / HIGHD_FRAME_RATE}
-    return _pairs_from_vehicles(vehicles.assign(site=path.stem, **motion), path, options)
+    return _trajectories_from_vehicles(vehicles.assign(site=path.stem, **motion), path, options)
 
 
-def _read_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of SUMO's FCD output, one for each vehicle, leader and lane."""
+def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
+    """Return the trajectories of SUMO's FCD output: one for each combination of vehicle, leader and lane."""
     key = ("vehicle_id", "vehicle_leaderID", "vehicle_lane")
-    vehicles = _select_columns(frame, FCD_COLUMNS, PAIR_COLUMNS[1:], path)
+    vehicles = _select_columns(frame, FCD_COLUMNS, TABLE_COLUMNS[1:], path)
     _check_columns(frame, key, path)
     is_free = vehicles["gap"] < 0
     driver = frame["vehicle_id"].astype(str)
@@ -107,8 +151,8 @@ def _read_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResu
     return _split_trajectories(vehicles.loc[~is_free], path, options, {"no leader": int(np.sum(is_free))})
 
 
-def _pairs_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a table of single vehicles with the numbers of their leaders."""
+def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
+    """Return the trajectories of a table with `VEHICLE_COLUMNS`, in which each row names the number of the leader."""
     low, high = MEDIAN_LENGTH_LIMITS
     median = float(np.nanmedian(vehicles["length"]))
     if not low <= median <= high:
@@ -134,7 +178,10 @@ def _pairs_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOption
 
 
 def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
-    """Return "2" for the second vehicle with a number, and so on: NGSIM's numbers restart every 15 minutes."""
+    """Return a suffix that distinguishes vehicles with the same number: "" for the first one, "2" for the second.
+
+    The vehicle numbers of NGSIM restart every 15 minutes.
+    """
     ordered = vehicles.sort_values(by="time", kind="stable")
     key = [ordered["site"], ordered["vehicle"]]
     is_new = ordered["time"].groupby(key, dropna=False).diff() > MAX_VEHICLE_ABSENCE
@@ -142,8 +189,8 @@ def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
     return pd.Series(np.where(count > 0, (count + 1).astype(str), ""), ordered.index)
 
 
-def _read_openacc(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of an OpenACC file (JRC): a platoon, each vehicle behind the previous one."""
+def _convert_openacc(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
+    """Return the trajectories of an OpenACC file (JRC): a platoon in which each vehicle follows the previous one."""
     numbers = sorted(int(name[3:]) for name in frame.columns if re.fullmatch(r"IVS\d+", name))
     if not numbers:
         raise InputError(f"{path.name}: no column IVS1: not an OpenACC file")
@@ -151,28 +198,28 @@ def _read_openacc(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Read
     parts = []
     for number in numbers:
         columns = ("Time", f"Speed{number + 1}", f"Speed{number}", f"IVS{number}")
-        part = _select_columns(frame, columns, PAIR_COLUMNS[1:], path)
+        part = _select_columns(frame, columns, TABLE_COLUMNS[1:], path)
         label = f"Driver{number + 1}"
         kind = frame[label].astype(str) if label in frame else pd.Series("", frame.index)
         suffix = np.where(kind == "", "", "-" + kind)
         name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
-        driver = name + suffix if len(set(kind)) > 1 else name  # another kind that takes over is another driver
+        driver = name + suffix if len(set(kind)) > 1 else name  # a change of kind is a change of driver
         parts.append(part.assign(pair=f"{path.stem}-{number + 1}" + suffix, driver=driver, kind=kind))
     return _split_trajectories(pd.concat(parts), path, options)
 
 
-PAIR_FORMATS: dict[str, Callable[[pd.DataFrame, Path, ReadOptions], ReadResult]] = {
-    "table": _read_table,
-    "ngsim": _read_ngsim,
-    "ngsim-reconstructed": _read_reconstructed,
-    "openacc": _read_openacc,
-    "highd": _read_highd,
-    "fcd": _read_fcd,
+FILE_FORMATS: dict[str, Callable[[pd.DataFrame, Path, ReadOptions], ReadResult]] = {
+    "table": _convert_table,
+    "ngsim": _convert_ngsim,
+    "ngsim-reconstructed": _convert_reconstructed,
+    "openacc": _convert_openacc,
+    "highd": _convert_highd,
+    "fcd": _convert_fcd,
 }
 
 
-def _read_frame(path: Path) -> pd.DataFrame:
-    """Return the table of a file with a column `line`; its `attrs` hold the lines above its header."""
+def _read_file(path: Path) -> pd.DataFrame:
+    """Return the table of a file with a column `line`; its `attrs` have the lines above the header, by first word."""
     if not path.is_file():
         raise InputError(f"data: {str(path)!r} does not exist")
     header, attributes = 0, dict[Hashable, str]()
@@ -223,7 +270,7 @@ def _alphanumeric(name: str) -> str:
 def _select_columns(
     frame: pd.DataFrame, names: tuple[str, ...], new_names: tuple[str, ...], path: Path
 ) -> pd.DataFrame:
-    """Return some columns of a file as numbers with new names, and `line`."""
+    """Return the column `line`, and these columns as numbers under new names."""
     _check_columns(frame, names, path)
     numbers = _to_numeric(frame.loc[:, ["line", *names]], names)
     return numbers.rename(columns=dict(zip(names, new_names, strict=True)))
@@ -237,7 +284,10 @@ def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> 
 
 
 def _join_columns(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
-    """Return the values of some columns joined by hyphens in each row; equal rows are joined only once."""
+    """Return for each row the values of these columns, joined by hyphens.
+
+    Rows with equal values are joined only once, because a file may have millions of rows.
+    """
     group = frame.groupby(list(columns), sort=False, observed=True, dropna=False).ngroup()
     first = frame[list(columns)].loc[~group.duplicated()]
     names = ["-".join(map(str, row)) for row in first.itertuples(index=False)]
@@ -245,17 +295,17 @@ def _join_columns(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
 
 
 def _to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
-    """Return the table with these columns as numbers; other values become NaN, and thereby bad rows."""
+    """Return the table with these columns as numbers; other values become NaN, which makes their rows bad."""
     return frame.assign(**{name: pd.to_numeric(frame[name], errors="coerce") for name in names})
 
 
 def _split_trajectories(
     frame: pd.DataFrame, path: Path, options: ReadOptions, skipped_rows: dict[str, int] | None = None
 ) -> ReadResult:
-    """Return the trajectories of a table with the columns `line`, `PAIR_COLUMNS` and any of `OPTIONAL_COLUMNS`.
+    """Return the trajectories of a table with the columns `line`, `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`.
 
-    A trajectory consists of evenly spaced rows of one pair; a missing moment starts another one. Rows may be in any
-    order; `skipped_rows` were skipped before.
+    A trajectory consists of the rows of one pair at equal intervals; after a missing row another trajectory starts.
+    Rows may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by reason.
 
     Raises:
         InputError: a row is bad, or no trajectory remains.
@@ -271,29 +321,29 @@ def _split_trajectories(
         raise InputError("time: no pair has two rows")
     step = round(float(steps.median()), 4)  # the precision of times in single precision
     starts = ~((steps - step).abs() <= TIME_STEP_TOLERANCE * step)
-    pairs, part_counts, short_count = list[Pair](), Counter[str](), 0
+    trajectories, part_counts, short_count = list[FollowingTrajectory](), Counter[str](), 0
     for _, rows in good.groupby(starts.cumsum(), sort=False):
         if (len(rows) - 1) * step < options.min_seconds or len(rows) < 2:
             short_count += len(rows)
             continue
         pair = str(rows["pair"].iloc[0])
-        speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in PAIR_COLUMNS[2:])
+        speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in TABLE_COLUMNS[2:])
         known = {name: rows[name].head(1).dropna() for name in OPTIONAL_COLUMNS if name in rows}
         driver, kind, split = ("".join(map(str, known.get(name, ()))) for name in OPTIONAL_COLUMNS)
         part_counts[pair] += 1
         name = pair if part_counts[pair] == 1 else f"{pair}/{part_counts[pair]}"
-        pairs.append(Pair(name, driver or pair, step, speed, leader_speed, gap, kind, split))
-    if not pairs:
+        trajectories.append(FollowingTrajectory(name, driver or pair, step, speed, leader_speed, gap, kind, split))
+    if not trajectories:
         raise InputError(f"{path.name}: no trajectory lasts {options.min_seconds:g} s")
     reasons = {**skipped_rows, f"trajectories shorter than {options.min_seconds:g} s": short_count}
-    return ReadResult(pairs, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
+    return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
 
 
 def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
     """Return whether each row is bad, shape (rows,), and the first reason of each line with bad rows."""
     reasons: dict[int, str] = {}
     is_bad = np.zeros(len(frame), bool)
-    for name in PAIR_COLUMNS[1:]:
+    for name in TABLE_COLUMNS[1:]:
         values = frame[name].to_numpy(np.float64)
         low, high = VALUE_LIMITS.get(name, (-np.inf, np.inf))
         is_wrong = ~np.isfinite(values) | (values < low) | (values > high)

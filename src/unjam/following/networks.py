@@ -1,7 +1,8 @@
-"""Networks as drivers: alone (`vanilla`), or as a residual on a base (`knowledge`, Eq. 4 of the paper).
+"""Networks as driver models: alone (`vanilla`), or as a residual added to a base (`knowledge`, Eq. 4 of the paper).
 
-A network that learned single accelerations (`fit_one_step`) has never seen the consequences of its own small errors.
-In `fit_multi_step`, the loss is the error of the simulated gap, with a gradient through every step behind the leader.
+The loss of `fit_one_step` is the error of single accelerations; small errors can accumulate when such a network drives.
+The loss of `fit_multi_step` is the error of the gap in a simulation behind the recorded leader; the gradient passes
+through all steps.
 """
 
 import itertools
@@ -19,7 +20,7 @@ from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
 from unjam.following.calibration import HiddenSizes, MultiStepSettings
-from unjam.following.open_loop import (
+from unjam.following.leader_replay import (
     AccelerationBounds,
     AccelerationFunction,
     DriverModel,
@@ -27,35 +28,43 @@ from unjam.following.open_loop import (
     add_residual,
     follow_leader,
     individual_idm,
-    simulate_open_loop,
+    simulate_followers,
 )
-from unjam.following.pairs import SEGMENT_FIELDS, FollowingSamples, Pair, Segments, following_samples, make_segments
+from unjam.following.trajectories import (
+    SEGMENT_FIELDS,
+    FollowingSamples,
+    FollowingTrajectory,
+    Segments,
+    following_samples,
+    make_segments,
+)
 from unjam.parameters import STRICT, Positive, PositiveInt
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMArrays, IDMParameters, stack_idm_parameters
 from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
 
 MEAN_SQUARE_OFFSET = 1e-2
-"""added to a mean square before its root, so that the slope of a perfect trajectory is finite [m2]"""
+"""constant added to a mean square before its root [m2]: the gradient of a trajectory without error stays finite"""
 MAX_GRADIENT_NORM = 1.0
-"""norm to which gradients are clipped, which can be very large after many steps"""
+"""norm to which gradients are clipped; through many simulated steps they can become very large"""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
 class NetworkSettings:
-    """A network that learns single accelerations; the defaults are those of the paper."""
+    """Settings of a network that learns single accelerations (`fit_one_step`); the defaults are those of the paper."""
 
     hidden: HiddenSizes = (128, 128)
     """sizes of the hidden layers"""
     learning_rate: Positive = 1e-4
-    """of Adam"""
+    """learning rate of Adam"""
     batch_size: PositiveInt = 1024
+    """number of samples in a gradient step"""
     epochs: PositiveInt = 200
-    """maximum number"""
+    """maximum number of epochs"""
     patience: PositiveInt = 200
-    """epochs without improvement in validation after which learning ends; as many as `epochs`: never"""
+    """number of epochs without a smaller validation error after which the fit ends"""
     authority: Positive = 8.0
-    """largest acceleration, which cars can reach [m/s2]"""
+    """largest magnitude of the output [m/s2]"""
 
 
 AnyNetworkSettings = NetworkSettings | MultiStepSettings
@@ -70,7 +79,7 @@ class FollowingNetwork(nn.Module):
     def __init__(
         self, settings: AnyNetworkSettings, samples: FollowingSamples, seed: int, zero_init: bool = False
     ) -> None:
-        """Make a network with inputs normalized by `samples`; with `zero_init` its initial output is zero."""
+        """Initialize a network with inputs normalized by `samples`; with `zero_init` its initial output is zero."""
         super().__init__()
         sizes = [len(RESIDUAL_INPUTS), *settings.hidden, 1]
         with torch.random.fork_rng():
@@ -86,14 +95,14 @@ class FollowingNetwork(nn.Module):
         self.register_buffer("scale", _to_tensor(inputs.std(0).clip(1e-3)))
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the acceleration [m/s2], shape (n,), for inputs of `residual_inputs`."""
+        """Return the acceleration [m/s2], shape (n,), for inputs of `residual_inputs`, shape (n, 3)."""
         hidden = (inputs - self.mean) / self.scale
         for layer in self.layers[:-1]:
             hidden = layer(hidden).relu()
         return self.authority * (self.layers[-1](hidden).squeeze(-1) / self.authority).tanh()
 
     def to_numpy_network(self) -> Network:
-        """Return the equivalent NumPy network, which drives in the simulator."""
+        """Return the equivalent NumPy network, which the simulator uses."""
         layers: list[tuple[Floats, Floats]] = [
             (layer.weight.detach().double().numpy().T, layer.bias.detach().double().numpy()) for layer in self.layers
         ]
@@ -109,16 +118,18 @@ def _to_tensor(values: Floats) -> Tensor:
 
 
 def batched_network(network: Network) -> ResidualFunction:
-    """Return a NumPy network as a function of inputs of any shape (..., 3)."""
+    """Return a NumPy network as a function of inputs of the shape (..., 3)."""
     return lambda inputs: network(inputs.reshape(-1, len(RESIDUAL_INPUTS))).reshape(inputs.shape[:-1])
 
 
 @dataclass(frozen=True)
 class LossHistory:
-    """Mean squared errors of the epochs of a fit [(m/s2)2]."""
+    """Mean squared errors of the acceleration in each epoch of a fit [(m/s2)2]."""
 
     training: list[float] = field(default_factory=list)
+    """error on the training samples, averaged over the gradient steps of the epoch"""
     validation: list[float] = field(default_factory=list)
+    """error on the validation samples at the end of the epoch"""
 
 
 def fit_one_step(
@@ -128,9 +139,10 @@ def fit_one_step(
     settings: NetworkSettings,
     seed: int,
 ) -> tuple[FollowingNetwork, LossHistory]:
-    """Return a network that has learned the accelerations of single moments, minus those of the base if there is one.
+    """Fit a network to the accelerations of single samples, minus those of the base if there is one.
 
-    It has the weights of the best epoch on `validation`. `seed` draws the initial weights and the order of the samples.
+    The network has the weights of the epoch with the smallest error on `validation`. `seed` determines the initial
+    weights and the order of the samples.
 
     Raises:
         UnjamError: a loss is not finite.
@@ -168,18 +180,20 @@ def fit_one_step(
 
 
 @dataclass(frozen=True)
-class CalibratedPairs:
-    """Trajectories with calibrated drivers, the base of a residual."""
+class CalibratedTrajectories:
+    """Trajectories with the calibrated IDM of each driver, which is the base of a residual."""
 
-    pairs: Sequence[Pair]
+    trajectories: Sequence[FollowingTrajectory]
     drivers: Sequence[IDMParameters]
-    """of each trajectory"""
+    """IDM parameters of the driver of each trajectory"""
     initial_headway_weight: float = 0.0
-    """of `individual_idm`"""
+    """weight of the initial time headway, see `individual_idm`"""
 
-    def model(self, pair_index: NDArray[np.int64], limits: AccelerationBounds, as_tensors: bool = False) -> DriverModel:
-        """Return the base of segments of the trajectories `pair_index`, for NumPy or for torch."""
-        parameters = stack_idm_parameters([self.drivers[number] for number in pair_index])
+    def model(
+        self, trajectory_index: NDArray[np.int64], limits: AccelerationBounds, as_tensors: bool = False
+    ) -> DriverModel:
+        """Return the base for segments of the trajectories with these indices, for NumPy arrays or torch tensors."""
+        parameters = stack_idm_parameters([self.drivers[number] for number in trajectory_index])
         if as_tensors:
             parameters = IDMArrays(*map(_to_tensor, parameters))
         return individual_idm(parameters, self.initial_headway_weight, limits)
@@ -187,37 +201,40 @@ class CalibratedPairs:
 
 @dataclass(frozen=True)
 class MultiStepFit:
-    """A residual with its validation errors."""
+    """The result of `fit_multi_step`."""
 
     network: FollowingNetwork
     validation_errors: list[float]
-    """mean over the validation trajectories of the RMS error of the gap [m], at each validation; the first: the base"""
+    """RMS gap error at each validation, averaged over the validation trajectories [m]; the first is that of the base"""
 
 
 def fit_multi_step(
-    training: CalibratedPairs,
-    validation: CalibratedPairs,
+    training: CalibratedTrajectories,
+    validation: CalibratedTrajectories,
     limits: AccelerationBounds,
     settings: MultiStepSettings,
     seed: int,
 ) -> MultiStepFit:
-    """Return a residual on calibrated drivers that brings the simulated gaps closer to the recorded ones.
+    """Fit a residual for calibrated drivers that reduces the difference between simulated and recorded gaps.
 
-    It starts at zero, where the base drives alone, and has the weights that were best on whole `validation`
-    trajectories, possibly the initial ones. `limits` are those of the acceleration [m/s2]; `seed` draws the initial
-    weights and the order of the segments.
+    The initial residual is zero. The network has the weights with the smallest error on uncut `validation`
+    trajectories, possibly the initial ones. `limits` are those of the acceleration [m/s2]; `seed` determines the
+    initial weights and the order of the segments.
 
     Raises:
         UnjamError: a loss is not finite.
     """
     torch.set_num_threads(1)
-    network = FollowingNetwork(settings, following_samples(training.pairs), seed, zero_init=True)
-    segments, whole = make_segments(training.pairs, settings.segment_seconds), make_segments(validation.pairs)
-    base = validation.model(whole.pair_index, limits)
+    network = FollowingNetwork(settings, following_samples(training.trajectories), seed, zero_init=True)
+    segments, whole = (
+        make_segments(training.trajectories, settings.segment_seconds),
+        make_segments(validation.trajectories),
+    )
+    base = validation.model(whole.trajectory_index, limits)
 
     def gap_error() -> float:
         model = add_residual(base, batched_network(network.to_numpy_network()), limits)
-        return float(np.sqrt(simulate_open_loop(model, whole).gap_mse).mean())
+        return float(np.sqrt(simulate_followers(model, whole).gap_mse).mean())
 
     optimizer = Adam(network.parameters(), lr=settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.gradient_steps)
@@ -225,7 +242,9 @@ def fit_multi_step(
     errors, best_state = [gap_error()], deepcopy(network.state_dict())
     for step in range(1, settings.gradient_steps + 1):
         batch = segments.select(generator.choice(segments.gap.shape[1], settings.batch_size))
-        loss = _gap_loss(network, training.model(batch.pair_index, limits, as_tensors=True), limits, batch, settings)
+        loss = _gap_loss(
+            network, training.model(batch.trajectory_index, limits, as_tensors=True), limits, batch, settings
+        )
         if not torch.isfinite(loss):
             raise UnjamError(f"following network: the loss of step {step} is not finite")
         optimizer.zero_grad()
@@ -253,7 +272,7 @@ def _gap_loss(
         return residuals[-1]
 
     follow = add_residual(base, recorded_network, limits)(speeds[0], gaps[0])
-    states = list(follow_leader(follow, (speeds[0], gaps[0]), (leader_speeds, paths), segments.step))
+    states = list(follow_leader(follow, (speeds[0], gaps[0]), (leader_speeds, paths), segments.time_step))
     speed, gap = (torch.stack(each) for each in zip(*states, strict=True))
     squares = (gap - gaps[1:]).square() + (settings.speed_weight * (speed - speeds[1:])).square()
     gap_part = ((squares * is_present).sum(0) / is_present.sum(0) + MEAN_SQUARE_OFFSET).sqrt().mean()

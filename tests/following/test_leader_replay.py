@@ -4,17 +4,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.following.synthetic_pairs import follower, idm_driver
-from unjam.following.open_loop import (
+from tests.following.synthetic_trajectories import follower, idm_driver
+from unjam.following.leader_replay import (
     add_residual,
-    fixed_driver,
+    as_driver_model,
     follow_leader,
     idm_function,
     individual_idm,
     one_step_error,
-    simulate_open_loop,
+    simulate_followers,
 )
-from unjam.following.pairs import make_segments
+from unjam.following.trajectories import make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios.population import residual_inputs
 
@@ -23,21 +23,21 @@ QUICK = IDMParameters(time_headway=0.8, max_acceleration=1.5)
 
 def test_true_driver_has_no_error() -> None:
     segments = make_segments([idm_driver(QUICK, seed=1), idm_driver(QUICK, seed=2, seconds=25.0)])
-    simulated = simulate_open_loop(fixed_driver(idm_function(QUICK)), segments)
+    simulated = simulate_followers(as_driver_model(idm_function(QUICK)), segments)
     assert simulated.gap_mse.max() < 1e-18
     assert simulated.speed_mse.max() < 1e-18
-    assert one_step_error(fixed_driver(idm_function(QUICK)), segments).max() < 1e-18
+    assert one_step_error(as_driver_model(idm_function(QUICK)), segments).max() < 1e-18
 
 
 def test_another_driver_has_an_error() -> None:
-    simulated = simulate_open_loop(fixed_driver(idm_function(PAPER_IDM)), make_segments([idm_driver(QUICK)]))
+    simulated = simulate_followers(as_driver_model(idm_function(PAPER_IDM)), make_segments([idm_driver(QUICK)]))
     assert simulated.gap_mse[0] > 0.5
     assert not simulated.has_collided[0]
 
 
 def test_vehicle_that_never_brakes_touches_its_leader_and_stays_behind_it() -> None:
-    simulated = simulate_open_loop(
-        fixed_driver(lambda speed, leader_speed, gap: speed * 0.0 + 1.0), make_segments([idm_driver(QUICK)])
+    simulated = simulate_followers(
+        as_driver_model(lambda speed, leader_speed, gap: speed * 0.0 + 1.0), make_segments([idm_driver(QUICK)])
     )
     assert simulated.has_collided[0]
     assert simulated.gap.min() == 0.0
@@ -56,7 +56,7 @@ def test_weighted_headway_lies_between_the_common_and_the_initial_one(weight: fl
 
 def test_residual_is_added_within_the_limits() -> None:
     inputs = (np.array([10.0, 10.0]), np.array([9.0, 9.0]), np.array([20.0, 0.5]))
-    base = fixed_driver(idm_function(PAPER_IDM))
+    base = as_driver_model(idm_function(PAPER_IDM))
     model = add_residual(base, lambda columns: columns[..., 1], (-4.0, 2.0))
     acceleration = model(*inputs[::2])(*inputs)
     assert acceleration[0] == pytest.approx(idm_function(PAPER_IDM)(*inputs)[0] - 1.0)
@@ -64,9 +64,9 @@ def test_residual_is_added_within_the_limits() -> None:
 
 
 def test_tensors_equal_arrays() -> None:
-    pair = follower(idm_function(QUICK))
-    leader = (pair.leader_speed[:, None], pair.leader_path[:, None])
-    start = (pair.speed[:1], pair.gap[:1])
+    trajectory = follower(idm_function(QUICK))
+    leader = (trajectory.leader_speed[:, None], trajectory.leader_path[:, None])
+    start = (trajectory.speed[:1], trajectory.gap[:1])
     model = individual_idm(PAPER_IDM, 0.4, (-4.0, 2.0))
     arrays = list(follow_leader(model(*start), start, leader, 0.1))
     speed, gap = map(torch.as_tensor, start)

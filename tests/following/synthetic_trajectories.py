@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from unjam.following.open_loop import AccelerationFunction, follow_leader, idm_function
-from unjam.following.pairs import Pair
+from unjam.following.leader_replay import AccelerationFunction, follow_leader, idm_function
+from unjam.following.trajectories import FollowingTrajectory
 from unjam.physics.idm import IDMParameters, equilibrium_gap
 
 STEP = 0.1
@@ -20,7 +20,7 @@ def follower(
     gap: float = 14.0,
     seed: int = 0,
     split: str = "",
-) -> Pair:
+) -> FollowingTrajectory:
     """Return the trajectory of `driver` behind a leader whose speed oscillates."""
     times = np.arange(round(seconds / STEP) + 1) * STEP
     phase = np.random.default_rng(seed).uniform(0, 6)
@@ -31,12 +31,12 @@ def follower(
     speeds, gaps = (
         np.concatenate([[first], *rows]) for first, rows in zip((speed, gap), zip(*states, strict=True), strict=True)
     )
-    return Pair(name, name, STEP, speeds, leader_speed, gaps, "human", split)
+    return FollowingTrajectory(name, name, STEP, speeds, leader_speed, gaps, "human", split)
 
 
 def idm_driver(
     parameters: IDMParameters, name: str = "0", seed: int = 0, seconds: float = 40.0, split: str = ""
-) -> Pair:
+) -> FollowingTrajectory:
     """Return the trajectory of an IDM that starts with its equilibrium gap."""
     gap = equilibrium_gap(8.0, parameters)
     return follower(idm_function(parameters), name, seconds, 8.0, gap, seed, split)
@@ -46,8 +46,8 @@ def write_table(path: Path, drivers: int = 3) -> None:
     """Write a CSV file of trajectories as a user has them, of drivers that differ in their time headway."""
     parts = []
     for number in range(drivers):
-        pair = idm_driver(IDMParameters(time_headway=0.9 + 0.1 * number), seed=number, seconds=20.0)
-        times = STEP * np.arange(len(pair.speed))
-        numbers = {"t": times, "v_foll": pair.speed, "v_lead": pair.leader_speed, "gap": pair.gap}
+        trajectory = idm_driver(IDMParameters(time_headway=0.9 + 0.1 * number), seed=number, seconds=20.0)
+        times = STEP * np.arange(len(trajectory.speed))
+        numbers = {"t": times, "v_foll": trajectory.speed, "v_lead": trajectory.leader_speed, "gap": trajectory.gap}
         parts.append(pd.DataFrame({"pair": number, **numbers}))
     pd.concat(parts).to_csv(path, index=False)

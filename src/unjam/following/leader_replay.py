@@ -1,0 +1,157 @@
+"""Simulation of driver models behind recorded leaders.
+
+The leader repeats its recorded speeds, and the model drives the follower, whose speeds and gaps are simulated. Errors
+one step ahead of recorded states are not sufficient: a model with smaller ones can collide more often when it drives.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.drivers.car_following import MIN_IDM_GAP
+from unjam.following.trajectories import Floats, Segments
+from unjam.physics.arrays import Array, clamp_min, clip, namespace
+from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMArrays, IDMParameters, idm_acceleration
+from unjam.physics.kinematics import next_position, next_speed
+from unjam.scenarios.population import residual_inputs
+
+AccelerationFunction = Callable[[Array, Array, Array], Array]
+"""returns the acceleration [m/s2] for own speed [m/s], leader speed [m/s] and gap [m]"""
+DriverModel = Callable[[Array, Array], AccelerationFunction]
+"""returns the `AccelerationFunction` of a driver that starts with a speed [m/s] and a gap [m]"""
+ResidualFunction = Callable[[Array], Array]
+"""returns the acceleration that a network adds [m/s2], for inputs of `residual_inputs`, shape (..., 3)"""
+AnyIDM = IDMParameters | IDMArrays
+"""one set of IDM parameters, or an array for each parameter"""
+AccelerationBounds = tuple[float, float]
+"""smallest and largest acceleration [m/s2]"""
+
+MIN_HEADWAY_SPEED = 2.0
+"""smallest divisor when a time headway is estimated as gap over speed [m/s]; at low speeds the ratio means nothing"""
+HEADWAY_LIMITS = (0.2, 6.0)
+"""smallest and largest estimated time headway [s]"""
+
+
+def as_driver_model(follow: AccelerationFunction) -> DriverModel:
+    """Return a driver model that uses one acceleration function, whatever its initial speed and gap."""
+    return lambda speed, gap: follow
+
+
+def replace_parameters(parameters: AnyIDM, **values: Array) -> IDMArrays:
+    """Return the parameters as arrays, with these `values` for some of them."""
+    return IDMArrays(*(values.get(name, getattr(parameters, name)) for name in IDM_PARAMETER_NAMES))
+
+
+def idm_function(parameters: AnyIDM, limits: AccelerationBounds | None = None) -> AccelerationFunction:
+    """Return the acceleration function of the IDM; with `limits`, the acceleration is clipped to them [m/s2]."""
+
+    def follow(speed: Array, leader_speed: Array, gap: Array) -> Array:
+        acceleration = idm_acceleration(speed, leader_speed, clamp_min(gap, MIN_IDM_GAP), parameters)
+        return acceleration if limits is None else clip(acceleration, *limits)
+
+    return follow
+
+
+def individual_idm(
+    parameters: AnyIDM, initial_headway_weight: Array, limits: AccelerationBounds | None = None
+) -> DriverModel:
+    """Return an IDM whose time headway depends on its initial gap and speed.
+
+    Human drivers differ most in the distance that they keep. A model can estimate it from its first state, as the
+    headway T0 = (gap - s0) / v. The headway of the driver is T^(1 - w) T0^w with the initial headway weight w: with
+    w = 0 all drivers have the headway T of `parameters`, with w = 1 each driver keeps its initial headway.
+    """
+    p = parameters
+
+    def start(speed: Array, gap: Array) -> AccelerationFunction:
+        initial = clip((gap - p.minimum_gap) / clamp_min(speed, MIN_HEADWAY_SPEED), *HEADWAY_LIMITS)
+        own = p.time_headway ** (1.0 - initial_headway_weight) * initial**initial_headway_weight
+        return idm_function(replace_parameters(p, time_headway=own), limits)
+
+    return start
+
+
+def add_residual(
+    base: DriverModel | None, network: ResidualFunction, limits: AccelerationBounds | None = None
+) -> DriverModel:
+    """Return a driver model that adds the output of a network to the acceleration of a base; None: the network alone.
+
+    With `limits`, the sum is clipped to them [m/s2].
+    """
+
+    def start(speed: Array, gap: Array) -> AccelerationFunction:
+        base_function = base(speed, gap) if base is not None else None
+
+        def follow(speed: Array, leader_speed: Array, gap: Array) -> Array:
+            acceleration = network(residual_inputs(speed, leader_speed, gap))
+            if base_function is not None:
+                acceleration = acceleration + base_function(speed, leader_speed, gap)
+            return acceleration if limits is None else clip(acceleration, *limits)
+
+        return follow
+
+    return start
+
+
+def follow_leader(
+    follow: AccelerationFunction, start: tuple[Array, Array], leader: Any, time_step: float
+) -> Iterator[Any]:
+    """Yield the speed [m/s] and the gap [m] of a follower after each step behind a recorded leader.
+
+    The gap never becomes negative: a follower that uses it up stays in contact with the leader, and is not faster than
+    the leader, until it brakes. A network could not act on negative gaps, which recorded data do not contain.
+
+    Args:
+        follow: acceleration function of the follower.
+        start: its initial speed [m/s] and gap [m], shape (..., n).
+        leader: speeds [m/s] and paths [m] of the leaders as in `FollowingTrajectory`, shape (T, n).
+        time_step: time between two samples [s].
+    """
+    (speed, gap), (leader_speeds, paths) = start, leader
+    position = gap * 0.0
+    for leader_speed, next_leader_speed, path in zip(leader_speeds[:-1], leader_speeds[1:], paths[1:], strict=True):
+        speed = next_speed(speed, follow(speed, leader_speed, gap), time_step)
+        gap = path - next_position(position, speed, time_step)
+        is_in_contact, xp = gap <= 0.0, namespace(gap)
+        gap = clamp_min(gap, 0.0)
+        position = path - gap
+        speed = xp.where(is_in_contact & (speed > next_leader_speed), next_leader_speed, speed)
+        yield speed, gap
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedFollowers:
+    """Followers that a driver model drives behind recorded leaders, and their errors: n segments of T samples."""
+
+    speed: Floats
+    """simulated speed [m/s], shape (T, n)"""
+    gap: Floats
+    """simulated gap [m], shape (T, n)"""
+    speed_mse: Floats
+    """mean squared difference to the recorded speed in each segment [m2/s2], shape (n,)"""
+    gap_mse: Floats
+    """mean squared difference to the recorded gap in each segment [m2], shape (n,)"""
+    has_collided: NDArray[np.bool_]
+    """whether the gap became zero in a segment, shape (n,)"""
+    sample_counts: NDArray[np.int64]
+    """number of simulated samples of each segment, without the given first one, shape (n,)"""
+
+
+def simulate_followers(model: DriverModel, segments: Segments) -> SimulatedFollowers:
+    """Simulate a driver model behind the leader of each segment, starting from the first recorded sample."""
+    start, is_present, counts = segments.start, segments.is_present, segments.sample_counts
+    states = follow_leader(model(*start), start, segments.leader, segments.time_step)
+    speed, gap = map(np.stack, zip(start, *states, strict=True))
+    speed_mse = (np.square(speed - segments.speed) * is_present).sum(0) / counts
+    gap_mse = (np.square(gap - segments.gap) * is_present).sum(0) / counts
+    return SimulatedFollowers(speed, gap, speed_mse, gap_mse, np.any((gap <= 0.0) & is_present, axis=0), counts)
+
+
+def one_step_error(model: DriverModel, segments: Segments) -> Floats:
+    """Return the mean squared error of the acceleration from each recorded sample to the next [(m/s2)2], shape (n,)."""
+    predicted = model(*segments.start)(segments.speed[:-1], segments.leader_speed[:-1], segments.gap[:-1])
+    error = predicted - np.diff(segments.speed, axis=0) / segments.time_step
+    return (np.square(error) * segments.is_present[1:]).sum(0) / segments.sample_counts
