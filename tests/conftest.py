@@ -17,6 +17,7 @@ from unjam.controller.file import sha256_of
 from unjam.drivers import LocalState
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import FileDriver
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
 if "UNJAM_STATE" not in os.environ:  # which code the tests ran is not what the user ran
@@ -51,6 +52,12 @@ def pytest_unconfigure() -> None:
 @pytest.fixture
 def simulation() -> Iterator[Simulation]:
     with Simulation() as opened:
+        yield opened
+
+
+@pytest.fixture
+def sumo() -> Iterator[SumoBackend]:
+    with SumoBackend() as opened:
         yield opened
 
 

@@ -150,7 +150,7 @@ def test_measures_draw_nothing() -> None:
 
 
 def test_sumo_is_imported_in_one_place() -> None:
-    assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/backends.py"}
+    assert importers({"libsumo", "traci", "sumolib"}) == {"worlds/sumo/transports.py"}
 
 
 def test_learning_libraries_are_imported_only_by_learning_parts() -> None:

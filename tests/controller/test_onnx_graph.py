@@ -29,6 +29,7 @@ from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Trajectory
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
 pytest.importorskip("onnxscript")
@@ -46,7 +47,7 @@ def driver_of(network: Network, expert: Driver, hold: int = 10) -> ResidualDrive
 
 
 def longest_stay(scenario: Scenario, driver: Driver, simulation: Simulation) -> Trajectory:
-    episode = run_episode(scenario, driver, (3,), simulation=simulation)
+    episode = run_episode(scenario, driver, (3,), backend=SumoBackend(simulation))
     return max(episode.trajectories, key=lambda trajectory: len(trajectory.applied_acceleration))
 
 

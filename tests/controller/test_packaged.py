@@ -24,6 +24,7 @@ from unjam.measures.statistics import paired_difference
 from unjam.scenarios import FigureEight, Ring
 from unjam.training.presets import preset_scenarios, preset_values
 from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
 SINGLE_ROADS = ("ring-best", "ring-jammed-best", "figure-eight-best")
@@ -113,7 +114,7 @@ EIGHTS = [FigureEight(radius=(radius, radius), vehicles=count, horizon=600) for 
 @cache
 def row_of(name: str, road: Ring | FigureEight, simulation: Simulation) -> dict[str, Any]:
     """What is measured of an episode; that of people alone is every controller's to compare with."""
-    return measure(run_episode(road, make_driver(name, 0.1), (11,), simulation=simulation))
+    return measure(run_episode(road, make_driver(name, 0.1), (11,), backend=SumoBackend(simulation)))
 
 
 @pytest.mark.slow

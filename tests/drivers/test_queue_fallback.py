@@ -17,7 +17,7 @@ from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import FigureEight
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 
 LEADS, GAVE_UP = 0.1, 0.2
 LAP = 400.0
@@ -77,12 +77,12 @@ def test_it_is_made_again_from_its_recipe_and_from_its_file(tmp_path: Path) -> N
 
 
 def test_among_people_who_keep_longer_distances_giving_up_helps_and_among_others_nothing_changes(
-    simulation: Simulation,
+    sumo: SumoBackend,
 ) -> None:
     for headway, helps in ((1.0, False), (1.5, True)):
         road = FigureEight(radius=(32, 32), humans=IDMParameters(time_headway=headway))
         led, given_up = (
-            measure(run_episode(road, driver, (3,), simulation=simulation))["mean_speed_second_half"]
+            measure(run_episode(road, driver, (3,), backend=sumo))["mean_speed_second_half"]
             for driver in (TWO.primary, TWO)
         )
         assert (given_up > led + 0.2) if helps else (given_up == led)

@@ -18,7 +18,7 @@ from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
 from unjam.tree import map_leaves
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 
 PI, STOPPER = PISaturation(), FollowerStopper()
 
@@ -75,17 +75,17 @@ def test_it_drives_tensors_as_it_drives_arrays() -> None:
     np.testing.assert_allclose(mixed.act(tensors, memory)[0].numpy(), expected, atol=1e-12)
 
 
-def test_the_first_cav_has_the_first_driver_and_the_second_the_second(simulation: Simulation) -> None:
+def test_the_first_cav_has_the_first_driver_and_the_second_the_second(sumo: SumoBackend) -> None:
     ring = Ring(length=(260, 260), cavs=2, horizon=80)
     driver = make_driver("pi+constant:acceleration=0.3", 0.1)
-    first, second = run_episode(ring, driver, (0,), simulation=simulation).trajectories
+    first, second = run_episode(ring, driver, (0,), backend=sumo).trajectories
     np.testing.assert_array_equal(second.applied_acceleration, 0.3)
     assert np.ptp(first.applied_acceleration) > 0.1
 
 
-def test_where_cavs_come_and_go_drivers_take_turns_as_they_enter(simulation: Simulation) -> None:
+def test_where_cavs_come_and_go_drivers_take_turns_as_they_enter(sumo: SumoBackend) -> None:
     driver = make_driver("constant:acceleration=0.1+constant:acceleration=0.2", 1.0)
-    episode = run_episode(Merge(horizon=90), driver, (0,), simulation=simulation)
+    episode = run_episode(Merge(horizon=90), driver, (0,), backend=sumo)
     entered = sorted(episode.trajectories, key=lambda stay: (stay.start_step, -stay.states.route_position[0]))
     assert len(entered) > 2
     for number, stay in enumerate(entered):

@@ -66,7 +66,7 @@ def test_steps_the_very_episode_that_run_episode_runs(name: str, warmup: int) ->
     while not done:
         _, reward, terminated, truncated, info = environment.step(np.array([0.3]))
         done = terminated or truncated
-        speeds.append(environment.unwrapped._road.traffic.speeds)  # pyright: ignore[reportAttributeAccessIssue]
+        speeds.append(environment.unwrapped._road.world.speeds)  # pyright: ignore[reportAttributeAccessIssue]
         rewards.append(reward)
         assert sum(info["reward_terms"].values()) == reward
     environment.close()
@@ -88,7 +88,7 @@ def test_actions_are_added_to_an_expert(environment: gymnasium.Env) -> None:
     speeds = []
     for _ in range(60):
         made.step(np.zeros(1))
-        speeds.append(made._road.traffic.speeds)
+        speeds.append(made._road.world.speeds)
     made.close()
     expected = run_episode(make_scenario("ring", SHORT), driver_from_name("pi", 0.1), (3,))
     np.testing.assert_array_equal(speeds, expected.speeds[1:])
@@ -99,7 +99,7 @@ def test_the_horizon_truncates_and_does_not_terminate(name: str) -> None:
     horizon = 20 if name in OPEN else 60
     environment = gymnasium.make(name, horizon=horizon)
     environment.reset(seed=1)
-    decided = environment.unwrapped._road.traffic.control_steps  # pyright: ignore[reportAttributeAccessIssue]
+    decided = environment.unwrapped._road.world.control_steps  # pyright: ignore[reportAttributeAccessIssue]
     ends = [environment.step(np.zeros(1))[2:4] for _ in range(horizon - decided)]
     environment.close()
     assert len(ends) > 5
@@ -116,7 +116,7 @@ def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
         observation, _, terminated, truncated, _ = environment.step(np.zeros(1))
         seen.append(observation)
         ends.append((terminated, truncated))
-    traffic = environment._road.traffic
+    traffic = environment._road.world
     assert not traffic.cav_ids
     assert traffic.control_steps < 200
     assert ends[-1] == (False, True)

@@ -109,7 +109,7 @@ def test_agents_of_the_merge_enter_and_leave_as_in_the_very_episode_that_run_epi
     while environment.agents:
         acting = environment.agents
         seen, rewards, terminated, truncated, _ = environment.step(dict.fromkeys(acting, np.array([0.2])))
-        moment = environment._road.traffic.control_steps
+        moment = environment._road.world.control_steps
         assert not any(terminated.values())
         assert set(seen) == set(rewards) == set(terminated) == set(truncated) >= set(acting)
         for name in acting:
@@ -135,14 +135,14 @@ def test_time_goes_on_by_itself_until_the_first_agent_enters_and_ends_with_the_l
     environment = unjam.parallel_env("merge", cavs=2, standing_vehicles=0, horizon=300)
     environment.reset(seed=1)
     assert len(environment.agents) == 1
-    assert environment._road.traffic.control_steps > 0
+    assert environment._road.world.control_steps > 0
     gaps = 0
     while environment.agents:
-        before = environment._road.traffic.control_steps
+        before = environment._road.world.control_steps
         environment.step(dict.fromkeys(environment.agents, np.array([0.5])))
-        gaps += environment._road.traffic.control_steps > before + 1
+        gaps += environment._road.world.control_steps > before + 1
     assert gaps <= 1
-    assert environment._road.traffic.control_steps < 300
+    assert environment._road.world.control_steps < 300
     assert environment.step({}) == ({}, {}, {}, {}, {})
     environment.close()
 
@@ -177,13 +177,13 @@ def test_a_vehicle_that_comes_back_is_no_agent_again() -> None:
     class Road:
         """Its second CAV leaves in the first decision, and is back after the second."""
 
-        lock, traffic = CopyableLock(), SimpleNamespace(cav_ids=there[0])
+        lock, world = CopyableLock(), SimpleNamespace(cav_ids=there[0])
 
         def step(self, actions: list[float]) -> RoadStepResult:
             before, now = there[len(told)], there[len(told) + 1]
             told.append(actions)
             left = {name: np.zeros(5, np.float32) for name in before if name not in now}
-            self.traffic.cav_ids = now
+            self.world.cav_ids = now
             return RoadStepResult(now, np.zeros((len(now), 5), np.float32), left, 1.0, {}, False, False)
 
     environment._road = Road()  # pyright: ignore[reportAttributeAccessIssue]

@@ -24,6 +24,7 @@ from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
 from unjam.training.run_folder import load_checkpoint
 from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -47,7 +48,9 @@ def resets(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     with Simulation() as simulation:
         for number in range(count):
             length = 220 + 5 * int(generator.integers(11))
-            episode = run_episode(Ring(length=(length, length), horizon=2), IDM(), (number,), simulation=simulation)
+            episode = run_episode(
+                Ring(length=(length, length), horizon=2), IDM(), (number,), backend=SumoBackend(simulation)
+            )
             assert episode.has_run
             outcome.happened["the episode ran"] += 1
             if number == count // 10:

@@ -46,7 +46,7 @@ from unjam.trust import check_trusted_values, expecting_code, remember_trusted
 from unjam.user_code import read_code
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import networks
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.backend import SumoBackend, sumo_inputs
 from unjam.worlds.sumo.networks import network_file
 from unjam.worlds.sumo.sandboxed import SandboxedSimulation
 from unjam.worlds.sumo.simulation import Simulation
@@ -328,9 +328,9 @@ def cheats(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
             road = make_scenario(str(own) if name == "own" else name, {**share, "horizon": 30})
             seed = int(generator.integers(10))
             if (name, seed) not in honest_ones:
-                driven = run_episode(road, honest, seed, simulation=simulation)
+                driven = run_episode(road, honest, seed, backend=SumoBackend(simulation))
                 honest_ones[name, seed] = episode_fingerprint(driven)
-            cheated = run_episode(road, insists, seed, simulation=simulation)
+            cheated = run_episode(road, insists, seed, backend=SumoBackend(simulation))
             assert episode_fingerprint(cheated) == honest_ones[name, seed]
             outcome.happened[f"{name}: measured as if it had not"] += 1
     return outcome

@@ -17,6 +17,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.networks import sumo_version
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -73,7 +74,7 @@ def drive_all() -> Iterator[tuple[str, Episode]]:
         for road, driver in cases():
             scenario = scenario_of(road, Path(network))
             expert = driver_from_name(driver, scenario.control_step)
-            yield f"{road}-{driver}", run_episode(scenario, expert, SEED, simulation=simulation)
+            yield f"{road}-{driver}", run_episode(scenario, expert, SEED, backend=SumoBackend(simulation))
 
 
 def hash_of(episode: Episode) -> str:

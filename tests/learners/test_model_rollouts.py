@@ -23,6 +23,7 @@ from unjam.models.settings import ModelSettings
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
 from unjam.worlds.episode import Task, run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
 torch.set_num_threads(1)
@@ -60,7 +61,7 @@ class Trained:
             self.episodes_run += 2
             return [
                 [
-                    run_episode(RING, driver, (0, iteration, index), explore=True, simulation=simulation)
+                    run_episode(RING, driver, (0, iteration, index), explore=True, backend=SumoBackend(simulation))
                     for index in range(2)
                 ]
             ]
@@ -185,7 +186,9 @@ def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, 10)
     for iteration in (1, 2):
-        episodes = [run_episode(RING, driver, (9, iteration, n), explore=True, simulation=shared) for n in (0, 1)]
+        episodes = [
+            run_episode(RING, driver, (9, iteration, n), explore=True, backend=SumoBackend(shared)) for n in (0, 1)
+        ]
         rollouts.learn(episodes, iteration)
     plans, batches = list[RolloutPlan](), list[RolloutBatch]()
     simulate = rollouts.simulate
@@ -245,7 +248,7 @@ def test_state_and_restore_keep_calibrated_humans(shared: Simulation) -> None:
     one, other = (RowRollouts(MODEL, TASK, POLICY, 0) for _ in range(2))
     humans = IDMParameters(time_headway=1.3, max_acceleration=0.8)
     one.scenario = replace(RING, humans=humans)
-    one.data.add([run_episode(RING, PISaturation(), (0,), simulation=shared)], RING)
+    one.data.add([run_episode(RING, PISaturation(), (0,), backend=SumoBackend(shared))], RING)
     facts, tensors = one.state()
     other.restore(json.loads(json.dumps(facts)), tensors)
     assert other.scenario == one.scenario

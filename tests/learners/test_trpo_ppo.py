@@ -17,7 +17,7 @@ from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
 from unjam.learners.trpo_ppo import ResidualPolicy
 from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 
 torch.set_num_threads(1)  # more threads are slower with small matrices
 new_policy = partial(make_policy, ResidualPolicy)
@@ -47,13 +47,13 @@ def test_policy_without_zero_init_has_random_residuals() -> None:
 
 @pytest.mark.parametrize("action_repeat", [1, 10])
 @pytest.mark.parametrize("cavs", [1, 3])
-def test_new_policy_drives_exactly_as_its_expert(action_repeat: int, cavs: int, simulation: Simulation) -> None:
+def test_new_policy_drives_exactly_as_its_expert(action_repeat: int, cavs: int, sumo: SumoBackend) -> None:
     ring = Ring(length=(230, 230), horizon=200, warmup=100, cavs=cavs)
     expert, parts = PISaturation(), PolicySettings().inputs
     network = new_policy(inputs=observation_size(parts, expert)).network()
     driver = ResidualDriver(expert, network, ring.action_limit, parts, action_repeat)
-    expert_episode = run_episode(ring, expert, (3,), simulation=simulation)
-    residual_episode = run_episode(ring, driver, (3,), simulation=simulation)
+    expert_episode = run_episode(ring, expert, (3,), backend=sumo)
+    residual_episode = run_episode(ring, driver, (3,), backend=sumo)
     np.testing.assert_array_equal(residual_episode.speeds, expert_episode.speeds)
     np.testing.assert_array_equal(residual_episode.positions, expert_episode.positions)
     for residual_trajectory, expert_trajectory in zip(

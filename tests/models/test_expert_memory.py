@@ -17,6 +17,7 @@ from unjam.models.rollouts import NumPyDriverAdapter, tensor_driver, tensor_memo
 from unjam.scenarios import Ring
 from unjam.tree import leaves, map_leaves
 from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
 RING = Ring(length=(60, 70), vehicles=5, cavs=2, horizon=90)
@@ -47,7 +48,7 @@ def experts(my_drivers: Path) -> list[Driver]:
 @pytest.mark.parametrize("number", [0, 1, 2])
 @pytest.mark.parametrize("warmup", [0, 40])
 def test_memory_equals_that_of_the_actual_drive(
-    number: int, warmup: int, my_drivers: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+    number: int, warmup: int, my_drivers: Path, sumo: SumoBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two episodes with two CAVs each, driven with exploration; random starts in all four trajectories."""
     expert = experts(my_drivers)[number]
@@ -56,7 +57,7 @@ def test_memory_equals_that_of_the_actual_drive(
     for seed in range(2):
         with monkeypatch.context() as patch:
             recorded = record_memories(expert, patch)
-            data.add([run_episode(ring, driver, (seed,), explore=True, simulation=simulation)], ring)
+            data.add([run_episode(ring, driver, (seed,), explore=True, backend=sumo)], ring)
         memories += [recorded, recorded]
     start_indices = np.random.default_rng(0).permutation(data.start_indices())[:40]
     found = reconstruct_memory(expert, data.recordings, start_indices)
@@ -74,7 +75,7 @@ def test_memory_has_no_later_or_foreign_states() -> None:
     data = EnvironmentData(1000)
     driver = ResidualDriver(expert, random_network(), 1.0, action_repeat=10)
     with Simulation() as simulation:
-        episodes = [run_episode(RING, driver, (seed,), simulation=simulation) for seed in range(3)]
+        episodes = [run_episode(RING, driver, (seed,), backend=SumoBackend(simulation)) for seed in range(3)]
     data.add(episodes, RING)
     start_indices = data.start_indices()
     found = reconstruct_memory(expert, data.recordings, start_indices)

@@ -8,7 +8,7 @@ import pytest
 from unjam.drivers import Human
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam_paper import assess_examples, open_test_roads
 from unjam_paper.assess_examples import ASSESS_EXAMPLES, EXAMPLES, EXAMPLES_PART, Example, examples_table
 from unjam_paper.results_file import read_part
@@ -16,10 +16,10 @@ from unjam_paper.study import StudyFolder
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_a_road_of_the_examples_carries_traffic(name: str, tmp_path: Path, simulation: Simulation) -> None:
+def test_a_road_of_the_examples_carries_traffic(name: str, tmp_path: Path, sumo: SumoBackend) -> None:
     example = EXAMPLES[name]
     scenario = make_scenario(str(example.write(tmp_path)), {"penetration_rate": example.rate, "end": 60.0})
-    episode = run_episode(scenario, Human(), (1,), simulation=simulation)
+    episode = run_episode(scenario, Human(), (1,), backend=sumo)
     assert (episode.status, episode.teleports, episode.warnings) == ("completed", 0, ())
     assert len(episode.vehicle_ids) > 5
     assert not [note for note in scenario.notes if "max-depart-delay" in note]

@@ -14,6 +14,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper import do_no_harm, open_test_roads
@@ -112,7 +113,7 @@ def travel_time(road: OpenTestRoad, driver: str, seconds: float, folder: Path, s
         file = write_road_files(road, folder)
     scenario = make_scenario(str(file), {"penetration_rate": 0.1, "steps_per_control_step": 2, **ACC_SETTINGS})
     made = make_driver(driver, scenario.control_step)
-    return measure(run_episode(scenario, made, (1,), simulation=simulation))["travel_time"]
+    return measure(run_episode(scenario, made, (1,), backend=SumoBackend(simulation)))["travel_time"]
 
 
 @pytest.mark.long

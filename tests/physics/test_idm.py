@@ -16,7 +16,7 @@ from unjam.physics.idm import (
 )
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios import Ring
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.backend import sumo_inputs
 from unjam.worlds.sumo.simulation import Simulation
 
 speeds = st.floats(0.0, 29.0)

@@ -22,7 +22,7 @@ from unjam.reports.video import (
     write_video,
 )
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo.traffic import RoadScene
+from unjam.worlds.road_world import RoadScene
 
 SECONDS = 20.0
 

@@ -11,7 +11,7 @@ from unjam.errors import InputError
 from unjam.scenarios import Merge, make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.merge import ENTRANCE_LENGTH, JUNCTION_LENGTHS
 from unjam.scenarios.road import MergeRoad
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.backend import sumo_inputs
 from unjam.worlds.sumo.networks import network_file
 
 

@@ -11,7 +11,7 @@ from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.population import Population, read_population, write_population
 from unjam.scenarios.road import BuiltRoad, MotorwayRoad
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.backend import sumo_inputs
 
 DRIVERS = (IDMParameters(time_headway=0.8, desired_speed=35.0), IDMParameters(time_headway=1.6, minimum_gap=4.0))
 NETWORK = Network(((np.ones((3, 2)), np.zeros(2)), (np.full((2, 1), 0.01), np.zeros(1))), 0.5)

@@ -13,7 +13,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.run import run_batch
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 
@@ -36,9 +36,9 @@ def subclass_of(kind: type[Scenario], **members: Any) -> Scenario:
 
 
 @pytest.mark.parametrize("scenario", [LongRing(), NamedRing()])
-def test_a_subclass_is_simulated_in_one_process_and_refused_in_others(scenario: Ring, simulation: Simulation) -> None:
+def test_a_subclass_is_simulated_in_one_process_and_refused_in_others(scenario: Ring, sumo: SumoBackend) -> None:
     scenario = type(scenario)(horizon=5)
-    assert run_episode(scenario, Human(), 1, simulation=simulation).loop_length == 300.0
+    assert run_episode(scenario, Human(), 1, backend=sumo).loop_length == 300.0
     words = rf"scenario: {type(scenario).__name__} is not allowed in a file or another process; allowed: Ring, "
     with pytest.raises(InputError, match=words), WorkerPool(1) as workers:
         workers.run([EpisodeTask(scenario, Human(), (1,))])

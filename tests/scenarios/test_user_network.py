@@ -15,8 +15,7 @@ from unjam.scenarios.road import UserNetworkRoad
 from unjam.scenarios.user_network import UserNetwork, _log_once, load_user_network, passenger_types
 from unjam.sumo_files import read_sumo_files
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.inputs import sumo_inputs
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend, sumo_inputs
 
 TYPES = """
 <routes>
@@ -64,24 +63,24 @@ def test_step_and_horizon_are_those_of_the_configuration_unless_set(
     assert (found.simulation_step, found.horizon) == (step, horizon)
 
 
-def test_vehicles_that_depart_before_the_begin_are_left_out(tmp_path: Path, simulation: Simulation) -> None:
+def test_vehicles_that_depart_before_the_begin_are_left_out(tmp_path: Path, sumo: SumoBackend) -> None:
     departing = (f'<vehicle id="{at}" type="car" route="along" depart="{at}"/>' for at in (0, 5, 40, 60))
     road = str(straight(tmp_path, "".join(departing)))
     asked = {"penetration_rate": 1.0, "end": 80.0}
     early, late = (
-        run_episode(load_user_network(road, {**asked, **begin}), Human(), (0,), simulation=simulation)
+        run_episode(load_user_network(road, {**asked, **begin}), Human(), (0,), backend=sumo)
         for begin in ({}, {"begin": 30.0})
     )
     assert (len(early.vehicle_ids), len(late.vehicle_ids)) == (4, 2)
 
 
 def test_a_begin_after_the_end_that_the_configuration_names_needs_another_end(
-    tmp_path: Path, simulation: Simulation
+    tmp_path: Path, sumo: SumoBackend
 ) -> None:
     road = str(straight(tmp_path, '<vehicle id="it" type="car" route="along" depart="90"/>', end=60.0))
     for end in ({"end": 100.0}, {"horizon": 200}):
         late = load_user_network(road, {"penetration_rate": 1.0, "begin": 80.0, **end})
-        episode = run_episode(late, Human(), (0,), simulation=simulation)
+        episode = run_episode(late, Human(), (0,), backend=sumo)
         assert (episode.vehicle_ids, late.horizon) == (("it",), 200)
 
 

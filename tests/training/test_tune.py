@@ -30,7 +30,7 @@ from unjam.training.trial_log import TRIALS_FILE
 from unjam.training.tune import TUNING_EPISODES, TUNING_EPISODES_PER_ROAD, TUNING_FILE, TUNING_FINALISTS, tune
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 SMALL = Ring(horizon=60)
@@ -101,7 +101,7 @@ def test_interrupted_tuning_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.slow
-def test_screened_scores_equal_those_of_sumo(tmp_path: Path, simulation: Simulation) -> None:
+def test_screened_scores_equal_those_of_sumo(tmp_path: Path, sumo: SumoBackend) -> None:
     steps = FINAL + 10 * TUNING_EPISODES * 60
     with WorkerPool(1) as workers:
         found = tune({"ring": SMALL}, "pi", SPACE, steps, tmp_path, workers, screen=True)
@@ -110,7 +110,7 @@ def test_screened_scores_equal_those_of_sumo(tmp_path: Path, simulation: Simulat
     for setting in (found.trials[1], found.trials[9]):  # of two batches
         driver = driver_from_name(setting.driver, 0.1)
         rows = [
-            measure(run_episode(SMALL.stratum(part, TUNING_EPISODES), driver, seed, simulation=simulation))
+            measure(run_episode(SMALL.stratum(part, TUNING_EPISODES), driver, seed, backend=sumo))
             for part, seed in enumerate(tuning_seeds(TUNING_EPISODES))
         ]
         assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-9)

@@ -16,6 +16,7 @@ from unjam.drivers.user_driver import FileDriver
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
 RING = Ring(horizon=300)
@@ -26,13 +27,13 @@ RESIDUAL = ResidualDriver(PISaturation(), random_network(), 1.0)
 
 def drives_badly(simulation: Simulation) -> None:
     ring = replace(UNFILTERED, actuation="raw", horizon=3000)
-    assert run_episode(ring, Constant(1.0), (9,), simulation=simulation).status == "collision"
+    assert run_episode(ring, Constant(1.0), (9,), backend=SumoBackend(simulation)).status == "collision"
 
 
 def another_road(simulation: Simulation) -> None:
     ring = Ring(length=(130, 140), vehicles=11, cavs=3, warmup=77, horizon=50, simulation_step=0.2)
     driver = replace(RESIDUAL, expert=PISaturation(time_step=0.2))
-    run_episode(ring, driver, (9,), explore=True, record_details=True, simulation=simulation)
+    run_episode(ring, driver, (9,), explore=True, record_details=True, backend=SumoBackend(simulation))
 
 
 def stops_in_the_middle(simulation: Simulation) -> None:
@@ -43,18 +44,18 @@ def stops_in_the_middle(simulation: Simulation) -> None:
             return state.speed * 0.0 + 1.0, memory
 
     with pytest.raises(KeyboardInterrupt):
-        run_episode(RING, Stops(), (9,), simulation=simulation)
+        run_episode(RING, Stops(), (9,), backend=SumoBackend(simulation))
 
 
 def cannot_start(simulation: Simulation) -> None:
     with pytest.raises(EpisodeError):
-        run_episode(replace(RING, emission_class="coal"), IDM(), (9,), simulation=simulation)
+        run_episode(replace(RING, emission_class="coal"), IDM(), (9,), backend=SumoBackend(simulation))
 
 
 def uses_up_random_numbers(simulation: Simulation) -> None:
     random.seed(9)
     np.random.seed(9)
-    run_episode(RING, IDM(), (9,), simulation=simulation)
+    run_episode(RING, IDM(), (9,), backend=SumoBackend(simulation))
 
 
 @pytest.mark.parametrize(
@@ -75,9 +76,9 @@ def test_an_episode_is_bit_identical_whatever_ran_before(
     first = fingerprint(run_episode(scenario, driver, (1, 2), explore=True))
     with Simulation() as simulation:
         before(simulation)
-        second = run_episode(scenario, driver, (1, 2), explore=True, simulation=simulation)
+        second = run_episode(scenario, driver, (1, 2), explore=True, backend=SumoBackend(simulation))
         before(simulation)
-        third = run_episode(scenario, driver, (1, 2), explore=True, simulation=simulation)
+        third = run_episode(scenario, driver, (1, 2), explore=True, backend=SumoBackend(simulation))
     fourth = run_episode(scenario, driver, (1, 2), explore=True)
     assert [fingerprint(episode) for episode in (second, third, fourth)] == [first] * 3
 
@@ -89,33 +90,31 @@ def test_an_episode_without_a_simulation_closes_its_own(my_drivers: Path) -> Non
     Simulation().close()
 
 
-def test_other_seeds_give_other_roads_and_other_noise(simulation: Simulation) -> None:
+def test_other_seeds_give_other_roads_and_other_noise(sumo: SumoBackend) -> None:
     seeds = [(0,), (1,), (2,), (0, 1), (1, 1), (1, 2, 3)]
     fixed = replace(RING, length=(230, 230))
-    found = [run_episode(fixed, IDM(), seed, simulation=simulation) for seed in seeds]
+    found = [run_episode(fixed, IDM(), seed, backend=sumo) for seed in seeds]
     assert len({episode.speeds.tobytes() for episode in found}) == len(seeds)
     assert [episode.seed for episode in found] == seeds
     short = replace(RING, horizon=1)
-    lengths = {run_episode(short, IDM(), (seed,), simulation=simulation).loop_length for seed in range(12)}
+    lengths = {run_episode(short, IDM(), (seed,), backend=sumo).loop_length for seed in range(12)}
     assert len(lengths) > 6
 
 
-def test_the_same_seed_is_the_same_traffic_for_every_driver(simulation: Simulation) -> None:
+def test_the_same_seed_is_the_same_traffic_for_every_driver(sumo: SumoBackend) -> None:
     ring = replace(RING, warmup=100, horizon=1)
-    found = [
-        run_episode(ring, driver, (4,), simulation=simulation) for driver in (IDM(), Human(), Constant(1.0), RESIDUAL)
-    ]
+    found = [run_episode(ring, driver, (4,), backend=sumo) for driver in (IDM(), Human(), Constant(1.0), RESIDUAL)]
     assert len({episode.speeds[0].tobytes() for episode in found}) == 1
     assert len({str(episode.drawn_values) for episode in found}) == 1
 
 
 @pytest.mark.parametrize(("warmup", "held", "hold", "cavs"), [(0, 1, 1, 1), (30, 5, 1, 2), (0, 1, 7, 3)])
 def test_records_have_a_row_for_each_control_step_and_one_for_the_end(
-    warmup: int, held: int, hold: int, cavs: int, simulation: Simulation
+    warmup: int, held: int, hold: int, cavs: int, sumo: SumoBackend
 ) -> None:
     ring = replace(RING, horizon=60, warmup=warmup, steps_per_control_step=held, cavs=cavs)
     driver = replace(RESIDUAL, expert=PISaturation(time_step=ring.control_step), action_repeat=hold)
-    episode = run_episode(ring, driver, (0,), simulation=simulation)
+    episode = run_episode(ring, driver, (0,), backend=sumo)
     assert episode.control_steps == 60
     for array in (episode.speeds, episode.positions, episode.gaps):
         assert array.shape == (61, 22)
@@ -138,13 +137,13 @@ def test_records_have_a_row_for_each_control_step_and_one_for_the_end(
 
 
 @pytest.mark.parametrize("cavs", [1, 2, 3, 4, 22])
-def test_each_trajectory_belongs_to_its_vehicle(cavs: int, simulation: Simulation) -> None:
+def test_each_trajectory_belongs_to_its_vehicle(cavs: int, sumo: SumoBackend) -> None:
     class Different(Driver):
         def act(self, state: LocalState, memory: dict) -> tuple:
             return np.linspace(0.1, 0.4, len(state.speed)), memory
 
     ring = replace(UNFILTERED, cavs=cavs, horizon=80)
-    episode = run_episode(ring, Different(), (0,), simulation=simulation)
+    episode = run_episode(ring, Different(), (0,), backend=sumo)
     assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids
     assert len(episode.cav_ids) == cavs
     for trajectory, push in zip(episode.trajectories, np.linspace(0.1, 0.4, cavs), strict=True):
@@ -164,8 +163,8 @@ def test_each_trajectory_belongs_to_its_vehicle(cavs: int, simulation: Simulatio
         assert not trajectory.residual.any()
 
 
-def test_the_values_drawn_from_the_seed_are_recorded(simulation: Simulation) -> None:
-    episode = run_episode(RING, IDM(), (5,), simulation=simulation)
+def test_the_values_drawn_from_the_seed_are_recorded(sumo: SumoBackend) -> None:
+    episode = run_episode(RING, IDM(), (5,), backend=sumo)
     assert episode.drawn_values == {"length": episode.loop_length}
     assert 220 <= episode.loop_length <= 270
     assert 3.0 <= episode.limit_speed <= 5.27
@@ -177,13 +176,11 @@ def test_the_values_drawn_from_the_seed_are_recorded(simulation: Simulation) -> 
 @pytest.mark.parametrize("hold", [1, 7])
 @pytest.mark.parametrize("expert", [PISaturation(time_constant=0), IDM()])
 def test_expert_and_residual_add_up_to_the_applied_acceleration(
-    cavs: int, hold: int, expert: Driver, simulation: Simulation
+    cavs: int, hold: int, expert: Driver, sumo: SumoBackend
 ) -> None:
     ring = replace(RING, cavs=cavs, horizon=500, warmup=50)
     driver = ResidualDriver(expert, random_network(), 0.5, action_repeat=hold)
-    calm, explored = (
-        run_episode(ring, driver, (0,), explore=explore, simulation=simulation) for explore in (False, True)
-    )
+    calm, explored = (run_episode(ring, driver, (0,), explore=explore, backend=sumo) for explore in (False, True))
     for episode in (calm, explored):
         for trajectory in episode.trajectories:
             total = np.clip(trajectory.expert_acceleration + trajectory.residual, -0.5, 0.5)
@@ -203,12 +200,10 @@ def test_expert_and_residual_add_up_to_the_applied_acceleration(
 @pytest.mark.long
 @pytest.mark.parametrize("cavs", [1, 2])
 @pytest.mark.parametrize("hold", [1, 5])
-def test_exploration_adds_noise_with_the_networks_standard_deviation(
-    cavs: int, hold: int, simulation: Simulation
-) -> None:
+def test_exploration_adds_noise_with_the_networks_standard_deviation(cavs: int, hold: int, sumo: SumoBackend) -> None:
     driver = replace(RESIDUAL, action_repeat=hold)
     ring = replace(RING, cavs=cavs, horizon=1000 * hold)
-    episode = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
+    episode = run_episode(ring, driver, (0,), explore=True, backend=sumo)
     noises = []
     for trajectory in episode.trajectories:
         chosen, _ = trajectory.actions_and_rewards
@@ -221,13 +216,13 @@ def test_exploration_adds_noise_with_the_networks_standard_deviation(
         assert abs(np.corrcoef(*noises)[0, 1]) < 0.1
 
 
-def test_exploration_depends_on_the_seed_and_does_not_change_the_traffic_noise(simulation: Simulation) -> None:
+def test_exploration_depends_on_the_seed_and_does_not_change_the_traffic_noise(sumo: SumoBackend) -> None:
     ring = replace(RING, length=(230, 230), horizon=100)
     mute = replace(RESIDUAL, network=replace(RESIDUAL.network, exploration_std=0.0))
-    still = run_episode(ring, mute, (0,), simulation=simulation)
-    explored = run_episode(ring, mute, (0,), explore=True, simulation=simulation)
+    still = run_episode(ring, mute, (0,), backend=sumo)
+    explored = run_episode(ring, mute, (0,), explore=True, backend=sumo)
     np.testing.assert_array_equal(explored.speeds, still.speeds)
-    first, second = (run_episode(ring, RESIDUAL, (seed,), explore=True, simulation=simulation) for seed in (0, 1))
+    first, second = (run_episode(ring, RESIDUAL, (seed,), explore=True, backend=sumo) for seed in (0, 1))
     noises = [
         trajectory.residual - RESIDUAL.network(trajectory.observations[:-1])
         for trajectory in (first.trajectories[0], second.trajectories[0])
@@ -235,20 +230,20 @@ def test_exploration_depends_on_the_seed_and_does_not_change_the_traffic_noise(s
     assert np.abs(noises[0] - noises[1]).min() > 0.0
 
 
-def test_a_driver_without_a_network_has_no_residual(simulation: Simulation) -> None:
+def test_a_driver_without_a_network_has_no_residual(sumo: SumoBackend) -> None:
     driver = PISaturation(time_constant=0)
-    episode = run_episode(RING, driver, (0,), explore=True, simulation=simulation)
+    episode = run_episode(RING, driver, (0,), explore=True, backend=sumo)
     trajectory = episode.trajectories[0]
     np.testing.assert_array_equal(trajectory.expert_acceleration, trajectory.applied_acceleration)
     assert not trajectory.residual.any()
     assert trajectory.observations.shape == (1, 0)
-    still = run_episode(RING, driver, (0,), simulation=simulation)
+    still = run_episode(RING, driver, (0,), backend=sumo)
     assert fingerprint(still) == fingerprint(episode)
 
 
-def test_recording_fuel_is_optional_and_changes_nothing_else(simulation: Simulation) -> None:
-    without = run_episode(RING, IDM(), (0,), simulation=simulation)
-    episode = run_episode(RING, IDM(), (0,), record_details=True, simulation=simulation)
+def test_recording_fuel_is_optional_and_changes_nothing_else(sumo: SumoBackend) -> None:
+    without = run_episode(RING, IDM(), (0,), backend=sumo)
+    episode = run_episode(RING, IDM(), (0,), record_details=True, backend=sumo)
     assert without.fuel.shape == (0, 0)
     assert episode.fuel.shape == (300, 22)
     assert (episode.fuel >= 0.0).all()
@@ -258,36 +253,35 @@ def test_recording_fuel_is_optional_and_changes_nothing_else(simulation: Simulat
     assert fingerprint(replace(episode, fuel=without.fuel)) == fingerprint(without)
 
 
-def test_fuel_depends_on_the_emission_class(simulation: Simulation) -> None:
+def test_fuel_depends_on_the_emission_class(sumo: SumoBackend) -> None:
     van = replace(RING, emission_class="HBEFA4/LCV_diesel_N1-III_Euro-6ab")
     car, other = (
-        run_episode(scenario, IDM(), (0,), record_details=True, simulation=simulation).fuel.mean()
-        for scenario in (RING, van)
+        run_episode(scenario, IDM(), (0,), record_details=True, backend=sumo).fuel.mean() for scenario in (RING, van)
     )
     assert other > 1.1 * car
 
 
-def test_the_default_reward_is_the_scenarios_own(simulation: Simulation) -> None:
-    episode = run_episode(RING, PISaturation(), (0,), simulation=simulation)
+def test_the_default_reward_is_the_scenarios_own(sumo: SumoBackend) -> None:
+    episode = run_episode(RING, PISaturation(), (0,), backend=sumo)
     trajectory = episode.trajectories[0]
     assert set(trajectory.reward_terms) == {"speed", "acceleration"}
     np.testing.assert_allclose(trajectory.reward_terms["speed"], 0.2 * episode.speeds[1:].mean(1), atol=1e-12)
     np.testing.assert_allclose(trajectory.reward_terms["acceleration"], -4.0 * np.abs(trajectory.applied_acceleration))
 
 
-def test_named_rewards_and_users_rewards_are_used(my_drivers: Path, simulation: Simulation) -> None:
+def test_named_rewards_and_users_rewards_are_used(my_drivers: Path, sumo: SumoBackend) -> None:
     ring = replace(UNFILTERED, cavs=2)
-    found = run_episode(ring, Constant(0.2), (0,), "eq16", simulation=simulation).trajectories
+    found = run_episode(ring, Constant(0.2), (0,), "eq16", backend=sumo).trajectories
     assert set(found[0].reward_terms) == {"speed", "time_gap", "acceleration"}
-    episode = run_episode(ring, Constant(0.2), (0,), f"{my_drivers}:calm", simulation=simulation)
+    episode = run_episode(ring, Constant(0.2), (0,), f"{my_drivers}:calm", backend=sumo)
     for trajectory in episode.trajectories:
         assert set(trajectory.reward_terms) == {"speed", "push"}
         np.testing.assert_allclose(trajectory.reward_terms["speed"], episode.speeds[1:].mean(1))
         np.testing.assert_allclose(trajectory.reward_terms["push"], -0.4)
 
 
-def test_time_gaps_of_a_reward_are_those_after_each_step(simulation: Simulation) -> None:
-    episode = run_episode(UNFILTERED, Constant(1.0), (0,), "eq16", simulation=simulation)
+def test_time_gaps_of_a_reward_are_those_after_each_step(sumo: SumoBackend) -> None:
+    episode = run_episode(UNFILTERED, Constant(1.0), (0,), "eq16", backend=sumo)
     trajectory = episode.trajectories[0]
     gap, speed = trajectory.states.leader_gap[1:], trajectory.states.speed[1:]
     expected = [-0.1 * max(1.0 - g / max(v, 1e-3), 0.0) for g, v in zip(gap, speed, strict=True)]
@@ -314,28 +308,28 @@ def listed(outcome):
 
 
 def test_a_reward_that_is_not_finite_is_refused_with_its_term_and_step(
-    my_drivers: Path, tmp_path: Path, simulation: Simulation
+    my_drivers: Path, tmp_path: Path, sumo: SumoBackend
 ) -> None:
     with pytest.raises(InputError, match="reward: step 0: term 'speed' is nan; allowed: finite"):
-        run_episode(RING, IDM(), (0,), f"{my_drivers}:wrong_reward", simulation=simulation)
+        run_episode(RING, IDM(), (0,), f"{my_drivers}:wrong_reward", backend=sumo)
     file = tmp_path / "rewards.py"
     file.write_text(BAD_REWARDS)
     with pytest.raises(InputError, match="reward: step 7: term 'bad' is inf; allowed: finite"):
-        run_episode(RING, IDM(), (0,), f"{file}:late", simulation=simulation)
+        run_episode(RING, IDM(), (0,), f"{file}:late", backend=sumo)
 
 
 @pytest.mark.parametrize("name", ["total", "each_vehicle"])
-def test_a_reward_of_a_wrong_shape_is_refused(name: str, tmp_path: Path, simulation: Simulation) -> None:
+def test_a_reward_of_a_wrong_shape_is_refused(name: str, tmp_path: Path, sumo: SumoBackend) -> None:
     file = tmp_path / "rewards.py"
     file.write_text(BAD_REWARDS)
     with pytest.raises(InputError, match=r"reward: term '\w+' has shape .*; allowed: \(300,\)"):
-        run_episode(RING, IDM(), (0,), f"{file}:{name}", simulation=simulation)
+        run_episode(RING, IDM(), (0,), f"{file}:{name}", backend=sumo)
 
 
-def test_a_reward_may_return_lists_of_integers(tmp_path: Path, simulation: Simulation) -> None:
+def test_a_reward_may_return_lists_of_integers(tmp_path: Path, sumo: SumoBackend) -> None:
     file = tmp_path / "rewards.py"
     file.write_text(BAD_REWARDS)
-    episode = run_episode(RING, IDM(), (0,), f"{file}:listed", simulation=simulation)
+    episode = run_episode(RING, IDM(), (0,), f"{file}:listed", backend=sumo)
     assert episode.trajectories[0].reward_terms["speed"].dtype == np.float64
 
 
@@ -344,20 +338,20 @@ def test_an_unknown_reward_is_refused_before_anything_runs() -> None:
         run_episode(RING, IDM(), (0,), "fame")
 
 
-def test_progress_is_reported_during_warm_up_and_episode(simulation: Simulation) -> None:
+def test_progress_is_reported_during_warm_up_and_episode(sumo: SumoBackend) -> None:
     reported: list[int] = []
     ring = replace(RING, warmup=1200, horizon=2600)
-    run_episode(ring, IDM(), (0,), simulation=simulation, on_progress=reported.append)
+    run_episode(ring, IDM(), (0,), backend=sumo, on_progress=reported.append)
     assert reported == sorted(reported)
     assert reported.count(0) >= 2
     assert 2000 < reported[-1] <= 2600
     assert len(set(reported)) >= 4
 
 
-def test_a_trajectory_has_the_experts_memory_of_the_warm_up(simulation: Simulation) -> None:
+def test_a_trajectory_has_the_experts_memory_of_the_warm_up(sumo: SumoBackend) -> None:
     warm = Ring(length=(230, 230), vehicles=8, horizon=20, warmup=30)
     driver = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=5)
-    trajectory = run_episode(warm, driver, (3,), simulation=simulation).trajectories[0]
+    trajectory = run_episode(warm, driver, (3,), backend=sumo).trajectories[0]
     assert set(trajectory.initial_memory) == {"window", "total", "count", "command"}
     assert trajectory.initial_memory["count"] == 30
     memory = {name: values[None] for name, values in trajectory.initial_memory.items()}
@@ -379,7 +373,7 @@ def insists(state: LocalState) -> np.ndarray:
 
 
 @pytest.mark.parametrize("road", ["ring", "figure-eight", "merge", "on-ramp", "own"])
-def test_a_driver_cannot_change_its_measurements(road: str, simulation: Simulation, tmp_path: Path) -> None:
+def test_a_driver_cannot_change_its_measurements(road: str, sumo: SumoBackend, tmp_path: Path) -> None:
     if road == "own":
         flow = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
         road = str(straight(tmp_path, flow, length=300.0))
@@ -390,15 +384,13 @@ def test_a_driver_cannot_change_its_measurements(road: str, simulation: Simulati
     def honest(state: LocalState) -> np.ndarray:
         return np.clip(0.5 * np.subtract(state.leader_speed, state.speed), -1, 1)
 
-    driven = [run_episode(scenario, driver, (0,), simulation=simulation) for driver in (honest, insists)]
+    driven = [run_episode(scenario, driver, (0,), backend=sumo) for driver in (honest, insists)]
     assert driven[0].trajectories
     assert fingerprint(driven[0]) == fingerprint(driven[1])
 
 
-def test_a_seed_may_be_any_non_negative_integer(simulation: Simulation) -> None:
-    first, *others = (
-        run_episode(SHORT_RING, PISaturation(), seed, simulation=simulation) for seed in (3, np.int64(3), [3])
-    )
+def test_a_seed_may_be_any_non_negative_integer(sumo: SumoBackend) -> None:
+    first, *others = (run_episode(SHORT_RING, PISaturation(), seed, backend=sumo) for seed in (3, np.int64(3), [3]))
     assert all(np.array_equal(first.speeds, other.speeds) for other in others)
     with pytest.raises(InputError, match="seed: -1 is not allowed; allowed: >= 0"):
-        run_episode(SHORT_RING, PISaturation(), -1, simulation=simulation)
+        run_episode(SHORT_RING, PISaturation(), -1, backend=sumo)

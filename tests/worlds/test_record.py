@@ -13,7 +13,7 @@ from unjam.tree import pack, unpack
 from unjam.worlds.episode import run_episode
 from unjam.worlds.messages import read_message, write_message
 from unjam.worlds.record import Episode, Trajectory, failed_episode
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 
 RING = Ring(length=(230, 240), horizon=60)
 
@@ -59,10 +59,8 @@ def test_fingerprints_differ_in_the_last_bit_of_any_array() -> None:
         ),
     ],
 )
-def test_an_episode_arrives_as_it_was_sent(scenario: Ring, driver: Driver, simulation: Simulation) -> None:
-    episode = run_episode(
-        scenario, driver, (1, 2), explore=True, record_details=scenario.cavs == 3, simulation=simulation
-    )
+def test_an_episode_arrives_as_it_was_sent(scenario: Ring, driver: Driver, sumo: SumoBackend) -> None:
+    episode = run_episode(scenario, driver, (1, 2), explore=True, record_details=scenario.cavs == 3, backend=sumo)
     assert len(episode.trajectories) == scenario.cavs
     assert fingerprint(travelled(episode)) == fingerprint(episode)
 
@@ -91,9 +89,9 @@ def test_only_a_failed_episode_has_not_run() -> None:
     assert found == {"completed": True, "collision": True, "failed": False}
 
 
-def test_the_reward_of_a_held_residual_is_the_sum_over_its_control_steps(simulation: Simulation) -> None:
+def test_the_reward_of_a_held_residual_is_the_sum_over_its_control_steps(sumo: SumoBackend) -> None:
     driver = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=7)
-    trajectory: Trajectory = run_episode(RING, driver, (0,), simulation=simulation).trajectories[0]
+    trajectory: Trajectory = run_episode(RING, driver, (0,), backend=sumo).trajectories[0]
     reward = trajectory.reward_terms["speed"] + trajectory.reward_terms["acceleration"]
     np.testing.assert_array_equal(trajectory.reward, reward)
     residuals, rewards = trajectory.actions_and_rewards

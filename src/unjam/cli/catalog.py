@@ -67,20 +67,17 @@ def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
     """Write a picture of the road that seed 0 draws: a loop at the start, an open road after a minute."""
     from unjam.files import atomic_write, check_parent_folder
     from unjam.reports.video import draw_road
-    from unjam.scenarios.road import ClosedRoad
-    from unjam.worlds.sumo import make_traffic
-    from unjam.worlds.sumo.sandboxed import open_simulation
+    from unjam.worlds.backend import WorldOptions
+    from unjam.worlds.sumo.backend import SumoBackend
 
     check_parent_folder(path)
-    with open_simulation(scenario) as simulation:
-        traffic = make_traffic(scenario, (0,), simulation)
-        traffic.start(is_controlled=False)
-        is_closed = isinstance(traffic.road, ClosedRoad)
-        for _ in range(0 if is_closed else round(PICTURE_SECONDS / scenario.control_step)):
-            traffic.advance(None)
-        scene = traffic.scene()
+    with SumoBackend() as sumo, sumo.open(scenario, (0,), WorldOptions()) as world:
+        world.start(is_controlled=False)
+        for _ in range(0 if scenario.is_closed else round(PICTURE_SECONDS / scenario.control_step)):
+            world.advance(None)
+        scene, drawn_values = world.scene(), world.road.drawn_values
     max_speed = max(1.0, float(scene.speeds.max(initial=0.0)))
-    caption = "\n".join([name, *(f"{key} {value:g} m" for key, value in traffic.road.drawn_values.items())])
+    caption = "\n".join([name, *(f"{key} {value:g} m" for key, value in drawn_values.items())])
     content = BytesIO()
     draw_road(scene, max_speed, caption).save(content, "PNG")
     atomic_write(path, content.getvalue())

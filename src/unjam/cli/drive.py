@@ -163,6 +163,7 @@ def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int],
         MissingPartError: there is no display.
     """
     from unjam.worlds.episode import run_episode
+    from unjam.worlds.sumo.backend import SumoBackend
     from unjam.worlds.sumo.simulation import Simulation
 
     if not has_display():
@@ -170,7 +171,7 @@ def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int],
     delay = 1000.0 / pace  # [ms] per second of simulation, for any number of steps
     window_options = ("--start", "true", "--quit-on-end", "true", "--delay", str(delay))
     with Simulation("gui", gui_options=window_options) as window:
-        return run_episode(scenario, driver, seed, simulation=window)
+        return run_episode(scenario, driver, seed, backend=SumoBackend(window))
 
 
 @opt.with_options(changes=opt.network_changes)

@@ -1,6 +1,7 @@
 """A scenario with external actions, and with one CAV as a Gymnasium environment."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -25,17 +26,14 @@ from unjam.drivers.observation import (
 )
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.threads import CopyableLock, synchronized
-from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, unknown_name
+from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
+from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
 from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap, validate_reward_terms
-from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.backends import Backend
-from unjam.worlds.sumo.sandboxed import open_simulation
-from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import Traffic
+from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
 
@@ -108,18 +106,21 @@ class RoadStepper:
         reward: RewardLike = "",
         expert: str | DriverLike = "",
         features: Sequence[FeatureLike] = ("local",),
-        backend: Backend = "libsumo",
+        backend: BackendLike = "sumo",
     ) -> None:
-        """Prepare a scenario, with arguments as `RoadEnv`; the first `reset` opens SUMO, as `backend`."""
+        """Prepare a scenario, with arguments as `RoadEnv`; the first `reset` opens the backend."""
         self.scenario = make_scenario(scenario, changes)
         self._reward = make_reward(reward or self.scenario.reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
         self._driver = ExternalDriver(driver, as_features(features), self.scenario.acceleration_limits)
         check_can_drive(driver, self.scenario)
         check_policy_inputs(self._driver.features, self.scenario, "features")
-        self._backend: Backend = backend
-        self._simulation: Simulation | None = None
-        self._traffic: Traffic | None = None
+        self._backend = backend
+        with open_backend(backend) as opened:
+            check_support(opened, self.scenario)
+        self._opened: Backend | None = None
+        self._world: RoadWorld | None = None
+        self._backend_context, self._world_context = ExitStack(), ExitStack()
         bound = np.full(observation_size(self._driver.features, driver), MAX_OBSERVATION, np.float32)
         self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
         """of one CAV"""
@@ -143,18 +144,16 @@ class RoadStepper:
             self._seed = int(generator.integers(2**31))
         numbers = (self._seed, self._episode_count) if self._episode_count else (self._seed,)
         self._episode_count += 1
-        if self._simulation is not None and self._simulation.is_lost:
-            self.close()
-        if self._simulation is None:
-            is_default = self._backend == "libsumo"
-            self._simulation = open_simulation(self.scenario) if is_default else Simulation(self._backend)
-        fields = self._driver.measured_fields
-        self._traffic = traffic = make_traffic(self.scenario, numbers, self._simulation, measured_fields=fields)
-        self._drive_loop = DriveLoop(traffic, self._driver)
+        self._world_context.close()
+        if self._opened is None:
+            self._opened = self._backend_context.enter_context(open_backend(self._backend))
+        opening = self._opened.open(self.scenario, numbers, WorldOptions(self._driver.measured_fields))
+        self._world = world = self._world_context.enter_context(opening)
+        self._drive_loop = DriveLoop(world, self._driver)
         self._control_steps = iter(self._drive_loop)
         self._wait_for_cav()
-        if not traffic.cav_ids:
-            raise EpisodeError(f"no CAV entered the road in {traffic.control_steps} control steps")
+        if not world.cav_ids:
+            raise EpisodeError(f"no CAV entered the road in {world.control_steps} control steps")
         return self._observe()
 
     def step(self, actions: Any) -> RoadStepResult:
@@ -162,57 +161,51 @@ class RoadStepper:
 
         Without CAVs on the road, the simulation continues until the next one enters.
         """
-        traffic, before, last_observations = self.traffic, list(self.traffic.cav_ids), self._observations
+        world, before, last_observations = self.world, list(self.world.cav_ids), self._observations
         self._driver.actions = np.asarray(actions, np.float64)
         if next(self._control_steps, None) is None:
             raise UnjamError("step: the episode is over; allowed: reset")
-        remaining = list(range(len(before)) if traffic.remaining_rows is None else traffic.remaining_rows)
-        state = traffic.exact_state()
+        remaining = list(range(len(before)) if world.remaining_rows is None else world.remaining_rows)
+        state = world.exact_state()
         outcome = Outcome(
-            np.array(traffic.speeds)[None],
-            traffic.last_applied_acceleration()[remaining][None],
+            np.array(world.speeds)[None],
+            world.last_applied_acceleration()[remaining][None],
             time_gap(state.leader_gap, state.speed)[: len(remaining)][None],
-            np.array([traffic.has_crashed]),
-            np.array([float(traffic.backlog)]),
+            np.array([world.has_crashed]),
+            np.array([float(world.backlog)]),
         )
-        step = slice(traffic.control_steps - 1, traffic.control_steps)
+        step = slice(world.control_steps - 1, world.control_steps)
         terms = {name: float(value) for name, (value,) in validate_reward_terms(self._reward(outcome), step).items()}
         departed = {name: last_observations[row] for row, name in enumerate(before) if row not in remaining}
-        terminated = traffic.has_crashed
+        terminated = world.has_crashed
         self._wait_for_cav()  # a crash of human drivers in the meantime ends the episode, but no CAV has caused it
-        truncated = not terminated and (traffic.has_ended or not traffic.cav_ids)
+        truncated = not terminated and (world.has_ended or not world.cav_ids)
         observations, reward = self._observe(), sum(terms.values())
-        return RoadStepResult(list(traffic.cav_ids), observations, departed, reward, terms, terminated, truncated)
+        return RoadStepResult(list(world.cav_ids), observations, departed, reward, terms, terminated, truncated)
 
     def _wait_for_cav(self) -> None:
         """Continue the simulation until a CAV is on the road, or none will enter before the episode ends."""
-        traffic = self.traffic
-        while traffic.expects_cavs and not (traffic.cav_ids or traffic.has_ended):
+        world = self.world
+        while world.expects_cavs and not (world.cav_ids or world.has_ended):
             next(self._control_steps)
 
     @property
-    def traffic(self) -> Traffic:
-        """The traffic of the running episode.
-
-        Raise `UnjamError` if there is none, `LostWorkerError` if other code has used libsumo in this process.
-        """
-        if self._traffic is None:
+    def world(self) -> RoadWorld:
+        """The world of the running episode; raise `UnjamError` if there is none."""
+        if self._world is None:
             raise UnjamError("no episode is running: call reset first")
-        assert self._simulation is not None
-        self._simulation.check()
-        return self._traffic
+        return self._world
 
     def _observe(self) -> Observations:
-        observations = self._driver.observation(self.traffic.local_state(), self._drive_loop.memory)
+        observations = self._driver.observation(self.world.local_state(), self._drive_loop.memory)
         self._observations = observations.clip(-MAX_OBSERVATION, MAX_OBSERVATION).astype(np.float32)
         return self._observations
 
     def close(self) -> None:
-        """Close SUMO; may be called twice."""
-        self._traffic = None
-        if self._simulation is not None:
-            self._simulation.close()
-            self._simulation = None
+        """Close the backend; may be called twice."""
+        self._world = self._opened = None
+        self._world_context.close()
+        self._backend_context.close()
 
 
 class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
@@ -252,9 +245,10 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         expert: str | DriverLike = "",
         features: Sequence[FeatureLike] = ("local",),
         render_mode: str | None = None,
+        backend: BackendLike = "sumo",
         **changes: Any,
     ) -> None:
-        """Prepare the environment; SUMO is opened by the first `reset`.
+        """Prepare the environment; the backend is opened by the first `reset`.
 
         Args:
             scenario: its name.
@@ -264,6 +258,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
             features: the observed features: names such as `local`, `expert_acceleration`, `expert_memory`, or
                 functions of a `LocalState`. Functions run in the process of the environment.
             render_mode: `rgb_array`, or `human` for SUMO's own window.
+            backend: the simulator: `sumo`, `batch`, `path.py:name`, or an object.
             changes: to the parameters of the scenario.
 
         Raises:
@@ -275,7 +270,9 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         if render_mode == "human" and not has_display():
             raise MissingPartError("render_mode: 'human' needs a display; without one: 'rgb_array'")
         self.render_mode = render_mode
-        backend = "gui" if render_mode == "human" else "libsumo"
+        if render_mode == "human" and backend != "sumo":
+            raise invalid_value("render_mode", render_mode, "rgb_array, except with backend='sumo'")
+        backend = "sumo-gui" if render_mode == "human" else backend
         self._road = RoadStepper(scenario, changes, reward, expert, features, backend)
         if getattr(self._road.scenario, "cavs", None) != 1:
             raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
@@ -289,7 +286,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         """Start an episode: that of `seed`; without one, the next after that of the last seed."""
         super().reset(seed=seed)
         observations = self._road.reset(seed, self.np_random)
-        return observations[0], {"drawn_values": dict(self._road.traffic.road.drawn_values)}
+        return observations[0], {"drawn_values": dict(self._road.world.road.drawn_values)}
 
     @synchronized
     def step(self, action: Any) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
@@ -306,10 +303,10 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
             return None
         from unjam.reports.video import draw_road
 
-        traffic = self._road.traffic
-        limit = traffic.road.limit_speed
+        world = self._road.world
+        limit = world.road.limit_speed
         max_speed = 2.0 * limit if np.isfinite(limit) else self._road.scenario.top_speed  # unknown on user networks
-        return np.asarray(draw_road(traffic.scene(), max_speed, f"mean {np.mean(traffic.speeds):.1f} m/s"))
+        return np.asarray(draw_road(world.scene(), max_speed, f"mean {np.mean(world.speeds):.1f} m/s"))
 
     @synchronized
     def close(self) -> None:

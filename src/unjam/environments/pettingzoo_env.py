@@ -13,6 +13,7 @@ from unjam.drivers.user_driver import DriverLike
 from unjam.environments.gymnasium_env import RoadStepper
 from unjam.environments.threads import synchronized
 from unjam.errors import InputError
+from unjam.worlds.backend import BackendLike
 from unjam.worlds.reward import RewardLike
 
 
@@ -32,10 +33,11 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
         reward: RewardLike = "",
         expert: str | DriverLike = "",
         features: Sequence[FeatureLike] = ("local",),
+        backend: BackendLike = "sumo",
         **changes: Any,
     ) -> None:
         """Prepare the environment; the arguments are those of `RoadEnv`."""
-        self._road = RoadStepper(scenario, changes, reward, expert, features)
+        self._road = RoadStepper(scenario, changes, reward, expert, features, backend)
         self.possible_agents = list(self._road.scenario.possible_cav_ids())
         self.agents: list[str] = []
         self._agent_by_vehicle: dict[str, str] = {}
@@ -61,7 +63,7 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
         observations = self._road.reset(seed, np.random.default_rng())
         self._agent_by_vehicle.clear()
         self._departed_agents.clear()
-        self.agents = self._agents_of(self._road.traffic.cav_ids)
+        self.agents = self._agents_of(self._road.world.cav_ids)
         return dict(zip(self.agents, observations, strict=True)), {agent: {} for agent in self.agents}
 
     @synchronized
@@ -72,7 +74,7 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each of the agents")
         acted, departed = self.agents, self._departed_agents
-        present = self._agents_of(self._road.traffic.cav_ids)
+        present = self._agents_of(self._road.world.cav_ids)
         values = [0.0 if agent in departed else float(np.asarray(actions[agent]).reshape(())) for agent in present]
         done = self._road.step(values)
         is_over = done.terminated or done.truncated

@@ -16,7 +16,7 @@ from unjam.reports.results import to_plot_episode
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.closed_road import poses_along
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo.traffic import RoadScene
+from unjam.worlds.road_world import RoadScene
 
 FRAME_SIZE = 640
 """of the square picture [pixels]"""

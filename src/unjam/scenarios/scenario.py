@@ -127,6 +127,8 @@ class Scenario:
     """optional fields of a `LocalState` that this road provides"""
     has_vehicle_types: ClassVar[bool] = False
     """whether the user defines vehicle types; a CAV keeps the properties of its type"""
+    reads_user_files: ClassVar[bool] = False
+    """whether the road is made of the user's own SUMO files, which are simulated in a sandbox"""
     sumo_human_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded human drivers [m]"""
 

@@ -62,6 +62,7 @@ class UserNetwork(Scenario):
     is_closed: ClassVar[bool] = False
     has_coordinate: ClassVar[bool] = False
     has_vehicle_types: ClassVar[bool] = True
+    reads_user_files: ClassVar[bool] = True
     provided_fields: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "penetration_rate", "congestion")
 
     file: str = ""

@@ -34,13 +34,14 @@ from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import MAX_HORIZON, Scenario
 from unjam.training.executors import MessageCallback
 from unjam.worlds.audit import braking_statistics, following_statistics
+from unjam.worlds.backend import WorldOptions
 from unjam.worlds.batch.human_idm import HumanSpeedModel
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.simulation import Simulation
 
 TRACI_STEPS = 200
@@ -94,8 +95,8 @@ def _run_rounds(rounds: int, on_message: MessageCallback) -> dict[str, Any]:
     batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
     with Simulation() as simulation:  # writes network files and fills caches
         for name in OTHER_SCENARIOS:
-            run_episode(SCENARIOS[name], driver, (0,), explore=True, simulation=simulation)
-        episode = run_episode(ring, driver, (0,), explore=True, simulation=simulation)
+            run_episode(SCENARIOS[name], driver, (0,), explore=True, backend=SumoBackend(simulation))
+        episode = run_episode(ring, driver, (0,), explore=True, backend=SumoBackend(simulation))
     for number in range(1, rounds + 1):
         on_message(f"round {number} of {rounds}")
         with Simulation() as simulation:
@@ -166,13 +167,13 @@ def _run_rounds(rounds: int, on_message: MessageCallback) -> dict[str, Any]:
 
 
 def _episode_rate(scenario: Scenario, driver: ResidualDriver, seed: int, simulation: Simulation) -> float:
-    run = partial(run_episode, scenario, driver, (seed,), explore=True, simulation=simulation)
+    run = partial(run_episode, scenario, driver, (seed,), explore=True, backend=SumoBackend(simulation))
     return steps_per_second(run, scenario.horizon)
 
 
 def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulation) -> float:
     """Return control steps per second of the driving loop alone."""
-    traffic = make_traffic(scenario, (1,), simulation, driver.accepts_floats)
+    traffic = make_traffic(scenario, (1,), simulation, WorldOptions(accepts_floats=driver.accepts_floats))
     return steps_per_second(lambda: deque(DriveLoop(traffic, driver, explore=True), maxlen=0), scenario.horizon)
 
 

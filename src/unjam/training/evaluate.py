@@ -6,7 +6,7 @@
 import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,10 +33,10 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.run_folder import lock_new_folder
 from unjam.training.seeds import TRAINING_SEED_LIMIT, make_test_seeds
+from unjam.worlds.backend import BackendLike, check_support, open_backend
 from unjam.worlds.episode import can_drive, check_time_step, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import RewardLike, make_reward, reward_label
-from unjam.worlds.sumo.sandboxed import open_simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 if TYPE_CHECKING:  # imported late, so that commands start quickly
@@ -174,10 +174,11 @@ def evaluate(
     workers: WorkerPool,
     reward: RewardLike = "",
     progress: EvaluationProgress | None = None,
+    backend: BackendLike = "sumo",
 ) -> Evaluation:
     """Run every driver on every seed, and measure."""
     setups = {label: (scenario, driver) for label, driver in drivers.items()}
-    return evaluate_on_roads(setups, seeds, workers, reward, progress)
+    return evaluate_on_roads(setups, seeds, workers, reward, progress, backend=backend)
 
 
 def evaluate_on_roads(
@@ -187,13 +188,15 @@ def evaluate_on_roads(
     reward: RewardLike = "",
     progress: EvaluationProgress | None = None,
     with_plots: bool = True,
+    backend: BackendLike = "sumo",
 ) -> Evaluation:
     """Run every driver, each on its own road, on every seed, and measure.
 
     With `with_plots` one episode of each is kept for figures, which needs much memory.
     """
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
-    settings: dict[str, Any] = {"reward": reward, "record_details": True, "stop_at_contact": False}
+    settings: dict[str, Any] = {"reward": reward, "backend": backend}
+    settings |= {"record_details": True, "stop_at_contact": False}
     tasks = [EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs]
     remote = [number for number, task in enumerate(tasks) if task.is_serializable]
     local = [number for number, task in enumerate(tasks) if not task.is_serializable]
@@ -212,11 +215,10 @@ def evaluate_on_roads(
         lambda index, steps: on_progress(remote[index], steps),
     )
     results = dict(zip(remote, measured, strict=True))
-    with open_simulation(*(tasks[number].scenario for number in local)) if local else nullcontext() as simulation:
+    with open_backend(backend) if local else nullcontext(backend) as opened:
         for number in local:
-            report = partial(on_progress, number)
-            episode = run_episode(**vars(tasks[number]), simulation=simulation, on_progress=report)
-            results[number] = measure_task(number, episode)
+            task = replace(tasks[number], backend=opened)
+            results[number] = measure_task(number, run_episode(**vars(task), on_progress=partial(on_progress, number)))
     rows: RowsByDriver = {label: [] for label in drivers}
     plot_episodes: dict[str, Episode] = {}
     for number, (label, _) in enumerate(pairs):
@@ -337,6 +339,7 @@ def drive(
     out: Path | str | None = None,
     progress: Callable[[Any, int], None] | None = None,
     test_seeds: bool = False,
+    backend: BackendLike = "sumo",
 ) -> DriveResult:
     """Run episodes and measure them.
 
@@ -354,6 +357,8 @@ def drive(
         out: folder for the results and a report.html; None: nothing is written.
         progress: called repeatedly with ((driver, episode), control steps so far).
         test_seeds: whether to use the test seeds instead of `seed` and the following ones.
+        backend: the simulator: `sumo`, `batch`, `path.py:name`, or an object, with which all episodes run in this
+            process.
 
     Raises:
         InputError: an argument is wrong; nothing was started.
@@ -378,11 +383,13 @@ def drive(
     if not drivers:
         raise invalid_value("driver", driver, driver_names())
     make_reward(reward or road.reward)
+    with open_backend(backend) as simulator:
+        check_support(simulator, road)
     folder, report = Path(out) if out is not None else None, None
     seeds = make_test_seeds(episodes) if test_seeds else [(seed + index,) for index in range(episodes)]
     pool = WorkerPool(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
     with lock_new_folder(folder) if folder is not None else nullcontext(), pool:
-        evaluation = evaluate(road, drivers, seeds, pool, reward, progress)
+        evaluation = evaluate(road, drivers, seeds, pool, reward, progress, backend)
         notes = [
             *episode_notes(evaluation.rows),
             *controller_notes(scenario_recipe(road), drivers, evaluation.plot_episodes),

@@ -10,15 +10,12 @@ import numpy as np
 from unjam.drivers.driver import Driver, other_time_steps
 from unjam.drivers.observation import Feature, feature
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import EpisodeError, InputError, NoCavError, SumoInputError, UnjamError, as_unjam_error, invalid_value
+from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_network import UserNetwork
+from unjam.worlds.backend import BackendLike, WorldOptions, check_support, open_backend
 from unjam.worlds.drive import drive_world
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import Reward, RewardLike, episode_reward_terms, make_reward
-from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.sandboxed import open_simulation
-from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.world import ProgressCallback
 
 
@@ -46,14 +43,14 @@ def run_episode(
     reward: RewardLike = "",
     explore: float = 0.0,
     record_details: bool = False,
-    simulation: Simulation | None = None,
+    backend: BackendLike = "sumo",
     on_progress: ProgressCallback | None = None,
     stop_at_contact: bool = True,
 ) -> Episode:
     """Run one episode and return its record.
 
-    The result depends only on scenario, driver, seed, reward, `explore` and `stop_at_contact`, not on the process,
-    earlier episodes in it, or the clock.
+    The result depends only on scenario, driver, seed, reward, `explore`, backend and `stop_at_contact`, not on the
+    process, earlier episodes in it, or the clock.
 
     Args:
         scenario: road, traffic and horizon.
@@ -63,45 +60,27 @@ def run_episode(
         reward: a name, `path.py:name`, or a function of an `Outcome`; empty: the scenario's own.
         explore: factor of a residual driver's exploration noise: 1, -1 for the opposite sign, or 0.
         record_details: whether fuel and, on roads with ends, positions (x, y) are recorded (10 % slower).
-        simulation: an open simulation to reuse; without it, one is opened and closed. It runs in a sandboxed process
-            (no writing, no network) on a user's network, and in its own process with a warning if libsumo already
-            holds a simulation in this process, unjam's or the user's.
+        backend: the simulator: `sumo`, `batch`, `path.py:name`, or an object, which stays open for other episodes.
         on_progress: called now and then with the number of control steps made.
         stop_at_contact: whether contact of a CAV ends an episode on a user's network, as in training. Otherwise the
             traffic goes on as in plain SUMO, and the contact is recorded.
 
     Raises:
-        InputError: driver or reward return a value that is not finite, or of a wrong shape.
+        InputError: driver or reward return a value that is not finite, or of a wrong shape, or the backend does not
+            support the scenario.
         SumoInputError: SUMO refuses files or options, at the start or later in the episode.
         EpisodeError: SUMO cannot run the scenario for another reason, or other code in this process has started,
             stepped or closed a simulation through libsumo meanwhile (`LostWorkerError`).
-        UnjamError: another episode runs in `simulation`.
+        UnjamError: another episode runs in the backend.
     """
     driver, seed = as_driver(driver, scenario.control_step), as_seed(seed)
     check_can_drive(driver, scenario)
     reward_function = make_reward(reward or scenario.reward)
-    if simulation is None:
-        with open_simulation(scenario) as simulation:
-            options = (reward, explore, record_details, simulation, on_progress, stop_at_contact)
-            return run_episode(scenario, driver, seed, *options)
-    if not simulation.episode_lock.acquire(blocking=False):
-        raise UnjamError("simulation: an episode is running in it; allowed: one at a time")
-    try:
-        details = driver.accepts_floats, record_details, driver.measured_fields
-        traffic = make_traffic(scenario, seed, simulation, *details)
-        traffic.stop_at_contact = stop_at_contact
-        episode = drive_world(traffic, driver, explore, on_progress=on_progress)
-        episode = replace(episode, warnings=simulation.finish())
-    except Exception as error:
-        simulation.check()  # otherwise changes by other code would be reported as an error of SUMO
-        unjam_error = as_unjam_error(error)
-        if isinstance(scenario, UserNetwork) and type(unjam_error) is EpisodeError and simulation.has_refused():
-            raise SumoInputError(str(unjam_error)) from error  # SUMO read further into a file
-        raise
-    finally:
-        simulation.episode_lock.release()
-    if isinstance(scenario, UserNetwork):
-        scenario.check_vehicles(bool(episode.vehicle_ids), [each.example for each in episode.warnings])
+    options = WorldOptions(driver.measured_fields, record_details, driver.accepts_floats, stop_at_contact)
+    with open_backend(backend) as simulator:
+        check_support(simulator, scenario)
+        with simulator.open(scenario, seed, options) as world:
+            episode = drive_world(world, driver, explore, on_progress=on_progress)
     check_has_cavs(episode, driver)
     return add_reward_terms(episode, reward_function)
 

@@ -14,12 +14,13 @@ from typing import IO, Any
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import as_unjam_error
 from unjam.scenarios import scenario_from_recipe
-from unjam.scenarios.user_network import UserNetwork
 from unjam.sumo_files import take_answer
 from unjam.tree import Arrays, pack
+from unjam.worlds.backend import Backend, open_backend
 from unjam.worlds.episode import run_episode
 from unjam.worlds.messages import answer_requests, open_answer_pipe, write_message
 from unjam.worlds.record import failed_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.sandboxed import enter_sandbox
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -28,7 +29,7 @@ PROGRESS_INTERVAL = 0.2
 
 
 def _answer_request(
-    open_simulation: Callable[[], Simulation], output: IO[bytes], request: dict[str, Any], arrays: Arrays
+    open_once: Callable[[str], Backend], output: IO[bytes], request: dict[str, Any], arrays: Arrays
 ) -> None:
     """Run an episode and send its record. The record of hours of traffic does not stay in memory here."""
     last = time.monotonic()
@@ -46,11 +47,11 @@ def _answer_request(
         if "files" in request:  # what the parent has read of the files; changed files are read again
             take_answer(request["scenario"]["file"], request["files"])
         scenario = scenario_from_recipe(request["scenario"])
-        if isinstance(scenario, UserNetwork):
+        if scenario.reads_user_files:
             enter_sandbox()
         driver = driver_from_recipe(request["driver"], arrays)
         options = {name: request[name] for name in ("seed", "reward", "explore", "record_details", "stop_at_contact")}
-        options |= {"simulation": open_simulation(), "on_progress": send_progress}
+        options |= {"backend": open_once(request["backend"]), "on_progress": send_progress}
         content, record_arrays = pack(run_episode(scenario, driver, **options))
     except Exception as error:  # every requested episode has a row, also one that failed
         unjam_error = as_unjam_error(error)
@@ -59,9 +60,15 @@ def _answer_request(
     write_message(output, {"episode": content}, record_arrays)
 
 
+def _open(stack: ExitStack, backend: str) -> Backend:
+    """Return a backend that stays open for all episodes; SUMO may run in this process, which has its own sandbox."""
+    if backend == "sumo":
+        return SumoBackend(stack.enter_context(Simulation(owns_stdout=True)))
+    return stack.enter_context(open_backend(backend))
+
+
 if __name__ == "__main__":
     answer_pipe = open_answer_pipe()
     gc.freeze()  # the imported objects stay; searching them for garbage would cost time in every episode
     with ExitStack() as stack:
-        simulation = cache(lambda: stack.enter_context(Simulation(owns_stdout=True)))
-        answer_requests(partial(_answer_request, simulation, answer_pipe))
+        answer_requests(partial(_answer_request, cache(partial(_open, stack)), answer_pipe))

@@ -16,9 +16,9 @@ from unjam.errors import EpisodeError, SumoInputError
 from unjam.processes import PrivateFolder, remove_stale_private_folders
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_network import UserNetwork
 from unjam.sumo_files import MAX_READER_TIME, answer_of
 from unjam.tree import Arrays, unpack
+from unjam.worlds.backend import BackendLike
 from unjam.worlds.messages import read_message, start_child, write_message
 from unjam.worlds.record import Episode, failed_episode
 from unjam.worlds.reward import RewardLike
@@ -44,16 +44,20 @@ class EpisodeTask:
     explore: float = 0.0
     record_details: bool = False
     stop_at_contact: bool = True
+    backend: BackendLike = "sumo"
+    """an object likewise"""
 
     @property
     def is_serializable(self) -> bool:
         """Whether another process can run it."""
-        return isinstance(self.reward, str) and is_serializable(self.driver)
+        is_named = isinstance(self.reward, str) and isinstance(self.backend, str)
+        return is_named and is_serializable(self.driver)
 
     def message(self) -> Message:
         """Return the message that sends the task to a worker."""
         recipe, arrays = driver_recipe(self.driver)
-        content = {name: getattr(self, name) for name in ("reward", "explore", "record_details", "stop_at_contact")}
+        names = "reward", "explore", "record_details", "stop_at_contact", "backend"
+        content = {name: getattr(self, name) for name in names}
         content |= {"seed": list(self.seed), "scenario": scenario_recipe(self.scenario), "driver": recipe}
         return content, arrays
 
@@ -163,7 +167,7 @@ class _Worker:
 
     def run(self, task: EpisodeTask, on_progress: Callable[[int], object]) -> Episode:
         """Return the episode of a task; raise `_WorkerLostError` if the process dies or does not answer."""
-        was_sandboxed, self._is_sandboxed = self._is_sandboxed, isinstance(task.scenario, UserNetwork)
+        was_sandboxed, self._is_sandboxed = self._is_sandboxed, task.scenario.reads_user_files
         if was_sandboxed and not self._is_sandboxed:  # a process cannot leave its sandbox
             self._kill()
         with self._start_lock:

@@ -12,12 +12,13 @@ from unjam.worlds.batch.human_idm import Leader
 from unjam.worlds.closed_road import NOISE_BLOCK_STEPS
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Floats
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
 
 def errors(eight: FigureEight, driver: Driver, seed: int, simulation: Simulation) -> Floats:
     """Return by how much each speed differs after one step from SUMO's own state, (steps, vehicles) [m/s]."""
-    episode = run_episode(eight, driver, (seed,), simulation=simulation)
+    episode = run_episode(eight, driver, (seed,), backend=SumoBackend(simulation))
     road, others = eight.draw_from_seed((seed,))
     assert isinstance(road, ClosedRoad)
     steps, vehicles = len(episode.speeds) - 1, len(road.vehicle_ids)

@@ -21,6 +21,7 @@ from unjam.worlds.batch.run import WARM_UP_CACHE, run_batch
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Floats
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask
 
@@ -46,12 +47,12 @@ EIGHTS: dict[str, tuple[FigureEight, str, int]] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", EIGHTS)
-def test_it_begins_as_sumos_of_the_same_seed(name: str, simulation: Simulation) -> None:
+def test_it_begins_as_sumos_of_the_same_seed(name: str, sumo: SumoBackend) -> None:
     eight, expert, until = EIGHTS[name]
     for task, found in zip(
         tasks(eight, expert, range(2)), run_batch(tasks(eight, expert, range(2)), allow_statistical=True), strict=True
     ):
-        actual = run_episode(eight, task.driver, task.seed, simulation=simulation)
+        actual = run_episode(eight, task.driver, task.seed, backend=sumo)
         assert np.abs(found.speeds[:until] - actual.speeds[:until]).max() < 1e-3
         assert np.abs(found.positions[:until] - actual.positions[:until]).max() < 1e-2
         assert found.crossings == actual.crossings
@@ -71,12 +72,12 @@ def test_from_each_of_sumos_moments_a_step_is_sumos(expert: str, simulation: Sim
 
 
 @pytest.mark.slow
-def test_whole_episodes_are_alike(simulation: Simulation) -> None:
+def test_whole_episodes_are_alike(sumo: SumoBackend) -> None:
     eight, seeds = FigureEight(), range(3)
     found = run_batch(tasks(eight, "idm", seeds), allow_statistical=True)
     driver = driver_from_name("idm", eight.control_step)
     for episode, seed in zip(found, seeds, strict=True):
-        actual = run_episode(eight, driver, seed, simulation=simulation)
+        actual = run_episode(eight, driver, seed, backend=sumo)
         assert episode.status == actual.status == "completed"
         assert episode.speeds.mean() == pytest.approx(actual.speeds.mean(), rel=0.01)
         assert measure(episode)["return"] == pytest.approx(measure(actual)["return"], rel=0.01)

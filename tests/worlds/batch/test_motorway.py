@@ -43,6 +43,7 @@ from unjam.worlds.batch.run import run_batch, run_batched_if_supported
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.networks import network_file, xml_document
 from unjam.worlds.sumo.simulation import Simulation
@@ -238,13 +239,10 @@ def about(episode: Episode) -> list[float]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param("human", marks=pytest.mark.slow), "jam-ahead"])
-def test_episodes_are_sumos_in_the_mean(name: str, driven: dict[str, list[Episode]], simulation: Simulation) -> None:
+def test_episodes_are_sumos_in_the_mean(name: str, driven: dict[str, list[Episode]], sumo: SumoBackend) -> None:
     ours = np.array([about(episode) for episode in driven[name]])
     theirs = np.array(
-        [
-            about(run_episode(SHORT, driver_of(name), seed, record_details=True, simulation=simulation))
-            for seed in seeds_of(4)
-        ]
+        [about(run_episode(SHORT, driver_of(name), seed, record_details=True, backend=sumo)) for seed in seeds_of(4)]
     )
     assert ours.mean(0) == pytest.approx(theirs.mean(0), rel=0.08)
 

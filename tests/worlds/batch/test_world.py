@@ -34,7 +34,7 @@ from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.drive import finish_drive
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.worker_pool import EpisodeTask
 
 NEEDS_A_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no graphics card")
@@ -131,11 +131,11 @@ def test_the_share_of_cavs_is_told_to_whom_asks_for_it_alone(cavs: int, warmup: 
 
 
 @pytest.mark.parametrize("name", RINGS)
-def test_a_ring_of_the_batch_is_sumos_of_the_same_seed(name: str, simulation: Simulation) -> None:
+def test_a_ring_of_the_batch_is_sumos_of_the_same_seed(name: str, sumo: SumoBackend) -> None:
     ring, expert = RINGS[name]
     driver = driver_from_name(expert, ring.control_step)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2))), (1, 2), strict=True):
-        assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
+        assert_alike(found, run_episode(ring, driver, seed, backend=sumo))
 
 
 @pytest.mark.long
@@ -176,21 +176,21 @@ def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
-def test_it_stays_so_for_five_minutes(simulation: Simulation) -> None:
+def test_it_stays_so_for_five_minutes(sumo: SumoBackend) -> None:
     ring, driver = Ring(cavs=2), driver_from_name("pi", 0.1)
     for found, seed in zip(run_batch(tasks(ring, driver, (7, 8))), (7, 8), strict=True):
         assert found.control_steps == 3000
-        assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
+        assert_alike(found, run_episode(ring, driver, seed, backend=sumo))
 
 
 @pytest.mark.parametrize("hold", [1, 10])
 @pytest.mark.parametrize("wrong", [{}, WRONG], ids=["exact sensors", "wrong sensors"])
 def test_a_network_sees_explores_and_is_recorded_as_in_sumo(
-    hold: int, wrong: dict[str, Any], simulation: Simulation
+    hold: int, wrong: dict[str, Any], sumo: SumoBackend
 ) -> None:
     ring, driver = Ring(cavs=2, warmup=120, horizon=100, **wrong), make_benchmark_driver(hold)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2), True)), (1, 2), strict=True):
-        actual = run_episode(ring, driver, seed, explore=True, simulation=simulation)
+        actual = run_episode(ring, driver, seed, explore=True, backend=sumo)
         assert_alike(found, actual)
         for one, other in zip(found.trajectories, actual.trajectories, strict=True):
             for name in (
@@ -206,11 +206,11 @@ def test_a_network_sees_explores_and_is_recorded_as_in_sumo(
                 assert one.initial_memory[name] == pytest.approx(values, abs=1e-9, nan_ok=True), name
 
 
-def test_who_collides_ends_there_and_others_go_on(simulation: Simulation) -> None:
+def test_who_collides_ends_there_and_others_go_on(sumo: SumoBackend) -> None:
     ring = Ring(length=(230, 260), horizon=200, actuation="raw", safety=NO_FILTER)
     found = run_batch(tasks(ring, Constant(0.6), (1, 2, 3)))
     for episode, seed in zip(found, (1, 2, 3), strict=True):
-        assert_alike(episode, run_episode(ring, Constant(0.6), seed, simulation=simulation))
+        assert_alike(episode, run_episode(ring, Constant(0.6), seed, backend=sumo))
     assert {episode.status for episode in found} == {"collision"}
     assert len({episode.control_steps for episode in found}) > 1
 
@@ -222,14 +222,14 @@ class Hasty(Driver):
         return np.where(np.asarray(state.speed) > 2.0, -8.0, 0.8), memory
 
 
-def test_brakes_do_what_they_can(simulation: Simulation) -> None:
+def test_brakes_do_what_they_can(sumo: SumoBackend) -> None:
     ring = replace(SHORT, action_limit=8.0)
     (found,) = run_batch(tasks(ring, Hasty(), (1,)))
-    assert_alike(found, run_episode(ring, Hasty(), 1, simulation=simulation))
+    assert_alike(found, run_episode(ring, Hasty(), 1, backend=sumo))
     assert found.audit.cav_braking.max_braking == pytest.approx(6.0)
 
 
-def test_each_of_a_population_drives_in_its_own_way(tmp_path: Path, simulation: Simulation) -> None:
+def test_each_of_a_population_drives_in_its_own_way(tmp_path: Path, sumo: SumoBackend) -> None:
     one = SHORT.humans
     slow = replace(one, time_headway=1.5, desired_speed=4.0, comfortable_deceleration=2.2)
     quick = replace(one, max_acceleration=1.8, minimum_gap=1.5, exponent=2.0)
@@ -237,14 +237,14 @@ def test_each_of_a_population_drives_in_its_own_way(tmp_path: Path, simulation: 
     ring = replace(SHORT, population=str(tmp_path / "people.json"), warmup=130)
     driver = driver_from_name("pi", 0.1)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2))), (1, 2), strict=True):
-        assert_alike(found, run_episode(ring, driver, seed, simulation=simulation))
+        assert_alike(found, run_episode(ring, driver, seed, backend=sumo))
 
 
-def test_people_collide_where_sumo_says_so(simulation: Simulation) -> None:
+def test_people_collide_where_sumo_says_so(sumo: SumoBackend) -> None:
     ring, driver = Ring(noise=40.0, horizon=90), driver_from_name("human", 0.1)
     found = run_batch(tasks(ring, driver, (1, 2, 3)))
     for episode, seed in zip(found, (1, 2, 3), strict=True):
-        assert_alike(episode, run_episode(ring, driver, seed, simulation=simulation))
+        assert_alike(episode, run_episode(ring, driver, seed, backend=sumo))
     assert {episode.status for episode in found} == {"collision"}
 
 

@@ -13,7 +13,7 @@ from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 
 RING = Ring(length=(230, 230), horizon=300, safety=SafetyFilter(active=False))
 """what SUMO does with commands, without the filter"""
@@ -85,9 +85,9 @@ def idm(episode: Episode) -> Floats:
 @pytest.mark.parametrize(
     ("vehicles", "cavs", "length"), [(2, 2, 40), (5, 1, 55), (11, 1, 120), (22, 1, 220), (44, 1, 520)]
 )
-def test_the_number_of_vehicles_is_as_configured(vehicles: int, cavs: int, length: int, simulation: Simulation) -> None:
+def test_the_number_of_vehicles_is_as_configured(vehicles: int, cavs: int, length: int, sumo: SumoBackend) -> None:
     ring = replace(RING, vehicles=vehicles, cavs=cavs, length=(length, length))
-    episode = run_episode(ring, PISaturation(), (0,), simulation=simulation)
+    episode = run_episode(ring, PISaturation(), (0,), backend=sumo)
     assert episode.speeds.shape == (301, vehicles)
     assert len(episode.vehicle_ids) == vehicles
     assert len(episode.cav_ids) == len(episode.trajectories) == cavs
@@ -98,17 +98,17 @@ def test_the_number_of_vehicles_is_as_configured(vehicles: int, cavs: int, lengt
 
 
 @pytest.mark.parametrize("warmup", [0, 20])
-def test_a_vehicle_that_vanishes_ends_the_episode_with_an_error(warmup: int, simulation: Simulation) -> None:
+def test_a_vehicle_that_vanishes_ends_the_episode_with_an_error(warmup: int, sumo: SumoBackend) -> None:
     def lose_one(speed: Any) -> Any:
         libsumo.vehicle.remove("human_5")
         return speed * 0.0
 
     with pytest.raises(EpisodeError, match="21 vehicles on the road; expected: 22"):
-        run_episode(replace(RING, warmup=warmup), Answers(lose_one), (0,), simulation=simulation)
-    assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
+        run_episode(replace(RING, warmup=warmup), Answers(lose_one), (0,), backend=sumo)
+    assert run_episode(RING, IDM(), (0,), backend=sumo).status == "completed"
 
 
-def test_an_additional_vehicle_ends_the_episode_with_an_error(simulation: Simulation) -> None:
+def test_an_additional_vehicle_ends_the_episode_with_an_error(sumo: SumoBackend) -> None:
     def add_one(speed: Any) -> Any:
         route = libsumo.vehicle.getRouteID("cav_0")
         libsumo.vehicle.add("stranger", route, typeID="human", departPos="23")
@@ -116,11 +116,11 @@ def test_an_additional_vehicle_ends_the_episode_with_an_error(simulation: Simula
 
     small = replace(RING, vehicles=5, length=(230, 230))
     with pytest.raises(EpisodeError, match="6 vehicles on the road; expected: 5"):
-        run_episode(small, Answers(add_one), (0,), simulation=simulation)
+        run_episode(small, Answers(add_one), (0,), backend=sumo)
 
 
-def test_human_drivers_and_native_cavs_move_as_in_the_paper(simulation: Simulation) -> None:
-    episode = run_episode(replace(RING, horizon=1500), Human(), (0,), simulation=simulation)
+def test_human_drivers_and_native_cavs_move_as_in_the_paper(sumo: SumoBackend) -> None:
+    episode = run_episode(replace(RING, horizon=1500), Human(), (0,), backend=sumo)
     np.testing.assert_allclose(moves(episode), idm(episode), rtol=0, atol=1e-9)
     assert np.ptp(episode.speeds[-1]) > 0.5
     assert not episode.trajectories[0].shield_braking.any()
@@ -128,9 +128,9 @@ def test_human_drivers_and_native_cavs_move_as_in_the_paper(simulation: Simulati
     np.testing.assert_allclose(episode.trajectories[0].applied_acceleration, done, atol=1e-12)
 
 
-def test_human_drivers_use_their_parameters(simulation: Simulation) -> None:
+def test_human_drivers_use_their_parameters(sumo: SumoBackend) -> None:
     slow = replace(RING, humans=replace(RING.humans, time_headway=2.0, max_acceleration=0.5), noise=0.0)
-    episode = run_episode(slow, Human(), (0,), simulation=simulation)
+    episode = run_episode(slow, Human(), (0,), backend=sumo)
     speed, gap = episode.speeds[:-1], episode.gaps[:-1]
     acceleration = 0.5 * (1.0 - (speed / 30.0) ** 4 - ((2.0 + 2.0 * speed) / gap) ** 2)
     np.testing.assert_allclose(moves(episode), speed + STEP * acceleration, atol=1e-9)
@@ -146,10 +146,10 @@ def test_human_drivers_use_their_parameters(simulation: Simulation) -> None:
     ],
 )
 def test_human_noise_has_the_configured_standard_deviation(
-    changes: dict[str, Any], std: float, simulation: Simulation
+    changes: dict[str, Any], std: float, sumo: SumoBackend
 ) -> None:
     ring = replace(RING, length=(270, 270), horizon=2000, **changes)
-    episode = run_episode(ring, IDM(), (0,), simulation=simulation)
+    episode = run_episode(ring, IDM(), (0,), backend=sumo)
     moved = moves(episode)
     noise = (episode.speeds[1:] - moved) / STEP
     np.testing.assert_allclose(noise[:, 0], 0.0, atol=1e-9)  # the CAV has none
@@ -166,10 +166,10 @@ def test_human_noise_has_the_configured_standard_deviation(
     assert episode.speeds.min() >= 0.0
 
 
-def test_raw_follows_every_command_exactly(simulation: Simulation) -> None:
+def test_raw_follows_every_command_exactly(sumo: SumoBackend) -> None:
     commands = np.random.default_rng(1).uniform(-0.5, 1.0, 3000)
     ring = replace(RING, actuation="raw", horizon=3000)
-    episode = run_episode(ring, Playback(commands), (0,), simulation=simulation)
+    episode = run_episode(ring, Playback(commands), (0,), backend=sumo)
     speed = episode.trajectories[0].states.speed
     expected = np.maximum(speed[:-1] + STEP * commands[: episode.control_steps], 0.0)
     np.testing.assert_allclose(speed[1:], expected, rtol=0, atol=1e-9)
@@ -177,9 +177,9 @@ def test_raw_follows_every_command_exactly(simulation: Simulation) -> None:
     assert not episode.trajectories[0].shield_braking.any()
 
 
-def test_a_reckless_raw_driver_collides_and_the_episode_ends_there(simulation: Simulation) -> None:
+def test_a_reckless_raw_driver_collides_and_the_episode_ends_there(sumo: SumoBackend) -> None:
     ring = replace(RING, actuation="raw", horizon=3000)
-    episode = run_episode(ring, Constant(1.0), (0,), simulation=simulation)
+    episode = run_episode(ring, Constant(1.0), (0,), backend=sumo)
     trajectory = episode.trajectories[0]
     assert episode.status == "collision"
     assert episode.has_run
@@ -195,11 +195,11 @@ def test_a_reckless_raw_driver_collides_and_the_episode_ends_there(simulation: S
 
 
 @pytest.mark.parametrize("held", [3, 5, 20, 100])
-def test_a_collision_ends_its_control_step(held: int, simulation: Simulation) -> None:
+def test_a_collision_ends_its_control_step(held: int, sumo: SumoBackend) -> None:
     ring = replace(RING, actuation="raw", horizon=3000, noise=0.0)
-    exact = run_episode(ring, Constant(1.0), (0,), simulation=simulation)
+    exact = run_episode(ring, Constant(1.0), (0,), backend=sumo)
     coarse = replace(ring, steps_per_control_step=held, horizon=3000 // held)
-    episode = run_episode(coarse, Constant(1.0), (0,), simulation=simulation)
+    episode = run_episode(coarse, Constant(1.0), (0,), backend=sumo)
     assert episode.status == "collision"
     assert episode.control_steps == -(-exact.control_steps // held)
     assert episode.collisions == 2
@@ -209,11 +209,11 @@ def test_a_collision_ends_its_control_step(held: int, simulation: Simulation) ->
 @pytest.mark.parametrize("length", [160, 220, 270])
 @pytest.mark.parametrize("held", [1, 5])
 def test_the_same_driver_shielded_never_collides_and_every_override_is_counted(
-    length: int, held: int, simulation: Simulation
+    length: int, held: int, sumo: SumoBackend
 ) -> None:
     ring = replace(RING, horizon=3000 // held, length=(length, length), steps_per_control_step=held)
     for seed in range(2):
-        episode = run_episode(ring, Constant(1.0), (seed,), simulation=simulation)
+        episode = run_episode(ring, Constant(1.0), (seed,), backend=sumo)
         trajectory = episode.trajectories[0]
         assert (episode.status, episode.collisions, episode.control_steps) == ("completed", 0, 3000 // held)
         assert not trajectory.terminated
@@ -222,10 +222,10 @@ def test_the_same_driver_shielded_never_collides_and_every_override_is_counted(
         np.testing.assert_array_equal(trajectory.applied_acceleration, 1.0)
 
 
-def test_shielded_executes_every_command_exactly_except_for_the_counted_braking(simulation: Simulation) -> None:
+def test_shielded_executes_every_command_exactly_except_for_the_counted_braking(sumo: SumoBackend) -> None:
     commands = np.random.default_rng(1).uniform(-0.6, 1.0, 3000)
     ring = replace(RING, horizon=3000)
-    episode = run_episode(ring, Playback(commands), (0,), simulation=simulation)
+    episode = run_episode(ring, Playback(commands), (0,), backend=sumo)
     trajectory = episode.trajectories[0]
     speed, shield = trajectory.states.speed, trajectory.shield_braking
     commanded = np.maximum(speed[:-1] + STEP * commands, 0.0)
@@ -236,28 +236,28 @@ def test_shielded_executes_every_command_exactly_except_for_the_counted_braking(
     assert shield.min() >= 0.0
 
 
-def test_the_shield_does_not_change_a_careful_driver(simulation: Simulation) -> None:
+def test_the_shield_does_not_change_a_careful_driver(sumo: SumoBackend) -> None:
     ring = replace(RING, horizon=3000, length=(270, 270))
-    trajectory = run_episode(ring, PISaturation(), (0,), simulation=simulation).trajectories[0]
+    trajectory = run_episode(ring, PISaturation(), (0,), backend=sumo).trajectories[0]
     assert trajectory.shield_braking.max() < 1e-9
     expected = np.maximum(trajectory.states.speed[:-1] + STEP * trajectory.applied_acceleration, 0.0)
     np.testing.assert_allclose(trajectory.states.speed[1:], expected, rtol=0, atol=1e-9)
     assert np.abs(trajectory.applied_acceleration).max() > 0.1
 
 
-def test_the_shield_of_a_held_command_is_its_hardest_braking(simulation: Simulation) -> None:
-    fine = run_episode(replace(RING, horizon=1000), Constant(1.0), (0,), simulation=simulation)
+def test_the_shield_of_a_held_command_is_its_hardest_braking(sumo: SumoBackend) -> None:
+    fine = run_episode(replace(RING, horizon=1000), Constant(1.0), (0,), backend=sumo)
     ring = replace(RING, horizon=200, steps_per_control_step=5)
-    coarse = run_episode(ring, Constant(1.0), (0,), simulation=simulation)
+    coarse = run_episode(ring, Constant(1.0), (0,), backend=sumo)
     expected = fine.trajectories[0].shield_braking.reshape(200, 5).max(1)
     np.testing.assert_array_equal(coarse.trajectories[0].shield_braking, expected)
 
 
-def test_flow_never_exceeds_the_human_model(simulation: Simulation) -> None:
+def test_flow_never_exceeds_the_human_model(sumo: SumoBackend) -> None:
     commands = np.random.default_rng(1).uniform(-0.4, 1.0, 3000)
     ring = replace(RING, horizon=3000, actuation="flow", cavs=2)
     for driver in (Constant(1.0), Playback(commands)):
-        episode = run_episode(ring, driver, (0,), simulation=simulation)
+        episode = run_episode(ring, driver, (0,), backend=sumo)
         assert episode.status == "completed"
         for trajectory in episode.trajectories:
             place = episode.vehicle_ids.index(trajectory.vehicle)
@@ -271,11 +271,11 @@ def test_flow_never_exceeds_the_human_model(simulation: Simulation) -> None:
 
 @pytest.mark.parametrize("limit", [0.4, 1.0, 3.0])
 @pytest.mark.parametrize("wanted", [-50.0, 50.0])
-def test_commands_stay_within_the_action_limit(limit: float, wanted: float, simulation: Simulation) -> None:
+def test_commands_stay_within_the_action_limit(limit: float, wanted: float, sumo: SumoBackend) -> None:
     ring = replace(RING, action_limit=limit, horizon=10, cavs=2)
     for driver in (Constant(wanted), Playback(np.full(10, wanted))):
         for scenario in (ring, replace(ring, cavs=1)):
-            episode = run_episode(scenario, driver, (0,), simulation=simulation)
+            episode = run_episode(scenario, driver, (0,), backend=sumo)
             for trajectory in episode.trajectories:
                 np.testing.assert_array_equal(trajectory.applied_acceleration, np.sign(wanted) * limit)
             assert episode.speeds[1, 0] == pytest.approx(max(np.sign(wanted) * limit * STEP, 0.0))
@@ -284,16 +284,16 @@ def test_commands_stay_within_the_action_limit(limit: float, wanted: float, simu
 @pytest.mark.parametrize("kind", [Answers, PlainAnswers])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_acceleration_that_is_not_finite_is_refused_with_its_step(
-    kind: type[Answers], value: float, simulation: Simulation
+    kind: type[Answers], value: float, sumo: SumoBackend
 ) -> None:
     with pytest.raises(InputError, match=f"driver: step 7: .*{value}.*allowed: finite"):
-        run_episode(RING, kind(lambda speed: speed * 0.0 + value), (0,), simulation=simulation)
+        run_episode(RING, kind(lambda speed: speed * 0.0 + value), (0,), backend=sumo)
 
 
-def test_of_several_cavs_the_one_with_the_wrong_acceleration_is_named(simulation: Simulation) -> None:
+def test_of_several_cavs_the_one_with_the_wrong_acceleration_is_named(sumo: SumoBackend) -> None:
     driver = Answers(lambda speed: np.array([0.0, np.nan, 0.0]))
     with pytest.raises(InputError, match="driver: step 7: acceleration of cav_7 is nan"):
-        run_episode(replace(RING, cavs=3), driver, (0,), simulation=simulation)
+        run_episode(replace(RING, cavs=3), driver, (0,), backend=sumo)
 
 
 @pytest.mark.parametrize("cavs", [1, 3])
@@ -311,26 +311,26 @@ def test_of_several_cavs_the_one_with_the_wrong_acceleration_is_named(simulation
     ids=["one too many", "none", "column", "number", "no axis", "None", "words"],
 )
 def test_an_answer_that_is_not_one_number_for_each_cav_is_refused_with_its_step(
-    answer: Callable[[Any], Any], cavs: int, simulation: Simulation
+    answer: Callable[[Any], Any], cavs: int, sumo: SumoBackend
 ) -> None:
     with pytest.raises(InputError, match="driver: step 7: "):
-        run_episode(replace(RING, cavs=cavs), Answers(answer), (0,), simulation=simulation)
+        run_episode(replace(RING, cavs=cavs), Answers(answer), (0,), backend=sumo)
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.float32, bool])
-def test_accelerations_may_have_any_numeric_type(kind: type, simulation: Simulation) -> None:
+def test_accelerations_may_have_any_numeric_type(kind: type, sumo: SumoBackend) -> None:
     expected, found = (
-        run_episode(RING, Answers(answer), (0,), simulation=simulation).speeds
+        run_episode(RING, Answers(answer), (0,), backend=sumo).speeds
         for answer in (lambda speed: np.ones(len(speed)), lambda speed: np.ones(len(speed), kind))
     )
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_driver_recalls_the_last_minute_of_the_warm_up_oldest_first(simulation: Simulation) -> None:
-    human = run_episode(replace(RING, horizon=900, cavs=2), Human(), (3,), simulation=simulation)
+def test_a_driver_recalls_the_last_minute_of_the_warm_up_oldest_first(sumo: SumoBackend) -> None:
+    human = run_episode(replace(RING, horizon=900, cavs=2), Human(), (3,), backend=sumo)
     driver = Watcher()
     ring = replace(RING, warmup=750, cavs=2, horizon=20)
-    episode = run_episode(ring, driver, (3,), simulation=simulation)
+    episode = run_episode(ring, driver, (3,), backend=sumo)
     (history,) = driver.history
     for row, trajectory in enumerate(human.trajectories):
         for heard, was in zip(history[:7], trajectory.states[:7], strict=True):
@@ -342,18 +342,18 @@ def test_a_driver_recalls_the_last_minute_of_the_warm_up_oldest_first(simulation
     assert episode.warmup == 750
 
 
-def test_a_short_warm_up_is_recalled_completely(simulation: Simulation) -> None:
+def test_a_short_warm_up_is_recalled_completely(sumo: SumoBackend) -> None:
     driver = Watcher()
-    run_episode(replace(RING, warmup=7, horizon=5), driver, (3,), simulation=simulation)
-    human = run_episode(RING, Human(), (3,), simulation=simulation).trajectories[0]
+    run_episode(replace(RING, warmup=7, horizon=5), driver, (3,), backend=sumo)
+    human = run_episode(RING, Human(), (3,), backend=sumo).trajectories[0]
     np.testing.assert_array_equal(driver.history[0].speed, human.states.speed[None, :7])
 
 
-def test_the_warm_up_is_recalled_once_per_control_step(simulation: Simulation) -> None:
+def test_the_warm_up_is_recalled_once_per_control_step(sumo: SumoBackend) -> None:
     driver = Watcher()
     ring = replace(RING, warmup=752, horizon=4, steps_per_control_step=5)
-    run_episode(ring, driver, (3,), simulation=simulation)
-    human = run_episode(replace(RING, horizon=800), Human(), (3,), simulation=simulation).trajectories[0]
+    run_episode(ring, driver, (3,), backend=sumo)
+    human = run_episode(replace(RING, horizon=800), Human(), (3,), backend=sumo).trajectories[0]
     moments = np.arange(752 - 120 * 5, 752, 5)
     assert driver.history[0].speed.shape == (1, 120)
     np.testing.assert_allclose(driver.history[0].leader_gap[0], human.states.leader_gap[moments], atol=1e-9)
@@ -361,25 +361,25 @@ def test_the_warm_up_is_recalled_once_per_control_step(simulation: Simulation) -
 
 
 @pytest.mark.parametrize("changes", [{"warmup": 0}, {"warmup": 100, "remember_warmup": False}])
-def test_no_warm_up_is_recalled_without_one_or_if_switched_off(changes: dict[str, Any], simulation: Simulation) -> None:
+def test_no_warm_up_is_recalled_without_one_or_if_switched_off(changes: dict[str, Any], sumo: SumoBackend) -> None:
     driver = Watcher()
-    run_episode(replace(RING, horizon=5, **changes), driver, (3,), simulation=simulation)
+    run_episode(replace(RING, horizon=5, **changes), driver, (3,), backend=sumo)
     assert driver.history == []
     assert len(driver.perceived) == 5
 
 
-def test_recalling_the_warm_up_changes_the_pi_driver(simulation: Simulation) -> None:
+def test_recalling_the_warm_up_changes_the_pi_driver(sumo: SumoBackend) -> None:
     ring = replace(RING, warmup=400)
     recalled, fresh = (
-        run_episode(scenario, PISaturation(), (3,), simulation=simulation).trajectories[0].applied_acceleration
+        run_episode(scenario, PISaturation(), (3,), backend=sumo).trajectories[0].applied_acceleration
         for scenario in (ring, replace(ring, remember_warmup=False))
     )
     assert not np.array_equal(recalled, fresh)
 
 
-def test_observed_states_are_recorded(simulation: Simulation) -> None:
+def test_observed_states_are_recorded(sumo: SumoBackend) -> None:
     driver = Watcher()
-    episode = run_episode(replace(RING, cavs=3, horizon=80), driver, (3,), simulation=simulation)
+    episode = run_episode(replace(RING, cavs=3, horizon=80), driver, (3,), backend=sumo)
     for row, trajectory in enumerate(episode.trajectories):
         for name in COMMON_FIELDS:
             seen = [getattr(state, name)[row] for state in driver.perceived]
@@ -387,12 +387,12 @@ def test_observed_states_are_recorded(simulation: Simulation) -> None:
 
 
 @pytest.mark.parametrize("actuation", ["shielded", "raw", "flow"])
-def test_a_command_is_held_for_the_steps_of_a_control_step(actuation: Any, simulation: Simulation) -> None:
+def test_a_command_is_held_for_the_steps_of_a_control_step(actuation: Any, sumo: SumoBackend) -> None:
     commands = np.random.default_rng(2).uniform(-0.8, 0.8, (60, 2))
     fine = replace(RING, cavs=2, horizon=300, warmup=50, actuation=actuation)
     coarse = replace(fine, horizon=60, steps_per_control_step=5)
-    held = run_episode(coarse, Playback(commands), (1,), simulation=simulation)
-    each = run_episode(fine, Playback(np.repeat(commands, 5, 0)), (1,), simulation=simulation)
+    held = run_episode(coarse, Playback(commands), (1,), backend=sumo)
+    each = run_episode(fine, Playback(np.repeat(commands, 5, 0)), (1,), backend=sumo)
     assert each.status == "completed"
     np.testing.assert_array_equal(held.speeds, each.speeds[::5])
     np.testing.assert_array_equal(held.positions, each.positions[::5])
@@ -401,23 +401,21 @@ def test_a_command_is_held_for_the_steps_of_a_control_step(actuation: Any, simul
         np.testing.assert_array_equal(trajectory.applied_acceleration, commands[:, row])
 
 
-def test_a_finer_simulation_step_gives_similar_results(simulation: Simulation) -> None:
+def test_a_finer_simulation_step_gives_similar_results(sumo: SumoBackend) -> None:
     ring = replace(RING, noise=0.0)
-    coarse = run_episode(ring, IDM(), (0,), simulation=simulation)
-    fine = run_episode(
-        replace(ring, simulation_step=0.05, steps_per_control_step=2), IDM(), (0,), simulation=simulation
-    )
+    coarse = run_episode(ring, IDM(), (0,), backend=sumo)
+    fine = run_episode(replace(ring, simulation_step=0.05, steps_per_control_step=2), IDM(), (0,), backend=sumo)
     np.testing.assert_allclose(fine.speeds[-1], coarse.speeds[-1], atol=0.02)
     np.testing.assert_allclose(fine.positions[-1], coarse.positions[-1], atol=0.3)
     assert fine.control_step == coarse.control_step == 0.1
 
 
-def test_positions_follow_from_speeds(simulation: Simulation) -> None:
+def test_positions_follow_from_speeds(sumo: SumoBackend) -> None:
     ring = replace(RING, warmup=30, cavs=3)
-    episode = run_episode(ring, PISaturation(), (0,), simulation=simulation)
+    episode = run_episode(ring, PISaturation(), (0,), backend=sumo)
     places = [episode.vehicle_ids.index(name) for name in episode.cav_ids]
     np.testing.assert_allclose(moves(episode)[:, places], episode.speeds[1:, places], atol=1e-9)
-    quiet = run_episode(replace(ring, noise=0.0), PISaturation(), (0,), simulation=simulation)
+    quiet = run_episode(replace(ring, noise=0.0), PISaturation(), (0,), backend=sumo)
     np.testing.assert_allclose(moves(quiet), quiet.speeds[1:], atol=1e-9)
     ahead = np.roll(episode.positions, -1, 1)
     expected = (ahead - episode.positions) % episode.loop_length - 5.0

@@ -16,7 +16,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.scenario import MIN_CAV_GAP
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.closed_road import ClosedTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -66,9 +66,9 @@ def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
 
 
 @pytest.mark.parametrize("cavs", [2, 7, 14])
-def test_several_cavs_are_driven_and_recorded_separately(cavs: int, simulation: Simulation) -> None:
+def test_several_cavs_are_driven_and_recorded_separately(cavs: int, sumo: SumoBackend) -> None:
     road = replace(AS_FLOW, cavs=cavs, horizon=300)
-    episode = run_episode(road, ByRow(), (1,), simulation=simulation)
+    episode = run_episode(road, ByRow(), (1,), backend=sumo)
     assert (episode.status, len(episode.trajectories)) == ("completed", cavs)
     assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids
     for row, trajectory in enumerate(episode.trajectories):
@@ -95,9 +95,9 @@ class ByRow(Driver):
         return push, {"decisions": memory["decisions"] + 1.0}
 
 
-def test_vehicles_from_the_right_yield(simulation: Simulation) -> None:
+def test_vehicles_from_the_right_yield(sumo: SumoBackend) -> None:
     """Vehicles stand before the crossing on the yielding approach, and never on the other one."""
-    episode = run_episode(FigureEight(radius=(32, 32)), Human(), (0,), simulation=simulation)
+    episode = run_episode(FigureEight(radius=(32, 32)), Human(), (0,), backend=sumo)
     road = FigureEight(radius=(32, 32)).draw(np.random.default_rng(0))
     place = episode.positions % road.loop_length
     standing = episode.speeds < 0.1

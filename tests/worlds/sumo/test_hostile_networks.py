@@ -21,6 +21,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import _log_once
 from unjam.sumo_files import PASSED_OPTIONS, is_passed_option, read_sumo_files
 from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -108,7 +109,7 @@ def test_nothing_is_written_and_nothing_listens(
     monkeypatch.chdir(here)  # outputs may have names of their own
     before = contents(tmp_path)
     scenario = make_scenario(str(hostile), {"penetration_rate": 0.5, "horizon": 100})
-    episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
+    episode = run_episode(scenario, IDM(), (0,), backend=SumoBackend(simulation))
     assert listening() == []
     simulation.close()  # outputs are written at the end at last
     assert (episode.status, episode.control_steps) == ("completed", 100)
@@ -152,7 +153,7 @@ def test_harmless_files_are_read_without_a_copy_or_message(tmp_path: Path, caplo
     assert (found.dropped_items, found.replaced_options, found.copy_sources, caplog.records) == ((), (), {}, [])
 
 
-def test_dropped_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulation) -> None:
+def test_dropped_outputs_change_no_vehicle(tmp_path: Path, sumo: SumoBackend) -> None:
     plain, noted = (tmp_path / name for name in ("plain", "noted"))
     episodes = []
     for folder in (plain, noted):
@@ -164,45 +165,45 @@ def test_dropped_outputs_change_no_vehicle(tmp_path: Path, simulation: Simulatio
             without = re.sub("<calibrator.*</calibrator>", "", WRITING, flags=re.DOTALL)
             (folder / "outputs.add.xml").write_text(without.replace("CANARY", str(tmp_path / "canary")))
         scenario = make_scenario(str(path), {"penetration_rate": 0.5, "horizon": 200})
-        episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
+        episode = run_episode(scenario, IDM(), (0,), backend=sumo)
         episodes.append(replace(episode, warnings=()))  # detectors warn of vehicles that miss them
     assert fingerprint(episodes[0]) == fingerprint(episodes[1])
     assert not (tmp_path / "canary").exists()
 
 
-def test_options_and_files_that_only_simulate_are_used(tmp_path: Path, simulation: Simulation) -> None:
+def test_options_and_files_that_only_simulate_are_used(tmp_path: Path, sumo: SumoBackend) -> None:
     path = straight(tmp_path, COLUMN)
     scenario = make_scenario(str(path), {"cav_types": ["van"], "horizon": 200})
-    fast = run_episode(scenario, IDM(), (0,), simulation=simulation)
+    fast = run_episode(scenario, IDM(), (0,), backend=sumo)
     sign = '<variableSpeedSign id="v" lanes="road_0"><step time="0" speed="11"/></variableSpeedSign>'
     (tmp_path / "slow.add.xml").write_text(f"<additional>{sign}</additional>")
     inside = "<additional-files value='slow.add.xml'/><time-to-teleport value='50'/><end "
     path.write_text(path.read_text().replace("<end ", inside))
     assert read_sumo_files(path).options == {"end": "60.0", "time-to-teleport": "50"}
-    slow = run_episode(scenario, IDM(), (0,), simulation=simulation)
+    slow = run_episode(scenario, IDM(), (0,), backend=sumo)
     assert np.nanmean(slow.speeds) < 12 < np.nanmean(fast.speeds)
 
 
-def test_folders_with_blanks_and_commas_give_the_same_traffic(tmp_path: Path, simulation: Simulation) -> None:
+def test_folders_with_blanks_and_commas_give_the_same_traffic(tmp_path: Path, sumo: SumoBackend) -> None:
     episodes = []
     for name in ("plain", "with a blank, a comma; and $HOME"):
         (tmp_path / name).mkdir()
         scenario = make_scenario(str(straight(tmp_path / name, COLUMN)), {"penetration_rate": 0.5, "horizon": 50})
-        episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
+        episode = run_episode(scenario, IDM(), (0,), backend=sumo)
         episodes.append(replace(episode, warnings=()))  # detectors warn of vehicles that miss them
     assert fingerprint(episodes[0]) == fingerprint(episodes[1])
 
 
-def test_compressed_and_strangely_encoded_files_are_copied(tmp_path: Path, simulation: Simulation) -> None:
+def test_compressed_and_strangely_encoded_files_are_copied(tmp_path: Path, sumo: SumoBackend) -> None:
     path = straight(tmp_path, COLUMN)
     scenario = make_scenario(str(path), {"penetration_rate": 0.5, "horizon": 50})
-    plain = run_episode(scenario, IDM(), (0,), simulation=simulation)
+    plain = run_episode(scenario, IDM(), (0,), backend=sumo)
     demand, network = tmp_path / "demand.rou.xml", tmp_path / "road.net.xml"
     demand.write_bytes(f"<?xml version='1.0' encoding='utf-16'?>{demand.read_text()}".encode("utf-16"))
     (tmp_path / "road.net.xml.gz").write_bytes(gzip.compress(network.read_bytes()))
     path.write_text(path.read_text().replace("road.net.xml", "road.net.xml.gz"))
     assert read_sumo_files(path).copy_sources.keys() == {demand, tmp_path / "road.net.xml.gz"}
-    assert fingerprint(run_episode(scenario, IDM(), (0,), simulation=simulation)) == fingerprint(plain)
+    assert fingerprint(run_episode(scenario, IDM(), (0,), backend=sumo)) == fingerprint(plain)
 
 
 @pytest.mark.parametrize("name", ["default namespace", "signal that writes", "swarm that writes"])
@@ -221,13 +222,13 @@ def test_hidden_outputs_are_found(name: str, tmp_path: Path) -> None:
     assert found.dropped_items in (("edgeData",), ("parameter file",), ("parameter SWARMLOG",))
 
 
-def test_an_option_value_that_looks_like_an_option_is_a_value(tmp_path: Path, simulation: Simulation) -> None:
+def test_an_option_value_that_looks_like_an_option_is_a_value(tmp_path: Path, sumo: SumoBackend) -> None:
     path = straight(tmp_path, COLUMN)
     sly = "<scale-suffix value='--log=canary'/><end "
     path.write_text(path.read_text().replace("<end ", sly))
     before = contents(tmp_path)
     scenario = make_scenario(str(path), {"penetration_rate": 0.5, "horizon": 20})
-    assert run_episode(scenario, IDM(), (0,), simulation=simulation).status == "completed"
+    assert run_episode(scenario, IDM(), (0,), backend=sumo).status == "completed"
     assert contents(tmp_path) == before
     assert not Path("canary").exists()
 
@@ -245,11 +246,11 @@ def test_no_option_that_is_passed_names_a_file_or_is_an_output(tmp_path: Path) -
     assert known >= PASSED_OPTIONS
 
 
-def test_sumos_games_run_without_their_outputs(tmp_path: Path, simulation: Simulation) -> None:
+def test_sumos_games_run_without_their_outputs(tmp_path: Path, sumo: SumoBackend) -> None:
     path = game(tmp_path, "cross")
     before = contents(tmp_path)
     scenario = make_scenario(str(path), {"penetration_rate": 0.3, "horizon": 50})
     assert read_sumo_files(path).dropped_items == ("edgeData", "osgFile of vType", "timedEvent")
-    assert run_episode(scenario, IDM(), (0,), simulation=simulation).status == "completed"
+    assert run_episode(scenario, IDM(), (0,), backend=sumo).status == "completed"
     assert contents(tmp_path) == before
     assert not {"netstate.xml", "tlsstate.xml"} & set(os.listdir())

@@ -16,8 +16,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic, sumo_inputs
 from unjam.worlds.sumo.merge_road import MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -156,8 +155,8 @@ def test_backlog_and_arrivals_agree_with_the_demand_and_with_sumo(simulation: Si
     assert found.arrivals == gone[-1] > 10
 
 
-def test_outflow_and_backlog_metrics_are_these_counts(simulation: Simulation) -> None:
-    episode = run_episode(Merge(horizon=120), PISaturation(time_step=1.0), (1,), simulation=simulation)
+def test_outflow_and_backlog_metrics_are_these_counts(sumo: SumoBackend) -> None:
+    episode = run_episode(Merge(horizon=120), PISaturation(time_step=1.0), (1,), backend=sumo)
     row = measure(episode)
     last = episode.speeds[-1]
     left = np.isnan(last).sum()
@@ -179,10 +178,8 @@ def test_positions_that_differ_from_sumos_odometer_are_an_error(
         traffic.record(DriverLog())
 
 
-def test_snapshots_of_a_merge(simulation: Simulation) -> None:
-    episode = run_episode(
-        Merge(horizon=60), PISaturation(time_step=1.0), (1,), record_details=True, simulation=simulation
-    )
+def test_snapshots_of_a_merge(sumo: SumoBackend) -> None:
+    episode = run_episode(Merge(horizon=60), PISaturation(time_step=1.0), (1,), record_details=True, backend=sumo)
     assert len(episode.branches) == len(episode.vehicle_ids)
     for name, branch in zip(episode.vehicle_ids, episode.branches, strict=True):
         assert branch == ("ramp" if re.match("human_r", name) else "highway")

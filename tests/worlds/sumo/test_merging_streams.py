@@ -13,7 +13,7 @@ from unjam.errors import EpisodeError
 from unjam.scenarios import Merge
 from unjam.scenarios.road import Origin
 from unjam.scenarios.scenario import MIN_CAV_GAP
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import make_traffic
 from unjam.worlds.sumo.merge_road import ABSENT_LEADER_GAP, MergingStreams, MergingTraffic
 from unjam.worlds.sumo.simulation import Simulation
 

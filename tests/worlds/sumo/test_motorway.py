@@ -16,7 +16,7 @@ from unjam.scenarios import OnRamp
 from unjam.worlds.batch.on_ramp.world import MotorwayBatch
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.motorway import MotorwayTraffic
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -152,8 +152,8 @@ def test_an_acc_keeps_the_commanded_time_gap_while_it_is_commanded(simulation: S
     assert shortest(2.0) > shortest(0.5) + 0.3
 
 
-def test_a_cav_without_a_cap_drives_as_its_own_acc(simulation: Simulation) -> None:
-    episode = run_episode(BUSY, Cruise(), (3,), simulation=simulation)
+def test_a_cav_without_a_cap_drives_as_its_own_acc(sumo: SumoBackend) -> None:
+    episode = run_episode(BUSY, Cruise(), (3,), backend=sumo)
     assert episode.status == "completed"
     assert measure(episode)["shield_override_share"] == 0.0
     fastest = max(trajectory.applied_acceleration.max() for trajectory in episode.trajectories)
@@ -231,9 +231,9 @@ def test_the_message_is_the_mean_speed_of_the_lane_ahead(simulation: Simulation)
     assert checked > 5
 
 
-def test_human_only_traffic_does_not_depend_on_the_penetration_rate(simulation: Simulation) -> None:
+def test_human_only_traffic_does_not_depend_on_the_penetration_rate(sumo: SumoBackend) -> None:
     one, other = (
-        run_episode(OnRamp(peak=(0.0, 60.0), horizon=60, penetration_rate=share), Human(), (1,), simulation=simulation)
+        run_episode(OnRamp(peak=(0.0, 60.0), horizon=60, penetration_rate=share), Human(), (1,), backend=sumo)
         for share in (0.05, 0.5)
     )
     np.testing.assert_array_equal(one.speeds, other.speeds)
@@ -264,10 +264,10 @@ def test_branches_and_demand_peak_are_recorded(capped: Episode) -> None:
 
 
 @pytest.mark.long
-def test_a_cav_with_a_cap_still_brakes_as_hard_as_its_own_acc(simulation: Simulation) -> None:
+def test_a_cav_with_a_cap_still_brakes_as_hard_as_its_own_acc(sumo: SumoBackend) -> None:
     """SUMO limits vehicles with a commanded speed to comfortable braking: they would run into the tail of a jam."""
     road = OnRamp(penetration_rate=0.3, horizon=800)
-    episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), simulation=simulation)
+    episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), backend=sumo)
     assert (episode.status, episode.collisions) == ("completed", 0)
     assert road.cruise.deceleration is not None
     assert episode.audit.cav_braking.max_braking > road.cruise.deceleration + 0.1

@@ -8,7 +8,7 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.scenarios import Ring
 from unjam.worlds.closed_road import loop_neighbors, loop_state
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import make_traffic
 from unjam.worlds.sumo.closed_road import ClosedTraffic
 from unjam.worlds.sumo.simulation import Simulation
 

@@ -16,7 +16,7 @@ from unjam.errors import InputError
 from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Trajectory
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -114,7 +114,7 @@ def test_commands_are_carried_out_unless_the_shield_brakes(counted: Episode) -> 
 
 
 @pytest.mark.long
-def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(simulation: Simulation) -> None:
+def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(sumo: SumoBackend) -> None:
     residual = ResidualDriver(PISaturation(time_step=1.0), random_network(), 1.0, action_repeat=3)
     tasks = [
         EpisodeTask(MERGE, residual, (2,), explore=True),
@@ -123,28 +123,22 @@ def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(simulation
     ]
     with WorkerPool(2) as workers:
         found = [fingerprint(episode) for episode in workers.run([*tasks[:1], *tasks[2:]])]
-    here = [
-        run_episode(task.scenario, task.driver, task.seed, explore=task.explore, simulation=simulation)
-        for task in tasks
-    ]
-    again = [
-        run_episode(task.scenario, task.driver, task.seed, explore=task.explore, simulation=simulation)
-        for task in tasks
-    ]
+    here = [run_episode(task.scenario, task.driver, task.seed, explore=task.explore, backend=sumo) for task in tasks]
+    again = [run_episode(task.scenario, task.driver, task.seed, explore=task.explore, backend=sumo) for task in tasks]
     assert [fingerprint(episode) for episode in again] == [fingerprint(episode) for episode in here]
     assert found == [fingerprint(here[0]), fingerprint(here[2])]
     assert [fingerprint(travelled(episode)) for episode in here] == [fingerprint(each) for each in here]
 
 
-def test_the_same_vehicles_are_cavs_for_every_driver(simulation: Simulation) -> None:
+def test_the_same_vehicles_are_cavs_for_every_driver(sumo: SumoBackend) -> None:
     short = replace(MERGE, horizon=40)
-    driven = [run_episode(short, driver, (4,), simulation=simulation) for driver in (Human(), Constant(0.5))]
+    driven = [run_episode(short, driver, (4,), backend=sumo) for driver in (Human(), Constant(0.5))]
     early = [[name for name in episode.cav_ids if int(name.removeprefix("cav_")) < 15] for episode in driven]
     assert early[0] == early[1] != []
 
 
-def test_cavs_with_a_native_driver_have_trajectories(simulation: Simulation) -> None:
-    episode = run_episode(MERGE, Human(), (2,), simulation=simulation)
+def test_cavs_with_a_native_driver_have_trajectories(sumo: SumoBackend) -> None:
+    episode = run_episode(MERGE, Human(), (2,), backend=sumo)
     assert len(episode.trajectories) > 5
     for trajectory in episode.trajectories:
         np.testing.assert_allclose(trajectory.applied_acceleration, np.diff(trajectory.states.speed), atol=1e-12)
@@ -152,9 +146,9 @@ def test_cavs_with_a_native_driver_have_trajectories(simulation: Simulation) -> 
 
 
 @pytest.mark.parametrize("hold", [1, 4])
-def test_a_residual_driver_counts_its_actions_from_each_entry(hold: int, simulation: Simulation) -> None:
+def test_a_residual_driver_counts_its_actions_from_each_entry(hold: int, sumo: SumoBackend) -> None:
     driver = ResidualDriver(Counting(), random_network(), 1.0, action_repeat=hold)
-    episode = run_episode(MERGE, driver, (2,), explore=True, simulation=simulation)
+    episode = run_episode(MERGE, driver, (2,), explore=True, backend=sumo)
     noises = []
     assert len(episode.trajectories) > 5
     for trajectory in episode.trajectories:
@@ -176,9 +170,9 @@ def test_a_residual_driver_counts_its_actions_from_each_entry(hold: int, simulat
     assert len(np.unique(noise)) == len(noise)
 
 
-def test_a_trip_can_be_replayed_from_its_trajectory(simulation: Simulation) -> None:
+def test_a_trip_can_be_replayed_from_its_trajectory(sumo: SumoBackend) -> None:
     driver = ResidualDriver(PISaturation(time_step=1.0), random_network(), 1.0)
-    episode = run_episode(MERGE, driver, (2,), simulation=simulation)
+    episode = run_episode(MERGE, driver, (2,), backend=sumo)
     for trajectory in episode.trajectories:
         memory = {name: values[None] for name, values in trajectory.initial_memory.items()}
         for step in range(len(trajectory.applied_acceleration)):
@@ -187,17 +181,15 @@ def test_a_trip_can_be_replayed_from_its_trajectory(simulation: Simulation) -> N
             assert np.clip(expert[0], -1, 1) == pytest.approx(trajectory.expert_acceleration[step], abs=1e-12)
 
 
-def test_exploration_does_not_change_the_traffic_noise(simulation: Simulation) -> None:
+def test_exploration_does_not_change_the_traffic_noise(sumo: SumoBackend) -> None:
     mute = ResidualDriver(Constant(), replace(random_network(), exploration_std=0.0), 1.0)
-    still, explored = (
-        run_episode(MERGE, mute, (2,), explore=explore, simulation=simulation) for explore in (False, True)
-    )
+    still, explored = (run_episode(MERGE, mute, (2,), explore=explore, backend=sumo) for explore in (False, True))
     np.testing.assert_array_equal(explored.speeds, still.speeds)
 
 
-def test_a_driver_without_memory_drives_all_cavs(simulation: Simulation) -> None:
+def test_a_driver_without_memory_drives_all_cavs(sumo: SumoBackend) -> None:
     function = FunctionDriver(lambda state: 0.1 * (state.leader_speed - state.speed))
-    episode = run_episode(MERGE, function, (2,), simulation=simulation)
+    episode = run_episode(MERGE, function, (2,), backend=sumo)
     for trajectory in episode.trajectories:
         states = trajectory.states.select(slice(-1))
         wanted = np.clip(0.1 * (states.leader_speed - states.speed), -1, 1)
@@ -207,9 +199,9 @@ def test_a_driver_without_memory_drives_all_cavs(simulation: Simulation) -> None
 @pytest.mark.parametrize(
     "driver", [IDM(), ResidualDriver(PISaturation(time_step=1.0), random_network(), 1.0, action_repeat=2)]
 )
-def test_time_continues_while_no_cav_is_on_the_road(driver: Driver, simulation: Simulation) -> None:
+def test_time_continues_while_no_cav_is_on_the_road(driver: Driver, sumo: SumoBackend) -> None:
     lonely = Merge(cavs=1, standing_vehicles=0, horizon=150)
-    episode = run_episode(lonely, driver, (3,), explore=True, simulation=simulation)
+    episode = run_episode(lonely, driver, (3,), explore=True, backend=sumo)
     (trajectory,) = episode.trajectories
     assert trajectory.start_step > 3
     assert trajectory.start_step + len(trajectory.applied_acceleration) < 150
@@ -217,16 +209,16 @@ def test_time_continues_while_no_cav_is_on_the_road(driver: Driver, simulation: 
     assert {values.shape for values in episode.reward_terms.values()} == {(150,)}
 
 
-def test_an_episode_without_cavs_is_an_error_in_one_line(simulation: Simulation) -> None:
+def test_an_episode_without_cavs_is_an_error_in_one_line(sumo: SumoBackend) -> None:
     empty = Merge(penetration_rate=0.0, horizon=10)
     with pytest.raises(InputError, match="no CAV was on the road in 10 control steps"):
-        run_episode(empty, Constant(), (0,), simulation=simulation)
-    assert run_episode(empty, Human(), (0,), simulation=simulation).trajectories == ()
+        run_episode(empty, Constant(), (0,), backend=sumo)
+    assert run_episode(empty, Human(), (0,), backend=sumo).trajectories == ()
 
 
-def test_a_warmup_hands_over_the_cavs_that_are_on_the_road(simulation: Simulation) -> None:
+def test_a_warmup_hands_over_the_cavs_that_are_on_the_road(sumo: SumoBackend) -> None:
     warm = replace(MERGE, warmup=200, horizon=60)
-    episode = run_episode(warm, Counting(), (2,), simulation=simulation)
+    episode = run_episode(warm, Counting(), (2,), backend=sumo)
     assert sum(trajectory.start_step == 0 for trajectory in episode.trajectories) > 2
     for trajectory in episode.trajectories:
         np.testing.assert_allclose(trajectory.applied_acceleration, expected_of_counting(trajectory), atol=1e-12)
@@ -234,9 +226,9 @@ def test_a_warmup_hands_over_the_cavs_that_are_on_the_road(simulation: Simulatio
     assert (~np.isnan(episode.speeds[0])).sum() > 15
 
 
-def test_a_collision_terminates_the_trips_that_it_ends_and_no_earlier_ones(simulation: Simulation) -> None:
+def test_a_collision_terminates_the_trips_that_it_ends_and_no_earlier_ones(sumo: SumoBackend) -> None:
     reckless = Merge(penetration_rate=0.5, actuation="raw", standing_vehicles=0)
-    episode = run_episode(reckless, Constant(1.0), (1,), simulation=simulation)
+    episode = run_episode(reckless, Constant(1.0), (1,), backend=sumo)
     assert (episode.status, episode.collisions >= 2) == ("collision", True)
     assert episode.control_steps < 600
     ends = [each.start_step + len(each.applied_acceleration) for each in episode.trajectories]
@@ -266,17 +258,15 @@ def test_remaining_rows_follow_leaving_and_entering_cavs(simulation: Simulation)
         (lambda state: state.speed * np.nan, "acceleration of cav_0 is nan; allowed: finite"),
     ],
 )
-def test_a_wrong_answer_is_refused_with_its_step(answer: Any, words: str, simulation: Simulation) -> None:
+def test_a_wrong_answer_is_refused_with_its_step(answer: Any, words: str, sumo: SumoBackend) -> None:
     everyone = Merge(penetration_rate=1.0, standing_vehicles=0, horizon=20)
     with pytest.raises(InputError, match=f"driver: step \\d+: {words}"):
-        run_episode(everyone, FunctionDriver(answer), (0,), simulation=simulation)
+        run_episode(everyone, FunctionDriver(answer), (0,), backend=sumo)
 
 
-def test_recording_fuel_and_poses_is_optional_and_changes_nothing_else(simulation: Simulation) -> None:
+def test_recording_fuel_and_poses_is_optional_and_changes_nothing_else(sumo: SumoBackend) -> None:
     short = replace(MERGE, horizon=40)
-    plain, full = (
-        run_episode(short, Counting(), (2,), record_details=asked, simulation=simulation) for asked in (False, True)
-    )
+    plain, full = (run_episode(short, Counting(), (2,), record_details=asked, backend=sumo) for asked in (False, True))
     steps, vehicles = plain.speeds.shape
     assert (plain.fuel.shape, plain.poses.shape, plain.lane_lines.shape) == ((0, 0), (0, 0, 3), (0, 2))
     assert (full.fuel.shape, full.poses.shape) == ((steps - 1,), (steps, vehicles, 3))

@@ -9,6 +9,7 @@ from unjam.drivers import Human
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import SumoWarning
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.outputs import MAX_EXAMPLE_LENGTH, MAX_LOG_BYTES, read_warnings, warning_kind
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -61,7 +62,9 @@ def test_an_episode_has_only_its_own_warnings(backend: str, tmp_path: Path) -> N
     plain = straight(tmp_path / "sorted", UNSORTED[: UNSORTED.index('<flow id="c"')])
     with Simulation(backend) as simulation:  # pyright: ignore[reportArgumentType]
         found = [
-            run_episode(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,), simulation=simulation)
+            run_episode(
+                make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,), backend=SumoBackend(simulation)
+            )
             for file in (unsorted, plain, unsorted)
         ]
     assert [[each.example for each in episode.warnings] for episode in found] == [
@@ -72,9 +75,9 @@ def test_an_episode_has_only_its_own_warnings(backend: str, tmp_path: Path) -> N
     assert len({len(episode.vehicle_ids) for episode in found}) == 1
 
 
-def test_teleports_are_counted_and_not_listed_as_warnings(tmp_path: Path, simulation: Simulation) -> None:
+def test_teleports_are_counted_and_not_listed_as_warnings(tmp_path: Path, sumo: SumoBackend) -> None:
     file = straight(tmp_path, STANDING, end=90.0, step=0.5, options=TELEPORTS)
-    episode = run_episode(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,), simulation=simulation)
+    episode = run_episode(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,), backend=sumo)
     assert episode.teleports > 0
     assert episode.warnings == ()
 
@@ -88,8 +91,6 @@ def test_teleports_are_counted_and_not_listed_as_warnings(tmp_path: Path, simula
         ("on-ramp", {"horizon": 60, "penetration_rate": 0.3}),
     ],
 )
-def test_there_are_no_warnings_on_the_built_in_roads(
-    road: str, changes: dict[str, object], simulation: Simulation
-) -> None:
+def test_there_are_no_warnings_on_the_built_in_roads(road: str, changes: dict[str, object], sumo: SumoBackend) -> None:
     scenario = make_scenario(road, changes)
-    assert run_episode(scenario, Human(), (0,), simulation=simulation).warnings == ()
+    assert run_episode(scenario, Human(), (0,), backend=sumo).warnings == ()

@@ -19,6 +19,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import sumo_seed
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Trips
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.outputs import read_trips, trip_options
 from unjam.worlds.sumo.simulation import Simulation
@@ -62,7 +63,7 @@ def trips_of_plain_sumo(path: Path, seed: int, end: float) -> Trips:
 def human_baseline(path: Path, simulation: Simulation, **changes: float) -> tuple[Episode, int]:
     """Return the human baseline, and the seed that SUMO had."""
     scenario = make_scenario(str(path), {"penetration_rate": 0.2, **changes})
-    return run_episode(scenario, Human(), 5, simulation=simulation), sumo_seed((5,))
+    return run_episode(scenario, Human(), 5, backend=SumoBackend(simulation)), sumo_seed((5,))
 
 
 def check_same_trips(found: Trips, plain: Trips) -> None:

@@ -16,7 +16,7 @@ from unjam.worlds.batch.on_ramp.traffic import make_vehicles
 from unjam.worlds.batch.on_ramp.vehicles import MotorwayVehicles
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import multi_lane
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam_paper.open_test_roads import OpenTestRoad, RoadSection, write_road_files
 
 TRUCKS = OpenTestRoad((RoadSection(1500.0, 2, 36.0),), (0.8,), trucks=0.25)
@@ -24,18 +24,18 @@ TRUCKS = OpenTestRoad((RoadSection(1500.0, 2, 36.0),), (0.8,), trucks=0.25)
 
 
 def test_an_acc_that_restores_its_gap_after_cut_ins_is_feasible(
-    tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, sumo: SumoBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     changes = {"penetration_rate": 0.3, "horizon": 240, **ACC_SETTINGS}
     scenario = make_scenario(str(write_road_files(TRUCKS, tmp_path)), changes)
     driver = make_driver("cruise", scenario.control_step)
-    episode = run_episode(scenario, driver, (1,), simulation=simulation)
+    episode = run_episode(scenario, driver, (1,), backend=sumo)
     found = episode.audit.following
     assert 1.0 <= found.min_time_gap < 1.3
     assert found.share_short_time_gap == 0.0
     assert measure(episode)["feasibility"] == FEASIBLE
     monkeypatch.setattr(multi_lane, "is_recovering", lambda *about: False)
-    every = run_episode(scenario, driver, (1,), simulation=simulation).audit.following
+    every = run_episode(scenario, driver, (1,), backend=sumo).audit.following
     assert every.min_time_gap < 0.8
     assert every.share_short_time_gap > 0.001
     assert every.min_time_to_collision == found.min_time_to_collision

@@ -13,6 +13,7 @@ from unjam.drivers import Human
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -60,7 +61,7 @@ def assert_same(file: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPa
     with monkeypatch.context() as patch:
         patch.setattr(simulation, "load", lambda *given: (seeds.append(given[2]), load(*given)))
         road = make_scenario(str(file), {"penetration_rate": 0.3, "cav_classes": ["passenger", "bus"]})
-        episode = run_episode(road, Human(), (0,), simulation=simulation)
+        episode = run_episode(road, Human(), (0,), backend=SumoBackend(simulation))
     expected = speeds_of_sumo(file, seeds[0])
     begin, compared = min(expected), 0
     for time, there in expected.items():
@@ -255,8 +256,8 @@ def test_a_changed_included_file_is_copied_again(
     assert before != after
 
 
-def test_an_episode_without_vehicles_is_an_error(network: str, tmp_path: Path, simulation: Simulation) -> None:
+def test_an_episode_without_vehicles_is_an_error(network: str, tmp_path: Path, sumo: SumoBackend) -> None:
     files: Files = {"r.xml": f"<routes>{TYPE}{ROUTE}{FLOW.replace('90', '9')}</routes>"}
     path = write(tmp_path, network, files, '<route-files value="r.xml"/><begin value="20"/>')
     with pytest.raises(InputError, match="no vehicle entered before 60 s; the first departs at 0 s; use --begin 0"):
-        run_episode(make_scenario(str(path), {"penetration_rate": 0.3}), Human(), (0,), simulation=simulation)
+        run_episode(make_scenario(str(path), {"penetration_rate": 0.3}), Human(), (0,), backend=sumo)

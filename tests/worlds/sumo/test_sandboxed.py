@@ -15,11 +15,10 @@ from tests.worlds.test_record import fingerprint
 from unjam import drive
 from unjam.drivers import IDM, LocalState
 from unjam.errors import EpisodeError
-from unjam.scenarios import Ring, make_scenario
+from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic, sumo_inputs
 from unjam.worlds.sumo.sandboxed import SandboxedSimulation, open_simulation
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -35,8 +34,8 @@ def road(tmp_path: Path) -> Scenario:
     return make_scenario(str(straight(tmp_path, CARS)), {"penetration_rate": 0.5, "horizon": 40})
 
 
-def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, simulation: Simulation) -> None:
-    here = run_episode(road, IDM(), 3, simulation=simulation, record_details=True)
+def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, sumo: SumoBackend) -> None:
+    here = run_episode(road, IDM(), 3, backend=sumo, record_details=True)
     apart = run_episode(road, IDM(), 3, record_details=True)
     assert fingerprint(here) == fingerprint(apart)
     np.testing.assert_array_equal(here.poses, apart.poses)
@@ -122,5 +121,5 @@ def test_the_process_outlives_the_thread_that_started_it(road: Scenario) -> None
 
 
 def test_only_users_networks_are_sandboxed(road: Scenario) -> None:
-    with open_simulation(Ring()) as here, open_simulation(Ring(), road) as apart:
+    with open_simulation(False) as here, open_simulation(True) as apart:
         assert [type(here), type(apart)] == [Simulation, SandboxedSimulation]

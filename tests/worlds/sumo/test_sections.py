@@ -14,8 +14,9 @@ from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState
 from unjam.drivers.road_experts import Cruise, JamAhead
 from unjam.drivers.roadside import RoadsideSettings
 from unjam.scenarios import make_scenario
+from unjam.worlds.backend import WorldOptions
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.networks import NetworkLane
 from unjam.worlds.sumo.sections import NO_SECTION, LaneSections
 from unjam.worlds.sumo.simulation import Simulation
@@ -113,7 +114,7 @@ def jammed(tmp_path: Path) -> Any:
 
 
 def roadside_state(scenario: Any, simulation: Simulation) -> tuple[UserNetworkTraffic, Any]:
-    traffic = make_traffic(scenario, (1,), simulation, measured_fields=JamAhead().measured_fields)
+    traffic = make_traffic(scenario, (1,), simulation, WorldOptions(JamAhead().measured_fields))
     assert isinstance(traffic, UserNetworkTraffic)
     traffic.start(is_controlled=True)
     return traffic, traffic.local_state()
@@ -140,11 +141,11 @@ def test_roadside_information_is_only_provided_if_required(jammed: Any, simulati
     assert traffic.local_state().lane_speeds is None
 
 
-def test_a_users_function_gets_roadside_information(jammed: Any, simulation: Simulation) -> None:
+def test_a_users_function_gets_roadside_information(jammed: Any, sumo: SumoBackend) -> None:
     def steady(state: LocalState) -> Any:
         return 0.2 * (state.lane_speeds[:, 4] - state.speed)
 
-    episode = run_episode(jammed, steady, (1,), simulation=simulation)
+    episode = run_episode(jammed, steady, (1,), backend=sumo)
     assert episode.trajectories[0].states.speed[-1] < 8.0
 
 
@@ -159,11 +160,11 @@ QUEUE = (
 
 
 @pytest.mark.long
-def test_a_cav_slows_down_for_congestion_beyond_its_sensors(tmp_path: Path, simulation: Simulation) -> None:
+def test_a_cav_slows_down_for_congestion_beyond_its_sensors(tmp_path: Path, sumo: SumoBackend) -> None:
     changes = {"cav_types": ("van",), "horizon": 5000, "actuation": "cruise", "safety.active": False}
     scenario = make_scenario(str(straight(tmp_path, QUEUE, 2500.0, 500.0)), changes)
     careful, free = (
-        run_episode(scenario, driver, (1,), simulation=simulation).trajectories[0].states
+        run_episode(scenario, driver, (1,), backend=sumo).trajectories[0].states
         for driver in (JamAhead(first_section=4, last_section=4, speed_margin=0.0, margin_by_penetration=0.0), Cruise())
     )
     slowest, of_acc = (states.speed[10:][states.leader_gap[10:] == 100.0].min() for states in (careful, free))
@@ -172,9 +173,9 @@ def test_a_cav_slows_down_for_congestion_beyond_its_sensors(tmp_path: Path, simu
     assert of_acc > 14.0
 
 
-def test_an_episode_that_starts_in_a_jam_has_no_cap(jammed: Any, simulation: Simulation) -> None:
+def test_an_episode_that_starts_in_a_jam_has_no_cap(jammed: Any, sumo: SumoBackend) -> None:
     first, second = (
-        run_episode(jammed, driver, (1,), simulation=simulation).trajectories[0].states
+        run_episode(jammed, driver, (1,), backend=sumo).trajectories[0].states
         for driver in (JamAhead(first_section=4, last_section=4, speed_margin=0.0, margin_by_penetration=0.0), Cruise())
     )
     assert first.speed.tolist() == second.speed.tolist()

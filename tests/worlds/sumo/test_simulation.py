@@ -13,10 +13,11 @@ from unjam.errors import EpisodeError, InputError, UnjamError
 from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.road import Connection
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.inputs import SumoInputs, sumo_inputs
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic, sumo_inputs
+from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.networks import network_file
-from unjam.worlds.sumo.simulation import Backend, Simulation
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.transports import Transport
 
 RING = Ring(horizon=100, length=(230, 230))
 
@@ -30,7 +31,7 @@ def road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SumoInputs:
 def test_a_second_simulation_in_one_process_is_refused(simulation: Simulation) -> None:
     with pytest.raises(UnjamError, match="already open in this process"):
         Simulation()
-    assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
+    assert run_episode(RING, IDM(), (0,), backend=SumoBackend(simulation)).status == "completed"
 
 
 def test_a_refused_simulation_does_not_release_libsumo(simulation: Simulation) -> None:
@@ -40,7 +41,7 @@ def test_a_refused_simulation_does_not_release_libsumo(simulation: Simulation) -
 
 
 def test_simulations_over_traci_do_not_disturb_it(simulation: Simulation) -> None:
-    expected = run_episode(RING, IDM(), (0,), simulation=simulation)
+    expected = run_episode(RING, IDM(), (0,), backend=SumoBackend(simulation))
     with Simulation("traci") as first, Simulation("traci") as second:
         traffics = [make_traffic(RING, (0,), each) for each in (simulation, first, second)]
         for traffic in traffics:
@@ -49,7 +50,7 @@ def test_simulations_over_traci_do_not_disturb_it(simulation: Simulation) -> Non
             for traffic in traffics:
                 traffic.advance(None)
     assert traffics[0].speeds == traffics[1].speeds == traffics[2].speeds
-    again = run_episode(RING, IDM(), (0,), simulation=simulation)
+    again = run_episode(RING, IDM(), (0,), backend=SumoBackend(simulation))
     np.testing.assert_array_equal(again.speeds, expected.speeds)
 
 
@@ -155,7 +156,7 @@ def test_an_error_has_its_own_reason_and_not_an_earlier_one(road: SumoInputs, si
 
 
 @pytest.mark.parametrize("backend", ["libsumo", pytest.param("traci", marks=pytest.mark.slow)])
-def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: Backend, road: SumoInputs) -> None:
+def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: Transport, road: SumoInputs) -> None:
     expected = run_episode(RING, IDM(), (0,))
     first, second, *_ = BROKEN_TRAFFIC
     with Simulation(backend) as simulation:
@@ -164,19 +165,19 @@ def test_after_a_refused_road_the_next_one_runs_as_in_a_new_simulation(backend: 
         simulation.load(road, 0.1, 0)
         with pytest.raises(EpisodeError):
             simulation.load(road._replace(traffic_xml=second), 0.1, 0)
-        assert fingerprint(run_episode(RING, IDM(), (0,), simulation=simulation)) == fingerprint(expected)
+        assert fingerprint(run_episode(RING, IDM(), (0,), backend=SumoBackend(simulation))) == fingerprint(expected)
 
 
-def test_an_unknown_emission_class_is_reported_with_sumos_message(simulation: Simulation) -> None:
+def test_an_unknown_emission_class_is_reported_with_sumos_message(sumo: SumoBackend) -> None:
     with pytest.raises(EpisodeError, match="emissionClass with name 'coal' doesn't exist"):
-        run_episode(replace(RING, emission_class="coal"), IDM(), (0,), simulation=simulation)
+        run_episode(replace(RING, emission_class="coal"), IDM(), (0,), backend=sumo)
 
 
 def test_libsumo_and_traci_give_identical_episodes() -> None:
     found = []
     for backend in ("libsumo", "traci"):
         with Simulation(backend) as simulation:
-            episode = run_episode(RING, PISaturation(), (5,), record_details=True, simulation=simulation)
+            episode = run_episode(RING, PISaturation(), (5,), record_details=True, backend=SumoBackend(simulation))
         found.append(fingerprint(episode))
     assert found[0] == found[1]
 
@@ -202,14 +203,14 @@ def broken(folder: Path, network: str, vehicles: str) -> Path:
     ],
 )
 def test_sumos_refusal_of_a_users_network_is_reported_in_one_line_and_the_next_episode_runs(
-    network: str, vehicles: str, words: str, tmp_path: Path, simulation: Simulation
+    network: str, vehicles: str, words: str, tmp_path: Path, sumo: SumoBackend
 ) -> None:
     scenario = make_scenario(str(broken(tmp_path, network, vehicles)), {"penetration_rate": 1.0})
     with pytest.raises(EpisodeError, match=words) as caught:
-        run_episode(scenario, IDM(), (0,), simulation=simulation)
+        run_episode(scenario, IDM(), (0,), backend=sumo)
     assert caught.value.exit_code == 2
     assert "\n" not in str(caught.value)
-    assert run_episode(RING, IDM(), (0,), simulation=simulation).status == "completed"
+    assert run_episode(RING, IDM(), (0,), backend=sumo).status == "completed"
 
 
 def test_sumo_over_traci_does_not_accept_connections_from_other_machines(road: SumoInputs) -> None:

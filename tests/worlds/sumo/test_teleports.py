@@ -14,7 +14,7 @@ from unjam.drivers.command import Command
 from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import make_traffic
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.open_road import OpenTraffic
 from unjam.worlds.sumo.simulation import Simulation

@@ -15,8 +15,8 @@ from unjam.errors import InputError, SumoInputError
 from unjam.scenarios import make_scenario
 from unjam.sumo_files import read_sumo_files
 from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.networks import sumo_program
-from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 PERSONS = '<personFlow id="p" begin="0" end="40" period="10"><personTrip from="ab" to="bc" {how}/></personFlow>'
@@ -38,11 +38,11 @@ def two_edges(folder: Path, demand: str) -> Path:
 @pytest.mark.parametrize(
     ("how", "kind"), [('modes="car"', "DEFAULT_VEHTYPE"), ('vTypes="own"', "own"), ('modes="car" vTypes="own"', "own")]
 )
-def test_personal_cars_are_demand_and_become_cavs(how: str, kind: str, tmp_path: Path, simulation: Simulation) -> None:
+def test_personal_cars_are_demand_and_become_cavs(how: str, kind: str, tmp_path: Path, sumo: SumoBackend) -> None:
     file = two_edges(tmp_path, '<vType id="own" speedDev="0"/>' + PERSONS.format(how=how))
     assert read_sumo_files(file).used_types == {kind}
     scenario = make_scenario(str(file), {"penetration_rate": 1.0})
-    episode = run_episode(scenario, IDM(), (1,), simulation=simulation)
+    episode = run_episode(scenario, IDM(), (1,), backend=sumo)
     assert len(episode.vehicle_ids) >= 3
     assert len(episode.cav_ids) >= 3
 
@@ -52,17 +52,17 @@ def test_persons_without_a_vehicle_are_not_demand(tmp_path: Path) -> None:
         read_sumo_files(two_edges(tmp_path, PERSONS.format(how='modes="public"')))
 
 
-def test_an_episode_waits_for_vehicles_of_calibrators_as_sumo_does(tmp_path: Path, simulation: Simulation) -> None:
+def test_an_episode_waits_for_vehicles_of_calibrators_as_sumo_does(tmp_path: Path, sumo: SumoBackend) -> None:
     file = straight(tmp_path, "", end=300.0, step=0.5, options='<additional-files value="more.add.xml"/>')
     (tmp_path / "more.add.xml").write_text(f'<additional><vType id="slow" speedDev="0"/>{CALIBRATOR}</additional>')
     scenario = make_scenario(str(file), {"penetration_rate": 1.0})
-    human = run_episode(scenario, Human(), (1,), simulation=simulation)
+    human = run_episode(scenario, Human(), (1,), backend=sumo)
     command = [sumo_program("sumo"), "-c", str(file), "--tripinfo-output", str(tmp_path / "trips.xml")]
     subprocess.run([*command, "--tripinfo-output.write-unfinished"], check=True, capture_output=True)
     alone = ElementTree.parse(tmp_path / "trips.xml").getroot().findall("tripinfo")
     assert 5 < len(human.vehicle_ids) == len(alone)
     assert human.control_steps * human.control_step < 300.0, "it ends once all have arrived and none can follow"
-    assert len(run_episode(scenario, IDM(), (1,), simulation=simulation).cav_ids) > 5
+    assert len(run_episode(scenario, IDM(), (1,), backend=sumo).cav_ids) > 5
 
 
 def test_a_calibrator_of_speeds_adds_no_vehicles(tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Scenario, make_scenario
 from unjam.scenarios.population import Population, write_population
+from unjam.worlds.backend import WorldOptions
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo import make_traffic
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic, sumo_inputs
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.user_network import UserNetworkTraffic
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -44,28 +44,28 @@ def scenario_of(file: Path, **changes: Any) -> Scenario:
 
 
 def own(simulation: Simulation, file: Path, seed: int = 0, **changes: Any) -> UserNetworkTraffic:
-    traffic = make_traffic(scenario_of(file, **changes), (seed,), simulation, record_details=True)
+    traffic = make_traffic(scenario_of(file, **changes), (seed,), simulation, WorldOptions(record_details=True))
     assert isinstance(traffic, UserNetworkTraffic)
     traffic.start(is_controlled=True)
     return traffic
 
 
 @pytest.mark.long
-def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(file: Path, simulation: Simulation) -> None:
+def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(file: Path, sumo: SumoBackend) -> None:
     task = EpisodeTask(scenario_of(file, horizon=80), PISaturation(), (3,))
-    here = run_episode(task.scenario, task.driver, task.seed, simulation=simulation)
-    run_episode(task.scenario, Constant(0.4), (4,), simulation=simulation)
+    here = run_episode(task.scenario, task.driver, task.seed, backend=sumo)
+    run_episode(task.scenario, Constant(0.4), (4,), backend=sumo)
     with WorkerPool(1) as workers:
         (there,) = workers.run([task])
-    again = run_episode(task.scenario, task.driver, task.seed, simulation=simulation)
+    again = run_episode(task.scenario, task.driver, task.seed, backend=sumo)
     assert here.status == "completed"
     assert fingerprint(there) == fingerprint(again) == fingerprint(here) == fingerprint(travelled(here))
 
 
-def test_the_same_vehicles_are_cavs_for_every_driver(file: Path, simulation: Simulation) -> None:
+def test_the_same_vehicles_are_cavs_for_every_driver(file: Path, sumo: SumoBackend) -> None:
     scenario = scenario_of(file)
     slow, fast, human = (
-        run_episode(scenario, driver, (0,), simulation=simulation) for driver in (Constant(-0.2), IDM(), Human())
+        run_episode(scenario, driver, (0,), backend=sumo) for driver in (Constant(-0.2), IDM(), Human())
     )
     assert len(human.cav_ids) > 2
     for one, other in ((slow, fast), (fast, human)):
@@ -133,12 +133,12 @@ def test_a_population_with_a_residual_is_refused_on_a_users_network(tmp_path: Pa
         make_scenario("ring", {"population": str(population), "human_control": "native"})
 
 
-def test_all_vehicles_or_none_may_be_cavs(file: Path, simulation: Simulation) -> None:
-    everyone = run_episode(scenario_of(file, penetration_rate=1.0, horizon=60), IDM(), (0,), simulation=simulation)
+def test_all_vehicles_or_none_may_be_cavs(file: Path, sumo: SumoBackend) -> None:
+    everyone = run_episode(scenario_of(file, penetration_rate=1.0, horizon=60), IDM(), (0,), backend=sumo)
     there = [name for name in everyone.vehicle_ids if stayed(everyone, name) > 1]
     assert set(everyone.cav_ids) == set(there)
     with pytest.raises(InputError, match="no CAV was on the road in 5 control steps"):
-        run_episode(scenario_of(file, penetration_rate=1e-9, horizon=5), IDM(), (0,), simulation=simulation)
+        run_episode(scenario_of(file, penetration_rate=1e-9, horizon=5), IDM(), (0,), backend=sumo)
 
 
 def test_cavs_exceed_the_allowed_speed_only_while_braking(file: Path, simulation: Simulation) -> None:
@@ -216,21 +216,21 @@ def test_neighbors_on_one_lane_agree_with_the_positions(tmp_path: Path, simulati
     assert seen > 500
 
 
-def test_commands_are_carried_out_exactly_where_it_is_safe_and_allowed(tmp_path: Path, simulation: Simulation) -> None:
+def test_commands_are_carried_out_exactly_where_it_is_safe_and_allowed(tmp_path: Path, sumo: SumoBackend) -> None:
     one = '<vehicle id="v" type="van" route="along" depart="0" departPos="10" departSpeed="5"/>'
     scenario = scenario_of(straight(tmp_path, one), penetration_rate=1.0, horizon=300)
-    (trajectory,) = run_episode(scenario, Constant(0.7), (0,), simulation=simulation).trajectories
+    (trajectory,) = run_episode(scenario, Constant(0.7), (0,), backend=sumo).trajectories
     expected = np.minimum(5.0 + 0.07 * np.arange(301), 20.0)
     np.testing.assert_allclose(trajectory.states.speed, expected, atol=1e-9)
     assert not (trajectory.shield_braking > 1e-9).any()
 
 
-def test_a_command_holds_for_its_step_whatever_the_configuration_says(tmp_path: Path, simulation: Simulation) -> None:
+def test_a_command_holds_for_its_step_whatever_the_configuration_says(tmp_path: Path, sumo: SumoBackend) -> None:
     one = '<vehicle id="v" type="car" route="along" depart="0" departPos="10" departSpeed="5"/>'
     file = straight(tmp_path, one)
     file.write_text(file.read_text().replace("<end ", '<default.action-step-length value="1"/><end '))
     scenario = scenario_of(file, penetration_rate=1.0, horizon=100)
-    (trajectory,) = run_episode(scenario, Constant(0.7), (0,), simulation=simulation).trajectories
+    (trajectory,) = run_episode(scenario, Constant(0.7), (0,), backend=sumo).trajectories
     np.testing.assert_allclose(np.diff(trajectory.states.speed), 0.07, atol=1e-9)
 
 
@@ -244,36 +244,36 @@ def test_a_heavy_vehicle_keeps_its_properties_as_a_cav(tmp_path: Path) -> None:
     assert 'mass="3000"' in traffic
 
 
-def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, simulation: Simulation) -> None:
+def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, sumo: SumoBackend) -> None:
     scenario = scenario_of(straight(tmp_path, COLUMN), penetration_rate=1.0, horizon=4000)
-    episode = run_episode(scenario, IDM(), (0,), simulation=simulation)
+    episode = run_episode(scenario, IDM(), (0,), backend=sumo)
     assert episode.status == "completed"
     assert episode.control_steps < 1500
     assert (episode.arrivals, len(episode.trajectories)) == (5, 5)
     assert not any(trajectory.terminated for trajectory in episode.trajectories)
 
 
-def test_the_flow_does_not_depend_on_the_last_arrival(tmp_path: Path, simulation: Simulation) -> None:
+def test_the_flow_does_not_depend_on_the_last_arrival(tmp_path: Path, sumo: SumoBackend) -> None:
     vehicles = '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>'
     scenario = make_scenario(str(straight(tmp_path, vehicles, 800.0, 120.0)), {"penetration_rate": 1.0})
-    one, other = (run_episode(scenario, driver, (0,), simulation=simulation) for driver in (Human(), Constant(0.3)))
+    one, other = (run_episode(scenario, driver, (0,), backend=sumo) for driver in (Human(), Constant(0.3)))
     assert other.control_steps != one.control_steps
     assert measure(other)["outflow_veh_per_h"] == measure(one)["outflow_veh_per_h"] == 10 * 3600.0 / 120.0
 
 
-def test_vehicles_with_a_long_insertion_delay_are_not_dropped(tmp_path: Path, simulation: Simulation) -> None:
+def test_vehicles_with_a_long_insertion_delay_are_not_dropped(tmp_path: Path, sumo: SumoBackend) -> None:
     vehicles = '<flow id="f" type="van" route="along" begin="0" end="30" period="0.2" departSpeed="0"/>'
     file = straight(tmp_path, vehicles)
     file.write_text(file.read_text().replace("<end ", '<max-depart-delay value="5"/><end '))
-    episode = run_episode(scenario_of(file, horizon=350), Human(), (0,), simulation=simulation)
+    episode = run_episode(scenario_of(file, horizon=350), Human(), (0,), backend=sumo)
     assert len(episode.vehicle_ids) + episode.backlog[-1] == 150
 
 
-def test_flows_without_an_end_last_until_the_given_end(tmp_path: Path, simulation: Simulation) -> None:
+def test_flows_without_an_end_last_until_the_given_end(tmp_path: Path, sumo: SumoBackend) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" period="5"/>', end=30.0)
     asked = [{}, {"end": 100.0}, {"end": 100.0, "begin": 0.0}, {"horizon": 1000}]
     roads = [make_scenario(str(file), {"penetration_rate": 0.5, **each}) for each in asked]
-    counts = [len(run_episode(road, Human(), (0,), simulation=simulation).vehicle_ids) for road in roads]
+    counts = [len(run_episode(road, Human(), (0,), backend=sumo).vehicle_ids) for road in roads]
     assert counts[0] < 8
     assert counts[1:] == [counts[1]] * 3
     assert counts[1] >= 20
@@ -285,14 +285,16 @@ def test_collisions_of_human_driven_vehicles_count_once_each_and_do_not_end_the_
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     collisions = iter([["f.0", "f.1"], ["f.0", "f.1"], ["f.1", "f.2"]])
     monkeypatch.setattr(simulation, "colliding_vehicles", lambda: next(collisions, []))
-    episode = run_episode(scenario_of(file, penetration_rate=0.2, horizon=300), IDM(), (0,), simulation=simulation)
+    episode = run_episode(
+        scenario_of(file, penetration_rate=0.2, horizon=300), IDM(), (0,), backend=SumoBackend(simulation)
+    )
     row = measure(episode)
     assert not {"f.0", "f.1", "f.2"} & set(episode.cav_ids)
     assert (episode.status, row["collisions"]) == ("completed", 3.0)
     assert "contact" not in feasibility(row)
 
 
-def test_all_metrics_of_an_episode_are_computed(file: Path, simulation: Simulation) -> None:
+def test_all_metrics_of_an_episode_are_computed(file: Path, sumo: SumoBackend) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for horizon in (2, 200):
@@ -301,7 +303,7 @@ def test_all_metrics_of_an_episode_are_computed(file: Path, simulation: Simulati
                 Human(),
                 (0,),
                 record_details=True,
-                simulation=simulation,
+                backend=sumo,
             )
             row = measure(found)
     assert 0 < row["mean_speed"] < 40
@@ -330,9 +332,9 @@ def test_lanes_are_those_of_sumo_counted_from_the_left(tmp_path: Path, simulatio
     assert len(seen) > 1
 
 
-def test_positions_are_along_the_most_frequent_route(file: Path, simulation: Simulation) -> None:
-    episode = run_episode(scenario_of(file), Human(), (0,), record_details=True, simulation=simulation)
-    assert np.isnan(run_episode(scenario_of(file), Human(), (0,), simulation=simulation).positions).all()
+def test_positions_are_along_the_most_frequent_route(file: Path, sumo: SumoBackend) -> None:
+    episode = run_episode(scenario_of(file), Human(), (0,), record_details=True, backend=sumo)
+    assert np.isnan(run_episode(scenario_of(file), Human(), (0,), backend=sumo).positions).all()
     there = ~np.isnan(episode.positions)
     assert there.sum() > 300
     assert not (there & np.isnan(episode.speeds)).any()
@@ -345,9 +347,9 @@ def test_positions_are_along_the_most_frequent_route(file: Path, simulation: Sim
     assert np.mean(close < 1e-3) > 0.6
 
 
-def test_a_warm_up_runs_before_the_first_control_step(file: Path, simulation: Simulation) -> None:
-    cold = run_episode(scenario_of(file, horizon=100), Human(), (1,), simulation=simulation)
-    warm = run_episode(scenario_of(file, horizon=40, warmup=60), Human(), (1,), simulation=simulation)
+def test_a_warm_up_runs_before_the_first_control_step(file: Path, sumo: SumoBackend) -> None:
+    cold = run_episode(scenario_of(file, horizon=100), Human(), (1,), backend=sumo)
+    warm = run_episode(scenario_of(file, horizon=40, warmup=60), Human(), (1,), backend=sumo)
     for name in warm.vehicle_ids:
         if name in cold.vehicle_ids:
             column, other = warm.vehicle_ids.index(name), cold.vehicle_ids.index(name)
@@ -387,10 +389,10 @@ def test_sumos_messages_before_it_has_a_log_are_reported(tmp_path: Path) -> None
         workers.run([EpisodeTask(scenario_of(file, penetration_rate=1.0, horizon=5), IDM(), (0,))])
 
 
-def test_figures_show_a_network_that_was_made_again(tmp_path: Path, simulation: Simulation) -> None:
+def test_figures_show_a_network_that_was_made_again(tmp_path: Path, sumo: SumoBackend) -> None:
     for length in (500.0, 800.0):
         scenario = scenario_of(straight(tmp_path, COLUMN, length), penetration_rate=1.0, horizon=5)
-        episode = run_episode(scenario, IDM(), (0,), simulation=simulation, record_details=True)
+        episode = run_episode(scenario, IDM(), (0,), backend=sumo, record_details=True)
         assert np.nanmax(episode.lane_lines) == length
 
 
@@ -417,7 +419,7 @@ def test_a_network_that_breaks_later_fails_its_episode_and_nothing_else(tmp_path
     assert mended.status == "completed"
 
 
-def test_a_fast_cav_stops_behind_a_standing_vehicle_beyond_sensor_range(tmp_path: Path, simulation: Simulation) -> None:
+def test_a_fast_cav_stops_behind_a_standing_vehicle_beyond_sensor_range(tmp_path: Path, sumo: SumoBackend) -> None:
     stands = '<vehicle id="stands" type="van" route="along" depart="0" departPos="900"><stop lane="road_0" '
     stands += 'endPos="905" duration="100"/></vehicle>'
     fast = '<vehicle id="fast" type="car" route="along" depart="1" departSpeed="max"/>'
@@ -431,7 +433,7 @@ def test_a_fast_cav_stops_behind_a_standing_vehicle_beyond_sensor_range(tmp_path
         action_limit=6.0,
         safety={"active": True},
     )
-    episode = run_episode(road, Constant(acceleration=1.0), (0,), simulation=simulation)
+    episode = run_episode(road, Constant(acceleration=1.0), (0,), backend=sumo)
     fastest = max(each.states.speed.max() for each in episode.trajectories)
     assert fastest > 36.0, "at this speed the braking distance exceeds 100 m"
     assert episode.status == "completed"

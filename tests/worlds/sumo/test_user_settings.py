@@ -14,6 +14,7 @@ from unjam.errors import EpisodeError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation
 
@@ -22,7 +23,9 @@ NONE = '<collision.action value="none"/>'
 
 
 def human(file: Path, simulation: Simulation, share: float = 0.5) -> Episode:
-    return run_episode(make_scenario(str(file), {"penetration_rate": share}), Human(), (0,), simulation=simulation)
+    return run_episode(
+        make_scenario(str(file), {"penetration_rate": share}), Human(), (0,), backend=SumoBackend(simulation)
+    )
 
 
 def trips_of_plain_sumo(file: Path) -> tuple[int, int, float]:
@@ -81,7 +84,7 @@ def test_vehicles_that_are_removed_after_a_collision_have_not_arrived(tmp_path: 
 
 @pytest.mark.parametrize("settings", ["", WARN, NONE])
 def test_a_collision_of_a_cav_ends_the_episode_even_if_sumo_counts_none(
-    settings: str, tmp_path: Path, simulation: Simulation
+    settings: str, tmp_path: Path, sumo: SumoBackend
 ) -> None:
     vehicles = (
         '<vehicle id="van" type="van" route="along" depart="0" departPos="400" departSpeed="0">'
@@ -90,11 +93,11 @@ def test_a_collision_of_a_cav_ends_the_episode_even_if_sumo_counts_none(
     )
     file = straight(tmp_path, vehicles, options=settings)
     changes = {"cav_types": ["car"], "actuation": "raw", "safety.active": False}
-    episode = run_episode(make_scenario(str(file), changes), Constant(0.5), (0,), simulation=simulation)
+    episode = run_episode(make_scenario(str(file), changes), Constant(0.5), (0,), backend=sumo)
     assert episode.status == "collision"
     assert episode.collisions == 2
     assert episode.control_steps < 300
-    human = run_episode(make_scenario(str(file), changes), Human(), (0,), simulation=simulation)
+    human = run_episode(make_scenario(str(file), changes), Human(), (0,), backend=sumo)
     assert (human.status, human.collisions) == ("completed", 0)
 
 
@@ -114,5 +117,5 @@ def test_an_episode_ends_beyond_the_configured_number_of_teleports(
         run_episode(
             make_scenario(str(file), {"penetration_rate": 0.5, "warmup": 200, "horizon": 10}),
             *(Human(), (0,)),
-            simulation=simulation,
+            backend=SumoBackend(simulation),
         )

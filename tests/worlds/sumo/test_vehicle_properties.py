@@ -15,7 +15,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo import make_traffic
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.user_network import UserNetworkTraffic
 
@@ -26,7 +26,7 @@ ACCS = {**ACC_SETTINGS, "penetration_rate": 1.0, "end": 60.0}
 
 def drive(simulation: Simulation, file: str, driver: DriverLike, **changes: Any) -> Episode:
     scenario = make_scenario(file, {**ACCS, **changes})
-    return run_episode(scenario, driver, (3,), record_details=True, simulation=simulation)
+    return run_episode(scenario, driver, (3,), record_details=True, backend=SumoBackend(simulation))
 
 
 BUS_STOPS = (
@@ -209,11 +209,11 @@ def test_set_speed_caps_count_as_delay(tmp_path: Path, simulation: Simulation) -
     assert slow.limit_speed == pytest.approx(free.limit_speed, rel=0.15)
 
 
-def test_cars_parked_off_the_road_have_no_allowed_speed(tmp_path: Path, simulation: Simulation) -> None:
+def test_cars_parked_off_the_road_have_no_allowed_speed(tmp_path: Path, sumo: SumoBackend) -> None:
     stop = '<stop lane="road_0" endPos="300" duration="30" parking="true"/>'
     cars = f'<vehicle id="parked" type="car" route="along" depart="0">{stop}</vehicle>'
     path = straight(tmp_path, cars + '<vehicle id="other" type="car" route="along" depart="2"/>')
     episode = run_episode(
-        make_scenario(str(path), {"penetration_rate": 0.5}), Human(), 1, record_details=True, simulation=simulation
+        make_scenario(str(path), {"penetration_rate": 0.5}), Human(), 1, record_details=True, backend=sumo
     )
     assert episode.limit_speed == pytest.approx(20.0)

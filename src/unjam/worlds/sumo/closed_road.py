@@ -24,9 +24,11 @@ from unjam.scenarios.population import apply_population
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds import closed_road
+from unjam.worlds.backend import WorldOptions
 from unjam.worlds.record import Episode, Floats
+from unjam.worlds.road_world import DrawnRoad, RoadScene
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import NO_SPEED_COMMAND, RoadScene, SeedTree, Traffic
+from unjam.worlds.sumo.traffic import NO_SPEED_COMMAND, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 
@@ -34,11 +36,17 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     """The SUMO environment of a closed road."""
 
     def __init__(
-        self, scenario: Scenario, road: ClosedRoad, seed: SeedTree, simulation: Simulation, record_details: bool
+        self,
+        scenario: Scenario,
+        seed: Sequence[int],
+        simulation: Simulation,
+        options: WorldOptions,
+        drawn: DrawnRoad | None = None,
     ) -> None:
-        super().__init__(scenario, road, seed, simulation, record_details)
-        vehicles = len(road.vehicle_ids)
+        super().__init__(scenario, seed, simulation, options, drawn)
+        road, vehicles = self.road, len(self.road.vehicle_ids)
         self.cav_ids, self.entered_count = road.cav_ids, len(road.cav_ids)
+        self.is_scalar = options.accepts_floats and self.cav_count == 1
         self._collided_vehicles: set[str] = set()
         self._cav_indices = [road.vehicle_ids.index(name) for name in road.cav_ids]
         self._neighbors = closed_road.loop_neighbors(np.array(self._cav_indices), vehicles)
@@ -76,7 +84,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         first; None without a warm-up that may be remembered.
         """
         scenario, road, history = self.scenario, self.road, None
-        self._penetration_rate = road.provided_penetration_rate(self.measured_fields)
+        self._penetration_rate = road.provided_penetration_rate(self.options.measured_fields)
         self._loop_arguments = road.loop_length, road.crossings, self._penetration_rate
         self._warm_up(self._simulate, on_progress)
         if scenario.warmup and scenario.remember_warmup:
@@ -113,7 +121,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
                 self._drive_cavs(accelerations)
             self._simulate()
         self.control_steps += 1
-        if self.record_details:
+        if self.options.record_details:
             self._fuel.append(self._simulation.fuel(self.road.vehicle_ids))
 
     def _drive_cavs(self, accelerations: list[float]) -> None:
@@ -213,7 +221,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             self.road,
             start_positions=self.road.start_positions + np.array(self._start_distances),
             has_crashed=self.has_crashed,
-            fuel=np.array(self._fuel) if self.record_details else np.zeros((0, 0)),
+            fuel=np.array(self._fuel) if self.options.record_details else np.zeros((0, 0)),
             penetration_rate=self._penetration_rate,
             **{name: np.array(row).reshape(-1, widths.get(name, self.cav_count)) for name, row in self._series.items()},
         )
@@ -224,8 +232,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._check_odometer(self.road.vehicle_ids, self.road.start_positions, positions[:, -1])
         return speeds, positions
 
-    def record(self, driver_log: DriverLog) -> Episode:
-        """Return the record since the start."""
+    def _make_record(self, driver_log: DriverLog) -> Episode:
         fields = {**self._common_fields(), "collisions": len(self._collided_vehicles)}
         rows = None if self.is_scalar else np.arange(len(self.cav_ids))
         return self._make_log().episode(self.speeds_and_positions(), fields, driver_log, rows)
@@ -237,6 +244,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""
+        self._simulation.check()
         road = self.road
         positions = road.start_positions + np.array(self._simulation.distances(road.vehicle_ids))
         poses = closed_road.poses_along(road.center_line, positions, road.loop_length)

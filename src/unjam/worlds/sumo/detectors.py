@@ -4,11 +4,13 @@ import queue
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
+from typing import cast
 
 from unjam.errors import EpisodeError, LostWorkerError
+from unjam.scenarios.road import UserNetworkRoad
 from unjam.scenarios.scenario import sumo_seed
 from unjam.scenarios.user_network import UserNetwork
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.inputs import user_network_inputs
 from unjam.worlds.sumo.networks import xml_document
 from unjam.worlds.sumo.sandboxed import SandboxedSimulation
 from unjam.worlds.sumo.simulation import DetectorPassage, InductionLoop, Simulation, loop_name
@@ -21,12 +23,13 @@ def load_with_loops(
     simulation: Simulation, scenario: UserNetwork, seed: Sequence[int], loops: Sequence[InductionLoop]
 ) -> None:
     """Load human-only traffic of a road and seed, with induction loops; raise `EpisodeError` if SUMO refuses it."""
-    road, _ = scenario.draw_from_seed(seed)
+    road = cast(UserNetworkRoad, scenario.draw_from_seed(seed)[0])
     elements = [
         {"id": loop_name(number), "lane": loop.lane, "pos": loop.position, "period": 3600, "file": "NUL"}
         for number, loop in enumerate(loops)
     ]
-    inputs = sumo_inputs(scenario, road)._replace(traffic_xml=xml_document("additional", "inductionLoop", elements))
+    xml = xml_document("additional", "inductionLoop", elements)
+    inputs = user_network_inputs(scenario, road)._replace(traffic_xml=xml)
     simulation.load(inputs, scenario.simulation_step, sumo_seed(seed))
 
 

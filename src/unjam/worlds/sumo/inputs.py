@@ -1,16 +1,16 @@
 """The files and options that SUMO reads for an episode: network, vehicle types, vehicles."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from unjam.physics.idm import IDMParameters
-from unjam.scenarios.road import BuiltRoad, MotorwayRoad, Road, UserNetworkRoad
+from unjam.scenarios.road import BuiltRoad, MotorwayRoad, UserNetworkRoad
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, UNLIMITED_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.scenarios.user_network import PASSENGER_CLASS
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE, is_harmless_attribute, is_harmless_parameter
-from unjam.worlds.sumo.networks import XMLAttributes, network_path, xml_element
+from unjam.worlds.sumo.networks import XMLAttributes, network_file, xml_element
 
 SUMO_CAV_COLOR = "215,38,61"
 """red, in SUMO's window"""
@@ -42,18 +42,30 @@ class SumoInputs(NamedTuple):
     """whether SUMO records all trips: see `Simulation.end_with_trips`"""
 
 
-def sumo_inputs(scenario: Scenario, road: Road) -> SumoInputs:
-    """Return SUMO's inputs for a road: one that is built for the episode, or a user's network."""
-    if isinstance(road, UserNetworkRoad):
-        return _user_network_inputs(scenario, road)
-    assert isinstance(road, BuiltRoad)
+def single_lane_inputs(scenario: Scenario, road: BuiltRoad) -> SumoInputs:
+    """Return SUMO's inputs for a road with one lane that is built for the episode."""
+    humans = {"human": scenario.humans}
+    if scenario.human_control == "native":
+        humans |= {f"of_{name}": idm for name, idm in road.human_parameters.items()}
+    types = [_vehicle_type_xml(name, scenario, _human_attributes(scenario, idm)) for name, idm in humans.items()]
+    types.append(_vehicle_type_xml("cav", scenario, _single_lane_cav_attributes(scenario)))
+    return _built_road_inputs(road, types, humans)
+
+
+def motorway_inputs(scenario: Scenario, road: MotorwayRoad) -> SumoInputs:
+    """Return SUMO's inputs for a motorway that is built for the episode."""
+    return _built_road_inputs(road, _motorway_types_xml(scenario, road))
+
+
+def _built_road_inputs(road: BuiltRoad, types: list[str], humans: Collection[str] = ()) -> SumoInputs:
+    """Return SUMO's inputs for a road with the XML of its vehicle types; `humans` has types of single vehicles."""
     # Vehicles are neither teleported out of a jam nor removed from the insertion backlog.
     patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
-    network = {"--net-file": (network_path(road),)}
-    return SumoInputs((*patience, *COLLISION_OPTIONS), network, _traffic_xml(scenario, road), "--route-files")
+    network = {"--net-file": (network_file(road.network),)}
+    return SumoInputs((*patience, *COLLISION_OPTIONS), network, _traffic_xml(road, types, humans), "--route-files")
 
 
-def _user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs:
+def user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs:
     """Return SUMO's inputs for a user's network: never its configuration file itself."""
     files = road.files
     # Vehicles of the insertion backlog must not vanish: their waiting time counts.
@@ -70,23 +82,18 @@ def _user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInput
     return SumoInputs(tuple(options), existing, types, "--additional-files", files.copy_sources, records_trips=True)
 
 
-def _traffic_xml(scenario: Scenario, road: BuiltRoad) -> str:
-    individual = road.human_parameters if scenario.human_control == "native" else {}
-    if isinstance(road, MotorwayRoad):
-        lines = _motorway_types_xml(scenario, road)
-    else:
-        humans = {"human": scenario.humans, **{f"of_{name}": idm for name, idm in individual.items()}}
-        lines = [_vehicle_type_xml(name, scenario, _human_attributes(scenario, idm)) for name, idm in humans.items()]
-        lines.append(_vehicle_type_xml("cav", scenario, _single_lane_cav_attributes(scenario)))
+def _traffic_xml(road: BuiltRoad, types: list[str], humans: Collection[str]) -> str:
+    lines = [*types]
     for route in road.routes:
         laps = route.laps if route.laps > 1 else None
         lines.append(xml_element("route", id=route.name, edges=" ".join(route.edges), repeat=laps))
     for entry in road.entries:
+        own_type = f"of_{entry.name}"
         attributes = {
             "id": entry.name,
-            "type": entry.vehicle_type or (f"of_{entry.name}" if entry.name in individual else "human"),
+            "type": entry.vehicle_type or (own_type if own_type in humans else "human"),
             # SUMO would not insert a vehicle below the gap that its driver keeps.
-            "insertionChecks": "collision" if entry.vehicle_type else "none" if entry.name in individual else None,
+            "insertionChecks": "collision" if entry.vehicle_type else "none" if own_type in humans else None,
             "route": entry.route,
             "depart": f"{entry.time:.2f}",
             "departPos": "base" if entry.vehicle_type else repr(entry.position),

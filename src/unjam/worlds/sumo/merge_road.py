@@ -164,9 +164,9 @@ class MergingTraffic(OpenTraffic[MergeRoad]):
     def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
         return [MERGE_BRANCHES[self.road.origins[name].branch] for name in vehicles]
 
-    def record(self, driver_log: DriverLog) -> Episode:
-        """Return the record since the start, after checking positions against SUMO's odometer."""
+    def _make_record(self, driver_log: DriverLog) -> Episode:
+        """Return the record after checking positions against SUMO's odometer."""
         streams = self._streams
         entries = np.array([self.road.origins[name].position for name in streams.names])
         self._check_odometer(streams.names, entries, streams.positions)
-        return super().record(driver_log)
+        return super()._make_record(driver_log)

@@ -13,6 +13,7 @@ from unjam.drivers.safety import FollowingState
 from unjam.scenarios.road import MotorwayRoad
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 from unjam.worlds.record import Floats
+from unjam.worlds.sumo.inputs import motorway_inputs
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
 from unjam.worlds.sumo.open_road import neighbor_state
 
@@ -20,6 +21,7 @@ from unjam.worlds.sumo.open_road import neighbor_state
 class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
     """The SUMO environment of a motorway."""
 
+    inputs = staticmethod(motorway_inputs)
     _cav_type_template = CAV_TYPE_TEMPLATE
 
     def _prepare(self) -> None:

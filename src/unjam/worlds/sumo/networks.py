@@ -22,7 +22,7 @@ import platformdirs
 from unjam.errors import DISK_ERRNOS, DiskError, EpisodeError, MissingPartError, disk_error, invalid_value
 from unjam.files import atomic_write, is_leftover, make_folder, remove
 from unjam.processes import PrivateFolder
-from unjam.scenarios.road import BuiltRoad, Edge, Road, RoadNetwork, UserNetworkRoad
+from unjam.scenarios.road import Edge, RoadNetwork
 from unjam.sumo_files import file_stamp, read_lanes
 from unjam.worlds.record import Floats
 
@@ -120,14 +120,6 @@ def network_file(network: RoadNetwork) -> Path:
         raise (disk_error(error, "a temporary file") if error.errno in DISK_ERRNOS else error) from None
     atomic_write(target, made + checksum_line(made))  # so that several workers can do this at the same time
     return target
-
-
-def network_path(road: Road) -> Path:
-    """Return the network file of a road: the user's, or one made by `network_file`."""
-    if isinstance(road, UserNetworkRoad):
-        return road.files.network
-    assert isinstance(road, BuiltRoad)
-    return network_file(road.network)
 
 
 class NetworkGeometry(NamedTuple):

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from math import inf
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,14 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.safety import FollowingState
 from unjam.physics.kinematics import next_speed
+from unjam.scenarios.road import BuiltRoad
 from unjam.worlds.record import Episode, Floats
+from unjam.worlds.road_world import RoadScene
 from unjam.worlds.sumo.inputs import lane_change_parameters
-from unjam.worlds.sumo.networks import network_geometry, network_path
+from unjam.worlds.sumo.networks import network_file, network_geometry
 from unjam.worlds.sumo.open_log import OpenRoadLog
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.traffic import OpenRoadT, RoadScene, Traffic
+from unjam.worlds.sumo.traffic import OpenRoadT, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 
@@ -94,6 +97,10 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     # What the kinds of roads do in their own way:
 
+    def _network_file(self) -> Path:
+        """Return SUMO's network file."""
+        return network_file(cast(BuiltRoad, self.road).network)
+
     def _prepare(self) -> None:
         """Create the attributes of this kind of road, before the warm-up."""
 
@@ -137,7 +144,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     def _snapshot_fields(self, columns: NDArray[np.intp]) -> dict[str, Any]:
         """Return the fields of the record that are made from snapshots, and others of this kind of road."""
-        names = ("positions", "gaps", "poses") if self.record_details else ("positions", "gaps")
+        names = ("positions", "gaps", "poses") if self.options.record_details else ("positions", "gaps")
         return {name: self._log.traffic.snapshots(name, columns) for name in names}
 
     def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
@@ -215,7 +222,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         trips.applied_accelerations.append([value - mean for value, mean in zip(requested, means, strict=True)])
         trips.filter_brakings.append([max(values, default=0.0) for values in reductions.values()])
         trips.shield_brakings.append(list(shield.values()))
-        if self.record_details and (self.control_steps - 1) % self._fuel_interval == 0:
+        if self.options.record_details and (self.control_steps - 1) % self._fuel_interval == 0:
             self._log.fuel.append(sum(self._simulation.fuel(self._log.traffic.names)))
 
     def _safe_speeds(self, accelerations: dict[str, float]) -> tuple[dict[str, float], dict[str, float]]:
@@ -260,15 +267,14 @@ class OpenTraffic(Traffic[OpenRoadT]):
         log, states = self._log, self._local_states(self.cav_ids)
         log.traffic.add(names, self.speeds)
         if log.traffic.needs_snapshot:
-            poses = {"poses": simulation.poses(names)} if self.record_details else {}
+            poses = {"poses": simulation.poses(names)} if self.options.record_details else {}
             log.traffic.add_snapshot({**self._snapshot(names), **poses})
         log.trips.cav_ids.append(self.cav_ids)
         log.trips.states.append(states)
         log.backlog.append(len(simulation.pending_vehicles()) + len(self._vehicles.teleported))
 
-    def record(self, driver_log: DriverLog) -> Episode:
-        """Return the record since the start."""
-        log, vehicles, details = self._log, self._vehicles, self.record_details
+    def _make_record(self, driver_log: DriverLog) -> Episode:
+        log, vehicles, details = self._log, self._vehicles, self.options.record_details
         trajectories = log.trips.trajectories(
             driver_log, self.has_crashed, lambda: self._report_progress(self.control_steps)
         )
@@ -280,7 +286,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
             "teleports": vehicles.teleports,
             "collisions": len(vehicles.collided),
             "planned_duration": self.scenario.horizon * self.scenario.control_step,
-            "lane_lines": network_geometry(network_path(self.road)).lane_lines if details else np.zeros((0, 2)),
+            "lane_lines": network_geometry(self._network_file()).lane_lines if details else np.zeros((0, 2)),
         }
         return Episode(**{**self._common_fields(), **fields, **self._snapshot_fields(columns)})
 
@@ -290,7 +296,8 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""
+        self._simulation.check()
         names = self._log.traffic.names
         is_cav = np.array([name in self.cav_ids for name in names], bool)
-        lines = network_geometry(network_path(self.road)).lane_lines
+        lines = network_geometry(self._network_file()).lane_lines
         return RoadScene(lines, self._simulation.poses(names), np.array(self.speeds), is_cav)

@@ -18,25 +18,23 @@ from typing import IO, Any, get_type_hints
 from unjam.errors import LostWorkerError, as_unjam_error, error_from_name
 from unjam.processes import PrivateFolder, remove_stale_private_folders
 from unjam.sandbox import confine_process, limit_resources
-from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_network import UserNetwork
 from unjam.tree import Arrays, pack, unpack
 from unjam.worlds.messages import answer_requests, open_answer_pipe, read_message, start_child, write_message
-from unjam.worlds.sumo.backends import InUseError
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.transports import InUseError
 
 MAX_NETWORK_MEMORY = 16 * 2**30
 """memory limit of a process that drives on a user's network [bytes]"""
 
 
-def open_simulation(*scenarios: Scenario) -> Simulation:
-    """Open a simulation for episodes of these scenarios: a sandboxed one if there is a user's network.
+def open_simulation(is_sandboxed: bool) -> Simulation:
+    """Open a simulation, a sandboxed one or one in this process.
 
-    Otherwise it runs in this process. If libsumo already holds one there, unjam's or the user's, it runs in its own
-    process, with a warning: another thread may use libsumo at the same time.
+    If libsumo already holds one there, unjam's or the user's, it runs in its own process, too, with a warning: another
+    thread may use libsumo at the same time.
     """
-    if not any(isinstance(scenario, UserNetwork) for scenario in scenarios):
+    if not is_sandboxed:
         try:
             return Simulation()
         except InUseError:
@@ -68,6 +66,8 @@ _process_starter_lock = Lock()
 
 class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
     """A `Simulation` in a sandboxed process, which carries out all calls."""
+
+    is_sandboxed = True
 
     def __init__(self) -> None:
         remove_stale_private_folders()

@@ -20,10 +20,10 @@ from unjam.processes import PrivateFolder, capture_stderr
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import file_stamp, write_harmless_copy
 from unjam.worlds.record import SumoWarning, Trips
-from unjam.worlds.sumo.backends import Backend, Libsumo, NeighborStates, Traci, sumo_function
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.networks import UNCONTROLLED_LINK_STATES, NetworkLane, last_error_message, sumo_program
 from unjam.worlds.sumo.outputs import MAX_EXAMPLES_OPTION, read_trips, read_warnings, trip_options
+from unjam.worlds.sumo.transports import Libsumo, NeighborStates, Traci, Transport, sumo_function
 
 MIN_CONTACT_OVERLAP = 0.01
 """overlap that is not a rounding error [m]"""
@@ -76,8 +76,10 @@ class Simulation(AbstractContextManager["Simulation"]):
     process starts, steps or closes one meanwhile. Over TraCI there may be several, each in its own process.
     """
 
+    is_sandboxed = False
+
     def __init__(
-        self, backend: Backend = "libsumo", gui_options: Sequence[str] = (), owns_stdout: bool = False
+        self, transport: Transport = "libsumo", gui_options: Sequence[str] = (), owns_stdout: bool = False
     ) -> None:
         """Open a simulation; nothing runs before `load`. Raise `InUseError` if libsumo already runs one here.
 
@@ -85,9 +87,9 @@ class Simulation(AbstractContextManager["Simulation"]):
         """
         if "," in (folder := gettempdir()):  # separates the names of SUMO's files
             raise invalid_value("TMPDIR", folder, "a folder without , in its name")
-        self.backend = backend
+        self.transport = transport
         self._gui_options = gui_options
-        self._library = Libsumo() if backend == "libsumo" else Traci()
+        self._library = Libsumo() if transport == "libsumo" else Traci()
         self.check: Callable[[], None] = self._library.check
         """raises `LostWorkerError` if other code of this process has changed the simulation"""
         self.step: Callable[[], None] = self._library.step
@@ -101,7 +103,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         self._harmless_copies: dict[Path, tuple[list[tuple[int, int]], Path]] = {}
         """of users' files, with the stamps of the files from which they are made"""
         self.episode_lock = Lock()
-        if backend == "libsumo":
+        if transport == "libsumo":
             self._bind()
 
     def _bind(self) -> None:
@@ -175,16 +177,16 @@ class Simulation(AbstractContextManager["Simulation"]):
                 if self._library.is_running:
                     self._library.load(options)
                 else:
-                    program = sumo_program("sumo-gui" if self.backend == "gui" else "sumo")
+                    program = sumo_program("sumo-gui" if self.transport == "gui" else "sumo")
                     self._library.start([program, *options, *self._gui_options], self._error_log)
-                    if self.backend != "libsumo":  # over TraCI each start makes another connection
+                    if self.transport != "libsumo":  # over TraCI each start makes another connection
                         self._bind()
                 self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
             self._library.end()  # then SUMO's message is in its log, and the next episode can start
             logs = [self._error_log, *([self._stdout_log] if self._stdout_log else [])]
             message = next(filter(None, map(last_error_message, logs)), "")
-            kind = SumoInputError if message or self.backend != "gui" else EpisodeError  # a window may be missing
+            kind = SumoInputError if message or self.transport != "gui" else EpisodeError  # a window may be missing
             raise kind(f"SUMO cannot start: {message or ' '.join(str(error).split())}") from error
 
     def _readable_path(self, path: Path, inputs: SumoInputs) -> str:

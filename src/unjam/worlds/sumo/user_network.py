@@ -5,7 +5,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import accumulate
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +16,15 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import RoadsideMessages
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.road import UserNetworkRoad
+from unjam.scenarios.user_network import UserNetwork
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.backends import NeighborStates
-from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, vehicle_class_by_type
+from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, user_network_inputs, vehicle_class_by_type
 from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
 from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.sections import RoadsideService
 from unjam.worlds.sumo.simulation import VehicleLimits
+from unjam.worlds.sumo.transports import NeighborStates
 from unjam.worlds.world import DriverLog
 
 SAFETY_FILTER_RANGE = 400.0
@@ -33,6 +35,11 @@ FUEL_INTERVAL_SECONDS = 1.0
 
 class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
     """The SUMO environment of a user's network."""
+
+    inputs = staticmethod(user_network_inputs)
+
+    def _network_file(self) -> Path:
+        return self.road.files.network
 
     def _prepare(self) -> None:
         super()._prepare()
@@ -47,7 +54,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         """time that vehicles lost by set-speed caps [s], which SUMO takes for their desired speed"""
         self._roadside_service = None
         step = self.scenario.control_step
-        if "lane_speeds" in self.measured_fields:
+        if "lane_speeds" in self.options.measured_fields:
             messages = RoadsideMessages(self.road.roadside, step, self._noise_generator)
             self._roadside_service = RoadsideService(self._simulation, messages, step)
         self._fuel_interval = max(1, int(FUEL_INTERVAL_SECONDS / step))
@@ -101,7 +108,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         # SUMO does not expect the vehicles that calibrators will add.
         until, simulation = self.road.files.calibrated_until, self._simulation
         self.is_finished = not simulation.expects_vehicles() and (not until or simulation.now() >= until)
-        if self.record_details:
+        if self.options.record_details:
             self._route_counts.update(simulation.route_of(name) for name in entered_names)
 
     def _vehicle_limits(self, names: Sequence[str]) -> tuple[Floats, Floats, Floats]:
@@ -169,11 +176,11 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
                 colliding |= {name: None, leader: None}
         cavs = set(self.cav_ids).intersection(colliding)
         self._contact_cavs |= cavs
-        return list(colliding), self.stop_at_contact and bool(cavs)
+        return list(colliding), self.options.stop_at_contact and bool(cavs)
 
     def _snapshot(self, names: Sequence[str]) -> dict[str, Any]:
         unknown = np.full(len(names), np.nan)
-        if not self.record_details:
+        if not self.options.record_details:
             return {"positions": unknown, "gaps": unknown}
         allowed = self._allowed_speeds(names)
         self._allowed_speed_sum += np.nansum(allowed)
@@ -230,8 +237,15 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return [self._cached_lane_positions[name] for name in names]
 
     def record(self, driver_log: DriverLog) -> Episode:
-        """Return the record since the start with all trips; this ends SUMO."""
+        """Return the record as `Traffic.record`; raise `InputError` if there was no vehicle."""
         episode = super().record(driver_log)
+        scenario = cast(UserNetwork, self.scenario)
+        scenario.check_vehicles(bool(episode.vehicle_ids), [each.example for each in episode.warnings])
+        return episode
+
+    def _make_record(self, driver_log: DriverLog) -> Episode:
+        """Return the record with all trips; this ends SUMO."""
+        episode = super()._make_record(driver_log)
         start = self.road.files.begin + self.scenario.warmup * self.scenario.simulation_step
         trips = self._simulation.end_with_trips(vehicle_class_by_type(self.road), start)
         hidden = [self._hidden_time_loss.get(name, 0.0) for name in trips.vehicle_ids]
@@ -243,7 +257,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
 
         Lanes of this route are counted from the left, as roads are usually widened on the right.
         """
-        if not self.record_details:
+        if not self.options.record_details:
             return super()._snapshot_fields(columns)
         gaps, poses, edge = (self._log.traffic.snapshots(name, columns) for name in ("gaps", "poses", "edge"))
         limit = self._allowed_speed_sum / self._allowed_speed_count if self._allowed_speed_count else float("nan")

@@ -1,4 +1,4 @@
-"""The access to SUMO: the only module that imports libsumo or traci.
+"""Transports to SUMO, and the only module that imports libsumo or traci; `sandboxed` puts one into another process.
 
 Both libraries keep state of the whole process, in which the user may run another simulation. unjam never closes, steps
 or replaces it, and the user's TraCI connection stays the active one.
@@ -21,10 +21,10 @@ from typing import Any, Literal, NamedTuple
 from unjam.errors import LostWorkerError, MissingPartError, UnjamError
 from unjam.sandbox import restrict_writing
 
-Backend = Literal["libsumo", "traci", "gui"]
+Transport = Literal["libsumo", "traci", "gui"]
 """`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
-BACKEND_MODULES = {"libsumo": "libsumo", "traci": "traci.main", "gui": "traci.main"}
-"""module of each backend; `import traci` would depend on LIBSUMO_AS_TRACI and LIBTRACI_AS_TRACI"""
+TRANSPORT_MODULES = {"libsumo": "libsumo", "traci": "traci.main", "gui": "traci.main"}
+"""module of each transport; `import traci` would depend on LIBSUMO_AS_TRACI and LIBTRACI_AS_TRACI"""
 MAX_START_SECONDS = 600.0
 """time limit for SUMO to accept a connection [s]: it reads the network first"""
 CONNECT_RETRY_SECONDS = 0.02
@@ -41,7 +41,7 @@ class Libsumo:
 
     def __init__(self) -> None:
         """Claim libsumo; raise `InUseError` if another simulation, unjam's or the user's, is open in this process."""
-        self.functions: Any = import_backend("libsumo")
+        self.functions: Any = import_library("libsumo")
         call = partial(sumo_function, self.functions)
         self._is_loaded = call("simulation", "isLoaded")
         self._get_time, self._step = call("simulation", "getTime"), call("simulation", "step")
@@ -124,7 +124,7 @@ class Traci:
     is_lost = has_refused = False
 
     def __init__(self) -> None:
-        self._traci = import_backend("traci")
+        self._traci = import_library("traci")
         self.functions: Any = None
 
     @property
@@ -205,10 +205,10 @@ def sumo_function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
     return getattr(compiled, f"{domain}_{name}", wrapper)
 
 
-def import_backend(backend: Backend) -> ModuleType:
-    """Return the library of a backend; raise `MissingPartError` if it is not installed."""
+def import_library(transport: Transport) -> ModuleType:
+    """Return the library of a transport; raise `MissingPartError` if it is not installed."""
     try:
-        return importlib.import_module(BACKEND_MODULES[backend])
+        return importlib.import_module(TRANSPORT_MODULES[transport])
     except ImportError as error:
-        name = BACKEND_MODULES[backend].partition(".")[0]
+        name = TRANSPORT_MODULES[transport].partition(".")[0]
         raise MissingPartError(f"{name} cannot be imported ({error}); install it: pip install {name}==1.28.0") from None

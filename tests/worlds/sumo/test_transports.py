@@ -22,10 +22,10 @@ from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import EpisodeError, LostWorkerError, UnjamError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo.backends import InUseError
-from unjam.worlds.sumo.inputs import sumo_inputs
+from unjam.worlds.sumo.backend import SumoBackend, sumo_inputs
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.transports import InUseError
 
 RING = Ring(warmup=0, horizon=20)
 FLOW = '<flow id="cav" type="car" route="along" begin="0" end="60" period="2"/>'
@@ -168,20 +168,20 @@ def test_libsumo_is_not_taken_from_the_user(command: list[str]) -> None:
     Simulation().close()
 
 
-def test_an_episode_within_an_episode_of_the_same_simulation_is_refused(simulation: Simulation) -> None:
+def test_an_episode_within_an_episode_of_the_same_simulation_is_refused(sumo: SumoBackend) -> None:
     def nested(state: LocalState) -> np.ndarray:
-        run_episode(RING, coast, 1, simulation=simulation)
+        run_episode(RING, coast, 1, backend=sumo)
         return coast(state)
 
     with pytest.raises(UnjamError, match="simulation: an episode is running in it; allowed: one at a time"):
-        run_episode(RING, nested, 0, simulation=simulation)
-    assert run_episode(RING, coast, 0, simulation=simulation).status == "completed"
+        run_episode(RING, nested, 0, backend=sumo)
+    assert run_episode(RING, coast, 0, backend=sumo).status == "completed"
 
 
 AS_USERS_DO = """
 import json, traci, unjam, warnings
 warnings.simplefilter("ignore")
-from tests.worlds.sumo.test_backends import environment_rewards, episode_speeds
+from tests.worlds.sumo.test_transports import environment_rewards, episode_speeds
 from unjam.environments.gymnasium_env import RoadEnv
 environment = RoadEnv(warmup=0)
 environment.reset(seed=0)

@@ -1,0 +1,88 @@
+"""Backends: simulators that make worlds of scenarios. SUMO and the batch are two of them; users bring their own."""
+
+from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Protocol
+
+from unjam.drivers.user_driver import FileReference, is_file_reference
+from unjam.errors import InputError, unknown_name
+from unjam.scenarios.scenario import Scenario
+from unjam.worlds.road_world import RoadWorld
+
+BACKEND_NAMES = ("sumo", "sumo-gui")
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """What a driver, and the user of an episode, want of a world; a backend may ignore what it does not have."""
+
+    measured_fields: Collection[str] = ()
+    """optional fields of `LocalState` that the driver reads; measuring others would take time for nothing"""
+    record_details: bool = False
+    """whether fuel and, on roads with ends, positions (x, y) are recorded"""
+    accepts_floats: bool = False
+    """whether the driver takes floats instead of arrays with one row; see `World.is_scalar`"""
+    stop_at_contact: bool = True
+    """whether contact of a CAV ends an episode on a user's network; on built-in roads it always does"""
+
+
+DEFAULT_OPTIONS = WorldOptions()
+
+
+class Backend(Protocol):
+    """A simulator. One that holds resources is a context manager, too, which releases them."""
+
+    def supports(self, scenario: Scenario) -> str:
+        """Return why it cannot simulate a scenario; empty if it can."""
+        ...
+
+    def open(
+        self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions
+    ) -> AbstractContextManager[RoadWorld]:
+        """Return the context in which the world of one episode exists; all its random numbers come from the seed."""
+        ...
+
+
+BackendLike = str | Backend
+"""a backend or its name: `sumo`, `sumo-gui` with SUMO's window, or `path.py:name` of a class or an object"""
+
+
+@contextmanager
+def open_backend(backend: BackendLike) -> Iterator[Backend]:
+    """Yield a backend: a given one, which stays open, or one by name, which is closed at the end.
+
+    Raise `InputError` if there is no such backend.
+    """
+    if not isinstance(backend, str):
+        yield check_backend(backend, type(backend).__name__)
+        return
+    made = _make_backend(backend)
+    with made if isinstance(made, AbstractContextManager) else nullcontext(made):
+        yield made
+
+
+def _make_backend(name: str) -> Backend:
+    if is_file_reference(name):
+        found = FileReference.parse(name).load_object()
+        return check_backend(found() if isinstance(found, type) else found, name)
+    if name in ("sumo", "sumo-gui"):
+        from unjam.worlds.sumo.backend import SumoBackend
+
+        return SumoBackend(transport="gui" if name == "sumo-gui" else None)
+    raise unknown_name("backend", name, [*BACKEND_NAMES, "path.py:name"])
+
+
+def check_backend(backend: Backend, label: str) -> Backend:
+    """Return a backend; raise `InputError` if it lacks a method of the protocol."""
+    missing = [name for name in ("supports", "open") if not callable(getattr(backend, name, None))]
+    if missing:
+        raise InputError(f"backend: {label} has no {' and no '.join(f'{name}()' for name in missing)}")
+    return backend
+
+
+def check_support(backend: Backend, *scenarios: Scenario) -> None:
+    """Raise `InputError` with the reason if a backend cannot simulate one of the scenarios."""
+    for scenario in scenarios:
+        if reason := backend.supports(scenario):
+            raise InputError(f"scenario: {reason}")

@@ -1,0 +1,105 @@
+"""SUMO as a backend: one simulation for all episodes, and the traffic of each kind of road."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
+
+from unjam.errors import EpisodeError, SumoInputError, UnjamError, as_unjam_error
+from unjam.scenarios.road import ClosedRoad, MergeRoad, MotorwayRoad, Road, UserNetworkRoad
+from unjam.scenarios.scenario import Scenario
+from unjam.worlds.backend import DEFAULT_OPTIONS, WorldOptions
+from unjam.worlds.sumo.closed_road import ClosedTraffic
+from unjam.worlds.sumo.inputs import SumoInputs
+from unjam.worlds.sumo.merge_road import MergingTraffic
+from unjam.worlds.sumo.motorway import MotorwayTraffic
+from unjam.worlds.sumo.sandboxed import open_simulation
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.traffic import Traffic
+from unjam.worlds.sumo.transports import Transport
+from unjam.worlds.sumo.user_network import UserNetworkTraffic
+
+TRAFFIC_CLASSES: dict[type[Road], type[Traffic[Any]]] = {
+    ClosedRoad: ClosedTraffic,
+    MergeRoad: MergingTraffic,
+    MotorwayRoad: MotorwayTraffic,
+    UserNetworkRoad: UserNetworkTraffic,
+}
+
+
+class SumoBackend(AbstractContextManager["SumoBackend"]):
+    """SUMO: a given simulation, or one that the first episode opens and the others reuse.
+
+    The latter runs in a sandboxed process (no writing, no network) for users' networks, and in its own process with a
+    warning if libsumo already holds a simulation in this process, unjam's or the user's.
+    """
+
+    def __init__(self, simulation: Simulation | None = None, transport: Transport | None = None) -> None:
+        """Use a simulation, which is not closed at the end, or open one of a transport when it is needed."""
+        self._given = simulation
+        self._transport: Transport | None = transport
+        self._opened: Simulation | None = None
+
+    def supports(self, scenario: Scenario) -> str:
+        """Return why SUMO cannot simulate a scenario; empty if it can."""
+        road, _ = scenario.draw_from_seed((0,))
+        if type(road) in TRAFFIC_CLASSES:
+            return ""
+        allowed = ", ".join(each.__name__ for each in TRAFFIC_CLASSES)
+        return f"{type(road).__name__} is not allowed as the road of SUMO; allowed: {allowed}"
+
+    @contextmanager
+    def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[Traffic[Any]]:
+        """Yield the traffic of an episode.
+
+        Raises:
+            SumoInputError: SUMO refuses files or options, at the start or later in the episode.
+            EpisodeError: SUMO cannot run the scenario for another reason, or other code in this process has started,
+                stepped or closed a simulation through libsumo meanwhile (`LostWorkerError`).
+            UnjamError: another episode runs in the simulation.
+        """
+        simulation = self._given or self._open_simulation(scenario.reads_user_files)
+        if not simulation.episode_lock.acquire(blocking=False):
+            raise UnjamError("simulation: an episode is running in it; allowed: one at a time")
+        try:
+            yield make_traffic(scenario, seed, simulation, options)
+        except Exception as error:
+            simulation.check()  # otherwise changes by other code would be reported as an error of SUMO
+            unjam_error = as_unjam_error(error)
+            if scenario.reads_user_files and type(unjam_error) is EpisodeError and simulation.has_refused():
+                raise SumoInputError(str(unjam_error)) from error  # SUMO read further into a file
+            raise
+        finally:
+            simulation.episode_lock.release()
+
+    def _open_simulation(self, is_sandboxed: bool) -> Simulation:
+        """Return the open simulation, or a new one if there is none, it is lost, or a sandbox is missing."""
+        lacks_sandbox = is_sandboxed and self._transport is None
+        opened = self._opened
+        if opened is not None and (opened.is_lost or (lacks_sandbox and not opened.is_sandboxed)):
+            self.close()
+        if self._opened is None:
+            transport = self._transport
+            self._opened = open_simulation(is_sandboxed) if transport is None else Simulation(transport)
+        return self._opened
+
+    def close(self) -> None:
+        """Close the simulation unless it was given; may be called twice."""
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def make_traffic(
+    scenario: Scenario, seed: Sequence[int], simulation: Simulation, options: WorldOptions = DEFAULT_OPTIONS
+) -> Traffic[Any]:
+    """Put the vehicles of a seed on the road; nothing moves yet."""
+    drawn = scenario.draw_from_seed(seed)
+    return TRAFFIC_CLASSES[type(drawn[0])](scenario, seed, simulation, options, drawn)
+
+
+def sumo_inputs(scenario: Scenario, road: Road) -> SumoInputs:
+    """Return the network and traffic of a scenario and its road, as SUMO reads them."""
+    return TRAFFIC_CLASSES[type(road)].inputs(scenario, road)
