@@ -12,6 +12,7 @@ import pytest
 from unjam.drivers import Human
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
+from unjam.sumo_files import read_lanes
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.networks import sumo_program
@@ -229,6 +230,20 @@ def test_files_in_every_form_that_sumo_reads_give_its_traffic(
     path = write(tmp_path, network, *FORMS[form])
     speeds, _ = assert_same(path, simulation, monkeypatch)
     assert sum(map(len, speeds.values())) > 40
+
+
+def test_a_compressed_network_below_a_variable_folder_gives_the_traffic_of_sumo(
+    network: str, tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The name of the network does not end in .gz, and the configuration names its folder by `${DEEP}`."""
+    monkeypatch.setenv("DEEP", "deep")
+    path = write(tmp_path, network, {"r.xml": PLAIN}, '<route-files value="r.xml"/>')
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep/road.net.xml").write_bytes(gzip.compress(network.encode()))
+    (tmp_path / "road.net.xml").unlink()
+    path.write_text(path.read_text().replace("road.net.xml", "${DEEP}/road.net.xml"))
+    assert_same(path, simulation, monkeypatch)
+    assert read_lanes(tmp_path / "deep/road.net.xml")
 
 
 @pytest.mark.parametrize("name", OPTIONS)

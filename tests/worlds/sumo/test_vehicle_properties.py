@@ -30,16 +30,17 @@ def drive(simulation: Simulation, file: str, driver: DriverLike, **changes: Any)
 
 
 BUS_STOPS = (
-    '<busStop id="s1" lane="road_0" startPos="150" endPos="200"/>'
-    '<busStop id="s2" lane="road_0" startPos="400" endPos="450"/>'
+    '<busStop id="s1" lane="road_0" startPos="50" endPos="100"/>'
+    '<busStop id="s2" lane="road_0" startPos="200" endPos="250"/>'
 )
 PASSENGERS = (
-    '<vType id="own" vClass="bus" personCapacity="60" boardingDuration="0.2" {law}/>'
-    '<vehicle id="bus" type="own" depart="20" route="along" line="L">'
+    '<vType id="own" vClass="bus" personCapacity="30" boardingDuration="0.2" {law}/>'
+    '<vehicle id="bus" type="own" depart="2" route="along" line="L">'
     '<stop busStop="s1" duration="2"/><stop busStop="s2" duration="2"/></vehicle>'
-    '<personFlow id="p" begin="0" end="2" number="50"><walk from="road" busStop="s1" departPos="190"/>'
+    '<personFlow id="p" begin="0" end="1" number="50"><stop busStop="s1" duration="0"/>'
     '<ride busStop="s2" lines="L"/></personFlow>'
 )
+"""more passengers wait than the bus has places"""
 CALIBRATOR = (
     f'<vType id="own" {LAW}/><route id="again" edges="road"/>'
     '<calibrator id="c" edge="road" pos="300" freq="20" vTypes="own">'
