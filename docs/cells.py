@@ -1,6 +1,6 @@
-"""How the cells of the pages are run: in one kernel, for imports take longer than all that they do; and kept.
+"""Run the code cells of the pages in one kernel, because imports take longer than the cells, and cache their outputs.
 
-What they make is kept for as long as nothing changes that they are made of: measured files, code, and Python.
+The cache is valid until the results, the code or the version of Python change.
 """
 
 import hashlib
@@ -17,15 +17,15 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell
 
 ROOT = Path(__file__).parents[1]
-MADE_OF = ("results", "src", "docs/*.py", "constraints.txt")
-"""what cells read and run, beside themselves"""
+SOURCES = ("results", "src", "docs/*.py", "constraints.txt")
+"""files on which the outputs of cells depend, in addition to the cells"""
 KERNEL = AsyncKernelManager()
 
 
-def kept_in(build: Path) -> Path:
-    """Return the folder for what cells make of what is there now; those of what was before are removed."""
+def cache_folder(build: Path) -> Path:
+    """Return the cache folder for the present sources, and remove those of earlier sources."""
     content = hashlib.sha256(sys.version.encode())
-    files = [path for pattern in MADE_OF for path in ROOT.glob(pattern)]
+    files = [path for pattern in SOURCES for path in ROOT.glob(pattern)]
     files += [path for folder in files if folder.is_dir() for path in folder.rglob("*")]
     for path in sorted(path for path in files if path.is_file() and path.suffix != ".pyc"):
         content.update(f"{path.relative_to(ROOT)}\n".encode())
@@ -38,8 +38,8 @@ def kept_in(build: Path) -> Path:
 
 
 def _run(notebook: NotebookNode, cwd: str, **options: Any) -> ExecutionResult:
-    """Run a page in the kernel of all pages, which knows nothing of those before it."""
-    fresh = f"import os; os.chdir({cwd!r})\n%reset -f\nimport unjam"  # it pins what NumPy computes with
+    """Run a page in the common kernel, without the variables of the pages before it."""
+    fresh = f"import os; os.chdir({cwd!r})\n%reset -f\nimport unjam"  # unjam selects the kernels of NumPy
     notebook.cells.insert(0, new_code_cell(fresh))
     try:
         return single_nb_execution(notebook, cwd, km=KERNEL, **options)
@@ -48,4 +48,4 @@ def _run(notebook: NotebookNode, cwd: str, **options: Any) -> ExecutionResult:
 
 
 cache.single_nb_execution = _run
-logging.getLogger("traitlets").setLevel(logging.ERROR)  # it tells of each page, and of each client that is left
+logging.getLogger("traitlets").setLevel(logging.ERROR)  # it warns about each page and each client

@@ -24,7 +24,7 @@ html_static_path = ["_static"]
 html_css_files = ["pictures.css"]
 
 nb_execution_mode = "cache"
-nb_execution_cache_path = str(cells.kept_in(here / "_build" / "cells"))
+nb_execution_cache_path = str(cells.cache_folder(here / "_build" / "cells"))
 nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from unjam.measures.effect import ControllerResult
+from unjam.measures.recommendation import ControllerResult
 from unjam.measures.statistics import Estimate, format_difference
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.training.assess import Assessment, assess, make_request

@@ -31,8 +31,9 @@ from unjam.measures.statistics import (
     paired_differences,
     probability_of_improvement,
 )
-from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure, trajectory_figure
+from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam.reports.results import PlotEpisode, read_results, validation_gains
+from unjam.reports.space_time import trajectory_figure
 from unjam.training.config import load_config
 from unjam.training.early_stopping import has_converged
 from unjam.worlds.record import Floats

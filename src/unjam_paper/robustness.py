@@ -24,8 +24,9 @@ from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
-from unjam.reports.figures import png_bytes, trajectory_figure
+from unjam.reports.figures import png_bytes
 from unjam.reports.results import read_results
+from unjam.reports.space_time import trajectory_figure
 from unjam.scenarios import make_scenario
 from unjam.training.config import load_config
 from unjam.training.evaluate import TRAINED_LABEL, Evaluation, evaluate, raise_failure, save_evaluation

@@ -7,14 +7,8 @@ from typing import Any
 import pytest
 
 from tests.measures.test_feasibility import FEASIBLE_ROW
-from unjam.measures.effect import (
-    MIN_VERDICT_SEEDS,
-    Effect,
-    describe_harm,
-    effect_of,
-    effects_by_driver,
-    rejection_reasons,
-)
+from unjam.measures.effect import Effect, describe_harm, effect_of, effects_by_driver
+from unjam.measures.recommendation import MIN_VERDICT_SEEDS, rejection_reasons
 from unjam.measures.statistics import Estimate, estimate
 
 USUAL: dict[str, Any] = {

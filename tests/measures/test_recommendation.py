@@ -6,7 +6,7 @@ from math import inf, nan
 import pytest
 
 from tests.measures.test_effect import GOOD, between
-from unjam.measures.effect import (
+from unjam.measures.recommendation import (
     MIN_VERDICT_SEEDS,
     AccResult,
     ControllerResult,

@@ -12,8 +12,8 @@ import pytest
 from tests.measures.test_effect import GOOD, between
 from unjam.errors import InputError
 from unjam.manifest import manifest
-from unjam.measures.effect import AccResult, ControllerResult, assessment_headline, recommended_result
 from unjam.measures.metrics import METRICS
+from unjam.measures.recommendation import AccResult, ControllerResult, assessment_headline, recommended_result
 from unjam.measures.statistics import Estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, effect_figure, render_assessment, write_assessment
 from unjam.scenarios import OnRamp, Ring, scenario_recipe

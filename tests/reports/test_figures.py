@@ -26,13 +26,11 @@ from unjam.reports.figures import (
     data_uri,
     learning_curve_figure,
     png_bytes,
-    speed_field,
-    speed_scale,
     time_series_figure,
     training_time_figure,
-    trajectory_figure,
 )
 from unjam.reports.results import PlotEpisode
+from unjam.reports.space_time import speed_field, speed_scale, trajectory_figure
 
 LENGTH = 120.0
 

@@ -7,8 +7,8 @@ import pytest
 from matplotlib.collections import LineCollection, QuadMesh
 
 from tests.reports.open_roads import merge_episode, plot_episode_of, ramp_episode
-from unjam.reports.figures import MAX_LANE_MAPS, has_lane_maps, lane_map_figure, mean_speed_grid, space_time_figure
 from unjam.reports.results import PlotEpisode, pack_episode, unpack_episode
+from unjam.reports.space_time import MAX_LANE_MAPS, has_lane_maps, lane_map_figure, mean_speed_grid, space_time_figure
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ def test_runs_are_listed_compared_and_printed_as_csv(unjam: Run) -> None:
     found = json.loads(unjam("runs", "--json", "--scenario", "ring").stdout)
     assert [run["state"] for run in found] == ["finished", "stopped"]
     compared = unjam("runs", "compare", "ring-001", "ring-002")
-    assert "their settings are the same" in compared.stdout
+    assert "the settings of these runs are the same" in compared.stdout
     assert "unjam report runs/ring-001 runs/ring-002 --out compared.html" in compared.stderr
     assert unjam("runs", "progress", "ring-002").stdout.splitlines() == ["iteration,environment_steps", "1,400"]
 
@@ -30,7 +30,7 @@ def test_runs_are_listed_compared_and_printed_as_csv(unjam: Run) -> None:
 def test_remove_asks_and_refuses_other_folders(unjam: Run, tmp_path: Path) -> None:
     unconfirmed = unjam("runs", "remove", "ring-001")
     assert (unconfirmed.returncode, unconfirmed.stdout) == (2, "")
-    assert "with --yes" in unconfirmed.stderr
+    assert "allowed: --yes" in unconfirmed.stderr
     assert unjam("runs", "remove", "ring-001", "runs", "--yes").returncode == 2
     assert (tmp_path / "runs" / "ring-001").is_dir()
     elsewhere = unjam("runs", "--folder", "studies", "remove", "ring-001", "--yes")

@@ -13,9 +13,8 @@ from typer.core import TyperGroup
 
 from unjam import __version__
 from unjam.child_processes import isolate_children
-from unjam.cli import catalog, controllers, diagnostics, drive, train, tune
+from unjam.cli import calibration, catalog, controllers, diagnostics, drive, runs, train
 from unjam.cli.options import with_trust_option
-from unjam.cli.runs import runs_app
 from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, invalid_value, missing_package_error
 from unjam.plugins import load_plugins, plugin_names
 from unjam.processes import exit_with_parent, mark_as_command_line
@@ -69,13 +68,13 @@ COMMANDS = {
     "drivers": catalog.drivers_command,
     "drive": drive.drive_command,
     "assess": drive.assess_command,
-    "calibrate": tune.calibrate_command,
+    "calibrate": calibration.calibrate_command,
     "train": train.train_command,
-    "evaluate": controllers.evaluate_command,
-    "model": controllers.model_command,
-    "fit-drivers": catalog.fit_drivers_command,
-    "report": controllers.report_command,
-    "tune": tune.tune_command,
+    "evaluate": runs.evaluate_command,
+    "model": runs.model_command,
+    "fit-drivers": calibration.fit_drivers_command,
+    "report": runs.report_command,
+    "tune": calibration.tune_command,
     "search": train.search_command,
     "export": controllers.export_command,
     "certify": controllers.certify_command,
@@ -89,10 +88,10 @@ COMMANDS = {
 CODE_RUNNING_COMMANDS = {
     *("drive", "assess", "train", "evaluate", "model", "search", "export", "certify", "verify", "watch")
 }
-"""commands that accept folders, which can name Python code"""
+"""commands with the option --trust-code: they read folders, which can name Python code"""
 for _name, _command in COMMANDS.items():
     app.command(_name)(with_trust_option(_command) if _name in CODE_RUNNING_COMMANDS else _command)
-app.add_typer(runs_app)
+app.add_typer(runs.runs_app)
 
 
 class _Terminated(BaseException):

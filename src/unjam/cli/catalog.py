@@ -1,4 +1,4 @@
-"""Scenarios and drivers: `unjam scenarios`, `unjam drivers`, and calibrated human drivers of `unjam fit-drivers`."""
+"""Lists of what the package contains: `unjam scenarios` and `unjam drivers`."""
 
 import ast
 import inspect
@@ -11,17 +11,17 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from unjam.cli.options import JsonOption, SeedOption, parse_settings
-from unjam.cli.output import ProgressReporter, console, err_console, new_table, print_json
+from unjam.cli.options import JsonOption
+from unjam.cli.output import console, new_table, print_json
 from unjam.errors import InputError
 
 PICTURE_SECONDS = 60.0
-"""time after which an open road is drawn [s]: at the start it is almost empty"""
+"""simulated time after which an open road is drawn [s]; at the start it is almost empty"""
 
 
 def scenarios_command(
     name: Annotated[str | None, Argument(help="Scenario to describe in detail.")] = None,
-    picture: Annotated[Path | None, Option(help="Draw its road with the first vehicles: a .png file.")] = None,
+    picture: Annotated[Path | None, Option(help="Draw the road with its first vehicles into this .png file.")] = None,
     json: JsonOption = False,
 ) -> None:
     """List the scenarios, or describe one: road, observation, reward, speed limit and all parameters.
@@ -64,7 +64,7 @@ def scenarios_command(
 
 
 def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
-    """Write a picture of the road that seed 0 draws: a loop at the start, an open road after a minute."""
+    """Write a picture of the road of seed 0: a closed road at the start, an open road after `PICTURE_SECONDS`."""
     from unjam.files import atomic_write, check_parent_folder
     from unjam.reports.video import draw_road
     from unjam.worlds.backend import WorldOptions
@@ -128,7 +128,7 @@ def drivers_command(json: JsonOption = False) -> None:
 
 
 def _packaged_summary(name: str) -> str:
-    """Return what a packaged controller is and its measured performance, from its manifest."""
+    """Return a description of a packaged controller and its measured performance, from its manifest."""
     from unjam.controller import packaged_file
     from unjam.controller.file import read_controller
     from unjam.measures.gain import MEAN_GAIN
@@ -184,63 +184,3 @@ def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
             value = ", ".join(f"{key}={text}" for key, text in texts.items())
         table.add_row(f"  {row['name']}", str(value), " ".join(row["description"].split()))
     return table
-
-
-def fit_drivers_command(
-    data: Annotated[
-        list[Path], Argument(help="Recorded trajectories: .parquet or .csv; several files are one data set.")
-    ],
-    out: Annotated[Path, Option(help="File for the population.")] = Path("drivers.json"),
-    format: Annotated[
-        str,
-        Option(help="table, ngsim, ngsim-reconstructed, highd, openacc, fcd.", show_default="derived from the columns"),
-    ] = "",
-    driver: Annotated[str, Option(help="Columns of a table that together identify the driver: period,follower.")] = "",
-    select: Annotated[list[str] | None, Option(help="Only trajectories with column=value, like kind=human.")] = None,
-    residual: Annotated[
-        bool, Option(help="Also learn what all drivers do in addition to their own IDM; takes minutes.")
-    ] = False,
-    drop_bad_rows: Annotated[
-        bool, Option("--drop-bad-rows", help="Cut bad rows out of their trajectories instead of refusing.")
-    ] = False,
-    settings: Annotated[list[str] | None, Option("--set", help="Settings such as calibration.generations=200.")] = None,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-) -> None:
-    """Calibrate human drivers to recorded trajectories: a population for any scenario.
-
-    All drivers get the IDM with the smallest gap errors in simulation; each has its own time headway (--set
-    'individual=["time_headway","minimum_gap"]' adds parameters). The command lists the data that it read and the
-    data that it skipped.
-
-    Examples:
-
-    - unjam fit-drivers data.parquet
-    - unjam fit-drivers trajectories.csv --format ngsim --out people.json --residual
-    - unjam drive ring-jammed -d human -d pi --humans drivers.json
-    """
-    from unjam.following.fit_drivers import fit_drivers_from_files
-    from unjam.scenarios.population import write_population
-
-    changes: dict[str, Any] = {"residual": residual, "seed": seed, **parse_settings(settings)}
-    columns = tuple(name for name in driver.split(",") if name)
-    filters = {name: str(value) for name, value in parse_settings(select, "--select").items()}
-    with ProgressReporter("calibrating drivers") as reporter:
-        fit = fit_drivers_from_files(data, changes, format, drop_bad_rows, columns, filters, out, reporter)
-    write_population(out, fit.population)
-    if json:
-        print_json({"population": str(out), "read": fit.notes, **fit.facts()})
-        return
-    for line in fit.notes:
-        err_console.print(line)
-    population: Any = fit.population
-    typical = asdict(population.typical)
-    table = new_table(("parameter",), ("one for all", "mean", "std", "quartiles of the drivers"))
-    for name, statistics in population.parameter_statistics().items():
-        values = (typical[name], statistics["mean"], statistics["std"])
-        quartiles = "  ".join(f"{value:.2f}" for value in statistics["quartiles"])
-        table.add_row(name, *(f"{value:.2f}" for value in values), quartiles)
-    console.print(table)
-    for line in fit.report_lines():
-        console.print(line)
-    err_console.print(f"population: {out}")

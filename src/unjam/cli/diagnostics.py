@@ -1,4 +1,4 @@
-"""State of this machine: `unjam doctor` checks the installation, `unjam bench` measures the speed of episodes."""
+"""`unjam doctor` checks the installation, and `unjam bench` measures the speed of episodes."""
 
 import os
 import platform
@@ -53,17 +53,20 @@ def doctor_command(json: JsonOption = False) -> None:
 
 @dataclass(frozen=True)
 class HealthCheck:
-    """One part of the installation."""
+    """Result of the check of one part of the installation."""
 
     name: str
     is_ok: bool
     detail: str
+    """what was found, such as a version"""
     remedy: str = ""
+    """what to do if the check failed"""
     is_required: bool = True
+    """whether unjam cannot run without this part"""
 
 
 def check_health() -> list[HealthCheck]:
-    """Return all checks, the slowest last: an episode in a worker process."""
+    """Run all checks and return their results; the last one, an episode in a worker process, is the slowest."""
     from unjam.worlds.sumo.networks import sumo_program
 
     python, sumo = platform.python_version(), f"pip install eclipse-sumo=={REFERENCE_SUMO_VERSION}"
@@ -159,16 +162,16 @@ def _run_test_episode() -> str:
 
 
 def bench_command(
-    rounds: Annotated[int, Option(min=1, help="Rounds; each measures all parts in turn.")] = 7,
+    rounds: Annotated[int, Option(min=1, help="Number of rounds; each measures all parts once.")] = 7,
     device: Annotated[
         Literal["cpu", "cuda"] | None,
         Option(help="Measure batches of rings of increasing size on this device instead."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Measure the speed of episodes, relative to SUMO alone, over TraCI, in a batch, and of model rollouts.
+    """Measure the speed of episodes in SUMO, over TraCI and in batches, and of model rollouts.
 
-    The benchmark uses one core. Ratios are comparable; steps per second change with the machine and its load.
+    The benchmark uses one core. Compare ratios: steps per second depend on the machine and its load.
 
     Examples:
 

@@ -1,4 +1,4 @@
-"""Episodes with drivers: `unjam drive` measures them, `watch` displays one, `assess` compares controllers on a road."""
+"""Episodes with drivers: `unjam drive` measures them, `watch` shows one, `assess` compares controllers on a road."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -107,13 +107,13 @@ def watch_command(
         list[str], Option("--driver", "-d", help="One driver, as in drive; a run folder: its trained controller.")
     ],
     seed: opt.SeedOption = 0,
-    video: Annotated[Path | None, Option(help="Write a video (.gif, .webp, .mp4) instead; needs no display.")] = None,
-    pace: Annotated[float, Option(min=0.1, max=1000.0, help="Speed relative to real time.")] = 10.0,
+    video: Annotated[Path | None, Option(help="Write a video instead: a .gif, .webp or .mp4 file.")] = None,
+    pace: Annotated[float, Option(min=0.1, max=1000.0, help="Playback speed relative to real time.")] = 10.0,
     changes: dict[str, Any],
     settings: opt.ScenarioSettingsOption = None,
     json: opt.JsonOption = False,
 ) -> None:
-    """Watch an episode in SUMO's window, or write a video of it without a display.
+    """Watch an episode in SUMO's window, or write a video of it, which needs no display.
 
     Examples:
 
@@ -157,7 +157,7 @@ def watch_command(
 
 
 def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int], pace: float) -> "Episode":
-    """Run an episode in SUMO's window, `pace` times as fast as real time; return it.
+    """Run an episode in SUMO's window, `pace` times as fast as real time, and return it.
 
     Raises:
         MissingPartError: there is no display.
@@ -201,7 +201,7 @@ def assess_command(
     json: opt.JsonOption = False,
     changes: dict[str, Any],
 ) -> None:
-    """What would CAVs do on my road? Compare human drivers, ACC vehicles and controllers on equal seeds.
+    """Assess CAVs on your own road: compare human drivers, ACC vehicles and controllers on equal seeds.
 
     For each penetration rate a controller is selected on tuning seeds and evaluated on test seeds. It is
     recommended only if travel time is shown to be shorter than with human drivers and than with ACC vehicles,

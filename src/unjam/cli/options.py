@@ -1,4 +1,4 @@
-"""Options that several commands share, each defined once: alone, or in a group."""
+"""Options that several commands share."""
 
 import inspect
 import os
@@ -26,12 +26,14 @@ RewardOption = Annotated[
 ]
 SeedOption = Annotated[int, Option("--seed", min=0, help="First seed.")]
 OptunaSeedOption = Annotated[int, Option("--seed", min=0, max=2**32 - 1, help="First seed.")]
-ScenarioSettingsOption = Annotated[list[str] | None, Option("--set", help="Any parameter of the scenario: key=value.")]
+ScenarioSettingsOption = Annotated[list[str] | None, Option("--set", help="Any setting of the scenario: key=value.")]
 WorkersOption = Annotated[
     int, Option("--workers", min=1, help="Worker processes; the result does not depend on their number.")
 ]
-TrainingWorkersOption = Annotated[int, Option("--workers", min=1, help="Trainings at the same time.")]
-ExecutorOption = Annotated[Executor, Option(help="local, or ray: a cluster that shares the folder.")]
+TrainingWorkersOption = Annotated[int, Option("--workers", min=1, help="Number of trainings at the same time.")]
+ExecutorOption = Annotated[
+    Executor, Option(help="Where trainings run: local, or ray (a cluster that shares the folder).")
+]
 OutOption = Annotated[
     Path | None, Option("--out", help="Folder for the results.", show_default="a new one under runs/")
 ]
@@ -44,10 +46,10 @@ DEFAULT_WORKERS = os.cpu_count() or 1
 
 
 def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Give a command, or a group, the options of whole groups.
+    """Replace parameters of a command by groups of options.
 
-    A group is a function with options as its parameters. They replace the command's parameter that has the
-    group's name; the command gets the return value of the function as its argument.
+    A group is a function whose parameters are options. On the command line they replace the parameter that has
+    the name of the group; the command is called with the return value of the function for this parameter.
     """
     members = {name: inspect.signature(group).parameters for name, group in groups.items()}
 
@@ -69,7 +71,7 @@ def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., Any]],
 
 
 def with_trust_option(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the option that lets it run Python code that foreign folders name."""
+    """Add the option that allows a command to run Python code that a folder of other users names."""
     option = Annotated[bool, Option(TRUST_CODE_OPTION, help="Run Python code that a folder names.")]
     added = inspect.Parameter("trust_code", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
 
@@ -82,7 +84,7 @@ def with_trust_option(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _with_parameters(command: Callable[..., None], parameters: Iterable[inspect.Parameter]) -> Callable[..., None]:
-    """Return the command with the parameters, as keywords, that typer shall see."""
+    """Set the signature from which typer makes the options of a command."""
     keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
     command.__signature__ = inspect.Signature(keywords)  # pyright: ignore[reportFunctionMemberAccess]
     return command
@@ -96,7 +98,7 @@ def network_changes(
     end: Annotated[float | None, Option(help="End time on your own network [s].")] = None,
     humans: HumansOption = None,
 ) -> dict[str, Any]:
-    """Return the changes to a user network: eligible vehicles, time, human drivers."""
+    """Return the scenario settings that the options for user networks set."""
     file = humans if humans is None or humans.startswith(PACKAGED_PREFIX) else str(Path(humans).absolute())
     classes = cav_classes.split(",") if cav_classes else None
     return _without_none({"cav_classes": classes, "begin": begin, "end": end, "population": file})
@@ -114,7 +116,7 @@ def scenario_changes(
     cav_types: Annotated[str | None, Option(help="Vehicle types of CAVs on your own network: car,truck.")] = None,
     network: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return the changes to a scenario that its options request."""
+    """Return the scenario settings that the options of a command set."""
     changes = {
         "length": parse_range("length", length),
         "radius": parse_range("radius", radius),
@@ -135,11 +137,13 @@ class TrainingOptions(NamedTuple):
     """Values of the options that configure a training."""
 
     preset: str
+    """name of the preset, or empty"""
     config: Path | None
+    """TOML file with the configuration"""
     options: dict[str, Any]
-    """configuration keys with an option of their own, where it was given"""
+    """configuration values of the options that were given, by key"""
     settings: dict[str, Any]
-    """values of `--set`"""
+    """configuration values of `--set`, by key"""
 
 
 def training_options(
@@ -166,11 +170,11 @@ def training_options(
 
 
 MAX_NUMBER_DIGITS = 10
-"""a length or radius has fewer digits"""
+"""a length or a radius has fewer digits than this"""
 
 
 def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
-    """Return (230, 230) for `230` and (220, 270) for `220-270`."""
+    """Return the range [m] of an option: (230, 230) for `230`, (220, 270) for `220-270`."""
     if text is None:
         return None
     parts = text.split("-")
@@ -180,7 +184,7 @@ def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
 
 
 def parse_settings(texts: list[str] | None, option: str = "--set") -> dict[str, Any]:
-    """Return the values of options like `--set key=value`; errors name the `option`."""
+    """Return the values of texts like `key=value`, by key; errors name the `option`."""
     return parse_assignments(texts or [], option)
 
 
@@ -194,7 +198,13 @@ def new_folder(out: Path | None, name: str) -> Path:
 
 
 def merge_settings(options: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of options and `--set` together; raise `InputError` if both set the same key."""
+    """Return the values of options and of `--set`, by key; raise `InputError` if both set the same key."""
     if duplicates := options.keys() & settings.keys():
         raise InputError(f"--set {min(duplicates)}: it is not allowed together with the option for it")
     return options | settings
+
+
+def check_page_path(path: Path) -> None:
+    """Raise `InputError` unless a path ends in .html or .htm, so that no other file is overwritten by mistake."""
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise invalid_value("out", str(path), "a file that ends in .html")

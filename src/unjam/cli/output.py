@@ -1,4 +1,4 @@
-"""Output of the command line: tables, one JSON document, progress on standard error, and proposed next commands."""
+"""Output of the command line: tables, one JSON document, progress on standard error, and suggested next commands."""
 
 import json
 import os
@@ -148,12 +148,12 @@ class ProgressReporter:
 
 
 def print_next_command(reason: str, *arguments: object) -> None:
-    """Propose a command line, unwrapped so that it can be copied."""
+    """Suggest a command line, without line breaks so that it can be copied."""
     err_console.print(f"{reason}: {shlex.join(['unjam', *map(str, arguments)])}", soft_wrap=True)
 
 
 def suggest_after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any], reward: str) -> None:
-    """Propose, on the same road, to compare with human drivers, else to train on an expert, else to watch."""
+    """Suggest the next command on the same road: compare with human drivers, train on an expert, or watch."""
     from unjam.drivers.registry import DRIVERS
 
     controllers = [driver for driver in drivers if driver != "human"]
@@ -170,7 +170,7 @@ def suggest_after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[
 
 
 def setting_options(changes: Mapping[str, Any], prefix: str = "", reward: str = "") -> Iterator[str]:
-    """Yield the options that select a reward, if any, and change a scenario."""
+    """Yield the command-line options that set these values, each key with a prefix, and the reward."""
     if reward:
         yield from ("--reward", reward)
     for key, value in changes.items():
@@ -178,7 +178,7 @@ def setting_options(changes: Mapping[str, Any], prefix: str = "", reward: str = 
 
 
 def _arguments_without_out() -> list[str]:
-    """Return the arguments of this command without the folder, which now exists."""
+    """Return the arguments of the running command without --out, whose folder exists now."""
     words = list(sys.argv[1:])
     if "--out" in words:
         index = words.index("--out")
@@ -187,10 +187,10 @@ def _arguments_without_out() -> list[str]:
 
 
 def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, run: Path, is_finished: bool) -> None:
-    """Propose to export a controller that gained, and to train one without a shown gain unless `is_finished`.
+    """Suggest to export the controller if its gain is positive or unknown, else to continue an unfinished training.
 
-    `folder` is that of a road, `run` that of the training; they are the same if there is only one road. A
-    single test seed shows nothing, so its gain is None.
+    `folder` is that of a road, and `run` that of the training; with one road they are the same. `gain` is None
+    with a single test seed.
     """
     if gain is None or gain.low > 0:
         print_next_command("export it", "export", folder, "--out", f"{folder.name}.unjam")
@@ -200,11 +200,11 @@ def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, ru
 
 @contextmanager
 def suggest_resume(folder: Path, workers: int) -> Iterator[None]:
-    """Print the command that resumes a training if it stops early."""
+    """Print the command that resumes the training if the body raises an error."""
     try:
         yield
     except BaseException as error:
         if not isinstance(error, InputError | MissingPartError) and (folder / "config.toml").is_file():
             options = [] if workers == DEFAULT_WORKERS else ["--workers", workers]
-            print_next_command("go on with", "train", "--resume", folder, *options)
+            print_next_command("continue with", "train", "--resume", folder, *options)
         raise

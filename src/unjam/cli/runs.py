@@ -1,18 +1,170 @@
-"""Training runs: `unjam runs` lists, compares and removes them, and prints their progress as CSV."""
+"""Results of training runs: `unjam evaluate`, `model`, `report`, and `unjam runs` to list, compare and remove runs."""
 
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
-from unjam.cli.options import JsonOption
-from unjam.cli.output import console, err_console, new_table, print_json, print_next_command
-from unjam.errors import InputError
+from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, check_page_path, network_changes
+from unjam.cli.output import (
+    ProgressReporter,
+    console,
+    err_console,
+    new_table,
+    print_json,
+    print_metrics,
+    print_next_command,
+    print_notes,
+)
+from unjam.errors import InputError, resume_hint
+from unjam.processes import check_not_locked, continue_in_limited_child, lock_folder
 
-RunsFolderOption = Annotated[Path, Option("--folder", help="The folder that contains the runs.")]
+
+def evaluate_command(
+    run: Annotated[Path, Argument(help="Folder of a training run.")],
+    episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Test episodes per driver.")] = 20,
+    humans: HumansOption = None,
+    out: Annotated[Path | None, Option(help="Folder for the results.", show_default="the run's own")] = None,
+    workers: WorkersOption = DEFAULT_WORKERS,
+    json: JsonOption = False,
+) -> None:
+    """Compare a trained controller with every expert and the human baseline on fixed test seeds.
+
+    The evaluation and the report of the run are replaced, unless --out names another folder. Other human
+    drivers (--humans) require another folder.
+
+    Examples:
+
+    - unjam evaluate runs/ring-001
+    - unjam evaluate runs/ring-001 --episodes 50 --json
+    - unjam evaluate runs/ring-001 --humans drivers.json --out runs/other-drivers
+    """
+    from unjam.drivers.registry import DRIVERS
+    from unjam.reports.results import read_results
+    from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
+    from unjam.training.run_folder import check_run_files, lock_new_folder, read_config
+    from unjam.worlds.worker_pool import WorkerPool
+
+    if humans is not None and out is None:
+        raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
+    config = read_config(run)
+    check_run_files(run, config)
+    evaluation = replace(config.evaluation, baselines=tuple(DRIVERS), episodes=episodes)
+    options = {**config.scenario_options, **network_changes(humans=humans)}
+    config = replace(config, scenario_options=options, evaluation=evaluation)
+    if config.tasks:
+        raise InputError(f"run: {str(run)!r} has several roads; allowed: the folder of one of them")
+    if not (run / "controller.unjam").is_file():
+        raise InputError(f"run: {str(run)!r} has no controller yet{resume_hint(run)}")
+    from unjam.reports.html import write_report_page  # loads matplotlib, so only after the checks
+    from unjam.reports.summary import main_finding
+
+    total = evaluation_steps(config, run)
+    target = out or run
+    with lock_folder(target) if out is None else lock_new_folder(out):
+        with ProgressReporter("evaluating", "steps", total) as progress, WorkerPool(workers) as pool:
+            evaluation = evaluate_run(run, config, pool, progress.update, out)
+        page = write_report_page([target], target / "report.html")
+    results = read_results(target)
+    if json:
+        gain, means = gain_over_expert(config, evaluation.rows), evaluation.means()
+        facts = {"run": str(run), "scenario": config.scenario, "gain": asdict(gain) if gain else None}
+        drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in evaluation.rows.items()]
+        print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})
+        return
+    print_metrics(evaluation.rows)
+    console.print(main_finding(results), soft_wrap=True)
+    print_notes(results.metadata["notes"])
+    err_console.print(f"report: {page}")
+
+
+def model_command(
+    run: Annotated[Path, Argument(help="Folder of a training run with a learned model.")], json: JsonOption = False
+) -> None:
+    """Show the errors of a run's learned model relative to the environment.
+
+    The errors are root mean squares on episodes that were not used for training. They are listed together with
+    the errors of the base model alone and the size of the predicted changes. For a model of whole roads, the
+    command compares the waves in model rollouts with those in a recorded episode. The report of the run, which
+    contains the figures, is written again.
+
+    Examples:
+
+    - unjam model runs/ring-001
+    - unjam model runs/ring-001 --json
+    """
+    from matplotlib import get_cachedir
+
+    continue_in_limited_child(f"model: {run}", run, Path(get_cachedir()))
+    from unjam.reports import model
+    from unjam.reports.html import write_report_page
+    from unjam.reports.results import read_progress
+    from unjam.training.model_facts import update_model_facts
+    from unjam.training.run_folder import read_config
+
+    config = read_config(run)
+    with lock_folder(run):
+        facts = update_model_facts(run, config)
+        is_evaluated = (run / "evaluation.json").is_file()
+        report = write_report_page([run], run / "report.html") if is_evaluated else None
+    if json:
+        print_json({"run": str(run), "report": str(report) if report else None, **facts})
+        return
+    lines = [model.rollout_summary(read_progress(run))]
+    if "waves" in facts:
+        table = new_table(("second half of the episode",), model.WAVE_HEADINGS)
+        for label, row in model.wave_rows(facts):
+            table.add_row(label, *row)
+    else:
+        table = new_table(("root mean square", "unit"), model.error_headings(facts))
+        for row in model.error_rows(facts):
+            table.add_row(row["label"], row["unit"], *row["cells"])
+        lines = [model.error_verdict(facts), *lines, model.bound_summary(facts)]
+    console.print(table)
+    for line in lines:
+        console.print(line)
+    err_console.print(f"report: {report}" if report else f"no report before the end of the training: --resume {run}")
+
+
+def report_command(
+    folders: Annotated[list[Path], Argument(help="Folders of training runs, or of results of unjam drive.")],
+    out: Annotated[
+        Path | None,
+        Option("--out", help="HTML file to write.", show_default="report.html in the folder, or comparison.html here"),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Write the report of one folder of results, or a comparison of several, as one HTML page that works offline.
+
+    Examples:
+
+    - unjam report runs/ring-001
+    - unjam report runs/ring-001 runs/ring-002 --out compared.html
+    """
+    from matplotlib import get_cachedir
+
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"report: {str(folder)!r} is not a folder; allowed: one with results")
+    target = out or (folders[0] / "report.html" if len(folders) == 1 else Path("comparison.html"))
+    check_page_path(target)
+    continue_in_limited_child(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
+    from unjam.reports.html import write_report_page
+
+    if target.parent in folders:
+        check_not_locked(target.parent)
+    page = write_report_page(folders, target)
+    if json:
+        print_json({"report": str(page), "folders": [str(folder) for folder in folders]})
+    else:
+        console.print(str(page))
+
+
+RunsFolderOption = Annotated[Path, Option("--folder", help="Folder that contains the runs.")]
 RunNamesArgument = Annotated[list[str], Argument(help="Names of runs, as listed, or their folders.", metavar="NAME...")]
 DEFAULT_RUNS_FOLDER = Path("runs")
 
@@ -23,7 +175,7 @@ runs_app = typer.Typer(name="runs", rich_markup_mode="markdown")
 def list_runs_command(
     context: typer.Context,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
-    scenario: Annotated[str, Option(help="Only runs on this scenario.")] = "",
+    scenario: Annotated[str, Option(help="List only runs on this scenario.")] = "",
     json: JsonOption = False,
 ) -> None:
     """List the training runs in a folder: their progress, and their return relative to the expert.
@@ -48,8 +200,8 @@ def list_runs_command(
         print_json([run.document() for run in runs])
         return
     if not runs:
-        kind = f" on {scenario}" if scenario else ""
-        err_console.print(f"no runs{kind} in {folder}; start one: unjam train ring --preset demo")
+        condition = f" on {scenario}" if scenario else ""
+        err_console.print(f"no runs{condition} in {folder}; start one: unjam train ring --preset demo")
         return
     table = new_table(("run", "scenario", "preset", "state"), ("steps", "difference to expert"))
     for run in runs:
@@ -71,7 +223,7 @@ def _gain_text(gain: Any) -> str:
 def compare_command(
     names: RunNamesArgument, folder: RunsFolderOption = DEFAULT_RUNS_FOLDER, json: JsonOption = False
 ) -> None:
-    """Compare runs: their returns, and the settings in which they differ.
+    """Compare the returns of runs, and list the settings in which they differ.
 
     Example:
 
@@ -96,8 +248,8 @@ def compare_command(
         table.add_row(name, *("–" if value is None else str(value) for value in values))
     console.print(table)
     if not settings:
-        console.print("their settings are the same")
-    print_next_command("on one page", "report", *(run.folder for run in runs), "--out", "compared.html")
+        console.print("the settings of these runs are the same")
+    print_next_command("compare them on one page", "report", *(run.folder for run in runs), "--out", "compared.html")
 
 
 @runs_app.command("progress")
@@ -106,7 +258,7 @@ def progress_command(
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     json: JsonOption = False,
 ) -> None:
-    """Print a run's progress as CSV: a row per iteration; names of nested values contain dots.
+    """Print the progress of a run as CSV, a row per iteration; names of nested values contain dots.
 
     Example:
 
@@ -127,12 +279,12 @@ def progress_command(
 def remove_command(
     names: RunNamesArgument,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
-    yes: Annotated[bool, Option("--yes", "-y", help="Do not ask.")] = False,
+    yes: Annotated[bool, Option("--yes", "-y", help="Remove without asking for confirmation.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Remove runs permanently, with their folders; asks for confirmation.
+    """Remove runs and their folders permanently, after confirmation.
 
-    Folders that are not run folders, and runs that are being trained, are not removed.
+    Runs that are being trained, and folders that are not run folders, are refused.
 
     Example:
 
@@ -145,7 +297,7 @@ def remove_command(
         if run.state == "running":
             raise InputError(f"run: {str(run.folder)!r} is being trained; allowed: runs that have ended")
     if not yes and (json or not sys.stdin.isatty()):
-        raise InputError("remove: confirmation needs a terminal; allowed: with --yes")
+        raise InputError("remove: confirmation requires a terminal; allowed: --yes")
     for run in runs:
         size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file()) / 1e6
         if yes or typer.confirm(f"Remove {run.folder} ({run.state}, {run.steps:,} steps, {size:.0f} MB)?"):

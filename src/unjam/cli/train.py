@@ -1,4 +1,4 @@
-"""Trainings: one (`unjam train`), or many that search for better settings (`unjam search`)."""
+"""`unjam train` runs one training, and `unjam search` many of them to find better settings."""
 
 from contextlib import nullcontext
 from dataclasses import asdict, replace
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 PROGRESS_LINE_INTERVAL = 5
 """iterations between two plain lines of progress without a terminal"""
 STEP_OVERRUN_RATIO = 1.1
-"""ratio of planned to requested steps above which a note is printed"""
+"""ratio of planned to requested steps above which a note is printed, as only whole iterations are trained"""
 EVALUATION_LABEL = "evaluating on test seeds"
 
 
@@ -33,7 +33,7 @@ def train_command(
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     out: opt.OutOption = None,
     resume: Annotated[
-        Path | None, Option(help="Continue this run: after a stop, or with more --steps after its end.")
+        Path | None, Option(help="Continue this run after it was stopped, or with more --steps after its end.")
     ] = None,
     tensorboard: Annotated[
         bool, Option("--tensorboard", help="Write curves for: tensorboard --logdir FOLDER.")
@@ -109,7 +109,7 @@ def train_command(
 
 
 def _result_facts(road: "TrainResult", run: "TrainResult") -> dict[str, Any]:
-    """Return the JSON of one road of a run; of a run of a single road, they are the same."""
+    """Return the result of a run on one road for JSON; for a run on a single road, both arguments are the same."""
     from unjam.measures.notes import episode_notes
     from unjam.training.evaluate import Evaluation
 
@@ -130,7 +130,7 @@ class _TrainingProgress(output.ProgressReporter):
         self._validation_text, self._worst_road = "-", ""
 
     def show_iteration(self, row: dict[str, Any]) -> None:
-        """Show a row of progress."""
+        """Show the progress row of an iteration."""
         if row["return_validation"] is not None:
             self._validation_text = f"{row['return_validation']:.0f}"
             self._worst_road = _worst_road_text(row.get("tasks", {}))
@@ -177,10 +177,10 @@ def search_command(
     out: opt.OutOption = None,
     json: opt.JsonOption = False,
 ) -> None:
-    """Search for better training settings: many trainings, which Optuna proposes.
+    """Search for better settings of a training with Optuna; each trial is a training.
 
-    Trials are compared on validation seeds, never on test seeds. The same command continues a stopped search; the
-    best settings are in best.toml, for `unjam train --config`.
+    Trials are compared on validation seeds, never on test seeds. The best settings are written to best.toml, for
+    `unjam train --config`. To continue a stopped search, repeat the command with the same --out.
 
     Examples:
 

@@ -291,10 +291,10 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     @synchronized
     def step(self, action: Any) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Advance one control step."""
-        done = self._road.step(np.asarray(action, np.float64).reshape(1))
-        observation = next(iter(done.departed.values())) if done.departed else done.observations[0]
-        truncated = done.truncated or (bool(done.departed) and not done.terminated)
-        return observation, done.reward, done.terminated, truncated, {"reward_terms": done.reward_terms}
+        result = self._road.step(np.asarray(action, np.float64).reshape(1))
+        observation = next(iter(result.departed.values())) if result.departed else result.observations[0]
+        truncated = result.truncated or (bool(result.departed) and not result.terminated)
+        return observation, result.reward, result.terminated, truncated, {"reward_terms": result.reward_terms}
 
     @synchronized
     def render(self) -> Any:

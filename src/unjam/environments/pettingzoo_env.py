@@ -20,9 +20,10 @@ from unjam.worlds.reward import RewardLike
 class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
     """Several CAVs among human drivers, with a common reward.
 
-    Action and observation of each CAV are those of `RoadEnv`. On the merge `agents` changes: a CAV appears at the
-    first control step after its entry, and is truncated when it leaves; without CAVs on the road, the simulation
-    continues by itself. On a user network the agents are cav_0, cav_1, ... in order of entry, at most `cavs`.
+    Action and observation of each CAV are those of `RoadEnv`. On open roads `agents` changes: a CAV becomes an agent at
+    the first control step after its entry, and is truncated when it leaves the road. While there are no CAVs, the
+    simulation continues until the next one enters. On a user network the agents are cav_0, cav_1, ... in the order of
+    entry, at most `cavs` of them.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "unjam_road_v0", "render_modes": []}  # pyright: ignore
@@ -42,7 +43,7 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
         self.agents: list[str] = []
         self._agent_by_vehicle: dict[str, str] = {}
         self._departed_agents: set[str] = set()
-        """agents with a vehicle that has left; if the vehicle returns, its expert drives it without the agent"""
+        """agents whose vehicle has left the road; if it returns, only the expert drives it"""
         self.render_mode = None
         self.observation_spaces = {agent: deepcopy(self._road.observation_space) for agent in self.possible_agents}
         self.action_spaces = {agent: deepcopy(self._road.action_space) for agent in self.possible_agents}
@@ -59,43 +60,44 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode: that of `seed`; without one, the next after that of the last seed."""
+        """Start the episode of `seed`; without a seed, the next episode of the last seed."""
         observations = self._road.reset(seed, np.random.default_rng())
         self._agent_by_vehicle.clear()
         self._departed_agents.clear()
-        self.agents = self._agents_of(self._road.world.cav_ids)
+        self.agents = self._assign_agents(self._road.world.cav_ids)
         return dict(zip(self.agents, observations, strict=True)), {agent: {} for agent in self.agents}
 
     @synchronized
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Advance one control step with the actions of all CAVs."""
+        """Advance one control step with the actions of all agents."""
         if not self.agents:
             return {}, {}, {}, {}, {}
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each of the agents")
-        acted, departed = self.agents, self._departed_agents
-        present = self._agents_of(self._road.world.cav_ids)
-        values = [0.0 if agent in departed else float(np.asarray(actions[agent]).reshape(())) for agent in present]
-        done = self._road.step(values)
-        is_over = done.terminated or done.truncated
-        left, now = (
-            {agent: each for agent, each in zip(self._agents_of(ids), rows, strict=True) if agent not in departed}
-            for ids, rows in ((done.departed, done.departed.values()), (done.cav_ids, done.observations))
+        previous, departed = self.agents, self._departed_agents
+        agents = self._assign_agents(self._road.world.cav_ids)
+        result = self._road.step([0.0 if agent in departed else np.asarray(actions[agent]).item() for agent in agents])
+        has_ended = result.terminated or result.truncated
+        leaving, present = (
+            {agent: each for agent, each in zip(self._assign_agents(ids), rows, strict=True) if agent not in departed}
+            for ids, rows in ((result.departed, result.departed.values()), (result.cav_ids, result.observations))
         )
-        departed.update(left)
-        # A vehicle that enters as the episode ends never becomes an agent.
-        observations = {agent: each for agent, each in (left | now).items() if agent in acted or not is_over}
-        self.agents = [] if is_over else list(now)
+        departed.update(leaving)
+        # A vehicle that enters in the last control step does not become an agent.
+        observations = {
+            agent: each for agent, each in (leaving | present).items() if agent in previous or not has_ended
+        }
+        self.agents = [] if has_ended else list(present)
         return (
             observations,
-            {agent: done.reward if agent in acted else 0.0 for agent in observations},
-            dict.fromkeys(observations, done.terminated),
-            {agent: done.truncated or (agent in left and not done.terminated) for agent in observations},
-            {agent: {"reward_terms": done.reward_terms} for agent in observations},
+            {agent: result.reward if agent in previous else 0.0 for agent in observations},
+            dict.fromkeys(observations, result.terminated),
+            {agent: result.truncated or (agent in leaving and not result.terminated) for agent in observations},
+            {agent: {"reward_terms": result.reward_terms} for agent in observations},
         )
 
-    def _agents_of(self, vehicles: Iterable[str]) -> list[str]:
-        """Return the agents of vehicles; if their names are not known in advance, in order of entry."""
+    def _assign_agents(self, vehicles: Iterable[str]) -> list[str]:
+        """Return the agents of vehicles; a new vehicle gets the agent with its name, else the first free one."""
         for name in vehicles:
             if name not in self._agent_by_vehicle:
                 taken = self._agent_by_vehicle.values()
@@ -108,10 +110,10 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
 
     @synchronized
     def close(self) -> None:
-        """Close SUMO; may be called twice."""
+        """Close SUMO; further calls have no effect."""
         self._road.close()
 
 
 def parallel_env(scenario: str = "ring", **arguments: Any) -> ParallelRoadEnv:
-    """Return a scenario with several CAVs as a PettingZoo environment; arguments are those of `RoadEnv`."""
+    """Return the PettingZoo environment of a scenario; the arguments are those of `RoadEnv`."""
     return ParallelRoadEnv(scenario, **arguments)

@@ -16,9 +16,9 @@ from unjam.worlds.sumo.simulation import DetectorPassage
 DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """columns of a file of measurements, in addition to `edge` or `lane`"""
 GEH_LIMIT = 5.0
-"""a flow agrees below this"""
+"""GEH below which a simulated flow agrees with the measured flow"""
 SAME_PASSAGE_SECONDS = 10.0
-"""a vehicle that passes loops of one edge again within this time has only changed lanes [s]"""
+"""time within which a second passage of a vehicle over loops of the same edge is only a lane change [s]"""
 
 
 @dataclass(frozen=True)
@@ -26,17 +26,17 @@ class Measurement:
     """Measurement of a detector in an interval."""
 
     place: str
-    """an edge, all lanes of which are counted, or a lane"""
+    """id of an edge, all lanes of which are counted, or of a lane"""
     position: float
-    """along it [m]"""
+    """position on the edge or lane [m]"""
     begin: float
-    """[s], in the simulation's time"""
+    """begin of the interval, in simulation time [s]"""
     end: float
-    """[s]"""
+    """end of the interval, in simulation time [s]"""
     flow: float
-    """[veh/h]"""
+    """flow [veh/h]"""
     speed: float
-    """mean of the vehicles that passed [m/s]; NaN if unknown"""
+    """mean speed of the vehicles that passed [m/s]; NaN if unknown"""
 
 
 @dataclass(frozen=True)
@@ -44,19 +44,19 @@ class Agreement:
     """Agreement of simulated traffic with measurements."""
 
     geh: float
-    """mean over all intervals of all detectors"""
+    """mean GEH over all intervals of all detectors"""
     geh_below_5: float
-    """share of the intervals"""
+    """share of the intervals with a GEH below 5"""
     flow_rmse: float
-    """[veh/h]"""
+    """root mean square error of the flow [veh/h]"""
     speed_rmse: float
-    """[m/s]; NaN if no speed was measured"""
+    """root mean square error of the speed [m/s]; NaN if no speed was measured"""
     score: float
     """objective of calibration, smaller is better: mean GEH over 5, plus speed error over mean measured speed"""
 
 
 def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
-    """Return whether a CSV file names places by `edge` or by `lane`, and its measurements; all in SI units.
+    """Return whether a CSV file names places by `edge` or by `lane`, and its measurements.
 
     It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown, and other columns are ignored. Raise
     `InputError` if a value is wrong, with its line, and if the file, a column or all rows are missing.

@@ -1,35 +1,36 @@
-"""Feasibility: whether a car could have driven as a CAV did. The verdict is the first limit that was violated."""
+"""Feasibility check: whether a real vehicle could drive as a CAV did. The verdict names the first violated limit."""
 
 from collections.abc import Sequence
 from math import isnan
 from typing import Any
 
 MIN_TIME_GAP_FRACTION = 0.9
-"""smallest time gap at any moment, as a fraction of the required one"""
+"""minimum time gap in every step, as a fraction of the required time gap"""
 DEFAULT_REQUIRED_TIME_GAP = 1.0
-"""required time gap on roads that do not set one [s]"""
+"""required time gap on roads that do not define one [s]"""
 MIN_TIME_GAP_WITH_LANES = 0.8
-"""smallest time gap at any moment on roads with lanes, recovery after cut-ins excluded [s]"""
+"""minimum time gap in every step on roads with lanes [s]; the recovery after cut-ins is excluded"""
 MAX_SHORT_TIME_GAP_SHARE = 1e-3
-"""share of that time in which the time gap may be shorter than the required one"""
+"""maximum share of the time with a time gap below the required one, on roads with lanes; the recovery is excluded"""
 MAX_CUT_IN_BRAKING = 9.0
-"""braking just after a cut-in [m/s2]: what dry asphalt allows"""
+"""maximum braking after a cut-in [m/s2]: about the limit on dry asphalt"""
 MIN_FEASIBLE_TTC = 1.0
-"""[s]"""
+"""minimum time to collision [s]"""
 MAX_FEASIBLE_BRAKING = 6.0
-"""[m/s2]"""
+"""maximum braking [m/s2]"""
 TOLERANCE = 1e-6
+"""tolerance of these limits for rounding errors"""
 
 FEASIBLE = "feasible"
 HARD_BRAKING_METRIC = "human_braking_beyond_4_5"
-"""metric of human drivers that is compared with the human baseline"""
+"""metric of human drivers whose value must not exceed that of the human baseline"""
 
 
 def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> str:
     """Return the verdict on an episode: `FEASIBLE`, or the first reason against it.
 
-    It is empty for an episode that failed or had no CAV. `baseline_braking` is how often human drivers brake
-    beyond 4.5 m/s2 without CAVs [per million vehicle-steps]; None: unknown.
+    It is empty for an episode that failed or had no CAV. `baseline_braking` is the `HARD_BRAKING_METRIC` of the human
+    baseline [per million vehicle-steps]; None: unknown.
     """
     if row["status"] == "failed" or isnan(row["cav_max_braking"]):
         return ""
@@ -37,7 +38,7 @@ def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> s
 
 
 def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tuple[int, float, str]]:
-    """Return the number of each violated limit, a value that is larger in worse violations, and the reason."""
+    """Return for each violated limit its number, a value that increases with the violation, and the reason as text."""
     required, has_lanes = row.get("required_time_gap") or DEFAULT_REQUIRED_TIME_GAP, row.get("has_lanes", False)
     time_gap, human_braking = row["min_time_gap"], row[HARD_BRAKING_METRIC]
     min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
@@ -71,16 +72,16 @@ def feasibility_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> di
 
 
 def baseline_rows(label: str, rows_by_driver: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the rows of the human baseline of a driver; of compared results, those of the same result."""
+    """Return the rows of the human baseline for a driver; in a comparison of results, those of the same result."""
     result, _, _ = label.rpartition(": ")
     return rows_by_driver.get(f"{result}: human", rows_by_driver.get("human", []))
 
 
 def overall_feasibility(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]] = ()) -> str:
-    """Return one verdict on all episodes of a driver, and how many violate a limit.
+    """Return one verdict on all episodes of a driver, with the number of episodes that violate a limit.
 
-    The reason is the first limit that any episode violates, with the value of the worst. `baseline` has the rows of
-    human-only traffic on the same road: a driver is not blamed for braking that human drivers do without CAVs.
+    The reason is the first limit that any episode violates, with the value of the worst episode. `baseline` has the
+    rows of the human baseline on the same road, with which the braking of human drivers is compared.
     """
     alone = [row[HARD_BRAKING_METRIC] for row in baseline if row["status"] == "completed"]
     own_rows = [{**row, HARD_BRAKING_METRIC: 0.0} for row in rows]

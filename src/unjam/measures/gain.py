@@ -16,9 +16,9 @@ from unjam.worlds.record import Floats
 MIN_GAIN, MAX_GAIN = -1.0, 1.5
 """range to which gains are clipped"""
 MIN_REFERENCE_GAIN = 0.03
-"""smallest improvement of the reference, as a share of the baseline's performance, with which a road has a gain"""
+"""smallest improvement by the reference, as a share of the baseline's performance; below it there is nothing to gain"""
 MEAN_GAIN = "mean gain"
-"""objective of tuning on several roads"""
+"""name of the objective of tuning on several roads"""
 
 EpisodeRows = Sequence[dict[str, Any]]
 
@@ -40,7 +40,7 @@ def performance_bound(row: dict[str, Any]) -> float:
 
 
 def is_gain_negligible(baseline: EpisodeRows, reference: Sequence[float]) -> bool:
-    """Return whether the reference is hardly better than the human baseline, so that only losses count."""
+    """Return whether the reference is hardly better than the human baseline, so that there is nothing to gain."""
     before = float(np.mean([performance(row) for row in baseline]))
     return float(np.mean(reference)) - before < MIN_REFERENCE_GAIN * abs(before)
 
@@ -48,8 +48,8 @@ def is_gain_negligible(baseline: EpisodeRows, reference: Sequence[float]) -> boo
 def normalized_differences(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Floats:
     """Return the gain over the baseline by seed, relative to that of the reference, linearized around the mean.
 
-    A negligible gain of the reference is replaced by `MIN_REFERENCE_GAIN`; episodes that did not run count as
-    zero. Arguments as in `normalized_gain`.
+    A negligible gain of the reference is replaced by `MIN_REFERENCE_GAIN`. Episodes that did not run have a gain of
+    zero. The arguments are those of `normalized_gain`.
     """
     pairs = {str(row["seed"]): (performance(row), best) for row, best in zip(baseline, reference, strict=True)}
     before, best = np.array([pairs[str(row["seed"])] for row in rows]).T
@@ -58,7 +58,7 @@ def normalized_differences(rows: EpisodeRows, baseline: EpisodeRows, reference: 
 
 
 def is_gain_capped(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> bool:
-    """Return whether only losses count: the driver is infeasible or lowers flow, or nothing is to be gained."""
+    """Return whether the gain is at most zero: the driver is infeasible or lowers flow, or there is nothing to gain."""
     flow = paired_difference(rows, baseline, FLOW_METRIC)
     lowers_flow = flow.high < -MAX_FLOW_LOSS * float(np.mean([row[FLOW_METRIC] for row in baseline]))
     return is_gain_negligible(baseline, reference) or lowers_flow or overall_feasibility(rows, baseline) != FEASIBLE
@@ -80,9 +80,10 @@ def normalized_gain(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequenc
 
 
 def gain_by_seed(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Floats:
-    """Return the gain on one road by seed, around its mean; where it is capped, only losses differ.
+    """Return the gain on one road by seed; the mean over the seeds is that of `normalized_gain`.
 
-    With these, a mean over roads that share seeds has a CI over seeds. Arguments as in `normalized_gain`.
+    From these values follows the CI of a mean over roads that share seeds. The arguments are those of
+    `normalized_gain`.
     """
     limit = 0.0 if is_gain_capped(rows, baseline, reference) else MAX_GAIN
     values = np.clip(normalized_differences(rows, baseline, reference), MIN_GAIN, limit)

@@ -20,18 +20,18 @@ from unjam.measures.statistics import (
 )
 
 RowsByDriver = dict[str, list[dict[str, Any]]]
-"""by driver: a row of metrics per episode, failed episodes included"""
+"""rows of metrics by driver: one row for each episode, failed ones included"""
 HUMAN_LABEL = "human"
 """label of the human baseline"""
 
 
 @dataclass(frozen=True)
 class TableCell:
-    """A number as tables show it."""
+    """A number in a table, as text."""
 
     mean: str
     interval: str = ""
-    """CI, or the range if there is none; with the number of episodes if it is not of all"""
+    """CI, or the range without a CI; with the number of episodes if some are left out"""
 
     def __str__(self) -> str:
         return f"{self.mean} {self.interval}".strip()
@@ -39,7 +39,7 @@ class TableCell:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A metric of all drivers, and then its differences."""
+    """A metric: a cell for each driver, then a cell for each difference to the baseline."""
 
     label: str
     unit: str
@@ -60,7 +60,7 @@ def choose_baseline(rows_by_driver: RowsByDriver) -> str:
 
 
 def table_headings(rows_by_driver: RowsByDriver, baseline: str) -> list[str]:
-    """Return the names of the columns: drivers, then the differences to the baseline."""
+    """Return the headings of the columns: drivers, then differences to the baseline."""
     return [*rows_by_driver, *(f"{label} − {baseline}" for label in _compared_rows(rows_by_driver, baseline))]
 
 
@@ -111,5 +111,5 @@ def estimate_cell(estimate: Estimate, digits: int, expected_count: int | None = 
 
 
 def with_no_break_spaces(text: str) -> str:
-    """Return a text that stays on one line of a table."""
+    """Return the text with no-break spaces, so that it stays on one line."""
     return text.replace(" ", "\N{NO-BREAK SPACE}")

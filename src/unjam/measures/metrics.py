@@ -1,4 +1,4 @@
-"""Metrics of an episode: each is defined here once, with its unit and source."""
+"""Metrics of an episode, with units and sources."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -14,19 +14,19 @@ from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats, Trajectory
 from unjam.worlds.reward import MAX_REWARD_CELLS, episode_reward_terms, eq16_reward
 
 STEADY_STATE_STEPS = 1000
-"""control steps at the end of an episode that count as steady state; of a shorter episode, its second half"""
+"""number of control steps at the end of an episode that are its steady state; in a shorter episode the second half"""
 STANDING_SPEED = 0.1
-"""[m/s]; SUMO's own threshold for a halting vehicle"""
+"""speed below which a vehicle counts as standing [m/s]: SUMO's threshold of a halting vehicle"""
 MAX_CALM_SPEED_STD = 0.3
-"""std of speed across vehicles below which traffic is calm [m/s]"""
+"""standard deviation of speed across vehicles below which there is no wave [m/s]"""
 MIN_CALM_SECONDS = 60.0
-"""how long traffic must stay calm before its wave counts as dissolved"""
+"""time without a wave after which the wave counts as dissolved [s]"""
 GASOLINE_DENSITY = 742.0
-"""[mg/ml], as in SUMO's PollutantsInterface"""
+"""density of gasoline in SUMO's PollutantsInterface [mg/ml]"""
 SHARE_BOUNDS, UNBOUNDED = (0.0, 1.0), (-inf, inf)
-"""bounds of metrics; others are not negative"""
+"""bounds of metrics that are shares, and of metrics that can be negative"""
 PEAK_END_SECONDS = 600.0
-"""end of the demand peak in which flow is counted [s]: there it is capacity, not demand"""
+"""duration at the end of the demand peak in which flow is counted [s]; there it is the capacity, not the demand"""
 
 EpisodeFunction = Callable[[Episode], float]
 
@@ -167,7 +167,7 @@ def share_standing(episode: Episode) -> float:
 def time_to_dissolve(episode: Episode) -> float:
     """Time until the wave at the start of the episode is dissolved [s]; NaN without a wave, or if it stays.
 
-    It ends with the first moment from which on the std of speed across vehicles stays below 0.3 m/s for 60 s.
+    The wave is dissolved when the standard deviation of speed across vehicles stays below 0.3 m/s for 60 s.
     """
     spread = _per_step(np.nanstd, episode.speeds)
     calm = np.isnan(spread) | (spread < MAX_CALM_SPEED_STD)
@@ -342,18 +342,20 @@ def travel_time_metric(group: str) -> EpisodeFunction:
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric as tables show it."""
+    """A metric, and how tables show it."""
 
     function: EpisodeFunction
+    """computes the metric; its docstring is the description in tables"""
     label: str
     unit: str
     digits: int = 2
+    """number of decimal places"""
     bounds: tuple[float, float] = (0.0, inf)
     """smallest and largest possible value"""
 
 
 def _braking_metrics(group: Literal["CAV", "human"]) -> dict[str, Metric]:
-    """Return the metrics of how often CAVs or human drivers brake beyond each of `BRAKING_THRESHOLDS`."""
+    """Return a metric for each of `BRAKING_THRESHOLDS`: how often a group of vehicles brakes harder."""
 
     def exceedance(index: int, limit: float) -> EpisodeFunction:
         def per_million(episode: Episode) -> float:
@@ -425,9 +427,9 @@ METRICS: dict[str, Metric] = {
 
 
 def measure(episode: Episode) -> dict[str, Any]:
-    """Return the row of an episode: its seed and SUMO's, status, steps, drawn values, every metric, the verdict.
+    """Return the row of an episode: its seeds, status, steps, drawn values, all metrics, and the feasibility.
 
-    The metrics of a failed episode are NaN; its row has the reason.
+    The metrics of a failed episode are NaN, and its row contains the reason.
     """
     row = {
         "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),

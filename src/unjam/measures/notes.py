@@ -1,4 +1,4 @@
-"""Notes to read before the metrics: missing demand, early ends, teleports, SUMO's warnings."""
+"""Notes on the episodes of an evaluation: missing demand, early ends, teleports, SUMO's warnings."""
 
 import re
 from collections import Counter
@@ -10,15 +10,15 @@ from unjam.measures.metric_table import RowsByDriver
 from unjam.measures.statistics import has_ended_early
 
 MAX_EARLY_END_SHARE = 0.05
-"""share of the baseline's episodes that may end early; beyond it comparisons would mislead"""
+"""maximum share of the baseline's episodes that end early; with more of them comparisons would mislead"""
 MAX_WARNING_KINDS = 10
 """kinds of SUMO's warnings that are shown, the most frequent first"""
 MAX_BACKLOG_SHARE = 0.05
-"""share of the vehicles in the insertion backlog at the end beyond which a note says so"""
+"""share of the vehicles in the insertion backlog at the end, above which there is a note"""
 LOST_DEMAND_PATTERN = re.compile(
     "sorted by departure time|no (valid )?route|discard|removing vehicle|not reachable|inserted", re.IGNORECASE
 )
-"""SUMO's warnings of missing demand: these come first"""
+"""pattern of SUMO's warnings about missing demand, which are listed first"""
 
 
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:

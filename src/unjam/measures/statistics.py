@@ -1,7 +1,7 @@
 """Means over seeds and over trainings, with confidence intervals (CI) that have the stated coverage.
 
-A CI is Student's t: it covers 95 % from three values on; a percentile bootstrap of five values covers 84 %.
-Where no CI would cover, there is none, and texts show the range of the values instead.
+A CI is that of Student's t, which has a coverage of 95 % for three values or more; a percentile bootstrap of five
+values has 84 %. Where no CI has the stated coverage, texts show the range of the values instead.
 """
 
 from collections.abc import Sequence
@@ -16,31 +16,34 @@ from unjam.measures.metrics import METRICS, UNBOUNDED
 
 CONFIDENCE = 0.95
 MIN_INTERVAL_VALUES = 3
-"""fewest values with a CI: that of two values is thirteen times as wide as their distance"""
+"""minimum number of values for a CI; that of two values is thirteen times as wide as their distance"""
 
 METRICS_DEFINED_AT_EARLY_END = {
     *("collisions", "min_ttc", "min_time_gap", "cav_min_ttc", "max_drac", "max_jerk", "shield_max_braking"),
     *("cav_max_braking", "cut_in_max_braking", "human_max_braking"),
 }
-"""metrics that also count for episodes that ended early: severity and number of conflicts"""
+"""metrics of conflicts, which are also defined for episodes that ended early"""
 RETURN_METRICS = {"return", "return_eq16"}
-"""metrics that the reward defines also for a collision"""
+"""metrics that are also defined for episodes with a collision, because the reward contains it"""
 MIN_VERDICT_TRAININGS = 10
-"""fewest trainings for a verdict on a method; with fewer, it covers only these trainings"""
+"""minimum number of trainings for a verdict on a method; with fewer, the verdict is about these trainings"""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean with its CI, NaN without one; all values are NaN if there is nothing to average."""
+    """A mean with its confidence interval (CI); all numbers are NaN if there are no values."""
 
     mean: float
     low: float
+    """lower end of the CI; NaN without a CI"""
     high: float
+    """upper end of the CI; NaN without a CI"""
     count: int
     """number of values"""
     smallest: float = field(default=nan, compare=False)
+    """smallest value"""
     largest: float = field(default=nan, compare=False)
-    """of the values: the range to show if there is no CI"""
+    """largest value; with `smallest` the range to show if there is no CI"""
 
     @property
     def half_width(self) -> float:
@@ -51,12 +54,15 @@ class Estimate:
 def estimate(
     values: Sequence[float], confidence: float = CONFIDENCE, trim: float = 0.0, bounds: tuple[float, float] = UNBOUNDED
 ) -> Estimate:
-    """Return the mean of independent `values` and its CI, Student's t; values that are not finite are left out.
+    """Return the mean of independent `values` with its CI; values that are not finite are left out.
 
-    Fewer than `MIN_INTERVAL_VALUES` values have no CI; equal values have one of no width. `confidence` is the coverage
-    of the CI; it is clipped at `bounds`, the smallest and largest possible mean. `trim` is the share left out at either
-    end, 0.25 for the interquartile mean; the CI is then that of the trimmed mean by winsorized variance: Tukey and
-    McLaughlin 1963, Sankhya A 25.
+    Fewer than `MIN_INTERVAL_VALUES` values have no CI; the CI of equal values has no width.
+
+    Args:
+        confidence: coverage of the CI.
+        trim: share of the values that is left out at either end, 0.25 for the interquartile mean. The CI is then that
+            of the trimmed mean by winsorized variance (Tukey and McLaughlin 1963, Sankhya A 25).
+        bounds: smallest and largest possible mean, at which the CI is clipped.
     """
     finite = np.array([value for value in values if np.isfinite(value)], float)
     if not len(finite):
@@ -82,7 +88,7 @@ def _student_t(degrees: float, confidence: float = CONFIDENCE) -> float:
 
 
 def display_digits(value: Estimate, digits: int) -> int:
-    """Return the number of digits to show an estimate: two more if the mean would be rounded to zero."""
+    """Return the number of digits with which to show an estimate: two more if the mean would be rounded to zero."""
     return digits + 2 if value.mean and not round(value.mean, digits) else digits
 
 
@@ -92,10 +98,7 @@ def has_ended_early(row: dict[str, Any]) -> bool:
 
 
 def metric_value(row: dict[str, Any], name: str) -> float:
-    """Return a metric of a row of `measure` for statistics: NaN if an early end makes it meaningless.
-
-    A metric of the first minutes must not be averaged with those of complete episodes.
-    """
+    """Return a metric from a row of `measure`: NaN if the episode ended early and the metric is then not comparable."""
     counts = not has_ended_early(row) or name in METRICS_DEFINED_AT_EARLY_END
     return row[name] if counts or (name in RETURN_METRICS and row["status"] == "collision") else nan
 
@@ -127,7 +130,7 @@ def paired_difference(
 
 
 def linearized_ratio(numerators: Any, denominators: Any) -> Any:
-    """Return values with the ratio of the means as mean, and its CI as CI (delta method).
+    """Return one value per seed, the mean and CI of which are those of the ratio of two means (delta method).
 
     Numerators and denominators are measured on the same seeds, so their errors are correlated; shape (seeds,).
     Source: Cochran 1977, Sampling Techniques, section 6.3.
@@ -137,7 +140,7 @@ def linearized_ratio(numerators: Any, denominators: Any) -> Any:
 
 
 def format_difference(difference: Estimate, digits: int = 0) -> str:
-    """Return a difference with its sign and its CI; without one, with the range of the values."""
+    """Return a difference with its sign, and its CI or else the range of the values, as text."""
     if not difference.count:
         return "–"
     interval = format_ci(difference, f"+.{digits}f")
@@ -150,8 +153,13 @@ def format_share(share: Estimate) -> str:
     return f"{100 * share.mean:.0f} %{interval}"
 
 
+def format_percent(share: float) -> str:
+    """Return a share in percent."""
+    return f"{100 * share:g} %"
+
+
 def format_ci(value: Estimate, format_spec: str) -> str:
-    """Return the CI as text, without one the range; empty for a single value."""
+    """Return the CI, or else the range of the values, as text; empty for a single value."""
     if not isnan(value.low):
         return f"[{value.low:{format_spec}}, {value.high:{format_spec}}]"
     if value.count < 2 or isnan(value.smallest):
@@ -160,7 +168,7 @@ def format_ci(value: Estimate, format_spec: str) -> str:
 
 
 def gain_verdict(gain: Estimate, trainings: int = 1) -> str:
-    """Return the verdict on the return difference to the expert; one on the method needs ten trainings."""
+    """Return a verdict on the difference of the return to that of the expert, as a sentence."""
     if isnan(gain.low):
         return "No conclusion: there is no confidence interval."
     if gain.low <= 0 <= gain.high:
@@ -175,7 +183,7 @@ def gain_verdict(gain: Estimate, trainings: int = 1) -> str:
 def estimate_over_trainings(
     values: Sequence[float], trim: float = 0.0, bounds: tuple[float, float] = UNBOUNDED
 ) -> Estimate:
-    """Return the estimate of one value per training; a bimodal sample has no CI, only the range."""
+    """Return the estimate from one value per training; bimodal values have no CI."""
     result = estimate(values, trim=trim, bounds=bounds)
     return replace(result, low=nan, high=nan) if is_bimodal(values) else result
 

@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 
 from unjam.errors import InputError
 from unjam.files import atomic_write, check_parent_folder
-from unjam.measures.effect import MAX_FLOW_LOSS, MIN_VERDICT_SEEDS, format_percent
+from unjam.measures.effect import MAX_FLOW_LOSS
 from unjam.measures.metric_table import estimate_cell
-from unjam.measures.statistics import Estimate, format_difference
-from unjam.reports import figures
+from unjam.measures.recommendation import MIN_VERDICT_SEEDS
+from unjam.measures.statistics import Estimate, format_difference, format_percent
+from unjam.reports import figures, space_time
 from unjam.reports.html import render_template
 from unjam.reports.results import original_command, read_results, replace_null
 
@@ -62,9 +63,9 @@ def render_assessment(folder: Path) -> str:
         result_rows=_result_rows(assessment),
         candidate_rows=[_tuning_row(each) for each in assessment["candidates"]],
         effect_figure=figures.data_uri(effect_figure(assessment)),
-        space_time=figures.data_uri(figures.space_time_figure(panels)) if panels else "",
+        space_time=figures.data_uri(space_time.space_time_figure(panels)) if panels else "",
         panels=[panel.driver for panel in panels],
-        has_lane_maps=figures.has_lane_maps(panels),
+        has_lane_maps=space_time.has_lane_maps(panels),
         percent=format_percent,
         breakable=breakable_label,
         max_flow_loss=MAX_FLOW_LOSS,

@@ -3,20 +3,17 @@
 import base64
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps, rc_context
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize, to_hex
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from unjam.reports.results import Float32s, PlotEpisode, seconds_by_part
+from unjam.reports.results import PlotEpisode, seconds_by_part
 
 SPEED_COLORMAP = "viridis"
 """slow is dark, fast is bright: readable with color blindness and in print"""
@@ -32,18 +29,6 @@ DPI = 130
 """pixels per inch of rasterized parts"""
 MAX_PLOT_TIMES = 600
 """times of an episode that a figure shows"""
-SPEED_FIELD_POSITIONS = 250
-"""positions along the road at which a figure shows a speed"""
-FILL_DISTANCE, FILL_SECONDS = 10.0, 1.4
-"""distance from a vehicle up to which a figure shows its speed: meters, plus seconds of driving"""
-MAX_TIME_BINS, MAX_POSITION_BINS = 240, 100
-"""of a map of a lane"""
-MIN_SAMPLES_PER_CELL = 4
-"""mean number of samples in a cell that leaves hardly any cell empty"""
-MAX_LANE_MAPS = 4
-"""if there are more lanes, those with the most traffic have maps"""
-HUMAN_LINE_STYLE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
-CAV_LINE_STYLE: dict[str, Any] = {"colors": CAV_PLOT_COLOR, "linewidths": 1.6}
 
 PLOT_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -106,225 +91,6 @@ def _reduce_colors(png: bytes) -> bytes:
     opaque = Image.alpha_composite(background, image).convert("RGB")
     opaque.quantize(256, Image.Quantize.MAXCOVERAGE).save(content, "PNG")
     return content.getvalue()
-
-
-def speed_scale(episodes: Sequence[PlotEpisode]) -> Normalize:
-    """Return one scale of speed for all figures of these episodes."""
-    max_speed = max(float(np.nanmax(episode.speeds, initial=0.0)) for episode in episodes)
-    return Normalize(0.0, max(1.0, np.ceil(max_speed)))
-
-
-class PanelRow(NamedTuple):
-    """A row of panels over time: its relative height, and how to draw an episode with a scale of speed."""
-
-    label: str
-    height: float
-    draw: Callable[[Axes, PlotEpisode, Normalize], None]
-
-
-def episode_grid(episodes: Sequence[PlotEpisode], rows: Sequence[PanelRow], height: float) -> Figure:
-    """Draw rows of panels for each episode, all with one scale of speed; up to three episodes next to each other.
-
-    `height` is that of all rows of one episode [inch].
-    """
-    count = len(episodes)
-    columns = 2 if count == 4 else min(count, 3)
-    blocks = -(-count // columns)
-    figure, heights = new_figure(height * blocks + 0.3), [row.height for row in rows] * blocks
-    panels = figure.subplots(len(heights), columns, sharex=True, squeeze=False, height_ratios=heights)
-    scale, longest = speed_scale(episodes), max(episode.times[-1] for episode in episodes)
-    for number, episode in enumerate(episodes):
-        block, column = divmod(number, columns)
-        for index, row in enumerate(rows):
-            axes = panels[block * len(rows) + index, column]
-            row.draw(axes, episode, scale)
-            axes.set_xlim(0, longest)
-            if index == 0:
-                axes.set_title(short_label(episode.driver), fontsize=10)
-            if column == 0:
-                axes.set_ylabel(row.label)
-            if index == len(rows) - 1 and number + columns >= count:
-                axes.set_xlabel("time [s]")
-                axes.tick_params(labelbottom=True)
-    for axes in panels.flat:
-        axes.set_visible(bool(axes.collections))
-    figure.align_ylabels(panels[:, 0])
-    bar = figure.colorbar(ScalarMappable(scale, SPEED_COLORMAP), ax=panels, shrink=0.8, pad=0.02, aspect=30)
-    bar.set_label("speed [m/s]")
-    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    return figure
-
-
-def add_vehicle_lines(axes: Axes, times: np.ndarray, positions: np.ndarray, max_step: float, **style: Any) -> None:
-    """Add a line for each vehicle, interrupted at NaN and at steps of `max_step` or more [m].
-
-    `times` has shape (T,), `positions` shape (T, N).
-    """
-    points = np.stack([np.broadcast_to(times, positions.T.shape), positions.T], axis=-1)
-    keep = np.abs(np.diff(positions.T)) < max_step
-    segments = list(np.stack([points[:, :-1], points[:, 1:]], axis=2)[keep])
-    axes.add_collection(LineCollection(segments, rasterized=True, **style))
-
-
-@rc_context(PLOT_STYLE)
-def trajectory_figure(episodes: Sequence[PlotEpisode]) -> Figure:
-    """Draw the position of every vehicle over time, and the speed; a panel per driver.
-
-    A stop-and-go wave is a dark band that runs against the direction of travel. Sections where the road crosses
-    itself are shaded. On a merge road the ramp has a panel below that of the main road; on a user network, the
-    most frequent route is shown.
-    """
-    branches = list(dict.fromkeys(branch for episode in episodes for branch in episode.branches)) or [""]
-    rows = [_branch_row(episodes, branch, number == 0) for number, branch in enumerate(branches)]
-    return episode_grid(episodes, rows, 3.1 + 0.9 * (len(rows) - 1))
-
-
-def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> PanelRow:
-    present = np.concatenate([_branch_positions(each, branch, is_main).ravel() for each in episodes])
-    present = present[~np.isnan(present)]
-    extent = (float(present.min()), float(present.max())) if present.size else (0.0, 1.0)
-    if all(episode.is_closed for episode in episodes):
-        extent = 0.0, max(episode.loop_length for episode in episodes)
-
-    def draw(axes: Axes, episode: PlotEpisode, scale: Normalize) -> None:
-        stride = max(1, len(episode.times) // MAX_PLOT_TIMES)
-        arrays = (episode.times, _branch_positions(episode, branch, is_main), episode.speeds)
-        times, positions, speeds = (array[::stride] for array in arrays)
-        axes.grid(False)
-        axes.set_ylim(*extent)
-        for start, end in episode.crossings:
-            axes.axhspan(start, end, color=TEXT_COLOR, alpha=0.15, lw=0, zorder=1.5, rasterized=True)
-        loop_length, max_step, width = 0.0, np.inf, 0.5  # open roads have many vehicles
-        grid = np.linspace(*extent, SPEED_FIELD_POSITIONS)
-        if episode.is_closed:
-            loop_length, max_step, width = episode.loop_length, episode.loop_length / 2, 1.0  # no line over the seam
-            positions, grid = positions % loop_length, np.linspace(0.0, loop_length, SPEED_FIELD_POSITIONS)
-        field = speed_field(positions, speeds, grid, loop_length)
-        axes.pcolormesh(times, grid, field, cmap=SPEED_COLORMAP, norm=scale, rasterized=True)
-        is_cav = np.isin(np.arange(speeds.shape[1]), episode.cav_columns)
-        for group, style in ((~is_cav, HUMAN_LINE_STYLE), (is_cav, CAV_LINE_STYLE)):
-            style = {**style, "linewidths": width * style["linewidths"]}
-            add_vehicle_lines(axes, times, positions[:, group], max_step, **style)
-
-    return PanelRow(f"{branch} [m]" if branch else "position along the road [m]", 3.0 if is_main else 1.0, draw)
-
-
-def _branch_positions(episode: PlotEpisode, branch: str, is_main: bool) -> np.ndarray:
-    """Return the positions of the vehicles while they are on a branch, shape (T + 1, N); NaN elsewhere.
-
-    Vehicles of other branches are on the main one downstream of the merge.
-    """
-    if not branch:
-        return episode.positions
-    own = np.array(episode.branches) == branch
-    merged = episode.positions >= 0
-    return np.where(own | merged if is_main else own & ~merged, episode.positions, np.nan)
-
-
-def speed_field(positions: np.ndarray, speeds: np.ndarray, grid: np.ndarray, loop_length: float) -> np.ndarray:
-    """Return the speed along the road at each time [m/s], shape (grid points, times).
-
-    It is interpolated between vehicles, and NaN far from all of them. Lines alone would leave white stripes, which make
-    moiré patterns on screens. `positions` [m] and `speeds` [m/s] of the vehicles have the shape (times, N), NaN off the
-    road; `grid` has the positions of the result [m], ascending; `loop_length` [m] is 0 for an open road.
-    """
-    field = np.full((len(grid), len(positions)), np.nan)
-    for step, (position, speed) in enumerate(zip(positions, speeds, strict=True)):
-        present = np.flatnonzero(~np.isnan(position))
-        if not len(present):
-            continue
-        present = present[np.argsort(position[present])]
-        position, speed = position[present], speed[present]
-        if loop_length:  # continue at both ends
-            position = np.concatenate([position - loop_length, position, position + loop_length])
-            speed = np.tile(speed, 3)
-        behind = (np.searchsorted(position, grid) - 1).clip(min=0)
-        ahead = (behind + 1).clip(max=len(position) - 1)
-        nearest = np.where(np.abs(grid - position[behind]) < np.abs(grid - position[ahead]), behind, ahead)
-        is_near = np.abs(grid - position[nearest]) <= FILL_DISTANCE + FILL_SECONDS * speed[nearest]
-        field[is_near, step] = np.interp(grid, position, speed)[is_near]
-    return field
-
-
-def has_lane_maps(episodes: Sequence[PlotEpisode]) -> bool:
-    """Return whether episodes are drawn lane by lane: whether all are on the same road with lanes."""
-    return bool(episodes) and len({tuple(each.lane_names) for each in episodes}) == 1 and bool(episodes[0].lane_names)
-
-
-def space_time_figure(episodes: Sequence[PlotEpisode]) -> Figure:
-    """Draw positions and speeds over time: a map for each lane, or without lanes a line for each vehicle."""
-    return lane_map_figure(episodes) if has_lane_maps(episodes) else trajectory_figure(episodes)
-
-
-@rc_context(PLOT_STYLE)
-def lane_map_figure(episodes: Sequence[PlotEpisode]) -> Figure:
-    """Draw the mean speed in cells of time and road, a row per lane from left to right, a column per driver.
-
-    Speeds are Edie's: total distance over total time in a cell. Cells without vehicles are white; red lines are
-    CAVs.
-    """
-    lanes = _busiest_lanes(episodes)
-    extents = [_lane_range(episodes, lane) for lane in lanes]
-    max_span = max(end - start for start, end in extents)
-    longest = max(episode.times[-1] for episode in episodes)
-    rows = [
-        _lane_row(episodes[0], lane, (longest, *extent), max_span) for lane, extent in zip(lanes, extents, strict=True)
-    ]
-    return episode_grid(episodes, rows, 0.4 + 1.75 * sum(row.height for row in rows))
-
-
-def _busiest_lanes(episodes: Sequence[PlotEpisode]) -> list[int]:
-    """Return the lanes to draw, from left to right: of those with vehicles on the road shown, the busiest."""
-    counts = {
-        lane: sum(int(np.sum((each.lane_indices == lane) & ~np.isnan(each.positions))) for each in episodes)
-        for lane in range(len(episodes[0].lane_names))
-    }
-    busy = sorted((lane for lane in counts if counts[lane]), key=lambda lane: -counts[lane])
-    return sorted(busy[:MAX_LANE_MAPS]) or [0]
-
-
-def _lane_range(episodes: Sequence[PlotEpisode], lane: int) -> tuple[float, float]:
-    present = np.concatenate([each.positions[each.lane_indices == lane] for each in episodes])
-    present = present[~np.isnan(present)]
-    return (float(present.min()), float(present.max()) + 1.0) if len(present) else (0.0, 1.0)
-
-
-def mean_speed_grid(episode: PlotEpisode, lane: int, extent: tuple[float, float, float]) -> Float32s:
-    """Return the mean speeds in a lane's cells of position and time [m/s], NaN where there is no vehicle.
-
-    `extent` is the last time [s] and the first and last position [m]. A cell is not shorter than the distance
-    between two samples of a vehicle, or fast vehicles would skip cells, unless there are enough vehicles.
-    """
-    longest, start, end = extent
-    steps, vehicles = np.nonzero((episode.lane_indices == lane) & ~np.isnan(episode.positions))
-    time_bins = max(1, min(MAX_TIME_BINS, int(longest / episode.control_step)))
-    step_length = float(np.nanmax(episode.speeds, initial=1.0)) * episode.control_step
-    enough = max((end - start) / step_length, len(steps) / time_bins / MIN_SAMPLES_PER_CELL)
-    position_bins = max(1, min(MAX_POSITION_BINS, int(enough)))
-    column = (episode.times[steps] / (longest + episode.control_step) * time_bins).astype(int)
-    share = (episode.positions[steps, vehicles] - start) / (end - start)
-    row = (share * position_bins).astype(int).clip(0, position_bins - 1)
-    sums, counts = np.zeros((2, position_bins, time_bins))
-    np.add.at(sums, (row, column), episode.speeds[steps, vehicles])
-    np.add.at(counts, (row, column), 1)
-    return np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0).astype(np.float32)
-
-
-def _lane_row(first: PlotEpisode, lane: int, extent: tuple[float, float, float], max_span: float) -> PanelRow:
-    longest, start, end = extent
-
-    def draw(axes: Axes, episode: PlotEpisode, scale: Normalize) -> None:
-        speeds = mean_speed_grid(episode, lane, extent)
-        axes.grid(False)
-        rows, columns = speeds.shape
-        edges = np.linspace(0.0, longest + episode.control_step, columns + 1), np.linspace(start, end, rows + 1)
-        axes.pcolormesh(*edges, speeds, cmap=SPEED_COLORMAP, norm=scale, rasterized=True)
-        axes.set_ylim(start, end)
-        cavs = episode.cav_columns
-        positions = np.where(episode.lane_indices[:, cavs] == lane, episode.positions[:, cavs], np.nan)
-        add_vehicle_lines(axes, episode.times, positions, np.inf, colors=CAV_PLOT_COLOR, linewidths=0.35)
-
-    return PanelRow(f"{first.lane_names[lane]}\n[m]", max((end - start) / max_span, 0.3), draw)
 
 
 @rc_context(PLOT_STYLE)

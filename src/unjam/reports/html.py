@@ -18,7 +18,7 @@ from unjam import __version__
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder
 from unjam.measures.metric_table import metric_table, table_headings
 from unjam.measures.statistics import metric_estimate
-from unjam.reports import figures, summary
+from unjam.reports import figures, space_time, summary
 from unjam.reports.model import error_figure, example_figure, model_section, rollout_figure, wave_figure
 from unjam.reports.results import PlotEpisode, Results, damaged_results_error, original_command, read_results
 from unjam.reports.video import split_lines
@@ -98,7 +98,7 @@ def render_report(results: Sequence[Results]) -> str:
         figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, panels).items()},
         panels=panels,
         road_values=list(dict.fromkeys(roads)),
-        has_lane_maps=figures.has_lane_maps(panels),
+        has_lane_maps=space_time.has_lane_maps(panels),
         baseline_differences=summary.baseline_differences(columns),
         episodes_csv=summary.episodes_as_csv(columns),
         model=model_section(single) if single else None,
@@ -116,7 +116,7 @@ def render_report(results: Sequence[Results]) -> str:
 def _report_figures(sources: Sequence[tuple[str, Results]], panels: Sequence[PlotEpisode]) -> dict[str, Figure]:
     found: dict[str, Figure] = {}
     if panels:
-        found |= {"space_time": figures.space_time_figure(panels), "time_series": figures.time_series_figure(panels)}
+        found |= {"space_time": space_time.space_time_figure(panels), "time_series": figures.time_series_figure(panels)}
     results = [result for _, result in sources]
     if runs := {name: result.progress for name, result in sources if result.progress}:
         found["learning_curve"] = figures.learning_curve_figure(runs, _reference_returns(results))
@@ -168,7 +168,7 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
         "step": step,
         "frames": frames,
         "start": 0,
-        "max_speed": figures.speed_scale(panels).vmax,
+        "max_speed": space_time.speed_scale(panels).vmax,
         "colors": figures.color_table(),
         "vehicle_length": VEHICLE_LENGTH,
         "no_value": REPLAY_NAN,

@@ -15,9 +15,15 @@ from unjam.drivers.driver import Driver
 from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
-from unjam.measures.effect import AccResult, ControllerResult, assessment_headline, plotted_result, recommended_result
 from unjam.measures.feasibility import HARD_BRAKING_METRIC
 from unjam.measures.notes import check_baseline, episode_notes
+from unjam.measures.recommendation import (
+    AccResult,
+    ControllerResult,
+    assessment_headline,
+    plotted_result,
+    recommended_result,
+)
 from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
 from unjam.scenarios import make_scenario, scenario_recipe

@@ -112,7 +112,8 @@ class DriveResult:
         """Return every metric with its CI, and the trajectories of all vehicles, for notebooks."""
         import pandas as pd
 
-        from unjam.reports.figures import data_uri, space_time_figure
+        from unjam.reports.figures import data_uri
+        from unjam.reports.space_time import space_time_figure
 
         baseline = choose_baseline(self.rows)
         cells = [

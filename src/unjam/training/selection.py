@@ -10,19 +10,10 @@ from dataclasses import dataclass
 from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
-from unjam.measures.effect import (
-    MIN_VERDICT_SEEDS,
-    AccResult,
-    ControllerResult,
-    Effect,
-    describe_harm,
-    effect_of,
-    format_percent,
-    is_too_small,
-    required_seeds,
-)
+from unjam.measures.effect import Effect, describe_harm, effect_of, is_too_small
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.statistics import CONFIDENCE, Estimate, paired_difference
+from unjam.measures.recommendation import MIN_VERDICT_SEEDS, AccResult, ControllerResult, required_seeds
+from unjam.measures.statistics import CONFIDENCE, Estimate, format_percent, paired_difference
 from unjam.training.evaluate import raise_failure
 from unjam.training.executors import MessageCallback
 from unjam.training.seeds import make_test_seeds, selection_seeds

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from tests.reports.open_roads import ramp_episode, user_episode
 from unjam.measures.metrics import measure
-from unjam.reports.figures import lane_map_figure
 from unjam.reports.html import replay_data
 from unjam.reports.results import pack_episode, to_plot_episode, unpack_episode
+from unjam.reports.space_time import lane_map_figure
 from unjam.worlds import reward
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import REWARDS, episode_reward_terms, make_reward

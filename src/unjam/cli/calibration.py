@@ -1,4 +1,4 @@
-"""Optimization with Optuna: `unjam tune` of an expert, `unjam calibrate` of a user network to detectors."""
+"""Calibration: `unjam tune` of experts, `unjam calibrate` of user networks, `unjam fit-drivers` of human drivers."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -7,7 +7,15 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.cli import options as opt
-from unjam.cli.output import console, err_console, new_table, print_json, print_next_command, setting_options
+from unjam.cli.output import (
+    ProgressReporter,
+    console,
+    err_console,
+    new_table,
+    print_json,
+    print_next_command,
+    setting_options,
+)
 from unjam.errors import InputError
 
 CALIBRATION_COLUMNS = {
@@ -17,7 +25,7 @@ CALIBRATION_COLUMNS = {
     "speed_rmse": ("speed error (RMSE)", "m/s", 2),
     "score": ("score", "", 3),
 }
-"""label, unit and digits of each measure"""
+"""label, unit and number of digits of each metric"""
 
 
 @opt.with_options(changes=opt.scenario_changes)
@@ -25,10 +33,13 @@ def tune_command(
     *,
     scenario: opt.ScenarioArgument,
     expert: Annotated[str, Option("--expert", help="Name of the expert, as in unjam drivers.")] = "pi",
-    steps: Annotated[int, Option(min=1, help="Budget of steps, as that of a training.")] = 2_000_000,
+    steps: Annotated[int, Option(min=1, help="Maximum number of control steps of all trials together.")] = 2_000_000,
     vary: Annotated[
         list[str] | None,
-        Option(help="Parameters to vary, as in search.", show_default="all, a quarter to four times each"),
+        Option(
+            help="Parameters to vary: name=low..high, name=low..high:log, or name=a,b,c.",
+            show_default="all, from a quarter of the default to four times the default",
+        ),
     ] = None,
     changes: dict[str, Any],
     settings: opt.ScenarioSettingsOption = None,
@@ -37,7 +48,7 @@ def tune_command(
     screen: Annotated[
         bool | None,
         Option(
-            help="Evaluate trials in the batch simulator, exact or statistical, and only finalists in SUMO.",
+            help="Evaluate all trials in the batch simulator, and only the best of them in SUMO.",
             show_default="where the batch simulator supports the road",
         ),
     ] = None,
@@ -45,11 +56,11 @@ def tune_command(
     out: opt.OutOption = None,
     json: opt.JsonOption = False,
 ) -> None:
-    """Tune the parameters of an expert with the step budget of a training.
+    """Tune the parameters of an expert with Optuna.
 
     Trials are evaluated on tuning seeds, with the limits and the safety filter of the road; infeasible ones are
-    rejected. The tuned expert is a controller that every command accepts. The same command with the same --out
-    continues a stopped tuning.
+    rejected. The tuned expert is a controller that every command accepts. To continue a stopped tuning, repeat
+    the command with the same --out.
 
     Examples:
 
@@ -99,12 +110,13 @@ def calibrate_command(
     scenario: Annotated[str, Argument(help="Your own .sumocfg file.")],
     *,
     detectors: Annotated[
-        Path, Option(help="CSV file: edge or lane, position, begin, end, flow_veh_per_h, speed; SI units.")
+        Path, Option(help="CSV file with edge or lane, position [m], begin [s], end [s], flow_veh_per_h, speed [m/s].")
     ],
-    trials: Annotated[int, Option(min=2, help="Number of settings, including the unchanged network.")] = 60,
-    seeds: Annotated[int, Option(min=1, help="Simulations of each.")] = 3,
+    trials: Annotated[int, Option(min=2, help="Number of trials, including the unchanged network.")] = 60,
+    seeds: Annotated[int, Option(min=1, help="Number of simulations per trial.")] = 3,
     vary: Annotated[
-        list[str] | None, Option(help="Factors to vary: tau=0.5..2:log.", show_default="all, around 1")
+        list[str] | None,
+        Option(help="Factors to vary: name=low..high, as in tau=0.5..2:log.", show_default="all, around 1"),
     ] = None,
     begin: Annotated[float | None, Option(min=0, help="Start time [s].")] = None,
     end: Annotated[float | None, Option(min=0, help="End time [s].")] = None,
@@ -113,11 +125,11 @@ def calibrate_command(
     out: opt.OutOption = None,
     json: opt.JsonOption = False,
 ) -> None:
-    """Calibrate vehicle types and flows of your own network to detectors; write a new network.
+    """Calibrate vehicle types and flows of your own network to detectors, and write a new network.
 
-    Optuna searches factors on tau, accel, decel, minGap and speedFactor of the passenger types, and on the
+    Optuna searches factors for tau, accel, decel, minGap and speedFactor of the passenger types, and for the
     flows. The best trial and the unchanged network are evaluated on separate seeds. Your files are not modified.
-    The same command with the same --out continues a stopped calibration, also with more trials.
+    To continue a stopped calibration, also with more trials, repeat the command with the same --out.
 
     Examples:
 
@@ -133,7 +145,9 @@ def calibrate_command(
     space = parse_factor_space(vary or [])
     corridor = load_corridor(scenario, detectors, begin, end)
     if corridor.excluded_count:
-        err_console.print(f"{corridor.excluded_count} of the intervals are excluded: not between begin and end")
+        err_console.print(
+            f"{corridor.excluded_count} intervals of the detectors are excluded: they are not between begin and end"
+        )
     folder = opt.new_folder(out, f"calibrate-{Path(scenario).stem}")
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), DetectorPool(workers) as pool:
         on_message = (lambda line: None) if json else err_console.print
@@ -141,7 +155,7 @@ def calibrate_command(
     if json:
         print_json({"file": str(result.file), **calibration_document(replace(result, trials=[]))})
         return
-    table = new_table(("measure", "unit"), ("original", "calibrated", "difference"))
+    table = new_table(("metric", "unit"), ("original", "calibrated", "difference"))
     for name, columns in result.estimates().items():
         label, unit, digits = CALIBRATION_COLUMNS[name]
         cells = (
@@ -154,3 +168,66 @@ def calibrate_command(
     times = {"--begin": begin, "--end": end}
     time_options = [word for name, time in times.items() if time is not None for word in (name, f"{time:g}")]
     print_next_command("assess it", "assess", result.file, *time_options)
+
+
+def fit_drivers_command(
+    data: Annotated[
+        list[Path], Argument(help="Files of recorded trajectories, .parquet or .csv; several files form one data set.")
+    ],
+    out: Annotated[Path, Option(help="File to write the population to.")] = Path("drivers.json"),
+    format: Annotated[
+        str,
+        Option(
+            help="Format: table, ngsim, ngsim-reconstructed, highd, openacc or fcd.",
+            show_default="detected from the columns",
+        ),
+    ] = "",
+    driver: Annotated[str, Option(help="Columns of a table that identify the driver, like period,follower.")] = "",
+    select: Annotated[list[str] | None, Option(help="Only trajectories with column=value, like kind=human.")] = None,
+    residual: Annotated[
+        bool, Option(help="Also fit a network that is added to the IDM of every driver; takes minutes.")
+    ] = False,
+    drop_bad_rows: Annotated[
+        bool, Option("--drop-bad-rows", help="Drop bad rows instead of refusing the file.")
+    ] = False,
+    settings: Annotated[list[str] | None, Option("--set", help="Any setting: key=value, like rounds=2.")] = None,
+    seed: opt.SeedOption = 0,
+    json: opt.JsonOption = False,
+) -> None:
+    """Calibrate human drivers to recorded trajectories, and write a population that any scenario can use.
+
+    The IDM parameters minimize the error of the simulated gaps. Each driver has its own time headway, and the
+    other parameters are the same for all drivers (--set 'individual=["time_headway","minimum_gap"]' changes
+    this). The command lists the rows that it used, skipped and dropped.
+
+    Examples:
+
+    - unjam fit-drivers data.parquet
+    - unjam fit-drivers trajectories.csv --format ngsim --out people.json --residual
+    - unjam drive ring-jammed -d human -d pi --humans drivers.json
+    """
+    from unjam.following.fit_drivers import fit_drivers_from_files
+    from unjam.scenarios.population import write_population
+
+    changes: dict[str, Any] = {"residual": residual, "seed": seed, **opt.parse_settings(settings)}
+    columns = tuple(name for name in driver.split(",") if name)
+    filters = {name: str(value) for name, value in opt.parse_settings(select, "--select").items()}
+    with ProgressReporter("calibrating drivers") as reporter:
+        fit = fit_drivers_from_files(data, changes, format, drop_bad_rows, columns, filters, out, reporter)
+    write_population(out, fit.population)
+    if json:
+        print_json({"population": str(out), "read": fit.notes, **fit.facts()})
+        return
+    for line in fit.notes:
+        err_console.print(line)
+    population: Any = fit.population
+    typical = asdict(population.typical)
+    table = new_table(("parameter",), ("one for all", "mean", "std", "quartiles of the drivers"))
+    for name, statistics in population.parameter_statistics().items():
+        values = (typical[name], statistics["mean"], statistics["std"])
+        quartiles = "  ".join(f"{value:.2f}" for value in statistics["quartiles"])
+        table.add_row(name, *(f"{value:.2f}" for value in values), quartiles)
+    console.print(table)
+    for line in fit.report_lines():
+        console.print(line)
+    err_console.print(f"population: {out}")

@@ -1,0 +1,229 @@
+"""Recommendation of a controller for a road, and the findings of an assessment as text.
+
+A controller is recommended only if travel time is shown to be shorter than in the human baseline and than with ACC
+vehicles at the same penetration rate, flow is shown not to be lower, the CAVs are feasible, and human drivers do not
+brake hard more often. A difference of travel time that is shown to be below 0.5 % is neither a gain nor harm.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil, inf, isfinite
+from operator import attrgetter
+from typing import Any
+
+from unjam.measures.effect import (
+    MAX_FLOW_LOSS,
+    TIME_METRIC,
+    TOO_SMALL,
+    Effect,
+    format_seconds,
+    harm_checks,
+    is_too_small,
+)
+from unjam.measures.feasibility import FEASIBLE
+from unjam.measures.statistics import Estimate, format_difference, format_percent, metric_estimate
+
+MAX_TELEPORT_SHARE = 0.01
+"""share of the baseline's vehicles that SUMO may teleport or remove; with more of them travel times mean nothing"""
+NEGLIGIBLE_DELAY_SHARE = 0.05
+"""delay of the human baseline up to which there is nothing to gain, as a share of the free-flow travel time"""
+MIN_VERDICT_SEEDS = 10
+"""minimum number of seeds for a recommendation; with fewer the CI is not reliable"""
+NO_RECOMMENDATION = "No controller is recommended on this road"
+
+
+def rejection_reasons(effect: Effect) -> list[str]:
+    """Return all reasons against a recommendation."""
+    time, max_loss = format_seconds(effect.travel_time), MAX_FLOW_LOSS * effect.baseline_flow
+    # Too few seeds give NaN, with which every comparison is false: then a check fails.
+    checks = (
+        (effect.travel_time.count >= MIN_VERDICT_SEEDS, f"{effect.travel_time.count} test seeds are too few"),
+        (not effect.failed_episodes, f"{effect.failed_episodes} episodes failed"),
+        (not effect.early_ends, f"{effect.early_ends} episodes ended early"),
+        (
+            effect.baseline_teleport_share <= MAX_TELEPORT_SHARE,
+            f"nothing can be concluded: in the human baseline SUMO teleports or removes "
+            f"{100 * effect.baseline_teleport_share:.1f} % of the vehicles (limit {100 * MAX_TELEPORT_SHARE:g} %)",
+        ),
+        (effect.teleports <= 0, f"{effect.teleports} more vehicles teleported or removed than without CAVs"),
+        *((not is_worse, reason) for is_worse, reason in harm_checks(effect)),
+        (not effect.is_too_small, f"travel time differs from that of the human baseline by {TOO_SMALL}: {time}"),
+        (
+            effect.travel_time.low > 0 or effect.travel_time.high < 0 or effect.is_too_small,
+            f"travel time is not shown to be shorter than that of the human baseline: {time}",
+        ),
+        (
+            effect.flow.high < 0 or effect.flow.low >= -max_loss,
+            f"flow may be lower by more than {100 * MAX_FLOW_LOSS:g} %: {format_difference(effect.flow)} veh/h",
+        ),
+        (effect.feasibility == FEASIBLE, f"infeasible: {effect.feasibility or 'no CAV drove'}"),
+        (effect.collisions <= 0, f"{effect.collisions:.0f} more vehicles in contact than without CAVs"),
+        (
+            effect.hard_braking.mean <= 0,
+            "human drivers brake beyond 4.5 m/s² more often than in the human baseline: "
+            f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (the sign of the mean counts)",
+        ),
+    )
+    return [reason for is_fine, reason in checks if not is_fine]
+
+
+def required_seeds(difference: Estimate, half_width: float) -> float:
+    """Return the number of seeds with which a CI would exclude zero or be narrower than ±`half_width`.
+
+    The assumption is that the mean stays the same and that the width of the CI falls with the square root of the number
+    of seeds. Without a CI the result is infinite.
+    """
+    half, target = difference.half_width, max(abs(difference.mean), half_width)
+    if not isfinite(half):
+        return inf
+    return max(float(MIN_VERDICT_SEEDS), ceil(difference.count * (half / target) ** 2) if half else 0.0)
+
+
+@dataclass(frozen=True)
+class AccResult:
+    """Effect of ACC vehicles without a controller at a penetration rate, on test seeds."""
+
+    penetration_rate: float
+    effect: Effect
+    property_effect: Estimate | None = None
+    """difference of travel time to ACC vehicles with all properties of the vehicles that they replace [s]; None: these
+    ACC vehicles have the same properties"""
+    missing_seeds: float = 0.0
+    """number of further test seeds that a verdict needs"""
+
+    @property
+    def has_enough_seeds(self) -> bool:
+        """Whether the CI has enough seeds for a finding."""
+        return self.effect.travel_time.count >= MIN_VERDICT_SEEDS
+
+    @property
+    def summary(self) -> str:
+        """The finding as text."""
+        time = self.effect.travel_time
+        change = "is longer" if time.low > 0 else "is shorter" if time.high < 0 else "is not shown to differ"
+        if not self.has_enough_seeds:
+            change = f"is not shown to differ ({time.count} test seeds are too few)"
+        elif self.effect.is_too_small:
+            change = f"differs by {TOO_SMALL},"
+        text = (
+            f"ACC vehicles alone at a penetration rate of {format_percent(self.penetration_rate)}: travel time "
+            f"{change} compared with the human baseline. "
+            f"Differences: {self.effect.summary}{_missing_seeds_text(self.missing_seeds, time, 2)}."
+        )
+        if self.effect.feasibility != FEASIBLE:
+            text += f" They are infeasible themselves: {self.effect.feasibility or 'no CAV drove'}."
+        if self.property_effect is None:
+            return text
+        return f"{text} The properties set for CAVs change {format_seconds(self.property_effect)} of travel time."
+
+
+@dataclass(frozen=True)
+class ControllerResult:
+    """Effect of the controller that was selected for a penetration rate, on test seeds."""
+
+    penetration_rate: float
+    driver: str
+    effect: Effect
+    difference_to_acc: Estimate
+    """difference of travel time to ACC vehicles at the same penetration rate [s]"""
+    missing_seeds: float = 0.0
+    """number of further test seeds that a verdict needs"""
+
+    @property
+    def reasons(self) -> list[str]:
+        """Reasons against a recommendation."""
+        change, reasons = self.difference_to_acc, rejection_reasons(self.effect)
+        acc = "with ACC vehicles alone at this penetration rate"
+        if change.low == change.high == 0.0:
+            reasons.append("it never intervened: all travel times are those of ACC vehicles alone")
+        elif is_too_small(change, self.effect.baseline_travel_time):
+            reasons.append(f"travel time differs from that {acc} by {TOO_SMALL}: {format_seconds(change)}")
+        elif not change.high < 0:
+            relation = "longer than" if change.low > 0 else "not shown to be shorter than"
+            reasons.append(f"travel time is {relation} {acc}: {format_seconds(change)}")
+        return reasons
+
+    @property
+    def summary(self) -> str:
+        """The finding as text."""
+        name = f"{self.driver} at a penetration rate of {format_percent(self.penetration_rate)}"
+        if self.reasons:
+            missing = _missing_seeds_text(self.missing_seeds, self.difference_to_acc, 3)
+            return f"{name}: not recommended: {'; '.join(self.reasons)}{missing}."
+        effect = self.effect
+        return (
+            f"{name}: recommended. Travel time {format_seconds(effect.travel_time)} "
+            f"({100 * effect.relative_travel_time:+.1f} %), flow {format_difference(effect.flow)} veh/h, fuel "
+            f"{format_difference(effect.fuel, 1)} ml/km compared with the human baseline; travel time "
+            f"{format_seconds(self.difference_to_acc)} compared with ACC vehicles alone; "
+            f"{effect.travel_time.count} test seeds."
+        )
+
+
+def _missing_seeds_text(missing_seeds: float, difference: Estimate, episodes_per_seed: int) -> str:
+    """Return the width of the CI and the number of further seeds that a verdict needs, as text."""
+    if not missing_seeds:
+        return ""
+    if not isfinite(missing_seeds):
+        return f"; no verdict yet: {difference.count} test seeds are too few for a confidence interval"
+    episodes = f"{episodes_per_seed * missing_seeds:.0f} episodes"
+    needed = f"a verdict needs about {missing_seeds:.0f} more test seeds ({episodes})"
+    return f"; no verdict yet: the confidence interval is ±{difference.half_width:.1f} s, and {needed}"
+
+
+def recommended_result(results: Sequence[ControllerResult]) -> ControllerResult | None:
+    """Return the result with the shortest travel time among those without a reason against them; None without any."""
+    return _quickest([each for each in results if not each.reasons])
+
+
+def _quickest(results: Sequence[ControllerResult]) -> ControllerResult | None:
+    return min(results, key=lambda each: each.effect.relative_travel_time, default=None)
+
+
+def plotted_result(results: Sequence[ControllerResult]) -> ControllerResult | None:
+    """Return the result to plot: the recommended one, else the one with the shortest travel time."""
+    return recommended_result(results) or _quickest(results)
+
+
+def assessment_headline(
+    results: Sequence[ControllerResult], acc_results: Sequence[AccResult], baseline: Sequence[dict[str, Any]] = ()
+) -> str:
+    """Return the main finding of an assessment: the recommendation, and the effect of ACC vehicles alone.
+
+    `baseline` has the rows of the human baseline, which show whether traffic is nearly free-flowing.
+    """
+    best = recommended_result(results)
+    if best is not None:
+        effect, rate = best.effect, format_percent(best.penetration_rate)
+        first = (
+            f"Recommended on this road: {best.driver} at a penetration rate of {rate}. Travel time "
+            f"{format_seconds(effect.travel_time)} per vehicle ({100 * effect.relative_travel_time:+.1f} %) compared "
+            f"with the human baseline, {format_seconds(best.difference_to_acc)} compared with ACC vehicles alone."
+        )
+    elif not results:
+        first = f"{NO_RECOMMENDATION}: none was tested, or all were rejected before the test."
+    elif any(each.missing_seeds for each in results):
+        first = f"{NO_RECOMMENDATION} so far: for some of them there is no verdict yet."
+    else:
+        first = f"{NO_RECOMMENDATION}: none passes the rule."
+    second = _acc_finding([each for each in acc_results if each.has_enough_seeds])
+    if best is None:
+        travel_time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
+        if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
+            within = max(1, ceil(100 * delay_share))
+            return f"Nothing to gain here: the human baseline is within {within} % of free flow. {first}"
+    return f"{first} ACC vehicles alone {second}."
+
+
+def _acc_finding(results: Sequence[AccResult]) -> str:
+    """Return the predicate of a sentence about ACC vehicles alone: their largest gain, else their largest loss."""
+    key = attrgetter("effect.relative_travel_time")
+    gains = [each for each in results if each.effect.travel_time.high < 0 and not each.effect.is_too_small]
+    losses = [each for each in results if each.effect.is_longer]
+    if gains or losses:
+        verb, most = ("shorten", min(gains, key=key)) if gains else ("lengthen", max(losses, key=key))
+        time, change = format_seconds(most.effect.travel_time), 100 * most.effect.relative_travel_time
+        return f"{verb} travel time: {time} ({change:+.1f} %) at {format_percent(most.penetration_rate)}"
+    if results and all(each.effect.is_too_small for each in results):
+        return f"change travel time by {TOO_SMALL}"
+    return "are not shown to shorten travel time" if results else f"have fewer than {MIN_VERDICT_SEEDS} test seeds"
