@@ -33,8 +33,8 @@ class MockWorld:
         return state.map(lambda values: float(values[0])) if self.is_scalar else state
 
     def advance(self, command: Command | None) -> None:
-        told = np.zeros(self.cav_count) if command is None else np.atleast_1d(command.acceleration)
-        self.applied.append(self.limits.clip(told))
+        acceleration = np.zeros(self.cav_count) if command is None else np.atleast_1d(command.acceleration)
+        self.applied.append(self.limits.clip(acceleration))
         self._speed = np.maximum(self._speed + 0.1 * self.applied[-1], 0.0)
         self._gap = self._gap + 0.1 * (4.0 - self._speed)
         self.remaining_rows = None

@@ -31,7 +31,7 @@ def as_range(value: Any) -> Any:
 NumberOrRange = BeforeValidator(as_range)
 """allows a single number for a parameter that is a range"""
 MAX_INTEGER_BITS = 63
-"""of the absolute value of an integer"""
+"""maximum number of bits of the absolute value of an integer"""
 MAX_KEY_PARTS = 100
 """parts of a key between its dots"""
 _DEEP_KEY = re.compile(rf"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{MAX_KEY_PARTS}}}""")

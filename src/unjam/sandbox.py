@@ -18,13 +18,13 @@ CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
 """Landlock's system calls, the same on all processors"""
 WRITE_FILE, TRUNCATE = 1 << 1, 1 << 14
 REMOVE_AND_CREATE = 0b1_1111_1111 << 4
-"""of folders, files, devices, sockets, pipes, links"""
+"""rights to remove and create folders, files, devices, sockets, pipes and links"""
 REFER = 1 << 13
 """moving to another folder"""
 NO_NEW_PRIVILEGES, SET_SECCOMP, SECCOMP_FILTER_MODE = 38, 22, 2
 """options of `prctl`"""
 SOCKET_SYSCALLS = {"x86_64": (0xC000003E, 41), "aarch64": (0xC00000B7, 198), "riscv64": (0xC00000F3, 198)}
-"""by processor: its number in the kernel, and the number of the system call `socket`"""
+"""number of the processor in the kernel and number of the system call `socket`, by name of the processor"""
 IO_URING_SETUP = 425
 """a system call that can open sockets too"""
 X32_SYSCALL_BIT = 0x40000000

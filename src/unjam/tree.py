@@ -14,7 +14,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 Arrays = dict[str, np.ndarray]
-"""by path in the tree: `trajectories.0.states.speed`"""
+"""arrays by path in the tree, such as `trajectories.0.states.speed`"""
 ARRAY_KEY = "array"
 """key of the JSON object that represents an array; its value is the path"""
 

@@ -23,7 +23,7 @@ EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"
 """environment variable with the hashes of code, by path, at the check of the configuration of a child"""
 _lock = threading.Lock()
 _saved_values: list[str | None] = []
-"""for each running block of `trusting_code` the value of the variable before the first of them"""
+"""value of the variable before the first of the running blocks of `trusting_code`, for each of them"""
 _expected_hashes: dict[str, str] = json.loads(os.environ.get(EXPECTED_CODE_VARIABLE, "{}"))
 
 

@@ -64,7 +64,7 @@ class FourRegimeFit:
     driver: str
     """a name in `DATA_SETTINGS`"""
     network: str
-    """in `FIGURE_6_NETWORKS`, or `NEAREST_ROW`"""
+    """a name in `FIGURE_6_NETWORKS`, or `NEAREST_ROW`"""
     size: float
     """share of the training rows"""
     repeat: int

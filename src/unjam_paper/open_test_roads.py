@@ -28,7 +28,7 @@ class RoadSection(NamedTuple):
     """A part of a road with the same lanes and speed limit; lanes begin and end on the right."""
 
     length: float
-    """[m]"""
+    """length [m]"""
     lanes: int
     speed: float
     """speed limit [m/s]"""
@@ -62,7 +62,7 @@ class OpenTestRoad:
     model: str = "EIDM"
     """car-following model of human drivers (SUMO's name)"""
     humans: IDMParameters = USUAL_HUMANS
-    """its parameters; the desired speed is a limit in addition to that of the road"""
+    """parameters of the human drivers; the desired speed is a limit in addition to that of the road"""
     speed_spread: float = 0.1
     """standard deviation of the factor by which drivers exceed the speed limit"""
     entry_speed: str = "avg"

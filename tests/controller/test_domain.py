@@ -24,13 +24,13 @@ TRAINED = {"scenario": scenario_recipe(Ring())}
     ],
 )
 def test_another_road_than_that_of_the_training_is_told(road: Scenario, words: str) -> None:
-    told = road_mismatch(TRAINED, scenario_recipe(road))
-    assert told.endswith(words) if words else told == ""
+    mismatch = road_mismatch(TRAINED, scenario_recipe(road))
+    assert mismatch.endswith(words) if words else mismatch == ""
 
 
 def test_a_tuned_controller_was_not_trained_and_an_unknown_road_is_no_other() -> None:
-    told = road_mismatch({**TRAINED, "tuning": {}}, scenario_recipe(make_scenario("merge")))
-    assert told == "was tuned on the ring, not on the merge"
+    mismatch = road_mismatch({**TRAINED, "tuning": {}}, scenario_recipe(make_scenario("merge")))
+    assert mismatch == "was tuned on the ring, not on the merge"
     assert road_mismatch({}, scenario_recipe(Ring())) == ""
     assert road_description(TRAINED) == "ring, length 220-270, vehicles 22, cavs 1, warmup 0"
 

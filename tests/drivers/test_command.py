@@ -9,9 +9,9 @@ LIMITS = Limits(-1.0, 0.5)
 
 @pytest.mark.parametrize("wanted", [[-3.0, 0.2, 3.0], np.array([-3.0, 0.2, 3.0])])
 def test_vehicles_are_told_plain_numbers_within_the_limits(wanted: object) -> None:
-    told = commanded_accelerations(Command(wanted), LIMITS, "abc", 0)
-    assert told == [-1.0, 0.2, 0.5]
-    assert {type(number) for number in told} == {float}
+    accelerations = commanded_accelerations(Command(wanted), LIMITS, "abc", 0)
+    assert accelerations == [-1.0, 0.2, 0.5]
+    assert {type(number) for number in accelerations} == {float}
 
 
 def test_a_plain_number_is_for_one_vehicle() -> None:

@@ -20,8 +20,8 @@ def state(speed: float, ahead: float, to_merge: float = 500.0, allowed: float = 
     speeds[0, :5] = ahead
     values = (speed, speed, 50.0, speed, 50.0, 1500.0, np.nan)
     near = LocalState(*(np.array([value]) for value in values))
-    told = {"allowed_speed": np.array([allowed]), "distance_to_merge": np.array([to_merge])}
-    return near._replace(**told, lane_speeds=speeds, road_speeds=speeds - 1.0)
+    road_fields = {"allowed_speed": np.array([allowed]), "distance_to_merge": np.array([to_merge])}
+    return near._replace(**road_fields, lane_speeds=speeds, road_speeds=speeds - 1.0)
 
 
 AT_ONCE = JamAhead(time_constant=1.0, speed_margin=0.0)
@@ -104,8 +104,8 @@ def test_sections_and_lanes_are_the_users_to_choose() -> None:
 def test_room_is_made_just_before_the_merge_for_those_on_the_right(
     to_merge: float, right: float, time_gap: float
 ) -> None:
-    beside = np.array([[1.0, 1.0, right, 100.0]])
-    driver, seen = GapMaker(merge_time_gap=2.0), state(20.0, 19.0, to_merge)._replace(adjacent_gaps=beside)
+    adjacent_gaps = np.array([[1.0, 1.0, right, 100.0]])
+    driver, seen = GapMaker(merge_time_gap=2.0), state(20.0, 19.0, to_merge)._replace(adjacent_gaps=adjacent_gaps)
     np.testing.assert_array_equal(driver.time_gaps(seen, {}), [time_gap])
     np.testing.assert_array_equal(driver.act(seen, {})[0], JamAhead().act(seen, {})[0])
 

@@ -71,15 +71,15 @@ class Pursuit:
         """Make one step in which leaders accelerate with `leader`; return the cars' accelerations."""
         step, sensed = self.step, self.readings.read_for_filter("all", self.ahead)
         actuation = None if self.actuator is None else (self.actuator, self.underway)
-        told = self.safety.limit(np.broadcast_to(wanted, self.ahead.speed.shape), sensed, step, actuation)
-        assert (told >= np.minimum(wanted, -self.safety.braking)).all()
+        limited = self.safety.limit(np.broadcast_to(wanted, self.ahead.speed.shape), sensed, step, actuation)
+        assert (limited >= np.minimum(wanted, -self.safety.braking)).all()
         if self.actuator is not None:
-            self.underway = self.actuator.apply_command(told, self.ahead.speed, self.underway, step)
-            told = self.underway.acceleration
-        speed = next_speed(self.ahead.speed, told, step)
+            self.underway = self.actuator.apply_command(limited, self.ahead.speed, self.underway, step)
+            limited = self.underway.acceleration
+        speed = next_speed(self.ahead.speed, limited, step)
         ahead = next_speed(self.ahead.leader_speed, leader, step)
         self.ahead = FollowingState(speed, ahead, self.ahead.gap + step * (ahead - speed))
-        return told
+        return limited
 
 
 @pytest.mark.parametrize("actuator", ACTUATORS, ids=str)
@@ -156,21 +156,21 @@ def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
     speed: float, leader: float, gap: float, wanted: float, step: float
 ) -> None:
     ahead, safety = FollowingState(speed, leader, gap), SafetyFilter()
-    told = safety.limit(wanted, ahead, step)
+    limited = safety.limit(wanted, ahead, step)
     rows = safety.limit(np.array([wanted]), FollowingState(*(np.array([value]) for value in ahead)), step)
     tensors = safety.limit(
         torch.tensor([wanted], dtype=torch.float64),
         FollowingState(*(torch.tensor([value], dtype=torch.float64) for value in ahead)),
         step,
     )
-    assert rows[0] == pytest.approx(told, abs=1e-9)
-    assert tensors[0].item() == pytest.approx(told, abs=1e-9)
+    assert rows[0] == pytest.approx(limited, abs=1e-9)
+    assert tensors[0].item() == pytest.approx(limited, abs=1e-9)
 
 
 @given(SPEEDS, SPEEDS, st.floats(-3.0, 3.0))
-def test_with_nobody_ahead_a_car_does_what_it_wants(speed: float, nobody: float, wanted: float) -> None:
+def test_with_nobody_ahead_a_car_does_what_it_wants(speed: float, leader_speed: float, wanted: float) -> None:
     for actuation in (None, (Actuator(lag=0.3), ActuatorState(0.0))):
-        free = SafetyFilter().limit(wanted, FollowingState(speed, nobody, inf), 0.1, actuation)
+        free = SafetyFilter().limit(wanted, FollowingState(speed, leader_speed, inf), 0.1, actuation)
         assert free == wanted
 
 

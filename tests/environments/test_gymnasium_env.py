@@ -270,9 +270,9 @@ def test_rewards_are_for_what_happens_and_not_for_what_sensors_read() -> None:
     expected = run_episode(make_scenario("ring", changes), IDM(time_headway=0.4), (0,), "eq16")
     environment = RoadEnv("ring", reward="eq16", expert="idm:time_headway=0.4", **changes)
     environment.reset(seed=0)
-    earned = [environment.step(np.zeros(1))[1] for _ in range(60)]
+    rewards = [environment.step(np.zeros(1))[1] for _ in range(60)]
     environment.close()
-    np.testing.assert_allclose(earned, expected.reward, atol=1e-12)
+    np.testing.assert_allclose(rewards, expected.reward, atol=1e-12)
 
 
 @pytest.mark.parametrize(

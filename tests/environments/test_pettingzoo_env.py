@@ -35,9 +35,9 @@ def test_steps_the_very_episode_that_run_episode_runs() -> None:
     environment.reset(seed=4)
     rewards = []
     while environment.agents:
-        _, earned, *_ = environment.step({agent: np.array([0.2]) for agent in environment.agents})
-        assert set(earned) == {"cav_0", "cav_7", "cav_15"}
-        rewards.append(earned["cav_0"])
+        _, reward, *_ = environment.step({agent: np.array([0.2]) for agent in environment.agents})
+        assert set(reward) == {"cav_0", "cav_7", "cav_15"}
+        rewards.append(reward["cav_0"])
     environment.close()
     np.testing.assert_allclose(rewards, expected.trajectories[0].reward, atol=1e-12)
 
@@ -90,7 +90,7 @@ MERGE: Any = {"horizon": 60, "penetration_rate": 0.3}
 def test_the_merge_passes_the_checks_of_pettingzoo_without_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Of those who might be CAVs only some are: which, is drawn anew in each episode.
+        # Each episode draws which of the possible agents are CAVs.
         warnings.filterwarnings("ignore", "No agents present but not all possible_agents are terminated")
         with closing(unjam.parallel_env("merge", **MERGE)) as environment:
             parallel_api_test(environment, num_cycles=100)
@@ -104,7 +104,7 @@ def test_agents_of_the_merge_enter_and_leave_as_in_the_very_episode_that_run_epi
     stays = {each.vehicle: each for each in expected.trajectories}
     environment = unjam.parallel_env("merge", **{**MERGE, "horizon": 100, "standing_vehicles": 0})
     last, _ = environment.reset(seed=4)
-    left, earned = [], {name: [] for name in stays}
+    left, rewards_by_agent = [], {name: [] for name in stays}
     truncated: dict[str, bool] = {}
     while environment.agents:
         acting = environment.agents
@@ -119,7 +119,7 @@ def test_agents_of_the_merge_enter_and_leave_as_in_the_very_episode_that_run_epi
                 np.testing.assert_array_equal(seen[name], last[name])  # what it saw before it left
                 assert stays[name].start_step + len(stays[name].applied_acceleration) == moment - 1
             else:
-                earned[name].append(rewards[name])
+                rewards_by_agent[name].append(rewards[name])
         for name in set(environment.agents) - set(acting):
             assert stays[name].start_step == moment
             assert (rewards[name], truncated[name]) == (0.0, False)
@@ -128,7 +128,7 @@ def test_agents_of_the_merge_enter_and_leave_as_in_the_very_episode_that_run_epi
     environment.close()
     assert len(left) > 3
     for name, trajectory in stays.items():
-        np.testing.assert_allclose(earned[name], trajectory.reward, atol=1e-12)
+        np.testing.assert_allclose(rewards_by_agent[name], trajectory.reward, atol=1e-12)
 
 
 def test_time_goes_on_by_itself_until_the_first_agent_enters_and_ends_with_the_last() -> None:
@@ -171,28 +171,28 @@ def test_an_agent_whose_action_lacks_is_named() -> None:
 
 def test_a_vehicle_that_comes_back_is_no_agent_again() -> None:
     environment = unjam.parallel_env("ring", **SHORT)
-    there = [["a", "b"], ["a"], ["a", "b"]]
-    told: list[list[float]] = []
+    cav_ids_by_step = [["a", "b"], ["a"], ["a", "b"]]
+    received_actions: list[list[float]] = []
 
     class Road:
-        """Its second CAV leaves in the first decision, and is back after the second."""
+        """A road whose second CAV leaves in the first control step and returns in the second."""
 
-        lock, world = CopyableLock(), SimpleNamespace(cav_ids=there[0])
+        lock, world = CopyableLock(), SimpleNamespace(cav_ids=cav_ids_by_step[0])
 
         def step(self, actions: list[float]) -> RoadStepResult:
-            before, now = there[len(told)], there[len(told) + 1]
-            told.append(actions)
+            before, now = cav_ids_by_step[len(received_actions)], cav_ids_by_step[len(received_actions) + 1]
+            received_actions.append(actions)
             left = {name: np.zeros(5, np.float32) for name in before if name not in now}
             self.world.cav_ids = now
             return RoadStepResult(now, np.zeros((len(now), 5), np.float32), left, 1.0, {}, False, False)
 
     environment._road = Road()  # pyright: ignore[reportAttributeAccessIssue]
-    environment.agents = environment._agents_of(there[0])
+    environment.agents = environment._assign_agents(cav_ids_by_step[0])
     first, second = environment.agents
-    there.append(["a", "b"])
+    cav_ids_by_step.append(["a", "b"])
     *_, truncated, _ = environment.step({first: [0.1], second: [0.2]})
     assert truncated == {first: False, second: True}
     environment.step({first: [0.3]})
     assert environment.agents == [first]
     environment.step({first: [0.4]})
-    assert told == [[0.1, 0.2], [0.3], [0.4, 0.0]]
+    assert received_actions == [[0.1, 0.2], [0.3], [0.4, 0.0]]

@@ -224,7 +224,7 @@ def inputs(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
         code, said, errors = ran(tried, here, environment)
         assert code in tried.codes, (tried, code, errors)
         assert "Traceback" not in errors, (tried, errors)
-        assert code == 0 or is_told(errors, 74 in tried.codes) or (code == GONE and not errors), (tried, errors)
+        assert code == 0 or is_clear_error(errors, 74 in tried.codes) or (code == GONE and not errors), (tried, errors)
         assert not said or code == 0, (tried, said)
         assert contents(here) == before, tried
         assert not list(temporary.iterdir()), tried
@@ -232,10 +232,10 @@ def inputs(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     return outcome
 
 
-def is_told(errors: str, begun: bool) -> bool:
+def is_clear_error(errors: str, has_started: bool) -> bool:
     """Return whether errors are one line; where the work may have begun, after its progress."""
     lines = [line for line in errors.splitlines() if line]
-    return one_line(errors) or (begun and [line for line in lines if line.startswith("unjam: ")] == lines[-1:])
+    return one_line(errors) or (has_started and [line for line in lines if line.startswith("unjam: ")] == lines[-1:])
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -61,15 +61,15 @@ def with_temporary_names(names: list[str]) -> list[str]:
 
 def links(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     """Plant links at up to three names of a run that was stopped, and let it go on."""
-    outcome, begun = Outcome(), folder / "begun"
+    outcome, interrupted = Outcome(), folder / "begun"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_folder, "manifest", lambda: {"started": "some day"})
         total = crash(folder / "whole", 0, "before", False).count
-        crash(begun, 2 * total // 3, "after", True)
-        names = with_temporary_names([str(path.relative_to(begun)) for path in sorted(begun.rglob("*"))])
+        crash(interrupted, 2 * total // 3, "after", True)
+        names = with_temporary_names([str(path.relative_to(interrupted)) for path in sorted(interrupted.rglob("*"))])
         for number in range(count):
             place, outside = folder / str(number) / "run", folder / str(number) / "outside"
-            shutil.copytree(begun, place)
+            shutil.copytree(interrupted, place)
             outside.mkdir()
             kind = str(generator.choice(KINDS))
             for name in generator.choice(names, int(generator.integers(1, 4)), replace=False):

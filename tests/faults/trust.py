@@ -79,9 +79,9 @@ def sandboxes(count: int, folder: Path, generator: np.random.Generator) -> Outco
                 words = f"a program in the sandbox: {wanted}: refused by the kernel"
             else:
                 wanted = str(generator.choice([*OPTIONS, "remote-port"]))
-                told = f"--{wanted}={45871 if wanted == 'remote-port' else canary}"
+                option = f"--{wanted}={45871 if wanted == 'remote-port' else canary}"
                 try:
-                    sumo.load(files._replace(options=(*files.options, told)), 0.1, 0)
+                    sumo.load(files._replace(options=(*files.options, option)), 0.1, 0)
                     sumo.step()
                 except EpisodeError as error:
                     one_line(error)

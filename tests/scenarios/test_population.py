@@ -70,10 +70,10 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, changes: dict, wo
 
 def test_damaged_weights_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path, NETWORK)
-    beside = path.with_suffix(".safetensors")
-    content = bytearray(beside.read_bytes())
+    weights = path.with_suffix(".safetensors")
+    content = bytearray(weights.read_bytes())
     content[-1] ^= 1
-    beside.write_bytes(content)
+    weights.write_bytes(content)
     with pytest.raises(InputError, match="damaged"):
         read_population(path)
 

@@ -199,8 +199,8 @@ def test_drive_works_with_an_open_environment_and_warns() -> None:
     with closing(RoadEnv(**ROAD)) as environment:
         environment.reset(seed=0)
         with pytest.warns(UserWarning, match="runs in a process of its own"):
-            beside = drive("ring", follow, 1, scenario_options=ROAD, workers=1)
-    assert beside.mean["return"] == drive("ring", follow, 1, scenario_options=ROAD, workers=1).mean["return"]
+            concurrent = drive("ring", follow, 1, scenario_options=ROAD, workers=1)
+    assert concurrent.mean["return"] == drive("ring", follow, 1, scenario_options=ROAD, workers=1).mean["return"]
 
 
 def test_result_has_a_pandas_table_and_a_notebook_view(compared: DriveResult) -> None:
@@ -221,15 +221,15 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
     """Detects whether a worker process was started."""
     from unjam.worlds import worker_pool
 
-    begun: list[object] = []
+    started: list[object] = []
     start = worker_pool._Worker._start
 
     def noted(self: Any) -> Any:
-        begun.append(self)
+        started.append(self)
         return start(self)
 
     monkeypatch.setattr(worker_pool._Worker, "_start", noted)
-    return lambda: bool(begun)
+    return lambda: bool(started)
 
 
 @pytest.mark.parametrize(

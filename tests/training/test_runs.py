@@ -20,8 +20,8 @@ def made(folder: Path, config: RunConfig, done: int, gain: float | None = None) 
     append_line(folder / "progress.jsonl", to_json({"iteration": 1, "environment_steps": done}))
     if gain is not None:
         rows = [
-            {"driver": driver, "seed": [1, seed], **dict.fromkeys(METRICS, 0.0), "return": earned + seed}
-            for driver, earned in (("pi", 100.0), ("trained", 100.0 + gain))
+            {"driver": driver, "seed": [1, seed], **dict.fromkeys(METRICS, 0.0), "return": mean_return + seed}
+            for driver, mean_return in (("pi", 100.0), ("trained", 100.0 + gain))
             for seed in range(3)
         ]
         about = {"trained": "trained", "expert": "pi", "rows": rows}

@@ -105,7 +105,7 @@ def test_trial_text_has_the_gain_of_the_last_checkpoint(gain: float | None, last
     assert describe_trial(SearchTrial(3, {"agent": "ppo"}, Path("trials/3"), gain, last)) == words
 
 
-EARNS = {"constant": 100.0}
+EXPERT_RETURNS = {"constant": 100.0}
 """experts that earn something, in trainings that stand for real ones"""
 
 
@@ -126,7 +126,7 @@ class Trainings:
         folder = Path(command.arguments[-1])
         folder.mkdir(parents=True)
         worth = -abs(math.log10(config.trpo.target_kl) + 2)
-        expert = EARNS.get(config.expert, 0.0)
+        expert = EXPERT_RETURNS.get(config.expert, 0.0)
         row = {"iteration": 1, "return_validation": expert + worth, "return_expert": expert}
         (folder / "progress.jsonl").write_text(to_json(row))
         self.done.append(folder)

@@ -25,12 +25,13 @@ ATTACK_SECONDS, ATTACK_STEP_SECONDS = 40.0, 1.0
 ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12
 """cross-entropy method: maneuvers in a generation, generations, and elites that determine the next generation"""
 MAX_LEADER_ACCELERATION = 3.0
-"""of an adversarial leader [m/s2]"""
+"""largest acceleration of an adversarial leader [m/s2]"""
 MIN_MOVING_SPEED, STRING_SPEED_RATIOS = 1.0, (0.5, 0.9)
 """speed above which time gaps and string stability are evaluated [m/s]; speeds for string stability, as shares of the
 highest visited speed"""
 OSCILLATION_FREQUENCIES, OSCILLATION_AMPLITUDE = np.geomspace(0.04, 3.0, 20), 0.05
-"""[rad/s]; amplitude of a leader's speed, as a share of its mean: small, so that the response is nearly linear"""
+"""frequencies at which leaders oscillate [rad/s], and amplitude of their speed as a share of its mean; it is small, so
+that the response is nearly linear"""
 SETTLING_SECONDS, MEASURED_PERIODS, MIN_MEASURED_SECONDS = 100.0, 2, 200.0
 """settling time [s]; number of measured periods, and minimum measured time [s]"""
 MAX_FOLLOWERS, GAIN_TOLERANCE = 60, 5e-3
@@ -63,7 +64,7 @@ class StringStability:
     gains: tuple[float, ...]
     """amplitude of the CAV divided by that of the leader, at each frequency"""
     human_gains: tuple[float, ...]
-    """the same for a human driver, by the linearized IDM"""
+    """gain of a human driver at each frequency, by the linearized IDM"""
     peak_frequency: float
     """frequency of the CAV's largest gain"""
     amplified_band: tuple[float, ...]

@@ -253,13 +253,13 @@ class DrivingStrategy(NamedTuple):
 
 
 FREE_ROAD_STRATEGY = DrivingStrategy(1.0, 1.0, 1.0)
-"""on a free road, and in a jam"""
+"""strategy on a free road, and in a jam"""
 JAM_TAIL_STRATEGY = DrivingStrategy(1.0, 1.0, 0.7)
-"""at the upstream end of a jam: early braking, for the safety of the vehicles behind"""
+"""strategy at the upstream end of a jam: early braking, for the safety of the vehicles behind"""
 BOTTLENECK_STRATEGY = DrivingStrategy(0.7, 1.5, 1.0)
 """near a merge"""
 JAM_HEAD_STRATEGY = DrivingStrategy(0.5, 2.0, 1.0)
-"""at the downstream end of a jam: a higher outflow makes it shrink"""
+"""strategy at the downstream end of a jam: a larger outflow makes the jam shorter"""
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -34,7 +34,7 @@ class Decision(NamedTuple):
     observation: Array | None
     """network input, shape (n, inputs); empty for a single CAV with a repeated residual; None without a network"""
     memory: Memory
-    """after the decision"""
+    """memory of the driver after the decision"""
 
 
 class Driver:

@@ -41,7 +41,7 @@ class LocalState(NamedTuple):
     """last received mean speeds of the road sections ahead in the own lane, beginning with the own section:
     (n, SECTIONS_AHEAD) [m/s]; empty sections have the allowed speed"""
     road_speeds: Array = None
-    """the same over all lanes of the main road"""
+    """mean speeds of the same sections, over all lanes of the main road [m/s]"""
     adjacent_gaps: Array = None
     """gaps to vehicles on adjacent lanes, ordered as `ADJACENT_POSITIONS`: (n, 4) [m]; negative for vehicles alongside,
     `MAX_OBSERVED_GAP` without a vehicle or lane. Before a merge, the ramp counts as the lane that it becomes"""

@@ -20,7 +20,7 @@ LapFraction = Annotated[float, Field(ge=0, lt=1)]
 GATHERED_LAP_FRACTION, BROKEN_LAP_FRACTION = 0.5, 0.45
 """free shares of the lap ahead: from the first on, all have gathered behind; below the second, their queue is broken"""
 MIN_PACE = 1.0
-"""[m/s]; at standstill no queue would form"""
+"""minimum speed of a pacer [m/s]; at standstill no queue would form"""
 MAX_JAM_DISTANCE = 60.0
 """distance to a jam from which it waits [m]"""
 FREE_ROAD_GAP = 99.0

@@ -22,7 +22,7 @@ class _SpeedBuffer:
     """Speeds of rows over time; consecutive memories share one buffer."""
 
     speeds: Array
-    """[m/s], shape (steps, n)"""
+    """speeds of the last steps [m/s], shape (steps, n)"""
     filled_steps: int
 
 
@@ -64,7 +64,7 @@ class CircularWindow:
     """
 
     rows: Array
-    """[m/s], shape (n, steps)"""
+    """speeds of the last steps [m/s], shape (n, steps)"""
     count: Array
     """number of speeds since the start, shape (n,)"""
 

@@ -52,7 +52,7 @@ class UserFunction:
 
     function: Callable[..., Any]
     label: str
-    """in messages: its name, or `path.py:name`"""
+    """name in messages: its own name, or `path.py:name`"""
     file: str = ""
     """path of its code"""
 

@@ -379,15 +379,16 @@ class RoadTypeSwitch(CompositeDriver):
     required_fields: ClassVar[tuple[str, ...]] = ("distance_to_crossing", "penetration_rate")
 
     motorway: Driver
-    """on roads with measured speeds of the lanes ahead"""
+    """driver on roads with measured speeds of the lanes ahead"""
     crossing_loop: Driver
-    """on a closed road that crosses itself"""
+    """driver on a closed road that crosses itself"""
     loop: Driver
-    """on any other closed road"""
+    """driver on any other closed road"""
     open_road: Driver
-    """on open roads without roadside information"""
+    """driver on open roads without roadside information"""
     shared_loop: Driver | None = None
-    """on closed roads without a crossing and with at least `MIN_SHARED_PENETRATION_RATE`; None: `loop`"""
+    """driver on closed roads without a crossing and with a penetration rate of at least `MIN_SHARED_PENETRATION_RATE`;
+    None: `loop`"""
 
     @property
     def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -48,7 +48,7 @@ class ExternalDriver(Driver):
         """Let `expert` drive within `limits`; `features` are the external observation."""
         self.expert, self.features, self._limits = expert, features, limits
         self.actions: Any = np.zeros(0)
-        """[m/s2], shape (CAVs,)"""
+        """additions to the accelerations [m/s2], shape (CAVs,)"""
 
     @property
     def measured_fields(self) -> frozenset[str]:
@@ -123,10 +123,10 @@ class RoadStepper:
         self._backend_context, self._world_context = ExitStack(), ExitStack()
         bound = np.full(observation_size(self._driver.features, driver), MAX_OBSERVATION, np.float32)
         self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
-        """of one CAV"""
+        """observation space of one CAV"""
         low, high = (np.full(1, limit, np.float32) for limit in self.scenario.acceleration_limits)
         self.action_space = spaces.Box(low, high, dtype=np.float32)
-        """of one CAV: acceleration [m/s2]"""
+        """action space of one CAV: an acceleration [m/s2]"""
         self._seed: int | None = None
         self._episode_count = 0
         """episodes since that seed"""

@@ -51,11 +51,11 @@ class Training:
     tasks: Sequence[Task]
     policy: PolicySettings
     seed: int
-    """of the whole run"""
+    """seed of the whole run"""
     learner: Learner
     """pi_theta and its value network"""
     model_rollouts: Sequence[ModelRollouts[Any]] = ()
-    """of each task, with its model and D_a; empty: model-free"""
+    """model rollouts of each task, with its model and D_a; empty: model-free"""
     iteration: int = 0
     """number of completed iterations"""
     environment_steps: int = 0
@@ -88,7 +88,7 @@ class Iteration:
     model: Sequence[dict[str, Any]]
     """facts about the model of each task; empty if model-free"""
     log: dict[str, float]
-    """of the learner's updates"""
+    """log of the updates of the learner"""
     seconds: dict[str, float]
     """wall time of each part"""
 

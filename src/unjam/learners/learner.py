@@ -41,12 +41,12 @@ class Update(NamedTuple):
     """The data of one update."""
 
     environment_rows: Experience | None
-    """of this iteration; None after its first update"""
+    """environment rows of this iteration; None after its first update"""
     model_rows: Experience | None
     share: float
-    """of this update in the gradient steps of the iteration"""
+    """share of the gradient steps of the iteration that this update makes"""
     environment_steps: int
-    """of all iterations"""
+    """number of environment steps of all iterations"""
 
 
 class Learner:

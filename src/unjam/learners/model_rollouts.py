@@ -44,9 +44,9 @@ class ExperienceFactory(NamedTuple):
     """Converts model rollouts to the experience of learners."""
 
     privileged_inputs: Callable[[Floats], Floats]
-    """from the scaled values that episodes drew, shape (rows, m), to the inputs of the critic alone"""
+    """returns the inputs of the critic alone, for the scaled values that episodes drew, shape (rows, m)"""
     from_episodes: Callable[[Sequence[Episode]], Experience]
-    """from whole episodes, as those of the environment"""
+    """returns the experience of whole episodes of the model, as for episodes of the environment"""
 
 
 class RolloutPlan(NamedTuple):
@@ -88,7 +88,7 @@ class ModelRollouts(Generic[EnsembleT]):
         check_device(settings.device, "model.device")
         self.settings = settings
         self.name = f"model-{task_index}" if task_index else "model"
-        """in checkpoints"""
+        """name in checkpoints"""
         self.data = EnvironmentData(settings.buffer_size)
         self.scenario = task.scenario
         """the road, with calibrated IDM parameters if the settings ask for them"""
@@ -96,7 +96,7 @@ class ModelRollouts(Generic[EnsembleT]):
         self._task_index = (task_index,) if task_index else ()
         self.model = self._new_model()
         self.model_steps = 0
-        """of all iterations"""
+        """number of model steps of all iterations"""
         self.facts: dict[str, Any] = {}
         """about the model in this iteration"""
 

@@ -53,7 +53,7 @@ class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
         super().__init__(*args)
         check_road_model(self.scenario, self.settings)
         self.samples: list[SamplesT] = []
-        """of the episodes in D_a, oldest first"""
+        """samples of the episodes in D_a, the oldest first"""
 
     def _new_model(self) -> RoadModel:
         return RoadModel(self.settings, self._seed(FIT_SEED))

@@ -54,7 +54,7 @@ class ReplayDriver(Driver):
     """Applies recorded accelerations, step by step."""
 
     accelerations: Array
-    """[m/s2], shape (H, rows)"""
+    """recorded accelerations [m/s2], shape (H, rows)"""
 
     def initial_memory(self, n: int) -> Memory:
         """Return the index of the first step."""

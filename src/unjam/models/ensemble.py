@@ -141,7 +141,7 @@ class EnsembleFit(NamedTuple):
     targets: Floats
     """residuals of the base on the holdout, shape (rows, outputs)"""
     predictions: Floats
-    """of the targets by each member; zero where the base is better, shape (members, rows, outputs)"""
+    """prediction of the targets by each member; zero where the base is better, shape (members, rows, outputs)"""
     holdout_indices: NDArray[np.int64]
     loss: float
     """mean squared training error of the last epoch, in units of the targets' variance"""
@@ -228,9 +228,9 @@ class OneStepRMSE(NamedTuple):
     """One-step root mean squared errors on the holdout [m/s, m, reward]."""
 
     base: float
-    """of the base alone"""
+    """error of the base alone"""
     model: float
-    """of a member of the ensemble; of the base where it is better"""
+    """error of a member of the ensemble; that of the base where it is better"""
     change: float
     """standard deviation of what is predicted: the change in the step, or the reward"""
 
@@ -249,7 +249,7 @@ class ModelFit:
     training error of the last epoch, in units of the targets' variance, as in the authors' code.
     """
     one_step: dict[str, OneStepRMSE]
-    """by name of `TARGET_NAMES`"""
+    """errors one step ahead, by name of `TARGET_NAMES`"""
     learned_targets: tuple[str, ...]
     """targets that the networks predict better than the base; the others are left to the base"""
     training_rows: int

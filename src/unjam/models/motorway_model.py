@@ -53,9 +53,9 @@ class MotorwaySamples:
     """Human drivers on an on-ramp at some steps of an environment episode."""
 
     episode: int
-    """its number"""
+    """number of the episode"""
     seed: tuple[int, ...]
-    """of the episode: it determines the vehicles and their entry times"""
+    """seed of the episode: it determines the vehicles and their entry times"""
     episode_return: float
     human_rows: HumanRows
     """steps of human drivers that keep their lane; the base is without perception errors"""

@@ -70,7 +70,7 @@ class RoadSamples:
     size: int
     """drawn by the episode: length of the ring, radius of the figure eight [m]"""
     length: float
-    """of the road [m]"""
+    """length of the road [m]"""
     is_human: Floats
     """1 for human drivers, 0 for CAVs, shape (N,)"""
     speeds: Floats
@@ -81,7 +81,7 @@ class RoadSamples:
     next_speeds: Floats
     """speeds after that step"""
     crossing_memory: CrossingMemory | None
-    """on a road that crosses itself: waiting times and entry steps"""
+    """waiting times and entry steps on a road that crosses itself"""
 
 
 def check_road_model(scenario: Scenario, settings: ModelSettings) -> None:

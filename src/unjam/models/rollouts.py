@@ -212,7 +212,7 @@ class RolloutStarts(NamedTuple):
     state: LocalState
     """tensors of shape (n,)"""
     memory: Memory
-    """of the expert, as its `tensor_driver` takes it"""
+    """memory of the expert, as its `tensor_driver` takes it"""
     drawn_values: Tensor
     """scaled values that the episodes drew, shape (n, m)"""
 
@@ -222,7 +222,7 @@ class RolloutBatch:
     """Model rollouts: n rows, each with the same number of actions of the network; tensors."""
 
     observations: Tensor
-    """of the network at each action, and at the end, shape (n, actions + 1, inputs)"""
+    """observations of the network at each action and at the end, shape (n, actions + 1, inputs)"""
     actions: Tensor
     """residuals with exploration noise, not clipped [m/s2], shape (n, actions)"""
     rewards: Tensor
@@ -285,7 +285,7 @@ class ModelWorld:
     ) -> None:
         self.limits, self.cav_count = limits, len(starts.state.speed)
         self.states = [starts.state]
-        """at each step, the last being the present one"""
+        """states at each step; the last one is the present state"""
         self._dynamics, self._starts, self._control_steps, self._generator = dynamics, starts, control_steps, generator
         speed = starts.state.speed
         self._is_running, self._running_log, self._rewards = torch.ones_like(speed), [], []

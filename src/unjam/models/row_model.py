@@ -151,9 +151,9 @@ class OneStepErrors(NamedTuple):
     """One-step prediction errors [m/s, m, reward]; R rows, columns as `TARGET_NAMES`."""
 
     base: Floats
-    """of the base alone, shape (R, 6)"""
+    """errors of the base alone, shape (R, 6)"""
     predictions: Floats
-    """of these errors, by each member of the ensemble, shape (members, R, 6)"""
+    """prediction of these errors by each member of the ensemble, shape (members, R, 6)"""
     change: Floats
     """what is predicted: the change in the step, and the reward, shape (R, 6)"""
 

@@ -27,7 +27,7 @@ from unjam.worlds.record import assign_columns
 
 MAX_PANELS = 6
 MAX_REPLAY_FRAMES = 600
-"""of a replay, which interpolates between frames"""
+"""maximum number of frames of a replay, which interpolates between them"""
 MAX_REPLAY_VALUES = 600_000
 """vehicles times frames of all drivers of a replay: about three megabytes"""
 REPLAY_NAN = 65535

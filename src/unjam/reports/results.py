@@ -105,9 +105,9 @@ class Results:
     metadata: dict[str, Any]
     """scenario, reward, expert, label of the trained controller, manifest"""
     rows: dict[str, list[dict[str, Any]]]
-    """by driver: a row of metrics per episode"""
+    """rows of metrics by driver, one for each episode"""
     plot_episodes: dict[str, PlotEpisode]
-    """by driver"""
+    """episodes for figures, by driver"""
     progress: list[dict[str, Any]] = field(default_factory=list)
     """a row per iteration of training; empty without training"""
     config: str = ""

@@ -23,15 +23,15 @@ from unjam.reports.figures import (
 from unjam.reports.results import Float32s, PlotEpisode
 
 SPEED_FIELD_POSITIONS = 250
-"""positions along the road at which a figure shows a speed"""
+"""number of positions along the road at which a figure shows a speed"""
 FILL_DISTANCE, FILL_SECONDS = 10.0, 1.4
 """distance from a vehicle up to which a figure shows its speed: meters, plus seconds of driving"""
 MAX_TIME_BINS, MAX_POSITION_BINS = 240, 100
-"""of a map of a lane"""
+"""maximum numbers of cells of a lane map, in time and along the road"""
 MIN_SAMPLES_PER_CELL = 4
 """mean number of samples in a cell that leaves hardly any cell empty"""
 MAX_LANE_MAPS = 4
-"""if there are more lanes, those with the most traffic have maps"""
+"""maximum number of lane maps; of more lanes, those with the most traffic are drawn"""
 HUMAN_LINE_STYLE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
 CAV_LINE_STYLE: dict[str, Any] = {"colors": CAV_PLOT_COLOR, "linewidths": 1.6}
 

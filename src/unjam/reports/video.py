@@ -19,16 +19,16 @@ from unjam.worlds.record import Episode
 from unjam.worlds.road_world import RoadScene
 
 FRAME_SIZE = 640
-"""of the square picture [pixels]"""
+"""width and height of a frame [pixels]"""
 ROAD_MARGIN = 8.0
-"""around the road [m]"""
+"""margin around the road [m]"""
 OVERSAMPLING = 2
-"""pictures are drawn larger and scaled down, for smooth edges"""
+"""factor by which pictures are drawn larger and then reduced, for smooth edges"""
 MIN_VEHICLE_PIXELS = 7.0
 """length of a vehicle on a large road, where the true length would be invisible"""
 ROAD_COLOR = "#dfe3e8"
 MAX_TITLE_WIDTH = 36
-"""of a line of the title, which must fit into a ring [characters]"""
+"""maximum length of a line of the title, which must fit into a ring [characters]"""
 MIN_EMPTY_CENTER = 0.15
 """empty radius around the center that a caption there needs, relative to the size of the road"""
 FRAMES_PER_SECOND = 20

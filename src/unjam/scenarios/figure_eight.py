@@ -16,14 +16,14 @@ from unjam.scenarios.road import Connection, Edge, Node, Polyline, RoadNetwork, 
 from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl
 
 CROSSING_RADIUS = 3.1
-"""of the node at the crossing [m], as in Flow"""
+"""radius of the node at the crossing [m], as in Flow"""
 CROSSING_LINK = 9.4
 """length of a lane across the junction [m], as netconvert makes it from that radius"""
 INNER_LINK, OUTER_LINK = 0.222837, 0.1
 """lengths of the links at both ends of the upper and of the lower arc [m], as netconvert makes them for lanes to the
 right of the line"""
 UPPER_ARC, LOWER_ARC = (1.0, pi, -pi / 2), (-1.0, pi / 2, 2 * pi)
-"""of a figure eight: both coordinates of the center [radii], first and last angle [rad]"""
+"""arcs of a figure eight: both coordinates of the center [radii], first and last angle [rad]"""
 ARC_POINTS = 61
 """points of each arc; the lengths of the links depend on it"""
 MAJOR_PRIORITY, MINOR_PRIORITY = 78, 46

@@ -21,7 +21,7 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl, Scenario
 MERGE_INFLOW_LENGTH, MERGE_HIGHWAY_LENGTH, MERGE_EXIT_LENGTH, MERGE_RAMP_LENGTH = 100.0, 500.0, 100.0, 100.0
 """lengths of the edges on which vehicles enter, of the highway upstream and downstream of the ramp, of the ramp [m]"""
 JUNCTION_RADIUS = 10.0
-"""of the node where highway and ramp meet [m], as in Flow"""
+"""radius of the node where highway and ramp meet [m], as in Flow"""
 JUNCTION_LENGTHS = (24.525483, 23.270389)
 """lengths of the lanes across that node, of highway and ramp [m], as netconvert makes them from the radius"""
 ENTRANCE_LENGTH = 0.1

@@ -31,7 +31,7 @@ POPULATION_FORMAT = 1
 RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
 """inputs of the residual [m/s, m/s, m]"""
 MAX_POPULATION_BYTES = 64 * 2**20
-"""of a file"""
+"""maximum size of a file with a population [bytes]"""
 POPULATION_KEYS = ("format", "unjam", "typical", "parameter_statistics", "limits", "drivers", "residual")
 """keys of the file; others are `metadata`"""
 
@@ -48,7 +48,7 @@ class Population:
     residual: Network | None = None
     """a correction of the IDM that all of them share: a network from RESIDUAL_INPUTS to an acceleration [m/s2]"""
     details: tuple[dict[str, Any], ...] = field(default=(), repr=False)
-    """of each driver, all other entries of the file"""
+    """other entries of the file about each driver"""
     metadata: dict[str, Any] = field(default_factory=dict, repr=False)
     """origin of the population"""
 

@@ -86,15 +86,15 @@ class SumoFiles(NamedTuple):
     sources: tuple[Path, ...]
     """all files that were read: this one, those that it names, and those that they include"""
     begin: float
-    """[s]"""
+    """begin of the simulation [s]"""
     end: float | None
-    """[s]; None: when the last vehicle has arrived"""
+    """end of the simulation [s]; None: when the last vehicle has arrived"""
     first_departure: float | None
     """earliest departure of a vehicle [s]; None: unknown"""
     calibrated_until: float
     """latest time at which calibrators may add vehicles [s]; zero: there are none"""
     step: float
-    """[s]"""
+    """simulation step [s]"""
     options: dict[str, str]
     """harmless options about how to simulate, by name, which SUMO receives"""
     dropped_items: tuple[str, ...]
@@ -113,9 +113,9 @@ class SumoFiles(NamedTuple):
 
 
 _read_files: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
-"""by configuration: the stamps of all its files, and their content"""
+"""stamps of all files, and their content, by path of the configuration"""
 _answers: dict[str, dict[str, Any]] = {}
-"""by configuration: the answer of the reader process, for other processes"""
+"""answer of the reader process by path of the configuration, for other processes"""
 
 
 def read_sumo_files(path: Path) -> SumoFiles:

@@ -75,7 +75,7 @@ class AssessmentRequest:
 
     file: str
     network: UserNetwork
-    """with human drivers alone"""
+    """user network with human drivers alone"""
     drivers: dict[str, Driver]
     """the controllers"""
     penetration_rates: tuple[float, ...]
@@ -158,9 +158,9 @@ class Assessment:
     """The result of an assessment."""
 
     controller_results: list[ControllerResult]
-    """of the selected controller of each penetration rate; empty if all were rejected"""
+    """results of the controller that was selected for each penetration rate; empty if all were rejected"""
     acc_results: list[AccResult]
-    """of ACC vehicles alone at each penetration rate"""
+    """results of ACC vehicles alone at each penetration rate"""
     document: dict[str, Any]
     """the content of `assessment.json`: everything except the rows"""
     page: Path

@@ -56,7 +56,7 @@ OTHER_SCENARIOS = ("figure-eight", "merge")
 STEPS_PER_ROUND = 100
 METERS_PER_VEHICLE = 245 / 22
 VEHICLES_PER_RING = 22
-"""on each ring of `benchmark_batches`"""
+"""number of vehicles on each ring of `benchmark_batches`"""
 BATCH_SIZES = {"cpu": (64, 256, 1024, 4096, 16_384), "cuda": (64, 256, 1024, 4096, 16_384, 65_536, 262_144)}
 """numbers of rings, by device"""
 BENCHMARK_MODEL = ModelSettings(hidden=(32, 32))

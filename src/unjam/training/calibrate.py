@@ -63,7 +63,7 @@ NORMAL_DISTRIBUTION = re.compile(r"(normc?)\(([^()]*)\)")
 """a speed factor that is drawn for each vehicle"""
 
 CalibrationFactors = dict[str, float]
-"""by the names of `FACTOR_RANGES`"""
+"""factors by the names of `FACTOR_RANGES`"""
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,9 @@ class Corridor:
     files: SumoFiles
     detectors: Path
     begin: float
-    """[s]"""
+    """begin of the calibrated time [s]"""
     end: float
-    """[s]"""
+    """end of the calibrated time [s]"""
     measurements: tuple[Measurement, ...]
     """intervals between `begin` and `end`"""
     excluded_count: int
@@ -212,9 +212,9 @@ class CalibrationResult:
     vehicle_types: dict[str, dict[str, str]]
     """changed attributes of vehicle types, by id"""
     original: list[Agreement]
-    """on test seeds"""
+    """agreement of the original network on the test seeds"""
     calibrated: list[Agreement]
-    """on the same seeds"""
+    """agreement of the calibrated network on the test seeds"""
     trials: list[CalibrationTrial]
     file: Path
     """the new configuration"""

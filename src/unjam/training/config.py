@@ -102,7 +102,7 @@ class RunConfig(AgentSettings):
     steps: PositiveInt = 960_000
     """environment steps of training"""
     seed: Annotated[int, Field(ge=0, lt=TRAINING_SEED_LIMIT)] = 0
-    """of the whole run; larger numbers are reserved for validation, tuning and test seeds"""
+    """seed of the whole run; larger numbers are reserved for validation, tuning and test seeds"""
     workers: PositiveInt = 2
     simulator: Literal["sumo", "batch"] = "sumo"
     """where training and validation episodes run: in SUMO, or all episodes of an iteration at once in the batch

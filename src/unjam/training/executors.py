@@ -45,7 +45,7 @@ class CommandLine(NamedTuple):
     """A command line of unjam."""
 
     arguments: Sequence[str]
-    """after `unjam`"""
+    """arguments of the command `unjam`"""
     log: Path
     """file to which its output is appended"""
     resume_marker: Path | None = None

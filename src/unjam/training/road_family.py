@@ -25,7 +25,7 @@ NGSIM_IDM = {
 }
 """the common IDM of the 325 drivers of the NGSIM pairs, results/field.json"""
 ACTUATOR_LATENCY, LONG_ACTUATOR_LATENCY = {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}
-"""[s]"""
+"""usual and long latency of an actuator [s]"""
 SENSOR_ERRORS = {"gap_error": 0.5, "speed_error": 0.3}
 NOISY_SENSORS: dict[str, Any] = {"sensors": {**SENSOR_ERRORS, "dropout": 0.1}, "safety": SENSOR_ERRORS}
 """sensors with errors that lose a tenth of the readings; the safety filter allows for the errors"""

@@ -55,7 +55,7 @@ class SearchTrial:
     gain: float | None
     """validation return of the best controller minus that of the expert; None if it failed"""
     last_gain: float | None
-    """the same for the last checkpoint"""
+    """gain of the last checkpoint"""
 
 
 def search(

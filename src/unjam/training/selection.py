@@ -91,9 +91,9 @@ class Selection:
 
     rows: dict[Option, OptionRows]
     rejection_reasons: dict[Option, str]
-    """by option that is not tested"""
+    """reason why an option is not tested, by option"""
     finalists: list[Option]
-    """at most one for each penetration rate"""
+    """options that are tested, at most one for each penetration rate"""
 
     def effect(self, option: Option) -> Effect:
         """Return the effect of an option compared with the human baseline on the same seeds."""

@@ -66,11 +66,11 @@ class TrainResult:
 
     folder: Path
     rows: RowsByDriver
-    """by driver: a row of metrics per test episode"""
+    """rows of metrics by driver, one for each test episode"""
     gain: Estimate | None
     """paired difference of return between the trained controller and its expert; None without an expert"""
     tasks: dict[str, "TrainResult"] = field(default_factory=dict)
-    """by task, each in its own folder; empty for a single road"""
+    """results by task, each in its own folder; empty for a single road"""
 
     @property
     def controller(self) -> Path:

@@ -22,7 +22,7 @@ class TuningTrial:
     """A trial of parameters of an expert."""
 
     driver: str
-    """as for `--driver`"""
+    """name of the driver, as for `--driver`"""
     values: dict[str, Any]
     score: float | None
     """mean return, on several roads the mean gain; None if the driver is infeasible"""
@@ -50,7 +50,7 @@ class TrialLog:
         atomic_write(path, to_json({"request": request, "starts": self.starts}, indent=1))
         self._path = folder / TRIALS_FILE
         self.verdicts: dict[tuple[int, str], TrialVerdict] = {}
-        """by first seed and driver; damaged rows are left out"""
+        """verdicts by first seed and driver, without damaged rows"""
         rows = read_json_lines(self._path)
         for row in rows:
             with suppress(KeyError, TypeError):

@@ -12,13 +12,13 @@ from unjam.physics.arrays import Floats
 BRAKING_THRESHOLDS = (3.5, 4.5, 9.0)
 """braking that is counted [m/s2]: limit of ISO 15622 above 20 m/s, hard braking, and the limit on dry asphalt"""
 BRAKING_TOLERANCE = 1e-6
-"""of a braking threshold [m/s2]"""
+"""tolerance of a braking threshold [m/s2]"""
 OVERRIDE_TOLERANCE = 1e-4
 """change of a command that is no override [m/s2]: a few micrometers near the minimum gap, where SUMO stops creeping"""
 MIN_TIME_GAP_SPEED = 1.0
 """speed above which time gaps matter for safety [m/s]"""
 SHORT_TIME_GAP = 1.0
-"""[s]"""
+"""time gap below which a step counts as short [s]"""
 HUMAN_DRIVER, CAV_DRIVER, CAV_AFTER_CUT_IN = 0, 1, 2
 """driver kinds of a braking vehicle; the last one is a CAV just after another vehicle cut in"""
 CUT_IN_SECONDS = 3.0
@@ -34,7 +34,7 @@ class BrakingStatistics:
     """Statistics of the braking of some vehicles; a sample is one vehicle in one simulation step."""
 
     max_braking: float = 0.0
-    """[m/s2]; zero without braking"""
+    """maximum braking [m/s2]; zero without braking"""
     exceedances: tuple[int, ...] = (0,) * len(BRAKING_THRESHOLDS)
     """samples beyond each of `BRAKING_THRESHOLDS`"""
     samples: int = 0
@@ -57,7 +57,7 @@ class FollowingStatistics:
     share_short_time_gap: float = 0.0
     """share of the time above 1 m/s with a time gap below 1 s, without recovery after cut-ins"""
     max_jerk: float = 0.0
-    """[m/s3]"""
+    """maximum jerk [m/s3]"""
     override_share: float = 0.0
     """share of the commands that SUMO's safety check changed, except for the right of way"""
     yield_share: float = 0.0

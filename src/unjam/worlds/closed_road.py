@@ -93,7 +93,7 @@ class ClosedRoadLog:
     noise_free_speeds: Floats
     """speeds with which the vehicles moved, before noise [m/s], shape (S, N)"""
     speeds: Floats
-    """with noise, first those at the start [m/s], shape (S + 1, N)"""
+    """speeds with noise, first those at the start [m/s], shape (S + 1, N)"""
     requested_accelerations: Floats
     """the drivers' accelerations within the limits [m/s2], shape (D, C); no rows if CAVs stayed human"""
     safe_accelerations: Floats
@@ -102,9 +102,9 @@ class ClosedRoadLog:
     """the resulting speeds [m/s], shape (S, C); likewise"""
     has_crashed: bool = False
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """[mg/s], shape (D, N); (0, 0) if not recorded"""
+    """fuel rate [mg/s], shape (D, N); (0, 0) if not recorded"""
     penetration_rate: float | None = None
-    """as reported to the CAVs; None: not reported"""
+    """penetration rate as reported to the CAVs; None: not reported"""
 
     @property
     def cav_indices(self) -> NDArray[np.intp]:

@@ -30,7 +30,7 @@ class Task:
     weight: float = 1.0
     """share of the environment steps, relative to the weights of the other tasks"""
     name: str = ""
-    """in progress reports, tables and folders; empty for a single task"""
+    """name in progress reports, tables and folders; empty for a single task"""
 
     def __post_init__(self) -> None:
         check_time_step(self.expert, self.scenario)

@@ -178,7 +178,7 @@ class Episode:
     contacts: int = 0
     """CAVs in contact with another vehicle on a user's network; on other roads contact ends the episode"""
     speeds: Floats = field(default_factory=lambda: np.zeros((1, 0)))
-    """[m/s], shape (T + 1, N); NaN if a vehicle is not on the road"""
+    """speeds [m/s], shape (T + 1, N); NaN if a vehicle is not on the road"""
     positions: Floats = field(default_factory=lambda: np.zeros((1, 0)))
     """front bumpers along the route, not wrapped [m], shape (T // snapshot_stride + 1, N)"""
     gaps: Floats = field(default_factory=lambda: np.zeros((1, 0)))
@@ -209,12 +209,12 @@ class Episode:
     lane_indices: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """index in `lane_names` or NaN of each vehicle, shape (T // snapshot_stride + 1, N); (0, 0) if not recorded"""
     lane_names: tuple[str, ...] = ()
-    """of a road with lanes, from left to right in driving direction"""
+    """names of the lanes from left to right in driving direction; empty on roads without lanes"""
     reward_terms: dict[str, Floats] = field(default_factory=dict)
     """terms of the reward by name, shape (T,)"""
     trajectories: tuple[Trajectory, ...] = ()
     trips: Trips = field(default_factory=Trips)
-    """of all vehicles on a user's network; empty on other roads"""
+    """trips of all vehicles on a user's network; empty on other roads"""
     audit: Audit = field(default_factory=Audit)
     warnings: tuple[SumoWarning, ...] = ()
     """SUMO's warnings, including the warm-up; without teleports, collisions and braking, which are counted above"""

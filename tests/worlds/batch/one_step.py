@@ -33,10 +33,10 @@ def errors(eight: FigureEight, driver: Driver, seed: int, simulation: Simulation
     for moment in range(steps):
         speed, position = episode.speeds[moment][:, None], episode.positions[moment][:, None]
         gap = gap_on_loop(position, np.roll(position, -1, 0), road.loop_length, VEHICLE_LENGTH)
-        told = None
+        commanded = None
         if controlled:
-            told = np.maximum(speed[controlled] + applied[:, [moment]] * step, 0.0)
+            commanded = np.maximum(speed[controlled] + applied[:, [moment]] * step, 0.0)
         ahead = Leader(np.roll(speed, -1, 0), gap)
-        moved = movement.move(speed, position, ahead, noise[moment][:, None], told)
+        moved = movement.move(speed, position, ahead, noise[moment][:, None], commanded)
         found[moment] = moved[:, 0] - episode.speeds[moment + 1]
     return found

@@ -141,12 +141,12 @@ def test_gaps_and_speeds_of_both_kinds_of_drivers_are_sumos(simulation: Simulati
         one = IDMArrays(*(each if np.ndim(each) == 0 else np.full(len(states), each[row]) for each in people))
         drivers = MotorwayDrivers(one, DriverErrors(*np.zeros((3, len(states)))), np.ones(len(states), bool))
         speed, leader, gap = states.T
-        told = [sumo.getSecureGap(name, *state[:2], 2.0, "car_1") for state in states]
-        assert drivers.secure_gap(speed, leader).clip(0.0) == pytest.approx(told, abs=1e-6)
-        told = [sumo.getFollowSpeed(name, own, gap, its, 2.0, "car_1") for own, its, gap in states]
-        assert drivers.follow_speed(speed, gap + one.minimum_gap, leader, STEP) == pytest.approx(told, abs=1e-6)
-        told = [sumo.getStopSpeed(name, own, way) for own, _, way in states]
-        assert drivers.stop_speed(speed, gap, STEP) == pytest.approx(told, abs=1e-6)
+        expected = [sumo.getSecureGap(name, *state[:2], 2.0, "car_1") for state in states]
+        assert drivers.secure_gap(speed, leader).clip(0.0) == pytest.approx(expected, abs=1e-6)
+        expected = [sumo.getFollowSpeed(name, own, gap, its, 2.0, "car_1") for own, its, gap in states]
+        assert drivers.follow_speed(speed, gap + one.minimum_gap, leader, STEP) == pytest.approx(expected, abs=1e-6)
+        expected = [sumo.getStopSpeed(name, own, way) for own, _, way in states]
+        assert drivers.stop_speed(speed, gap, STEP) == pytest.approx(expected, abs=1e-6)
 
 
 def test_who_changes_lanes_is_who_does_in_sumo(simulation: Simulation) -> None:

@@ -23,7 +23,7 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.batch.noise import ArrayFactory
 
 HumanSpeedModel = Callable[[Array, Array, Array], Array]
-"""from speeds, leader speeds and gaps, shape (vehicles, W), to the speeds after a step without noise"""
+"""returns the speeds after a step without noise, for speeds, leader speeds and gaps of shape (vehicles, W)"""
 
 SUMO_MIN_GAP = 1e-3
 """minimum gap in `_v`: SUMO's NUMERICAL_EPS [m]"""
@@ -42,7 +42,7 @@ CONTACT_GAP = -1e-3
 FREE_GAP = 1e6
 """gap in SUMO's `freeSpeed` without a leader; the leader then drives at the desired speed [m]"""
 HumanParameters = IDMParameters | IDMArrays
-"""of all human drivers, or of each"""
+"""parameters of all human drivers, or of each of them"""
 
 
 class Leader(NamedTuple):

@@ -13,7 +13,7 @@ ArrayFactory = Callable[[Floats], Array]
 DrawNormal = Callable[[tuple[int, ...]], Array]
 """draws standard normal numbers of a shape"""
 WorldSeeds = Sequence[Sequence[np.random.SeedSequence]]
-"""of each world, from `Scenario.draw_from_seed`"""
+"""seeds of each world, from `Scenario.draw_from_seed`"""
 
 
 class NoiseState(NamedTuple):

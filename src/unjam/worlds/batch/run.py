@@ -35,7 +35,7 @@ WARM_UP_CACHE = WarmUpCache[_WarmUpKey]()
 MAX_BATCH_ROADS = 128
 """maximum number of rings in a batch that keeps whole episodes: some 130 MB for 22 vehicles each"""
 MAX_BATCH_MOTORWAYS = 64
-"""the same for motorways: some 40 MB each"""
+"""maximum number of motorways in a batch; each takes some 40 MB"""
 
 
 def start_batch_drive(

@@ -24,7 +24,8 @@ COLLISION_OPTIONS = (
     *("--collision.action", "warn", "--collision.mingap-factor", "0"),
     *("--collision.check-junctions", "true"),
 )
-"""on built-in roads a collision is physical contact, and each is reported; users' networks have their own settings"""
+"""options of built-in roads, where a collision is physical contact and each is reported; users' networks have their own
+settings"""
 
 
 class SumoInputs(NamedTuple):

@@ -35,9 +35,9 @@ class MergingStreams:
     def __init__(self) -> None:
         self.names: list[str] = []
         self.positions: Floats = np.zeros(0)
-        """of front bumpers, zero at the merge point, negative before it [m]"""
+        """positions of the front bumpers, zero at the merge point and negative before it [m]"""
         self.speeds: Floats = np.zeros(0)
-        """[m/s]"""
+        """speeds [m/s]"""
         self._branches = np.zeros(0, np.intp)
         """0: the main road; 1: the ramp"""
 

@@ -29,7 +29,7 @@ from unjam.worlds.record import Floats
 STALE_FILE_SECONDS = 3600.0
 """age of a temporary file after which no process uses it any more"""
 MESSAGE_TOTAL_MARKER = "total messages of type:"
-"""in the lines at the end of a log that count its messages"""
+"""text of the lines at the end of a log that count its messages"""
 XMLAttributes = dict[str, Any]
 UNCONTROLLED_LINK_STATES = "MZ-"
 """states of connections without waiting vehicles: right of way, zipper merge, dead end"""

@@ -34,7 +34,7 @@ class LaneSections:
             (lane, number) for lane, count in zip(self._lanes.values(), counts, strict=True) for number in range(count)
         ]
         self.speed_limits: Floats = np.array([lane.speed_limit for lane, _ in sections])
-        """[m/s]"""
+        """speed limits [m/s]"""
         rows: dict[tuple[str, int], int] = {}
         cross_sections = [rows.setdefault((lane.edge, number), len(rows)) for lane, number in sections]
         self.cross_sections = np.array(cross_sections, np.intp)
@@ -98,7 +98,7 @@ class RoadsideService:
         self._last_sections: defaultdict[str, list[int]] = defaultdict(lambda: [NO_SECTION] * SECTIONS_AHEAD)
         """sections ahead of each CAV when it was last on a lane"""
         self._desired_speeds: dict[str, tuple[float, float]] = {}
-        """of each CAV: desired speed over the speed limit, and maximum speed [m/s]"""
+        """desired speed over the speed limit, and maximum speed [m/s], of each CAV"""
 
     def measure(self, lane_positions: Sequence[tuple[str, float]], speeds: Floats) -> None:
         """Measure all vehicles, with their lanes, positions along them [m] and speeds [m/s], and send the results."""

@@ -58,7 +58,7 @@ class DetectorPassage(NamedTuple):
     loop: int
     vehicle: str
     time: float
-    """at which its front bumper reached the loop [s]"""
+    """time at which its front bumper reached the loop [s]"""
     speed: float
     """mean speed above the loop [m/s]; NaN if it changed lanes before its rear had passed"""
 
@@ -101,7 +101,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         self._stdout_log = folder / "printed.log" if owns_stdout else None
         """SUMO's messages before it has a log"""
         self._harmless_copies: dict[Path, tuple[list[tuple[int, int]], Path]] = {}
-        """of users' files, with the stamps of the files from which they are made"""
+        """harmless copies of users' files, with the stamps of the files from which they are made"""
         self.episode_lock = Lock()
         if transport == "libsumo":
             self._bind()

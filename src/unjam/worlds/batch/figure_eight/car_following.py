@@ -14,7 +14,7 @@ from unjam.worlds.batch.human_idm import EMERGENCY_BRAKING, SUMO_MIN_GAP, look_a
 from unjam.worlds.batch.noise import ArrayFactory
 
 COMMANDED_HUMAN_BRAKING = 4.5
-"""of SUMO's model beneath commanded human drivers [m/s2]"""
+"""deceleration of the SUMO model below commanded human drivers [m/s2]"""
 HALTING_SPEED = 0.1
 """speed below which SUMO counts a vehicle as standing [m/s]"""
 MIN_STOP_DISTANCE = 0.01
@@ -45,10 +45,10 @@ class CarFollowingModels:
             return to_array(column)
 
         self.braking = make_column(COMMANDED_HUMAN_BRAKING, self._cav_braking)
-        """of SUMO's model [m/s2], shape (vehicles, 1)"""
+        """deceleration of the SUMO model [m/s2], shape (vehicles, 1)"""
         self._emergency_braking = make_column(EMERGENCY_BRAKING, self._cav_braking)
         self.minimum_gap = make_column(0.0, MIN_CAV_GAP)
-        """of SUMO's model [m], likewise"""
+        """minimum gap of the SUMO model [m], shape (vehicles, 1)"""
         self._time_headway = make_column(1.0, scenario.simulation_step)
 
     def follow_speed(self, speed: Array, leader_speed: Array, gap: Array) -> Array:

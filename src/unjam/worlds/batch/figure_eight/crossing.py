@@ -42,7 +42,7 @@ IMPATIENCE_TIME = 300.0
 MAX_WAITING_ACCELERATION = 0.5 * SUMO_ACCELERATION
 """acceleration up to which a slow vehicle counts as waiting [m/s2]"""
 CROSSED_LANE_WIDTH, CAR_WIDTH = 3.2, 1.8
-"""[m]"""
+"""width of the crossed lane, and of a car [m]"""
 CONFLICT_AREA_START = CROSSING_LINK / 2.0 - CROSSED_LANE_WIDTH / 2.0
 """distance from the start of the crossing to the crossed lane [m]"""
 STOPPING_FOE_DELAY = 30.0
@@ -50,14 +50,14 @@ STOPPING_FOE_DELAY = 30.0
 LANE_LENGTH_DIGITS = 6
 """decimal places of lane lengths in SUMO's networks [m]"""
 COMMANDED_SPEED_TOLERANCE = 1e-9
-"""[m/s]"""
+"""tolerance of a commanded speed [m/s]"""
 
 
 class CrossingMemory(NamedTuple):
     """The state that one step leaves to the next; shape (vehicles, W), or (vehicles,) of one road."""
 
     waiting_time: Array
-    """[s]"""
+    """time that a vehicle has waited [s]"""
     entry_step: Array
     """when each vehicle entered the crossing that it is on or was on last, in steps from now (at most 0)"""
 
@@ -68,7 +68,7 @@ class _CrossingSide(NamedTuple):
     start: Array
     """position where the crossing starts [m]"""
     lane_length: Array
-    """of the lane before it [m]"""
+    """length of the lane before the crossing [m]"""
     approach_distance: Array
     """distance before it from which SUMO registers approaching vehicles [m]"""
 
@@ -77,7 +77,7 @@ class _Vehicle(NamedTuple):
     """The last vehicle past the start of a crossing; shapes (W,)."""
 
     front: Array
-    """of its front bumper past the start [m]"""
+    """position of the front bumper past the start [m]"""
     speed: Array
     index: Array
 
@@ -86,7 +86,7 @@ class _Approach(NamedTuple):
     """The plans of vehicles that approach one side of the crossing."""
 
     distance: Array
-    """to the crossing [m]; negative on it"""
+    """distance to the crossing [m]; negative on it"""
     is_approaching: Array
     """whether SUMO registers them"""
     approach_speed: Array
@@ -96,9 +96,9 @@ class _Approach(NamedTuple):
     go_speed: Array
     """maximum speed of vehicles that may enter [m/s]"""
     arrival_time: Array
-    """at the crossing [s]"""
+    """time of arrival at the crossing [s]"""
     leave_time: Array
-    """from the crossing [s]"""
+    """time of leaving the crossing [s]"""
 
 
 def _last_vehicle(speed: Array, distance_past: Array) -> _Vehicle:

@@ -35,7 +35,7 @@ class _Placements(NamedTuple):
     position: Floats
     speed: Floats
     gap: Floats
-    """to the vehicle ahead; NaN without one"""
+    """gap to the vehicle ahead [m]; NaN without one"""
 
 
 class MotorwayLog:

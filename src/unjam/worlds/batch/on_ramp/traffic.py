@@ -38,7 +38,7 @@ INSERTION_OFFSET = 0.1
 LEADER_BRAKING_THRESHOLD = 0.5
 """braking that drivers never exceed without a leader [m/s2]"""
 NO_SPEED_CAP = 1e6
-"""[m/s]"""
+"""speed cap of vehicles without one [m/s]"""
 
 LearnedCorrection = Callable[[Array, Array, Array, Array], Array]
 """A learned model of human drivers: from own speed, leader speed, gap, and known speed after a control step, to the

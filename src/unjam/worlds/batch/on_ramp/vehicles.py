@@ -35,13 +35,13 @@ class MotorwayVehicles(NamedTuple):
     lane: Array
     """0: the ramp and its lane; then the motorway's lanes from right to left; an integer"""
     position: Array
-    """of the front bumper along the road [m]"""
+    """position of the front bumper along the road [m]"""
     speed: Array
     acceleration: Array
-    """in the last step [m/s2]"""
+    """acceleration in the last step [m/s2]"""
     time_headway: Array
     max_acceleration: Array
-    """[m/s2]"""
+    """maximum acceleration [m/s2]"""
     braking: Array
     """comfortable deceleration [m/s2]"""
     minimum_gap: Array
@@ -51,9 +51,9 @@ class MotorwayVehicles(NamedTuple):
     """whether SUMO's EIDM drives; otherwise its IDM"""
     speed_cap: Array
     desired_speed: Array
-    """of an EIDM, which adapts gradually when the limit rises"""
+    """desired speed of an EIDM, which adapts gradually when the limit rises [m/s]"""
     start_time: Array
-    """when it last started from standstill [s]"""
+    """time of the last start from standstill [s]"""
     gap_error: Array
     leader_error: Array
     driving_error: Array

@@ -28,13 +28,13 @@ class ReplayOptions(NamedTuple):
     """Options of a replay, in which the vehicles of an episode enter again at the same times."""
 
     seeds: Sequence[tuple[Sequence[int], Sequence[int]]]
-    """of drivers' errors, and of exploration, for each road"""
+    """seeds of the drivers' errors and of exploration, for each road"""
     control_steps: int
-    """after which the replay ends"""
+    """number of control steps after which the replay ends"""
     has_driver_errors: bool
     """whether human drivers make errors"""
     correction: LearnedCorrection | None
-    """of the speeds of human drivers"""
+    """correction of the speeds of human drivers"""
 
 
 class MotorwayBatch:

@@ -27,7 +27,7 @@ class RingResults:
     reward_terms: dict[str, Floats]
     """sums over the control steps"""
     mean_speed: Floats
-    """of all vehicles after each control step [m/s]"""
+    """mean speed of all vehicles after each control step [m/s]"""
     min_time_gap: Floats
     """minimum of the CAVs above 1 m/s over all simulation steps [s]; infinite if they never drive that fast"""
     max_braking: Floats
@@ -46,7 +46,7 @@ class RingLog:
     start_positions: Floats
     """front bumpers at the start [m], shape (vehicles, W)"""
     find_contacts: Callable[[Array, Array, Array], Array]
-    """from positions, gaps and the road's length [m] to the vehicles that touch another one"""
+    """returns the vehicles that touch another one, for positions, gaps and the length of the road [m]"""
     series: dict[str, list[Array]]
     """the series of `ClosedRoadLog` by name; arrays of shape (vehicles, W) or (CAVs * W,) for each step"""
 

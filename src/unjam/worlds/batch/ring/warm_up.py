@@ -19,18 +19,18 @@ class WarmUpState(NamedTuple):
     """State of one ring at the moment when its CAVs are handed over."""
 
     speed: Floats
-    """[m/s], shape (vehicles + 1,), the first again at the end"""
+    """speeds [m/s], shape (vehicles + 1,), with the first one again at the end"""
     position: Floats
-    """[m], shape (vehicles,)"""
+    """positions [m], shape (vehicles,)"""
     gap: Floats
-    """to the vehicle ahead [m], likewise"""
+    """gaps to the vehicle ahead [m], shape (vehicles,)"""
     has_crashed: bool
     """whether human drivers collided"""
     noise: NoiseState
     history: LocalState | None
     """what the CAVs observed in the last minute, shape (CAVs, moments); None if it is not remembered"""
     crossing_memory: CrossingMemory | None = None
-    """of a figure eight; None on rings"""
+    """memory of the crossing of a figure eight; None on rings"""
 
 
 class WarmUpCache(dict[WarmUpKey, WarmUpState]):
