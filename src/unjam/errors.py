@@ -105,6 +105,11 @@ def error_from_name(name: str, message: str) -> UnjamError:
     return classes.get(name, UnjamError)(message)
 
 
+def one_line(value: object, length: int = 200) -> str:
+    """Return a text of a stranger on one line of at most `length` letters, without control characters."""
+    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(value).split()))[:length]
+
+
 def as_unjam_error(error: Exception) -> UnjamError:
     """Return any error as an `UnjamError`, to report it to another process."""
     if isinstance(error, OSError) and error.errno in DISK_ERRNOS:

@@ -9,6 +9,7 @@ from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import unjam
+from unjam.adapters import PolicyOutput
 from unjam.adapters.stable_baselines3 import stable_baselines3_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
@@ -88,7 +89,7 @@ def test_features_are_functions_and_actions_have_a_scale() -> None:
         return state.leader_gap / 20.0
 
     model = small(TD3, Space(1))
-    driver, half = (stable_baselines3_driver(model, (gap,), action_scale=scale) for scale in (1.0, 0.5))
+    driver, half = (stable_baselines3_driver(model, (gap,), output=PolicyOutput(scale=scale)) for scale in (1.0, 0.5))
     state = LocalState(*(np.full(2, 7.0) for _ in range(7)))
     expected = model.predict(np.full((2, 1), 0.35, np.float32), deterministic=True)[0][:, 0]
     np.testing.assert_allclose(driver.act(state, driver.initial_memory(2))[0], expected, atol=1e-6)
@@ -112,7 +113,7 @@ def test_observations_are_normalized_as_in_training() -> None:
         (Space(action=spaces.Discrete(3)), DQN, r"DQN: action space: .* is not allowed; allowed: Box of shape \(1,\)"),
         (Space(action=2), PPO, r"PPO: action space: .* is not allowed; allowed: Box of shape \(1,\)"),
         (Space(spaces.Discrete(4)), PPO, r"PPO: observation space: .*; allowed: Box of shape \(n,\)"),
-        (Space(6), PPO, "features: 5 numbers are not allowed; allowed: 6, the inputs of PPO"),
+        (Space(6), PPO, "inputs: 5 numbers are not allowed; allowed: 6, the inputs of PPO"),
     ],
 )
 def test_a_model_that_does_not_fit_is_refused(environment: Any, algorithm: Any, words: str) -> None:

@@ -59,7 +59,7 @@ def test_features_and_expert_are_given_in_python_and_local_features_by_name(tmp_
     with_expert = save(PPO("MlpPolicy", Space(6), seed=1, device="cpu"), tmp_path)
     driver = read_stable_baselines3(with_expert, ("local", "expert_acceleration"), PISaturation())
     assert driver.describe() == "pi + model.zip"
-    with pytest.raises(InputError, match=r"features: 5 numbers are not allowed; allowed: 6, the inputs of model\.zip"):
+    with pytest.raises(InputError, match=r"inputs: 5 numbers are not allowed; allowed: 6, the inputs of model\.zip"):
         make_driver(str(with_expert), 0.1)
     assert make_driver(str(save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)), 0.1).describe() == "model.zip"
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import unjam
+from unjam.adapters import PolicyInput, PolicyOutput
 from unjam.adapters.torch_module import torch_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LocalState
@@ -24,7 +25,7 @@ def network() -> torch.nn.Module:
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 def test_a_network_reads_features_and_returns_accelerations(network: torch.nn.Module, kind: torch.dtype) -> None:
     network = network.to(kind)
-    driver = torch_driver(network, action_scale=2.0)
+    driver = torch_driver(network, output=PolicyOutput(scale=2.0))
     unjam.check_driver(driver)
     state = random_state(np.random.default_rng(0), 6)
     found, _ = driver.act(state, driver.initial_memory(6))
@@ -34,11 +35,23 @@ def test_a_network_reads_features_and_returns_accelerations(network: torch.nn.Mo
 
 
 def test_a_network_is_added_to_an_expert_within_the_limit(network: torch.nn.Module) -> None:
-    driver = torch_driver(network, expert=PISaturation(), action_scale=100.0, action_limit=0.5)
+    driver = torch_driver(network, expert=PISaturation(), output=PolicyOutput(scale=100.0, limits=(-0.5, 0.5)))
     state = random_state(np.random.default_rng(0), 50)
     found, _ = driver.act(state, driver.initial_memory(50))
     assert np.abs(found).max() == 0.5
     assert driver.describe() == "pi + Sequential"
+
+
+def test_quantities_and_units_are_described_as_for_onnx() -> None:
+    network = torch.nn.Linear(2, 1, bias=False, dtype=torch.float64)
+    with torch.no_grad():
+        network.weight.copy_(torch.tensor([[1.0, 2.0]]))
+    inputs = PolicyInput("speed", "km/h", scale=10.0, offset=36.0), PolicyInput("leader_relative_speed")
+    driver = torch_driver(network, inputs, output=PolicyOutput("desired_speed", "km/h", limits=(0.0, 54.0)))
+    state = LocalState(*(np.array(each) for each in ([20.0, 20.0], [25.0, 60.0], *[[5.0, 5.0]] * 5)))
+    found, _ = driver.act(state, driver.initial_memory(2))
+    desired = np.array([(72.0 - 36.0) / 10.0 + 2.0 * 5.0, 54.0]) / 3.6
+    np.testing.assert_allclose(found, (desired - 20.0) / 0.1)
 
 
 def test_training_a_network_further_does_not_change_its_driver(network: torch.nn.Module) -> None:
@@ -62,7 +75,7 @@ def test_a_network_drives_in_this_process(network: torch.nn.Module) -> None:
     ("module", "words"),
     [
         (torch.nn.Linear(6, 1), "Linear: RuntimeError: mat1 and mat2 shapes cannot be multiplied"),
-        (torch.nn.Linear(5, 3), r"policy: returns shape \(2, 3\) for 2 CAVs; allowed: \(2,\) or \(2, 1\)"),
+        (torch.nn.Linear(5, 3), r"driver Linear: returns shape \(2, 3\) for 2 CAVs; allowed: \(2,\) or \(2, 1\)"),
     ],
 )
 def test_a_network_that_does_not_fit_is_refused(module: torch.nn.Module, words: str) -> None:

@@ -6,8 +6,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.adapters.policy_driver import PolicyDriver, policy_driver
+from unjam.adapters.policies import limited_output, policy_driver
 from unjam.drivers.observation import FeatureLike
+from unjam.drivers.policy import PolicyDriver, PolicyOutput
 from unjam.drivers.user_driver import DriverLike, object_label
 from unjam.errors import InputError, invalid_value
 
@@ -25,22 +26,25 @@ class PredictingModel(Protocol):
 
 def stable_baselines3_driver(
     model: PredictingModel,
-    features: Sequence[FeatureLike] = ("local",),
+    inputs: Sequence[FeatureLike] = ("local",),
     expert: DriverLike | None = None,
-    action_scale: float = 1.0,
+    output: PolicyOutput = PolicyOutput(),  # noqa: B008 - frozen
+    time_step: float = 0.1,
 ) -> PolicyDriver:
     """Return a model as a driver that runs in this process, without exploration.
 
-    With the features and the expert of its Gymnasium environment, it drives as in that environment. Observations are
-    clipped to the model's observation space, and normalized by its `VecNormalize` environment if it has one. Expert
-    and sum are limited to the action space.
+    With the features of its Gymnasium environment as `inputs`, and the same expert, it drives as in that environment.
+    Observations are clipped to the model's observation space, and normalized by its `VecNormalize` environment if it
+    has one. Expert and sum are limited as the actions.
 
     Args:
         model: an algorithm or a policy with `predict` whose actions are a `Box` of one number. Further training
             of it changes the driver, too.
-        features: its observation in order: names such as `local`, or functions of a `LocalState`.
-        expert: a driver to which the actions are added; None: the model drives alone.
-        action_scale: acceleration for an action of one [m/s2].
+        inputs: its observation in order: names of features such as `local`, `PolicyInput`s, or functions of a
+            `LocalState`.
+        expert: a driver to which the accelerations are added; None: the model drives alone.
+        output: what its actions mean; without limits, those of the action space.
+        time_step: control step of the road [s].
 
     Raises:
         InputError: the model has other actions or observations, or is recurrent.
@@ -60,5 +64,5 @@ def stable_baselines3_driver(
 
     if model.predict(np.zeros((1, *observed.shape), observed.dtype), deterministic=True)[1] is not None:
         raise InputError(f"{label}: a recurrent policy is not allowed; allowed: policies without memory")
-    limit = action_scale * float(np.abs([acted.low, acted.high]).max())
-    return policy_driver(act, label, features, expert, action_scale, limit, observed.shape[0])
+    output = limited_output(output, acted.low[0], acted.high[0])
+    return policy_driver(act, label, inputs, expert, output, time_step, observed.shape[0])

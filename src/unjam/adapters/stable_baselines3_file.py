@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.adapters.policy_driver import PolicyDriver, policy_driver
+from unjam.adapters.policies import limited_output, policy_driver
 from unjam.drivers.observation import FeatureLike
+from unjam.drivers.policy import PolicyDriver, PolicyOutput
 from unjam.drivers.user_driver import DriverLike
-from unjam.errors import InputError, MissingPartError, import_optional
+from unjam.errors import InputError, MissingPartError, import_optional, one_line
 from unjam.physics.arrays import Floats
 
 DATA_PART, POLICY_PART = "data", "policy.pth"
@@ -68,9 +69,10 @@ ACTORS = (
 
 def read_stable_baselines3(
     file: Path | str,
-    features: Sequence[FeatureLike] = ("local",),
+    inputs: Sequence[FeatureLike] = ("local",),
     expert: DriverLike | None = None,
-    action_scale: float = 1.0,
+    output: PolicyOutput = PolicyOutput(),  # noqa: B008 - frozen
+    time_step: float = 0.1,
 ) -> PolicyDriver:
     """Return the model of a .zip file as a driver that runs in this process, without unpickling; float64.
 
@@ -98,9 +100,8 @@ def read_stable_baselines3(
     except (InputError, MissingPartError):
         raise
     except Exception as error:  # damaged files cause any error, also in torch
-        line = " ".join(str(error).split())
         hint = "allowed: an MlpPolicy of Stable-Baselines3 with a Box of one action; others as Python objects"
-        raise InputError(f"driver {path.name}: {type(error).__name__}: {line[:200]}; {hint}") from None
+        raise InputError(f"driver {path.name}: {type(error).__name__}: {one_line(error)}; {hint}") from None
     (low, high), bounds = acted, observed
 
     def act(observations: Floats) -> Any:
@@ -110,8 +111,8 @@ def read_stable_baselines3(
         units = units @ layers[-1][0].T + layers[-1][1]
         return low + 0.5 * (np.tanh(units) + 1.0) * (high - low) if actor.is_squashed else units.clip(low, high)
 
-    limit = action_scale * float(np.abs(acted).max())
-    return policy_driver(act, path.name, features, expert, action_scale, limit, layers[0][0].shape[1])
+    output = limited_output(output, low[0], high[0])
+    return policy_driver(act, path.name, inputs, expert, output, time_step, layers[0][0].shape[1])
 
 
 def _read_parts(content: bytes, names: Sequence[str] = ()) -> dict[str, bytes]:

@@ -34,8 +34,9 @@ def drive_command(
         Option(
             "--driver",
             "-d",
-            help="Driver of the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, or a .unjam "
-            "file; drivers joined by + share the CAVs. Several are compared on the same traffic.",
+            help="Driver of the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, a .unjam "
+            "file, or an .onnx file with a description; drivers joined by + share the CAVs. Several are compared on "
+            "the same traffic.",
             show_default="human and unjam:best; on your own network CAVs then have ACCs, as in assess",
         ),
     ] = None,

@@ -31,8 +31,9 @@ def make_driver(name: str, time_step: float) -> Driver:
 
     Args:
         name: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own (`path.py:name`), a run folder,
-            a `.unjam` file, a `.zip` file of Stable-Baselines3 with a model that observes `local`, or a packaged
-            controller (`unjam:ring-best`); or several of them joined by `+`, which CAVs use in turn.
+            a `.unjam` file, a `.zip` file of Stable-Baselines3 with a model that observes `local`, an `.onnx` file with
+            a description (`policy.toml`), or a packaged controller (`unjam:ring-best`); or several of them joined by
+            `+`, which CAVs use in turn.
         time_step: control step of the road [s].
     """
     is_path = os.path.exists(name) or os.path.exists(name.rpartition(":")[0])
@@ -46,6 +47,10 @@ def make_driver(name: str, time_step: float) -> Driver:
         from unjam.adapters.stable_baselines3_file import read_stable_baselines3
 
         return read_stable_baselines3(name)
+    if name.endswith((".onnx", ".toml")) and not is_folder:
+        from unjam.adapters.onnx_file import onnx_driver
+
+        return onnx_driver(name, time_step=time_step)
     is_named = name.partition(":")[0] in DRIVERS or (is_file_reference(name) and not is_folder)
     if not is_named and (name.endswith(SUFFIX) or is_folder):
         return load_controller(name)

@@ -133,10 +133,14 @@ class ACC(FormulaDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the smaller of the accelerations for following and for free driving."""
+        return self.acceleration(state, self.set_speed), memory
+
+    def acceleration(self, state: LocalState, set_speed: Array) -> Array:
+        """Return the acceleration of `act` with another set speed, also one for each row [m/s]."""
         excess = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
         following = self.gap_gain * excess + self.speed_gain * (state.leader_speed - state.speed)
-        free = self.set_speed_gain * (self.set_speed - state.speed)
-        return namespace(state.speed).minimum(following, free), memory
+        free = self.set_speed_gain * (set_speed - state.speed)
+        return namespace(state.speed).minimum(following, free)
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -6,21 +6,24 @@ A user's own feature is a function of a `LocalState` that returns an array of sh
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 from operator import attrgetter
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.local_state import (
     ADJACENT_POSITIONS,
     COMMON_FIELDS,
+    FIELD_SIZES,
     ROAD_SECTION_LENGTH,
     SECTIONS_AHEAD,
     SPEED_SCALE,
+    STATE_UNITS,
     LocalState,
     ScaledInput,
     lap_angle,
@@ -28,6 +31,7 @@ from unjam.drivers.local_state import (
 )
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference
 from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.parameters import STRICT
 from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace, stack_columns
 from unjam.user_code import UserCode
 
@@ -186,6 +190,77 @@ FEATURES: dict[str, Feature] = {
 """all features of networks; `local` has the five numbers of the paper"""
 
 
+RELATIVE_SPEEDS = {"leader_relative_speed": "leader_speed", "follower_relative_speed": "follower_speed"}
+"""quantities that are the difference of a field of `LocalState` and the own speed"""
+UNIT_FACTORS = {"m/s": {"m/s": 1.0, "km/h": 3.6}}
+"""by SI unit, the allowed units with the number of them in one SI unit; otherwise only the SI unit itself"""
+
+
+def unit_factor(unit: str, si_unit: str) -> float:
+    """Return the number of units in one SI unit, an empty `unit`; raise `InputError` if it is not allowed."""
+    factors = UNIT_FACTORS.get(si_unit, {si_unit: 1.0})
+    if (unit or si_unit) not in factors:
+        raise unknown_name("unit", unit, factors)
+    return factors[unit or si_unit]
+
+
+def _check_scale(scale: float) -> float:
+    if not scale or not np.isfinite(scale):
+        raise ValueError("a number other than 0")
+    return scale
+
+
+Scale = Annotated[float, AfterValidator(_check_scale)]
+
+
+@checked_dataclass(frozen=True, config=STRICT, repr=False)
+class PolicyInput:
+    """A quantity among the inputs of a network, which is given `(value in unit - offset) / scale`."""
+
+    quantity: str
+    """a field of `LocalState`, or the speed of another vehicle minus the own: `leader_relative_speed` or
+    `follower_relative_speed`"""
+    unit: str = ""
+    """km/h instead of m/s; empty: the SI unit"""
+    scale: Scale = 1.0
+    offset: float = 0.0
+    """in the unit"""
+    tensor: str = ""
+    """input of an ONNX graph, of which this is the next column; empty: that with this name, or the only one"""
+
+    def __post_init__(self) -> None:
+        if self._field not in STATE_UNITS:
+            raise unknown_name("quantity", self.quantity, [*STATE_UNITS, *RELATIVE_SPEEDS])
+        unit_factor(self.unit, STATE_UNITS[self._field])
+
+    def __repr__(self) -> str:
+        return repr(self.quantity)
+
+    @property
+    def _field(self) -> str:
+        return RELATIVE_SPEEDS.get(self.quantity, self.quantity)
+
+    @cached_property
+    def feature(self) -> Feature:
+        """The feature with these numbers."""
+        name, unit = self._field, self.unit or STATE_UNITS[self._field]
+        factor, is_relative = unit_factor(self.unit, STATE_UNITS[name]), self.quantity in RELATIVE_SPEEDS
+
+        def compute(inputs: FeatureInputs) -> Array:
+            value = getattr(inputs.state, name)
+            value = ((value - inputs.state.speed if is_relative else value) * factor - self.offset) / self.scale
+            return value if name in FIELD_SIZES else as_column(value)
+
+        label = f"{self.quantity} - {self.offset:g} {unit}" if self.offset else self.quantity
+        return Feature(
+            compute,
+            (ScaledInput(label, self.scale, unit),) * FIELD_SIZES.get(name, 1),
+            FEATURES[name].road_requirement if name in FEATURES else "",
+            () if name in COMMON_FIELDS else (name,),
+            accepts_floats=name not in FIELD_SIZES,
+        )
+
+
 def _check_feature_name(name: str) -> str:
     if name not in FEATURES and not is_file_reference(name):
         raise ValueError(f"{', '.join(map(repr, FEATURES))} or 'path.py:name'")
@@ -194,24 +269,25 @@ def _check_feature_name(name: str) -> str:
 
 FeatureName = Annotated[str, AfterValidator(_check_feature_name)]
 """a key of FEATURES, or `path.py:name`"""
-FeatureLike = FeatureName | Feature | Callable[[LocalState], Any]
-"""the name of a feature, or a function of this process"""
+NetworkInput = str | PolicyInput | Feature
+FeatureLike = FeatureName | PolicyInput | Feature | Callable[[LocalState], Any]
+"""the name of a feature, a quantity, or a function of this process"""
 
 
-def as_features(features: Sequence[FeatureLike]) -> tuple[str | Feature, ...]:
+def as_features(features: Sequence[FeatureLike]) -> tuple[NetworkInput, ...]:
     """Return features, functions among them as `Feature`; raise `InputError` if it is no list, or one is invalid."""
     if isinstance(features, str) or not isinstance(features, Sequence) or not features:
         raise invalid_value("features", features, "a list of features, like ('local', 'expert_acceleration')")
     return tuple(
-        each if isinstance(each, str | Feature) else _user_feature(UserFunction.from_object(each, "a LocalState"))
+        each if isinstance(each, NetworkInput) else _user_feature(UserFunction.from_object(each, "a LocalState"))
         for each in features
     )
 
 
-def feature(name: str | Feature) -> Feature:
+def feature(name: NetworkInput) -> Feature:
     """Return a feature by name; raise `InputError` if there is none, or a user's file has no such function."""
-    if isinstance(name, Feature):
-        return name
+    if not isinstance(name, str):
+        return name if isinstance(name, Feature) else name.feature
     if name not in FEATURES and not is_file_reference(name):
         raise unknown_name("features", name, [*FEATURES, "path.py:name"])
     return FEATURES[name] if name in FEATURES else _file_feature(name)
@@ -245,7 +321,7 @@ def _user_feature(function: UserFunction) -> Feature:
     return Feature(compute, tuple(entries), accepts_floats=False, reads_any_field=True)
 
 
-def feature_fields(names: Sequence[str | Feature]) -> frozenset[str]:
+def feature_fields(names: Sequence[NetworkInput]) -> frozenset[str]:
     """Return the fields of `LocalState` that features read; for a user's own feature all, as its code decides."""
     features = [feature(name) for name in names]
     if any(each.reads_any_field for each in features):
@@ -253,7 +329,7 @@ def feature_fields(names: Sequence[str | Feature]) -> frozenset[str]:
     return frozenset(field for each in features for field in each.required_fields)
 
 
-def compute_observation(names: Sequence[str | Feature], inputs: FeatureInputs) -> Array:
+def compute_observation(names: Sequence[NetworkInput], inputs: FeatureInputs) -> Array:
     """Return the input of a network: the features concatenated, shape (n, inputs), no unit."""
     blocks = [block for name in names if (block := feature(name).compute(inputs)) is not None]
     if not blocks:
@@ -261,7 +337,7 @@ def compute_observation(names: Sequence[str | Feature], inputs: FeatureInputs) -
     return join_columns(blocks)
 
 
-def observation_inputs(names: Sequence[str | Feature], expert: Driver) -> tuple[ScaledInput, ...]:
+def observation_inputs(names: Sequence[NetworkInput], expert: Driver) -> tuple[ScaledInput, ...]:
     """Return the descriptions of a network's inputs with this expert, in the order of `compute_observation`."""
     described = sum(len(feature(name).inputs or ()) for name in names)
     remaining = range(observation_size(names, expert) - described)
@@ -269,7 +345,7 @@ def observation_inputs(names: Sequence[str | Feature], expert: Driver) -> tuple[
     return tuple(entry for name in names for entry in (feature(name).inputs or own))
 
 
-def observation_size(names: Sequence[str | Feature], expert: Driver) -> int:
+def observation_size(names: Sequence[NetworkInput], expert: Driver) -> int:
     """Return the number of a network's inputs with this expert."""
     state = state_of_ones(LocalState._fields, np.ones)
     acceleration, memory = expert.act(state, expert.initial_memory(1))

@@ -14,7 +14,9 @@ from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, AdaptiveACC, C
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.network import network_from_weights
 from unjam.drivers.observation import FEATURES, FeatureName, check_user_files, observation_size
+from unjam.drivers.onnx_policy import GRAPH_WEIGHTS, make_onnx_driver
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
+from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
 from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.user_driver import FileDriver, FileReference, is_file_reference
@@ -35,8 +37,8 @@ InnerDriverBuilder = Callable[[Any, str], Driver]
 
 def driver_names() -> str:
     """Return what `--driver` allows, for messages."""
-    others = ["path.py:name", "a run folder", "a .unjam file", "unjam:ring-best", "several joined by +"]
-    return ", ".join([*DRIVERS, *others])
+    files = ["path.py:name", "a run folder", "a .unjam file", "an .onnx file", "unjam:ring-best"]
+    return ", ".join([*DRIVERS, *files, "several joined by +"])
 
 
 def driver_from_name(text: str, time_step: float) -> Driver:
@@ -54,6 +56,15 @@ def driver_from_name(text: str, time_step: float) -> Driver:
     if any(field.name == "time_step" for field in fields(kind)):  # pyright: ignore[reportArgumentType]
         parameters = {"time_step": time_step, **parameters}
     return build_dataclass(kind, parameters, f"driver {name}")
+
+
+@dataclass(frozen=True, config=STRICT)
+class _OnnxRecipe:
+    kind: Literal["onnx"]
+    label: str
+    description: PolicyDescription
+    time_step: Positive | None
+    expert: dict[str, Any]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -122,6 +133,14 @@ def _build_residual(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBui
     return ResidualDriver(expert, network, found.action_limit, found.inputs, found.action_repeat)
 
 
+def _build_onnx(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder) -> Driver:
+    found, graph = build_dataclass(_OnnxRecipe, recipe, "driver recipe"), weights.get(GRAPH_WEIGHTS)
+    if graph is None or graph.dtype != np.uint8 or graph.ndim != 1:
+        raise InputError(f"driver recipe: weights {GRAPH_WEIGHTS!r} are not bytes")
+    expert = build_inner(found.expert, EXPERT_KEY)
+    return make_onnx_driver(graph.tobytes(), found.description, expert, found.label, found.time_step)
+
+
 def _build_composite(
     driver_class: type[Driver], recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder
 ) -> Driver:
@@ -137,6 +156,7 @@ RECIPE_BUILDERS: dict[str, Callable[[Recipe, Arrays, InnerDriverBuilder], Driver
     "file": lambda recipe, weights, build_inner: FileDriver(
         Path(recipe["path"]), recipe["name"], recipe["parameters"], recipe["time_step"], recipe["sha256"]
     ),
+    "onnx": _build_onnx,
     "residual": _build_residual,
     "mixed": lambda recipe, weights, build_inner: MixedDriver(
         tuple(build_inner(part, str(number)) for number, part in enumerate(recipe["drivers"]))

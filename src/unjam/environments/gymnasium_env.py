@@ -16,9 +16,9 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import (
-    Feature,
     FeatureInputs,
     FeatureLike,
+    NetworkInput,
     as_features,
     compute_observation,
     feature_fields,
@@ -44,7 +44,7 @@ MAX_OBSERVATION = 50.0
 class ExternalDriver(Driver):
     """An expert with external additions to its accelerations: `actions`, set before each decision."""
 
-    def __init__(self, expert: Driver, features: tuple[str | Feature, ...], limits: Limits) -> None:
+    def __init__(self, expert: Driver, features: tuple[NetworkInput, ...], limits: Limits) -> None:
         """Let `expert` drive within `limits`; `features` are the external observation."""
         self.expert, self.features, self._limits = expert, features, limits
         self.actions: Any = np.zeros(0)

@@ -8,7 +8,7 @@ from typing import SupportsIndex
 import numpy as np
 
 from unjam.drivers.driver import Driver, other_time_steps
-from unjam.drivers.observation import Feature, feature
+from unjam.drivers.observation import NetworkInput, feature
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.scenarios.scenario import Scenario
@@ -111,7 +111,7 @@ def check_time_step(driver: Driver, scenario: Scenario, label: str = "") -> None
         raise InputError(f"{context}: {found}; allowed: {step:g} s, its control step")
 
 
-def check_policy_inputs(features: Sequence[str | Feature], scenario: Scenario, context: str) -> None:
+def check_policy_inputs(features: Sequence[NetworkInput], scenario: Scenario, context: str) -> None:
     """Raise `InputError` if features use fields that a scenario's road does not provide."""
     for name in features:
         requirement, fields = feature(name).road_requirement, feature(name).required_fields

@@ -1,0 +1,108 @@
+"""An ONNX file of a third party as a driver, with a description of its inputs and outputs in TOML.
+
+The description stands beside the graph (`policy.toml` for `policy.onnx`), or in the metadata of the graph itself. It
+names data only: the graph in its own folder, and an expert among the drivers with names.
+"""
+
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+from unjam.drivers.car_following import Constant
+from unjam.drivers.driver import Driver
+from unjam.drivers.onnx_policy import OnnxDriver, make_onnx_driver
+from unjam.drivers.policy import PolicyDescription
+from unjam.drivers.registry import DRIVERS, driver_from_name
+from unjam.drivers.user_driver import DriverLike, as_driver
+from unjam.errors import InputError, invalid_value, one_line, unknown_name
+from unjam.folders import open_folder
+from unjam.onnx_models import MAX_MODEL_BYTES, parse_model
+from unjam.parameters import build_dataclass, parse_toml, split_parameters
+
+GRAPH_SUFFIX, DESCRIPTION_SUFFIX = ".onnx", ".toml"
+DESCRIPTION_KEY = "unjam"
+"""key of the description among the metadata of a graph"""
+MAX_DESCRIPTION_BYTES = 2**20
+
+
+def onnx_driver(
+    file: Path | str,
+    description: PolicyDescription | None = None,
+    expert: DriverLike | None = None,
+    time_step: float = 0.1,
+) -> OnnxDriver:
+    """Return the driver of an ONNX graph, which onnxruntime runs; workers and controller files carry it as data.
+
+    Args:
+        file: the graph (.onnx), or its description (.toml).
+        description: of inputs and outputs; None: that in the file beside the graph, or in its metadata.
+        expert: a driver to which the accelerations are added; None: that of the description, if it has one.
+        time_step: control step of the road [s].
+
+    Raises:
+        InputError: a file is missing, or is not allowed: the graph is not pure arithmetic, or does not fit its
+            description.
+        MissingPartError: onnx or onnxruntime is not installed.
+    """
+    path = Path(file)
+    if description is not None:
+        content, table = _read(path, MAX_MODEL_BYTES), {}
+    else:
+        content, table = _read_described(path)
+    inner = _expert(table.pop("expert", ""), time_step) if expert is None else as_driver(expert, time_step)
+    if description is None:
+        description = build_dataclass(PolicyDescription, table, f"driver {path.name}")
+    return make_onnx_driver(content, description, inner, path.name, time_step)
+
+
+def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:
+    """Return a graph and the table of its description."""
+    beside = path.with_suffix(DESCRIPTION_SUFFIX)
+    if os.path.lexists(beside):
+        table = _parse_description(_read(beside, MAX_DESCRIPTION_BYTES), beside.name)
+        name = table.pop("graph", path.with_suffix(GRAPH_SUFFIX).name)
+        if not isinstance(name, str) or Path(name).name != name or not name.endswith(GRAPH_SUFFIX):
+            allowed = f"the name of a file in its folder that ends in {GRAPH_SUFFIX}"
+            raise invalid_value(f"driver {beside.name}: graph", name, allowed)
+        graph = path if path.suffix == GRAPH_SUFFIX else path.with_name(name)
+        return _read(graph, MAX_MODEL_BYTES), table
+    content = _read(path, MAX_MODEL_BYTES)
+    texts = {each.key: each.value for each in parse_model(content).metadata_props}
+    if DESCRIPTION_KEY not in texts:
+        needed = f"{beside.name}, with the inputs and the output of the graph"
+        raise InputError(f"driver {path.name}: its description is missing; needed: {needed}")
+    return content, _parse_description(texts[DESCRIPTION_KEY].encode(), path.name)
+
+
+def _read(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a regular file, which is no link."""
+    if path.is_symlink():
+        raise InputError(f"driver {path.name}: a symbolic link is not allowed; allowed: the file itself")
+    try:
+        with open_folder(path.parent) as folder, open(folder.open(path.name, os.O_RDONLY), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise InputError(f"driver {path.name}: it is not a file")
+            content = file.read(max_bytes + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"driver: {str(path)!r}: {reason}") from None
+    if len(content) > max_bytes:
+        raise InputError(f"driver {path.name}: more than {max_bytes:,} bytes are not allowed; allowed: at most that")
+    return content
+
+
+def _parse_description(content: bytes, name: str) -> dict[str, Any]:
+    try:
+        return parse_toml(content.decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"driver {name}: not TOML: {one_line(error)}") from None
+
+
+def _expert(name: Any, time_step: float) -> Driver:
+    """Return the expert of a description: a driver with a name, which is no file."""
+    if name == "":
+        return Constant()
+    if not isinstance(name, str) or split_parameters(name)[0] not in DRIVERS:
+        raise unknown_name("expert", name, DRIVERS)
+    return driver_from_name(name, time_step)

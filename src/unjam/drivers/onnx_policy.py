@@ -1,0 +1,223 @@
+"""An ONNX graph of a third party as a driver: data, which workers and controller files carry."""
+
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unjam.drivers.driver import Driver, Memory, Recipe
+from unjam.drivers.observation import PolicyInput, observation_size
+from unjam.drivers.policy import (
+    PolicyDescription,
+    PolicyDriver,
+    PolicyMemory,
+    action_limits,
+    action_repeat,
+    assumed_time_step,
+)
+from unjam.errors import InputError, MissingPartError, invalid_value, unknown_name
+from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session
+from unjam.tree import Arrays
+
+OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)
+"""allowed versions of the operators and of the format"""
+TYPES: dict[int, type[np.floating[Any]]] = {1: np.float32, 11: np.float64}
+"""allowed types of inputs and outputs, by their numbers in ONNX"""
+GRAPH_WEIGHTS = "graph"
+"""name of the graph among the weights of a driver: its bytes"""
+MAX_MEMORY_NUMBERS = 100_000
+"""maximum count of numbers in the recurrent state of one CAV"""
+PROBE_ROWS, MAX_PROBE_DIFFERENCE = 3, 1e-4
+"""CAVs in the check that rows are independent, and the allowed difference, relative to the largest number"""
+
+
+class Tensor(NamedTuple):
+    """An input or output of a graph."""
+
+    type: type[np.floating[Any]]
+    shape: tuple[int, ...] | None
+    """0 for an axis without a fixed length; None: unknown"""
+
+
+@dataclass(frozen=True, eq=False)
+class OnnxPolicy:
+    """A checked graph as the function of a policy."""
+
+    graph: bytes
+    columns: dict[str, tuple[int, ...]]
+    """columns of the observation, by input"""
+    output: str
+    memory: tuple[PolicyMemory, ...]
+    tensors: dict[str, Tensor]
+    """its inputs"""
+    is_batched: bool
+    """whether the graph takes any number of rows; otherwise it runs once for each CAV"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return the initial recurrent state of `n` CAVs, in the types of the graph."""
+        return {each.input: self._initial_rows(each, n) for each in self.memory}
+
+    def _initial_rows(self, memory: PolicyMemory, n: int) -> NDArray[Any]:
+        tensor = self.tensors[memory.input]
+        return np.broadcast_to(np.array(memory.initial, tensor.type), (n, *(tensor.shape or ())[1:])).copy()
+
+    def __call__(self, observation: NDArray[np.float64], memory: Memory) -> tuple[Any, Memory]:
+        """Return the numbers of the graph and the new recurrent state; raise `InputError` if it cannot be run."""
+        values = {name: self._as_input(name, observation[:, columns]) for name, columns in self.columns.items()}
+        values |= memory
+        outputs = [self.output, *(each.output for each in self.memory)]
+        session = _cached_session(self.graph)
+        if self.is_batched:
+            found = run_session(session, outputs, values)
+        else:
+            rows = range(len(observation))
+            single = [run_session(session, outputs, {k: v[row : row + 1] for k, v in values.items()}) for row in rows]
+            found = [np.concatenate(parts) for parts in zip(*single, strict=True)]
+        numbers, *after = found
+        return numbers, dict(zip(memory, after, strict=True))
+
+    def _as_input(self, name: str, columns: NDArray[np.float64]) -> NDArray[Any]:
+        tensor = self.tensors[name]
+        values = columns.astype(tensor.type)
+        return values[:, 0] if len(tensor.shape or ()) == 1 else values
+
+
+@lru_cache(maxsize=16)
+def _cached_session(graph: bytes) -> Any:
+    return open_session(graph)
+
+
+@dataclass(frozen=True, eq=False)
+class OnnxDriver(PolicyDriver):
+    """A policy from an ONNX graph, alone or added to an expert."""
+
+    policy: OnnxPolicy
+    description: PolicyDescription | None = None
+
+    def recipe(self) -> Recipe:
+        """Return its specification, without the graph."""
+        description = asdict(self.description)  # pyright: ignore[reportArgumentType]
+        fields = {"label": self.label, "description": description, "time_step": self.time_step}
+        return {"kind": "onnx", **fields, "expert": self.expert.recipe()}
+
+    def weights(self) -> Arrays:
+        """Return the graph as bytes and, with their prefix, the weights of its expert."""
+        return {**super().weights(), GRAPH_WEIGHTS: np.frombuffer(self.policy.graph, np.uint8)}
+
+
+def make_onnx_driver(
+    graph: bytes, description: PolicyDescription, expert: Driver, label: str, time_step: float | None
+) -> OnnxDriver:
+    """Return the driver of a graph on roads with this control step [s]; None if it does not depend on it.
+
+    Raise `InputError` if the graph is not allowed, or does not fit its description, `MissingPartError` if a package is
+    not installed.
+    """
+    try:
+        limits = action_limits(description.output, expert)
+        step = None if time_step is None else assumed_time_step(description.output, description.time_step, time_step)
+        repeat = 1 if step is None else action_repeat(description.time_step, step)
+        policy = _read_policy(graph, description, expert)
+        inputs, output = description.inputs, description.output
+        driver = OnnxDriver(policy, label, inputs, output, expert, step, repeat, limits, description)
+        _probe(driver, sum(map(len, policy.columns.values())))
+    except MissingPartError:
+        raise
+    except InputError as error:
+        prefix = f"driver {label}: "
+        raise InputError(f"{prefix}{str(error).removeprefix(prefix)}") from None
+    return driver
+
+
+def _read_policy(content: bytes, description: PolicyDescription, expert: Driver) -> OnnxPolicy:
+    model = parse_model(content)
+    remove_texts(model)
+    check_model(model, model.ByteSize(), OPSETS, IR_VERSIONS)
+    inputs = {each.name: _read_tensor(each) for each in model.graph.input}
+    outputs = {each.name: _read_tensor(each) for each in model.graph.output}
+    remembered = {each.input for each in description.memory}
+    if unknown := remembered - inputs.keys():
+        raise unknown_name("memory.input", min(unknown), inputs)
+    columns = _assign_columns(description, expert, [name for name in inputs if name not in remembered])
+    for name, positions in columns.items():
+        _check_columns(name, inputs[name].shape, len(positions))
+    others = {each.output for each in description.memory}
+    names = [each for each in outputs if each not in others]
+    output = description.output.tensor
+    if output not in names and (output or len(names) != 1):
+        raise unknown_name("output.tensor", output, names)
+    for each in description.memory:
+        _check_memory(each, inputs, outputs)
+    is_batched = not any((inputs[name].shape or (0,))[0] for name in inputs)
+    content = model.SerializeToString()
+    return OnnxPolicy(content, columns, output or names[0], description.memory, inputs, is_batched)
+
+
+def _read_tensor(value: Any) -> Tensor:
+    if not value.name.isprintable():
+        raise invalid_value("graph: name", value.name, "printable characters")
+    tensor = value.type.tensor_type
+    if tensor.elem_type not in TYPES:
+        raise InputError(f"graph: {value.name!r} has the type {tensor.elem_type}; allowed: 1 (float32) or 11 (float64)")
+    shape = tuple(each.dim_value for each in tensor.shape.dim) if tensor.HasField("shape") else None
+    return Tensor(TYPES[tensor.elem_type], shape)
+
+
+def _assign_columns(description: PolicyDescription, expert: Driver, names: list[str]) -> dict[str, tuple[int, ...]]:
+    """Return the columns of the observation for each input of a graph."""
+    columns: dict[str, list[int]] = {name: [] for name in names}
+    start = 0
+    for each in description.inputs:
+        tensor, default = (each.tensor, each.quantity) if isinstance(each, PolicyInput) else ("", "")
+        if not tensor:
+            tensor = default if default in columns else names[0] if len(names) == 1 else ""
+        if tensor not in columns:
+            raise unknown_name(f"inputs: tensor of {each!r}", tensor, names)
+        size = observation_size((each,), expert)
+        columns[tensor] += range(start, start + size)
+        start += size
+    for name in names:
+        if not columns[name]:
+            raise InputError(f"inputs: nothing for the input {name!r} of the graph; allowed: a quantity, or memory")
+    return {name: tuple(positions) for name, positions in columns.items()}
+
+
+def _check_columns(name: str, shape: tuple[int, ...] | None, count: int) -> None:
+    allowed = {(count,), (0,), *([()] if count == 1 else [])}
+    if shape is None or shape[:1] not in ((0,), (1,)) or shape[1:] not in allowed:
+        raise InputError(f"input {name!r}: shape {_shape_text(shape)} is not allowed; allowed: (n, {count})")
+
+
+def _check_memory(memory: PolicyMemory, inputs: dict[str, Tensor], outputs: dict[str, Tensor]) -> None:
+    if memory.output not in outputs:
+        raise unknown_name("memory.output", memory.output, outputs)
+    given, returned = inputs[memory.input], outputs[memory.output]
+    shape = given.shape
+    if shape is None or shape[:1] not in ((0,), (1,)) or 0 in shape[1:] or np.prod(shape[1:]) > MAX_MEMORY_NUMBERS:
+        allowed = f"(n, fixed lengths), at most {MAX_MEMORY_NUMBERS:,} numbers"
+        raise InputError(f"memory {memory.input!r}: shape {_shape_text(shape)} is not allowed; allowed: {allowed}")
+    if returned.type != given.type:
+        raise InputError(f"memory {memory.output!r}: the type of {memory.input!r} is not allowed; allowed: the same")
+    try:
+        np.broadcast_to(np.array(memory.initial, given.type), shape[1:])
+    except (TypeError, ValueError):
+        allowed = f"a number, or numbers of shape {shape[1:]}"
+        raise InputError(f"memory {memory.input!r}: initial value is not allowed; allowed: {allowed}") from None
+
+
+def _shape_text(shape: tuple[int, ...] | None) -> str:
+    return "unknown" if shape is None else f"({', '.join(str(length or 'n') for length in shape)})"
+
+
+def _probe(driver: PolicyDriver, size: int) -> None:
+    """Raise `InputError` unless a graph runs, returns numbers, and treats each row by itself."""
+    observation = np.random.default_rng(0).uniform(0.0, 1.0, (PROBE_ROWS, size))
+    together, after = driver.evaluate(observation, driver.policy.initial_memory(PROBE_ROWS))
+    for name, rows in driver.policy.initial_memory(PROBE_ROWS).items():
+        if np.shape(after[name]) != rows.shape:
+            raise InputError(f"memory {name!r}: returns shape {np.shape(after[name])}; allowed: {rows.shape}")
+    alone = [driver.evaluate(row[None], driver.policy.initial_memory(1))[0][0] for row in observation]
+    if not np.allclose(together, alone, rtol=0.0, atol=MAX_PROBE_DIFFERENCE * max(1.0, np.abs(together).max())):
+        raise InputError("graph: CAVs influence each other; allowed: rows that are computed independently")

@@ -1,0 +1,185 @@
+"""ONNX models of strangers: their allowed content, and their execution with little memory.
+
+An untrusted model is only data if it is pure arithmetic: ONNX has loops, functions, operators of other domains, and
+tensors in external files. Therefore anything that is not listed here is refused, at any depth.
+"""
+
+from functools import cache
+from math import prod
+from typing import Any
+
+from unjam.errors import InputError, import_optional, invalid_value, one_line
+
+ALLOWED_OPERATORS: dict[str, dict[str, str]] = {
+    **{
+        name: {}
+        for name in (
+            *("Abs", "Add", "And", "Ceil", "Cos", "Div", "Equal", "Erf", "Exp", "Expand", "Floor", "Greater"),
+            *("GreaterOrEqual", "HardSwish", "Identity", "IsNaN", "Less", "LessOrEqual", "Log", "MatMul", "Max"),
+            *("Mean", "Min", "Mish", "Mul", "Neg", "Not", "Or", "PRelu", "Pow", "Reciprocal", "Relu", "Round"),
+            *("Sigmoid", "Sign", "Sin", "Slice", "Softplus", "Softsign", "Sqrt", "Sub", "Sum", "Tan", "Tanh", "Where"),
+        )
+    },
+    **{name: {"alpha": "f"} for name in ("Elu", "LeakyRelu", "ThresholdedRelu")},
+    **{name: {"axis": "i"} for name in ("Concat", "Flatten", "Gather", "GatherElements", "LogSoftmax", "Softmax")},
+    **{
+        name: {"axes": "ints", "keepdims": "i", "noop_with_empty_axes": "i"}
+        for name in ("ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum")
+    },
+    **{name: {"axes": "ints"} for name in ("Squeeze", "Unsqueeze")},
+    "BatchNormalization": {"epsilon": "f", "momentum": "f", "training_mode": "i"},
+    "Cast": {"to": "i"},
+    "Clip": {"max": "f", "min": "f"},
+    "Constant": {"value": "t", "value_float": "f", "value_int": "i"},
+    "GatherND": {"batch_dims": "i"},
+    "Gelu": {"approximate": "s"},
+    "Gemm": {"alpha": "f", "beta": "f", "transA": "i", "transB": "i"},
+    "HardSigmoid": {"alpha": "f", "beta": "f"},
+    "LayerNormalization": {"axis": "i", "epsilon": "f", "stash_type": "i"},
+    "Mod": {"fmod": "i"},
+    "Reshape": {"allowzero": "i"},
+    "ScatterElements": {"axis": "i", "reduction": "s"},
+    "Selu": {"alpha": "f", "gamma": "f"},
+    "Shape": {"end": "i", "start": "i"},
+    "Split": {"axis": "i", "num_outputs": "i", "split": "ints"},
+    "Transpose": {"perm": "ints"},
+}
+"""all allowed operators: arithmetic, without subgraphs; with the field that stores each of their attributes"""
+ALLOWED_FIELDS = {
+    "ModelProto": {"ir_version", "producer_name", "producer_version", "opset_import", "graph"},
+    "OperatorSetIdProto": {"domain", "version"},
+    "GraphProto": {"name", "node", "initializer", "input", "output", "value_info"},
+    "NodeProto": {"name", "op_type", "domain", "input", "output", "attribute"},
+    "AttributeProto": {"name", "type", "i", "f", "s", "t", "ints"},
+    "TensorProto": {"name", "dims", "data_type", "raw_data", "double_data", "float_data"}
+    | {"int32_data", "int64_data"},
+    "ValueInfoProto": {"name", "type"},
+    "TypeProto": {"tensor_type"},
+    "Tensor": {"elem_type", "shape"},
+    "TensorShapeProto": {"dim"},
+    "Dimension": {"dim_param", "dim_value"},
+}
+"""all fields that messages of a model may set: no function, subgraph, sparse or external tensor, metadata"""
+ONNX_DOMAINS = "", "ai.onnx"
+"""both names of the domain of ONNX itself"""
+TEXT_FIELDS = {"doc_string", "metadata_props", "model_version", "producer_name", "producer_version", "denotation"}
+"""fields with texts for readers, which change no number"""
+MAX_MODEL_BYTES = 64 * 2**20
+MAX_TENSOR_NUMBERS = MAX_MODEL_BYTES // 4
+"""maximum count of numbers in a constant"""
+MAX_RUN_BYTES = 256 * 2**20
+"""maximum memory of all running models of this process"""
+
+
+def parse_model(content: bytes) -> Any:
+    """Return the message of a model, unchecked; raise `InputError` if it cannot be read."""
+    if len(content) > MAX_MODEL_BYTES:
+        raise InputError(f"graph: {len(content):,} bytes are not allowed; allowed: at most {MAX_MODEL_BYTES:,}")
+    onnx = import_optional("onnx")
+    try:
+        return onnx.load_model_from_string(content)
+    except Exception as error:  # protobuf has its own error classes
+        raise InputError(f"graph: cannot be read: {one_line(error)}") from None
+
+
+def remove_texts(message: Any) -> None:
+    """Remove the texts of a message, and of all messages nested in it."""
+    for each, value in message.ListFields():
+        if each.name in TEXT_FIELDS:
+            message.ClearField(each.name)
+        elif each.message_type is not None:
+            for inner in (value,) if hasattr(value, "ListFields") else value:
+                remove_texts(inner)
+
+
+def check_model(model: Any, size: int, opsets: range, ir_versions: range) -> None:
+    """Raise `InputError` unless a model of `size` bytes has only arithmetic, and these versions of ONNX."""
+    _check_fields(model)
+    model.DiscardUnknownFields()
+    if model.ByteSize() != size:
+        raise InputError("graph: it contains bytes that ONNX does not know; allowed: fields of ONNX, each once")
+    if model.ir_version not in ir_versions:
+        raise invalid_value("graph: ir_version", model.ir_version, f"{ir_versions[0]} to {ir_versions[-1]}")
+    imported = [(each.domain, each.version) for each in model.opset_import]
+    if len(imported) != 1 or imported[0][0] not in ONNX_DOMAINS or imported[0][1] not in opsets:
+        allowed = f"[('', {opsets[0]})]" + (f" to [('', {opsets[-1]})]" if len(opsets) > 1 else "")
+        raise invalid_value("graph: opset_import", imported, allowed)
+    graph = model.graph
+    if fixed := {each.name for each in graph.initializer} & {each.name for each in graph.input}:
+        raise invalid_value("graph: initializer", min(fixed), "constants, not inputs")
+    attribute_types = import_optional("onnx").AttributeProto
+    for node in graph.node:
+        _check_node(node, attribute_types)
+
+
+def _check_fields(message: Any) -> None:
+    """Raise `InputError` if a message, or one nested in it, sets a field that is not allowed."""
+    kind = message.DESCRIPTOR.name
+    for each, value in message.ListFields():
+        if each.name not in ALLOWED_FIELDS.get(kind, ()):
+            allowed = ", ".join(sorted(ALLOWED_FIELDS.get(kind, ()))) or "no message of this kind"
+            raise InputError(f"graph: {kind}.{each.name} is not allowed; allowed: {allowed}")
+        if each.message_type is not None:
+            for inner in (value,) if hasattr(value, "ListFields") else value:
+                _check_fields(inner)
+    if kind == "TensorProto" and (min(message.dims, default=0) < 0 or prod(message.dims) > MAX_TENSOR_NUMBERS):
+        allowed = f"at most {MAX_TENSOR_NUMBERS:,} numbers"
+        raise invalid_value(f"graph: shape of constant {message.name!r}", [*message.dims], allowed)
+
+
+def _check_node(node: Any, types: Any) -> None:
+    if node.domain not in ONNX_DOMAINS or node.op_type not in ALLOWED_OPERATORS:
+        operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
+        raise InputError(f"graph: operator {operator!r} is not allowed; allowed: arithmetic")
+    allowed, seen = ALLOWED_OPERATORS[node.op_type], set[str]()
+    types_of = {"i": types.INT, "f": types.FLOAT, "s": types.STRING, "t": types.TENSOR, "ints": types.INTS}
+    for attribute in node.attribute:
+        value_field = allowed.get(attribute.name)
+        fields = {each.name for each, _ in attribute.ListFields()}
+        if value_field is None or attribute.name in seen or fields != {"name", "type", value_field}:
+            names = ", ".join(allowed) or "none"
+            raise invalid_value(f"graph: attribute of {node.op_type}", attribute.name, f"{names}, each once")
+        if attribute.type != types_of[value_field]:
+            field = f"graph: type of {node.op_type}.{attribute.name}"
+            raise invalid_value(field, attribute.type, types_of[value_field])
+        seen.add(attribute.name)
+
+
+def open_session(content: bytes) -> Any:
+    """Return the session of onnxruntime for a checked model, on one thread and with at most `MAX_RUN_BYTES`.
+
+    Raise `InputError` if onnxruntime refuses it, `MissingPartError` if it is not installed.
+    """
+    runtime = import_optional("onnxruntime")
+    _limit_memory()
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    providers, disabled = ["CPUExecutionProvider"], ["ConstantFolding"]  # it would not obey the memory limit
+    try:
+        return runtime.InferenceSession(content, options, providers=providers, disabled_optimizers=disabled)
+    except Exception as error:  # the runtime has its own error classes
+        raise _run_error(error) from None
+
+
+def run_session(session: Any, outputs: list[str] | None, values: dict[str, Any]) -> list[Any]:
+    """Return the outputs (None: all) for the values of the inputs; raise `InputError` if it fails."""
+    try:
+        return session.run(outputs, values)
+    except Exception as error:  # the runtime has its own error classes
+        raise _run_error(error) from None
+
+
+def _run_error(error: Exception) -> InputError:
+    return InputError(f"graph: cannot be run: {one_line(error)}")
+
+
+@cache
+def _limit_memory() -> None:
+    """Register the memory that all sessions of this process share."""
+    runtime = import_optional("onnxruntime")
+    memory = runtime.OrtMemoryInfo("Cpu", runtime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, runtime.OrtMemType.DEFAULT)
+    grow_as_requested = 1
+    limits = runtime.OrtArenaCfg({"max_mem": MAX_RUN_BYTES, "arena_extend_strategy": grow_as_requested})
+    runtime.create_and_register_allocator(memory, limits)
