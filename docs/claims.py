@@ -1,4 +1,4 @@
-"""The paper's claims beside what the studies found, from files under results/."""
+"""Claims of the paper, compared with the results of the studies, from files under results/."""
 
 from typing import Any
 
@@ -63,7 +63,7 @@ def together(verdicts: list[str]) -> str:
 
 
 def earns_more(rows: dict[str, dict[str, Any]], name: str, *others: str) -> str:
-    """Say whether one earns more than all others, trainings of the same seed paired, 95 % interval."""
+    """Say whether one has a larger return than all others, trainings of the same seed paired, 95 % interval."""
     gain = {one: np.array(rows[one]["gains"]) for one in (name, *others)}
     found = [estimate_over_trainings(gain[name] - gain[other]) for other in others]
     trainings = f"({len(gain[name])} trainings)"
@@ -100,7 +100,7 @@ def tenths(study: str, road: str, variant: str, name: str) -> np.ndarray:
 
 
 def first_rounds_on(road: str) -> Claim:
-    """Does it earn more in the first tenth of the training?"""
+    """Does it have a larger return in the first tenth of the training?"""
     words, study = f"more reward in the first rounds on {road}", f"table-1-{road}"
     variants = {"proposed": "proposed", **OTHERS}
     starts = {name: tenths(study, road, variant, "return_mean")[0] for name, variant in variants.items()}
@@ -137,7 +137,7 @@ def collisions() -> Claim:
     rows = [row for study, road in studies for row in table(study, road).values() if row["is_learned"]]
     most = max(row["collisions"]["mean"] for row in rows)
     numbers = f"at most {most:.2f} in an episode, held-out, over {sum(row['trainings'] for row in rows)} trainings"
-    return "collisions are rare, whoever learns", verdict(most < 0.05), numbers
+    return "collisions are rare with all learners", verdict(most < 0.05), numbers
 
 
 def trpo_slowest() -> Claim:
@@ -218,7 +218,7 @@ def percent_over_ppo() -> Claim:
     """Is it 483 % over PPO?"""
     rows = table("table-2", "ring")
     best = max(of(rows, name) for name in rows)
-    numbers = "PPO's 1,057 times 5.83 is 6,162; nobody can earn more than 2,481; "
+    numbers = "PPO's 1,057 times 5.83 is 6,162; no driver can have a larger return than 2,481; "
     numbers += f"the most of these rows, a tuned PI, {best:,.0f}"
     return "483 % more return than PPO, 34 % more than SAC", "impossible", numbers
 
@@ -233,7 +233,7 @@ def beyond_the_expert() -> Claim:
     numbers = (
         f"the paper's settings {interval_text(papers, 0, '+')}; ours, on a tuned PI, {interval_text(ours, 0, '+')}, "
     )
-    numbers += f"which is {interval_text(best, 0, '+')} beside the best tuned expert"
+    numbers += f"which is {interval_text(best, 0, '+')} compared with the best tuned expert"
     gain = papers["mean"] / of(rows, "PI (paper)")
     words = "the residual improves on its expert (ring; the paper does not show the expert alone)"
     return words, f"by {100 * gain:.1f} %", numbers

@@ -104,7 +104,7 @@ def gap_error(model: str, data: str = "ngsim", test: str = "test") -> float:
 
 
 def ring() -> pd.DataFrame:
-    """Return what happens on the ring, by who the people are and who drives the CAV."""
+    """Return what happens on the ring, by who the people are and which driver drives the CAV."""
     table = []
     for (people, driver), found in rows_of("field/ring").groupby(["humans", "driver"], sort=False):
         table.append(

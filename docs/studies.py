@@ -28,9 +28,9 @@ def page_table(study: str, name: str) -> pd.DataFrame:
 
 
 def rows_of(study: str, road: str) -> list[dict[str, Any]]:
-    """Return the rows of a study's table on a road, beside the best tuned expert.
+    """Return the rows of a study's table on a road, compared with the best tuned expert.
 
-    Tables of before have percentile intervals: they are made anew from the trainings' gains, where these are.
+    Tables of before have percentile intervals: they are made again from the trainings' gains, where these are.
     """
     rows = results_part(f"{study}/table")
     for row in rows:

@@ -154,13 +154,13 @@ def _known(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.Da
     for (known, steps), of in found.groupby(["known", "steps"], sort=False):
         cells = {"what is known": known, "environment steps": f"{steps:,}" if steps else "none"}
         cells["error of a step [m/s]"] = f"{of['step_error'].mean():.4f}"
-        for who, words in drivers.items():
+        for driver, label in drivers.items():
             for name, (heading, unit, digits) in metrics.items():
-                whole = [each for each in of[who] if 2 * each["collisions"] < len(each[name])]
-                beyond = [np.mean(each[name]) - np.mean(actual[who][name]) for each in whole]
-                cells[f"{heading}, {words} [{unit}]"] = _in_range(beyond, digits) if whole else "–"
-        crashed = sum(each["collisions"] for who in drivers for each in of[who])
-        episodes = len(drivers) * len(of) * len(actual[who][name])
+                whole = [each for each in of[driver] if 2 * each["collisions"] < len(each[name])]
+                beyond = [np.mean(each[name]) - np.mean(actual[driver][name]) for each in whole]
+                cells[f"{heading}, {label} [{unit}]"] = _in_range(beyond, digits) if whole else "–"
+        crashed = sum(each["collisions"] for driver in drivers for each in of[driver])
+        episodes = len(drivers) * len(of) * len(actual[driver][name])
         cells["collide"] = f"{crashed} of {episodes}"
         table.append(cells)
     return pd.DataFrame(table)

@@ -18,7 +18,7 @@ def measured() -> dict[str, Any]:
 
 
 def untrained() -> pd.DataFrame:
-    """A1: returns of policies that nobody has trained, with the expert below them and without."""
+    """A1: returns of untrained policies, with and without the expert."""
     table: dict[str, dict[str, str]] = {}
     for row in measured()["untrained"]:
         cells = table.setdefault(row["road"], {"": row["road"]})

@@ -1,6 +1,6 @@
-"""Time until traffic settles after a change of the road: a wave arrives, human drivers change, a CAV switches off.
+"""Time until traffic settles after a change: a wave arrives, human drivers change, or a CAV switches off.
 
-Rings are stepped in batches, which equal SUMO's except for rounding. Drivers do not know of the change.
+Rings are simulated in batches, which equal SUMO except for rounding. Drivers are not informed of the change.
 """
 
 from dataclasses import replace
@@ -34,13 +34,13 @@ ADAPTATION_EPISODES = 20
 STEPS_PER_SECOND = 10
 CHANGE_STEP, END_STEP = 3000, 7200
 CHANGE_SECOND = CHANGE_STEP // STEPS_PER_SECOND
-"""control step of the change and the last one; second of the change"""
+"""time of the change [s]; `CHANGE_STEP` and `END_STEP` are the control steps of the change and of the end"""
 WAVE_BRAKING, WAVE_SPEED, WAVE_STEPS = 2.0, 0.5, 200
-"""how a vehicle makes a wave: braking [m/s2], the speed that it keeps then [m/s], and the number of control steps"""
+"""a vehicle causes a wave by this braking [m/s2] down to this speed [m/s], for this number of control steps"""
 SMOOTHING_SECONDS, FINAL_SECONDS = 10, 60
-"""intervals over which the mean speed is averaged: to see whether it has settled, and at the end [s]"""
+"""duration over which the mean speed is averaged for the settling time, and at the end of an episode [s]"""
 SETTLED_SHARE = 0.95
-"""share of the speed limit of the road from which on the mean speed counts as settled"""
+"""mean speed that counts as settled, as a share of the speed limit of the road"""
 ADAPTATION_DRIVERS = {
     **{HUMAN_LABEL: "human", PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
     **{"FollowerStopper": "follower-stopper", "unjam:best": "unjam:best"},
@@ -134,10 +134,10 @@ def read_speeds(folder: Path, name: str, label: str) -> dict[str, Floats]:
 
 
 def settling_times(speeds: Floats, limits: Floats) -> Floats:
-    """Return how long after the change the mean speed has settled [s], shape (episodes,); NaN where it never does.
+    """Return the time from the change until the mean speed has settled [s], shape (episodes,); NaN if it does not.
 
-    It has settled when its average over ten seconds stays at `SETTLED_SHARE` of the limit or above until the end, and
-    for at least a minute.
+    It has settled when its average over ten seconds stays at or above `SETTLED_SHARE` of the limit until the end, for
+    at least a minute.
     """
     times = []
     for values, limit in zip(speeds, limits, strict=True):

@@ -1,8 +1,8 @@
-"""Gain of drivers on roads of the family, training roads and unseen roads: any drivers, and joint trainings.
+"""Gain of drivers on the training roads and the unseen roads of the family, and of joint trainings on many roads.
 
-On each road a gain of 0 is the human baseline and 1 is the best tuned expert known there, which is selected on other
-seeds than the test seeds. The controllers of a joint training learned on many roads together. There, rings are stepped
-in batches, which equal SUMO's except for rounding.
+On each road a gain of 0 is the human baseline, and 1 is the best tuned expert of this road, which is selected on other
+seeds than the test seeds. In the studies of joint trainings, rings are simulated in batches, which equal SUMO except
+for rounding.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -55,11 +55,11 @@ from unjam_paper.study import PlannedRun, Study, StudyFolder
 from unjam_paper.variants import RINGS_EXPERT, SHARED_RINGS_EXPERT, VARIANTS
 
 EPISODES_PER_ROAD = 10
-"""episodes of each driver on each road"""
+"""number of episodes of each driver on each road"""
 EXPERT_SELECTION_SEEDS, FAMILY_TEST_SEEDS = tuning_seeds(EPISODES_PER_ROAD, 1000), make_test_seeds(EPISODES_PER_ROAD)
 Seeds = Sequence[tuple[int, ...]]
 EpisodeRunner = Callable[[list[EpisodeTask]], EpisodeRows]
-"""runs tasks and returns the result of `family_metrics` for each of them, in order"""
+"""runs tasks and returns the result of `family_metrics` for each of them, in their order"""
 PI_TUNED_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
 """result of `unjam tune rings --expert pi`"""
 PI_TUNED_ON_ALL = (
@@ -88,7 +88,7 @@ FAMILY_EXPERTS: dict[str, tuple[str, ...]] = {
 UNSEEN_PARTS = ("combination", "axis")
 """parts of the family that no driver was trained or tuned on"""
 TABLE_PARTS = {"training": ("training",), "unseen": UNSEEN_PARTS}
-"""tables of a page, and the parts of the family in each"""
+"""parts of the family by table of the page"""
 PI_ON_ALL_LABEL, JAM_AHEAD_ON_ALL_LABEL = "PI, tuned on all roads", "jam-ahead, tuned on all roads"
 PI_ON_RINGS_LABEL = "PI, tuned on the rings"
 SINGLE_CONTROLLERS: dict[str, str] = {
@@ -107,7 +107,7 @@ FAMILY_DRIVERS: dict[str, str] = {
 }
 """drivers that are evaluated on every road, by label"""
 TWO_LAWS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned on all roads)"
-"""the combination of two single controllers by the type of road: its rows are theirs"""
+"""label of the combination of two controllers by the type of road; its results are taken from theirs"""
 RING_GROUP = "rings"
 RING_BASELINES = {
     RINGS_EXPERT: RINGS_EXPERT,

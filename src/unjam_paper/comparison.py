@@ -246,7 +246,7 @@ def _resample(grid: np.ndarray, progress: Table, name: str) -> list[float]:
 def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
     """Return the best and the last checkpoint on validation seeds, and how many trainings kept the untrained network.
 
-    Older tables have no `untrained_count`: there a gain of zero tells it.
+    In older tables without `untrained_count`, a gain of zero means that the untrained network was kept.
     """
     curves, table = read_part(folder, "curves")[road], []
     for row in read_part(folder, "table"):

@@ -1,7 +1,7 @@
-"""Harm check of `unjam:best`: a verdict against the ACC alone on each of several open roads.
+"""Harm check of `unjam:best` on open roads: comparison with ACC vehicles without a controller, with a verdict.
 
-Seeds are paired, and added in batches until the confidence intervals allow a verdict or `MAX_SEEDS` are used. The 95 %
-of an interval hold for a single evaluation: with several of them, intervals miss the true mean more often.
+Seeds are paired, and added in batches until the confidence intervals allow a verdict or `MAX_SEEDS` are used. The
+coverage of 95 % holds for a single evaluation; with repeated evaluations it is smaller.
 """
 
 import json
@@ -129,7 +129,7 @@ def _evaluate_rate(results: Mapping[str, Any], rate: float) -> HarmVerdict:
 
 
 def _write_harm(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    """Run what is missing; results are kept unless the controller or the road has changed."""
+    """Run the missing episodes; results are kept unless the controller or the road has changed."""
     results = _read_results(folder) if (folder / f"{RESULTS_FILE}.json").is_file() else {}
     with TemporaryDirectory() as place, WorkerPool(workers) as pool:
         for number, (name, road) in enumerate(OPEN_TEST_ROADS.items()):

@@ -44,7 +44,7 @@ rows are drawn one by one, so that the neighbors of a test row, 0.1 s before and
 as in the authors' code, test rows are drawn from all rows, including those of training."""
 SPLIT_SHARES = (0.7, 0.1, 0.2)
 TRAINING_SIZES, LEAKING_SIZES = (0.01, 0.1, 0.3, 0.5, 1.0), (0.01, 0.1)
-"""shares of the training rows; the latter for the splits that leak"""
+"""shares of the training rows; the latter for splits with test rows close to training rows"""
 FIT_REPEATS, FEWER_REPEATS = 5, 3
 LONG_PASS_REPEATS = 30
 """how often each row occurs in a pass of the long fits at 1 % of the data: as many gradient steps as at 30 %"""
@@ -52,14 +52,14 @@ MAX_VALIDATION_ROWS = 5000
 DATA_SETTINGS = {"other": FourRegimesSettings(), "same": FourRegimesSettings(driver=PAPER_IDM)}
 FIGURE_6_NETWORKS = ("knowledge", "vanilla")
 NEAREST_ROW = "nearest row"
-"""no network: the acceleration of the most similar training row"""
+"""name of a predictor without a network: it returns the acceleration of the most similar training row"""
 NETWORK_COLORS = {"knowledge": LINE_COLORS[2], "vanilla": LINE_COLORS[1]}
 NETWORK_LABELS = {"knowledge": "IDM + residual", "vanilla": "network alone"}
 
 
 @dataclass(frozen=True)
 class FourRegimeFit:
-    """One fit."""
+    """A fit of one network to a share of the training rows."""
 
     driver: str
     """a name in `DATA_SETTINGS`"""
@@ -74,7 +74,7 @@ class FourRegimeFit:
 
     @property
     def name(self) -> str:
-        """The name of its part."""
+        """Name of the file with the result."""
         words = (self.driver, self.split, self.network.replace(" ", "-"), f"{100 * self.size:g}", f"{self.repeat}")
         return "-".join((*words, "is_long") if self.is_long else words)
 

@@ -1,4 +1,4 @@
-"""Controllers on roads, with human drivers and with sensors that differ from training.
+"""Controllers with roads, human drivers and sensors that differ from those of the training.
 
 Three studies: packaged controllers with single changes (`robustness`); other numbers of vehicles (Figure 10); and
 calibrated human drivers on the ring: whether their waves are like real ones, and whether a CAV still dissolves them. In
@@ -48,14 +48,14 @@ from unjam_paper.study import (
 )
 
 CONDITION_EPISODES = 10
-"""episodes of each driver under each condition"""
+"""number of episodes of each driver under each condition"""
 TUNED_EXPERT = "tuned expert"
 ROBUSTNESS_METRICS = (
     *("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_time_gap", "collisions"),
     "insertion_backlog_veh",
 )
 WAVE_CELLS = 512
-"""positions along the road at which the speed is sampled"""
+"""number of positions along the road at which the speed is sampled"""
 WAVE_LAG = 8.0
 """time between the two compared speed profiles [s]: a wave moves far less than half a lap in it"""
 MIN_WAVE_STD = 0.5

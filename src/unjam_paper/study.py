@@ -39,7 +39,7 @@ STUDY_ROADS: dict[str, dict[str, Any]] = {
 }
 PAPER_ROADS = ("ring", "figure-eight", "merge")
 FINAL_SHARE = 0.1
-"""share of the iterations, the last ones, which the convention of the paper averages"""
+"""share of the iterations at the end of a training, over which the convention of the paper averages"""
 NO_VALUE_TEXT = "–"
 
 Table = list[dict[str, Any]]
@@ -53,17 +53,19 @@ class PlannedRun:
     """A training that a study needs."""
 
     road: str
+    """a name in `STUDY_ROADS`"""
     variant: str
+    """a name in `VARIANTS`"""
     seed: int
 
     @property
     def name(self) -> str:
-        """The path of the training below the trainings of all studies."""
+        """Path of the training, relative to the folder of all trainings."""
         return f"{self.road}/{self.variant}/{self.seed}"
 
     @cached_property
     def config(self) -> RunConfig:
-        """The configuration: one worker, without baselines, which would be the same in all trainings."""
+        """Configuration with one worker and without baselines, which would be the same in all trainings."""
         variant = VARIANTS[self.variant]
         changes = {**STUDY_ROADS[self.road], "seed": self.seed, "workers": 1, "evaluation.baselines": []}
         steps = {} if variant.steps is None else {"steps": variant.steps}
@@ -97,7 +99,7 @@ class TrainedRun:
 
 @dataclass(frozen=True)
 class StudyFolder:
-    """The folder with the trainings and references of all studies, each made once; it need not exist yet."""
+    """The folder with the trainings and reference evaluations of all studies; it need not exist yet."""
 
     folder: Path
 
@@ -145,7 +147,7 @@ class Study:
 
     title: str
     write: Callable[[StudyFolder, int, Path, int], None]
-    """measures and writes parts and figures into a folder; arguments: studies, seeds, folder, worker processes"""
+    """measures, and writes parts and figures; arguments: folder of all studies, seeds, folder of this study, workers"""
     make_runs: Callable[[int], list[PlannedRun]] = lambda seeds: []
     """returns the trainings for a number of seeds"""
     roads: tuple[str, ...] = ()
@@ -255,7 +257,7 @@ def number_text(value: float | None, digits: int, sign: str = "") -> str:
 
 def interval_text(entries: Mapping[str, Any], digits: int, sign: str = "") -> str:
     """Return an estimate of a results file as pages show it: with its 95 % CI, else with the range if it is known."""
-    older: dict[str, Any] = {"count": 0, "smallest": nan, "largest": nan}  # tables of before have no such entries
+    older: dict[str, Any] = {"count": 0, "smallest": nan, "largest": nan}  # older tables do not have these entries
     values: dict[str, Any] = older | {name: nan if value is None else value for name, value in entries.items()}
     known = Estimate(**{each.name: values[each.name] for each in fields(Estimate)})
     ci = format_ci(known, f"{sign}.{digits}f")

@@ -21,9 +21,9 @@ class Sensors:
     """Errors of the sensed gaps and speeds of neighbors; the own speed is exact."""
 
     gap_error: NonNegative = 0.0
-    """largest error of a gap; independent for each reading, uniformly distributed in both directions [m]"""
+    """largest error of a gap [m]; errors are independent for each reading, with a symmetric uniform distribution"""
     speed_error: NonNegative = 0.0
-    """largest error of a neighbor's speed, likewise [m/s]"""
+    """largest error of the speed of a neighbor [m/s], with the same distribution"""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """share of missing readings, independent for each reading"""
 
@@ -44,10 +44,11 @@ class SensorReadings:
         self._last_readings: dict[str, Floats] = {}
 
     def read_for_filter(self, name: str, state: FollowingState) -> FollowingState:
-        """Return the readings for a safety filter, which subtracts the largest errors; once per simulation step.
+        """Return the readings for a safety filter, which subtracts the largest errors.
 
-        If a reading is missing, the leader counts as braking at its maximum since the last one. Plain numbers, or
-        arrays of vehicles with a common name.
+        It must be called once per simulation step. If a reading is missing, it is assumed that the leader has braked at
+        its maximum since the last reading. The values of `state` are numbers, or arrays for several vehicles with a
+        common name.
         """
         sensors, generator, shape = self._sensors, self._filter_generator, np.shape(state.speed)
         leader = state.leader_speed + sensors.speed_error * generator.uniform(-1.0, 1.0, shape)
@@ -63,9 +64,9 @@ class SensorReadings:
         return FollowingState(state.speed, *((leader, gap) if shape else (float(leader), float(gap))))
 
     def read_for_driver(self, names: Sequence[str], state: LocalState) -> LocalState:
-        """Return the observation of drivers in the true `state`; missing readings keep the last value.
+        """Return the true `state` with the readings of the sensors; missing readings keep the last value.
 
-        Arrays with one row for each of the `names`, or plain numbers of a single CAV.
+        The values of `state` are arrays with a row for each of the `names`, or numbers for a single CAV.
         """
         sensors, generator = self._sensors, self._driver_generator
         true = np.array([state.leader_gap, state.follower_gap, state.leader_speed, state.follower_speed])

@@ -75,7 +75,7 @@ def render_assessment(folder: Path) -> str:
 
 
 def breakable_label(text: str) -> Markup:
-    """Return a driver's name, which may be long, with line breaks allowed after its punctuation."""
+    """Return the name of a driver, with line breaks allowed after punctuation, because it may be long."""
     return Markup("<wbr>").join(re.split(r"(?<=[:,=_])", text))
 
 
@@ -100,7 +100,7 @@ def _rates_without_controller(assessment: dict[str, Any]) -> list[tuple[float, d
 
 
 def _key_figures(assessment: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return label, value and detail of key figures: the human baseline, and the effect of the recommended CAVs."""
+    """Return label, value and detail of key figures: human baseline, and effect of the recommended controller."""
     best = assessment["recommended"] or {"penetration_rate": None}
     results = assessment["controller_results"]
     effect = next((each["effect"] for each in results if each["penetration_rate"] == best["penetration_rate"]), None)
@@ -114,7 +114,7 @@ def _key_figures(assessment: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows of the test seeds: the human baseline in absolute numbers, then differences to it."""
+    """Return the rows of the results on test seeds: the human baseline in absolute numbers, then differences to it."""
     options = _evaluated_options(assessment)
     effects = [option["effect"] for option in options]
     baseline = {name: _parse_estimate(value) for name, value in assessment["baseline"].items()}
@@ -141,7 +141,7 @@ def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _evaluated_options(assessment: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the evaluated options: ACC vehicles and the controller of each penetration rate."""
+    """Return the results of ACC vehicles and controllers on test seeds, ordered by penetration rate."""
     options = [*assessment["acc_results"], *assessment["controller_results"]]
     return sorted(options, key=lambda each: each["penetration_rate"])
 

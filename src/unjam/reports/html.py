@@ -132,10 +132,10 @@ def _report_figures(sources: Sequence[tuple[str, Results]], panels: Sequence[Plo
 
 
 def _reference_returns(results: Sequence[Results]) -> dict[str, float]:
-    """Return the returns of drivers that do not learn.
+    """Return the mean returns of drivers that do not learn, by label.
 
-    The expert's is that on the validation seeds, where the curve starts; other drivers did not run on those and
-    have their return on the test seeds.
+    The return of the expert is that on the validation seeds, with which the curve starts. Other drivers are not
+    evaluated on validation seeds; theirs is that on the test seeds.
     """
     returns: dict[str, float] = {}
     has_several_roads = len({result.metadata.get("scenario") for result in results}) > 1
@@ -177,9 +177,10 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
 
 
 def _replay_track(episode: PlotEpisode, step: float, frames: int) -> dict[str, Any]:
-    """Return positions, along a loop or on the plane, and speeds of the vehicles, and the lines of the road.
+    """Return the positions and speeds of the vehicles, and the lines of the road.
 
-    A line has rows (coordinate along the road, x, y) [m]. After an early end the vehicles stand still.
+    On a closed road positions are along the loop, otherwise on the plane. A line has rows (coordinate along the road,
+    x, y) [m]. After an early end the vehicles stand still.
     """
     indices = np.round(np.arange(frames) * step / episode.control_step).astype(int)
     indices = indices.clip(max=len(episode.speeds) - 1)
@@ -213,11 +214,11 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int) -> dict[str, A
 
 
 def _encode_array(array: np.ndarray) -> dict[str, Any]:
-    """Return values of shape (frames, columns) for the page, in a twentieth of their size in memory.
+    """Return values of shape (frames, columns) in the compressed format of the page.
 
-    They are quantized to 65,534 steps from the lowest to the highest, `REPLAY_NAN` for NaN; each frame is stored
-    as the difference to the previous one, modulo 65,536, in zlib's format, as base64. On three kilometers a step
-    is 5 cm.
+    Values are quantized to 65,534 steps between the smallest and the largest, with `REPLAY_NAN` for NaN; on three
+    kilometers a step is 5 cm. Each frame is stored as the difference to the previous one, modulo 65,536, compressed
+    with zlib, as base64.
     """
     low, high = (float(end(array, initial=0.0)) for end in (np.nanmin, np.nanmax))
     scale = (high - low) / (REPLAY_NAN - 1) or 1.0

@@ -21,9 +21,9 @@ PREDICTED_QUANTITIES = {
     "follower_gap": ("follower gap", "m"),
     "reward": ("reward", ""),
 }
-"""label and unit"""
+"""label and unit of each predicted quantity"""
 ERROR_KINDS = ("change", "base", "model")
-"""root mean squares: of the predicted changes, of the base model's errors, of the learned model's errors"""
+"""quantities with a root mean square: the predicted changes, the errors of the base model and of the learned model"""
 BASE_LABELS = {
     "idm": ("IDM alone", "physics with an IDM follower"),
     "population": (
@@ -37,22 +37,22 @@ BASE_LABELS = {
 """label and description of each base model"""
 WAVE_HEADINGS = ("mean speed [m/s]", "std across vehicles [m/s]", "slowest vehicle [m/s]")
 ERROR_PRECISION = 1e-5
-"""errors below this are those of single precision [m/s, m, reward]"""
+"""errors below this are rounding errors of single precision [m/s, m, reward]"""
 
 MODEL_COLOR, BASE_COLOR, CHANGE_COLOR, RECORDED_COLOR = LINE_COLORS[2], LINE_COLORS[1], LINE_COLORS[0], TEXT_COLOR
 ESTIMATORS = ("unexplained_variance", "transitions", "total_variation", "training_loss")
 REPLAYED_QUANTITIES = ("leader_speed", "leader_gap", "follower_gap")
 """quantities with errors drawn over the time ahead"""
 ERROR_BINS = (("leader_speed", "leader_gap"), ("leader_speed", "speed"), ("reward", "leader_gap"))
-"""a quantity, and the state over which its errors are drawn"""
+"""pairs of a quantity and of the state over which its errors are drawn"""
 STEPS_LABEL = "environment steps [thousands]"
 
 
 def error_rows(facts: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the errors by quantity, one control step ahead and, with `final_`, at the end of the replay.
 
-    Each row has its label, its unit, the `ERROR_KINDS`, and them as text in `cells`. The reward is not replayed:
-    its final errors are None.
+    Each row has a label, a unit, the values of the `ERROR_KINDS`, and the same values as text in `cells`. The reward is
+    not replayed: its final errors are None.
     """
     rows = []
     for name, (label, unit) in PREDICTED_QUANTITIES.items():

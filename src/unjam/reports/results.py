@@ -1,4 +1,4 @@
-"""The content of result folders, which all reports read."""
+"""Read the folders of results of `unjam train` and `unjam drive`, for all reports."""
 
 import json
 import shlex
@@ -42,7 +42,7 @@ EPISODE_ENTRIES = (
 
 @dataclass(frozen=True)
 class PlotEpisode(Episode):
-    """Data of one driver's episode for figures; all drivers of a folder have the same seed."""
+    """Episode of a driver with the data for figures; the drivers of a folder have the same seed."""
 
     seed: tuple[int, ...] = ()
     status: str = ""
@@ -55,12 +55,12 @@ class PlotEpisode(Episode):
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """[s], shape (T + 1,)."""
+        """Times of the snapshots [s], shape (T + 1,)."""
         return np.arange(len(self.speeds), dtype=np.float64) * self.control_step
 
 
 def to_plot_episode(driver: str, episode: Episode) -> PlotEpisode:
-    """Return the data of an episode for figures; its control step is then that of snapshots."""
+    """Return the data of an episode for figures; its `control_step` is the time between two snapshots."""
     values = {name: getattr(episode, name) for name in (*EPISODE_ENTRIES, *PLOT_ARRAYS)}
     values |= {name: values[name][:: episode.snapshot_stride] for name in FULL_RATE_ARRAYS}
     return PlotEpisode(**{**values, "control_step": episode.control_step * episode.snapshot_stride}, driver=driver)
@@ -69,8 +69,8 @@ def to_plot_episode(driver: str, episode: Episode) -> PlotEpisode:
 def pack_episode(episode: PlotEpisode) -> dict[str, Float32s]:
     """Return the arrays for figures in single precision, without entries of absent vehicles.
 
-    On an open road each vehicle is present for a small part of the time: `is_present` has those times, and
-    `VEHICLE_ARRAYS` contain only those entries.
+    On an open road each vehicle is present for a small part of the time: `is_present` marks these times, and the
+    `VEHICLE_ARRAYS` contain only their entries.
     """
     arrays = {name: getattr(episode, name).astype(np.float32) for name in PLOT_ARRAYS}
     is_present = ~np.isnan(episode.speeds)
@@ -122,7 +122,7 @@ class Results:
 
 
 def read_results(folder: Path) -> Results:
-    """Return the content of a folder of results; raise `InputError` if it is none, or not finished."""
+    """Return the content of a folder of results; raise `InputError` if a file is missing or damaged."""
     for name in (EVALUATION_FILE, PLOT_EPISODES_FILE):
         if not (folder / name).is_file():
             hint = resume_hint(folder) if (folder / "config.toml").exists() else ""
@@ -199,7 +199,7 @@ def read_model_facts(folder: Path) -> dict[str, Any] | None:
 
 
 def original_command(results: Results) -> str:
-    """Return the command line that made a folder; of a resumed run the first, with the last step budget."""
+    """Return the command line that wrote a folder; for a resumed run the first one, with the last step budget."""
     command = [str(word) for word in results.metadata.get("manifest", {}).get("command", [])]
     if results.trained_label is None or "--resume" not in command:
         return shlex.join(command)

@@ -63,7 +63,7 @@ def common_baseline(results: Sequence[Results]) -> str:
 
 
 def _episode_keys(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Return keys that differ between the episodes of a driver on different roads."""
+    """Return a key for each episode of a driver; the keys differ between different roads."""
     return [(str(row["seed"]), str(row["return"])) for row in rows]
 
 
@@ -78,7 +78,7 @@ def folder_names(results: Sequence[Results]) -> list[str]:
 
 
 def report_title(results: Sequence[Results]) -> str:
-    """Return the page's title."""
+    """Return the title of the page."""
     names = ", ".join(dict.fromkeys(result.metadata["scenario"] for result in results))
     if len(results) > 1:
         return f"{names}: comparison of {len(results)} results"
@@ -114,12 +114,12 @@ def main_finding(result: Results) -> str:
 
 
 def _pair_count(effect: Effect) -> int:
-    """Return on how many seeds both ran."""
+    """Return the number of seeds on which both drivers ran."""
     return max(effect.flow.count, effect.speed.count)
 
 
 def _effect_text(effect: Effect, verdict: str) -> str:
-    """Return the effect on all vehicles, and feasibility: of the CAVs, and of all vehicles as the `verdict`."""
+    """Return the effect and the feasibility of the CAVs as text; `verdict` also takes human drivers into account."""
     feasible = "; feasible" + ("" if verdict == FEASIBLE else f", but {verdict}")
     texts = {"": "", FEASIBLE: feasible}
     return effect.summary + texts.get(effect.feasibility, f"; infeasible: {effect.feasibility}")
@@ -179,7 +179,7 @@ def _driver_notes(result: Results, label: str) -> list[str]:
 
 
 def key_figures(result: Results) -> list[dict[str, str]]:
-    """Return the key figures of the trained controller or the only driver of a folder; of several drivers none."""
+    """Return the key figures of the trained controller or of the only driver of a folder; none for several drivers."""
     if result.trained_label is None and len(result.rows) > 1:
         return []
     label = result.trained_label or next(iter(result.rows))

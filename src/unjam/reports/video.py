@@ -103,7 +103,7 @@ def _densify_line(line: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def episode_scenes(episode: Episode, steps: Sequence[int]) -> Iterator[RoadScene]:
-    """Yield the scenes of an episode at some of its steps."""
+    """Yield the scenes of an episode at these steps."""
     lines, poses = episode.lane_lines, episode.poses
     if len(episode.outline):
         lines = episode.outline[:, 1:]
@@ -114,7 +114,7 @@ def episode_scenes(episode: Episode, steps: Sequence[int]) -> Iterator[RoadScene
 
 
 def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) -> None:
-    """Write a video of an episode, `pace` times as fast as real time; .gif, .webp, or .mp4 by the file's name.
+    """Write a video of an episode, `pace` times as fast as real time; the file name ends in .gif, .webp or .mp4.
 
     Raise `InputError` for another file format, `DiskError` if its folder does not exist or the disk is full (a previous
     file is unchanged), and `MissingPartError` for .mp4 without imageio-ffmpeg.

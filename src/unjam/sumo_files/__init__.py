@@ -1,7 +1,8 @@
-"""Read and check the user's SUMO files before SUMO starts: SUMO crashes on some broken ones.
+"""Read and check users' SUMO files before SUMO starts, because SUMO crashes on some broken files.
 
 The files are untrusted. `reader_program.py` reads them in a separate process that `unjam.sandbox` limits, and returns
-one JSON document. SUMO never receives options and elements that make it write or listen: see `write_harmless_copy`.
+one JSON document. Options and elements that make SUMO write files or open ports are not passed to SUMO: see
+`write_harmless_copy`.
 """
 
 import json
@@ -17,10 +18,10 @@ from unjam.sumo_files.reader import file_stamp
 
 READER_PROGRAM = Path(__file__).with_name("reader_program.py")
 MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120
-"""limits of the reader process [bytes, s]"""
+"""maximum memory [bytes] and time [s] of the reader process"""
 
 LaneShape = tuple[str, float, list[tuple[float, float]]]
-"""edge, length [m] and center line [(x, y), m]"""
+"""id of the edge, length [m], and points (x, y) of the center line [m]"""
 _PASSED = """
 begin end junction-taz weight-attribute step-method.ballistic extrapolate-departpos lateral-resolution route-steps
 no-internal-links ignore-junction-blocker ignore-route-errors ignore-accidents intermodal-collision.action
@@ -47,20 +48,20 @@ selection-file demo disable-textures window-size window-pos tracker-interval gui
 suppress-warnings no-duration-log
 """
 PASSED_OPTIONS = set(_PASSED.split())
-"""options that only define how to simulate"""
+"""options that only define how to simulate; they are passed to SUMO"""
 PASSED_OPTION_PREFIXES = tuple(_PASSED_PREFIXES.split())
-"""beginnings of the names of other such options"""
+"""prefixes of the names of further options that are passed to SUMO"""
 IGNORED_OPTIONS = {*_IGNORED.split(), *"vtgdHWXVQGSDTBmN?"}
-"""options that unjam decides itself, or that change nothing: not reported if they are left out"""
+"""options that unjam sets itself, or that do not affect traffic; that they are left out is not reported"""
 REPLACED_OPTIONS = ("seed", "random", "max-depart-delay", "threads")
-"""options that change the traffic, and that unjam replaces by its own values"""
+"""options that affect traffic and get other values from unjam"""
 OUTPUT_OPTIONS = re.compile(
     r"output|^(write-|save-|netstate|ndump|dump-|summary$|tripinfo$|personinfo$|vehroutes|personroutes$)"
     r"|^(log|log-file|message-log|error-log|precision\.geo|person-fcd|remote-port|num-clients|l|C)$"
     r"|^(person-)?device\.(fcd|ssm|tripinfo|vehroute|btsender|btreceiver|example)\."
     r"|^device\.toc\.file$|^device\.fcd-replay\.(?!files)|^pedestrian\.jupedsim\.(wkt|py)"
 )
-"""options about SUMO's output and connections: without them the traffic is the same"""
+"""names of options for output and connections of SUMO, which do not affect traffic"""
 REFUSED_OPTIONS = {
     "load-state": "no file, as episodes begin on an empty road; begin earlier, with --set warmup=600",
     **dict.fromkeys(
@@ -69,7 +70,7 @@ REFUSED_OPTIONS = {
     ),
     "phemlight-path": "./PHEMlight/, SUMO's default",
 }
-"""options that change the simulation but cannot be passed to SUMO; with the allowed values"""
+"""options that affect traffic but cannot be passed to SUMO, with the allowed values"""
 HARMFUL_OPTION_PARTS = ("file", "output", "threads", ".wkt", ".py")
 """parts of the names of harmful options among those with PASSED_OPTION_PREFIXES"""
 
@@ -82,9 +83,9 @@ class SumoFiles(NamedTuple):
     additional_files: tuple[Path, ...]
     route_files: tuple[Path, ...]
     weight_files: tuple[Path, ...]
-    """travel times of edges, for vehicles that choose their route"""
+    """files with travel times of edges, for vehicles that choose their route"""
     sources: tuple[Path, ...]
-    """all files that were read: this one, those that it names, and those that they include"""
+    """all files that were read: the configuration, the files that it names, and those that these include"""
     begin: float
     """begin of the simulation [s]"""
     end: float | None
@@ -96,20 +97,21 @@ class SumoFiles(NamedTuple):
     step: float
     """simulation step [s]"""
     options: dict[str, str]
-    """harmless options about how to simulate, by name, which SUMO receives"""
+    """values of the options that are passed to SUMO, by name"""
     dropped_items: tuple[str, ...]
-    """options and elements that are left out because they only write or listen"""
+    """options and elements that are left out because they only write files or open ports"""
     replaced_options: tuple[str, ...]
-    """options that change the traffic, and that unjam replaces by its own values"""
+    """options that affect traffic and get other values from unjam"""
     copy_sources: dict[Path, tuple[Path, ...]]
-    """files of which SUMO reads a harmless copy, with the sources of the copy; SUMO reads the others directly"""
+    """sources of the harmless copy of a file, by file; SUMO reads files without a copy directly"""
     types: dict[str, dict[str, str]]
     """attributes of all vehicle types, by id"""
     type_parameters: dict[str, dict[str, str]]
     """nested `<param>` elements of the types: values by key, by the type's id"""
     used_types: frozenset[str]
-    """types that vehicles have"""
+    """ids of the types that vehicles have"""
     has_bicycle_lanes: bool
+    """whether the network has lanes for bicycles only"""
 
 
 _read_files: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
@@ -131,12 +133,12 @@ def read_sumo_files(path: Path) -> SumoFiles:
 
 
 def answer_of(path: str) -> dict[str, Any] | None:
-    """Return the reader's answer for another process, which then need not read a configuration; None: not read."""
+    """Return the stored answer of the reader process for a configuration, or None; another process can take it."""
     return _answers.get(path)
 
 
 def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
-    """Store and return the content of a .sumocfg file from the reader's answer, made in any process.
+    """Store and return the content of a .sumocfg file, from an answer of the reader process.
 
     Raise `InputError` as `classify_option` does.
     """

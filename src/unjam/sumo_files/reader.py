@@ -1,6 +1,6 @@
 """Read SUMO's XML files in one pass: find vehicles and harmful elements, and write a harmless copy.
 
-It needs only Python's standard library: `reader_program.py` runs it in a separate process.
+The module imports only the standard library, because `reader_program.py` uses it in a separate process.
 """
 
 import os
@@ -13,26 +13,25 @@ from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
 
 XML_CHUNK_BYTES, MAX_UNPACKED_BYTES = 1 << 18, 1 << 22
-"""bytes read at once, and bytes unpacked at once"""
+"""maximum number of bytes that are read, and that are unpacked, at a time"""
 MAX_INCLUDED_FILES = 1000
-"""files that one file may include: without a limit a few of them could include each other endlessly"""
+"""maximum number of files that one file includes, because files could include each other endlessly"""
 OUTPUT_ELEMENTS = {"edgeData", "laneData", "vTypeProbe", "timedEvent", "instantInductionLoop"}
 """elements that only write files"""
 DETECTOR_SUFFIXES = ("Detector", "inductionLoop", "routeProbe", "detector")
-"""ends of the names of elements that traffic lights and calibrators use too: they stay, but write no file"""
+"""suffixes of elements that are detectors of traffic lights and calibrators: they are kept, but write no file"""
 EXTERNAL_ELEMENTS = ("calibrator", "variableSpeedSign")
 """elements with an attribute `file` that names the file of their content"""
 NULL_FILE = "NUL"
-"""the file that SUMO never creates"""
+"""name of a file that SUMO never creates"""
 FILE_ATTRIBUTES = ("file", "output", "dest", "href")
 """attributes that name files, in addition to those that end in `File`"""
 FILE_PARAMETER_PARTS = ("file", "output", "log", "ssm", "tripinfo")
-"""parts of the names of parameters of vehicles and traffic lights that name files, write one themselves, or keep trips
-out of the records from which delays are read"""
+"""parts of the keys of harmful parameters: they name a file, write one, or remove trips from the records with delays"""
 LANE_NAME = re.compile(r"_\d+$")
-"""end of the name of a lane: such a key of a traffic light's parameter names the detector of a lane"""
+"""end of the id of a lane; a parameter of a traffic light with such a key names the detector of a lane"""
 CAV_TYPE_TEMPLATE = "cav_of_{}"
-"""name of the type of the CAVs that replace vehicles of a type"""
+"""id of the vehicle type of CAVs that replace vehicles of another type"""
 TYPE_LIST, TYPE_LIST_DEFINITIONS = "vTypes", ("vTypeDistribution", "personTrip")
 """attribute by which rerouters, calibrators and detectors select vehicles, and elements in which it creates vehicles"""
 TYPE_ELEMENTS = "vType", "vTypeDistribution"
@@ -41,12 +40,14 @@ CHECKED_ELEMENTS = {*OUTPUT_ELEMENTS, *TYPE_ELEMENTS, "include", "param"}
 PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")
 """encodings in which SUMO's parser finds the same elements as this one"""
 XML_ERRORS = (expat.ExpatError, OSError, EOFError, zlib.error, LookupError, ValueError)
-"""errors of reading a broken file"""
+"""errors that reading a broken file can raise"""
 
 FileStamp = tuple[int, int]
+"""time of the last change [ns] and size [bytes]"""
 XmlAttributes = dict[str, str]
+"""attributes of an element, by name"""
 XmlHandlers = dict[str, Callable[[XmlAttributes], None]]
-"""functions to call with the attributes of an element, by its name; at its end by `/name`"""
+"""functions that receive the attributes of an element, by its name; the end of an element has the name `/name`"""
 
 
 class BrokenFileError(Exception):
@@ -60,7 +61,7 @@ def check_file_exists(file: Path) -> None:
 
 
 def file_stamp(file: Path) -> FileStamp:
-    """Return time of change and size of a file, which change with its content."""
+    """Return the stamp of a file, which changes with its content."""
     status = file.stat()
     return status.st_mtime_ns, status.st_size
 

@@ -33,9 +33,9 @@ from unjam.sumo_files.reader import (  # noqa: E402
 )
 
 DEFAULT_VEHICLE_TYPE = "DEFAULT_VEHTYPE"
-"""SUMO's type of vehicles that name none"""
+"""vehicle type that SUMO uses for vehicles without a type"""
 MODE_TYPES = {"car": DEFAULT_VEHICLE_TYPE, "bicycle": "DEFAULT_BIKETYPE"}
-"""types of the vehicles that SUMO creates for a person's trip that only names modes"""
+"""vehicle type that SUMO uses for the trip of a person, by mode"""
 OTHER_DEFAULT_TYPES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
 """vehicle classes of SUMO's other predefined types"""
 DEMAND_ELEMENTS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}
@@ -43,7 +43,7 @@ DEMAND_ELEMENTS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}
 TIME_UNITS = (1.0, 60.0, 3600.0, 86400.0)
 """seconds, minutes, hours and days [s]: SUMO's times can be 1:30:00"""
 FILE_OPTIONS = ("net-file", "additional-files", "route-files", "weight-files")
-"""options that name the files that SUMO reads once they are checked"""
+"""options that name files, which SUMO reads after they were checked"""
 SYNONYMS = {
     synonym: name
     for name, synonyms in {
@@ -57,14 +57,14 @@ SYNONYMS = {
     }.items()
     for synonym in synonyms.split()
 }
-"""SUMO's other names of options"""
+"""name of an option by each of its synonyms in SUMO"""
 CAR_FOLLOWING_MODELS = (
     *("Krauss", "KraussOrig1", "KraussPS", "KraussX", "IDM", "IDMM", "EIDM", "SmartSK"),
     *("Daniel1", "PWagner2009", "BKerner", "Wiedemann", "W99", "ACC", "CACC", "CC", "Rail"),
 )
-"""car-following models that older files name in an element of their own"""
+"""car-following models that older files define in a nested element"""
 TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")
-"""SUMO's words for true"""
+"""texts that SUMO accepts as true"""
 
 
 def _read_configuration(path: Path) -> dict[str, Any]:
