@@ -63,7 +63,7 @@ def sumo() -> Iterator[SumoBackend]:
 
 @pytest.fixture
 def without_pictures() -> Iterator[None]:
-    """For a test whose reports need no pictures."""
+    """For a test in which reports need no pictures."""
     with empty_pictures():
         yield
 

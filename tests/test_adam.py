@@ -1,4 +1,4 @@
-"""Does Adam step as torch's does?"""
+"""Adam makes the same steps as that of torch."""
 
 import pytest
 import torch

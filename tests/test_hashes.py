@@ -8,17 +8,17 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def pinned(file: str) -> dict[str, str]:
+def pinned_hashes(file: str) -> dict[str, str]:
     found = re.findall(r"^([\w.-]+)==([^\s;]+)", (ROOT / file).read_text(), flags=re.MULTILINE)
     return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
 
 
 def test_all_tested_versions_have_hashes() -> None:
-    assert pinned("hashes/all.txt") == pinned("constraints.txt")
+    assert pinned_hashes("hashes/all.txt") == pinned_hashes("constraints.txt")
 
 
 def test_core_packages_are_installed_by_hash_in_the_tested_versions() -> None:
-    tested, core = pinned("constraints.txt"), pinned("hashes/core.txt")
+    tested, core = pinned_hashes("constraints.txt"), pinned_hashes("hashes/core.txt")
     assert core.pop("colorama")  # on Windows alone, where nothing was tested
     assert core.items() <= tested.items()
     assert {"libsumo", "numpy", "typer", "safetensors"} <= core.keys()

@@ -55,7 +55,7 @@ MAX_MODULE_LINES = 450
 EXECUTABLE = ("sys.executable", "sys._base_executable", "executable", "_base_executable")
 
 
-def imported(tree: ast.AST) -> Iterator[str]:
+def imported_modules(tree: ast.AST) -> Iterator[str]:
     """Every module that is imported, wherever in the file, in whatever way."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -101,13 +101,15 @@ def part_of(module: str) -> str:
 def importers(packages: set[str]) -> set[str]:
     """The files that import one of `packages` from outside."""
     return {
-        module for module, tree in MODULES.items() if packages & {name.partition(".")[0] for name in imported(tree)}
+        module
+        for module, tree in MODULES.items()
+        if packages & {name.partition(".")[0] for name in imported_modules(tree)}
     }
 
 
 def own_imports(tree: ast.AST) -> set[str]:
     """The parts of both packages that a file imports."""
-    names = [name.split(".") for name in imported(tree)]
+    names = [name.split(".") for name in imported_modules(tree)]
     return {(*parts, "")[parts[0] == "unjam"] for parts in names if parts[0] in ("unjam", "unjam_paper")}
 
 

@@ -91,7 +91,7 @@ RESULTS = Path(__file__).parents[1] / "results"
 FILTERED = "2026-11-22T13:41"
 """since when CAVs have a safety filter"""
 OF_RECORDED_PEOPLE = {"field/field", "field/ngsim-drivers"}
-"""among whom is no CAV"""
+"""without a CAV"""
 
 
 def test_no_result_with_cavs_is_older_than_the_safety_filter() -> None:

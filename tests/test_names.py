@@ -1,4 +1,4 @@
-"""Does each public name have one definition? A reader who searches for it finds what it is, once."""
+"""Each public name has one definition, so that a search for it finds one place."""
 
 import ast
 from collections import defaultdict

@@ -1,4 +1,4 @@
-"""Do entry points of installed packages add commands and presets, and does a broken one do no harm?"""
+"""Entry points of installed packages add commands and presets; a broken one does no harm."""
 
 import logging
 from importlib.metadata import EntryPoint, EntryPoints
@@ -14,7 +14,7 @@ MISSING_NAME = EntryPoint("nameless", "math:no_such_name", "unjam.commands")
 
 
 @pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def installed_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     points = EntryPoints([MISSING_NAME, GOOD, MISSING_MODULE])
     monkeypatch.setattr(plugins, "entry_points", lambda group: points.select(group=group))
 

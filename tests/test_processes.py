@@ -1,4 +1,4 @@
-"""Who writes a folder, and who ends with whom."""
+"""Locks of folders, and processes that end with their parent."""
 
 import os
 import platform
@@ -31,7 +31,7 @@ from unjam.processes import (
 from unjam.training.run_folder import create_run_folder
 from unjam.training.train import train
 
-linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux tells a process that its parent is gone")
+linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux notifies a process of the end of its parent")
 HOLD = (
     "import sys\nfrom pathlib import Path\nfrom unjam.processes import lock_folder\n"
     "with lock_folder(Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
@@ -181,7 +181,7 @@ def test_a_lock_that_is_a_link_is_refused_and_its_target_unchanged(
 
 
 def test_an_owner_on_another_machine_locks_a_folder_while_it_sends_heartbeats(tmp_path: Path) -> None:
-    (tmp_path / LOCK_FILE).write_text("elsewhere 12\n")  # a file system whose locks end at the machine
+    (tmp_path / LOCK_FILE).write_text("elsewhere 12\n")  # a file system with locks that are local to the machine
     with pytest.raises(InputError, match="is being written on elsewhere; allowed: "), lock_folder(tmp_path):
         pass
     assert (tmp_path / LOCK_FILE).is_file()
@@ -214,14 +214,14 @@ def test_private_folders_of_killed_processes_are_removed(tmp_path: Path, monkeyp
         for _ in range(2)
     ]
     killed, alive = (Path(process.stdout.readline().strip()) for process in started if process.stdout)
-    mine = tmp_path / "unjam-results"  # of somebody who keeps results here
+    mine = tmp_path / "unjam-results"  # a folder with results of a user
     mine.mkdir()
     for name in (LOCK_FILE, PRIVATE_LOCK_FILE):
         (mine / name).touch()
     started[0].kill()
     started[0].wait()
     remove_stale_private_folders.__wrapped__()
-    assert killed.exists()  # it may be so new that nobody has had the time to hold it
+    assert killed.exists()  # it may be so new that its process does not hold it yet
     for folder in (killed, alive, mine):
         os.utime(folder, (1, 1))
     remove_stale_private_folders.__wrapped__()

@@ -40,7 +40,12 @@ def test_a_star_import_gives_all_public_names() -> None:
 
 
 def test_importing_unjam_imports_nothing_heavy() -> None:
-    heavy = {"torch", "libsumo", "matplotlib", "pandas"}  # Gymnasium, with NumPy, is told of the roads
+    heavy = {
+        "torch",
+        "libsumo",
+        "matplotlib",
+        "pandas",
+    }  # the environments are registered with Gymnasium, which needs NumPy
     program = f"import sys, unjam; print(*({heavy!r} & set(sys.modules)))"
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60, check=True)
     assert ran.stdout.strip() == b""

@@ -1,4 +1,4 @@
-"""Which code is trusted, and who is told."""
+"""Which code is trusted, and how this is reported."""
 
 import os
 import subprocess
@@ -26,7 +26,7 @@ from unjam.trust import (
 
 @pytest.fixture
 def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Code that nobody has named."""
+    """Code that no user has named."""
     monkeypatch.setenv("UNJAM_STATE", str(tmp_path / "state"))
     monkeypatch.delenv(TRUSTED_VARIABLE, raising=False)
     path = tmp_path / "code+1.py"
@@ -92,7 +92,7 @@ def test_modules_that_code_imports_are_trusted_only_unchanged(code: Path) -> Non
     helper.write_text("value = 22\n")
     with pytest.raises(InputError, match="not run yourself in this version"):
         check_trusted("run", code)
-    assert file.load_object() == 22  # whoever names it runs it
+    assert file.load_object() == 22  # naming it runs it
     check_trusted("run", code)
     helper.unlink()
     with pytest.raises(InputError):
@@ -159,7 +159,7 @@ def test_code_that_changes_after_it_was_checked_does_not_run(changed: str, code:
     assert not canary.exists()
     with expecting_code():
         pass
-    FileReference(code, "late").load_object()()  # its user names it anew
+    FileReference(code, "late").load_object()()  # its user names it again
     assert canary.exists()
 
 

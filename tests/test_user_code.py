@@ -20,7 +20,7 @@ GOOD, EVIL = "value = 'good'\n", "value = 'evil'\n"
 
 
 def plant_bytecode(source: Path, kind: str) -> None:
-    """Put bytecode beside a source that Python itself would run in its place."""
+    """Put bytecode next to a source that Python itself would run instead."""
     evil = compile(EVIL, str(source), "exec")
     cached = Path(importlib.util.cache_from_source(str(source)))
     cached.parent.mkdir(exist_ok=True)

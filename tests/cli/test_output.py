@@ -1,4 +1,4 @@
-"""Are tables, progress and proposed commands printed as documented?"""
+"""Tables, progress and suggested commands are printed as documented."""
 
 import shlex
 import sys
@@ -27,7 +27,7 @@ def rows_of(first: float) -> list[dict[str, Any]]:
     return [{**USUAL, "seed": seed, "return": value} for seed, value in enumerate(returns)]
 
 
-def printed(monkeypatch: pytest.MonkeyPatch, width: int, labels: tuple[str, ...] = LABELS) -> list[str]:
+def print_example(monkeypatch: pytest.MonkeyPatch, width: int, labels: tuple[str, ...] = LABELS) -> list[str]:
     text = StringIO()
     monkeypatch.setattr(output, "console", Console(file=text, width=width, highlight=False))
     output.print_metrics({label: rows_of(1000.0 * number) for number, label in enumerate(labels)})
@@ -36,7 +36,7 @@ def printed(monkeypatch: pytest.MonkeyPatch, width: int, labels: tuple[str, ...]
 
 @pytest.mark.parametrize("width", [80, 120, 160, 400])
 def test_intervals_are_not_broken_and_lines_fit_the_terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
-    lines = printed(monkeypatch, width)
+    lines = print_example(monkeypatch, width)
     assert max(map(len, lines)) <= width
     assert not any("…" in line for line in lines)
     assert all(line.count("[") == line.count("]") for line in lines)
@@ -48,13 +48,13 @@ def test_intervals_are_not_broken_and_lines_fit_the_terminal(monkeypatch: pytest
 
 def test_wide_terminals_have_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
     def tables(width: int) -> int:
-        return sum(line.startswith("metric") for line in printed(monkeypatch, width))
+        return sum(line.startswith("metric") for line in print_example(monkeypatch, width))
 
     assert (tables(400), tables(120) > 1) == (1, True)
 
 
 def test_a_single_driver_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert printed(monkeypatch, 120, ("pi",))[0].split() == ["metric", "unit", "pi"]
+    assert print_example(monkeypatch, 120, ("pi",))[0].split() == ["metric", "unit", "pi"]
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ def with_entry(entry: zipfile.ZipInfo, part: bytes = b"more") -> bytes:
     return content.getvalue()
 
 
-def refused(folder: Path, content: bytes) -> str:
+def refusal_message(folder: Path, content: bytes) -> str:
     before = sorted(folder.iterdir())
     with pytest.raises(InputError) as caught:
         unpack_parts(written(folder, content))
@@ -72,19 +72,19 @@ def test_the_same_parts_have_the_same_bytes_on_any_system() -> None:
 )
 def test_a_part_of_another_name_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "inner").mkdir()
-    assert "is unknown; allowed: " in refused(tmp_path / "inner", with_entry(zipfile.ZipInfo(name)))
+    assert "is unknown; allowed: " in refusal_message(tmp_path / "inner", with_entry(zipfile.ZipInfo(name)))
     assert [path.name for path in tmp_path.iterdir()] == ["inner"]
 
 
 @pytest.mark.parametrize("name", [MANIFEST_PART, WEIGHTS_PART])
 def test_a_second_part_of_a_name_is_refused(tmp_path: Path, name: str) -> None:
-    assert f"has {name} twice" in refused(tmp_path, with_entry(zipfile.ZipInfo(name)))
+    assert f"has {name} twice" in refusal_message(tmp_path, with_entry(zipfile.ZipInfo(name)))
 
 
 def test_a_link_is_refused(tmp_path: Path) -> None:
     entry = zipfile.ZipInfo(ARCHIVE_PARTS[2])
     entry.external_attr = (stat.S_IFLNK | 0o777) << 16
-    assert "is a link" in refused(tmp_path, with_entry(entry, b"/etc/passwd"))
+    assert "is a link" in refusal_message(tmp_path, with_entry(entry, b"/etc/passwd"))
 
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
@@ -94,15 +94,15 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, how: int, monke
     content = with_entry(entry, bytes(2**22))
     assert len(content) < 2**14
     monkeypatch.setattr(zipfile.ZipExtFile, "read1", None)  # what it would be unpacked with
-    assert "is compressed or encrypted" in refused(tmp_path, content)
+    assert "is compressed or encrypted" in refusal_message(tmp_path, content)
 
 
 def test_a_part_that_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "MAX_PART_BYTES", 1000)
-    assert "has 1001 bytes; allowed: at most 1000" in refused(
+    assert "has 1001 bytes; allowed: at most 1000" in refusal_message(
         tmp_path, with_entry(zipfile.ZipInfo(ARCHIVE_PARTS[2]), bytes(1001))
     )
-    assert "bytes; allowed: at most 6000" in refused(
+    assert "bytes; allowed: at most 6000" in refusal_message(
         tmp_path, with_entry(zipfile.ZipInfo(ARCHIVE_PARTS[2]), bytes(6000))
     )
 
@@ -110,10 +110,10 @@ def test_a_part_that_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest
 def test_a_part_that_says_it_is_larger_than_it_is_is_refused(tmp_path: Path) -> None:
     content = bytearray(pack_parts(WHOLE))
     struct.pack_into("<I", content, content.index(b"PK\x01\x02") + 24, MAX_PART_BYTES)
-    assert "is compressed or encrypted" in refused(tmp_path, bytes(content))
+    assert "is compressed or encrypted" in refusal_message(tmp_path, bytes(content))
 
 
 @pytest.mark.parametrize("name", [MANIFEST_PART, WEIGHTS_PART])
 def test_without_what_every_controller_has_it_is_none(tmp_path: Path, name: str) -> None:
     parts = {key: part for key, part in WHOLE.items() if key != name}
-    assert f"not a controller: it has no {name}" in refused(tmp_path, pack_parts(parts))
+    assert f"not a controller: it has no {name}" in refusal_message(tmp_path, pack_parts(parts))

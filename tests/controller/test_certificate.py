@@ -1,4 +1,4 @@
-"""Does a certificate say what is so, and is one that does not found out?"""
+"""A certificate states what is true, and a false one is detected."""
 
 import json
 from dataclasses import asdict
@@ -48,11 +48,11 @@ def few_attacks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(certificates, "OSCILLATION_FREQUENCIES", OSCILLATION_FREQUENCIES[::4])
 
 
-def filtered(driver: Driver, **changes: Any) -> FilteredDriver:
+def filter_driver(driver: Driver, **changes: Any) -> FilteredDriver:
     return FilteredDriver(driver, 1.0, SafetyFilter(**changes), 0.1)
 
 
-def visited(count: int = 60) -> LocalState:
+def visited_states(count: int = 60) -> LocalState:
     speed = np.linspace(0.0, 5.0, count)
     return LocalState(
         speed, speed[::-1].copy(), 8.0 + 3.0 * speed, speed, 9.0 + speed, speed * 0.0, speed * 0.0 + 245.0
@@ -60,7 +60,7 @@ def visited(count: int = 60) -> LocalState:
 
 
 def test_a_reckless_driver_behind_its_filter_touches_nobody() -> None:
-    worst = certify_driver(filtered(Constant(1.0)), visited(), PAPER_IDM).worst_cases
+    worst = certify_driver(filter_driver(Constant(1.0)), visited_states(), PAPER_IDM).worst_cases
     assert worst.contacts == 0
     assert worst.min_gap == pytest.approx(1.0, abs=1e-6)
     assert worst.min_time_gap > 1.0
@@ -69,14 +69,14 @@ def test_a_reckless_driver_behind_its_filter_touches_nobody() -> None:
 
 
 def test_a_filter_that_does_not_act_is_found_out() -> None:
-    bare = filtered(Constant(1.0), active=False)
-    assert certify_driver(bare, visited(), PAPER_IDM).worst_cases.contacts > 0
+    bare = filter_driver(Constant(1.0), active=False)
+    assert certify_driver(bare, visited_states(), PAPER_IDM).worst_cases.contacts > 0
 
 
 @pytest.mark.parametrize("humans", [PAPER_IDM, IDMParameters(time_headway=1.6, max_acceleration=2.0)])
 def test_the_measured_gain_of_an_idm_is_that_of_the_linearised_one(humans: IDMParameters) -> None:
     idm = FilteredDriver(IDM(**asdict(humans)), 3.0, SafetyFilter(time_gap=0.0), 0.1)
-    for each in certify_driver(idm, visited(), humans).string_stability:
+    for each in certify_driver(idm, visited_states(), humans).string_stability:
         assert each.speed in (2.5, 4.5)
         np.testing.assert_allclose(each.gains, each.human_gains, atol=0.05)
 
@@ -94,20 +94,20 @@ def test_people_amplify_sway_exactly_where_the_idm_is_known_to_be_unstable(accel
 
 
 def test_who_stands_still_stabilises_any_number_of_people() -> None:
-    still = certify_driver(filtered(Constant(-1.0)), visited(), PAPER_IDM)
+    still = certify_driver(filter_driver(Constant(-1.0)), visited_states(), PAPER_IDM)
     assert all(each.max_stable_followers == certificates.MAX_FOLLOWERS for each in still.string_stability)
 
 
 def test_a_state_outside_of_the_domain_is_told_from_one_within() -> None:
     domain = OperatingDomain((0.0, 5.0), (0.0, 6.0), (2.0, 30.0))
-    states = visited(3)._replace(speed=np.array([4.0, 5.5, 4.0]), leader_gap=np.array([9.0, 9.0, 40.0]))
+    states = visited_states(3)._replace(speed=np.array([4.0, 5.5, 4.0]), leader_gap=np.array([9.0, 9.0, 40.0]))
     assert domain.contains(states).tolist() == [True, False, False]
 
 
 def written(folder: Path, driver: Driver | None = None) -> Path:
-    driver = driver or filtered(PISaturation())
+    driver = driver or filter_driver(PISaturation())
     file, ring = folder / "ring.unjam", Ring()
-    sample = sample_bytes(driver, visited(), 6.0)
+    sample = sample_bytes(driver, visited_states(), 6.0)
     file.write_bytes(controller_bytes(driver, controller_origin(ring, driver), {SAMPLE_PART: sample}))
     return file
 
@@ -121,7 +121,7 @@ def test_a_certificate_becomes_a_part_of_the_file_and_is_tried_again(tmp_path: P
     assert json.loads(read_controller(file).parts[CERTIFICATE_PART]) == json.loads(json.dumps(found))
     (said,) = [each.detail for each in verify_controller_file(file) if each.part == "certificate"]
     assert "0 contacts" in said
-    write_certificate_page(file.name, filtered(PISaturation()), found, tmp_path / "page.html")
+    write_certificate_page(file.name, filter_driver(PISaturation()), found, tmp_path / "page.html")
     assert "No contact in" in (tmp_path / "page.html").read_text()
 
 
@@ -144,7 +144,7 @@ def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_pa
 
 @pytest.mark.long
 def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
-    file = written(tmp_path, filtered(FollowerStopper()))
+    file = written(tmp_path, filter_driver(FollowerStopper()))
     other = make_certificate(read_controller(file))
     file = written(tmp_path)
     own = make_certificate(read_controller(file))
@@ -171,7 +171,7 @@ def test_counts_and_answers_of_a_certificate_are_compared_exactly(tmp_path: Path
             verify_controller_file(file)
 
 
-@pytest.mark.parametrize("driver", [PISaturation(), filtered(PISaturation(), active=False)])
+@pytest.mark.parametrize("driver", [PISaturation(), filter_driver(PISaturation(), active=False)])
 def test_what_has_no_filter_has_no_certificate(driver: Driver, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="without safety filter"):
         make_certificate(read_controller(written(tmp_path, driver)))
@@ -189,7 +189,7 @@ def test_a_controller_that_names_no_road_is_not_certified(tmp_path: Path) -> Non
 
 def test_speeds_that_nobody_behind_would_drive_are_left_out_of_the_strings() -> None:
     slow = IDMParameters(desired_speed=4.0)
-    found = certify_driver(filtered(PISaturation()), visited(), slow)
+    found = certify_driver(filter_driver(PISaturation()), visited_states(), slow)
     assert found.string_stability
     assert all(each.speed < 4.0 for each in found.string_stability)
 
@@ -214,4 +214,4 @@ def test_a_damaged_certificate_is_one_line_and_costs_no_drive(tmp_path: Path) ->
     file.write_bytes(pack_parts({MANIFEST_PART: json.dumps(manifest).encode(), **parts}))
     with pytest.raises(InputError, match="the controller is damaged: JSONDecodeError"):
         verify_controller_file(file)
-    assert outside_domain_share(read_controller(file), visited()) == 0.0
+    assert outside_domain_share(read_controller(file), visited_states()) == 0.0

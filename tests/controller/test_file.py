@@ -57,7 +57,7 @@ def written(folder: Path, content: bytes) -> Path:
     return path
 
 
-def refused(path: Path) -> str:
+def refusal_message(path: Path) -> str:
     """The one line with which a controller is refused."""
     with pytest.raises(InputError) as caught:
         load_controller(path)
@@ -81,7 +81,7 @@ def archive_of(**parts: bytes | str) -> bytes:
 
 
 def with_weights(weights: bytes, change: Callable[[dict[str, Any]], object] = lambda manifest: None) -> bytes:
-    """A controller whose hash fits its weights, whatever they are."""
+    """A controller with arbitrary weights and the hash of them."""
     manifest, _ = parts_of(controller_bytes(residual(IDM()), ABOUT))
     manifest["sha256"][WEIGHTS_PART] = hashlib.sha256(weights).hexdigest()
     change(manifest)
@@ -171,13 +171,13 @@ def test_a_file_by_itself_never_runs_code_that_it_names(tmp_path: Path, nested: 
     expert: Driver = FileDriver(code, "trap")
     content = controller_bytes(residual(MixedDriver((IDM(), residual(expert))) if nested else expert), ABOUT)
     code.write_text(code.read_text() + f"Path({str(tmp_path / 'sprung')!r}).touch()\n")
-    assert "is Python code (code.py), which a file by itself may not run" in refused(written(tmp_path, content))
+    assert "is Python code (code.py), which a file by itself may not run" in refusal_message(written(tmp_path, content))
     assert not (tmp_path / "sprung").exists()
 
 
 @pytest.fixture
 def seen_by_own(tmp_path: Path) -> tuple[Path, dict[str, Any], bytes]:
-    """A file whose running leaves a mark; manifest and weights of a mixture that sees its feature."""
+    """A Python file that leaves a mark when it runs, and manifest and weights of a mixture with its feature."""
     code = tmp_path / "eyes.py"
     code.write_text("def look(state):\n    return state.speed\n")
     driver = MixedDriver((IDM(), residual(IDM(), parts=("local", f"{code}:look"))))
@@ -233,14 +233,14 @@ def test_a_feature_of_the_users_own_runs_from_its_run_folder_alone_and_unchanged
     code, manifest, weights = seen_by_own
     content = archive_of(manifest=json.dumps(manifest), weights=weights)
     (tmp_path / "controller.unjam").write_bytes(content)
-    assert "is Python code (eyes.py), which a file by itself may not run" in refused(written(tmp_path, content))
+    assert "is Python code (eyes.py), which a file by itself may not run" in refusal_message(written(tmp_path, content))
     assert not (tmp_path / "sprung").exists()
-    assert "runs only with --trust-code" in refused(tmp_path)
+    assert "runs only with --trust-code" in refusal_message(tmp_path)
     assert not (tmp_path / "sprung").exists()
     with trusting_code():
         assert isinstance(load_controller(tmp_path), MixedDriver)
     code.write_text(code.read_text() + "# changed")
-    assert "has changed since" in refused(tmp_path)
+    assert "has changed since" in refusal_message(tmp_path)
 
 
 def test_changed_weights_are_noticed(tmp_path: Path) -> None:
@@ -248,18 +248,20 @@ def test_changed_weights_are_noticed(tmp_path: Path) -> None:
     changed = bytearray(weights)
     changed[-3] ^= 1
     content = archive_of(manifest=json.dumps(manifest), weights=bytes(changed))
-    assert f"damaged: {WEIGHTS_PART} does not have the hash that it names" in refused(written(tmp_path, content))
+    assert f"damaged: {WEIGHTS_PART} does not have the hash that it names" in refusal_message(
+        written(tmp_path, content)
+    )
 
 
 @pytest.mark.parametrize("change", [{"sample.safetensors": "0"}, {"another": "0"}])
 def test_parts_that_are_not_those_that_are_named_are_refused(tmp_path: Path, change: dict[str, str]) -> None:
     content = with_manifest(lambda manifest: manifest["sha256"].update(change))
-    assert "damaged: its parts are not those that it names" in refused(written(tmp_path, content))
+    assert "damaged: its parts are not those that it names" in refusal_message(written(tmp_path, content))
 
 
 def test_weights_of_no_network_are_refused(tmp_path: Path) -> None:
     arrays = {**driver_recipe(residual(IDM()))[1], "expert.0.weight": np.zeros((2, 2))}
-    words = refused(written(tmp_path, with_weights(save(arrays))))
+    words = refusal_message(written(tmp_path, with_weights(save(arrays))))
     assert "weights 'expert.0.weight' belong to no network" in words
 
 
@@ -287,7 +289,7 @@ def test_a_changed_byte_is_refused_or_changes_nothing(place: float, bits: int) -
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5, 0.9, 0.99])
 def test_a_file_cut_short_is_refused(tmp_path: Path, share: float) -> None:
     content = controller_bytes(residual(IDM()), ABOUT)
-    assert "not a controller" in refused(written(tmp_path, content[: int(share * len(content))]))
+    assert "not a controller" in refusal_message(written(tmp_path, content[: int(share * len(content))]))
 
 
 def test_bytes_before_the_archive_do_no_harm_and_none_are_run(tmp_path: Path) -> None:
@@ -333,38 +335,38 @@ def test_an_archive_that_lies_about_a_part_is_refused(
     if part == 1:
         entry = content.index(DIRECTORY, entry + 1)
     struct.pack_into(kind, content, entry + offset, value)
-    refused(written(tmp_path, bytes(content)))
+    refusal_message(written(tmp_path, bytes(content)))
 
 
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 not really", bytes(1000)])
 def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes) -> None:
-    assert "controller it.unjam: not a controller" in refused(written(tmp_path, content))
+    assert "controller it.unjam: not a controller" in refusal_message(written(tmp_path, content))
 
 
 def test_an_archive_without_a_part_is_refused(tmp_path: Path) -> None:
     manifest, weights = parts_of(controller_bytes(residual(IDM()), ABOUT))
-    assert WEIGHTS_PART in refused(written(tmp_path, archive_of(manifest=json.dumps(manifest))))
-    assert MANIFEST_PART in refused(written(tmp_path, archive_of(weights=weights)))
-    refused(written(tmp_path, archive_of()))
+    assert WEIGHTS_PART in refusal_message(written(tmp_path, archive_of(manifest=json.dumps(manifest))))
+    assert MANIFEST_PART in refusal_message(written(tmp_path, archive_of(weights=weights)))
+    refusal_message(written(tmp_path, archive_of()))
 
 
 @pytest.mark.parametrize("manifest", ["", "{", "[]", "3", "null", "{}", '"format"', "\xff", '{"format": 1}'])
 def test_a_manifest_that_is_none_is_refused(tmp_path: Path, manifest: str) -> None:
     content = archive_of(manifest=manifest.encode("latin-1"), weights=save({"x": np.zeros(1)}))
-    refused(written(tmp_path, content))
+    refusal_message(written(tmp_path, content))
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 3, -4])
 def test_another_format_is_refused_with_the_version_that_wrote_it(tmp_path: Path, number: int) -> None:
     content = with_manifest(lambda manifest: manifest.update(format=number, unjam="9.8.7"))
-    line = refused(written(tmp_path, content))
+    line = refusal_message(written(tmp_path, content))
     assert f"format {number}, written by unjam '9.8.7', is not allowed; allowed: format {MANIFEST_FORMAT}, " in line
 
 
 @pytest.mark.parametrize("number", [True, 2.0, 4.0, "4", None, [4], {}], ids=str)
 def test_a_format_that_is_no_integer_is_refused(tmp_path: Path, number: object) -> None:
     content = with_manifest(lambda manifest: manifest.update(format=number))
-    assert f"manifest.format: {number!r} is not allowed" in refused(written(tmp_path, content))
+    assert f"manifest.format: {number!r} is not allowed" in refusal_message(written(tmp_path, content))
 
 
 DEEP = '"driver": ' + "[" * 100_000 + "]" * 100_000
@@ -386,12 +388,12 @@ def test_a_manifest_in_loose_json_is_refused(tmp_path: Path, name: str) -> None:
     text, words = NO_STRICT_JSON[name]
     manifest, weights = parts_of(controller_bytes(residual(IDM()), {}))
     part = f"{json.dumps(manifest)[:-1]}, {text}}}".encode(errors="surrogateescape")
-    assert words in refused(written(tmp_path, archive_of(manifest=part, weights=weights)))
+    assert words in refusal_message(written(tmp_path, archive_of(manifest=part, weights=weights)))
 
 
 def test_a_manifest_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     content = with_manifest(lambda manifest: manifest.update(summary="x" * 2**20))
-    assert "part 'manifest.json' has " in refused(written(tmp_path, content))
+    assert "part 'manifest.json' has " in refusal_message(written(tmp_path, content))
 
 
 @pytest.mark.parametrize("key", ["time_step", "action_limit"])
@@ -400,7 +402,7 @@ def test_statements_that_contradict_the_scenario_are_refused(tmp_path: Path, key
     about = {"scenario": scenario, "time_step": 0.5, "action_limit": 2.0}
     load_controller(written(tmp_path, controller_bytes(residual(IDM()), about)))
     content = controller_bytes(residual(IDM()), {**about, key: 0.25})
-    assert f"manifest.{key}: 0.25 is not allowed; allowed: " in refused(written(tmp_path, content))
+    assert f"manifest.{key}: 0.25 is not allowed; allowed: " in refusal_message(written(tmp_path, content))
 
 
 @pytest.mark.parametrize(
@@ -448,7 +450,7 @@ def test_a_recipe_that_is_no_table_is_refused(tmp_path: Path, recipe: object) ->
 
 def test_a_recipe_of_endless_depth_is_refused(tmp_path: Path) -> None:
     manifest = '{"format": 1, "driver": ' + '{"expert": ' * 100_000 + "1" + "}" * 100_001
-    refused(written(tmp_path, archive_of(manifest=manifest, weights=save({"x": np.zeros(1)}))))
+    refusal_message(written(tmp_path, archive_of(manifest=manifest, weights=save({"x": np.zeros(1)}))))
 
 
 @pytest.mark.parametrize(
@@ -494,7 +496,7 @@ def test_a_pickle_inside_is_never_run(tmp_path: Path, part: str) -> None:
     trap = pickle.dumps(Trap(sprung))
     manifest, weights = parts_of(with_weights(trap if part == "weights" else save(driver_recipe(residual(IDM()))[1])))
     parts = {"manifest": json.dumps(manifest).encode(), "weights": weights, part: trap}
-    refused(written(tmp_path, archive_of(**parts)))
+    refusal_message(written(tmp_path, archive_of(**parts)))
     assert not sprung.exists()
 
 
@@ -506,5 +508,5 @@ def test_a_run_folder_stands_for_its_controller(tmp_path: Path) -> None:
 
 
 def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
-    assert "does not exist" in refused(tmp_path / "none.unjam")
-    assert "controller.unjam' does not exist" in refused(tmp_path)
+    assert "does not exist" in refusal_message(tmp_path / "none.unjam")
+    assert "controller.unjam' does not exist" in refusal_message(tmp_path)

@@ -22,7 +22,7 @@ Change = Callable[[Any], object]
 
 
 def graph(change: Change = lambda model: None, remembered: tuple[str, ...] = ()) -> bytes:
-    """A graph whose acceleration is the leader's speed less the own."""
+    """A graph with the acceleration leader speed minus own speed."""
     rows = helper.make_tensor_value_info
 
     def value(name: str) -> Any:
@@ -82,7 +82,7 @@ def foreign(model: Any) -> None:
 
 
 def external() -> Any:
-    """A tensor whose values lie in another file."""
+    """A tensor with values in another file."""
     tensor = helper.make_tensor("far", TensorProto.DOUBLE, [1], [0.0])
     tensor.data_location = TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value="/etc/passwd")

@@ -40,7 +40,7 @@ MAKER_ONLY = {*PROVENANCE_ENTRIES, "unjam"}
 
 
 @pytest.fixture(scope="module")
-def signed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def signed_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A controller with all that an exported one of a run says of itself, signed."""
     driver = FilteredDriver(residual(PISaturation(), hold=3), 1.0, SafetyFilter(), 0.1)
     run = {"scenario": "ring", "agent": "trpo", "seed": 3}
@@ -60,7 +60,7 @@ def known(path: Path) -> tuple[Any, dict[str, PartCheck]]:
     return driver_recipe(controller.driver)[0], checks
 
 
-def replaced(manifest: Any, place: tuple[Any, ...], change: Callable[[Any, Any], None]) -> Any:
+def replace_entry(manifest: Any, place: tuple[Any, ...], change: Callable[[Any, Any], None]) -> Any:
     """The manifest with a change (of the table or list around a place, at its key)."""
     copy = deepcopy(manifest)
     around = copy
@@ -110,17 +110,17 @@ def changes(manifest: Any, kind: str) -> Iterator[tuple[tuple[Any, ...], Any]]:
     for place in places(manifest):
         alike = any(type(key) is int and key > 0 for key in place)
         if not alike and len(place) <= (2 if place[0] in MAKER_ONLY else 9):
-            changed = replaced(manifest, place, KINDS[kind])
+            changed = replace_entry(manifest, place, KINDS[kind])
             if json.dumps(changed) != json.dumps(manifest):
                 yield place, changed
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_entry_of_another_type_is_refused_or_means_the_same(kind: str, signed: Path, tmp_path: Path) -> None:
+def test_an_entry_of_another_type_is_refused_or_means_the_same(kind: str, signed_file: Path, tmp_path: Path) -> None:
     """A forger signs with a key of their own; that the first signature no longer fits is tested, too."""
-    parts = unpack_parts(signed)
-    before, count, path = known(signed), 0, tmp_path / "it.unjam"
+    parts = unpack_parts(signed_file)
+    before, count, path = known(signed_file), 0, tmp_path / "it.unjam"
     for place, manifest in changes(json.loads(parts[MANIFEST_PART]), kind):
         forged = {**parts, MANIFEST_PART: json.dumps(manifest).encode()}
         path.write_bytes(pack_parts(forged))

@@ -30,7 +30,7 @@ def test_a_driver_is_made_from_its_name_file_or_path(
     assert make_driver("pi", 0.1) == PISaturation()
 
 
-@pytest.mark.parametrize("text", ["", "nobody", "runs/none", "pi:speed=1", "none.unjam", "pi:window=0"])
+@pytest.mark.parametrize("text", ["", "nonesuch", "runs/none", "pi:speed=1", "none.unjam", "pi:window=0"])
 def test_what_names_no_driver_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:

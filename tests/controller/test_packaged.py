@@ -113,7 +113,7 @@ EIGHTS = [FigureEight(radius=(radius, radius), vehicles=count, horizon=600) for 
 
 @cache
 def row_of(name: str, road: Ring | FigureEight, simulation: Simulation) -> dict[str, Any]:
-    """What is measured of an episode; that of people alone is every controller's to compare with."""
+    """Metrics of an episode; those of human-only traffic are shared by all controllers."""
     return measure(run_episode(road, make_driver(name, 0.1), (11,), backend=SumoBackend(simulation)))
 
 

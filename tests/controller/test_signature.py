@@ -1,4 +1,4 @@
-"""Is it found out what was changed after it was signed, and who signed."""
+"""Changes after signing are detected, and the signer is identified."""
 
 import hashlib
 import io
@@ -28,7 +28,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.controller.test_file import written
-from tests.controller.test_verify import content_of, refused
+from tests.controller.test_verify import content_of, refusal_message
 from unjam.controller import load_controller, packaged_file
 from unjam.controller.file import (
     ARCHIVE_PARTS,
@@ -54,10 +54,10 @@ FINGERPRINT = fingerprint_of(KEY.public_key())
 FORGED = "controller it.unjam: forged: it was changed after it was signed"
 NONE = "controller it.unjam: its signature is not one that unjam writes"
 ALL = {GRAPH_PART: b"drawn", CERTIFICATE_PART: b"{}"}
-"""parts that nobody looks into before the signature"""
+"""parts that are not read before the signature is checked"""
 
 
-def signed(folder: Path, key: Ed25519PrivateKey = KEY, parts: dict[str, bytes] | None = None) -> Path:
+def write_signed(folder: Path, key: Ed25519PrivateKey = KEY, parts: dict[str, bytes] | None = None) -> Path:
     path = written(folder, content_of(parts=parts))
     add_signature(path, read_controller(path), key)
     return path
@@ -81,7 +81,7 @@ def found(path: Path, signer: Path | None = None) -> str:
 
 
 def test_who_signed_is_told(tmp_path: Path) -> None:
-    path = signed(tmp_path)
+    path = write_signed(tmp_path)
     said = found(path)
     assert f", by the key {FINGERPRINT}; the owner of the key was not checked: " in said
     of_maker = f", by {str(tmp_path / 'maker.pub')!r}, the key {FINGERPRINT}"
@@ -97,7 +97,7 @@ def test_a_file_without_a_signature_is_read_as_before(tmp_path: Path) -> None:
 
 
 def test_the_other_parts_stay_as_they_are_and_a_signature_is_reproducible(tmp_path: Path) -> None:
-    path = signed(tmp_path)
+    path = write_signed(tmp_path)
     parts, content = unpack_parts(path), path.read_bytes()
     assert parts.pop(SIGNATURE_PART)
     assert pack_parts(parts) == content_of()
@@ -106,15 +106,15 @@ def test_the_other_parts_stay_as_they_are_and_a_signature_is_reproducible(tmp_pa
 
 
 def test_another_key_takes_the_place_of_the_first(tmp_path: Path) -> None:
-    path = signed(tmp_path)
+    path = write_signed(tmp_path)
     add_signature(path, read_controller(path), OTHER)
     once = path.read_bytes()
     assert read_controller(path).signed_by == fingerprint_of(OTHER.public_key())
-    assert signed(tmp_path, OTHER).read_bytes() == once
+    assert write_signed(tmp_path, OTHER).read_bytes() == once
 
 
 def test_what_is_signed_is_what_the_documentation_says(tmp_path: Path) -> None:
-    parts = unpack_parts(signed(tmp_path, parts=ALL))
+    parts = unpack_parts(write_signed(tmp_path, parts=ALL))
     said = json.loads(parts.pop(SIGNATURE_PART))
     lines = ["unjam controller, signature 1", f"public key {said['public_key']}"]
     lines += [f"{hashlib.sha256(parts[name]).hexdigest()}  {name}" for name in sorted(parts)]
@@ -134,10 +134,10 @@ def test_what_is_signed_is_what_the_documentation_says(tmp_path: Path) -> None:
 )
 def test_a_part_that_was_changed_with_its_hash_is_forged(name: str, place: float, bits: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        parts = unpack_parts(signed(Path(folder), parts=ALL))
+        parts = unpack_parts(write_signed(Path(folder), parts=ALL))
         changed = bytearray(parts[name])
         changed[int(place * len(changed))] ^= bits
-        assert refused(written(Path(folder), forge({**parts, name: bytes(changed)}))) == FORGED
+        assert refusal_message(written(Path(folder), forge({**parts, name: bytes(changed)}))) == FORGED
         with pytest.raises(InputError) as caught:
             load_controller(Path(folder, "it.unjam"))
         assert str(caught.value) == FORGED
@@ -148,21 +148,21 @@ def test_a_part_that_was_changed_with_its_hash_is_forged(name: str, place: float
 @given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
 def test_no_byte_of_a_signed_file_can_be_another(place: float, bits: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        content = bytearray(signed(Path(folder)).read_bytes())
+        content = bytearray(write_signed(Path(folder)).read_bytes())
         content[int(place * len(content))] ^= bits
-        assert refused(written(Path(folder), bytes(content)))
+        assert refusal_message(written(Path(folder), bytes(content)))
 
 
 @pytest.mark.parametrize("name", [SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART])
 def test_a_part_that_is_gone_is_missed(tmp_path: Path, name: str) -> None:
-    parts = unpack_parts(signed(tmp_path, parts=ALL))
+    parts = unpack_parts(write_signed(tmp_path, parts=ALL))
     del parts[name]
-    assert refused(written(tmp_path, forge(parts))) == FORGED
+    assert refusal_message(written(tmp_path, forge(parts))) == FORGED
 
 
 def test_a_part_that_was_added_is_noticed(tmp_path: Path) -> None:
-    parts = unpack_parts(signed(tmp_path))
-    assert refused(written(tmp_path, forge({**parts, CERTIFICATE_PART: b"{}"}))) == FORGED
+    parts = unpack_parts(write_signed(tmp_path))
+    assert refusal_message(written(tmp_path, forge({**parts, CERTIFICATE_PART: b"{}"}))) == FORGED
 
 
 @pytest.mark.parametrize(
@@ -175,20 +175,26 @@ def test_a_part_that_was_added_is_noticed(tmp_path: Path) -> None:
     ],
 )
 def test_a_manifest_that_was_changed_is_forged(tmp_path: Path, change: Callable[[Any], object]) -> None:
-    parts = unpack_parts(signed(tmp_path))
+    parts = unpack_parts(write_signed(tmp_path))
     manifest = json.loads(parts[MANIFEST_PART])
     change(manifest)
-    assert refused(written(tmp_path, pack_parts({**parts, MANIFEST_PART: json.dumps(manifest).encode()}))) == FORGED
+    assert (
+        refusal_message(written(tmp_path, pack_parts({**parts, MANIFEST_PART: json.dumps(manifest).encode()})))
+        == FORGED
+    )
 
 
 def test_a_wrong_hash_is_damage_in_a_signed_file_too(tmp_path: Path) -> None:
-    parts = unpack_parts(signed(tmp_path))
+    parts = unpack_parts(write_signed(tmp_path))
     path = written(tmp_path, pack_parts({**parts, WEIGHTS_PART: parts[WEIGHTS_PART][:-1] + b"x"}))
-    assert refused(path) == "controller it.unjam: damaged: weights.safetensors does not have the hash that it names"
+    assert (
+        refusal_message(path)
+        == "controller it.unjam: damaged: weights.safetensors does not have the hash that it names"
+    )
 
 
 def test_what_lies_in_an_archive_beside_its_parts_is_forged(tmp_path: Path) -> None:
-    content = signed(tmp_path).read_bytes()
+    content = write_signed(tmp_path).read_bytes()
     with_comment = io.BytesIO(content)
     with zipfile.ZipFile(with_comment, "a") as archive:
         archive.comment = b"drives better"
@@ -197,7 +203,7 @@ def test_what_lies_in_an_archive_beside_its_parts_is_forged(tmp_path: Path) -> N
     dated = content.replace(b"\x00\x00\x21\x00", b"\x00\x00\x22\x00")
     for other in (with_comment.getvalue(), b"#!/bin/sh\n" + content, backwards, dated):
         assert other != content
-        assert refused(written(tmp_path, other)) == FORGED
+        assert refusal_message(written(tmp_path, other)) == FORGED
 
 
 @pytest.mark.parametrize(
@@ -216,24 +222,25 @@ def test_what_lies_in_an_archive_beside_its_parts_is_forged(tmp_path: Path) -> N
     ],
 )
 def test_a_signature_of_another_form_is_refused(tmp_path: Path, change: Callable[[Any], object], words: str) -> None:
-    parts = unpack_parts(signed(tmp_path))
+    parts = unpack_parts(write_signed(tmp_path))
     said = json.loads(parts[SIGNATURE_PART])
     change(said)
     assert (
-        refused(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: json.dumps(said, indent=1).encode()}))) == words
+        refusal_message(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: json.dumps(said, indent=1).encode()})))
+        == words
     )
 
 
 @pytest.mark.parametrize("part", [b"", b"[]", b"null", b"\xff", b"{}", b"[" * 9_000, b'{"public_key": "\\ud800"}'])
 def test_nonsense_for_a_signature_is_refused(tmp_path: Path, part: bytes) -> None:
-    parts = unpack_parts(signed(tmp_path))
-    assert refused(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: part}))) == NONE
+    parts = unpack_parts(write_signed(tmp_path))
+    assert refusal_message(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: part}))) == NONE
 
 
 def test_the_signature_of_another_controller_does_not_fit(tmp_path: Path) -> None:
-    other = unpack_parts(signed(tmp_path, parts=ALL))[SIGNATURE_PART]
-    parts = unpack_parts(signed(tmp_path))
-    assert refused(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: other}))) == FORGED
+    other = unpack_parts(write_signed(tmp_path, parts=ALL))[SIGNATURE_PART]
+    parts = unpack_parts(write_signed(tmp_path))
+    assert refusal_message(written(tmp_path, pack_parts({**parts, SIGNATURE_PART: other}))) == FORGED
 
 
 Point = tuple[int, int]
@@ -250,7 +257,7 @@ def points_at(y: int) -> list[Point]:
     return [(x, y) for x in sorted(roots) if x * x % PRIME == square]
 
 
-def added(one: Point, other: Point) -> Point:
+def add_points(one: Point, other: Point) -> Point:
     (a, b), (c, d) = one, other
     both = CURVE_D * a * b * c * d
     x, y = (a * d + b * c) * pow(1 + both, -1, PRIME), (b * d + a * c) * pow(1 - both, -1, PRIME)
@@ -260,13 +267,13 @@ def added(one: Point, other: Point) -> Point:
 def times(factor: int, point: Point) -> Point:
     total = (0, 1)
     for bit in f"{factor:b}":
-        total = added(total, total)
-        total = added(total, point) if bit == "1" else total
+        total = add_points(total, total)
+        total = add_points(total, point) if bit == "1" else total
     return total
 
 
 def small_order() -> set[Point]:
-    """All points whose order divides 8: multiples of the group's order of any points."""
+    """All points with an order that divides 8: multiples of the group's order of any points."""
     found = {times(ORDER, point) for y in range(2, 60) for point in points_at(y)}
     assert {times(8, point) for point in found} == {(0, 1)}
     return found
@@ -308,7 +315,7 @@ def signed_with(folder: Path, key: bytes, signature: bytes) -> Path:
 @pytest.mark.parametrize("key", [*WEAK, *NOT_CANONICAL], ids=bytes.hex)
 def test_a_weak_key_is_refused_in_a_file_and_as_signer(tmp_path: Path, key: bytes) -> None:
     path = signed_with(tmp_path, key, FOR_ANY_MESSAGE)
-    assert refused(path).startswith("controller it.unjam: it is signed by a weak Ed25519 key, ")
+    assert refusal_message(path).startswith("controller it.unjam: it is signed by a weak Ed25519 key, ")
     public = tmp_path / "weak.pub"
     shown = Ed25519PublicKey.from_public_bytes(key).public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
     public.write_bytes(shown)
@@ -333,12 +340,12 @@ def test_a_weak_private_key_is_refused(tmp_path: Path, monkeypatch: Any) -> None
 @pytest.mark.parametrize("multiple", range(1, 16))
 def test_a_malleable_signature_is_forged(tmp_path: Path, multiple: int) -> None:
     """s + k L is the same number in the group; only the smallest is a signature."""
-    said = json.loads(unpack_parts(signed(tmp_path))[SIGNATURE_PART])
+    said = json.loads(unpack_parts(write_signed(tmp_path))[SIGNATURE_PART])
     key, signature = (bytes.fromhex(said[name]) for name in ("public_key", "signature"))
     s = int.from_bytes(signature[32:], "little") + multiple * ORDER
     if s < 2**256:
         other = signature[:32] + s.to_bytes(32, "little")
-        assert refused(signed_with(tmp_path, key, other)) == FORGED
+        assert refusal_message(signed_with(tmp_path, key, other)) == FORGED
     assert verify_controller_file(signed_with(tmp_path, key, signature))
 
 
@@ -361,15 +368,15 @@ def test_a_signature_whose_point_is_weak_is_forged_whoever_checks_it(
     key = KEY.public_key().public_bytes_raw()
     honest = BASE_Y.to_bytes(32, "little")
     assert verify_controller_file(signed_with(tmp_path, key, honest + bytes(32)))
-    assert refused(signed_with(tmp_path, key, point + bytes(32))) == FORGED
-    assert refused(signed_with(tmp_path, key, honest + ORDER.to_bytes(32, "little"))) == FORGED
+    assert refusal_message(signed_with(tmp_path, key, point + bytes(32))) == FORGED
+    assert refusal_message(signed_with(tmp_path, key, honest + ORDER.to_bytes(32, "little"))) == FORGED
 
 
 def test_with_a_signer_another_or_none_is_refused(tmp_path: Path) -> None:
     signer = public_file(tmp_path)
     other = fingerprint_of(OTHER.public_key())
     for content, how in (
-        (signed(tmp_path, OTHER).read_bytes(), f"it is signed by another key, {other}"),
+        (write_signed(tmp_path, OTHER).read_bytes(), f"it is signed by another key, {other}"),
         (content_of(), "it is not signed"),
     ):
         with pytest.raises(InputError) as caught:
@@ -378,7 +385,7 @@ def test_with_a_signer_another_or_none_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_signed_file_is_not_certified_again(tmp_path: Path) -> None:
-    path = signed(tmp_path)
+    path = write_signed(tmp_path)
     before = path.read_bytes()
     with pytest.raises(InputError, match="allowed: one that is not: certify it first, then sign it"):
         add_certificate(path, read_controller(path), {})
@@ -480,7 +487,7 @@ def test_a_pipe_a_folder_or_nothing_is_no_key(tmp_path: Path) -> None:
 
 
 def test_only_signatures_need_what_checks_them(tmp_path: Path) -> None:
-    signed(tmp_path)
+    write_signed(tmp_path)
     (tmp_path / "cryptography.py").write_text("raise ImportError('gone')")
     program = "import sys\nfrom unjam.controller import load_controller\nload_controller(sys.argv[1])\n"
     command = [sys.executable, "-c", program]

@@ -40,7 +40,7 @@ def content_of(driver: Driver = HELD, limit: float | None = None, parts: dict[st
     return controller_bytes(driver, about, {SAMPLE_PART: sample, **(parts or {})})
 
 
-def changed(folder: Path, change: Callable[[dict[str, Any]], object], content: bytes | None = None) -> Path:
+def write_changed(folder: Path, change: Callable[[dict[str, Any]], object], content: bytes | None = None) -> Path:
     """A controller with another manifest."""
     parts = unpack_parts(written(folder, content or content_of()))
     manifest = json.loads(parts[MANIFEST_PART])
@@ -48,7 +48,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], object], content: b
     return written(folder, pack_parts({**parts, MANIFEST_PART: json.dumps(manifest).encode()}))
 
 
-def refused(path: Path) -> str:
+def refusal_message(path: Path) -> str:
     with pytest.raises(InputError) as caught:
         verify_controller_file(path)
     assert "\n" not in str(caught.value)
@@ -80,7 +80,7 @@ def test_what_a_recipe_leaves_out_is_said_to_be_a_default(tmp_path: Path) -> Non
 
     for content, words in (
         (content_of(), "of which nothing was ignored"),
-        (changed(tmp_path, leave_out).read_bytes(), "missing parameters have the defaults of this version"),
+        (write_changed(tmp_path, leave_out).read_bytes(), "missing parameters have the defaults of this version"),
     ):
         found = verify_controller_file(written(tmp_path, content))
         assert [each.detail.endswith(words) for each in found if each.part == "driver"] == [True]
@@ -91,10 +91,10 @@ def test_code_of_a_folder_runs_only_where_it_is_trusted(tmp_path: Path) -> None:
     code.write_text("def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n")
     held = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
-    alone = refused(tmp_path / "controller.unjam")
+    alone = refusal_message(tmp_path / "controller.unjam")
     assert alone.endswith("Python code (code.py), which a file by itself may not run; use the run folder")
-    assert f"names Python code ({str(code)!r}), which " in refused(tmp_path)
-    assert refused(tmp_path).endswith("it runs only with --trust-code")
+    assert f"names Python code ({str(code)!r}), which " in refusal_message(tmp_path)
+    assert refusal_message(tmp_path).endswith("it runs only with --trust-code")
     assert not ran.exists()
     with trusting_code():
         assert statuses(tmp_path)["code"] == "checked"
@@ -111,7 +111,7 @@ def test_a_feature_of_a_folder_is_code_too(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
     ran.unlink(missing_ok=True)
     monkeypatch.setenv("UNJAM_STATE", str(tmp_path / "of another user"))
-    assert refused(tmp_path).endswith("it runs only with --trust-code")
+    assert refusal_message(tmp_path).endswith("it runs only with --trust-code")
     assert not ran.exists()
 
 
@@ -143,18 +143,18 @@ def test_a_formula_without_any_statement_is_said_to_have_none(tmp_path: Path) ->
 def test_a_manifest_that_says_something_else_is_refused(
     tmp_path: Path, change: Callable[[dict[str, Any]], object], key: str
 ) -> None:
-    words = refused(changed(tmp_path, change))
+    words = refusal_message(write_changed(tmp_path, change))
     assert f"its manifest says of {key}" in words or f"manifest.{key}: missing" in words
 
 
 def test_a_sample_that_the_driver_does_not_answer_so_is_refused(tmp_path: Path) -> None:
     other = sample_bytes(residual(PISaturation(), seed=1), perceived(), 1.0)
-    words = refused(written(tmp_path, content_of(parts={SAMPLE_PART: other})))
+    words = refusal_message(written(tmp_path, content_of(parts={SAMPLE_PART: other})))
     assert words.startswith("controller: step 0 of its sample: its driver answers ")
 
 
 def test_a_sample_without_bounds_is_refused(tmp_path: Path) -> None:
-    assert "names no bounds" in refused(written(tmp_path, content_of(PISaturation())))
+    assert "names no bounds" in refusal_message(written(tmp_path, content_of(PISaturation())))
     assert statuses(written(tmp_path, content_of(PISaturation(), limit=1.0)))["sample"] == "checked"
 
 
@@ -162,13 +162,13 @@ def test_a_sample_without_bounds_is_refused(tmp_path: Path) -> None:
 def test_a_sample_that_checks_nothing_or_takes_long_is_refused(tmp_path: Path, count: int) -> None:
     longest = load(sample_bytes(HELD, perceived(1001), 1.0))
     sample = save({name: values[:count] for name, values in longest.items()})
-    words = refused(written(tmp_path, content_of(parts={SAMPLE_PART: sample})))
+    words = refusal_message(written(tmp_path, content_of(parts={SAMPLE_PART: sample})))
     assert words == f"sample: control steps: {count} is not allowed; allowed: 1 to 1000"
 
 
 def test_a_graph_without_a_sample_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, controller_bytes(HELD, ABOUT, {GRAPH_PART: b"graph"}))
-    assert "has controller.onnx, but no recorded sample" in refused(path)
+    assert "has controller.onnx, but no recorded sample" in refusal_message(path)
 
 
 def test_a_graph_that_answers_something_else_is_refused(tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_a_graph_that_answers_something_else_is_refused(tmp_path: Path) -> None:
 
     driver = Constant()
     path = written(tmp_path, content_of(driver, limit=20.0, parts={GRAPH_PART: graph()}))
-    assert "step 0 of its sample: its graph answers " in refused(path)
+    assert "step 0 of its sample: its graph answers " in refusal_message(path)
 
 
 def test_a_graph_that_agrees_on_the_makers_sample_alone_is_refused(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_a_graph_that_agrees_on_the_makers_sample_alone_is_refused(tmp_path: Pat
     states = same.select(np.zeros(30, int))._replace(speed=np.full(30, 5.0), leader_speed=np.full(30, 5.0))
     resting = states._replace(leader_gap=np.full(30, equilibrium_gap(5.0, PAPER_IDM)))
     parts = {SAMPLE_PART: sample_bytes(driver, resting, 9.0), GRAPH_PART: graph(constant)}
-    words = refused(written(tmp_path, controller_bytes(driver, {"action_limit": 9.0}, parts)))
+    words = refusal_message(written(tmp_path, controller_bytes(driver, {"action_limit": 9.0}, parts)))
     assert words.startswith("controller: random state ")
 
 
@@ -255,7 +255,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 @settings(max_examples=60)
 @given(number=st.integers(0), value=JSON)
 def test_whatever_a_manifest_says_it_is_refused_in_one_line_or_drives(number: int, value: Any) -> None:
-    """A manifest with one thing replaced, by a forger who also made the hashes fit."""
+    """A manifest with one thing replaced, by a forger that also adapted the hashes."""
 
     def change(manifest: dict[str, Any]) -> None:
         found = places({key: part for key, part in manifest.items() if key != "sha256"})
@@ -266,7 +266,7 @@ def test_whatever_a_manifest_says_it_is_refused_in_one_line_or_drives(number: in
         inner[last] = value
 
     with tempfile.TemporaryDirectory() as folder:
-        path = changed(Path(folder), change)
+        path = write_changed(Path(folder), change)
         try:
             verify_controller_file(path)
         except InputError as error:
@@ -284,5 +284,5 @@ def test_what_a_stranger_wrote_of_the_road_stays_on_its_line_and_out_of_the_term
     def forge(manifest: dict[str, Any]) -> None:
         manifest["scenario"] = {"kind": "ring\nchecked signature: by 'maker.pub'\x1b[31m"}
 
-    (said,) = [each.detail for each in verify_controller_file(changed(tmp_path, forge)) if each.part == "road"]
+    (said,) = [each.detail for each in verify_controller_file(write_changed(tmp_path, forge)) if each.part == "road"]
     assert said == "made for the ring?checked signature: by 'maker.pub'?[31m"

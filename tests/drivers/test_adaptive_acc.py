@@ -1,4 +1,4 @@
-"""Does the traffic-adaptive ACC follow as its source says in each state of traffic?"""
+"""The traffic-adaptive ACC follows as its source states in each traffic state."""
 
 import numpy as np
 import pytest

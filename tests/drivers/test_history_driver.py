@@ -1,4 +1,4 @@
-"""Are the means those of the past, wherever it was watched?"""
+"""History features are the means of the past, independent of where the history starts."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from unjam.drivers.wrappers import AVERAGING_TIMES, HistoryDriver
 STEP = 0.5
 
 
-def watched(speeds: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+def history_features(speeds: np.ndarray, gaps: np.ndarray) -> np.ndarray:
     """What a network sees after moments of one car, shape (3 spans, 3)."""
     driver = HistoryDriver(FollowerStopper(), STEP)
     memory = driver.initial_memory(1)
@@ -25,13 +25,13 @@ def watched(speeds: np.ndarray, gaps: np.ndarray) -> np.ndarray:
 def test_until_a_span_has_passed_all_that_was_watched_counts_alike() -> None:
     generator = np.random.default_rng(0)
     speeds, gaps = generator.uniform(0, 10, 15), generator.uniform(2, 40, 15)
-    longest = watched(speeds, gaps)[-1]
+    longest = history_features(speeds, gaps)[-1]
     assert longest == pytest.approx([speeds.mean() / 10, speeds.std() / 2, gaps.mean() / 20], rel=1e-6)
 
 
 def test_after_a_long_time_what_was_before_is_forgotten_soonest_by_the_shortest_span() -> None:
     speeds = np.repeat([8.0, 2.0], [400, 40])
-    means = watched(speeds, np.full(440, 10.0))[:, 0] * 10
+    means = history_features(speeds, np.full(440, 10.0))[:, 0] * 10
     assert means[0] < means[1] < means[2] < 8.0
     assert means[0] == pytest.approx(2.0 + 6.0 * np.exp(-20.0 / AVERAGING_TIMES[0]), rel=1e-3)
 

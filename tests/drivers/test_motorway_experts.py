@@ -1,4 +1,4 @@
-"""Do the experts of motorways hold back where the road ahead is slow, and nowhere else?"""
+"""Experts for motorways reduce the speed upstream of slow traffic, and nowhere else."""
 
 from dataclasses import replace
 
@@ -41,11 +41,11 @@ def test_it_drives_towards_the_mean_speed_ahead_and_never_brakes_hard_for_it() -
 
 
 def test_the_more_cavs_there_are_the_less_each_holds_back() -> None:
-    """Else each follows the mean of others who hold back, and all come to a stop."""
+    """Otherwise each CAV follows the mean of others that hold back, and all of them stop."""
     crowd = state(20.0, 19.0)._replace(penetration_rate=np.array([0.2]))
     driver = replace(AT_ONCE, margin_by_penetration=10.0)
     assert driver.act(crowd, {})[0].tolist() == pytest.approx([1.0])
-    assert answer(driver, 20.0, 19.0) == pytest.approx(-1.0)  # where nobody counts CAVs
+    assert answer(driver, 20.0, 19.0) == pytest.approx(-1.0)  # without a penetration rate
 
 
 def test_it_never_asks_for_more_than_is_allowed() -> None:
@@ -53,7 +53,7 @@ def test_it_never_asks_for_more_than_is_allowed() -> None:
 
 
 def without_map(ahead: float, *congested: int, report: float = 1.0) -> LocalState:
-    """As `state`, on a road of which nobody knows where ramps join, and the sections that are congested."""
+    """As `state`, on a road without known merge points, with the sections that are congested."""
     congestion = np.zeros((1, SECTIONS_AHEAD))
     congestion[0, list(congested)] = report
     return state(20.0, ahead)._replace(distance_to_merge=None, congestion=congestion)

@@ -1,4 +1,4 @@
-"""Does the leader of a queue give up where the queue does not hold, and only there?"""
+"""The leader of a queue falls back to another driver if and only if the queue breaks."""
 
 from pathlib import Path
 
@@ -27,8 +27,8 @@ EACH = QueueFallback(Constant(acceleration=LEADS), Constant(acceleration=GAVE_UP
 TWO = QueueFallback(make_driver("pacer:use_tuned=true", 0.1), PISaturation(), 0.1)
 
 
-def seen(*free: float) -> LocalState:
-    """Return what CAVs see before whom so many shares of the lap are free."""
+def observation(*free: float) -> LocalState:
+    """Return the observations of CAVs with these free shares of the lap ahead."""
     everything = state_of_ones(COMMON_FIELDS, np.ones, rows=len(free))
     gap = LAP * np.array(free)
     return everything._replace(leader_gap=gap, loop_length=np.full(len(free), LAP))
@@ -39,7 +39,7 @@ def seen(*free: float) -> LocalState:
     [
         ((0.1, 0.3, 0.6, 0.6, 0.46, 0.6), (LEADS,) * 6),  # all gather, and stay so
         ((0.1, 0.6, 0.44, 0.6, 0.6), (LEADS, LEADS, GAVE_UP, GAVE_UP, GAVE_UP)),  # the queue breaks
-        ((0.1, 0.2, 0.3, 0.4, 0.6), (LEADS, LEADS, LEADS, GAVE_UP, GAVE_UP)),  # nobody gathers in time
+        ((0.1, 0.2, 0.3, 0.4, 0.6), (LEADS, LEADS, LEADS, GAVE_UP, GAVE_UP)),  # no vehicle gathers in time
     ],
 )
 def test_who_leads_gives_up_for_good_when_the_queue_does_not_hold(
@@ -49,8 +49,8 @@ def test_who_leads_gives_up_for_good_when_the_queue_does_not_hold(
     assert 3 * STEP <= MAX_GATHERING_TIME < 4 * STEP
     memory, plain = EACH.initial_memory(1), scalar_memory(EACH.initial_memory(1))
     for share, expected in zip(free, driven, strict=True):
-        wanted, memory = EACH.act(seen(share), memory)
-        alone, plain = EACH.act(seen(share).map(lambda values: float(values[0])), plain)
+        wanted, memory = EACH.act(observation(share), memory)
+        alone, plain = EACH.act(observation(share).map(lambda values: float(values[0])), plain)
         assert (wanted.tolist(), alone) == ([expected], expected)
 
 
@@ -59,7 +59,7 @@ def test_each_car_gives_up_by_itself_and_the_other_law_begins_then() -> None:
     memory = watching.initial_memory(2)
     driven: list[list[bool]] = []
     for look in ((0.6, 0.6), (0.6, 0.3), (0.3, 0.3)):
-        wanted, memory = watching.act(seen(*look), memory)
+        wanted, memory = watching.act(observation(*look), memory)
         driven.append((wanted == LEADS).tolist())
     assert driven == [[True, True], [True, False], [False, False]]
     assert memory["fallback"]["count"].tolist() == [1.0, 2.0], "as long as each has driven by it"

@@ -1,4 +1,4 @@
-"""Does each road get the law that was made for it, from one file?"""
+"""Each type of road gets its own driver from one file."""
 
 from pathlib import Path
 

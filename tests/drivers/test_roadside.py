@@ -1,4 +1,4 @@
-"""Does a message say what was measured, as late and as smooth as it should?"""
+"""A roadside message contains the measured speeds, with the configured latency and smoothing."""
 
 import numpy as np
 import pytest

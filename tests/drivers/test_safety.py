@@ -1,4 +1,4 @@
-"""Does the safety filter keep what docs/safety.md proves, whatever leaders and drivers do?"""
+"""The safety filter keeps what docs/safety.md proves, for arbitrary leaders and drivers."""
 
 from math import inf
 from typing import Any
@@ -168,7 +168,7 @@ def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
 
 
 @given(SPEEDS, SPEEDS, st.floats(-3.0, 3.0))
-def test_with_nobody_ahead_a_car_does_what_it_wants(speed: float, leader_speed: float, wanted: float) -> None:
+def test_without_a_leader_commands_are_not_limited(speed: float, leader_speed: float, wanted: float) -> None:
     for actuation in (None, (Actuator(lag=0.3), ActuatorState(0.0))):
         free = SafetyFilter().limit(wanted, FollowingState(speed, leader_speed, inf), 0.1, actuation)
         assert free == wanted

@@ -1,4 +1,4 @@
-"""Do sensors err within their bounds, miss as many readings as they say, and change nothing else?"""
+"""Sensor errors stay within their bounds, readings are missing at the stated rate, and nothing else changes."""
 
 from typing import Any
 

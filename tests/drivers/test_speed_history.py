@@ -12,7 +12,7 @@ def tensors(memory: dict) -> dict:
     return {key: torch.tensor(values) for key, values in memory.items()}
 
 
-def watched(steps: int, speeds: np.ndarray) -> dict:
+def record_speeds(steps: int, speeds: np.ndarray) -> dict:
     memory = empty_window(ROWS, float(steps), 1.0)
     for speed in speeds:
         memory = slide_window(memory, speed)
@@ -23,7 +23,7 @@ def watched(steps: int, speeds: np.ndarray) -> dict:
 @pytest.mark.parametrize("before", [0, 3, 250])
 def test_tensors_remember_what_arrays_do(steps: int, before: int) -> None:
     generator = np.random.default_rng(0)
-    expected = watched(steps, generator.uniform(0, 9, (before, ROWS)))
+    expected = record_speeds(steps, generator.uniform(0, 9, (before, ROWS)))
     found = tensors(expected)
     for speed in generator.uniform(0, 9, (3 * (steps + MIN_SPARE_STEPS), ROWS)):
         expected, found = slide_window(expected, speed), slide_window(found, torch.tensor(speed))
@@ -33,7 +33,7 @@ def test_tensors_remember_what_arrays_do(steps: int, before: int) -> None:
 def test_rows_of_different_age_keep_their_own_windows() -> None:
     generator = np.random.default_rng(1)
     ages = [2, 5, 12]
-    alone = [watched(5, generator.uniform(0, 9, (age, ROWS))) for age in ages]
+    alone = [record_speeds(5, generator.uniform(0, 9, (age, ROWS))) for age in ages]
     together = {key: np.stack([memory[key][0] for memory in alone]) for key in alone[0]}
     found = tensors(together)
     for speed in generator.uniform(0, 9, (20, ROWS)):
@@ -61,7 +61,7 @@ def test_two_memories_may_follow_from_the_same(after: int) -> None:
 @pytest.mark.parametrize("before", [0, 3, 40])
 def test_rows_that_share_nothing_remember_what_arrays_do(before: int) -> None:
     generator = np.random.default_rng(3)
-    expected = watched(7, generator.uniform(0, 9, (before, ROWS)))
+    expected = record_speeds(7, generator.uniform(0, 9, (before, ROWS)))
     found = tensors(expected)
     for speed in generator.uniform(0, 9, (30, ROWS)):
         rows, kept = CircularWindow(found["window"], found["count"]), found["window"].clone()

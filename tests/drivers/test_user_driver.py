@@ -33,7 +33,7 @@ def test_a_class_takes_parameters_and_the_time_step(my_drivers: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("nobody", "has no 'nobody'; it has: .*gentle"),
+        ("nonesuch", "has no 'nonesuch'; it has: .*gentle"),
         ("NoMemory", r"has act\(\) but no initial_memory"),
         ("Raises", "RuntimeError when made: no battery"),
         ("not_callable", "neither a function nor a class"),

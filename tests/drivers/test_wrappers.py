@@ -98,7 +98,7 @@ def test_a_mixture_is_named_and_written_down_like_any_driver() -> None:
     assert driver_from_recipe(*driver_recipe(mixed)) == mixed
 
 
-@pytest.mark.parametrize(("text", "words"), [("pi+human", "human"), ("pi+nobody", "nobody")])
+@pytest.mark.parametrize(("text", "words"), [("pi+human", "human"), ("pi+nonesuch", "nonesuch")])
 def test_what_cannot_be_mixed_is_told_in_one_line(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:
         make_driver(text, 0.1)

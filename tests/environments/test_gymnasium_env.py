@@ -249,7 +249,7 @@ def test_renders_the_road_with_its_cav(scenario: str) -> None:
         ({"render_mode": "cinema"}, "human, rgb_array"),
         ({"scenario": "moon"}, "ring, ring-warm"),
         ({"lenght": (230, 230)}, "lenght: unknown name"),
-        ({"expert": "nobody"}, "nobody"),
+        ({"expert": "nonesuch"}, "nonesuch"),
         ({"scenario": "merge", "expert": "pacer"}, "it needs a closed road"),
     ],
 )

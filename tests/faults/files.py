@@ -1,4 +1,4 @@
-"""Faults in what is read and written: checkpoints, controllers, configurations, the disk."""
+"""Faults of files: damaged checkpoints, controllers, configurations and results, and a full disk."""
 
 import json
 import resource
@@ -39,19 +39,33 @@ from unjam.training.run_folder import CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_
 from unjam.training.runs import list_runs
 
 MUTATIONS = ("change", "cut", "insert", "double", "swap")
-LONGEST = 2.0
-"""seconds in which a wrong configuration is refused"""
-JUNK = ["nan", "-1", "1e400", '""', '"ghost"', "[]", "{}", "true", "9" * 30, "[[[[1]]]]", "0", "1979-05-27", "="]
+MAX_REFUSAL_SECONDS = 2.0
+"""maximum time until an invalid configuration is refused [s]"""
+INVALID_VALUES = [
+    "nan",
+    "-1",
+    "1e400",
+    '""',
+    '"ghost"',
+    "[]",
+    "{}",
+    "true",
+    "9" * 30,
+    "[[[[1]]]]",
+    "0",
+    "1979-05-27",
+    "=",
+]
 
 
-def save(folder: Path, iteration: int) -> None:
-    """Save a small checkpoint that is all its iteration's own."""
+def save_small_checkpoint(folder: Path, iteration: int) -> None:
+    """Save a small checkpoint with values that depend on the iteration."""
     tensors = {"policy.weight": torch.full((20, 5), float(iteration)), "step": torch.tensor(iteration)}
     save_checkpoint(folder, {"iteration": iteration, "validation_best": 0.1 * iteration}, tensors)
 
 
-def loaded(folder: Path) -> int:
-    """Return of which iteration the checkpoint is that is loaded, all of it."""
+def loaded_iteration(folder: Path) -> int:
+    """Load the newest intact checkpoint, check that all values are of one iteration, and return the iteration."""
     found = load_checkpoint(folder)
     assert found is not None
     state, tensors = found
@@ -61,18 +75,18 @@ def loaded(folder: Path) -> int:
 
 
 def any_mutation(content: bytes, generator: np.random.Generator) -> bytes:
-    """Return `content` with something changed, cut off, put in, doubled or swapped."""
+    """Return `content` with some bytes changed, cut off, inserted, doubled or swapped."""
     other = generator.bytes(int(generator.integers(1, 5)))
     return mutated(content, str(generator.choice(MUTATIONS)), generator.random(), other)
 
 
 def checkpoints(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Damage the newest checkpoint: its bytes, parts of another, an older schema, nothing at all."""
+    """Damage the newest checkpoint: changed bytes, parts of another one, an older format, empty or missing files."""
     outcome = Outcome()
     for number in range(count):
         place = folder / str(number)
-        save(place, 1)
-        save(place, 2)
+        save_small_checkpoint(place, 1)
+        save_small_checkpoint(place, 2)
         part = place / "000002" / str(generator.choice([CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE]))
         kind = generator.choice(["bytes", "bytes", "bytes", "empty", "missing", "another's", "old schema"])
         if kind == "bytes":
@@ -85,15 +99,15 @@ def checkpoints(count: int, folder: Path, generator: np.random.Generator) -> Out
             part.write_bytes((place / "000001" / part.name).read_bytes())
         else:
             (place / "000002" / CHECKPOINT_STATE_FILE).write_text('{"iteration": 2, "format": 0}')
-        newest = loaded(place)
+        newest = loaded_iteration(place)
         outcome.happened["the generation before was used" if newest == 1 else "nothing was lost"] += 1
     return outcome
 
 
 def controllers(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Damage a controller."""
+    """Damage the file of a controller."""
     outcome, content, path = Outcome(), content_of(), folder / "it.unjam"
-    whole = controller_bytes(HELD, {})
+    original = controller_bytes(HELD, {})
     for _ in range(count):
         path.write_bytes(any_mutation(content, generator))
         try:
@@ -102,27 +116,27 @@ def controllers(count: int, folder: Path, generator: np.random.Generator) -> Out
             one_line(error)
             outcome.happened["refused in one line"] += 1
             continue
-        assert controller_bytes(load_controller(path), {}) == whole
+        assert controller_bytes(load_controller(path), {}) == original
         outcome.happened["nothing was lost"] += 1
     return outcome
 
 
 def signatures(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Change a signed controller as a forger would, who makes all hashes fit, or its signature."""
+    """Change a signed controller as a forger would that adapts all hashes, or change its signature."""
     outcome, path, maker = Outcome(), folder / "it.unjam", make_keys(folder / "maker")
     key, other = read_private_key(maker.private), Ed25519PrivateKey.generate()
     path.write_bytes(content_of(parts={GRAPH_PART: b"drawn", CERTIFICATE_PART: b"{}"}))
     add_signature(path, read_controller(path), key)
-    whole = unpack_parts(path)
+    original = unpack_parts(path)
     while outcome.injected < count:
-        parts = dict(whole)
+        parts = dict(original)
         kind, part = str(generator.choice(FORGERIES)), str(generator.choice(ARCHIVE_PARTS[1:-1]))
         if kind == "a part changed":
             parts[part] = any_mutation(parts[part], generator)
         elif kind == "a part gone" and part != WEIGHTS_PART:
             del parts[part]
         elif kind == "its manifest changed":
-            parts[MANIFEST_PART] = with_junk(json.loads(parts[MANIFEST_PART]), generator).encode()
+            parts[MANIFEST_PART] = with_invalid_entry(json.loads(parts[MANIFEST_PART]), generator).encode()
         elif kind == "its signature changed":
             parts[SIGNATURE_PART] = any_mutation(parts[SIGNATURE_PART], generator)
         elif kind == "signed by another":
@@ -132,7 +146,7 @@ def signatures(count: int, folder: Path, generator: np.random.Generator) -> Outc
             parts[SIGNATURE_PART] = signature_part(WEAK[int(generator.integers(len(WEAK)))], FOR_ANY_MESSAGE)
         elif kind == "its signature taken away":
             del parts[SIGNATURE_PART]
-        if parts == whole:
+        if parts == original:
             continue
         path.write_bytes(pack_parts(parts) if kind == "its manifest changed" else forge(parts))
         signed = kind not in ("signed by another", "its signature taken away")
@@ -151,20 +165,20 @@ FORGERIES = (
 
 
 def configurations(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Put nonsense into a configuration."""
-    outcome, path, slowest = Outcome(), folder / "config.toml", 0.0
+    """Change a configuration at random."""
+    outcome, path, longest = Outcome(), folder / "config.toml", 0.0
     lines = to_toml(load_config()).splitlines()
     for _ in range(count):
-        changed, place = list(lines), int(generator.integers(len(lines)))
-        key, equals, _ = changed[place].partition(" = ")
+        changed_lines, place = list(lines), int(generator.integers(len(lines)))
+        key, equals, _ = changed_lines[place].partition(" = ")
         kind = generator.choice(["value", "value", "value", "name", "twice", "bytes"])
         if kind == "value" and equals:
-            changed[place] = f"{key} = {generator.choice(JUNK)}"
+            changed_lines[place] = f"{key} = {generator.choice(INVALID_VALUES)}"
         elif kind == "name":
-            changed[place] = f"ghost_{changed[place]}"
+            changed_lines[place] = f"ghost_{changed_lines[place]}"
         else:
-            changed.insert(place, changed[place])
-        content = "\n".join(changed).encode()
+            changed_lines.insert(place, changed_lines[place])
+        content = "\n".join(changed_lines).encode()
         path.write_bytes(any_mutation(content, generator) if kind == "bytes" else content)
         started = time.monotonic()
         try:
@@ -173,27 +187,27 @@ def configurations(count: int, folder: Path, generator: np.random.Generator) -> 
         except InputError as error:
             one_line(error)
             outcome.happened["refused in one line before anything started"] += 1
-        slowest = max(slowest, time.monotonic() - started)
-    assert slowest < LONGEST
-    outcome.facts["slowest [s]"] = round(slowest, 3)
+        longest = max(longest, time.monotonic() - started)
+    assert longest < MAX_REFUSAL_SECONDS
+    outcome.facts["slowest [s]"] = round(longest, 3)
     return outcome
 
 
 def results(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Damage a folder of results, and ask for its report and for all runs."""
-    outcome, whole = Outcome(), folder / "whole"
-    drive("ring", "pi", 1, scenario_options={"horizon": 20, "warmup": 0}, workers=1, out=whole)
-    (whole / "config.toml").write_text(to_toml(load_config()))
-    (whole / "progress.jsonl").write_text('{"iteration": 1, "environment_steps": 5}\n')
-    (whole / "manifest.json").write_text("{}")
+    """Damage a folder of results; then write its report, and list all runs."""
+    outcome, original = Outcome(), folder / "whole"
+    drive("ring", "pi", 1, scenario_options={"horizon": 20, "warmup": 0}, workers=1, out=original)
+    (original / "config.toml").write_text(to_toml(load_config()))
+    (original / "progress.jsonl").write_text('{"iteration": 1, "environment_steps": 5}\n')
+    (original / "manifest.json").write_text("{}")
     for number in range(count):
         place = folder / str(number)
-        shutil.copytree(whole, place)
+        shutil.copytree(original, place)
         files = sorted(path for path in place.iterdir() if path.is_file())
         part = files[int(generator.integers(len(files)))]
         kind = generator.choice(["bytes", "value", "value", "value", "empty", "missing", "a folder", "nested"])
         if kind == "value" and part.suffix == ".json":
-            part.write_text(with_junk(json.loads(part.read_text()), generator))
+            part.write_text(with_invalid_entry(json.loads(part.read_text()), generator))
         elif kind in ("bytes", "value"):
             part.write_bytes(any_mutation(part.read_bytes(), generator))
         elif kind == "nested":
@@ -203,10 +217,10 @@ def results(count: int, folder: Path, generator: np.random.Generator) -> Outcome
             if kind != "missing":
                 part.mkdir() if kind == "a folder" else part.touch()
         happened = "the report was written"
-        for ask in (lambda at: write_report_page([at], at / "page.html"), list_runs):
+        for read_folder in (lambda path: write_report_page([path], path / "page.html"), list_runs):
             try:
                 with empty_pictures():
-                    ask(place)
+                    read_folder(place)
             except InputError as error:
                 one_line(error)
                 happened = "refused in one line"
@@ -215,8 +229,8 @@ def results(count: int, folder: Path, generator: np.random.Generator) -> Outcome
     return outcome
 
 
-def with_junk(document: Any, generator: np.random.Generator) -> str:
-    """Return JSON in which something is gone, or is something else."""
+def with_invalid_entry(document: Any, generator: np.random.Generator) -> str:
+    """Return a JSON document with one entry removed or replaced."""
     place = document
     while isinstance(place, dict | list) and place:
         keys = list(place) if isinstance(place, dict) else range(len(place))
@@ -225,22 +239,22 @@ def with_junk(document: Any, generator: np.random.Generator) -> str:
             if generator.random() < 0.3:
                 del place[key]
             else:
-                junk = (None, {}, [], 5, "x", True, -1, 1e308, [[]])
-                place[key] = junk[int(generator.integers(len(junk)))]
+                invalid = (None, {}, [], 5, "x", True, -1, 1e308, [[]])
+                place[key] = invalid[int(generator.integers(len(invalid)))]
             break
         place = place[key]
     return json.dumps(document)
 
 
 def full_disks(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Let the disk be full after some bytes of a checkpoint."""
+    """Save checkpoints on a disk that is full after some bytes."""
     outcome, before = Outcome(), resource.getrlimit(resource.RLIMIT_FSIZE)
     newest = 1
-    save(folder, newest)
+    save_small_checkpoint(folder, newest)
     for _ in range(count):
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(generator.integers(0, 1500)), before[1]))
         try:
-            save(folder, newest + 1)
+            save_small_checkpoint(folder, newest + 1)
             newest += 1
             outcome.happened["it still had room"] += 1
         except DiskError as error:
@@ -248,6 +262,6 @@ def full_disks(count: int, folder: Path, generator: np.random.Generator) -> Outc
             outcome.happened["the checkpoint before was whole, exit code 74"] += 1
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        assert loaded(folder) == newest
+        assert loaded_iteration(folder) == newest
         assert not list(folder.rglob("*.part"))
     return outcome

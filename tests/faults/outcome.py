@@ -1,4 +1,4 @@
-"""What became of injected faults."""
+"""Injected faults, and their outcomes."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -11,40 +11,41 @@ import numpy as np
 
 @dataclass
 class Outcome:
-    """How often a fault was injected, and what happened; a fault that does harm is an AssertionError."""
+    """Outcomes of injected faults; a fault with a harmful outcome raises an AssertionError."""
 
     happened: Counter[str] = field(default_factory=Counter)
+    """number of faults by outcome"""
     facts: dict[str, Any] = field(default_factory=dict)
-    """what else was measured"""
+    """other measured quantities"""
 
     @property
     def injected(self) -> int:
-        """How many faults there were."""
+        """Number of injected faults."""
         return self.happened.total()
 
 
-Inject = Callable[[int, Path, np.random.Generator], Outcome]
-"""(how many, a folder of its own, where all chance comes from) -> what happened"""
+FaultInjector = Callable[[int, Path, np.random.Generator], Outcome]
+"""injects a number of faults in an empty folder, with random numbers of a generator, and returns their outcomes"""
 
 
 @dataclass(frozen=True)
 class Fault:
     """One kind of fault."""
 
-    about: str
-    """what is injected"""
-    inject: Inject
-    quick: int
-    """how many in the tests"""
-    long: int
-    """how many in a soak"""
-    slow: bool = False
-    """whether even a few take long"""
+    description: str
+    """description of the fault"""
+    inject: FaultInjector
+    quick_count: int
+    """number of faults in the tests"""
+    long_count: int
+    """number of faults in a soak test"""
+    is_slow: bool = False
+    """whether even a few faults take minutes"""
 
 
 def one_line(error: Exception) -> str:
-    """Return an error's words, which must be one line."""
-    words = str(error)
-    assert words, type(error).__name__
-    assert "\n" not in words, words
-    return words
+    """Return the message of an error, which must be one line."""
+    message = str(error)
+    assert message, type(error).__name__
+    assert "\n" not in message, message
+    return message

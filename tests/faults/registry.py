@@ -11,11 +11,11 @@ FAULTS: dict[str, Fault] = {
     "checkpoints": Fault(
         "checkpoint damaged: bits flipped, cut off, doubled, empty, missing, parts of another, an old schema",
         checkpoints,
-        quick=60,
-        long=1000,
+        quick_count=60,
+        long_count=1000,
     ),
     "controllers": Fault(
-        "controller damaged: bits flipped, cut off, doubled, swapped", controllers, quick=60, long=1000
+        "controller damaged: bits flipped, cut off, doubled, swapped", controllers, quick_count=60, long_count=1000
     ),
     "configurations": Fault(
         "configuration with a nonsensical value, an unknown name, a line twice, torn", configurations, 40, 200
@@ -23,65 +23,67 @@ FAULTS: dict[str, Fault] = {
     "results": Fault(
         "folder of results damaged: torn, empty, missing, nested, a value gone or another", results, 10, 300
     ),
-    "full disk": Fault("disk full after some bytes of a checkpoint", full_disks, quick=20, long=200),
-    "networks": Fault("network, demand or configuration of SUMO broken", networks, quick=6, long=500),
+    "full disk": Fault("disk full after some bytes of a checkpoint", full_disks, quick_count=20, long_count=200),
+    "networks": Fault("network, demand or configuration of SUMO broken", networks, quick_count=6, long_count=500),
     "hostile files": Fault(
         "network of others that wants SUMO to write, to listen or to read another file", hostile, 8, 200
     ),
     "sandbox": Fault(
-        "program beside the reader of networks, and SUMO, that write or open a socket", sandboxes, 12, 300
+        "program next to the reader of networks, and SUMO, that write or open a socket", sandboxes, 12, 300
     ),
     "cached networks": Fault("network in the cache edited, cut, emptied or removed", caches, 8, 300),
     "code in folders": Fault(
         "run folder that names Python code, given to verify, drive, watch, assess, train, search, evaluate, "
         "export and certify",
         codes,
-        quick=8,
-        long=300,
+        quick_count=8,
+        long_count=300,
     ),
     "drivers that change": Fault(
-        "driver that changes all that it is shown, on every kind of road", cheats, quick=5, long=200
+        "driver that changes all that it is shown, on every kind of road", cheats, quick_count=5, long_count=200
     ),
     "crash points": Fault(
         "run killed, or the disk full, before, within or after each thing that it does to its folder",
         crash_points,
-        quick=30,
-        long=600,
+        quick_count=30,
+        long_count=600,
     ),
     "lineage": Fault(
         "run that goes on with other settings, another expert, reward, network or checkpoint",
         lineages,
-        quick=8,
-        long=200,
+        quick_count=8,
+        long_count=200,
     ),
-    "locks": Fault("folder that another process writes, which is then killed", locks, quick=3, long=100),
-    "lost workers": Fault("worker killed, crashed or stopped in an episode", lost_workers, quick=2, long=200),
-    "resets": Fault("episodes one after the other in one process", resets, quick=100, long=10_000),
-    "killed runs": Fault("training run killed (signal 9)", killed_runs, quick=4, long=12, slow=True),
+    "locks": Fault("folder that another process writes, which is then killed", locks, quick_count=3, long_count=100),
+    "lost workers": Fault(
+        "worker killed, crashed or stopped in an episode", lost_workers, quick_count=2, long_count=200
+    ),
+    "resets": Fault("episodes one after the other in one process", resets, quick_count=100, long_count=10_000),
+    "killed runs": Fault("training run killed (signal 9)", killed_runs, quick_count=4, long_count=12, is_slow=True),
     "signatures": Fault(
-        "signed controller changed by a forger who makes the hashes fit, signed by another, or not at all",
+        "signed controller changed by a forger that adapts the hashes, signed by another, or not at all",
         signatures,
-        quick=60,
-        long=1000,
+        quick_count=60,
+        long_count=1000,
     ),
     "inputs": Fault(
         "command line with names too long, odd or no text, configurations without end, NUL, special files, "
         "weights that are none; with a closed output, in a removed folder, with few file descriptors",
         inputs,
-        quick=6,
-        long=200,
+        quick_count=6,
+        long_count=200,
     ),
     "replaced code": Fault(
         "user's Python file, or a module that it imports, replaced after it was read or trusted, or with "
-        "bytecode beside it",
+        "bytecode next to it",
         replacements,
-        quick=12,
-        long=500,
+        quick_count=12,
+        long_count=500,
     ),
     "links": Fault(
         "links to files, folders or nothing elsewhere, and hard links, planted in a run folder that goes on",
         links,
-        quick=40,
-        long=500,
+        quick_count=40,
+        long_count=500,
     ),
 }

@@ -1,4 +1,4 @@
-"""Injects thousands of faults, and writes down what happened: results/soak.json. Takes half an hour.
+"""Inject thousands of faults, and write their outcomes to results/soak.json; takes half an hour.
 
 Run: python tests/faults/soak.py [NAME ...]
 """
@@ -23,16 +23,16 @@ TARGET = ROOT / "results" / "soak.json"
 
 
 def soak(names: list[str]) -> None:
-    """Inject the faults of these names; the rows of others stay as they were measured before."""
+    """Inject the faults with these names; the rows of other faults are kept."""
     rows = {row["name"]: row for row in json.loads(TARGET.read_text())["rows"]} if TARGET.exists() else {}
     about = manifest()  # now: later the results themselves are a change of the tree
     for name in names:
         fault, started = FAULTS[name], time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
-            outcome = fault.inject(fault.long, Path(folder), np.random.default_rng(list(FAULTS).index(name)))
+            outcome = fault.inject(fault.long_count, Path(folder), np.random.default_rng(list(FAULTS).index(name)))
         rows[name] = {
             "name": name,
-            "about": fault.about,
+            "about": fault.description,
             "injected": outcome.injected,
             "happened": dict(sorted(outcome.happened.items())),
             "facts": outcome.facts,

@@ -52,14 +52,14 @@ from unjam.worlds.sumo.sandboxed import SandboxedSimulation
 from unjam.worlds.sumo.simulation import Simulation
 
 FORBIDDEN = ("write", "make", "remove", "move", "link", "by a child", "TCP", "UDP", "Unix")
-"""what `TRIES` tries and must not do"""
+"""forbidden actions that the program `TRIES` attempts"""
 CARS = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
 GENTLE = "def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n"
 ROADS = ("ring", "figure-eight", "merge", "on-ramp", "own")
 
 
 def sandboxes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Let what runs in the sandbox write, or open a socket: a program beside the reader, and SUMO itself."""
+    """Let programs in the sandbox write or open a socket: one next to the reader, and SUMO itself."""
     outcome, inside = Outcome(), folder / "inside"
     inside.mkdir()
     program, canary = folder / "tries.py", folder / "canary"
@@ -73,13 +73,13 @@ def sandboxes(count: int, folder: Path, generator: np.random.Generator) -> Outco
     with SandboxedSimulation() as sumo:
         for _ in range(count):
             if generator.random() < 0.5:
-                wanted = str(generator.choice(FORBIDDEN))
-                ran = subprocess.run([*limited, str(canary), str(inside), wanted], capture_output=True, check=True)
-                assert ran.stdout == b"", wanted
-                words = f"a program in the sandbox: {wanted}: refused by the kernel"
+                expected = str(generator.choice(FORBIDDEN))
+                ran = subprocess.run([*limited, str(canary), str(inside), expected], capture_output=True, check=True)
+                assert ran.stdout == b"", expected
+                words = f"a program in the sandbox: {expected}: refused by the kernel"
             else:
-                wanted = str(generator.choice([*OPTIONS, "remote-port"]))
-                option = f"--{wanted}={45871 if wanted == 'remote-port' else canary}"
+                expected = str(generator.choice([*OPTIONS, "remote-port"]))
+                option = f"--{expected}={45871 if expected == 'remote-port' else canary}"
                 try:
                     sumo.load(files._replace(options=(*files.options, option)), 0.1, 0)
                     sumo.step()
@@ -87,7 +87,7 @@ def sandboxes(count: int, folder: Path, generator: np.random.Generator) -> Outco
                     one_line(error)
                 process = psutil.Process(sumo._process.pid)
                 assert not any(one.status == "LISTEN" for one in process.net_connections())
-                words = "SUMO that was told to write or to listen: it did not"
+                words = "SUMO with options to write or to listen: it did not"
             assert canary.read_text() == "as it was"
             assert sorted(path.name for path in folder.iterdir()) == before
             outcome.happened[words] += 1
@@ -95,33 +95,33 @@ def sandboxes(count: int, folder: Path, generator: np.random.Generator) -> Outco
 
 
 def crash_points(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Kill a run, or fill the disk, before, within or after a thing that it does to its folder; go on."""
+    """Kill a run or fill the disk before, during or after a write to its folder, and resume the run."""
     outcome = Outcome()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_folder, "manifest", lambda: {"started": "some day"})
         total = crash(folder / "wanted", 0, "before", False).count
-        wanted = content_of(folder / "wanted")
+        expected = content_of(folder / "wanted")
         points = list(product((True, False), get_args(Moment), range(1, total + 1)))
         order = generator.permutation(len(points))
-        for number in np.resize(order, count):  # none twice before all were once
+        for number in np.resize(order, count):  # every point occurs once before a point is repeated
             kill, moment, at = points[number]
             place = folder / "run"
             crash(place, at, moment, kill)
             run(place)
-            assert content_of(place) == wanted, points[number]
+            assert content_of(place) == expected, points[number]
             shutil.rmtree(place)
             how = "killed" if kill else "the disk was full"
-            outcome.happened[f"{how} {HALF.get(moment, moment)}: it went on to the same files"] += 1
+            outcome.happened[f"{how} {MOMENT_LABELS.get(moment, moment)}: it went on to the same files"] += 1
     outcome.facts["points"] = len(points)
     return outcome
 
 
-HALF = {"half": "within"}
+MOMENT_LABELS = {"half": "within"}
 
 
 @dataclass(frozen=True)
 class _Run:
-    """A run folder with a checkpoint, that somebody changes."""
+    """A run folder with a checkpoint that is changed."""
 
     folder: Path
     place: Path
@@ -174,7 +174,7 @@ LINEAGES: dict[str, Callable[[_Run, np.random.Generator], Any]] = {
 
 
 def lineages(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Let a run go on from a checkpoint that is not its own, or as another run."""
+    """Resume a run from the checkpoint of another run, or with another configuration."""
     outcome = Outcome()
     for number in range(count):
         at = _Run(folder / str(number) / "run", folder / str(number))
@@ -192,7 +192,7 @@ def lineages(count: int, folder: Path, generator: np.random.Generator) -> Outcom
 
 
 def locks(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Write into a folder that another process writes, and again once that is killed."""
+    """Lock a folder that another process has locked, and again after that process was killed."""
     outcome = Outcome()
     for _ in range(count):
         process = holder(folder)
@@ -208,7 +208,7 @@ def locks(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
 
 
 def caches(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Edit, cut, empty or remove a network in the cache, and ask for it."""
+    """Edit, cut, empty or remove a network in the cache, and request it again."""
     outcome, road = Outcome(), Ring(length=(230, 230)).draw(np.random.default_rng(0)).network
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("UNJAM_CACHE", str(folder))
@@ -225,12 +225,12 @@ def caches(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
             assert network_file(road) == made
             assert edges_of(made) == edges
             assert len(list(made.parent.iterdir())) == 1
-            outcome.happened[f"{kind}: noticed, and made anew"] += 1
+            outcome.happened[f"{kind}: noticed, and made again"] += 1
     return outcome
 
 
 def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Let a run folder name Python code, in its controller and in its configuration; try it with any verb."""
+    """Read a run folder that names Python code in its controller and in its configuration, with each command."""
     outcome = Outcome()
     for number in range(count):
         place = folder / str(number)
@@ -239,13 +239,13 @@ def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
         (run / "best.toml").write_text((run / "config.toml").read_text())
         straight(place, CARS)
         code.write_text(f"{GENTLE}seen = gentle\n")
-        mine = strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n")
-        driver, where = _hidden(mine, generator)
+        user_driver = strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n")
+        driver, where = _nest_driver(user_driver, generator)
         (run / "controller.unjam").write_bytes(controller_bytes(driver, {}))
         before = sorted(place.rglob("*"))
-        verb = list(TRIED)[number % len(TRIED)]
+        verb = list(READERS)[number % len(READERS)]
         with chdir(place), pytest.raises(InputError, match="Python code") as caught:
-            TRIED[verb]()
+            READERS[verb]()
         one_line(caught.value)
         assert sorted(place.rglob("*")) == before
         outcome.happened[f"{where}: refused in one line, nothing ran"] += 1
@@ -253,31 +253,31 @@ def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
     return outcome
 
 
-def _as_typed(words: Sequence[str]) -> Callable[[], object]:
+def _command(words: Sequence[str]) -> Callable[[], object]:
     return lambda: app(list(words), standalone_mode=False)
 
 
-TRIED: dict[str, Callable[[], object]] = {
+READERS: dict[str, Callable[[], object]] = {
     "verify": lambda: verify_controller_file("run"),
     "verify of the file": lambda: verify_controller_file("run/controller.unjam"),
-    **{verb: _as_typed(words) for verb, words in COMMANDS.items() if verb not in ("verify", "model")},
+    **{verb: _command(words) for verb, words in COMMANDS.items() if verb not in ("verify", "model")},
 }
-"""what a folder is given to, in this process; `verify_command` and `model` go on in a limited child"""
+"""functions that read the folder, in this process; the commands `verify` and `model` start a child process"""
 
 
-def _hidden(mine: Driver, generator: np.random.Generator) -> tuple[Driver, str]:
-    """Return a driver that holds Python code, and where."""
+def _nest_driver(user_driver: Driver, generator: np.random.Generator) -> tuple[Driver, str]:
+    """Return a driver that contains a driver of Python code, and a description of it."""
     choices: Sequence[tuple[Driver, str]] = (
-        (mine, "a driver"),
-        (residual(mine), "an expert"),
-        (MixedDriver((PISaturation(), mine)), "one of several drivers"),
-        (HistoryDriver(mine, 0.1), "a driver that another holds"),
+        (user_driver, "a driver"),
+        (residual(user_driver), "an expert"),
+        (MixedDriver((PISaturation(), user_driver)), "one of several drivers"),
+        (HistoryDriver(user_driver, 0.1), "a driver that another holds"),
     )
     return choices[int(generator.integers(len(choices)))]
 
 
 def replacements(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Replace a user's file, or a module that it imports, or put bytecode beside it, at any moment."""
+    """Replace a user's file, or a module that it imports, or put bytecode next to it, at any time."""
     outcome = Outcome()
     for number in range(count):
         place = folder / str(number)
@@ -287,7 +287,7 @@ def replacements(count: int, folder: Path, generator: np.random.Generator) -> Ou
             (place / f"{name}.py").write_text("value = 'good'\n")
         main.write_text(LATE)
         file = place / f"{generator.choice(['main', 'neighbor', 'later', 'package/inner'])}.py"
-        evil = f"open({str(place / 'ran')!r}, 'w').close()\n{file.read_text()}"
+        changed_code = f"open({str(place / 'ran')!r}, 'w').close()\n{file.read_text()}"
         moment = str(generator.choice(["bytecode", "after it was read", "after it was checked"]))
         with expecting_code():
             if moment == "bytecode":
@@ -295,12 +295,12 @@ def replacements(count: int, folder: Path, generator: np.random.Generator) -> Ou
                 late = FileReference(main, "late").load_object()
             elif moment == "after it was read":
                 code = read_code(main)
-                file.write_text(evil)
+                file.write_text(changed_code)
                 late = code.run().late
             else:
                 remember_trusted(main)
                 check_trusted_values("run", f"{main}:late")
-                file.write_text(evil)
+                file.write_text(changed_code)
                 with pytest.raises(InputError, match="has changed since") as caught:
                     FileReference(main, "late").load_object()
                 one_line(caught.value)
@@ -314,10 +314,10 @@ def replacements(count: int, folder: Path, generator: np.random.Generator) -> Ou
 
 
 def cheats(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
-    """Let a driver change all that it is shown, by force, on every kind of road."""
-    outcome, own, honest_ones = Outcome(), straight(folder, CARS, length=300.0), {}
+    """Run a driver that modifies its read-only observations, on every kind of road."""
+    outcome, own, expected_fingerprints = Outcome(), straight(folder, CARS, length=300.0), {}
 
-    def honest(state: LocalState) -> np.ndarray:
+    def unmodified_driver(state: LocalState) -> np.ndarray:
         return np.clip(0.5 * np.subtract(state.leader_speed, state.speed), -1, 1)
 
     with Simulation() as simulation:
@@ -327,10 +327,10 @@ def cheats(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
             share = {"cavs": 2, "warmup": 0} if closed else {"penetration_rate": 1.0}
             road = make_scenario(str(own) if name == "own" else name, {**share, "horizon": 30})
             seed = int(generator.integers(10))
-            if (name, seed) not in honest_ones:
-                driven = run_episode(road, honest, seed, backend=SumoBackend(simulation))
-                honest_ones[name, seed] = episode_fingerprint(driven)
-            cheated = run_episode(road, insists, seed, backend=SumoBackend(simulation))
-            assert episode_fingerprint(cheated) == honest_ones[name, seed]
+            if (name, seed) not in expected_fingerprints:
+                driven = run_episode(road, unmodified_driver, seed, backend=SumoBackend(simulation))
+                expected_fingerprints[name, seed] = episode_fingerprint(driven)
+            episode = run_episode(road, insists, seed, backend=SumoBackend(simulation))
+            assert episode_fingerprint(episode) == expected_fingerprints[name, seed]
             outcome.happened[f"{name}: measured as if it had not"] += 1
     return outcome

@@ -16,7 +16,7 @@ SPEED, LEADER, GAP = 10.0, 12.0, 20.0
 SAMPLES = 30
 
 
-def table(path: Path, **changes: object) -> Path:
+def write_table_file(path: Path, **changes: object) -> Path:
     """Write a plain table of two pairs, the second of which starts later."""
     parts = []
     for pair, start in (("one", 0.0), ("two", 100.0)):
@@ -28,7 +28,7 @@ def table(path: Path, **changes: object) -> Path:
     return path
 
 
-def ngsim(path: Path, feet: float = METERS_PER_FOOT, **changes: object) -> Path:
+def write_ngsim(path: Path, feet: float = METERS_PER_FOOT, **changes: object) -> Path:
     """Write two vehicles, the second behind the first, in the public format: feet and milliseconds."""
     rows = []
     for vehicle, preceding, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
@@ -50,7 +50,7 @@ def ngsim(path: Path, feet: float = METERS_PER_FOOT, **changes: object) -> Path:
     return path
 
 
-def reconstructed(path: Path, header: bool) -> Path:
+def write_reconstructed(path: Path, header: bool) -> Path:
     """Write the same in meters, as in the reconstructed files."""
     rows = []
     for vehicle, leader, front, speed in ((7, 0, 100.0, LEADER), (8, 7, 100.0 - GAP - 5.0, SPEED)):
@@ -62,7 +62,7 @@ def reconstructed(path: Path, header: bool) -> Path:
     return path
 
 
-def openacc(path: Path) -> Path:
+def write_openacc(path: Path) -> Path:
     """Write a platoon of three vehicles, of which the third is driven by ACC."""
     times = 0.1 * np.arange(SAMPLES)
     gap = GAP + (LEADER - SPEED) * times
@@ -73,7 +73,7 @@ def openacc(path: Path) -> Path:
     return path
 
 
-def highd(path: Path, sign: int = 1) -> Path:
+def write_highd(path: Path, sign: int = 1) -> Path:
     """Write two vehicles as in highD: x is the left end of a vehicle, whatever its direction."""
     rows = []
     for vehicle, leader, rear, speed in ((1, 0, 100.0, LEADER), (2, 1, 100.0 - GAP - 5.0, SPEED)):
@@ -88,7 +88,7 @@ def highd(path: Path, sign: int = 1) -> Path:
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_highd_is_read_on_both_carriageways(tmp_path: Path, sign: int) -> None:
-    (trajectory,) = read_trajectories(highd(tmp_path / "01_tracks.csv", sign), options=SHORT).trajectories
+    (trajectory,) = read_trajectories(write_highd(tmp_path / "01_tracks.csv", sign), options=SHORT).trajectories
     assert trajectory.time_step == 0.04
     np.testing.assert_allclose(trajectory.speed, SPEED)
     np.testing.assert_allclose(trajectory.leader_speed, LEADER)
@@ -97,13 +97,15 @@ def test_highd_is_read_on_both_carriageways(tmp_path: Path, sign: int) -> None:
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_standing_vehicle_on_highd_keeps_its_position(tmp_path: Path, sign: int) -> None:
-    path = highd(tmp_path / "01_tracks.csv", sign)
-    table = pd.read_csv(path)
-    leader, half = table["id"] == 1, SAMPLES // 2
-    is_standing = leader & (table["frame"] >= half)
-    table.loc[is_standing, "x"] = table.loc[leader & (table["frame"] == half), "x"].item()
-    table.loc[is_standing, "xVelocity"] = 0.0
-    table.to_csv(path, index=False)
+    path = write_highd(tmp_path / "01_tracks.csv", sign)
+    write_table_file = pd.read_csv(path)
+    leader, half = write_table_file["id"] == 1, SAMPLES // 2
+    is_standing = leader & (write_table_file["frame"] >= half)
+    write_table_file.loc[is_standing, "x"] = write_table_file.loc[
+        leader & (write_table_file["frame"] == half), "x"
+    ].item()
+    write_table_file.loc[is_standing, "xVelocity"] = 0.0
+    write_table_file.to_csv(path, index=False)
     (trajectory,) = read_trajectories(path, options=SHORT).trajectories
     assert np.abs(np.diff(trajectory.gap)).max() < 0.04 * max(SPEED, LEADER) + 1e-6
 
@@ -127,7 +129,7 @@ def test_fcd_output_of_sumo_has_consistent_gaps(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_plain_table_is_read(tmp_path: Path, suffix: str) -> None:
-    result = read_trajectories(table(tmp_path / f"t{suffix}", kind="human", driver="me"), options=SHORT)
+    result = read_trajectories(write_table_file(tmp_path / f"t{suffix}", kind="human", driver="me"), options=SHORT)
     assert [each.name for each in result.trajectories] == ["one", "two"]
     trajectory = result.trajectories[0]
     assert (trajectory.time_step, trajectory.kind, trajectory.driver) == (0.1, "human", "me")
@@ -136,7 +138,13 @@ def test_plain_table_is_read(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "make", [ngsim, lambda path: reconstructed(path, True), lambda path: reconstructed(path, False), openacc]
+    "make",
+    [
+        write_ngsim,
+        lambda path: write_reconstructed(path, True),
+        lambda path: write_reconstructed(path, False),
+        write_openacc,
+    ],
 )
 def test_public_formats_are_converted_to_si_units(tmp_path: Path, make) -> None:
     trajectory = read_trajectories(make(tmp_path / "data.csv"), options=SHORT).trajectories[0]
@@ -148,7 +156,7 @@ def test_public_formats_are_converted_to_si_units(tmp_path: Path, make) -> None:
 
 
 def test_rows_without_leader_are_counted(tmp_path: Path) -> None:
-    result = read_trajectories(ngsim(tmp_path / "data.csv"), options=SHORT)
+    result = read_trajectories(write_ngsim(tmp_path / "data.csv"), options=SHORT)
     assert result.summary_lines() == [
         "1 trajectories with 30 of 60 rows",
         "skipped: 30 rows: no leader, or leader not recorded",
@@ -157,11 +165,11 @@ def test_rows_without_leader_are_counted(tmp_path: Path) -> None:
 
 def test_meters_in_a_format_in_feet_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a median vehicle length of 1\.5 m is not allowed"):
-        read_trajectories(ngsim(tmp_path / "data.csv", feet=1.0), options=SHORT)
+        read_trajectories(write_ngsim(tmp_path / "data.csv", feet=1.0), options=SHORT)
 
 
 def test_openacc_drivers_have_the_names_of_their_vehicles(tmp_path: Path) -> None:
-    result = read_trajectories(openacc(tmp_path / "platoon.csv"), options=SHORT)
+    result = read_trajectories(write_openacc(tmp_path / "platoon.csv"), options=SHORT)
     assert [(each.driver, each.kind) for each in result.trajectories] == [
         ("Tesla(Model3)", "Human"),
         ("BMW(X5)", "ACC"),
@@ -169,7 +177,7 @@ def test_openacc_drivers_have_the_names_of_their_vehicles(tmp_path: Path) -> Non
 
 
 def test_change_of_kind_is_another_driver_and_a_bad_gap_ends_only_its_own_pair(tmp_path: Path) -> None:
-    path = openacc(tmp_path / "platoon.csv")
+    path = write_openacc(tmp_path / "platoon.csv")
     lines = path.read_text().splitlines()
     frame = pd.read_csv(path, skiprows=3)
     frame.loc[SAMPLES // 2 :, "Driver2"] = "ACC"
@@ -185,7 +193,7 @@ def test_change_of_kind_is_another_driver_and_a_bad_gap_ends_only_its_own_pair(t
 
 
 def table_with_bad_value(path: Path, row: int, column: str, value: object) -> Path:
-    frame = pd.read_csv(table(path)).astype({column: object})
+    frame = pd.read_csv(write_table_file(path)).astype({column: object})
     frame.loc[row, column] = value
     frame.to_csv(path, index=False)
     return path
@@ -215,7 +223,7 @@ def test_bad_row_can_be_dropped_and_is_reported(tmp_path: Path) -> None:
 
 
 def test_short_trajectories_are_counted(tmp_path: Path) -> None:
-    path = table(tmp_path / "t.csv")
+    path = write_table_file(tmp_path / "t.csv")
     frame = pd.read_csv(path)
     frame.drop(index=[40]).to_csv(path, index=False)
     result = read_trajectories(path, options=ReadOptions(min_seconds=1.5))
@@ -227,8 +235,8 @@ def test_short_trajectories_are_counted(tmp_path: Path) -> None:
     ("make", "words"),
     [
         (lambda path: path / "none.csv", "does not exist"),
-        (lambda path: table(path / "t.csv").rename(path / "t.parquet"), "cannot be read"),
-        (lambda path: openacc(path / "t.csv"), "no column 'pair'; it has: Time"),
+        (lambda path: write_table_file(path / "t.csv").rename(path / "t.parquet"), "cannot be read"),
+        (lambda path: write_openacc(path / "t.csv"), "no column 'pair'; it has: Time"),
     ],
 )
 def test_unreadable_files_are_refused(tmp_path: Path, make, words: str) -> None:
@@ -238,11 +246,11 @@ def test_unreadable_files_are_refused(tmp_path: Path, make, words: str) -> None:
 
 def test_table_with_only_short_trajectories_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no trajectory lasts 20 s"):
-        read_trajectories(table(tmp_path / "t.csv"))
+        read_trajectories(write_table_file(tmp_path / "t.csv"))
 
 
 def test_driver_columns_name_the_driver(tmp_path: Path) -> None:
-    path = table(tmp_path / "t.csv", period=400, follower=5)
+    path = write_table_file(tmp_path / "t.csv", period=400, follower=5)
     trajectories = read_trajectories(
         path, options=ReadOptions(min_seconds=1.0, driver_columns=("period", "follower"))
     ).trajectories
@@ -251,11 +259,11 @@ def test_driver_columns_name_the_driver(tmp_path: Path) -> None:
 
 def test_unknown_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format: 'ind' is not allowed"):
-        read_trajectories(table(tmp_path / "t.csv"), "ind")
+        read_trajectories(write_table_file(tmp_path / "t.csv"), "ind")
 
 
 def test_reused_vehicle_number_is_another_driver(tmp_path: Path) -> None:
-    first = pd.read_csv(ngsim(tmp_path / "first.csv"))
+    first = pd.read_csv(write_ngsim(tmp_path / "first.csv"))
     reused = first.assign(Global_Time=first["Global_Time"] + 15 * 60 * 1000)
     pd.concat([reused, first]).to_csv(tmp_path / "both.csv", index=False)
     result = read_trajectories(tmp_path / "both.csv", options=SHORT).trajectories
@@ -264,5 +272,5 @@ def test_reused_vehicle_number_is_another_driver(tmp_path: Path) -> None:
 
 def test_pair_without_driver_name_is_its_own_driver(tmp_path: Path) -> None:
     drivers = ["anna"] * SAMPLES + [None] * SAMPLES
-    result = read_trajectories(table(tmp_path / "data.csv", driver=drivers, kind=None), options=SHORT)
+    result = read_trajectories(write_table_file(tmp_path / "data.csv", driver=drivers, kind=None), options=SHORT)
     assert [(each.driver, each.kind) for each in result.trajectories] == [("anna", ""), ("two", "")]

@@ -69,10 +69,10 @@ def test_differences_are_paired_and_have_their_own_columns() -> None:
 
 
 def test_cell_of_incomplete_pairs_has_the_count() -> None:
-    never = {"time_to_dissolve": np.nan}
-    alone = [row | {"time_to_dissolve": 100.0} for row in rows_of(1.0, 1.0, 1.0, 1.0)]
-    pi = [row | ({"time_to_dissolve": 60.0 + k} if k < 3 else never) for k, row in enumerate(alone)]
-    table = metric_table({"human": alone, "pi": pi}, "human")
+    undissolved = {"time_to_dissolve": np.nan}
+    human_rows = [row | {"time_to_dissolve": 100.0} for row in rows_of(1.0, 1.0, 1.0, 1.0)]
+    pi = [row | ({"time_to_dissolve": 60.0 + k} if k < 3 else undissolved) for k, row in enumerate(human_rows)]
+    table = metric_table({"human": human_rows, "pi": pi}, "human")
     gain = row_named(table, METRICS["time_to_dissolve"].label).cells[2]
     assert (gain.mean, gain.interval) == ("-39", "[-41, -37] 3 of 4")
 

@@ -199,7 +199,7 @@ def test_vehicles_off_the_road_are_left_out() -> None:
     assert metric("share_standing", episode) == pytest.approx(1 / 3)
 
 
-def seen(**changes: list[float]) -> LocalState:
+def cav_states(**changes: list[float]) -> LocalState:
     """What a CAV perceives that follows at the speed of all others, but for `changes`."""
     steps = len(next(iter(changes.values())))
     usual = {"speed": 5.0, "leader_speed": 5.0, "leader_gap": 10.0, "follower_speed": 5.0, "follower_gap": 10.0}
@@ -215,23 +215,23 @@ def with_states(states: LocalState) -> Episode:
 
 
 def test_time_to_collision_of_a_closing_pair() -> None:
-    states = seen(leader_gap=[12.0, 9.0, 8.0], leader_speed=[6.0, 3.0, 4.0])
+    states = cav_states(leader_gap=[12.0, 9.0, 8.0], leader_speed=[6.0, 3.0, 4.0])
     assert metric("min_ttc", with_states(states)) == pytest.approx(4.5)  # 9 m at 2 m/s; 8 m at 1 m/s take 8 s
 
 
 def test_time_to_collision_includes_the_follower() -> None:
-    states = seen(follower_gap=[10.0, 6.0, 6.0], follower_speed=[5.0, 8.0, 4.0])
+    states = cav_states(follower_gap=[10.0, 6.0, 6.0], follower_speed=[5.0, 8.0, 4.0])
     assert metric("min_ttc", with_states(states)) == pytest.approx(2.0)  # 6 m at 3 m/s
 
 
 def test_time_to_collision_is_infinite_without_closing() -> None:
-    assert metric("min_ttc", with_states(seen(leader_gap=[2.0, 2.0], leader_speed=[6.0, 6.0]))) == np.inf
+    assert metric("min_ttc", with_states(cav_states(leader_gap=[2.0, 2.0], leader_speed=[6.0, 6.0]))) == np.inf
 
 
 def test_time_gap_counts_only_while_the_cav_moves() -> None:
-    states = seen(speed=[0.5, 1.0, 2.0, 5.0], leader_gap=[0.1, 0.2, 3.0, 10.0])
+    states = cav_states(speed=[0.5, 1.0, 2.0, 5.0], leader_gap=[0.1, 0.2, 3.0, 10.0])
     assert metric("min_time_gap", with_states(states)) == pytest.approx(1.5)
-    assert np.isnan(metric("min_time_gap", with_states(seen(speed=[0.5, 0.9]))))
+    assert np.isnan(metric("min_time_gap", with_states(cav_states(speed=[0.5, 0.9]))))
 
 
 def test_constant_jerk_is_measured() -> None:
@@ -267,20 +267,20 @@ def test_unrecorded_fuel_is_nan() -> None:
 
 def test_return_counts_shared_reward_terms_once() -> None:
     terms = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1.0, 0.0, 0.0])}
-    shares = tuple(trajectory_of(seen(speed=[5.0] * 4), reward_terms=terms) for _ in range(2))
+    shares = tuple(trajectory_of(cav_states(speed=[5.0] * 4), reward_terms=terms) for _ in range(2))
     for cavs in ((), shares[:1], shares):
         episode = episode_of(steady(5.0, 3), trajectories=cavs, reward_terms=terms)
         assert metric("return", episode) == pytest.approx(5.0)
 
 
 def test_return_eq16_rewards_speed_and_penalizes_acceleration_and_short_time_gaps() -> None:
-    states = seen(speed=[5.0] * 3, leader_gap=[10.0, 2.5, 10.0])
+    states = cav_states(speed=[5.0] * 3, leader_gap=[10.0, 2.5, 10.0])
     episode = episode_of(steady(5.0, 2), trajectories=(trajectory_of(states, [1.0, -0.5]),))
     assert metric("return_eq16", episode) == pytest.approx(2 * 5.0 - 0.1 * 0.5 - 0.1 * 1.5)
 
 
 def test_shield_metrics_count_overrides_and_their_size() -> None:
-    states = seen(speed=[5.0] * 5)
+    states = cav_states(speed=[5.0] * 5)
     first, second = np.array([0.0, 1e-9, 0.5, 3.0]), np.array([0.0, 0.0, 0.0, 1.0])
     cavs = tuple(trajectory_of(states, shield_braking=shield) for shield in (first, second))
     episode = episode_of(steady(5.0, 4), trajectories=cavs)
@@ -294,9 +294,11 @@ def test_collision_is_measured_up_to_its_end() -> None:
     assert row["status"] == "collision"
     assert row["collisions"] == 2.0
     assert row["mean_speed"] == pytest.approx(4.0)
-    seen = (episode.speeds, episode.trajectories)
+    cav_states = (episode.speeds, episode.trajectories)
     crashed, calm = (
-        episode_reward_terms(lambda outcome: {"end": 1.0 * outcome.has_crashed}, *seen, end, episode.backlog)["end"]
+        episode_reward_terms(lambda outcome: {"end": 1.0 * outcome.has_crashed}, *cav_states, end, episode.backlog)[
+            "end"
+        ]
         for end in (True, False)
     )
     assert np.flatnonzero(crashed).tolist() == [20 - 1]

@@ -1,4 +1,4 @@
-"""Do notes say which episodes ended early, what SUMO warns of and which demand is missing?"""
+"""Notes report early ends, SUMO's warnings and missing demand."""
 
 from typing import Any
 

@@ -44,7 +44,7 @@ def episode(*trajectories: Trajectory, length: float = 245.0, status: str = "com
     return Episode(seed=(1,), status=status, drawn_values={"length": length}, trajectories=trajectories)
 
 
-def filled(*control_steps: int, rows: int = 10**6, action_repeat: int = 1) -> EnvironmentData:
+def make_data(*control_steps: int, rows: int = 10**6, action_repeat: int = 1) -> EnvironmentData:
     data = EnvironmentData(rows)
     data.add([episode(trajectory(number, count, action_repeat)) for number, count in enumerate(control_steps)], RING)
     return data
@@ -74,7 +74,7 @@ def test_failed_episodes_are_not_stored() -> None:
 
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=12), st.integers(1, 60))
 def test_newest_episodes_are_stored_completely(control_steps: list[int], rows: int) -> None:
-    data = filled(*control_steps, rows=rows)
+    data = make_data(*control_steps, rows=rows)
     stored = [recording.episode for recording in data.recordings]
     assert stored == list(range(len(control_steps)))[-len(stored) :]
     assert len(data) == sum(control_steps[-len(stored) :])
@@ -93,7 +93,7 @@ def test_holdout_share_holds_from_the_first_episode_on(share: float) -> None:
 
 
 def test_holdout_episode_stays_complete_and_held_out() -> None:
-    data = filled(*[10] * 8, rows=60)
+    data = make_data(*[10] * 8, rows=60)
     for _ in range(2):
         found = data.transitions(0.2)
         numbers = (found.states.speed // 1000).astype(int)
@@ -104,7 +104,7 @@ def test_holdout_episode_stays_complete_and_held_out() -> None:
 
 @pytest.mark.parametrize("control_steps", [(10,), (10, 1)])
 def test_end_of_a_single_episode_is_held_out(control_steps: tuple[int, ...]) -> None:
-    data = filled(*control_steps)
+    data = make_data(*control_steps)
     data.recordings = [replace(recording, episode=0) for recording in data.recordings]
     found = data.transitions(0.2)
     np.testing.assert_array_equal(found.states.speed[found.is_holdout], [8, 9])
@@ -116,7 +116,7 @@ def test_transitions_without_data_raise_error() -> None:
 
 
 def test_start_indices_are_due_actions_with_enough_steps_left() -> None:
-    data = filled(7, 3, action_repeat=3)
+    data = make_data(7, 3, action_repeat=3)
     assert data.start_indices().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0]]
     assert data.start_indices(3).tolist() == [[0, 0], [0, 3], [1, 0]]
     assert data.start_indices(8).tolist() == []

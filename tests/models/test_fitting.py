@@ -31,14 +31,14 @@ def inputs_of(transitions: Transitions) -> np.ndarray:
     return model_inputs(transitions.states, transitions.acceleration, transitions.drawn_values)
 
 
-def fitted(transitions: Transitions, settings: ModelSettings = SETTINGS) -> tuple[RowModel, ModelFit]:
+def fit_example(transitions: Transitions, settings: ModelSettings = SETTINGS) -> tuple[RowModel, ModelFit]:
     model = RowModel(settings, transitions.drawn_values.shape[1], (1,))
     return model, fit_row_model(model, transitions, settings, RING, "", (2,))
 
 
 @pytest.fixture(scope="module")
 def fit(transitions: Transitions) -> tuple[RowModel, ModelFit]:
-    return fitted(transitions)
+    return fit_example(transitions)
 
 
 def test_targets_are_zero_where_the_base_is_exact(transitions: Transitions) -> None:
@@ -66,12 +66,12 @@ def test_fit_counts_rows(fit: tuple[RowModel, ModelFit], transitions: Transition
     _, fit_result = fit
     assert fit_result.training_rows == int((~transitions.is_holdout).sum())
     assert fit_result.holdout_rows == int(transitions.is_holdout.sum())
-    limited = fitted(transitions, replace(SETTINGS, max_fit_rows=100, epochs=2))[1]
+    limited = fit_example(transitions, replace(SETTINGS, max_fit_rows=100, epochs=2))[1]
     assert (limited.training_rows, limited.holdout_rows, limited.epochs) == (100, 20, 2)
 
 
 def test_better_base_has_less_unexplained_variance(fit: tuple[RowModel, ModelFit], transitions: Transitions) -> None:
-    _, without_base = fitted(transitions, replace(SETTINGS, base="none"))
+    _, without_base = fit_example(transitions, replace(SETTINGS, base="none"))
     assert fit[1].errors["unexplained_variance"] < without_base.errors["unexplained_variance"]
     assert fit[1].one_step["leader_gap"].base < without_base.one_step["leader_gap"].base
     assert set(without_base.learned_targets) == set(TARGET_NAMES)
@@ -81,7 +81,7 @@ def test_base_is_used_for_unpredictable_targets(transitions: Transitions) -> Non
     noise = np.random.default_rng(0).normal(size=len(transitions.acceleration))
     next_states = transitions.next_states._replace(follower_speed=transitions.next_states.follower_speed + noise)
     fit = transitions.reward - residual_targets(transitions, "idm", RING, "")[:, -1]
-    model, fit_result = fitted(transitions._replace(next_states=next_states, reward=fit))
+    model, fit_result = fit_example(transitions._replace(next_states=next_states, reward=fit))
     assert "follower_speed" not in fit_result.learned_targets
     assert "reward" not in fit_result.learned_targets
     assert "leader_speed" in fit_result.learned_targets
@@ -93,7 +93,7 @@ def test_base_is_used_for_unpredictable_targets(transitions: Transitions) -> Non
 def test_constant_training_input_does_not_mislead_on_the_holdout(transitions: Transitions) -> None:
     """As the length of the ring, of which the first episodes may have a single one."""
     other = transitions.drawn_values + np.where(transitions.is_holdout, 0.5, 0.1 / 3.0)[:, None]
-    _, fit_result = fitted(transitions._replace(drawn_values=other))
+    _, fit_result = fit_example(transitions._replace(drawn_values=other))
     for name in ("leader_speed", "leader_gap"):
         assert fit_result.one_step[name].model < 0.5 * fit_result.one_step[name].base, name
 
@@ -105,7 +105,7 @@ def test_noise_has_the_distribution_of_holdout_errors(transitions: Transitions) 
         follower_speed=transitions.next_states.follower_speed + 0.5 * error,
         follower_gap=transitions.next_states.follower_gap - 0.1 * error,
     )
-    model, _ = fitted(transitions._replace(next_states=next_states))
+    model, _ = fit_example(transitions._replace(next_states=next_states))
     assert model.noise.shape == (NOISE_SAMPLES, len(TARGET_NAMES))
     noise = dict(zip(TARGET_NAMES, model.noise.double().numpy().T, strict=True))
     assert noise["follower_speed"].std() == pytest.approx(0.5, rel=0.15)
@@ -122,7 +122,7 @@ def test_reward_range_is_that_of_the_data(fit: tuple[RowModel, ModelFit], transi
 def test_the_same_seed_gives_the_same_bits(fit: tuple[RowModel, ModelFit], transitions: Transitions) -> None:
     torch.rand(7)
     np.random.rand(3)
-    model, fit_result = fitted(transitions)
+    model, fit_result = fit_example(transitions)
     assert fit_result == fit[1]
     for name, tensor in model.state_dict().items():
         assert torch.equal(tensor, fit[0].state_dict()[name]), name
@@ -132,7 +132,7 @@ def test_the_same_seed_gives_the_same_bits(fit: tuple[RowModel, ModelFit], trans
 
 def test_second_fit_continues_the_first(transitions: Transitions) -> None:
     short = replace(SETTINGS, epochs=1)
-    model, first = fitted(transitions, short)
+    model, first = fit_example(transitions, short)
     last = [fit_row_model(model, transitions, short, RING, "", (5, number)) for number in range(3)][-1]
     assert last.one_step["leader_speed"].model < 0.9 * first.one_step["leader_speed"].model
 
@@ -150,7 +150,7 @@ def test_non_finite_loss_raises_error(transitions: Transitions) -> None:
     infinite = transitions.next_states.leader_gap.copy()
     infinite[:] = np.inf
     with pytest.raises(UnjamError, match="loss of its fit is not finite in epoch 1"):
-        fitted(transitions._replace(next_states=transitions.next_states._replace(leader_gap=infinite)))
+        fit_example(transitions._replace(next_states=transitions.next_states._replace(leader_gap=infinite)))
 
 
 def test_fit_returns_all_error_estimators(fit: tuple[RowModel, ModelFit]) -> None:
@@ -164,7 +164,7 @@ def test_fit_returns_all_error_estimators(fit: tuple[RowModel, ModelFit]) -> Non
 
 def test_networks_without_fallback_are_always_added(transitions: Transitions) -> None:
     large_rate = replace(SETTINGS, members=1, fallback_to_base=False, epochs=1, max_fit_rows=20)
-    _, fit_result = fitted(transitions, large_rate)
+    _, fit_result = fit_example(transitions, large_rate)
     assert set(fit_result.learned_targets) == set(TARGET_NAMES)
     assert fit_result.one_step["speed"].model > fit_result.one_step["speed"].base  # the base knew it
     fresh = RowModel(large_rate, transitions.drawn_values.shape[1], (1,))

@@ -1,4 +1,4 @@
-"""Does the page of an assessment show the content of its folder?"""
+"""The page of an assessment shows the content of its folder."""
 
 import json
 import re

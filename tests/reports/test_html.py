@@ -25,7 +25,7 @@ from unjam.worlds.record import Episode, failed_episode
 SPEEDS = {"human": 3.0, "pi": 4.0, "trained": 4.5, "follower-stopper": 3.5}
 
 
-def driven(speed: float, seed: int, steps: int = 60) -> Episode:
+def make_driven_episode(speed: float, seed: int, steps: int = 60) -> Episode:
     """Vehicles with equal speeds except for a wave that grows with the seed."""
     times, vehicles = np.arange(steps + 1)[:, None], np.arange(6)
     speeds = speed + (0.5 + 0.1 * seed) * np.sin(times / 20 + vehicles)
@@ -34,7 +34,7 @@ def driven(speed: float, seed: int, steps: int = 60) -> Episode:
 
 def results_in(folder: Path, *drivers: str, failing: int = 0, **metadata: Any) -> Path:
     """A folder of results like `unjam drive` writes."""
-    episodes = {name: [driven(SPEEDS.get(name, 4.0), seed) for seed in range(3)] for name in drivers}
+    episodes = {name: [make_driven_episode(SPEEDS.get(name, 4.0), seed) for seed in range(3)] for name in drivers}
     rows = {name: [measure(episode) for episode in found] for name, found in episodes.items()}
     for seed in range(failing):
         rows[drivers[-1]].append(measure(failed_episode((9, seed), "SUMO <cannot> start", "EpisodeError")))
@@ -204,7 +204,7 @@ def test_names_of_drivers_are_escaped(tmp_path: Path) -> None:
     names = ["<b>x", "a&b", '"quoted"', "</script><script>document.title='x'</script>", "<!--<script>", "ünïcode"]
     text, page = page_of(results_in(tmp_path / "drive", *names))
     assert len(page.of("script")) == 3
-    row = measure(driven(4.0, 0))
+    row = measure(make_driven_episode(4.0, 0))
     defined = [name for name in METRICS if np.isfinite(row[name])]
     assert len(page.of("b")) == len(names) * (len(defined) + 1)  # and the verdict
     assert page.drivers[:6] == names
@@ -262,7 +262,7 @@ def save_driven(folder: Path, **episodes: Episode) -> Path:
 
 @pytest.mark.long
 def test_replay_is_not_truncated_by_a_collision(tmp_path: Path) -> None:
-    crashed, complete = driven(3.0, 0, steps=20), driven(3.0, 0, steps=60)
+    crashed, complete = make_driven_episode(3.0, 0, steps=20), make_driven_episode(3.0, 0, steps=60)
     for number, episodes in enumerate(({"a": crashed, "b": complete}, {"a": complete, "b": crashed})):
         _, page = page_of(save_driven(tmp_path / str(number), **episodes))
         assert (page.replay["frames"] - 1) * page.replay["step"] == pytest.approx(6.0)

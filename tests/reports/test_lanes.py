@@ -1,4 +1,4 @@
-"""Do lane maps show the positions and speeds of vehicles?"""
+"""Lane maps show the positions and speeds of vehicles."""
 
 from dataclasses import replace
 

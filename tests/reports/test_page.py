@@ -30,7 +30,7 @@ def mark_slow(size: tuple[int, int]) -> Any:
 
 
 @pytest.fixture(scope="module")
-def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drive_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam drive`."""
     folder = tmp_path_factory.mktemp("drive") / "results"
     report = unjam.drive(driver=["human", "pi"], episodes=2, scenario_options=ROAD, workers=1, out=folder).report
@@ -39,7 +39,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def merged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def merge_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam drive merge`: vehicles enter and leave."""
     road = {"horizon": 40, "penetration_rate": 0.3}
     folder = tmp_path_factory.mktemp("merge") / "results"
@@ -49,7 +49,7 @@ def merged(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def training_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of `unjam train`."""
     changes = {
         "scenario_options": ROAD,
@@ -66,7 +66,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def assessed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def assessment_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of `unjam assess`."""
     folder = assessment_folder(tmp_path_factory.mktemp("assess"), [HELPS, HARMS])
     return write_assessment(folder, folder / "assessment.html")
@@ -184,14 +184,14 @@ def test_page_is_not_wider_than_the_screen(
     assert too_wide == []
 
 
-def test_figures_fill_a_laptop_and_scroll_on_a_phone(open_page: Opener, driven: Path) -> None:
+def test_figures_fill_a_laptop_and_scroll_on_a_phone(open_page: Opener, drive_report: Path) -> None:
     sizes = """all => all.map(each => [each.clientWidth, each.scrollWidth, each.firstChild.clientWidth,
                  getComputedStyle(each, "::before").content.includes("swipe")])"""
-    page = open_page(driven, LAPTOP).page
+    page = open_page(drive_report, LAPTOP).page
     for visible, total, image, has_hint in page.eval_on_selector_all(".picture", sizes):
         assert visible == total == image > 1000
         assert not has_hint
-    page = open_page(driven, PHONE).page
+    page = open_page(drive_report, PHONE).page
     for visible, total, image, has_hint in page.eval_on_selector_all(".picture", sizes):
         assert visible < 390 < 700 < total == image
         assert has_hint
@@ -203,8 +203,8 @@ def test_figures_fill_a_laptop_and_scroll_on_a_phone(open_page: Opener, driven: 
     assert all(abs(off) < 0.01 for off in page.eval_on_selector_all("img", shape)), "in the original proportions"
 
 
-def test_replay_shows_the_vehicles_of_every_driver(open_page: Opener, driven: Path) -> None:
-    visit = open_page(driven)
+def test_replay_shows_the_vehicles_of_every_driver(open_page: Opener, drive_report: Path) -> None:
+    visit = open_page(drive_report)
     captions = visit.page.locator("figcaption").all_inner_texts()
     assert [caption.split("\n")[0] for caption in captions] == ["human", "pi"]
     assert all("mean" in caption for caption in captions)
@@ -229,8 +229,8 @@ def test_replay_shows_the_vehicles_of_every_driver(open_page: Opener, driven: Pa
 
 
 @pytest.mark.long
-def test_play_starts_and_pause_stops_the_replay(open_page: Opener, driven: Path) -> None:
-    visit = open_page(driven)
+def test_play_starts_and_pause_stops_the_replay(open_page: Opener, drive_report: Path) -> None:
+    visit = open_page(drive_report)
     page, button = visit.page, visit.page.locator(".play")
     before = visit.canvases()
     assert (visit.time(), button.inner_text()) == (0.0, "Play")
@@ -247,8 +247,8 @@ def test_play_starts_and_pause_stops_the_replay(open_page: Opener, driven: Path)
     assert (visit.time(), visit.canvases()) == (time, pictures)
 
 
-def test_replay_stops_at_its_end_and_restarts_from_the_beginning(open_page: Opener, driven: Path) -> None:
-    visit = open_page(driven)
+def test_replay_stops_at_its_end_and_restarts_from_the_beginning(open_page: Opener, drive_report: Path) -> None:
+    visit = open_page(drive_report)
     page, button = visit.page, visit.page.locator(".play")
     page.locator(".pace").select_option("30")
     button.click()
@@ -262,8 +262,8 @@ def test_replay_stops_at_its_end_and_restarts_from_the_beginning(open_page: Open
 
 
 @pytest.mark.long
-def test_replay_of_an_open_road_plays_the_whole_episode(open_page: Opener, merged: Path) -> None:
-    visit = open_page(merged)
+def test_replay_of_an_open_road_plays_the_whole_episode(open_page: Opener, merge_report: Path) -> None:
+    visit = open_page(merge_report)
     means = visit.page.locator("figcaption small")
     pictures, texts = [], []
     for moment in ("0", "10", "25.5", "40"):
@@ -283,8 +283,8 @@ def test_replay_of_an_open_road_plays_the_whole_episode(open_page: Opener, merge
     assert all(size > 3 for size in sizes), "a long road has a wide picture"
 
 
-def test_pace_is_the_speed_relative_to_real_time(open_page: Opener, driven: Path) -> None:
-    visit = open_page(driven)
+def test_pace_is_the_speed_relative_to_real_time(open_page: Opener, drive_report: Path) -> None:
+    visit = open_page(drive_report)
     visit.page.locator(".pace").select_option("5")
     ratio = visit.page.evaluate(
         """() => new Promise(done => {
@@ -301,8 +301,8 @@ def test_pace_is_the_speed_relative_to_real_time(open_page: Opener, driven: Path
     assert ratio == pytest.approx(1 / 5, rel=0.2)
 
 
-def test_slider_selects_the_time(open_page: Opener, driven: Path) -> None:
-    visit = open_page(driven)
+def test_slider_selects_the_time(open_page: Opener, drive_report: Path) -> None:
+    visit = open_page(drive_report)
     pictures = []
     for moment in ("4", "9.5", "15", "4"):
         visit.page.locator(".time").fill(moment)
@@ -312,8 +312,8 @@ def test_slider_selects_the_time(open_page: Opener, driven: Path) -> None:
     assert len({picture[0] for picture in pictures}) == 3
 
 
-def test_replay_shows_the_current_mean_speed(open_page: Opener, driven: Path) -> None:
-    visit = open_page(driven)
+def test_replay_shows_the_current_mean_speed(open_page: Opener, drive_report: Path) -> None:
+    visit = open_page(drive_report)
     means = visit.page.locator("figcaption small")
     assert means.all_inner_texts() == ["mean 0.0 m/s"] * 2
     visit.page.locator(".time").fill("12")
@@ -321,8 +321,8 @@ def test_replay_shows_the_current_mean_speed(open_page: Opener, driven: Path) ->
 
 
 @pytest.mark.parametrize("key", ["Enter", " "])
-def test_keyboard_plays_and_pauses(open_page: Opener, driven: Path, key: str) -> None:
-    visit = open_page(driven)
+def test_keyboard_plays_and_pauses(open_page: Opener, drive_report: Path, key: str) -> None:
+    visit = open_page(drive_report)
     visit.page.locator(".pace").select_option("1")
     visit.page.locator(".play").focus()
     visit.page.keyboard.press(key)
@@ -331,8 +331,8 @@ def test_keyboard_plays_and_pauses(open_page: Opener, driven: Path, key: str) ->
     assert visit.page.locator(".play").get_attribute("aria-label") == "Play"
 
 
-def test_keyboard_moves_the_slider(open_page: Opener, driven: Path) -> None:
-    visit = open_page(driven)
+def test_keyboard_moves_the_slider(open_page: Opener, drive_report: Path) -> None:
+    visit = open_page(drive_report)
     slider = visit.page.locator(".time")
     slider.focus()
     moments = []
@@ -345,8 +345,8 @@ def test_keyboard_moves_the_slider(open_page: Opener, driven: Path) -> None:
     assert back == pytest.approx(once)
 
 
-def test_all_controls_are_reachable_by_tab_and_have_names(open_page: Opener, driven: Path) -> None:
-    page = open_page(driven).page
+def test_all_controls_are_reachable_by_tab_and_have_names(open_page: Opener, drive_report: Path) -> None:
+    page = open_page(drive_report).page
     page.locator(".play").focus()
     reached = []
     for _ in range(3):
@@ -364,12 +364,12 @@ def metrics_in(report: Path) -> list[Metric]:
 
 
 @pytest.mark.long
-def test_table_has_all_metrics_of_all_drivers(open_page: Opener, trained: Path) -> None:
-    table = open_page(trained).page.locator("section:has(h2:text-is('All metrics')) table")
+def test_table_has_all_metrics_of_all_drivers(open_page: Opener, training_report: Path) -> None:
+    table = open_page(training_report).page.locator("section:has(h2:text-is('All metrics')) table")
     assert table.locator("thead th").all_inner_texts() == [
         *("metric", "human", "pi", "trained", "pi − human", "trained − human")
     ]
-    rows, metrics = table.locator("tbody tr"), metrics_in(trained)
+    rows, metrics = table.locator("tbody tr"), metrics_in(training_report)
     assert rows.count() == len(metrics) + 2  # and feasibility and probability of improvement
     assert rows.first.locator("th").inner_text() == "feasible"
     for row, metric in zip(rows.all()[2:], metrics, strict=True):
@@ -378,15 +378,15 @@ def test_table_has_all_metrics_of_all_drivers(open_page: Opener, trained: Path) 
         assert all(row.locator("td b").all_inner_texts())
 
 
-def test_metrics_have_their_definition_as_a_tooltip(open_page: Opener, driven: Path) -> None:
-    page = open_page(driven).page
+def test_metrics_have_their_definition_as_a_tooltip(open_page: Opener, drive_report: Path) -> None:
+    page = open_page(drive_report).page
     heads = page.locator("section:has(h2:text-is('All metrics')) tbody th")
-    for head, metric in zip(heads.all()[2:], metrics_in(driven), strict=True):
+    for head, metric in zip(heads.all()[2:], metrics_in(drive_report), strict=True):
         assert head.get_attribute("title") == " ".join((metric.function.__doc__ or "").split())
 
 
-def test_metric_names_stay_visible_when_a_phone_scrolls_the_table(open_page: Opener, trained: Path) -> None:
-    page = open_page(trained, PHONE).page
+def test_metric_names_stay_visible_when_a_phone_scrolls_the_table(open_page: Opener, training_report: Path) -> None:
+    page = open_page(training_report, PHONE).page
     page.eval_on_selector(".scroll", "element => element.scrollLeft = 1000")
     assert page.eval_on_selector(".scroll", "element => element.scrollLeft") > 0
     box = page.locator("tbody th").first.bounding_box()
@@ -394,8 +394,8 @@ def test_metric_names_stay_visible_when_a_phone_scrolls_the_table(open_page: Ope
     assert 0 <= box["x"] < 40
 
 
-def test_report_of_a_run_has_finding_and_configuration(open_page: Opener, trained: Path) -> None:
-    page = open_page(trained).page
+def test_report_of_a_run_has_finding_and_configuration(open_page: Opener, training_report: Path) -> None:
+    page = open_page(training_report).page
     assert page.title() == page.locator("h1").inner_text() == "ring: a trained residual on pi"
     finding = page.locator(".lead").inner_text()
     assert finding.startswith("Compared with the human baseline on ring, 2 paired test seeds")
@@ -407,8 +407,8 @@ def test_report_of_a_run_has_finding_and_configuration(open_page: Opener, traine
     assert "steps = 600" in code.inner_text()
 
 
-def test_replay_adapts_to_the_size_of_the_window(open_page: Opener, driven: Path) -> None:
-    page = open_page(driven).page
+def test_replay_adapts_to_the_size_of_the_window(open_page: Opener, drive_report: Path) -> None:
+    page = open_page(drive_report).page
     for width in (1280, 500):
         page.set_viewport_size({"width": width, "height": 800})
         page.wait_for_function(
@@ -439,8 +439,8 @@ def test_every_figure_and_table_can_be_downloaded(
             assert {len(row) for row in rows} == {len(header)}
 
 
-def test_zoom_centers_the_slowest_vehicle_and_dragging_moves_the_view(open_page: Opener, merged: Path) -> None:
-    visit = open_page(merged)
+def test_zoom_centers_the_slowest_vehicle_and_dragging_moves_the_view(open_page: Opener, merge_report: Path) -> None:
+    visit = open_page(merge_report)
     visit.page.locator(".time").fill("20")
     overview = visit.canvases()
     visit.page.locator(".zoom").select_option("16")
@@ -460,17 +460,17 @@ def test_zoom_centers_the_slowest_vehicle_and_dragging_moves_the_view(open_page:
 
 
 @pytest.mark.long
-def test_a_wide_table_has_a_hint_to_swipe(open_page: Opener, trained: Path) -> None:
+def test_a_wide_table_has_a_hint_to_swipe(open_page: Opener, training_report: Path) -> None:
     scroll = "document.querySelector('.scroll')"
     for size in (PHONE, LAPTOP):
-        page = open_page(trained, size).page
+        page = open_page(training_report, size).page
         wide = page.evaluate(f"{scroll}.scrollWidth > {scroll}.clientWidth + 1")
         assert page.evaluate(f"getComputedStyle({scroll}, '::before').content.includes('swipe')") is wide
         assert wide is (size == PHONE)
 
 
-def test_dark_mode_has_light_text_on_dark_background(open_page: Opener, driven: Path) -> None:
-    page = open_page(driven).page
+def test_dark_mode_has_light_text_on_dark_background(open_page: Opener, drive_report: Path) -> None:
+    page = open_page(drive_report).page
     style = "getComputedStyle(document.querySelector('section'))"
     colors = f"['background', 'color'].map(name => {style}[name].match(/\\d+/g)[0])"
     day = [int(part) for part in page.evaluate(colors)]
@@ -482,8 +482,8 @@ def test_dark_mode_has_light_text_on_dark_background(open_page: Opener, driven: 
 
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
 def test_page_can_be_captured_as_a_screenshot(
-    open_page: Opener, driven: Path, tmp_path: Path, size: tuple[int, int]
+    open_page: Opener, drive_report: Path, tmp_path: Path, size: tuple[int, int]
 ) -> None:
     path = tmp_path / "page.png"
-    open_page(driven, size).page.screenshot(path=path, full_page=True)
+    open_page(drive_report, size).page.screenshot(path=path, full_page=True)
     assert path.stat().st_size > 20_000

@@ -28,22 +28,22 @@ ROAD = {"length": (120, 120), "vehicles": 8, "horizon": 150}
 
 
 @pytest.fixture(scope="module")
-def driven(tmp_path_factory: pytest.TempPathFactory) -> DriveResult:
+def drive_result(tmp_path_factory: pytest.TempPathFactory) -> DriveResult:
     folder = tmp_path_factory.mktemp("drive") / "results"
     return unjam.drive(driver=["human", "pi"], episodes=2, seed=3, scenario_options=ROAD, workers=1, out=folder)
 
 
 @pytest.fixture
-def folder(driven: DriveResult, tmp_path: Path) -> Path:
+def folder(drive_result: DriveResult, tmp_path: Path) -> Path:
     """A copy that a test may modify."""
-    assert driven.folder is not None
-    return shutil.copytree(driven.folder, tmp_path / "results")
+    assert drive_result.folder is not None
+    return shutil.copytree(drive_result.folder, tmp_path / "results")
 
 
-def test_rows_equal_those_that_drive_returned(driven: DriveResult, folder: Path) -> None:
+def test_rows_equal_those_that_drive_returned(drive_result: DriveResult, folder: Path) -> None:
     found = read_results(folder).rows
     assert list(found) == ["human", "pi"]
-    for driver, rows in driven.rows.items():
+    for driver, rows in drive_result.rows.items():
         assert [row["seed"] for row in found[driver]] == [3, 4]
         for row, read in zip(rows, found[driver], strict=True):
             finite = [name for name in METRICS if np.isfinite(row[name])]

@@ -37,7 +37,7 @@ def trained_on_pi(trained: list[float], pi: list[float], reward: str = "released
     return Results(Path("runs/ring-001"), metadata, rows, {})
 
 
-def driven(folder: str = "runs/drive-001", scenario: str = "ring", **rows: list[dict[str, Any]]) -> Results:
+def drive_results(folder: str = "runs/drive-001", scenario: str = "ring", **rows: list[dict[str, Any]]) -> Results:
     return Results(Path(folder), {"scenario": scenario, "reward": "released"}, rows, {})
 
 
@@ -100,19 +100,19 @@ def test_finding_without_an_expert_has_the_return() -> None:
 
 def test_finding_counts_seeds_on_which_both_ran() -> None:
     human = rows_of([1.0] * 3, travel_time=100.0)
-    result = driven(human=human, pi=[*rows_of([2.0, 2.0], travel_time=90.0), {**failed_rows(1)[0], "seed": 2}])
+    result = drive_results(human=human, pi=[*rows_of([2.0, 2.0], travel_time=90.0), {**failed_rows(1)[0], "seed": 2}])
     assert main_finding(result).startswith("Compared with the human baseline on ring, 2 episodes on paired seeds: ")
 
 
 def test_finding_of_a_single_driver_has_speed_and_share_of_the_limit() -> None:
-    finding = main_finding(driven(pi=rows_of([1.0, 2.0], mean_speed=4.0, speed_limit_ratio_steady=0.83)))
+    finding = main_finding(drive_results(pi=rows_of([1.0, 2.0], mean_speed=4.0, speed_limit_ratio_steady=0.83)))
     assert "pi on ring, 2 episodes" in finding
     assert "all vehicles is 4.00 m/s" in finding
     assert "83 % of the limit" in finding
 
 
 def test_results_of_failed_episodes_show_no_nan() -> None:
-    result = driven(pi=failed_rows(2))
+    result = drive_results(pi=failed_rows(2))
     texts = [main_finding(result), *report_notes(result), *(card["value"] for card in key_figures(result))]
     assert not any("nan" in text for text in texts)
 
@@ -124,8 +124,8 @@ def test_results_without_caveats_have_no_notes() -> None:
 def test_early_ends_of_each_driver_are_noted_once() -> None:
     rows = [*rows_of([1.0] * 3), *rows_of([1.0], status="collision"), *failed_rows(1)]
     note = "pi: 1 of 5 episodes ended early: collision; means are over complete episodes only"
-    assert report_notes(driven(pi=rows)) == [f"{note}."]
-    noted = driven(pi=rows)
+    assert report_notes(drive_results(pi=rows)) == [f"{note}."]
+    noted = drive_results(pi=rows)
     noted.metadata["notes"] = [note]
     assert report_notes(noted) == [f"{note}."]
     result = trained_on_pi([1.0], [1.0])
@@ -163,7 +163,7 @@ def test_traffic_above_the_limit_is_explained() -> None:
 
 
 def test_a_comparison_has_notes_about_each_driver() -> None:
-    found = driven(human=rows_of([1.0]), pi=rows_of([1.0], min_time_gap=0.3, status="collision"))
+    found = drive_results(human=rows_of([1.0]), pi=rows_of([1.0], min_time_gap=0.3, status="collision"))
     assert [note.split()[0] for note in report_notes(found)] == ["pi:", "pi"]
 
 
@@ -184,15 +184,15 @@ def test_key_figures_have_the_human_baseline_and_the_difference_to_the_expert() 
 
 
 def test_key_figures_without_a_human_baseline_have_no_comparison() -> None:
-    cards = key_figures(driven(pi=rows_of([1.0, 2.0])))
+    cards = key_figures(drive_results(pi=rows_of([1.0, 2.0])))
     assert len(cards) == 3
     assert all(card["detail"] == "pi" for card in cards)
 
 
 def test_title_names_what_was_compared() -> None:
-    assert report_title([driven(human=rows_of([1.0]), pi=rows_of([1.0]))]) == "ring: human, pi"
+    assert report_title([drive_results(human=rows_of([1.0]), pi=rows_of([1.0]))]) == "ring: human, pi"
     assert report_title([trained_on_pi([1.0], [1.0])]) == "ring: a trained residual on pi"
-    both = [driven(pi=rows_of([1.0])), driven(scenario="ring-warm", pi=rows_of([1.0]))]
+    both = [drive_results(pi=rows_of([1.0])), drive_results(scenario="ring-warm", pi=rows_of([1.0]))]
     assert report_title(both) == "ring, ring-warm: comparison of 2 results"
 
 
@@ -206,7 +206,10 @@ def test_columns_of_one_folder_are_its_drivers() -> None:
 
 
 def test_columns_of_several_folders_have_their_names() -> None:
-    names = [column.name for column in report_columns([driven("a", pi=rows_of([1.0])), driven("b", pi=rows_of([2.0]))])]
+    names = [
+        column.name
+        for column in report_columns([drive_results("a", pi=rows_of([1.0])), drive_results("b", pi=rows_of([2.0]))])
+    ]
     assert names == ["a: pi", "b: pi"]
 
 
@@ -218,7 +221,9 @@ def test_common_drivers_of_runs_have_one_column() -> None:
 
 
 def test_folders_of_the_same_name_have_different_columns() -> None:
-    columns = report_columns([driven("old/ring", pi=rows_of([1.0])), driven("new/ring", pi=rows_of([2.0]))])
+    columns = report_columns(
+        [drive_results("old/ring", pi=rows_of([1.0])), drive_results("new/ring", pi=rows_of([2.0]))]
+    )
     assert [column.rows[0]["return"] for column in columns] == [1.0, 2.0]
     assert len({column.name for column in columns}) == 2
 
@@ -236,8 +241,8 @@ def test_the_baseline_of_several_folders_ran_the_same_episodes() -> None:
     assert common_baseline([first]) == common_baseline([first, second]) == "human"
     elsewhere = replace(second, rows={**second.rows, "human": rows_of([9.0])})
     assert common_baseline([first, elsewhere]) == ""
-    assert common_baseline([driven("a", human=rows_of([1.0]), pi=rows_of([1.0]))] * 2) == ""
-    assert common_baseline([driven(pi=rows_of([1.0]))]) == ""
+    assert common_baseline([drive_results("a", human=rows_of([1.0]), pi=rows_of([1.0]))] * 2) == ""
+    assert common_baseline([drive_results(pi=rows_of([1.0]))]) == ""
 
 
 def test_a_difference_shows_its_sign() -> None:

@@ -27,7 +27,7 @@ from unjam.worlds.road_world import RoadScene
 SECONDS = 20.0
 
 
-def driven(seconds: float = SECONDS, cavs: int = 1) -> Episode:
+def make_episode(seconds: float = SECONDS, cavs: int = 1) -> Episode:
     steps = round(seconds / 0.1)
     return episode_of(np.tile([4.0, 3.0, 3.5, 2.5], (steps + 1, 1)), cavs=cavs)
 
@@ -58,7 +58,7 @@ def count_reddish(frame: np.ndarray) -> int:
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_frames_of_a_video_differ(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"wave{suffix}"
-    write_video(driven(), path, "pi", pace=40.0)
+    write_video(make_episode(), path, "pi", pace=40.0)
     frames = frames_of(path)
     assert len(frames) == SECONDS / 40.0 * FRAMES_PER_SECOND + 1
     assert all(frame.shape == (FRAME_SIZE, FRAME_SIZE, 3) for frame in frames)
@@ -69,7 +69,7 @@ def test_frames_of_a_video_differ(tmp_path: Path, suffix: str) -> None:
 def test_a_video_can_be_an_mp4(tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="pip install imageio-ffmpeg")
     path = tmp_path / "wave.MP4"
-    write_video(driven(), path, "pi", pace=40.0)
+    write_video(make_episode(), path, "pi", pace=40.0)
     reader: Iterator = ffmpeg.read_frames(str(path))
     properties = next(reader)
     frames = [np.frombuffer(data, np.uint8).reshape(FRAME_SIZE, FRAME_SIZE, 3) for data in reader]
@@ -84,7 +84,7 @@ def test_a_video_can_be_an_mp4(tmp_path: Path) -> None:
 @pytest.mark.parametrize("pace", [1.0, 10.0, *(pytest.param(pace, marks=pytest.mark.slow) for pace in (3.0, 5.0))])
 def test_pace_is_the_speed_relative_to_real_time(tmp_path: Path, pace: float) -> None:
     path = tmp_path / "wave.gif"
-    write_video(driven(seconds=pace * 0.8), path, "pi", pace)
+    write_video(make_episode(seconds=pace * 0.8), path, "pi", pace)
     assert seconds_of(path) == pytest.approx(0.8, abs=0.11)  # plus the duration of the last frame
 
 
@@ -92,7 +92,7 @@ def test_only_cavs_are_marked(tmp_path: Path) -> None:
     counts = {}
     for cavs in (0, 1, 2):
         path = tmp_path / f"{cavs}.webp"
-        write_video(driven(0.1, cavs), path, "pi")
+        write_video(make_episode(0.1, cavs), path, "pi")
         counts[cavs] = count_reddish(frames_of(path)[0])
     assert counts[0] == 0
     assert counts[1] > 50
@@ -101,7 +101,7 @@ def test_only_cavs_are_marked(tmp_path: Path) -> None:
 
 def test_the_cav_is_at_its_position(tmp_path: Path) -> None:
     path = tmp_path / "wave.webp"
-    write_video(driven(0.1), path, "pi")
+    write_video(make_episode(0.1), path, "pi")
     frame = frames_of(path)[0].astype(int)
     rgb = [int(CAV_PLOT_COLOR[start : start + 2], 16) for start in (1, 3, 5)]
     rows, columns = np.nonzero(np.abs(frame - rgb).max(axis=-1) < 40)
@@ -110,14 +110,14 @@ def test_the_cav_is_at_its_position(tmp_path: Path) -> None:
 
 
 def test_vehicles_that_are_not_on_the_road_are_not_drawn(tmp_path: Path) -> None:
-    episode = driven(0.1)
+    episode = make_episode(0.1)
     episode.speeds[:, 0] = np.nan
     write_video(episode, tmp_path / "wave.webp", "pi")
     assert count_color(frames_of(tmp_path / "wave.webp")[0], CAV_PLOT_COLOR) == 0
 
 
 def test_an_episode_of_one_step_is_a_video_of_one_frame(tmp_path: Path) -> None:
-    write_video(driven(0.1), tmp_path / "wave.gif", "pi")
+    write_video(make_episode(0.1), tmp_path / "wave.gif", "pi")
     assert len(frames_of(tmp_path / "wave.gif")) == 1
 
 
@@ -126,12 +126,12 @@ def test_other_file_formats_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=r"allowed: a name that ends in \.gif, \.webp, \.mp4"):
         check_video_format(Path(name))
     with pytest.raises(InputError, match="video:"):
-        write_video(driven(), tmp_path / name, "pi")
+        write_video(make_episode(), tmp_path / name, "pi")
     assert not (tmp_path / name).exists()
 
 
 def test_a_long_title_fits_into_the_draw(tmp_path: Path) -> None:
-    write_video(driven(1.0), tmp_path / "wave.gif", "pi:" + ",".join(f"parameter_{n}={n}" for n in range(12)))
+    write_video(make_episode(1.0), tmp_path / "wave.gif", "pi:" + ",".join(f"parameter_{n}={n}" for n in range(12)))
     frame = np.asarray(Image.open(tmp_path / "wave.gif").convert("L"))
     assert frame[:, :4].min() == frame[:, -4:].min() == 255
     assert frame.min() < 100
@@ -140,7 +140,7 @@ def test_a_long_title_fits_into_the_draw(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4"])
 def test_a_video_that_cannot_be_written_is_refused(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(DiskError, match="cannot write"):
-        write_video(driven(1.0), tmp_path / "nowhere" / f"wave{suffix}", "pi")
+        write_video(make_episode(1.0), tmp_path / "nowhere" / f"wave{suffix}", "pi")
 
 
 def test_a_video_of_the_merge_shows_the_present_vehicles(tmp_path: Path) -> None:
@@ -224,6 +224,6 @@ def test_a_full_disk_leaves_the_previous_video(tmp_path: Path, suffix: str, monk
     monkeypatch.setattr("unjam.files.os.fsync", full)
     monkeypatch.setattr(ffmpeg, "count_frames_and_secs", full)
     with pytest.raises(DiskError, match="No space left on device"):
-        write_video(driven(1.0), path, "pi")
+        write_video(make_episode(1.0), path, "pi")
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
     assert path.read_text() == "previous"

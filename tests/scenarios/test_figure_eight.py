@@ -13,7 +13,7 @@ from unjam.worlds.sumo.networks import network_file
 ORDER = ["bottom", "top", "upper_ring", "right", "left", "lower_ring"]
 
 
-def drawn(radius: int, **changes: object) -> ClosedRoad:
+def draw_road(radius: int, **changes: object) -> ClosedRoad:
     scenario = make_scenario("figure-eight", {"radius": (radius, radius), **changes})
     road = scenario.draw(np.random.default_rng(0))
     assert isinstance(road, ClosedRoad)
@@ -22,7 +22,7 @@ def drawn(radius: int, **changes: object) -> ClosedRoad:
 
 @pytest.mark.parametrize("radius", [20, 30, 32, 35, 50])
 def test_the_lap_length_is_that_of_the_network_file(radius: int) -> None:
-    tree = ElementTree.parse(network_file(drawn(radius).network))
+    tree = ElementTree.parse(network_file(draw_road(radius).network))
     lanes = {lane.get("id"): float(lane.get("length", "nan")) for lane in tree.iter("lane")}
     links = {(link.get("from"), link.get("to")): link.get("via") for link in tree.iter("connection") if link.get("via")}
     length, crossings = 0.0, []
@@ -32,8 +32,8 @@ def test_the_lap_length_is_that_of_the_network_file(radius: int) -> None:
         if name in ("bottom", "right"):
             crossings.append((length, length + way_across))
         length += way_across
-    assert drawn(radius).loop_length == pytest.approx(length, abs=1e-4)
-    np.testing.assert_allclose(drawn(radius).crossings, crossings, atol=1e-4)
+    assert draw_road(radius).loop_length == pytest.approx(length, abs=1e-4)
+    np.testing.assert_allclose(draw_road(radius).crossings, crossings, atol=1e-4)
 
 
 def test_edges_are_four_arms_and_two_arcs() -> None:
@@ -48,7 +48,7 @@ def test_radii_are_integers_from_the_whole_range() -> None:
 
 
 def test_the_first_cav_leads_a_queue_with_free_road_ahead() -> None:
-    road = drawn(32)
+    road = draw_road(32)
     assert road.cav_ids == (road.vehicle_ids[-1],)
     assert np.all(np.diff(road.start_positions) > 7)
     ahead = road.loop_length - road.start_positions[-1]
@@ -57,13 +57,13 @@ def test_the_first_cav_leads_a_queue_with_free_road_ahead() -> None:
 
 def test_no_vehicle_starts_on_the_crossing() -> None:
     for radius in range(20, 51):
-        road = drawn(radius)
+        road = draw_road(radius)
         for start, end in road.crossings:
             assert not np.any((road.start_positions > start) & (road.start_positions < end))
 
 
 def test_the_outline_is_as_long_as_the_lap() -> None:
-    road = drawn(32)
+    road = draw_road(32)
     coordinates, places = road.center_line[:, 0], road.center_line[:, 1:]
     assert coordinates[0] == 0
     assert coordinates[-1] == road.loop_length

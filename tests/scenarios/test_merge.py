@@ -15,7 +15,7 @@ from unjam.worlds.sumo.backend import sumo_inputs
 from unjam.worlds.sumo.networks import network_file
 
 
-def drawn(seed: int = 0, **changes: Any) -> MergeRoad:
+def draw_road(seed: int = 0, **changes: Any) -> MergeRoad:
     return Merge(**changes).draw(np.random.default_rng(seed))
 
 
@@ -35,7 +35,7 @@ def times_of(road: MergeRoad, pattern: str) -> list[float]:
 
 
 def test_entries_are_evenly_spaced_according_to_the_flows() -> None:
-    road = drawn()
+    road = draw_road()
     highway, ramp = times_of(road, r"(human|cav)_\d+"), times_of(road, r"human_r\d+")
     assert (len(highway), len(ramp)) == (333, 16)  # 2,000 and 100 an hour, in 600 s
     np.testing.assert_allclose(highway, np.arange(333) * 1.8, atol=0.006)
@@ -44,7 +44,7 @@ def test_entries_are_evenly_spaced_according_to_the_flows() -> None:
 
 
 def test_the_file_lists_vehicles_by_entry_time() -> None:
-    road = drawn(warmup=100)
+    road = draw_road(warmup=100)
     times = [float(entry["depart"]) for entry in entries(road)]
     assert times == sorted(times)
     assert {entry["id"] for entry in entries(road)} == set(road.origins)
@@ -53,11 +53,11 @@ def test_the_file_lists_vehicles_by_entry_time() -> None:
 
 
 def test_vehicles_enter_during_the_warm_up_too() -> None:
-    assert len(times_of(drawn(warmup=500, horizon=100), r"(human|cav)_\d+")) == 200 * 2000 // 3600
+    assert len(times_of(draw_road(warmup=500, horizon=100), r"(human|cav)_\d+")) == 200 * 2000 // 3600
 
 
 def test_vehicles_enter_at_their_origin() -> None:
-    road = drawn(standing_vehicles=3)
+    road = draw_road(standing_vehicles=3)
     highway, ramp = JUNCTION_LENGTHS
     starts = {"from_inflow_highway": -(600.1 + highway), "from_highway": -(500 + highway)}
     starts |= {"from_inflow_ramp": -(200.1 + ramp)}
@@ -69,43 +69,43 @@ def test_vehicles_enter_at_their_origin() -> None:
 
 
 def test_without_standing_vehicles_the_road_is_empty() -> None:
-    assert times_of(drawn(standing_vehicles=0), r"human_s\d+") == []
+    assert times_of(draw_road(standing_vehicles=0), r"human_s\d+") == []
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_cavs_are_drawn_independently(seed: int, cav_share: float) -> None:
-    count = len(cavs(drawn(seed, penetration_rate=cav_share)))
+    count = len(cavs(draw_road(seed, penetration_rate=cav_share)))
     spread = np.sqrt(333 * cav_share * (1 - cav_share))
     assert abs(count - 333 * cav_share) <= 5.5 * spread + 1e-9
 
 
 @pytest.mark.parametrize("spacing", ["random", "even"])
 def test_none_or_all_of_the_highways_vehicles_are_cavs(spacing: str) -> None:
-    assert cavs(drawn(penetration_rate=0.0, cav_spacing=spacing)) == []
-    assert cavs(drawn(penetration_rate=1.0, cav_spacing=spacing)) == list(range(333))
+    assert cavs(draw_road(penetration_rate=0.0, cav_spacing=spacing)) == []
+    assert cavs(draw_road(penetration_rate=1.0, cav_spacing=spacing)) == list(range(333))
 
 
 def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
     for seed in range(3):
-        assert cavs(drawn(seed, cav_spacing="even")) == list(range(0, 333, 10))
+        assert cavs(draw_road(seed, cav_spacing="even")) == list(range(0, 333, 10))
 
 
 @given(st.floats(0, 1))
 def test_even_spacing_spreads_cavs_evenly(cav_share: float) -> None:
-    found = cavs(drawn(penetration_rate=cav_share, cav_spacing="even"))
+    found = cavs(draw_road(penetration_rate=cav_share, cav_spacing="even"))
     assert abs(len(found) - 333 * cav_share) <= 1.0
     assert len(np.unique(np.diff(found))) <= 2
 
 
 def test_random_cavs_differ_from_episode_to_episode() -> None:
-    found = [tuple(cavs(drawn(seed))) for seed in range(6)]
+    found = [tuple(cavs(draw_road(seed))) for seed in range(6)]
     assert len(set(found)) == 6
-    assert found[0] == tuple(cavs(drawn(0)))
+    assert found[0] == tuple(cavs(draw_road(0)))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 166))
 def test_the_set_number_of_cavs_enters_in_the_first_half(seed: int, count: int) -> None:
-    road = drawn(seed, cavs=count)
+    road = draw_road(seed, cavs=count)
     assert len(cavs(road)) == count
     assert max(cavs(road)) * 1.8 < 300.0
 
@@ -113,11 +113,11 @@ def test_the_set_number_of_cavs_enters_in_the_first_half(seed: int, count: int) 
 def test_cav_ids_are_among_the_possible_ones() -> None:
     some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"penetration_rate": 1.0}, {"inflow": 700.0}]
     for changes in some:
-        assert drawn(**changes).cav_ids <= set(Merge(**changes).possible_cav_ids())
+        assert draw_road(**changes).cav_ids <= set(Merge(**changes).possible_cav_ids())
 
 
 def test_lanes_across_the_junction_are_those_of_the_network_file() -> None:
-    tree = ElementTree.parse(network_file(drawn().network))
+    tree = ElementTree.parse(network_file(draw_road().network))
     lanes = {lane.get("id"): float(lane.get("length", "nan")) for lane in tree.iter("lane")}
     via = {
         link.get("from"): lanes[link.get("via")]
@@ -125,21 +125,21 @@ def test_lanes_across_the_junction_are_those_of_the_network_file() -> None:
         if link.get("to") == "after" and link.get("via")
     }
     np.testing.assert_allclose((via["highway"], via["ramp"]), JUNCTION_LENGTHS, atol=1e-6)
-    assert drawn().junction_lengths == JUNCTION_LENGTHS
+    assert draw_road().junction_lengths == JUNCTION_LENGTHS
     assert lanes[":highway_begin_0_0"] == lanes[":ramp_begin_0_0"] == ENTRANCE_LENGTH
     edges = [lanes[f"{name}_0"] for name in ("inflow_highway", "highway", "after", "inflow_ramp", "ramp")]
     np.testing.assert_allclose(edges, [100.0, 500.0, 100.0, 100.0, 100.0], atol=1e-6)
 
 
 def plain_highway(flow: float, vehicles: int = 120, step: float = 0.2) -> float:
-    """Mean speed of the last of many people on 724.6 m, all on one clock, Eq. 5-6 written down once more."""
+    """Mean speed of the last of many human drivers on 724.6 m with the same reaction time, by Eq. 5-6."""
     length, every = 700.1 + JUNCTION_LENGTHS[0], round(3600.0 / flow / step)
     position, speed, taken = (np.full(vehicles, value) for value in (np.nan, 10.0, 0.0))
     clock = 0
     while not position[-1] >= length:
         there = np.arange(vehicles) * every <= clock
         position[there & np.isnan(position)] = 0.0
-        leader = np.where(position[:-1] >= length, np.inf, position[:-1])  # who has left is no leader
+        leader = np.where(position[:-1] >= length, np.inf, position[:-1])  # a vehicle that has left is no leader
         gap = np.append(np.inf, leader - position[1:] - 5.0)
         closing = np.append(0.0, speed[1:] - speed[:-1])
         wanted = 2.0 + np.maximum(speed + speed * closing / (2 * np.sqrt(1.5)), 0.0)
@@ -153,7 +153,7 @@ def plain_highway(flow: float, vehicles: int = 120, step: float = 0.2) -> float:
 
 @pytest.mark.parametrize("flow", [1200.0, 2000.0])
 def test_limit_is_the_speed_of_undisturbed_human_drivers(flow: float) -> None:
-    assert drawn(inflow=flow).limit_speed == pytest.approx(plain_highway(flow), rel=1e-9)
+    assert draw_road(inflow=flow).limit_speed == pytest.approx(plain_highway(flow), rel=1e-9)
 
 
 def test_limit_is_about_twenty_and_falls_with_the_flow() -> None:

@@ -35,7 +35,7 @@ def own(folder: Path, times: str = "", routes: str = TYPES, **changes: Any) -> U
     return found
 
 
-def drawn(folder: Path, **changes: Any) -> UserNetworkRoad:
+def draw_road(folder: Path, **changes: Any) -> UserNetworkRoad:
     return own(folder, **changes).draw(np.random.default_rng(0))
 
 
@@ -172,7 +172,7 @@ def test_types_within_distributions_are_eligible_by_their_own_class(tmp_path: Pa
         '<vTypeDistribution id="more" vTypes="a t"/><flow id="f" type="mix"/><flow id="g" type="more"/>'
         "</routes>"
     )
-    assert drawn(tmp_path, routes=routes, penetration_rate=0.5).eligible_types == {"a", "b"}
+    assert draw_road(tmp_path, routes=routes, penetration_rate=0.5).eligible_types == {"a", "b"}
 
 
 def test_the_acc_has_the_limits_of_its_vehicle_by_default(tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ def test_a_predefined_type_of_sumo_can_become_a_cav(tmp_path: Path) -> None:
     routes = '<routes><flow id="g" type="DEFAULT_BIKETYPE"/></routes>'
     with pytest.raises(InputError, match="no vehicle has one of the classes"):
         own(tmp_path, routes=routes)
-    road = drawn(tmp_path, routes=routes, cav_types=["DEFAULT_BIKETYPE"])
+    road = draw_road(tmp_path, routes=routes, cav_types=["DEFAULT_BIKETYPE"])
     types = ElementTree.fromstring(sumo_inputs(own(tmp_path), road).traffic_xml)
     (bike,) = [kind for kind in types if kind.get("id") == "cav_of_DEFAULT_BIKETYPE"]
     assert bike.get("vClass") == "bicycle"

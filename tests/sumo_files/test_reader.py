@@ -1,4 +1,4 @@
-"""Files that would harm who reads them: read in a process of their own, and refused in one line."""
+"""Harmful files are read in a separate process, and refused in one line."""
 
 import gzip
 import json
@@ -24,7 +24,7 @@ DEFINITIONS = {
 }
 
 
-def refused(path: Path) -> str:
+def refusal_message(path: Path) -> str:
     with pytest.raises(InputError) as caught:
         read_sumo_files(path)
     assert "\n" not in str(caught.value)
@@ -36,7 +36,7 @@ def refused(path: Path) -> str:
 def test_a_document_type_is_refused(name: str, file: str, tmp_path: Path) -> None:
     path = configuration(tmp_path)
     (tmp_path / file).write_text(DEFINITIONS[name] + (tmp_path / file).read_text())
-    assert refused(path) == f"{file}: a document type (<!DOCTYPE ...>) is not allowed"
+    assert refusal_message(path) == f"{file}: a document type (<!DOCTYPE ...>) is not allowed"
 
 
 def test_the_word_doctype_in_a_comment_is_harmless(tmp_path: Path) -> None:
@@ -51,19 +51,19 @@ def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch:
     bomb = b'<routes name="' + b"a" * 200_000_000 + b'"/>'
     (tmp_path / "road.rou.xml.gz").write_bytes(gzip.compress(bomb, 1))
     path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml.gz"))
-    assert "road.rou.xml.gz: cannot be read: out of memory" in refused(path)
+    assert "road.rou.xml.gz: cannot be read: out of memory" in refusal_message(path)
 
 
 def test_reading_that_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = configuration(tmp_path)
     monkeypatch.setattr(sumo_files, "MAX_READER_TIME", 0.001)
-    assert refused(path) == "road.sumocfg: its files cannot be read within 4 GiB, 0.001 s"
+    assert refusal_message(path) == "road.sumocfg: its files cannot be read within 4 GiB, 0.001 s"
 
 
 def test_a_lost_reader_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = configuration(tmp_path)
     monkeypatch.setattr(sumo_files, "READER_PROGRAM", tmp_path / "none.py")
-    assert "cannot be read within" in refused(path)
+    assert "cannot be read within" in refusal_message(path)
 
 
 def test_the_reader_needs_only_the_standard_library(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_harmful_included_files_are_refused(name: str, tmp_path: Path) -> None:
     for file, included in files.items():
         inside = "".join(f'<include href="{other}"/>' for other in included or ())
         (tmp_path / file).write_text("" if included is None else f"<routes>{inside}</routes>")
-    assert words in refused(path)
+    assert words in refusal_message(path)
 
 
 def test_included_files_are_read_wherever_they_are_included(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ ROUTES = (
 )
 
 
-def changed(folder: Path, types: dict[str, dict[str, str]], scale: float, inside: str = "") -> Path:
-    """A network written again, beside the one it comes from."""
+def write_changed_variant(folder: Path, types: dict[str, dict[str, str]], scale: float, inside: str = "") -> Path:
+    """A variant of a network, next to the original."""
     (folder / "mine").mkdir()
     (folder / "new").mkdir()
     files = read_sumo_files(configuration(folder / "mine", inside, routes=ROUTES))
@@ -24,7 +24,7 @@ def changed(folder: Path, types: dict[str, dict[str, str]], scale: float, inside
 
 
 def test_types_are_changed_wherever_they_are_defined(tmp_path: Path) -> None:
-    path = changed(tmp_path, {"car": {"tau": "1.5"}, "DEFAULT_VEHTYPE": {"accel": "2"}}, 1.0)
+    path = write_changed_variant(tmp_path, {"car": {"tau": "1.5"}, "DEFAULT_VEHTYPE": {"accel": "2"}}, 1.0)
     found = read_sumo_files(path)
     assert found.types["car"] == {"id": "car", "tau": "1.5", "length": "4"}
     assert found.types["van"] == {"id": "van"}
@@ -33,7 +33,7 @@ def test_types_are_changed_wherever_they_are_defined(tmp_path: Path) -> None:
 
 
 def test_the_network_and_the_users_files_are_unchanged(tmp_path: Path) -> None:
-    path = changed(tmp_path, {"car": {"tau": "1.5"}}, 1.0)
+    path = write_changed_variant(tmp_path, {"car": {"tau": "1.5"}}, 1.0)
     assert read_sumo_files(path).network.resolve() == (tmp_path / "mine" / "road.net.xml").resolve()
     assert (tmp_path / "mine" / "road.rou.xml").read_text() == ROUTES
     assert sorted(file.name for file in path.parent.iterdir()) == ["0.rou.xml", "other.sumocfg"]
@@ -41,7 +41,7 @@ def test_the_network_and_the_users_files_are_unchanged(tmp_path: Path) -> None:
 
 def test_times_and_harmless_options_stay_and_the_scale_is_multiplied(tmp_path: Path) -> None:
     inside = '<begin value="10"/><end value="100"/><step-length value="0.5"/><scale value="2"/>'
-    path = changed(tmp_path, {}, 0.75, inside + '<fcd-output value="big.xml"/>')
+    path = write_changed_variant(tmp_path, {}, 0.75, inside + '<fcd-output value="big.xml"/>')
     found = read_sumo_files(path)
     assert (found.begin, found.end, found.step) == (10.0, 100.0, 0.5)
     assert float(found.options["scale"]) == 1.5
@@ -50,14 +50,14 @@ def test_times_and_harmless_options_stay_and_the_scale_is_multiplied(tmp_path: P
 
 @pytest.mark.parametrize("text", ["tau<5", 'a"b&c'])
 def test_special_characters_in_attributes_are_quoted(text: str, tmp_path: Path) -> None:
-    path = changed(tmp_path, {"car": {"imgFile2": text}, "DEFAULT_VEHTYPE": {"x": text}}, 1.0)
+    path = write_changed_variant(tmp_path, {"car": {"imgFile2": text}, "DEFAULT_VEHTYPE": {"x": text}}, 1.0)
     found = read_sumo_files(path).types
     assert found["car"]["imgFile2"] == found["DEFAULT_VEHTYPE"]["x"] == text
 
 
 def test_a_scale_that_is_not_a_number_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"road\.sumocfg: scale: 'much' is not allowed; allowed: a number"):
-        changed(tmp_path, {}, 1.0, '<scale value="much"/>')
+        write_changed_variant(tmp_path, {}, 1.0, '<scale value="much"/>')
 
 
 def test_a_file_that_has_become_broken_is_reported(tmp_path: Path) -> None:

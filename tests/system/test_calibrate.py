@@ -1,4 +1,4 @@
-"""Does `unjam calibrate` write a network that other commands accept?"""
+"""`unjam calibrate` writes a network that other commands accept."""
 
 import json
 from pathlib import Path

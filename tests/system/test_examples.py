@@ -42,7 +42,7 @@ def test_the_examples_run(name: str, argument: int, words: str, tmp_path: Path) 
 
 
 UNREAD = "human", "gap-maker"
-"""the simulator itself, and who asks its car's own ACC for time headways"""
+"""the simulator itself, and a driver that sets the time headway of the ACC of its vehicle"""
 WITHOUT_UNJAM = """
 import json, sys
 
@@ -62,7 +62,7 @@ assert not {"unjam", "torch", "safetensors"} & set(sys.modules)
 """
 
 
-def shipped(driver: Driver, path: Path, states: LocalState, limit: float = 1.0) -> Path:
+def write_controller(driver: Driver, path: Path, states: LocalState, limit: float = 1.0) -> Path:
     about = {"time_step": 0.1, "action_limit": 1.5}
     path.write_bytes(controller_bytes(driver, about, {SAMPLE_PART: sample_bytes(driver, states, limit)}))
     return path
@@ -83,7 +83,7 @@ def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
         FilteredDriver(driver_from_name("constant:acceleration=1", 0.1), 1.5, SafetyFilter(time_gap=0.0), 0.1),
     ]
     states = perceived(700)
-    paths = [shipped(driver, tmp_path / f"{number}.unjam", states) for number, driver in enumerate(drivers)]
+    paths = [write_controller(driver, tmp_path / f"{number}.unjam", states) for number, driver in enumerate(drivers)]
     command = [sys.executable, "-I", "-c", WITHOUT_UNJAM, str(EXAMPLES), *map(str, paths)]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     for driver, line in zip(drivers, ran.stdout.splitlines(), strict=True):
@@ -92,41 +92,43 @@ def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, replay_states(driver, states, limit), rtol=0, atol=1e-9, err_msg=str(driver))
 
 
-def compared(path: Path) -> subprocess.CompletedProcess[str]:
+def run_comparison(path: Path) -> subprocess.CompletedProcess[str]:
     """What the plain reader says of a file, as a program of its own."""
     command = [sys.executable, "-E", "-s", str(EXAMPLES / "run_controller.py"), str(path)]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
 def test_the_plain_reader_compares_itself_with_the_recorded_sample(tmp_path: Path) -> None:
-    path = shipped(residual(PISaturation()), tmp_path / "it.unjam", perceived())
-    ran = compared(path)
+    path = write_controller(residual(PISaturation()), tmp_path / "it.unjam", perceived())
+    ran = run_comparison(path)
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ran.stdout.startswith("40 control steps, at most ")
     other = path.read_bytes().replace(b'"action_repeat": 1,', b'"action_repeat": 2,')
     path.write_bytes(other)
-    assert compared(path).returncode != 0
+    assert run_comparison(path).returncode != 0
 
 
 def test_without_a_map_the_plain_reader_holds_back_for_reported_congestion_alone(tmp_path: Path) -> None:
     states = perceived(700)._replace(distance_to_merge=None)
     driver = driver_from_name("jam-ahead", 1.0)
-    path = shipped(driver, tmp_path / "it.unjam", states, limit=1.5)
+    path = write_controller(driver, tmp_path / "it.unjam", states, limit=1.5)
     wanted = replay_states(driver, states, 1.5)
     assert 0.1 < np.mean(wanted < 1.5) < 0.9
-    ran = compared(path)
+    ran = run_comparison(path)
     assert (ran.returncode, ran.stderr) == (0, "")
 
 
 def test_the_plain_reader_says_what_it_cannot_read(tmp_path: Path) -> None:
-    asks = compared(shipped(driver_from_name("gap-maker", 0.1), tmp_path / "asks.unjam", perceived()))
+    asks = run_comparison(write_controller(driver_from_name("gap-maker", 0.1), tmp_path / "asks.unjam", perceived()))
     assert asks.stderr.endswith("ValueError: gap-maker is not read here; read it with unjam\n")
-    ran = compared(shipped(MixedDriver((PISaturation(), PISaturation())), tmp_path / "it.unjam", perceived()))
+    ran = run_comparison(
+        write_controller(MixedDriver((PISaturation(), PISaturation())), tmp_path / "it.unjam", perceived())
+    )
     assert ran.stderr.endswith("ValueError: a driver of the kind mixed is not read here; read it with unjam\n")
 
 
 def test_the_plain_reader_drives_by_what_has_no_sample_and_says_so() -> None:
-    ran = compared(packaged_file("ring-tuned"))
+    ran = run_comparison(packaged_file("ring-tuned"))
     assert ran.returncode == 1
     assert "it can drive, but has no sample to compare with" in ran.stderr
     assert "Traceback" not in ran.stderr
@@ -187,7 +189,7 @@ def test_the_client_drives_a_vehicle_of_a_running_sumo(tmp_path: Path) -> None:
     )
     driver = residual(LACC(time_gap=2.0, lag=0.5), hold=4, parts=("local", "expert_acceleration"))
     driver = replace(driver, network=replace(driver.network, authority=0.2))
-    path, port = shipped(driver, tmp_path / "it.unjam", perceived()), free_port()
+    path, port = write_controller(driver, tmp_path / "it.unjam", perceived()), free_port()
     record = tmp_path / "record.xml"
     sumo = [sumo_program("sumo"), "-c", str(road), "--remote-port", str(port), "--no-step-log"]
     sumo += ["--fcd-output", str(record), "--precision", "9"]

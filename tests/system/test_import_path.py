@@ -29,7 +29,7 @@ CARS = "".join(f'<vehicle id="{n}" type="car" route="along" depart="{2 * n}"/>' 
 
 
 @pytest.fixture(scope="module")
-def planted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def planted_module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Make a folder with a module for every importable name, and files that name others."""
     folder = tmp_path_factory.mktemp("planted")
     canary = folder / "canary"
@@ -79,10 +79,12 @@ def check_nothing_ran(folder: Path) -> None:
     ],
     ids=lambda words: words[0],
 )
-def test_command_and_children_import_nothing_from_the_working_folder(words: tuple[str, ...], planted: Path) -> None:
-    done = subprocess.run([UNJAM, *words], cwd=planted, capture_output=True, text=True, check=False)
+def test_command_and_children_import_nothing_from_the_working_folder(
+    words: tuple[str, ...], planted_module: Path
+) -> None:
+    done = subprocess.run([UNJAM, *words], cwd=planted_module, capture_output=True, text=True, check=False)
     assert done.returncode in ((0, 3) if words == ("doctor",) else (0,)), done.stderr
-    check_nothing_ran(planted)
+    check_nothing_ran(planted_module)
 
 
 COMMANDS = """
@@ -115,12 +117,12 @@ fit-drivers data.csv --set calibration.generations=2
 
 @pytest.mark.long
 @pytest.mark.parametrize("commands", [COMMANDS, pytest.param(SLOW_COMMANDS, marks=pytest.mark.slow)], ids=["", "slow"])
-def test_commands_import_nothing_from_the_working_folder(commands: str, planted: Path, preloaded: Run) -> None:
+def test_commands_import_nothing_from_the_working_folder(commands: str, planted_module: Path, preloaded: Run) -> None:
     for words in map(str.split, commands.strip().splitlines()):
-        done = preloaded(*words, folder=planted, pictures=True)
+        done = preloaded(*words, folder=planted_module, pictures=True)
         assert "Traceback" not in done.stderr, (words, done.stderr)
         assert done.returncode in ((0, 1) if words[0] == "certify" else (0,)), (words, done.stderr)
-        check_nothing_ran(planted)
+        check_nothing_ran(planted_module)
 
 
 SCRIPT = """
@@ -142,15 +144,15 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "here"), [("script", "here"), ("notebook", "''")])
-def test_children_of_a_program_import_nothing_from_its_folder(name: str, here: str, planted: Path) -> None:
-    (planted / "program.py").write_text(SCRIPT.format(name=name, here=here))
+def test_children_of_a_program_import_nothing_from_its_folder(name: str, here: str, planted_module: Path) -> None:
+    (planted_module / "program.py").write_text(SCRIPT.format(name=name, here=here))
     root = str(Path(__file__).parents[2])
     environment = {**os.environ, "PYTHONPATH": root}
     done = subprocess.run(
-        [sys.executable, "program.py"], cwd=planted, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "program.py"], cwd=planted_module, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    check_nothing_ran(planted)
+    check_nothing_ran(planted_module)
 
 
 def test_python_m_unjam_imports_nothing_from_the_working_folder(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Does the command line report incomplete episodes on a user network?"""
+"""The command line reports incomplete episodes on a user network."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Do all commands and snippets of the README run?"""
+"""All commands and snippets of the README run."""
 
 import re
 import shlex

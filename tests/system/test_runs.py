@@ -1,4 +1,4 @@
-"""Does `unjam runs` list, compare and remove runs?"""
+"""`unjam runs` lists, compares and removes runs."""
 
 import json
 from pathlib import Path
@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 
 from tests.system.conftest import Run
-from tests.training.test_runs import CONFIG, made
+from tests.training.test_runs import CONFIG, write_run
 
 
 @pytest.fixture(autouse=True)
 def runs(tmp_path: Path) -> None:
-    made(tmp_path / "runs" / "ring-001", CONFIG, 1000, gain=7.0)
-    made(tmp_path / "runs" / "ring-002", CONFIG, 400)
+    write_run(tmp_path / "runs" / "ring-001", CONFIG, 1000, gain=7.0)
+    write_run(tmp_path / "runs" / "ring-002", CONFIG, 400)
 
 
 def test_runs_are_listed_compared_and_printed_as_csv(unjam: Run) -> None:

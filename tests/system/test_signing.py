@@ -25,7 +25,7 @@ def maker(unjam: Run, tmp_path: Path) -> str:
     return json.loads(unjam("keys", "maker", "--json").stdout)["fingerprint"]
 
 
-def refused(unjam: Run, *words: str) -> str:
+def refusal_message(unjam: Run, *words: str) -> str:
     ran = unjam(*words)
     assert (ran.returncode, ran.stdout) == (2, ""), ran.stderr
     assert one_line(ran.stderr), ran.stderr
@@ -67,7 +67,7 @@ def test_the_documented_check_without_unjam_agrees(unjam: Run, tmp_path: Path, m
 
 
 def test_a_missing_signature_is_refused_if_a_signer_is_required(unjam: Run, maker: str) -> None:
-    assert "it is not signed" in refused(unjam, "verify", "it.unjam", "--signer", "maker.pub")
+    assert "it is not signed" in refusal_message(unjam, "verify", "it.unjam", "--signer", "maker.pub")
     assert unjam("verify", "it.unjam").returncode == 0
 
 
@@ -86,7 +86,7 @@ def test_a_forged_controller_is_refused(command: str, unjam: Run, tmp_path: Path
     }[command]
     for content, reason in ((forge(changed), FORGED), (pack_parts(changed), "controller it.unjam: damaged: ")):
         path.write_bytes(content)
-        assert reason in refused(unjam, *words)
+        assert reason in refusal_message(unjam, *words)
         assert path.read_bytes() == content
     assert sorted(each.name for each in tmp_path.iterdir()) == ["it.unjam", "maker.key", "maker.pub"]
 
@@ -95,7 +95,7 @@ def test_a_signed_file_is_not_certified(unjam: Run, tmp_path: Path, maker: str) 
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
     before = (tmp_path / "it.unjam").read_bytes()
     words = f"a file that is signed (by {maker}) is not allowed; allowed: one that is not: certify it first"
-    assert words in refused(unjam, "certify", "it.unjam")
+    assert words in refusal_message(unjam, "certify", "it.unjam")
     assert (tmp_path / "it.unjam").read_bytes() == before
     assert not (tmp_path / "it.html").exists()
 
@@ -104,16 +104,18 @@ def test_a_signature_of_another_key_is_replaced_only_on_demand(unjam: Run, maker
     other = json.loads(unjam("keys", "other", "--json").stdout)["fingerprint"]
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0
-    assert f"(it is signed by {maker}); or --replace" in refused(unjam, "sign", "it.unjam", "--key", "other.key")
+    assert f"(it is signed by {maker}); or --replace" in refusal_message(
+        unjam, "sign", "it.unjam", "--key", "other.key"
+    )
     ran = unjam("sign", "it.unjam", "--key", "other.key", "--replace", "--json")
     assert json.loads(ran.stdout) == {"file": "it.unjam", "fingerprint": other, "previous_fingerprint": maker}
     words = f"it is signed by another key, {other}; allowed: signed by 'maker.pub', {maker}"
-    assert words in refused(unjam, "verify", "it.unjam", "--signer", "maker.pub")
+    assert words in refusal_message(unjam, "verify", "it.unjam", "--signer", "maker.pub")
 
 
 def test_existing_keys_are_not_overwritten(unjam: Run, tmp_path: Path, maker: str) -> None:
     before = (tmp_path / "maker.key").read_bytes()
-    assert "name: 'maker' is not allowed; allowed: a name without keys: " in refused(unjam, "keys", "maker")
+    assert "name: 'maker' is not allowed; allowed: a name without keys: " in refusal_message(unjam, "keys", "maker")
     assert (tmp_path / "maker.key").read_bytes() == before
     assert stat.S_IMODE((tmp_path / "maker.key").stat().st_mode) == 0o600
     assert unjam("keys", "nowhere/maker").returncode == 74
@@ -125,11 +127,13 @@ def test_other_keys_are_refused(name: str, unjam: Run, tmp_path: Path) -> None:
     content, words = NO_PRIVATE_KEYS[name]
     (tmp_path / "other.key").write_bytes(content)
     before = (tmp_path / "it.unjam").read_bytes()
-    assert f"key: 'other.key' {words}; allowed: an Ed25519" in refused(unjam, "sign", "it.unjam", "--key", "other.key")
+    assert f"key: 'other.key' {words}; allowed: an Ed25519" in refusal_message(
+        unjam, "sign", "it.unjam", "--key", "other.key"
+    )
     assert (tmp_path / "it.unjam").read_bytes() == before
-    refused(unjam, "verify", "it.unjam", "--signer", "other.key")
-    refused(unjam, "sign", ".", "--key", "maker.key")
-    refused(unjam, "sign", "maker.pub", "--key", "maker.key")
+    refusal_message(unjam, "verify", "it.unjam", "--signer", "other.key")
+    refusal_message(unjam, "sign", ".", "--key", "maker.key")
+    refusal_message(unjam, "sign", "maker.pub", "--key", "maker.key")
 
 
 @pytest.mark.usefixtures("maker")

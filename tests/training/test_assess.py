@@ -35,14 +35,14 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def asked(file: str) -> AssessmentRequest:
+def example_request(file: str) -> AssessmentRequest:
     return make_request(file, [0.5], 40, 0.02, None, ["acc", "idm"], HELD)
 
 
 @pytest.fixture(scope="module")
-def answer(asked: AssessmentRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Assessment]:
+def answer(example_request: AssessmentRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Assessment]:
     with WorkerPool(2) as workers:
-        yield assess(asked, tmp_path_factory.mktemp("answer") / "out", workers)
+        yield assess(example_request, tmp_path_factory.mktemp("answer") / "out", workers)
 
 
 def test_request_has_all_penetration_rates_controllers_and_two_baselines(file: str) -> None:
@@ -103,7 +103,9 @@ def test_packaged_scenario_is_refused() -> None:
 
 
 @pytest.mark.long
-def test_rows_of_selection_and_test_are_stored_separately(asked: AssessmentRequest, answer: Assessment) -> None:
+def test_rows_of_selection_and_test_are_stored_separately(
+    example_request: AssessmentRequest, answer: Assessment
+) -> None:
     folder = answer.page.parent
     chose, judged = read_rows(folder / SELECTION_FOLDER), read_rows(folder)
     (found,) = answer.controller_results
@@ -111,7 +113,7 @@ def test_rows_of_selection_and_test_are_stored_separately(asked: AssessmentReque
     assert set(judged) == {"human", "cruise, 50 %", f"{found.driver}, 50 %"}
     assert not {str(row["seed"]) for row in chose["human"]} & {str(row["seed"]) for row in judged["human"]}
     driven = sum(map(len, [*chose.values(), *judged.values()])) + 2
-    assert answer.document["episodes"]["total"] == driven <= asked.episodes
+    assert answer.document["episodes"]["total"] == driven <= example_request.episodes
     assert all(row["status"] == "completed" for rows in judged.values() for row in rows)
     assert [*read_results(folder).plot_episodes] == ["human", f"{found.driver}, 50 %"]
 
@@ -141,10 +143,10 @@ def test_document_equals_the_file_and_has_all_results(answer: Assessment) -> Non
 
 @pytest.mark.long
 def test_result_does_not_depend_on_the_number_of_workers(
-    asked: AssessmentRequest, answer: Assessment, tmp_path: Path
+    example_request: AssessmentRequest, answer: Assessment, tmp_path: Path
 ) -> None:
     with WorkerPool(1) as workers:
-        again = assess(asked, tmp_path / "again", workers)
+        again = assess(example_request, tmp_path / "again", workers)
     assert repr(again.controller_results) == repr(answer.controller_results)  # NaN, of what is not known, is not itself
     assert again.document["candidates"] == answer.document["candidates"]
 
@@ -170,15 +172,15 @@ def test_seeds_without_a_cav_use_the_human_baseline(file: str, tmp_path: Path) -
     few = make_request(file, [0.06], 20, 0.02, None, ["acc"], HELD)
     with WorkerPool(2) as workers:
         assess(few, tmp_path / "out", workers)
-    people, acc, driven = read_rows(tmp_path / "out").values()
+    human_rows, acc, driven = read_rows(tmp_path / "out").values()
     for found in (acc, driven):
         assert not any(row["status"] == "failed" for row in found)
-    pairs = zip(people, driven, strict=False)
+    pairs = zip(human_rows, driven, strict=False)
     assert any(one["travel_time"] == other["travel_time"] for one, other in pairs)
 
 
-def test_nonempty_folder_is_not_changed(asked: AssessmentRequest, tmp_path: Path) -> None:
+def test_nonempty_folder_is_not_changed(example_request: AssessmentRequest, tmp_path: Path) -> None:
     (tmp_path / "precious.txt").write_text("keep me")
     with WorkerPool(1) as workers, pytest.raises(InputError, match="is not empty"):
-        assess(asked, tmp_path, workers)
+        assess(example_request, tmp_path, workers)
     assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]

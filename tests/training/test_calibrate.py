@@ -45,17 +45,17 @@ def road(folder: Path, tau: float = 1.0, speed: float = 1.0, flow: float = FLOW_
     return straight(folder, HUMAN_TYPE.format(tau, speed) + FLOW.format(flow), 800.0, END)
 
 
-def measured(path: Path, file: Path, places: tuple[float, ...] = (200.0, 700.0)) -> Path:
+def write_detectors(path: Path, file: Path, places: tuple[float, ...] = (200.0, 700.0)) -> Path:
     """A file of what detectors measure on a road, seed 12345."""
     rows = [
         f"road,{position},{begin},{begin + INTERVAL},0," for position in places for begin in range(0, END, INTERVAL)
     ]
     head = ",".join(("edge", *DETECTOR_COLUMNS))
     file.write_text("\n".join([head, *rows]) + "\n")
-    asked = load_corridor(str(path), file)
+    corridor = load_corridor(str(path), file)
     with DetectorPool(1) as counting:
-        (passed,) = counting.run(asked.scenario(path), [(12345,)], asked.loops)
-    flows, speeds = aggregate_passages(asked.measurements, asked.loop_numbers, passed)
+        (passed,) = counting.run(corridor.scenario(path), [(12345,)], corridor.loops)
+    flows, speeds = aggregate_passages(corridor.measurements, corridor.loop_numbers, passed)
     lines = [
         row.removesuffix("0,") + f"{flow:.1f},{'' if isnan(speed) else f'{speed:.3f}'}"
         for row, flow, speed in zip(rows, flows, speeds, strict=True)
@@ -65,10 +65,10 @@ def measured(path: Path, file: Path, places: tuple[float, ...] = (200.0, 700.0))
 
 
 @pytest.fixture(scope="module")
-def asked(tmp_path_factory: pytest.TempPathFactory) -> Corridor:
+def corridor(tmp_path_factory: pytest.TempPathFactory) -> Corridor:
     """A road with faster human drivers and a larger flow than measured."""
     folder = tmp_path_factory.mktemp("roads")
-    detectors = measured(road(folder / "true", 1.5, TRUE_SPEED, TRUE_FLOW), folder / "detectors.csv")
+    detectors = write_detectors(road(folder / "true", 1.5, TRUE_SPEED, TRUE_FLOW), folder / "detectors.csv")
     return load_corridor(str(road(folder / "mine")), detectors)
 
 
@@ -77,16 +77,16 @@ TRIALS = 10
 
 
 @pytest.fixture(scope="module")
-def done(asked: Corridor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CalibrationResult]:
+def done(corridor: Corridor, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CalibrationResult]:
     """The folder of a calibration, and what it found."""
     folder = tmp_path_factory.mktemp("calibration")
     with pytest.MonkeyPatch.context() as patched, DetectorPool(2) as counting:
         patched.setattr("unjam.training.calibrate.CALIBRATION_TEST_SEEDS", 4)
-        return folder, calibrate(asked, folder, counting, SPACE, TRIALS, seeds_per_trial=1)
+        return folder, calibrate(corridor, folder, counting, SPACE, TRIALS, seeds_per_trial=1)
 
 
 @pytest.mark.long
-def test_calibration_improves_the_agreement(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
+def test_calibration_improves_the_agreement(corridor: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     folder, found = done
     estimates = found.estimates()
     for name in ("geh", "flow_rmse", "speed_rmse", "score"):
@@ -98,20 +98,22 @@ def test_calibration_improves_the_agreement(asked: Corridor, done: tuple[Path, C
     assert written["manifest"]["starts"]
     assert written["trials"][0]["factors"] == {"speedFactor": 1.0, "flow": 1.0}
     assert len(written["trials"]) == TRIALS
-    assert read_sumo_files(asked.files.path) == asked.files  # the files have not changed
+    assert read_sumo_files(corridor.files.path) == corridor.files  # the files have not changed
 
 
 @pytest.mark.slow
-def test_written_network_has_the_reported_agreement(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
+def test_written_network_has_the_reported_agreement(corridor: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     folder, found = done
     files = read_sumo_files(folder / CALIBRATED_NETWORK_FILE)
-    own = asked.files.types["person"]
+    own = corridor.files.types["person"]
     assert float(files.types["person"]["speedFactor"]) == pytest.approx(found.factors["speedFactor"])
     assert {**files.types["person"], "speedFactor": own["speedFactor"]} == own
     with DetectorPool(1) as counting:
-        (passed,) = counting.run(asked.scenario(folder / CALIBRATED_NETWORK_FILE), make_test_seeds(1), asked.loops)
-    flows, speeds = aggregate_passages(asked.measurements, asked.loop_numbers, passed)
-    assert compute_agreement(asked.measurements, flows, speeds) == found.calibrated[0]
+        (passed,) = counting.run(
+            corridor.scenario(folder / CALIBRATED_NETWORK_FILE), make_test_seeds(1), corridor.loops
+        )
+    flows, speeds = aggregate_passages(corridor.measurements, corridor.loop_numbers, passed)
+    assert compute_agreement(corridor.measurements, flows, speeds) == found.calibrated[0]
     road = load_user_network(str(folder / CALIBRATED_NETWORK_FILE), {"penetration_rate": 0.2})
     episode = run_episode(road, PISaturation(time_step=road.control_step), 1)
     assert episode.status == "completed"
@@ -119,7 +121,7 @@ def test_written_network_has_the_reported_agreement(asked: Corridor, done: tuple
 
 @pytest.mark.long
 def test_interrupted_calibration_resumes(
-    asked: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    corridor: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, before = done
     rows = (folder / TRIALS_FILE).read_text().splitlines(keepends=True)
@@ -134,22 +136,22 @@ def test_interrupted_calibration_resumes(
             return super().run(scenario, seeds, loops)
 
     with Watched(2) as counting:
-        again = calibrate(asked, tmp_path, counting, SPACE, TRIALS, seeds_per_trial=1)
+        again = calibrate(corridor, tmp_path, counting, SPACE, TRIALS, seeds_per_trial=1)
     assert driven == [2, 4, 4]
     assert again.trials == before.trials
     assert (again.factors, again.calibrated) == (before.factors, before.calibrated)
 
 
-def test_folder_of_another_calibration_is_refused(asked: Corridor, done: tuple[Path, CalibrationResult]) -> None:
+def test_folder_of_another_calibration_is_refused(corridor: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     with DetectorPool(1) as counting, pytest.raises(InputError, match="was made with other settings"):
-        calibrate(asked, done[0], counting, SPACE, TRIALS, seeds_per_trial=2)
+        calibrate(corridor, done[0], counting, SPACE, TRIALS, seeds_per_trial=2)
 
 
-def test_unusable_original_network_is_reported(asked: Corridor, tmp_path: Path) -> None:
+def test_unusable_original_network_is_reported(corridor: Corridor, tmp_path: Path) -> None:
     path = road(tmp_path / "broken")
     demand = path.with_name("demand.rou.xml")
     demand.write_text(demand.read_text().replace('route="along"', 'route="astray"'))
-    broken = load_corridor(str(path), asked.detectors)
+    broken = load_corridor(str(path), corridor.detectors)
     with DetectorPool(1) as counting, pytest.raises(UnjamError, match=r"as it is: SUMO cannot start.*astray"):
         calibrate(broken, tmp_path / "out", counting, SPACE, 2, seeds_per_trial=1)
 
@@ -203,11 +205,11 @@ def test_intervals_outside_the_simulated_time_are_excluded(tmp_path: Path) -> No
     rows = [f"road_0,5,{begin},{begin + 60},1,1" for begin in range(0, 360, 60)]
     file.write_text("\n".join([f"lane,{','.join(DETECTOR_COLUMNS)}", *rows]))
     path = str(road(tmp_path / "road"))
-    asked = load_corridor(path, file)
-    assert (len(asked.measurements), asked.excluded_count, asked.begin, asked.end) == (4, 2, 0.0, 240.0)
-    asked = load_corridor(path, file, 60.0, 200.0)
-    assert (len(asked.measurements), asked.excluded_count, asked.begin, asked.end) == (2, 4, 60.0, 180.0)
-    assert len(asked.loops) == 1
+    corridor = load_corridor(path, file)
+    assert (len(corridor.measurements), corridor.excluded_count, corridor.begin, corridor.end) == (4, 2, 0.0, 240.0)
+    corridor = load_corridor(path, file, 60.0, 200.0)
+    assert (len(corridor.measurements), corridor.excluded_count, corridor.begin, corridor.end) == (2, 4, 60.0, 180.0)
+    assert len(corridor.loops) == 1
 
 
 def test_network_without_passenger_cars_is_refused(tmp_path: Path) -> None:
@@ -246,12 +248,12 @@ def test_intervals_of_agreement_are_clipped_at_their_bounds(done: tuple[Path, Ca
 
 
 def test_lost_process_is_not_a_verdict_on_the_factors(
-    asked: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path
+    corridor: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path
 ) -> None:
     class Lost(DetectorPool):
         def run(self, scenario: UserNetwork, seeds: Any, loops: Any) -> list[list[DetectorPassage]]:
             raise LostWorkerError("SUMO was lost: its process ended with code -9")
 
     with Lost(1) as counting, pytest.raises(LostWorkerError):
-        calibrate(asked, tmp_path / "out", counting, SPACE, TRIALS, seeds_per_trial=1)
+        calibrate(corridor, tmp_path / "out", counting, SPACE, TRIALS, seeds_per_trial=1)
     assert not (tmp_path / "out" / TRIALS_FILE).exists()

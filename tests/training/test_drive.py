@@ -23,22 +23,22 @@ ROAD: dict[str, Any] = {"length": (120, 130), "vehicles": 8, "horizon": 60}
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory: pytest.TempPathFactory) -> DriveResult:
+def drive_result(tmp_path_factory: pytest.TempPathFactory) -> DriveResult:
     """Two drivers on the same three episodes, written into a folder."""
     out = tmp_path_factory.mktemp("drives") / "new" / "folder"
     return drive("ring", ["pi", IDM()], episodes=3, seed=4, scenario_options=ROAD, workers=1, out=out)
 
 
-def test_every_driver_has_a_row_for_every_seed(compared: DriveResult) -> None:
-    assert list(compared.rows) == ["pi", "idm"]
-    for rows in compared.rows.values():
+def test_every_driver_has_a_row_for_every_seed(drive_result: DriveResult) -> None:
+    assert list(drive_result.rows) == ["pi", "idm"]
+    for rows in drive_result.rows.values():
         assert [row["seed"] for row in rows] == [4, 5, 6]
         assert {row["status"] for row in rows} == {"completed"}
 
 
-def test_row_measures_the_episode_of_its_seed(compared: DriveResult) -> None:
+def test_row_measures_the_episode_of_its_seed(drive_result: DriveResult) -> None:
     ring = Ring(**ROAD)
-    for row in compared.rows["pi"]:
+    for row in drive_result.rows["pi"]:
         (trajectory,) = run_episode(ring, PISaturation(), (row["seed"],)).trajectories
         assert row["return"] == trajectory.reward.sum()
 
@@ -49,38 +49,38 @@ def test_test_seeds_are_those_of_training_evaluations() -> None:
     assert [row["return"] for row in judged] == [trajectory.reward.sum() for trajectory in again]
 
 
-def test_results_are_written_with_a_report(compared: DriveResult) -> None:
-    assert compared.folder is not None
-    assert {path.name for path in compared.folder.iterdir()} == {
+def test_results_are_written_with_a_report(drive_result: DriveResult) -> None:
+    assert drive_result.folder is not None
+    assert {path.name for path in drive_result.folder.iterdir()} == {
         "evaluation.json",
         "episodes.parquet",
         "plot_episodes.safetensors",
         "report.html",
     }
-    assert compared.report == compared.folder / "report.html"
-    results = read_results(compared.folder)
+    assert drive_result.report == drive_result.folder / "report.html"
+    results = read_results(drive_result.folder)
     assert list(results.rows) == ["pi", "idm"]
     assert results.metadata["reward"] == "released"
     assert results.trained_label is None
 
 
-def test_mean_is_that_of_the_first_driver(compared: DriveResult) -> None:
-    speeds = [row["mean_speed"] for row in compared.rows["pi"]]
-    assert compared.mean["mean_speed"] == pytest.approx(np.mean(speeds))
-    found = compared.summary("idm")["mean_speed"]
-    assert found.mean == pytest.approx(np.mean([row["mean_speed"] for row in compared.rows["idm"]]))
+def test_mean_is_that_of_the_first_driver(drive_result: DriveResult) -> None:
+    speeds = [row["mean_speed"] for row in drive_result.rows["pi"]]
+    assert drive_result.mean["mean_speed"] == pytest.approx(np.mean(speeds))
+    found = drive_result.summary("idm")["mean_speed"]
+    assert found.mean == pytest.approx(np.mean([row["mean_speed"] for row in drive_result.rows["idm"]]))
     assert found.low <= found.mean <= found.high
     assert found.count == 3
 
 
-def test_document_of_several_drivers_is_a_list(compared: DriveResult) -> None:
-    document = json.loads(to_json(compared.document()))
+def test_document_of_several_drivers_is_a_list(drive_result: DriveResult) -> None:
+    document = json.loads(to_json(drive_result.document()))
     assert document["scenario"] == "ring"
     assert [entry["driver"] for entry in document["drivers"]] == ["pi", "idm"]
     for entry in document["drivers"]:
         assert len(entry["episodes"]) == 3
         assert entry["mean"].keys() == entry["ci95"].keys() == METRICS.keys()
-        assert entry["report"] == str(compared.report)
+        assert entry["report"] == str(drive_result.report)
     expert = document["drivers"][0]["baseline"]
     assert expert in ("pi", "idm")
     for entry in document["drivers"]:
@@ -112,9 +112,9 @@ def test_no_temporary_file_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not list(tmp_path.iterdir())
 
 
-def test_number_of_workers_does_not_change_the_result(compared: DriveResult) -> None:
+def test_number_of_workers_does_not_change_the_result(drive_result: DriveResult) -> None:
     other = drive("ring", ["pi", "idm"], episodes=3, seed=4, scenario_options=ROAD, workers=2)
-    assert to_json(other.rows) == to_json(compared.rows)
+    assert to_json(other.rows) == to_json(drive_result.rows)
 
 
 def test_progress_has_driver_and_episode() -> None:
@@ -150,8 +150,8 @@ def test_failed_driver_has_rows_and_can_be_raised(my_drivers: Path, tmp_path: Pa
     assert "\n" not in str(caught.value)
 
 
-def test_nothing_is_raised_without_failures(compared: DriveResult) -> None:
-    raise_failures(compared)
+def test_nothing_is_raised_without_failures(drive_result: DriveResult) -> None:
+    raise_failures(drive_result)
 
 
 class Stays(Driver):
@@ -203,41 +203,41 @@ def test_drive_works_with_an_open_environment_and_warns() -> None:
     assert concurrent.mean["return"] == drive("ring", follow, 1, scenario_options=ROAD, workers=1).mean["return"]
 
 
-def test_result_has_a_pandas_table_and_a_notebook_view(compared: DriveResult) -> None:
-    table = compared.table()
+def test_result_has_a_pandas_table_and_a_notebook_view(drive_result: DriveResult) -> None:
+    table = drive_result.table()
     assert list(table.index) == list(METRICS)
-    assert table["pi", "mean"].to_dict() == pytest.approx(compared.mean, nan_ok=True)
+    assert table["pi", "mean"].to_dict() == pytest.approx(drive_result.mean, nan_ok=True)
     assert list(table["idm"].columns) == ["mean", "low", "high"]
-    episodes = compared.episodes()
+    episodes = drive_result.episodes()
     assert len(episodes) == 6
     assert list(episodes.loc[episodes["driver"] == "pi", "seed"]) == ["4", "5", "6"]
-    html = compared._repr_html_()
+    html = drive_result._repr_html_()
     assert "mean speed [m/s]" in html
     assert html.count('src="data:image/svg+xml;base64,') == 1
 
 
 @pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
+def detect_worker_start(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
     """Detects whether a worker process was started."""
     from unjam.worlds import worker_pool
 
-    started: list[object] = []
+    detect_worker_start: list[object] = []
     start = worker_pool._Worker._start
 
     def noted(self: Any) -> Any:
-        started.append(self)
+        detect_worker_start.append(self)
         return start(self)
 
     monkeypatch.setattr(worker_pool._Worker, "_start", noted)
-    return lambda: bool(started)
+    return lambda: bool(detect_worker_start)
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
         {"scenario": "rong"},
-        {"driver": "nobody"},
-        {"driver": ["pi", "nobody"]},
+        {"driver": "nonesuch"},
+        {"driver": ["pi", "nonesuch"]},
         {"driver": "pi:speed=1"},
         {"driver": 3},
         {"driver": []},
@@ -254,7 +254,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
     ids=str,
 )
 def test_wrong_arguments_are_refused_before_the_start(
-    tmp_path: Path, started: Callable[[], bool], wrong: dict[str, Any]
+    tmp_path: Path, detect_worker_start: Callable[[], bool], wrong: dict[str, Any]
 ) -> None:
     arguments = {
         "driver": "pi",
@@ -268,24 +268,24 @@ def test_wrong_arguments_are_refused_before_the_start(
         drive(**arguments)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
-    assert not started()
+    assert not detect_worker_start()
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
-def test_existing_files_are_not_changed(tmp_path: Path, started: Callable[[], bool], kind: str) -> None:
+def test_existing_files_are_not_changed(tmp_path: Path, detect_worker_start: Callable[[], bool], kind: str) -> None:
     mine = tmp_path / "out" / "mine.txt" if kind == "folder" else tmp_path / "out"
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("keep")
     with pytest.raises(InputError, match="out' is not empty; allowed: a new folder"):
         drive("ring", "pi", 1, scenario_options=ROAD, out=tmp_path / "out")
     assert mine.read_text() == "keep"
-    assert not started()
+    assert not detect_worker_start()
 
 
-def test_fixture_detects_started_workers(started: Callable[[], bool]) -> None:
-    assert not started()
+def test_fixture_detects_started_workers(detect_worker_start: Callable[[], bool]) -> None:
+    assert not detect_worker_start()
     drive("ring", "idm", 1, scenario_options=ROAD, workers=1)
-    assert started()
+    assert detect_worker_start()
 
 
 def test_drivers_with_equal_descriptions_are_both_run(my_drivers: Path) -> None:

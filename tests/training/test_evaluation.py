@@ -26,7 +26,7 @@ def pool() -> Iterator[WorkerPool]:
         yield workers
 
 
-def learned(pool: WorkerPool, folder: Path, **changes: object) -> tuple[Path, RunConfig]:
+def train_small_run(pool: WorkerPool, folder: Path, **changes: object) -> tuple[Path, RunConfig]:
     """A run of one iteration that is not evaluated yet."""
     config = small_config(**{"steps": STEPS, "evaluation__validation_interval": 0, **changes})
     learn_with(pool, folder, config)
@@ -42,7 +42,7 @@ def with_evaluation(config: RunConfig, baselines: Sequence[str] | None = None) -
 
 @pytest.fixture(scope="module")
 def run(pool: WorkerPool, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunConfig]:
-    return learned(pool, tmp_path_factory.mktemp("runs") / "run")
+    return train_small_run(pool, tmp_path_factory.mktemp("runs") / "run")
 
 
 def test_comparison_has_baselines_expert_and_trained_controller(run: tuple[Path, RunConfig]) -> None:
@@ -115,7 +115,7 @@ def test_baselines_and_episodes_can_be_overridden(run: tuple[Path, RunConfig], p
 
 
 def test_no_expert_is_compared_without_one(pool: WorkerPool, tmp_path: Path) -> None:
-    folder, config = learned(pool, tmp_path / "run", expert="none")
+    folder, config = train_small_run(pool, tmp_path / "run", expert="none")
     found = evaluate_run(folder, with_evaluation(config), pool)
     assert list(found.rows) == ["human", TRAINED_LABEL]
     assert read_results(folder).metadata["expert"] == "none"
@@ -125,7 +125,7 @@ def test_trained_controller_can_be_the_next_expert(
     run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
 ) -> None:
     first, _ = run
-    folder, config = learned(pool, tmp_path / "next", expert=str(first), policy__action_duration=3)
+    folder, config = train_small_run(pool, tmp_path / "next", expert=str(first), policy__action_duration=3)
     found = evaluate_run(folder, with_evaluation(config), pool)
     assert list(found.rows) == ["human", "pi + residual", TRAINED_LABEL]
     trained, expert = load_controller(folder), load_controller(first)
@@ -139,14 +139,14 @@ def test_baseline_with_the_description_of_the_expert_is_kept(
     run: tuple[Path, RunConfig], pool: WorkerPool, tmp_path: Path
 ) -> None:
     first, _ = run
-    second, _ = learned(pool, tmp_path / "second", seed=1)
-    folder, config = learned(pool, tmp_path / "next", expert=str(first))
+    second, _ = train_small_run(pool, tmp_path / "second", seed=1)
+    folder, config = train_small_run(pool, tmp_path / "next", expert=str(first))
     assert len(drivers_to_compare(with_evaluation(config, [str(second)]), folder)) == 3
 
 
 def test_user_expert_and_reward_are_used(pool: WorkerPool, tmp_path: Path, my_drivers: Path) -> None:
     changes = {"expert": f"{my_drivers}:gentle", "reward": f"{my_drivers}:calm"}
-    folder, config = learned(pool, tmp_path / "run", **changes)
+    folder, config = train_small_run(pool, tmp_path / "run", **changes)
     found = evaluate_run(folder, with_evaluation(config), pool)
     assert list(found.rows) == ["human", "mine.py:gentle", TRAINED_LABEL]
     about = json.loads((folder / "evaluation.json").read_text())

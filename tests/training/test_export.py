@@ -37,24 +37,24 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def exported(run: Path) -> Path:
+def exported_file(run: Path) -> Path:
     return export_controller(run, run.parent / "ring.unjam").file
 
 
 @pytest.mark.long
-def test_export_has_the_controller_of_the_run(run: Path, exported: Path) -> None:
-    made, kept = load_controller(exported), load_controller(run)
+def test_export_has_the_controller_of_the_run(run: Path, exported_file: Path) -> None:
+    made, kept = load_controller(exported_file), load_controller(run)
     assert isinstance(made, FilteredDriver)
     made = made.driver
     assert isinstance(made, ResidualDriver)
     assert isinstance(kept, ResidualDriver)
     for ours, theirs in zip(made.network.layers, kept.network.layers, strict=True):
         np.testing.assert_array_equal(ours[0], theirs[0])
-    assert unpack_parts(exported).keys() == {MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART}
+    assert unpack_parts(exported_file).keys() == {MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART}
 
 
-def test_manifest_has_origin_and_metrics(run: Path, exported: Path) -> None:
-    said = manifest_of(exported)
+def test_manifest_has_origin_and_metrics(run: Path, exported_file: Path) -> None:
+    said = manifest_of(exported_file)
     assert said["run"] == {"scenario": "ring", "agent": "trpo", "seed": 0}
     assert said["scenario"]["vehicles"] == 8
     assert (said["time_step"], said["action_limit"], said["expert"]) == (0.1, 1.0, "pi")
@@ -67,8 +67,8 @@ def test_manifest_has_origin_and_metrics(run: Path, exported: Path) -> None:
     assert {"reward", "trained", "pi"} == metrics.keys()
 
 
-def test_sample_has_the_local_states_of_an_episode(exported: Path) -> None:
-    states, answers = read_sample(unpack_parts(exported)[SAMPLE_PART])
+def test_sample_has_the_local_states_of_an_episode(exported_file: Path) -> None:
+    states, answers = read_sample(unpack_parts(exported_file)[SAMPLE_PART])
     assert len(answers) == 100  # the horizon of the run
     np.testing.assert_allclose(np.diff(states.speed), 0.1 * answers[:-1], atol=1e-6)
     assert set(states.loop_length) <= set(range(120, 131))

@@ -34,7 +34,7 @@ def with_checkpoint(folder: Path, config: RunConfig) -> None:
     save_checkpoint(folder / "checkpoint", {"iteration": 1, "fingerprint": fingerprint(config)}, {})
 
 
-def refused(folder: Path, config: RunConfig) -> str:
+def refusal_message(folder: Path, config: RunConfig) -> str:
     before = (folder / "progress.jsonl").read_bytes()
     with pytest.raises(InputError, match=r"^resume: ") as caught:
         restore_newest_checkpoint(folder, {folder}, fingerprint(config))
@@ -53,7 +53,7 @@ def refused(folder: Path, config: RunConfig) -> str:
 def test_checkpoint_of_another_configuration_is_refused(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
     with_checkpoint(tmp_path, small_config())
     (tmp_path / "config.toml").write_text(to_toml(small_config(**changes)))
-    assert words in refused(tmp_path, small_config(**changes))
+    assert words in refusal_message(tmp_path, small_config(**changes))
 
 
 def test_steps_and_workers_do_not_change_the_fingerprint(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_changed_files_of_a_training_are_refused(make: Callable[[Path], RunConfi
     (tmp_path / file).write_text((tmp_path / file).read_text() + " ")
     with pytest.raises(InputError, match=r"evaluate: .* has changed since the checkpoint"):
         check_run_files(run, config)
-    assert "has changed since the checkpoint" in refused(run, config)
+    assert "has changed since the checkpoint" in refusal_message(run, config)
     for state in (run / "checkpoint").rglob("state.json"):
         state.write_text("{ torn")
     check_run_files(run, config)  # what is damaged does not tell
@@ -119,7 +119,7 @@ def test_longer_run_resumes_with_the_best_scheduled_controller(ended: bool, cont
     controllers.save([b"best"], is_best=True)
     controllers.save([b"last"], is_best=False)
     assert (tmp_path / "controller.unjam").read_bytes() == b"last"
-    (tmp_path / "controller.unjam").write_bytes(b"somebody else's")
+    (tmp_path / "controller.unjam").write_bytes(b"another file")
     tensors = {**controllers.tensors(), "weight": torch.zeros(1)}
     ControllerStore([tmp_path]).restore(tensors, ended)
     assert (tmp_path / "controller.unjam").read_bytes() == content

@@ -105,8 +105,8 @@ def test_missing_damaged_and_old_facts_are_measured_again(kept: str | None, run:
 
 
 def test_current_facts_are_read(run: Path) -> None:
-    (run / MODEL_FILE).write_text('{"iteration": 2, "base": "told"}')
-    assert update_model_facts(run, CONFIG)["base"] == "told"
+    (run / MODEL_FILE).write_text('{"iteration": 2, "base": "stored"}')
+    assert update_model_facts(run, CONFIG)["base"] == "stored"
 
 
 def without_virtual() -> RunConfig:

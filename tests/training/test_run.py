@@ -81,7 +81,7 @@ def learn_with(
     return run
 
 
-def collected(monkeypatch: pytest.MonkeyPatch) -> list[Episode]:
+def collected_episodes(monkeypatch: pytest.MonkeyPatch) -> list[Episode]:
     """The episodes that are driven from now on for an iteration, as they come."""
     episodes: list[Episode] = []
     collect = Trainer.collect
@@ -125,22 +125,22 @@ def controller_manifest(folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory: pytest.TempPathFactory, learn: Learn) -> Path:
+def uninterrupted_run(tmp_path_factory: pytest.TempPathFactory, learn: Learn) -> Path:
     """A run of four iterations."""
     folder = tmp_path_factory.mktemp("runs") / "uninterrupted"
     learn(folder, small_config(steps=4 * STEPS))
     return folder
 
 
-def test_progress_counts_environment_steps_by_iteration(uninterrupted: Path) -> None:
-    rows = progress(uninterrupted)
+def test_progress_counts_environment_steps_by_iteration(uninterrupted_run: Path) -> None:
+    rows = progress(uninterrupted_run)
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
     assert [row["environment_steps"] for row in rows] == [300, 600, 900, 1200]
     assert all(row["model_steps"] >= row["environment_steps"] for row in rows if row["k_star"] >= 10)
 
 
-def test_progress_row_is_complete(uninterrupted: Path) -> None:
-    for row in read_progress(uninterrupted):
+def test_progress_row_is_complete(uninterrupted_run: Path) -> None:
+    for row in read_progress(uninterrupted_run):
         numbers = [
             row[name] for name in ("return_mean", "return_expert", "return_validation", "mean_speed", "mean_abs_accel")
         ]
@@ -160,32 +160,32 @@ def test_steps_are_rounded_up_to_whole_iterations(tmp_path: Path, learn: Learn) 
 
 
 @pytest.mark.long
-def test_same_configuration_repeats_bit_for_bit(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_same_configuration_repeats_bit_for_bit(uninterrupted_run: Path, tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "again", small_config(steps=4 * STEPS))
-    assert outcome(tmp_path / "again") == outcome(uninterrupted)
+    assert outcome(tmp_path / "again") == outcome(uninterrupted_run)
 
 
-def test_other_seed_gives_another_run(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_other_seed_gives_another_run(uninterrupted_run: Path, tmp_path: Path, learn: Learn) -> None:
     learn(tmp_path / "other", small_config(steps=STEPS, seed=1))
-    assert progress(tmp_path / "other")[0]["return_mean"] != progress(uninterrupted)[0]["return_mean"]
+    assert progress(tmp_path / "other")[0]["return_mean"] != progress(uninterrupted_run)[0]["return_mean"]
 
 
 @pytest.mark.long
-def test_number_of_workers_does_not_change_the_result(uninterrupted: Path, tmp_path: Path) -> None:
+def test_number_of_workers_does_not_change_the_result(uninterrupted_run: Path, tmp_path: Path) -> None:
     with WorkerPool(2) as two:
         learn_with(two, tmp_path / "two", small_config(steps=4 * STEPS, workers=2))
-    assert outcome(tmp_path / "two") == outcome(uninterrupted)
+    assert outcome(tmp_path / "two") == outcome(uninterrupted_run)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("iterations", [pytest.param(1, marks=pytest.mark.slow), 3])
-def test_interrupted_run_ends_unchanged(uninterrupted: Path, tmp_path: Path, iterations: int, learn: Learn) -> None:
+def test_interrupted_run_ends_unchanged(uninterrupted_run: Path, tmp_path: Path, iterations: int, learn: Learn) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
     with pytest.raises(Stop):
         learn(folder, config, stop_after(iterations))
     assert len(progress(folder)) == iterations
     learn(folder, config, resume=True)
-    assert outcome(folder) == outcome(uninterrupted)
+    assert outcome(folder) == outcome(uninterrupted_run)
 
 
 @pytest.mark.slow
@@ -201,11 +201,11 @@ def test_interrupted_run_of_any_learner_ends_unchanged(tmp_path: Path, agent: st
 
 
 @pytest.mark.long
-def test_learners_give_different_results(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_learners_give_different_results(uninterrupted_run: Path, tmp_path: Path, learn: Learn) -> None:
     for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss", "td3": "critic_loss"}.items():
         learn(tmp_path / agent, small_config(agent=agent))
         rows = progress(tmp_path / agent)
-        assert rows[0]["return_expert"] == progress(uninterrupted)[0]["return_expert"]
+        assert rows[0]["return_expert"] == progress(uninterrupted_run)[0]["return_expert"]
         assert key in rows[1]["learner"]
         assert [row["environment_steps"] for row in rows] == [STEPS, 2 * STEPS]
         loaded = load_controller(tmp_path / agent)
@@ -214,21 +214,21 @@ def test_learners_give_different_results(uninterrupted: Path, tmp_path: Path, le
 
 
 @pytest.mark.slow
-def test_repeatedly_interrupted_run_ends_unchanged(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_repeatedly_interrupted_run_ends_unchanged(uninterrupted_run: Path, tmp_path: Path, learn: Learn) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
     for iterations in (1, 2, 3):
         with pytest.raises(Stop):
             learn(folder, config, stop_after(iterations), resume=iterations > 1)
     learn(folder, config, resume=True)
-    assert outcome(folder) == outcome(uninterrupted)
+    assert outcome(folder) == outcome(uninterrupted_run)
 
 
 @pytest.mark.long
-def test_extended_run_equals_one_long_run(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_extended_run_equals_one_long_run(uninterrupted_run: Path, tmp_path: Path, learn: Learn) -> None:
     folder = tmp_path / "run"
     learn(folder, small_config(steps=2 * STEPS))
     learn(folder, small_config(steps=4 * STEPS, workers=2), resume=True)
-    assert outcome(folder) == outcome(uninterrupted)
+    assert outcome(folder) == outcome(uninterrupted_run)
 
 
 def test_fewer_steps_than_done_are_refused(tmp_path: Path, learn: Learn) -> None:
@@ -249,14 +249,14 @@ def test_final_validation_does_not_change_learning(tmp_path: Path, learn: Learn)
 
 
 @pytest.mark.long
-def test_run_without_a_checkpoint_starts_again(uninterrupted: Path, tmp_path: Path, learn: Learn) -> None:
+def test_run_without_a_checkpoint_starts_again(uninterrupted_run: Path, tmp_path: Path, learn: Learn) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
     with pytest.raises(Stop):
         learn(folder, config, stop_after(1))
     shutil.rmtree(folder / "checkpoint")
     (folder / "progress.jsonl").unlink()
     learn(folder, config, resume=True)
-    assert outcome(folder) == outcome(uninterrupted)
+    assert outcome(folder) == outcome(uninterrupted_run)
 
 
 DAMAGE: dict[str, Callable[[Path], object]] = {
@@ -272,26 +272,26 @@ KILLED, *OTHERS = DAMAGE
 @pytest.mark.long
 @pytest.mark.parametrize("name", [KILLED, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_leftovers_of_a_crash_do_not_change_the_result(
-    uninterrupted: Path, tmp_path: Path, name: str, learn: Learn
+    uninterrupted_run: Path, tmp_path: Path, name: str, learn: Learn
 ) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
     with pytest.raises(Stop):
         learn(folder, config, stop_after(3))
     DAMAGE[name](folder)
     learn(folder, config, resume=True)
-    assert outcome(folder) == outcome(uninterrupted)
+    assert outcome(folder) == outcome(uninterrupted_run)
 
 
-def test_run_keeps_two_checkpoints(uninterrupted: Path) -> None:
-    assert sorted(place.name for place in (uninterrupted / "checkpoint").iterdir()) == ["000003", "000004"]
+def test_run_keeps_two_checkpoints(uninterrupted_run: Path) -> None:
+    assert sorted(place.name for place in (uninterrupted_run / "checkpoint").iterdir()) == ["000003", "000004"]
 
 
-def test_controller_is_the_best_on_validation_seeds(uninterrupted: Path) -> None:
-    rows = progress(uninterrupted)
+def test_controller_is_the_best_on_validation_seeds(uninterrupted_run: Path) -> None:
+    rows = progress(uninterrupted_run)
     best = max(rows, key=lambda row: row["return_validation"])
     expected = best["iteration"] if best["return_validation"] > best["return_expert"] else 0
-    assert controller_manifest(uninterrupted)["iteration"] == expected
-    assert controller_manifest(uninterrupted)["environment_steps"] == expected * STEPS
+    assert controller_manifest(uninterrupted_run)["iteration"] == expected
+    assert controller_manifest(uninterrupted_run)["environment_steps"] == expected * STEPS
 
 
 def test_earlier_controller_stays_if_it_is_the_best(tmp_path: Path, learn: Learn) -> None:
@@ -352,7 +352,7 @@ def test_stratified_episodes_cover_all_lengths(
         scenario_options__horizon=20,
         evaluation__validation_interval=0,
     )
-    episodes = collected(monkeypatch)
+    episodes = collected_episodes(monkeypatch)
     learn(tmp_path / "run", config)
     lengths = [episode.drawn_values["length"] for episode in episodes]
     assert (sorted(lengths) == list(range(120, 131))) is spread
@@ -362,7 +362,7 @@ def test_stratified_episodes_cover_all_lengths(
 def test_training_seeds_are_unique_and_not_reserved(
     tmp_path: Path, learn: Learn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    episodes = collected(monkeypatch)
+    episodes = collected_episodes(monkeypatch)
     learn(tmp_path, small_config(seed=5))
     seeds = [episode.seed for episode in episodes]
     assert len(seeds) == len(set(seeds)) == 6
@@ -373,7 +373,7 @@ def test_training_seeds_are_unique_and_not_reserved(
 def test_training_explores_and_validation_does_not(
     tmp_path: Path, learn: Learn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    episodes = collected(monkeypatch)
+    episodes = collected_episodes(monkeypatch)
     run = learn(tmp_path / "run", small_config(policy__exploration_std=0.3))
     (trajectory,) = episodes[-1].trajectories
     assert np.std(trajectory.residual) > 0.1

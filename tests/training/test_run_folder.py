@@ -21,10 +21,10 @@ def test_empty_folder_is_allowed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"expert": "nobody"},
+        {"expert": "nonesuch"},
         {"expert": "nowhere.py:nothing"},
         {"reward": "gold"},
-        {"evaluation__baselines": ["human", "nobody"]},
+        {"evaluation__baselines": ["human", "nonesuch"]},
         {"expert": "none", "policy__inputs": ["expert_memory"]},
         {"scenario": "merge", "scenario_options": {}, "policy__inputs": ["local", "lap_position"]},
         {"scenario": "merge", "scenario_options": {}, "expert": "pacer"},

@@ -14,7 +14,7 @@ from unjam.training.run_folder import create_run_folder
 from unjam.training.runs import config_differences, read_run, remove_run
 
 
-def made(folder: Path, config: RunConfig, done: int, gain: float | None = None) -> Path:
+def write_run(folder: Path, config: RunConfig, done: int, gain: float | None = None) -> Path:
     """A run folder with so many steps, evaluated with such a gain."""
     create_run_folder(folder, config)
     append_line(folder / "progress.jsonl", to_json({"iteration": 1, "environment_steps": done}))
@@ -34,9 +34,9 @@ CONFIG = load_config(changes={"steps": 1000, "preset": ""})
 
 @pytest.fixture
 def under(tmp_path: Path) -> Path:
-    made(tmp_path / "ring-001", CONFIG, 1000, gain=7.0)
-    made(tmp_path / "deep" / "ring-002", replace(CONFIG, seed=3, scenario_options={"cavs": 2}), 400)
-    made(tmp_path / "merge-001", replace(CONFIG, scenario="merge", expert="acc"), 0)
+    write_run(tmp_path / "ring-001", CONFIG, 1000, gain=7.0)
+    write_run(tmp_path / "deep" / "ring-002", replace(CONFIG, seed=3, scenario_options={"cavs": 2}), 400)
+    write_run(tmp_path / "merge-001", replace(CONFIG, scenario="merge", expert="acc"), 0)
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "config.toml").write_text("mine = 1")
     return tmp_path

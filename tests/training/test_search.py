@@ -59,7 +59,7 @@ def test_empty_search_space_is_refused() -> None:
     [
         ({}, "trpo.nothing=1..2", "trpo.nothing: unknown name"),
         ({}, "trpo.gamma=0.9..1.5", "trpo.gamma: 1.5 is not allowed"),
-        ({}, "expert=pi,nobody", "nobody"),
+        ({}, "expert=pi,nonesuch", "nonesuch"),
         ({"evaluation__validation_interval": 0}, "trpo.gamma=0.9..0.99", "compared by validations"),
     ],
 )
@@ -267,4 +267,4 @@ def test_search_over_experts_maximizes_the_return(tmp_path: Path, trainings: Tra
     best, *_ = search(BASE, space, 12, tmp_path / "search", 1)
     assert best.values["expert"] == "constant"
     worth = -abs(math.log10(best.values["trpo.target_kl"]) + 2)
-    assert best.gain == pytest.approx(worth), "beyond its expert, whatever that earns"
+    assert best.gain == pytest.approx(worth), "relative to its expert, whatever the return of the expert is"

@@ -1,4 +1,4 @@
-"""Is the best controller of each penetration rate found, tested on other seeds, and the budget kept?"""
+"""The best controller of each penetration rate is selected, tested on other seeds, and the budget is kept."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -52,16 +52,16 @@ class MadeUp:
         return {option: [self._row(option, seed) for seed in seeds] for option in options}
 
     def _row(self, option: Option, seed: EpisodeSeed) -> dict[str, Any]:
-        people = {**USUAL, "seed": list(seed), "travel_time": 100 + np.random.default_rng(seed).normal()}
+        human_row = {**USUAL, "seed": list(seed), "travel_time": 100 + np.random.default_rng(seed).normal()}
         generator = np.random.default_rng((*seed, OPTIONS.index(option) if option in OPTIONS else 9))
         change = self.changes.get(option, lambda generator: {})(generator)
-        return {**people, **change, "travel_time": people["travel_time"] + change.get("travel_time", 0.0)}
+        return {**human_row, **change, "travel_time": human_row["travel_time"] + change.get("travel_time", 0.0)}
 
     def seeds_of(self, option: Option) -> list[EpisodeSeed]:
         return [seed for each, seed in self.driven if each == option]
 
 
-def shifted(mean: float, spread: float = 0.3, **changes: Any) -> Change:
+def shift_travel_time(mean: float, spread: float = 0.3, **changes: Any) -> Change:
     return lambda generator: {"travel_time": generator.normal(mean, spread), **changes}
 
 
@@ -73,7 +73,14 @@ def run_judge(
 
 
 def test_best_controller_of_each_penetration_rate_is_selected() -> None:
-    drive = MadeUp({IDM: shifted(-2), PI: shifted(-4), IDM_MORE: shifted(-3), PI_MORE: shifted(-1)})
+    drive = MadeUp(
+        {
+            IDM: shift_travel_time(-2),
+            PI: shift_travel_time(-4),
+            IDM_MORE: shift_travel_time(-3),
+            PI_MORE: shift_travel_time(-1),
+        }
+    )
     found = select_controllers(OPTIONS, drive, drive.budget, quiet)
     assert found.finalists == [PI, IDM_MORE]
     assert found.rejection_reasons[IDM].startswith("behind pi (selection seeds: ")
@@ -85,7 +92,7 @@ def test_best_controller_of_each_penetration_rate_is_selected() -> None:
 
 def test_half_of_the_controllers_are_rejected_in_each_round() -> None:
     many = [Option(0.1, name) for name in ("a", "b", "c", "d", "e")]
-    drive = MadeUp({option: shifted(-number) for number, option in enumerate(many)})
+    drive = MadeUp({option: shift_travel_time(-number) for number, option in enumerate(many)})
     found = select_controllers(many, drive, drive.budget, quiet)
     assert found.finalists == [many[-1]]
     counts = [len(drive.seeds_of(option)) for option in (*many, HUMAN_BASELINE)]
@@ -99,20 +106,20 @@ def test_single_controller_needs_no_selection_seeds() -> None:
 
 
 def test_lower_flow_is_rejected_despite_shorter_travel_time() -> None:
-    drive = MadeUp({IDM: shifted(-30, outflow_veh_per_h=1900.0), PI: shifted(-1)})
+    drive = MadeUp({IDM: shift_travel_time(-30, outflow_veh_per_h=1900.0), PI: shift_travel_time(-1)})
     found = select_controllers([IDM, PI], drive, drive.budget, quiet)
     assert found.finalists == [PI]
     assert found.rejection_reasons[IDM].startswith("flow is lower than that of the human baseline")
 
 
 def test_feasible_controllers_rank_before_quick_ones() -> None:
-    drive = MadeUp({IDM: shifted(-9, 20.0, min_time_gap=0.1), PI: shifted(0, 20.0)})
+    drive = MadeUp({IDM: shift_travel_time(-9, 20.0, min_time_gap=0.1), PI: shift_travel_time(0, 20.0)})
     assert select_controllers([IDM, PI], drive, drive.budget, quiet).finalists == [PI]
 
 
 def test_failed_option_is_rejected_with_the_reason() -> None:
     failed = {"status": "failed", "reason": "no CAV was on the road", "error": "InputError"}
-    drive = MadeUp({IDM: lambda generator: failed, PI: shifted(-1)})
+    drive = MadeUp({IDM: lambda generator: failed, PI: shift_travel_time(-1)})
     found = select_controllers([IDM, PI], drive, drive.budget, quiet)
     assert found.rejection_reasons == {IDM: "failed: no CAV was on the road"}
     assert found.finalists == [PI]
@@ -126,7 +133,7 @@ def test_failed_option_is_rejected_with_the_reason() -> None:
 def test_budget_is_never_exceeded(drivers: int, more: int) -> None:
     episodes = min_episodes(2, drivers) + more
     options = [Option(share, f"driver {number}") for share in SHARES for number in range(drivers)]
-    drive = MadeUp({option: shifted(0.0, 40.0) for option in options}, episodes)
+    drive = MadeUp({option: shift_travel_time(0.0, 40.0) for option in options}, episodes)
     found = select_controllers(options, drive, drive.budget, quiet)
     assert [option.penetration_rate for option in found.finalists] == [*SHARES]
     assert drive.budget.used_episodes <= max(SELECTION_BUDGET_FRACTION * episodes, 1 + len(options))
@@ -136,7 +143,7 @@ def test_budget_is_never_exceeded(drivers: int, more: int) -> None:
 
 
 def test_human_baseline_runs_once_per_seed() -> None:
-    drive = MadeUp({PI: shifted(-2.0), IDM_MORE: shifted(-3.0)})
+    drive = MadeUp({PI: shift_travel_time(-2.0), IDM_MORE: shift_travel_time(-3.0)})
     found = run_judge(drive, [PI, IDM_MORE])
     assert {seed[0] for _, seed in drive.driven} == {TEST_SEED}
     assert drive.seeds_of(HUMAN_BASELINE) == [(TEST_SEED, number) for number in range(len(found.rows[HUMAN_BASELINE]))]
@@ -145,7 +152,7 @@ def test_human_baseline_runs_once_per_seed() -> None:
 
 
 def test_gain_over_acc_vehicles_runs_until_its_interval_is_narrow() -> None:
-    drive = MadeUp({PI: shifted(-6.0, 6.0), BASELINE: shifted(-2.0, 0.1)}, 4000)
+    drive = MadeUp({PI: shift_travel_time(-6.0, 6.0), BASELINE: shift_travel_time(-2.0, 0.1)}, 4000)
     (judged,) = run_judge(drive, [PI]).controller_results
     assert judged.reasons == []
     assert judged.effect.relative_half_width <= 0.01
@@ -154,7 +161,7 @@ def test_gain_over_acc_vehicles_runs_until_its_interval_is_narrow() -> None:
 
 
 def test_gain_equal_to_acc_vehicles_is_not_recommended() -> None:
-    drive = MadeUp({PI: shifted(-5.0, 0.01), BASELINE: shifted(-5.5, 0.01)})
+    drive = MadeUp({PI: shift_travel_time(-5.0, 0.01), BASELINE: shift_travel_time(-5.5, 0.01)})
     found = run_judge(drive, [PI])
     (judged,), (acc,) = found.controller_results, found.acc_results
     assert acc.effect.travel_time.high < 0
@@ -164,16 +171,18 @@ def test_gain_equal_to_acc_vehicles_is_not_recommended() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        shifted(5.0),
-        shifted(-9.0, outflow_veh_per_h=1900.0),
-        shifted(-9.0, min_time_gap=0.1),
-        shifted(-0.01, 30.0),
+        shift_travel_time(5.0),
+        shift_travel_time(-9.0, outflow_veh_per_h=1900.0),
+        shift_travel_time(-9.0, min_time_gap=0.1),
+        shift_travel_time(-0.01, 30.0),
         lambda generator: {"status": "failed", "reason": "lost", "error": "EpisodeError"},
     ],
     ids=["slower", "less flow", "infeasible", "out of reach", "failed"],
 )
 def test_hopeless_controller_ends_early(change: Change) -> None:
-    drive = MadeUp({PI: change, IDM_MORE: shifted(-6.0, 6.0), Option(0.2, ACC_DRIVER): shifted(0.0, 0.1)}, 800)
+    drive = MadeUp(
+        {PI: change, IDM_MORE: shift_travel_time(-6.0, 6.0), Option(0.2, ACC_DRIVER): shift_travel_time(0.0, 0.1)}, 800
+    )
     found = run_judge(drive, [PI, IDM_MORE])
     hopeless, good = found.controller_results
     assert hopeless.reasons
@@ -183,7 +192,7 @@ def test_hopeless_controller_ends_early(change: Change) -> None:
 
 
 def test_small_budget_reports_the_missing_seeds() -> None:
-    drive = MadeUp({PI: shifted(-1.0, 9.0)}, 12)
+    drive = MadeUp({PI: shift_travel_time(-1.0, 9.0)}, 12)
     (judged,) = run_judge(drive, [PI], 0.001).controller_results
     assert judged.difference_to_acc.count == 4
     assert judged.missing_seeds > 0
@@ -191,7 +200,7 @@ def test_small_budget_reports_the_missing_seeds() -> None:
 
 
 def test_acc_vehicles_are_tested_without_controllers() -> None:
-    found = run_judge(MadeUp({BASELINE: shifted(-3.0)}), [])
+    found = run_judge(MadeUp({BASELINE: shift_travel_time(-3.0)}), [])
     assert (found.controller_results, len(found.acc_results)) == ([], 1)
     assert found.acc_results[0].effect.travel_time.high < 0
     assert found.acc_results[0].property_effect is None
@@ -199,7 +208,7 @@ def test_acc_vehicles_are_tested_without_controllers() -> None:
 
 def test_property_effect_is_reported_separately() -> None:
     unchanged = Option(0.1, UNCHANGED_ACC_DRIVER)
-    drive = MadeUp({BASELINE: shifted(-5.0), unchanged: shifted(-1.0)})
+    drive = MadeUp({BASELINE: shift_travel_time(-5.0), unchanged: shift_travel_time(-1.0)})
     (acc,) = run_judge(drive, [PI], split=True).acc_results
     assert acc.property_effect is not None
     assert acc.property_effect.mean == pytest.approx(-4.0, abs=0.5)
@@ -222,7 +231,7 @@ def test_each_round_has_a_line_with_the_remaining_time() -> None:
     lines: list[str] = []
     now = [0.0]
     budget = EpisodeBudget(40, clock=lambda: now[0])
-    drive = MadeUp({PI: shifted(-1.0, 9.0)})
+    drive = MadeUp({PI: shift_travel_time(-1.0, 9.0)})
 
     def timed(options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
         found = drive(options, seeds)

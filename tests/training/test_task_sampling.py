@@ -1,4 +1,4 @@
-"""Do the episodes of an iteration go where a policy falls short, and is no road forgotten?"""
+"""Regret-weighted task sampling prefers tasks on which the policy falls short, and omits no task."""
 
 import pytest
 from hypothesis import given

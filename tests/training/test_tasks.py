@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.test_run import Stop, collected, learn_with, outcome, progress, small_config, stop_after
+from tests.training.test_run import Stop, collected_episodes, learn_with, outcome, progress, small_config, stop_after
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
@@ -88,7 +88,7 @@ def test_incompatible_tasks_are_refused(task: dict[str, Any], words: str) -> Non
 )
 def test_interrupted_mixture_ends_unchanged(agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, places = mixture(agent=agent), [tmp_path / "one go", tmp_path / "run"]
-    episodes = collected(monkeypatch)
+    episodes = collected_episodes(monkeypatch)
     with WorkerPool(1) as workers:
         learn_with(workers, places[0], config)
         # 300 steps by weight: two episodes of the first road and one of the other, each with its own seed.

@@ -50,7 +50,7 @@ class Trained(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+def finished_training(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A finished run of two iterations."""
     folder, config = tmp_path_factory.mktemp("runs") / "finished", small_config()
     shown: list[dict[str, Any]] = []
@@ -62,27 +62,27 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return Trained(config, result, shown, judged)
 
 
-def test_run_folder_is_complete(trained: Trained) -> None:
-    folder = trained.result.folder
+def test_run_folder_is_complete(finished_training: Trained) -> None:
+    folder = finished_training.result.folder
     assert {path.name for path in folder.iterdir()} == CONTENT
-    assert trained.result.controller == folder / "controller.unjam"
-    assert trained.result.report == folder / "report.html"
+    assert finished_training.result.controller == folder / "controller.unjam"
+    assert finished_training.result.report == folder / "report.html"
 
 
-def test_run_folder_has_its_configuration_and_manifest(trained: Trained) -> None:
-    assert read_config(trained.result.folder) == trained.config
-    manifest = json.loads((trained.result.folder / "manifest.json").read_text())
+def test_run_folder_has_its_configuration_and_manifest(finished_training: Trained) -> None:
+    assert read_config(finished_training.result.folder) == finished_training.config
+    manifest = json.loads((finished_training.result.folder / "manifest.json").read_text())
     assert manifest["packages"]["torch"]
     assert manifest["started"]
 
 
-def test_callback_gets_the_rows_of_progress(trained: Trained) -> None:
-    assert trained.shown == read_progress(trained.result.folder)
-    assert [row["environment_steps"] for row in trained.shown] == [STEPS, 2 * STEPS]
+def test_callback_gets_the_rows_of_progress(finished_training: Trained) -> None:
+    assert finished_training.shown == read_progress(finished_training.result.folder)
+    assert [row["environment_steps"] for row in finished_training.shown] == [STEPS, 2 * STEPS]
 
 
-def test_every_driver_is_evaluated_on_test_seeds(trained: Trained) -> None:
-    rows = trained.result.rows
+def test_every_driver_is_evaluated_on_test_seeds(finished_training: Trained) -> None:
+    rows = finished_training.result.rows
     assert list(rows) == ["human", "pi", "trained"]
     for found in rows.values():
         assert [tuple(row["seed"]) for row in found] == make_test_seeds(2)
@@ -90,69 +90,76 @@ def test_every_driver_is_evaluated_on_test_seeds(trained: Trained) -> None:
         assert {row["steps"] for row in found} == {100}
 
 
-def test_evaluation_reports_progress(trained: Trained) -> None:
-    ended = {episode for episode, steps in trained.judged if steps == 100}
+def test_evaluation_reports_progress(finished_training: Trained) -> None:
+    ended = {episode for episode, steps in finished_training.judged if steps == 100}
     assert ended == {(driver, index) for driver in ("human", "pi", "trained") for index in (0, 1)}
 
 
-def test_controller_has_the_reported_return(trained: Trained) -> None:
-    scenario, driver = trained.config.make_scenario(), load_controller(trained.result.controller)
-    for seed, row in zip(make_test_seeds(2), trained.result.rows["trained"], strict=True):
+def test_controller_has_the_reported_return(finished_training: Trained) -> None:
+    scenario, driver = finished_training.config.make_scenario(), load_controller(finished_training.result.controller)
+    for seed, row in zip(make_test_seeds(2), finished_training.result.rows["trained"], strict=True):
         (trajectory,) = run_episode(scenario, driver, seed).trajectories
         assert trajectory.reward.sum() == row["return"]
 
 
-def test_gain_is_the_paired_difference_to_the_expert(trained: Trained) -> None:
-    rows = trained.result.rows
+def test_gain_is_the_paired_difference_to_the_expert(finished_training: Trained) -> None:
+    rows = finished_training.result.rows
     differences = [ours["return"] - theirs["return"] for ours, theirs in zip(rows["trained"], rows["pi"], strict=True)]
-    assert trained.result.gain is not None
-    assert trained.result.gain.mean == pytest.approx(np.mean(differences))
-    assert trained.result.gain.count == 2
-    assert (trained.result.gain.smallest, trained.result.gain.largest) == (min(differences), max(differences))
+    assert finished_training.result.gain is not None
+    assert finished_training.result.gain.mean == pytest.approx(np.mean(differences))
+    assert finished_training.result.gain.count == 2
+    assert (finished_training.result.gain.smallest, finished_training.result.gain.largest) == (
+        min(differences),
+        max(differences),
+    )
 
 
-def test_stored_evaluation_equals_the_result(trained: Trained) -> None:
-    results = read_results(trained.result.folder)
+def test_stored_evaluation_equals_the_result(finished_training: Trained) -> None:
+    results = read_results(finished_training.result.folder)
     about = results.metadata
     assert (about["scenario"], about["reward"], about["expert"]) == ("ring", "released", "pi")
     assert results.trained_label == "trained"
-    for driver, rows in trained.result.rows.items():
+    for driver, rows in finished_training.result.rows.items():
         for found, expected in zip(results.rows[driver], rows, strict=True):
             for name in METRICS:
                 assert found[name] == pytest.approx(expected[name], rel=0, abs=0, nan_ok=True), name
-    table = pd.read_parquet(trained.result.folder / "episodes.parquet")
+    table = pd.read_parquet(finished_training.result.folder / "episodes.parquet")
     assert table.groupby("driver").size().to_dict() == {"human": 2, "pi": 2, "trained": 2}
-    assert table["return"].tolist() == [row["return"] for rows in trained.result.rows.values() for row in rows]
+    assert table["return"].tolist() == [
+        row["return"] for rows in finished_training.result.rows.values() for row in rows
+    ]
 
 
-def test_plot_episode_is_the_first_of_each_driver(trained: Trained) -> None:
-    shown = read_results(trained.result.folder).plot_episodes
+def test_plot_episode_is_the_first_of_each_driver(finished_training: Trained) -> None:
+    shown = read_results(finished_training.result.folder).plot_episodes
     assert list(shown) == ["human", "pi", "trained"]
     expected = run_episode(
-        trained.config.make_scenario(), load_controller(trained.result.controller), make_test_seeds(1)[0]
+        finished_training.config.make_scenario(),
+        load_controller(finished_training.result.controller),
+        make_test_seeds(1)[0],
     )
     np.testing.assert_array_equal(shown["trained"].speeds, expected.speeds.astype(np.float32))
     assert shown["trained"].speeds.shape == (101, 8)
 
 
-def test_report_has_the_run(trained: Trained) -> None:
-    page = trained.result.report.read_text()
+def test_report_has_the_run(finished_training: Trained) -> None:
+    page = finished_training.result.report.read_text()
     assert page.lower().startswith("<!doctype html>")
     assert "trained" in page
     assert len(page) > 20_000
 
 
 @pytest.mark.slow
-def test_finished_run_resumes_with_a_larger_budget(trained: Trained, tmp_path: Path) -> None:
-    folder, longer = tmp_path / "run", replace(trained.config, steps=3 * STEPS)
-    shutil.copytree(trained.result.folder, folder)
+def test_finished_run_resumes_with_a_larger_budget(finished_training: Trained, tmp_path: Path) -> None:
+    folder, longer = tmp_path / "run", replace(finished_training.config, steps=3 * STEPS)
+    shutil.copytree(finished_training.result.folder, folder)
     result = train(longer, folder, resume=True)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "one go", longer)
     assert outcome(folder) == outcome(tmp_path / "one go")
     assert read_config(folder) == longer
     assert {path.name for path in folder.iterdir()} == CONTENT
-    assert same_rows(result.rows["pi"], trained.result.rows["pi"])
+    assert same_rows(result.rows["pi"], finished_training.result.rows["pi"])
 
 
 def same_rows(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> bool:

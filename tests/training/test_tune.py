@@ -1,4 +1,4 @@
-"""Does tuning find better settings with the steps it has, and write what every verb can drive?"""
+"""Tuning finds better parameters within its step budget, and writes a controller that every command accepts."""
 
 import json
 from dataclasses import replace
@@ -97,7 +97,7 @@ def test_interrupted_tuning_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert len(json.loads((folder / TUNING_FILE).read_text())["manifest"]["starts"]) == 2
         with pytest.raises(InputError, match="was made with other settings"):
             tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers, seed=1)
-    assert tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).best == whole.best  # nobody drives
+    assert tune({"ring": SMALL}, "pi", SPACE, STEPS, folder, workers).best == whole.best  # no episode runs
 
 
 @pytest.mark.slow
@@ -154,7 +154,7 @@ def test_default_space_has_numbers_words_and_booleans() -> None:
     assert first == NumericRange(0, 4)
     assert isinstance(first, NumericRange)
     assert first.is_integer
-    for name in ("human", "nobody"):
+    for name in ("human", "nonesuch"):
         with pytest.raises(InputError):
             default_search_space(name, 0.1)
 

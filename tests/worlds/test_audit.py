@@ -1,4 +1,4 @@
-"""Does the audit see what a stopwatch and a ruler would?"""
+"""The audit equals values that are computed independently from positions and speeds."""
 
 import numpy as np
 import pytest

@@ -31,7 +31,7 @@ def fingerprint(value: Any) -> Any:
     return repr(value)
 
 
-def travelled(episode: Episode) -> Episode:
+def serialize_and_restore(episode: Episode) -> Episode:
     pipe = BytesIO()
     write_message(pipe, *pack(episode))
     pipe.seek(0)
@@ -62,7 +62,7 @@ def test_fingerprints_differ_in_the_last_bit_of_any_array() -> None:
 def test_an_episode_arrives_as_it_was_sent(scenario: Ring, driver: Driver, sumo: SumoBackend) -> None:
     episode = run_episode(scenario, driver, (1, 2), explore=True, record_details=scenario.cavs == 3, backend=sumo)
     assert len(episode.trajectories) == scenario.cavs
-    assert fingerprint(travelled(episode)) == fingerprint(episode)
+    assert fingerprint(serialize_and_restore(episode)) == fingerprint(episode)
 
 
 def test_nan_and_infinity_arrive() -> None:
@@ -73,12 +73,12 @@ def test_nan_and_infinity_arrive() -> None:
         limit_speed=float("inf"),
         drawn_values={"length": float("nan")},
     )
-    assert fingerprint(travelled(episode)) == fingerprint(episode)
+    assert fingerprint(serialize_and_restore(episode)) == fingerprint(episode)
 
 
 def test_a_failed_episode_arrives_with_its_reason() -> None:
     episode = failed_episode((3, 4), "lost the map: 'Straße'\nline 2", "InputError")
-    arrived = travelled(episode)
+    arrived = serialize_and_restore(episode)
     assert fingerprint(arrived) == fingerprint(episode)
     assert (arrived.status, arrived.has_run, arrived.control_steps) == ("failed", False, 0)
     assert (arrived.seed, arrived.error) == ((3, 4), "InputError")

@@ -230,7 +230,7 @@ def test_a_reward_that_is_one_array_is_one_term(tmp_path: Path) -> None:
     [
         ("not_callable", "mine.py:not_callable: is not a function of an Outcome"),
         ("Keeper", "mine.py:Keeper: is not a function of an Outcome"),
-        ("nobody", "mine.py: has no 'nobody'; it has: .*calm"),
+        ("nonesuch", "mine.py: has no 'nonesuch'; it has: .*calm"),
     ],
 )
 def test_objects_that_are_not_rewards_are_refused(name: str, words: str, my_drivers: Path) -> None:

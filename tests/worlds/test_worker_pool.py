@@ -98,7 +98,7 @@ def workers() -> Iterator[WorkerPool]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed() -> list[Any]:
+def undisturbed_results() -> list[Any]:
     return [fingerprint(run_episode(LONG, PISaturation(), (seed,))) for seed in range(2)]
 
 
@@ -197,7 +197,7 @@ def test_progress_is_reported_for_each_task() -> None:
     [signal.SIGKILL, *(pytest.param(other, marks=pytest.mark.slow) for other in (signal.SIGSEGV, signal.SIGSTOP))],
 )
 def test_an_episode_whose_worker_is_lost_is_repeated_to_the_same_bytes(
-    how: signal.Signals, undisturbed: list[Any]
+    how: signal.Signals, undisturbed_results: list[Any]
 ) -> None:
     disturbed: list[int] = []
     with WorkerPool(1, timeout=3.0) as workers:
@@ -213,11 +213,11 @@ def test_an_episode_whose_worker_is_lost_is_repeated_to_the_same_bytes(
         assert len(disturbed) == 1
         assert not is_running(disturbed[0])
         assert processes(workers) != disturbed
-    assert fingerprint(found) == undisturbed[0]
+    assert fingerprint(found) == undisturbed_results[0]
 
 
 @pytest.mark.slow
-def test_losing_worker_after_worker_changes_nothing(undisturbed: list[Any]) -> None:
+def test_losing_worker_after_worker_changes_nothing(undisturbed_results: list[Any]) -> None:
     killed: list[int] = []
     one_at_a_time = threading.Lock()
     with WorkerPool(2) as workers:
@@ -230,7 +230,7 @@ def test_losing_worker_after_worker_changes_nothing(undisturbed: list[Any]) -> N
 
         found = workers.run([EpisodeTask(LONG, PISaturation(), (seed,)) for seed in range(2)], kill_two)
     assert len(killed) == 2
-    assert [fingerprint(episode) for episode in found] == undisturbed
+    assert [fingerprint(episode) for episode in found] == undisturbed_results
 
 
 def test_an_idle_worker_that_is_lost_is_replaced(workers: WorkerPool) -> None:

@@ -1,4 +1,4 @@
-"""What a batch makes of each moment of a figure eight in SUMO, beside what SUMO made of it."""
+"""One step of a batch from each step of a figure eight in SUMO, compared with the next step of SUMO."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Does a batch of figures eight do what SUMO's episodes do, step by step and in the mean?"""
+"""A batch of figure eights agrees with SUMO's episodes, step by step and in the mean."""
 
 from dataclasses import replace
 from typing import Any, cast
@@ -26,7 +26,7 @@ from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask
 
 SHORT = FigureEight(horizon=300)
-"""those who must yield have waited for some, gone before others, and stood"""
+"""vehicles that must yield have waited for some vehicles, gone before others, and stood"""
 
 
 def tasks(eight: FigureEight, expert: str, seeds: range) -> list[EpisodeTask]:
@@ -34,12 +34,12 @@ def tasks(eight: FigureEight, expert: str, seeds: range) -> list[EpisodeTask]:
 
 
 EIGHTS: dict[str, tuple[FigureEight, str, int]] = {
-    "people alone": (SHORT, "human", 170),
+    "human-only traffic": (SHORT, "human", 170),
     "a CAV": (SHORT, "pi", 300),
     "three CAVs": (replace(SHORT, cavs=3), "pi", 300),
     "a CAV after a warm-up": (replace(SHORT, warmup=130, horizon=150), "idm", 40),
     "few on a small one": (replace(SHORT, vehicles=6, radius=(30, 31)), "idm", 60),
-    "patient people": (replace(SHORT, impatience=0.0), "pi", 80),
+    "patient human drivers": (replace(SHORT, impatience=0.0), "pi", 80),
     "commands that are held": (replace(SHORT, steps_per_control_step=5, horizon=30), "pi", 30),
 }
 """by what is special: road, driver, and for how many decisions it is to be SUMO's"""
@@ -66,7 +66,7 @@ def test_from_each_of_sumos_moments_a_step_is_sumos(expert: str, simulation: Sim
     eight = replace(SHORT, horizon=900)
     found = np.abs(errors(eight, driver_from_name(expert, eight.control_step), 3, simulation))
     assert np.median(found) < 1e-12
-    # Who stands at the line may creep, and where times are equal but for rounding somebody goes a step later.
+    # A vehicle at the stop line may creep, and where times differ only by rounding a vehicle may start a step later.
     assert (found > 1e-6).mean() < 0.02
     assert (found > 1e-4).sum() <= 1
 

@@ -1,4 +1,4 @@
-"""Does a batch of rings do what SUMO's episodes of the same seeds do?"""
+"""A batch of rings equals SUMO's episodes of the same seeds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -44,7 +44,7 @@ WRONG: dict[str, Any] = {
     "sensors": Sensors(gap_error=0.5, speed_error=0.4, dropout=0.2),
     "safety": SafetyFilter(gap_error=0.5, speed_error=0.5),
 }
-QUICK_PEOPLE = replace(SHORT.humans, exponent=3.0, time_headway=1.4, desired_speed=12.0)
+QUICK_HUMANS = replace(SHORT.humans, exponent=3.0, time_headway=1.4, desired_speed=12.0)
 
 
 def tasks(
@@ -65,8 +65,8 @@ def assert_alike(found: Episode, actual: Episode) -> None:
 
 
 RINGS: dict[str, tuple[Ring, str]] = {
-    "people alone": (SHORT, "human"),
-    "people alone after a warm-up": (replace(SHORT, warmup=130), "human"),
+    "human-only traffic": (SHORT, "human"),
+    "human-only traffic after a warm-up": (replace(SHORT, warmup=130), "human"),
     "a CAV": (SHORT, "pi"),
     "a CAV after a warm-up": (replace(SHORT, warmup=750), "pi"),
     "a CAV that forgets the warm-up": (replace(SHORT, warmup=130, remember_warmup=False), "pi"),
@@ -76,7 +76,7 @@ RINGS: dict[str, tuple[Ring, str]] = {
     "a tiny ring": (Ring(length=(24, 28), vehicles=3, horizon=300), "pi"),
     "a long ring": (Ring(length=(500, 560), vehicles=50, cavs=5, horizon=300), "pi"),
     "a ring with few": (Ring(length=(300, 400), vehicles=2, horizon=300), "pi"),
-    "a wide ring, where people see past the car ahead": (Ring(length=(800, 900), horizon=300), "pi"),
+    "a wide ring, where human drivers observe beyond the leader": (Ring(length=(800, 900), horizon=300), "pi"),
     "commands that are held": (replace(SHORT, steps_per_control_step=5, horizon=80, warmup=52), "pi"),
     "a coarser step": (replace(SHORT, simulation_step=0.3), "pi"),
     "the paper's PI": (SHORT, "pi:time_constant=0"),
@@ -87,13 +87,13 @@ RINGS: dict[str, tuple[Ring, str]] = {
         "idm",
     ),
     "raw": (replace(SHORT, actuation="raw", safety=NO_FILTER), "pi"),
-    "wild people": (replace(SHORT, noise=10.0), "pi"),
-    "people who brake as hard as they can": (replace(SHORT, noise=20.0), "human"),
-    "people faster than they want": (
+    "human drivers with much noise": (replace(SHORT, noise=10.0), "pi"),
+    "human drivers that brake as hard as they can": (replace(SHORT, noise=20.0), "human"),
+    "human drivers above their desired speed": (
         Ring(length=(400, 400), vehicles=12, horizon=300, humans=replace(SHORT.humans, desired_speed=3.0)),
         "human",
     ),
-    "people faster than they want who brake gently": (
+    "human drivers above their desired speed that brake gently": (
         Ring(
             length=(400, 400),
             vehicles=12,
@@ -102,14 +102,14 @@ RINGS: dict[str, tuple[Ring, str]] = {
         ),
         "human",
     ),
-    "calm people": (replace(SHORT, noise=0.0), "pi"),
-    "people of another kind": (replace(SHORT, humans=QUICK_PEOPLE), "pi"),
+    "human drivers without noise": (replace(SHORT, noise=0.0), "pi"),
+    "other human drivers": (replace(SHORT, humans=QUICK_HUMANS), "pi"),
 }
 
 
 @dataclass(frozen=True)
 class ByShare(Driver):
-    """Brakes by the share of CAVs that it is told."""
+    """Brakes by the penetration rate that it receives."""
 
     required_fields: ClassVar[tuple[str, ...]] = ("penetration_rate",)
 
@@ -139,7 +139,7 @@ def test_a_ring_of_the_batch_is_sumos_of_the_same_seed(name: str, sumo: SumoBack
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["people alone after a warm-up", "a CAV after a warm-up", "wrong sensors"])
+@pytest.mark.parametrize("name", ["human-only traffic after a warm-up", "a CAV after a warm-up", "wrong sensors"])
 def test_a_ring_that_was_warmed_up_with_others_goes_on_to_the_same_bits(name: str) -> None:
     ring, expert = RINGS[name]
     now, coming = (tasks(ring, driver_from_name(expert, 0.1), seeds) for seeds in ((1, 2), (3, 4, 5)))
@@ -314,8 +314,8 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
     cav = episodes[0].vehicle_ids.index("cav_0")
     added = np.array(noise)
     assert np.abs(added[:, :, cav]).max() < 1e-3
-    people = np.delete(added, cav, axis=2)
-    assert people.std() == pytest.approx(ring.noise_per_step * ring.simulation_step, rel=0.05)
+    human_changes = np.delete(added, cav, axis=2)
+    assert human_changes.std() == pytest.approx(ring.noise_per_step * ring.simulation_step, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -383,7 +383,7 @@ def test_rings_of_many_kinds_come_back_in_their_order() -> None:
         EpisodeTask(replace(SHORT, cavs=2), pi, (2,)),
         EpisodeTask(SHORT.stratum(0, 2), pi, (3,)),
         EpisodeTask(SHORT.stratum(0, 2), idm, (4,)),
-        EpisodeTask(replace(SHORT, vehicles=40, length=(400, 480)), pi, (5,)),  # who do not fit on the others
+        EpisodeTask(replace(SHORT, vehicles=40, length=(400, 480)), pi, (5,)),  # they do not fit on the other roads
     ]
     found = run_batches(asked)
     assert [episode.seed for episode in found] == [(1,), (2,), (3,), (4,), (5,)]

@@ -1,4 +1,4 @@
-"""The figure eight on the actual simulator."""
+"""The figure eight in SUMO."""
 
 from dataclasses import replace
 from typing import Any
@@ -22,7 +22,7 @@ from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 SEEDS = 5
-FLOW = {
+FLOW_SPEEDS = {
     # (driver, radius): mean speed of all vehicles in the first 1,500 steps, measured with Flow on SUMO 1.28
     ("human", 32): 6.02,
     ("human", 35): 6.34,
@@ -37,14 +37,14 @@ DRIVERS = {"human": Human(), "pi": PISaturation(time_constant=0.0)}
 def test_agrees_with_flow_within_six_percent_without_collision() -> None:
     tasks = [
         EpisodeTask(replace(AS_FLOW, radius=(radius, radius)), DRIVERS[driver], (seed,))
-        for driver, radius in FLOW
+        for driver, radius in FLOW_SPEEDS
         for seed in range(SEEDS)
     ]
     with WorkerPool(2) as workers:
         episodes = workers.run(tasks)
     assert all(episode.status == "completed" for episode in episodes)
     speeds = np.array([measure(episode)["mean_speed"] for episode in episodes]).reshape(-1, SEEDS).mean(1)
-    np.testing.assert_allclose(speeds, list(FLOW.values()), rtol=0.06)
+    np.testing.assert_allclose(speeds, list(FLOW_SPEEDS.values()), rtol=0.06)
 
 
 def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
@@ -68,42 +68,42 @@ def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
 @pytest.mark.parametrize("cavs", [2, 7, 14])
 def test_several_cavs_are_driven_and_recorded_separately(cavs: int, sumo: SumoBackend) -> None:
     road = replace(AS_FLOW, cavs=cavs, horizon=300)
-    episode = run_episode(road, ByRow(), (1,), backend=sumo)
+    episode = run_episode(road, AccelerationByRow(), (1,), backend=sumo)
     assert (episode.status, len(episode.trajectories)) == ("completed", cavs)
     assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids
     for row, trajectory in enumerate(episode.trajectories):
-        place = episode.vehicle_ids.index(trajectory.vehicle)
+        position = episode.vehicle_ids.index(trajectory.vehicle)
         states = trajectory.states
-        np.testing.assert_array_equal(states.speed, episode.speeds[:, place])
-        np.testing.assert_array_equal(states.leader_speed, episode.speeds[:, (place + 1) % 14])
-        np.testing.assert_array_equal(states.follower_gap, episode.gaps[:, (place - 1) % 14])
+        np.testing.assert_array_equal(states.speed, episode.speeds[:, position])
+        np.testing.assert_array_equal(states.leader_speed, episode.speeds[:, (position + 1) % 14])
+        np.testing.assert_array_equal(states.follower_gap, episode.gaps[:, (position - 1) % 14])
         np.testing.assert_allclose(
             trajectory.applied_acceleration, 0.1 + 0.02 * row + 0.001 * np.arange(300), atol=1e-12
         )
-        wanted = np.maximum(states.speed[:-1] + 0.1 * trajectory.applied_acceleration, 0.0)
-        np.testing.assert_allclose(states.speed[1:], wanted - 0.1 * trajectory.shield_braking, atol=1e-9)
+        commanded_speed = np.maximum(states.speed[:-1] + 0.1 * trajectory.applied_acceleration, 0.0)
+        np.testing.assert_allclose(states.speed[1:], commanded_speed - 0.1 * trajectory.shield_braking, atol=1e-9)
 
 
-class ByRow(Driver):
-    """Each CAV pushes a little harder than the one before it, and all harder with time."""
+class AccelerationByRow(Driver):
+    """A driver with an acceleration that increases with the row of the CAV and with time."""
 
     def initial_memory(self, n: int) -> Memory:
         return {"decisions": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
-        push = 0.1 + 0.02 * np.arange(len(state.speed)) + 0.001 * memory["decisions"]
-        return push, {"decisions": memory["decisions"] + 1.0}
+        acceleration = 0.1 + 0.02 * np.arange(len(state.speed)) + 0.001 * memory["decisions"]
+        return acceleration, {"decisions": memory["decisions"] + 1.0}
 
 
 def test_vehicles_from_the_right_yield(sumo: SumoBackend) -> None:
     """Vehicles stand before the crossing on the yielding approach, and never on the other one."""
     episode = run_episode(FigureEight(radius=(32, 32)), Human(), (0,), backend=sumo)
     road = FigureEight(radius=(32, 32)).draw(np.random.default_rng(0))
-    place = episode.positions % road.loop_length
+    position = episode.positions % road.loop_length
     standing = episode.speeds < 0.1
     for (start, _), expected in zip(road.crossings, (False, True), strict=True):
-        at_the_line = (place > start - 3) & (place <= start)
-        assert bool((standing & at_the_line)[50:].any()) is expected
+        is_at_stop_line = (position > start - 3) & (position <= start)
+        assert bool((standing & is_at_stop_line)[50:].any()) is expected
 
 
 def test_sumo_drives_human_driven_vehicles_on_the_crossing(
@@ -111,31 +111,33 @@ def test_sumo_drives_human_driven_vehicles_on_the_crossing(
 ) -> None:
     traffic = make_traffic(FigureEight(radius=(32, 32)), (0,), simulation)
     assert isinstance(traffic, ClosedTraffic)
-    asked: list[tuple[str, float]] = []
-    monkeypatch.setattr(simulation, "command_speeds", lambda ids, speeds: asked.extend(zip(ids, speeds, strict=True)))
+    commands: list[tuple[str, float]] = []
+    monkeypatch.setattr(
+        simulation, "command_speeds", lambda ids, speeds: commands.extend(zip(ids, speeds, strict=True))
+    )
     traffic.start(is_controlled=False)
     for _ in range(200):
-        asked.clear()
-        place = np.array(list(traffic._tracked_positions.values())) % traffic.road.loop_length
+        commands.clear()
+        position = np.array(list(traffic._tracked_positions.values())) % traffic.road.loop_length
         traffic.advance(None)
-        for row, (_, speed) in enumerate(asked):
-            inside = any(start <= place[row] < end for start, end in traffic.road.crossings)
-            assert (speed == -1.0) == inside
-            assert inside or speed >= 0.0
+        for row, (_, speed) in enumerate(commands):
+            is_on_crossing = any(start <= position[row] < end for start, end in traffic.road.crossings)
+            assert (speed == -1.0) == is_on_crossing
+            assert is_on_crossing or speed >= 0.0
 
 
-def slowly(*values: object) -> Any:
+def slow_case(*values: object) -> Any:
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
     ("driver", "radius", "speed"),
     [
-        slowly(Pacer(), 32, 5.8),
-        slowly(Pacer(), 35, 6.2),
-        slowly(Pacer(use_tuned=True), 32, 6.8),
-        slowly(Pacer(use_tuned=True), 33, 6.8),
-        slowly(Pacer(use_tuned=True), 34, 6.9),
+        slow_case(Pacer(), 32, 5.8),
+        slow_case(Pacer(), 35, 6.2),
+        slow_case(Pacer(use_tuned=True), 32, 6.8),
+        slow_case(Pacer(use_tuned=True), 33, 6.8),
+        slow_case(Pacer(use_tuned=True), 34, 6.9),
         (Pacer(use_tuned=True), 35, 7.2),
     ],
 )

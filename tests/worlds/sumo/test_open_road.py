@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import random_network
-from tests.worlds.test_record import fingerprint, travelled
+from tests.worlds.test_record import fingerprint, serialize_and_restore
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
 from unjam.drivers.command import Command
 from unjam.drivers.observation import local_observation
@@ -43,53 +43,55 @@ def expected_of_counting(trajectory: Trajectory) -> Any:
 
 
 @pytest.fixture(scope="module")
-def counted() -> Episode:
+def counted_episode() -> Episode:
     return run_episode(MERGE, Counting(), (2,))
 
 
-def test_each_cav_has_its_own_memory_from_its_entry(counted: Episode) -> None:
-    assert len(counted.trajectories) > 12
-    for trajectory in counted.trajectories:
+def test_each_cav_has_its_own_memory_from_its_entry(counted_episode: Episode) -> None:
+    assert len(counted_episode.trajectories) > 12
+    for trajectory in counted_episode.trajectories:
         np.testing.assert_allclose(
             trajectory.applied_acceleration, expected_of_counting(trajectory), rtol=0, atol=1e-12
         )
 
 
-def test_cavs_enter_and_leave_during_the_episode(counted: Episode) -> None:
-    stays = [(each.start_step, each.start_step + len(each.applied_acceleration)) for each in counted.trajectories]
+def test_cavs_enter_and_leave_during_the_episode(counted_episode: Episode) -> None:
+    stays = [
+        (each.start_step, each.start_step + len(each.applied_acceleration)) for each in counted_episode.trajectories
+    ]
     assert len({start for start, _ in stays}) > 10
     assert sum(end < 120 for _, end in stays) > 3
     assert sum(end == 120 for _, end in stays) > 3
     assert [start for start, _ in stays] == sorted(start for start, _ in stays)
 
 
-def test_each_trip_of_a_cav_is_one_trajectory_with_its_records(counted: Episode) -> None:
-    assert len({each.vehicle for each in counted.trajectories}) == len(counted.trajectories)
-    assert counted.cav_ids == tuple(each.vehicle for each in counted.trajectories)
-    for trajectory in counted.trajectories:
-        column = counted.vehicle_ids.index(trajectory.vehicle)
+def test_each_trip_of_a_cav_is_one_trajectory_with_its_records(counted_episode: Episode) -> None:
+    assert len({each.vehicle for each in counted_episode.trajectories}) == len(counted_episode.trajectories)
+    assert counted_episode.cav_ids == tuple(each.vehicle for each in counted_episode.trajectories)
+    for trajectory in counted_episode.trajectories:
+        column = counted_episode.vehicle_ids.index(trajectory.vehicle)
         start, end = trajectory.start_step, trajectory.start_step + len(trajectory.applied_acceleration)
-        speeds = counted.speeds[:, column]
+        speeds = counted_episode.speeds[:, column]
         there = np.flatnonzero(~np.isnan(speeds))
         assert there.tolist() == list(range(start, end + 1))
         states = trajectory.states
         np.testing.assert_array_equal(states.speed, speeds[start : end + 1])
-        np.testing.assert_array_equal(states.leader_gap, counted.gaps[start : end + 1, column])
-        np.testing.assert_array_equal(states.route_position, counted.positions[start : end + 1, column])
+        np.testing.assert_array_equal(states.leader_gap, counted_episode.gaps[start : end + 1, column])
+        np.testing.assert_array_equal(states.route_position, counted_episode.positions[start : end + 1, column])
         assert np.isnan(states.loop_length).all()
         assert not trajectory.terminated
         for name, values in trajectory.reward_terms.items():
-            np.testing.assert_array_equal(values, counted.reward_terms[name][start:end])
+            np.testing.assert_array_equal(values, counted_episode.reward_terms[name][start:end])
 
 
-def test_leader_and_follower_of_a_trip_are_as_recorded(counted: Episode) -> None:
+def test_leader_and_follower_of_a_trip_are_as_recorded(counted_episode: Episode) -> None:
     seen = 0
-    for trajectory in counted.trajectories:
-        column = counted.vehicle_ids.index(trajectory.vehicle)
+    for trajectory in counted_episode.trajectories:
+        column = counted_episode.vehicle_ids.index(trajectory.vehicle)
         for moment in range(len(trajectory.applied_acceleration) + 1):
             row = trajectory.start_step + moment
-            own, others = counted.positions[row, column], np.delete(counted.positions[row], column)
-            speeds = np.delete(counted.speeds[row], column)
+            own, others = counted_episode.positions[row, column], np.delete(counted_episode.positions[row], column)
+            speeds = np.delete(counted_episode.speeds[row], column)
             states = trajectory.states.select(moment)
             for gap, speed, place in (
                 (states.leader_gap, states.leader_speed, own + 5.0 + states.leader_gap),
@@ -104,8 +106,8 @@ def test_leader_and_follower_of_a_trip_are_as_recorded(counted: Episode) -> None
     assert seen > 1000
 
 
-def test_commands_are_carried_out_unless_the_shield_brakes(counted: Episode) -> None:
-    for trajectory in counted.trajectories:
+def test_commands_are_carried_out_unless_the_shield_brakes(counted_episode: Episode) -> None:
+    for trajectory in counted_episode.trajectories:
         speed, free = trajectory.states.speed, trajectory.shield_braking < 1e-9
         expected = np.maximum(speed[:-1] + trajectory.applied_acceleration, 0.0)  # five steps of 0.2 s
         calm = free & (expected < 29.0) & (speed[:-1] > 1.0)
@@ -127,7 +129,7 @@ def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(sumo: Sumo
     again = [run_episode(task.scenario, task.driver, task.seed, explore=task.explore, backend=sumo) for task in tasks]
     assert [fingerprint(episode) for episode in again] == [fingerprint(episode) for episode in here]
     assert found == [fingerprint(here[0]), fingerprint(here[2])]
-    assert [fingerprint(travelled(episode)) for episode in here] == [fingerprint(each) for each in here]
+    assert [fingerprint(serialize_and_restore(episode)) for episode in here] == [fingerprint(each) for each in here]
 
 
 def test_the_same_vehicles_are_cavs_for_every_driver(sumo: SumoBackend) -> None:

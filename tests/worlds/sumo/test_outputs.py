@@ -1,4 +1,4 @@
-"""Are SUMO's warnings read from its log: each kind once, counted, and without those that unjam counts?"""
+"""SUMO's warnings are read from its log: each kind once, with its count, without those that unjam counts itself."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Does the filter alone keep CAVs safe in SUMO without SUMO's safety check?"""
+"""The safety filter alone keeps CAVs safe in SUMO without SUMO's safety check."""
 
 from dataclasses import replace
 
@@ -35,10 +35,10 @@ def test_a_reckless_driver_has_no_contact_on_any_ring(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("late", [Actuator(), Actuator(lag=0.3, delay=0.2)], ids=["at once", "late"])
-def test_there_is_no_contact_with_noisy_sensors_and_missing_readings(late: Actuator, sumo: SumoBackend) -> None:
-    sensors, knows = Sensors(0.5, 0.5, dropout=0.3), SafetyFilter(gap_error=0.5, speed_error=0.5)
-    ring = replace(RAW, cavs=2, sensors=sensors, safety=knows, actuator=late)
+@pytest.mark.parametrize("actuator", [Actuator(), Actuator(lag=0.3, delay=0.2)], ids=["at once", "late"])
+def test_there_is_no_contact_with_noisy_sensors_and_missing_readings(actuator: Actuator, sumo: SumoBackend) -> None:
+    sensors, safety = Sensors(0.5, 0.5, dropout=0.3), SafetyFilter(gap_error=0.5, speed_error=0.5)
+    ring = replace(RAW, cavs=2, sensors=sensors, safety=safety, actuator=actuator)
     episode = run_episode(ring, Constant(1.0), (3,), backend=sumo)
     row = measure(episode)
     assert (row["status"], row["collisions"], row["feasibility"]) == ("completed", 0.0, FEASIBLE)
@@ -56,8 +56,8 @@ def test_the_command_is_the_output_of_the_filter(sumo: SumoBackend) -> None:
 
 
 def test_every_simulation_step_of_a_control_step_is_filtered(sumo: SumoBackend) -> None:
-    held = replace(RAW, steps_per_control_step=10, horizon=150)
-    episode = run_episode(held, Constant(1.0), (0,), backend=sumo)
+    ring = replace(RAW, steps_per_control_step=10, horizon=150)
+    episode = run_episode(ring, Constant(1.0), (0,), backend=sumo)
     assert episode.audit.following.min_time_gap > 1.0
     assert measure(episode)["feasibility"] == FEASIBLE
 
@@ -69,10 +69,10 @@ def test_sumo_overrides_no_command_in_following(road: Scenario, driver: Driver, 
 
 
 def test_yielding_on_the_figure_eight_is_counted_separately(sumo: SumoBackend) -> None:
-    found = run_episode(FigureEight(), PISaturation(catch_up_speed=8.0), (1,), backend=sumo)
-    followed = found.audit.following
-    assert followed.override_share == 0.0
-    assert followed.yield_share == pytest.approx((found.trajectories[0].shield_braking > 1e-5).mean())
+    episode = run_episode(FigureEight(), PISaturation(catch_up_speed=8.0), (1,), backend=sumo)
+    statistics = episode.audit.following
+    assert statistics.override_share == 0.0
+    assert statistics.yield_share == pytest.approx((episode.trajectories[0].shield_braking > 1e-5).mean())
 
 
 @pytest.mark.long
@@ -81,12 +81,12 @@ def test_human_braking_on_the_published_merge_is_infeasible_and_elsewhere_feasib
     assert measure(published)["feasibility"] not in ("", FEASIBLE)
     assert published.audit.human_braking.max_braking > 9.0
     bounded = Merge(safety=SafetyFilter(), enforce_human_limits=True, right_of_way=True)
-    honest = run_episode(bounded, IDM(), (0,), backend=sumo)
-    assert honest.audit.human_braking.max_braking < published.audit.human_braking.max_braking
+    bounded_episode = run_episode(bounded, IDM(), (0,), backend=sumo)
+    assert bounded_episode.audit.human_braking.max_braking < published.audit.human_braking.max_braking
 
 
 def test_the_required_time_gap_is_kept_and_may_be_zero(sumo: SumoBackend) -> None:
-    for floor in (0.0, 1.5):
-        ring = replace(RAW, warmup=0, safety=SafetyFilter(time_gap=floor))
-        headway = run_episode(ring, Constant(1.0), (0,), backend=sumo).audit.following.min_time_gap
-        assert headway > 1.5 if floor else headway < 1.0
+    for time_gap in (0.0, 1.5):
+        ring = replace(RAW, warmup=0, safety=SafetyFilter(time_gap=time_gap))
+        min_time_gap = run_episode(ring, Constant(1.0), (0,), backend=sumo).audit.following.min_time_gap
+        assert min_time_gap > 1.5 if time_gap else min_time_gap < 1.0

@@ -1,4 +1,4 @@
-"""Is the human baseline on a network of the user's own what SUMO alone makes of the same files?"""
+"""The human baseline on a user's network equals plain SUMO with the same files."""
 
 import gzip
 import subprocess

@@ -1,4 +1,4 @@
-"""Do the sections of a user's network say how fast the lanes ahead are?"""
+"""Sections of a user's network measure the speeds of the lanes ahead."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +44,7 @@ def sections() -> LaneSections:
     return LaneSections(simulation)
 
 
-def numbered(sections: LaneSections) -> dict[int, str]:
+def section_numbers(sections: LaneSections) -> dict[int, str]:
     """The lane of each section."""
     cells = [lane for lane in LANES for _ in range(int(np.ceil(lane.length / 100)))]
     assert len(cells) == len(sections.speed_limits)
@@ -60,7 +60,7 @@ def test_vehicles_are_counted_in_the_sections_of_their_lanes_and_not_in_junction
 
 
 def test_the_sections_ahead_follow_the_lanes_of_the_route(sections: LaneSections) -> None:
-    names = numbered(sections)
+    names = section_numbers(sections)
     ahead = sections.sections_ahead("a_1", 20.0, ("a", "b"))
     assert [names[each] for each in ahead] == ["a_1"] * 2 + ["b_1"] * 4 + [""] * (SECTIONS_AHEAD - 6)
     assert len(set(ahead)) == 7
@@ -71,7 +71,7 @@ def test_the_lanes_of_an_edge_share_their_cross_sections(sections: LaneSections)
     assert sections.cross_sections.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 7]
 
 
-def monitored(length: float, *, stop_line: bool) -> list[bool]:
+def congestion_states(length: float, *, stop_line: bool) -> list[bool]:
     """Of two lanes of 600 m and of a `length`, one after the other: which sections are monitored."""
     lanes = [NetworkLane("a_0", "a", 600.0, 20.0, ("b_0",)), NetworkLane("b_0", "b", length, 20.0, (), stop_line)]
     simulation: Any = SimpleNamespace(lanes=lambda: lanes)
@@ -79,14 +79,14 @@ def monitored(length: float, *, stop_line: bool) -> list[bool]:
 
 
 def test_no_congestion_is_reported_within_queue_length_of_a_stop_line() -> None:
-    assert monitored(600.0, stop_line=False) == [True] * 12
-    assert monitored(600.0, stop_line=True) == [True] * 2 + [False] * 10
-    assert monitored(1200.0, stop_line=True) == [True] * 8 + [False] * 10
+    assert congestion_states(600.0, stop_line=False) == [True] * 12
+    assert congestion_states(600.0, stop_line=True) == [True] * 2 + [False] * 10
+    assert congestion_states(1200.0, stop_line=True) == [True] * 8 + [False] * 10
 
 
 def test_no_congestion_is_reported_of_a_short_section() -> None:
-    assert monitored(649.0, stop_line=False) == [True] * 12 + [False]
-    assert monitored(651.0, stop_line=False) == [True] * 13
+    assert congestion_states(649.0, stop_line=False) == [True] * 12 + [False]
+    assert congestion_states(651.0, stop_line=False) == [True] * 13
 
 
 @pytest.mark.parametrize("kind", ["traffic_light", "priority", "right_before_left"])
@@ -103,12 +103,12 @@ def test_a_motorway_is_monitored_where_ramps_join_and_leave(tmp_path: Path, simu
 
 
 def test_sections_ahead_switch_to_the_adjacent_lane_of_the_route(sections: LaneSections) -> None:
-    names = numbered(sections)
+    names = section_numbers(sections)
     assert [names[each] for each in sections.sections_ahead("a_1", 240.0, ("a", "ramp"))][:2] == ["a_1", "ramp_0"]
 
 
 @pytest.fixture
-def jammed(tmp_path: Path) -> Any:
+def jammed_network(tmp_path: Path) -> Any:
     changes = {"cav_types": ("car",), "horizon": 50, "actuation": "cruise", "safety.active": False}
     return make_scenario(str(straight(tmp_path, JAM)), changes)
 
@@ -120,8 +120,8 @@ def roadside_state(scenario: Any, simulation: Simulation) -> tuple[UserNetworkTr
     return traffic, traffic.local_state()
 
 
-def test_a_cav_observes_the_speed_of_its_lane_ahead(jammed: Any, simulation: Simulation) -> None:
-    _, state = roadside_state(jammed, simulation)
+def test_a_cav_observes_the_speed_of_its_lane_ahead(jammed_network: Any, simulation: Simulation) -> None:
+    _, state = roadside_state(jammed_network, simulation)
     own, van, other = simulation.speeds(["0", "1", "2"])
     expected = [own, 20.0, 20.0, 20.0, (van + other) / 2, *[20.0] * 6]
     assert state.lane_speeds[0].tolist() == pytest.approx(expected)
@@ -129,23 +129,25 @@ def test_a_cav_observes_the_speed_of_its_lane_ahead(jammed: Any, simulation: Sim
     assert state.leader_gap[0] == 100.0, "there is no leader: only the message reports the jam"
 
 
-def test_a_set_speed_cap_does_not_change_the_observed_allowed_speed(jammed: Any, simulation: Simulation) -> None:
-    traffic, _ = roadside_state(jammed, simulation)
+def test_a_set_speed_cap_does_not_change_the_observed_allowed_speed(
+    jammed_network: Any, simulation: Simulation
+) -> None:
+    traffic, _ = roadside_state(jammed_network, simulation)
     simulation.set_max_speed("0", 6.0)
     assert traffic._local_states(["0"]).allowed_speed.tolist() == [20.0]
 
 
-def test_roadside_information_is_only_provided_if_required(jammed: Any, simulation: Simulation) -> None:
-    traffic = make_traffic(jammed, (1,), simulation)
+def test_roadside_information_is_only_provided_if_required(jammed_network: Any, simulation: Simulation) -> None:
+    traffic = make_traffic(jammed_network, (1,), simulation)
     traffic.start(is_controlled=True)
     assert traffic.local_state().lane_speeds is None
 
 
-def test_a_users_function_gets_roadside_information(jammed: Any, sumo: SumoBackend) -> None:
+def test_a_users_function_gets_roadside_information(jammed_network: Any, sumo: SumoBackend) -> None:
     def steady(state: LocalState) -> Any:
         return 0.2 * (state.lane_speeds[:, 4] - state.speed)
 
-    episode = run_episode(jammed, steady, (1,), backend=sumo)
+    episode = run_episode(jammed_network, steady, (1,), backend=sumo)
     assert episode.trajectories[0].states.speed[-1] < 8.0
 
 
@@ -173,16 +175,16 @@ def test_a_cav_slows_down_for_congestion_beyond_its_sensors(tmp_path: Path, sumo
     assert of_acc > 14.0
 
 
-def test_an_episode_that_starts_in_a_jam_has_no_cap(jammed: Any, sumo: SumoBackend) -> None:
+def test_an_episode_that_starts_in_a_jam_has_no_cap(jammed_network: Any, sumo: SumoBackend) -> None:
     first, second = (
-        run_episode(jammed, driver, (1,), backend=sumo).trajectories[0].states
+        run_episode(jammed_network, driver, (1,), backend=sumo).trajectories[0].states
         for driver in (JamAhead(first_section=4, last_section=4, speed_margin=0.0, margin_by_penetration=0.0), Cruise())
     )
     assert first.speed.tolist() == second.speed.tolist()
 
 
-def test_roadside_messages_have_the_configured_latency(jammed: Any, simulation: Simulation) -> None:
-    traffic, first = roadside_state(replace(jammed, roadside=RoadsideSettings(latency=2.0)), simulation)
+def test_roadside_messages_have_the_configured_latency(jammed_network: Any, simulation: Simulation) -> None:
+    traffic, first = roadside_state(replace(jammed_network, roadside=RoadsideSettings(latency=2.0)), simulation)
     for _ in range(10):
         traffic.advance(Command(np.zeros(1)))
     assert traffic.local_state().lane_speeds.tolist() == first.lane_speeds.tolist()

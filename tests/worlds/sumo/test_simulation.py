@@ -185,7 +185,7 @@ def test_libsumo_and_traci_give_identical_episodes() -> None:
 FLOW = '<flow id="f" route="along" end="9" number="3"/>'
 
 
-def broken(folder: Path, network: str, vehicles: str) -> Path:
+def write_broken_network(folder: Path, network: str, vehicles: str) -> Path:
     """A road with a complete network, or without any edge."""
     path = straight(folder, vehicles)
     if network == "hollow":
@@ -205,7 +205,7 @@ def broken(folder: Path, network: str, vehicles: str) -> Path:
 def test_sumos_refusal_of_a_users_network_is_reported_in_one_line_and_the_next_episode_runs(
     network: str, vehicles: str, words: str, tmp_path: Path, sumo: SumoBackend
 ) -> None:
-    scenario = make_scenario(str(broken(tmp_path, network, vehicles)), {"penetration_rate": 1.0})
+    scenario = make_scenario(str(write_broken_network(tmp_path, network, vehicles)), {"penetration_rate": 1.0})
     with pytest.raises(EpisodeError, match=words) as caught:
         run_episode(scenario, IDM(), (0,), backend=sumo)
     assert caught.value.exit_code == 2

@@ -22,7 +22,7 @@ from unjam.worlds.world import DriverLog
 
 
 @pytest.fixture(scope="module")
-def blocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def blocked_network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A van stops at the end of an edge, and others fill the next one; vehicles are teleported after 5 s."""
     folder = tmp_path_factory.mktemp("blocked")
     places = {"a": 0, "b": 200, "c": 240, "d": 540}
@@ -55,7 +55,7 @@ def blocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def driven(simulation: Simulation, file: Path, share: float) -> tuple[Episode, int]:
+def drive_network(simulation: Simulation, file: Path, share: float) -> tuple[Episode, int]:
     """Drive CAVs with 0.3 m/s2 until all have left; the record, and how many SUMO had there in all steps."""
     scenario = make_scenario(str(file), {"penetration_rate": share, "horizon": 400})
     traffic = make_traffic(scenario, (0,), simulation)
@@ -70,9 +70,9 @@ def driven(simulation: Simulation, file: Path, share: float) -> tuple[Episode, i
 
 @pytest.mark.parametrize("share", [1e-9, 1.0])
 def test_teleported_vehicles_count_in_the_backlog_until_they_arrive(
-    share: float, blocked: Path, simulation: Simulation
+    share: float, blocked_network: Path, simulation: Simulation
 ) -> None:
-    episode, count = driven(simulation, blocked, share)
+    episode, count = drive_network(simulation, blocked_network, share)
     assert episode.teleports >= 4
     assert (~np.isnan(episode.speeds[1:])).sum() == count
     assert episode.arrivals == len(episode.vehicle_ids) == 15
@@ -81,8 +81,8 @@ def test_teleported_vehicles_count_in_the_backlog_until_they_arrive(
     assert measure(episode)["teleports"] == episode.teleports
 
 
-def test_a_reinserted_cav_is_driven_again(blocked: Path, simulation: Simulation) -> None:
-    episode, _ = driven(simulation, blocked, 1.0)
+def test_a_reinserted_cav_is_driven_again(blocked_network: Path, simulation: Simulation) -> None:
+    episode, _ = drive_network(simulation, blocked_network, 1.0)
     stays = Counter(each.vehicle for each in episode.trajectories)
     again = [name for name, count in stays.items() if count > 1]
     assert again
@@ -96,9 +96,9 @@ def test_a_reinserted_cav_is_driven_again(blocked: Path, simulation: Simulation)
     assert sum(is_commanded) > 100, "with 0.3 m/s2 for half a second, without a leader"
 
 
-def test_teleports_are_reported(blocked: Path, tmp_path: Path) -> None:
+def test_teleports_are_reported(blocked_network: Path, tmp_path: Path) -> None:
     (note,) = unjam.drive(
-        str(blocked),
+        str(blocked_network),
         ["human"],
         scenario_options={"horizon": 400, "penetration_rate": 0.5},
         workers=1,

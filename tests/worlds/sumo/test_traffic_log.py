@@ -41,7 +41,7 @@ def whole() -> Episode:
 
 
 @pytest.fixture(scope="module")
-def thinned(whole: Episode, small: None) -> Episode:
+def thinned_episode(whole: Episode, small: None) -> Episode:
     return ramp_episode.__wrapped__()
 
 
@@ -82,29 +82,29 @@ def test_every_moment_has_a_snapshot_until_there_are_many() -> None:
     assert log.columns(["", ""]).tolist() == [0, 1]
 
 
-def test_metrics_are_the_same_with_shared_columns(whole: Episode, thinned: Episode) -> None:
-    assert thinned.snapshot_stride > 1
-    assert 0 < thinned.speeds.shape[1] < whole.speeds.shape[1] == len(whole.vehicle_ids)
-    assert (thinned.vehicle_ids, thinned.cav_ids) == (whole.vehicle_ids, whole.cav_ids)
-    column = dict(zip(thinned.vehicle_ids, thinned.vehicle_columns, strict=True))
+def test_metrics_are_the_same_with_shared_columns(whole: Episode, thinned_episode: Episode) -> None:
+    assert thinned_episode.snapshot_stride > 1
+    assert 0 < thinned_episode.speeds.shape[1] < whole.speeds.shape[1] == len(whole.vehicle_ids)
+    assert (thinned_episode.vehicle_ids, thinned_episode.cav_ids) == (whole.vehicle_ids, whole.cav_ids)
+    column = dict(zip(thinned_episode.vehicle_ids, thinned_episode.vehicle_columns, strict=True))
     for number, name in enumerate(whole.vehicle_ids):
         there = ~np.isnan(whole.speeds[:, number])
-        np.testing.assert_array_equal(thinned.speeds[there, column[name]], whole.speeds[there, number])
+        np.testing.assert_array_equal(thinned_episode.speeds[there, column[name]], whole.speeds[there, number])
     cavs = {column[name] for name in whole.cav_ids}
-    assert set(thinned.cav_columns) == cavs
+    assert set(thinned_episode.cav_columns) == cavs
     assert not cavs & {column[name] for name in set(whole.vehicle_ids) - set(whole.cav_ids)}
-    expected, found = measure(whole), measure(thinned)
+    expected, found = measure(whole), measure(thinned_episode)
     for name, value in expected.items():
         close = isinstance(value, float)
         assert found[name] == (pytest.approx(value, nan_ok=True, rel=1e-9) if close else value), name
 
 
-def test_figures_of_thinned_snapshots_show_the_remaining_moments(whole: Episode, thinned: Episode) -> None:
-    every = thinned.snapshot_stride
-    one, other = to_plot_episode("", whole), to_plot_episode("", thinned)
+def test_figures_of_thinned_snapshots_show_the_remaining_moments(whole: Episode, thinned_episode: Episode) -> None:
+    every = thinned_episode.snapshot_stride
+    one, other = to_plot_episode("", whole), to_plot_episode("", thinned_episode)
     assert other.control_step == pytest.approx(one.control_step * every)
     assert len(other.speeds) == len(other.positions) == len(other.backlog) == len(one.speeds[::every])
-    column = dict(zip(thinned.vehicle_ids, thinned.vehicle_columns, strict=True))
+    column = dict(zip(thinned_episode.vehicle_ids, thinned_episode.vehicle_columns, strict=True))
     for number, name in enumerate(whole.vehicle_ids):
         there = ~np.isnan(whole.speeds[::every, number])
         for quantity in ("positions", "lane_indices", "poses"):

@@ -1,4 +1,4 @@
-"""Are personal cars and vehicles of calibrators demand that can become CAVs, as SUMO drives them?"""
+"""Personal cars and vehicles of calibrators are demand, and can become CAVs."""
 
 import json
 import subprocess

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.worlds.sumo.user_networks import game, grid, straight
-from tests.worlds.test_record import fingerprint, travelled
+from tests.worlds.test_record import fingerprint, serialize_and_restore
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.command import Command
 from unjam.drivers.network import Network
@@ -35,7 +35,7 @@ def file(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.fixture(scope="module")
-def signalled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def network_with_signals(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return grid(tmp_path_factory.mktemp("signalled"))
 
 
@@ -59,7 +59,7 @@ def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(file: Path
         (there,) = workers.run([task])
     again = run_episode(task.scenario, task.driver, task.seed, backend=sumo)
     assert here.status == "completed"
-    assert fingerprint(there) == fingerprint(again) == fingerprint(here) == fingerprint(travelled(here))
+    assert fingerprint(there) == fingerprint(again) == fingerprint(here) == fingerprint(serialize_and_restore(here))
 
 
 def test_the_same_vehicles_are_cavs_for_every_driver(file: Path, sumo: SumoBackend) -> None:
@@ -71,11 +71,11 @@ def test_the_same_vehicles_are_cavs_for_every_driver(file: Path, sumo: SumoBacke
     for one, other in ((slow, fast), (fast, human)):
         both = set(one.vehicle_ids) & set(other.vehicle_ids)
         # A vehicle that came in the very last decision has no trajectory.
-        new = {name for each in (one, other) for name in each.vehicle_ids if stayed(each, name) < 2}
+        new = {name for each in (one, other) for name in each.vehicle_ids if steps_on_road(each, name) < 2}
         assert set(one.cav_ids) & both - new == set(other.cav_ids) & both - new
 
 
-def stayed(episode: Any, name: str) -> int:
+def steps_on_road(episode: Any, name: str) -> int:
     column = episode.vehicle_ids.index(name)
     return int((~np.isnan(episode.speeds[:, column])).sum())
 
@@ -135,7 +135,7 @@ def test_a_population_with_a_residual_is_refused_on_a_users_network(tmp_path: Pa
 
 def test_all_vehicles_or_none_may_be_cavs(file: Path, sumo: SumoBackend) -> None:
     everyone = run_episode(scenario_of(file, penetration_rate=1.0, horizon=60), IDM(), (0,), backend=sumo)
-    there = [name for name in everyone.vehicle_ids if stayed(everyone, name) > 1]
+    there = [name for name in everyone.vehicle_ids if steps_on_road(everyone, name) > 1]
     assert set(everyone.cav_ids) == set(there)
     with pytest.raises(InputError, match="no CAV was on the road in 5 control steps"):
         run_episode(scenario_of(file, penetration_rate=1e-9, horizon=5), IDM(), (0,), backend=sumo)
@@ -158,8 +158,8 @@ def test_cavs_exceed_the_allowed_speed_only_while_braking(file: Path, simulation
     assert not traffic.has_crashed
 
 
-def test_cavs_stop_at_red(signalled: Path, simulation: Simulation) -> None:
-    traffic = own(simulation, signalled, penetration_rate=1.0, horizon=240)
+def test_cavs_stop_at_red(network_with_signals: Path, simulation: Simulation) -> None:
+    traffic = own(simulation, network_with_signals, penetration_rate=1.0, horizon=240)
     waited = passed = 0
     ahead: dict[str, Any] = {}
     for _ in range(200):

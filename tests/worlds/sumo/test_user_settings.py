@@ -1,4 +1,4 @@
-"""Is human-only traffic on a user's network that of plain SUMO, and do CAVs and SUMO's rules end episodes?"""
+"""Human-only traffic on a user's network is that of plain SUMO; CAVs and SUMO's rules end episodes."""
 
 import subprocess
 from collections.abc import Callable

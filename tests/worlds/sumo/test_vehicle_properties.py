@@ -1,4 +1,4 @@
-"""Does a CAV keep everything of the vehicle that it replaces, except the car-following law?"""
+"""A CAV keeps all properties of the vehicle that it replaces, except the car-following model."""
 
 from pathlib import Path
 from typing import Any
