@@ -19,7 +19,7 @@ def installed_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plugins, "entry_points", lambda group: points.select(group=group))
 
 
-@pytest.mark.usefixtures("installed")
+@pytest.mark.usefixtures("installed_plugins")
 def test_plugins_that_cannot_be_imported_are_left_out_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         loaded = load_plugins("unjam.commands")
@@ -30,7 +30,7 @@ def test_plugins_that_cannot_be_imported_are_left_out_with_a_warning(caplog: pyt
     assert load_plugins("unjam.presets") == {}
 
 
-@pytest.mark.usefixtures("installed")
+@pytest.mark.usefixtures("installed_plugins")
 def test_only_the_named_plugins_are_imported(caplog: pytest.LogCaptureFixture) -> None:
     assert list(load_plugins("unjam.commands", "good", "unknown")) == ["good"]
     assert not caplog.records
