@@ -153,7 +153,7 @@ def following_statistics(
     is_yielding: Any = (),
     in_recovery: Any = False,
 ) -> FollowingStatistics:
-    """Return statistics of speeds [m/s] and gaps [m]: shape (moments, CAVs), one `step` [s] apart, NaN without a CAV.
+    """Return statistics of speeds [m/s] and gaps [m]: shape (steps, CAVs), one `step` [s] apart, NaN without a CAV.
 
     `is_overridden` are the commands that SUMO changed, `is_yielding` those given near a crossing, of any same shape.
     Moments that are `in_recovery`, see `is_recovering`, do not count for time gaps.

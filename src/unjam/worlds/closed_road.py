@@ -97,9 +97,9 @@ class ClosedRoadLog:
     requested_accelerations: Floats
     """the drivers' accelerations within the limits [m/s2], shape (D, C); no rows if CAVs stayed human"""
     safe_accelerations: Floats
-    """what passed the safety filter [m/s2], shape (S, C); likewise"""
+    """accelerations after the safety filter [m/s2], shape (S, C); no rows if CAVs stayed human"""
     commanded_speeds: Floats
-    """the resulting speeds [m/s], shape (S, C); likewise"""
+    """speeds that follow from them [m/s], shape (S, C); no rows if CAVs stayed human"""
     has_crashed: bool = False
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """fuel rate [mg/s], shape (D, N); (0, 0) if not recorded"""

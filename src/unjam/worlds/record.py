@@ -82,7 +82,7 @@ def make_trajectory(
 ) -> Trajectory:
     """Return the trajectory of a trip with the driver's decisions; arguments are as in `Trajectory`, or as follows.
 
-    `entry_number` is the number of earlier CAVs, `rows` the row among the CAVs at each moment, shape (T + 1,), or None
+    `entry_number` is the number of earlier CAVs, `rows` the row among the CAVs in each step, shape (T + 1,), or None
     if decisions are floats. `applied_acceleration` is the actual acceleration of human drivers.
     """
     trip, commands = (vehicle, start_step, states), (applied_acceleration, filter_braking, shield_braking)
@@ -199,7 +199,7 @@ class Episode:
     free_flow_time: float = float("nan")
     """mean travel time in free flow [s]; NaN if unknown"""
     backlog: Floats = field(default_factory=lambda: np.zeros(0))
-    """insertion backlog, including teleported vehicles, at each moment, shape (T + 1,); (0,) of a closed road"""
+    """insertion backlog, including teleported vehicles, shape (T + 1,); (0,) on a closed road"""
     teleported: int = 0
     """vehicles of the backlog at the end that were teleported and not reinserted"""
     lane_lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
@@ -243,22 +243,22 @@ class Episode:
 
 
 def assign_columns(
-    first_moments: NDArray[np.intp], last_moments: NDArray[np.intp], groups: Sequence[Hashable], min_spacing: int = 1
+    first_steps: NDArray[np.intp], last_steps: NDArray[np.intp], groups: Sequence[Hashable], min_spacing: int = 1
 ) -> NDArray[np.intp]:
-    """Return a column for each of n trips, given the first and last moment of each (inclusive).
+    """Return a column for each of n trips, given the first and the last step of each (inclusive).
 
-    Only trips of the same group share a column, with at least `min_spacing` empty moments between two of them.
+    Only trips of the same group share a column, with at least `min_spacing` empty steps between two of them.
     """
     columns, used = np.zeros(len(groups), np.intp), 0
     heaps: dict[Hashable, list[tuple[int, int]]] = {}
-    for trip in np.argsort(first_moments, kind="stable").tolist():
+    for trip in np.argsort(first_steps, kind="stable").tolist():
         heap = heaps.setdefault(groups[trip], [])
-        if heap and heap[0][0] + min_spacing < first_moments[trip]:
+        if heap and heap[0][0] + min_spacing < first_steps[trip]:
             _, column = heappop(heap)
         else:
             column, used = used, used + 1
         columns[trip] = column
-        heappush(heap, (int(last_moments[trip]), column))
+        heappush(heap, (int(last_steps[trip]), column))
     return columns
 
 

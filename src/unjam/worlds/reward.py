@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
     accelerations: Array
     """commands of the CAVs within the action limit [m/s2], shape (rows, CAVs); NaN if absent"""
     time_gaps: Array
-    """time gaps of the CAVs after the step [s], shape (rows, CAVs); NaN likewise"""
+    """time gaps of the CAVs after the step [s], shape (rows, CAVs); NaN if absent"""
     has_crashed: Array
     backlog: Array
     """insertion backlog [vehicles], shape (rows,)"""

@@ -45,7 +45,7 @@ class EpisodeTask:
     record_details: bool = False
     stop_at_contact: bool = True
     backend: BackendLike = "sumo"
-    """an object likewise"""
+    """an object only for episodes in this process"""
 
     @property
     def is_serializable(self) -> bool:

@@ -45,7 +45,7 @@ class World(Protocol[RecordT]):
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Start, and hand the CAVs to the driver unless they stay human (`is_controlled` false).
 
-        Return their earlier states for drivers with a memory, shape (CAVs, moments), oldest first; None without any.
+        Return their earlier states for drivers with a memory, shape (CAVs, steps), oldest first; None without any.
         """
         ...
 
@@ -102,28 +102,28 @@ class RecordedWorld(_OfflineWorld):
     """A recording of states that does not depend on the driver: for the commands and memories that result."""
 
     def __init__(self, states: LocalState, limits: Limits) -> None:
-        """Take the states of n CAVs at T moments, arrays of shape (T, n)."""
+        """Take the states of n CAVs in T control steps, arrays of shape (T, n)."""
         self.states, self.limits = states, limits
         self.cav_count = self.entered_count = states.speed.shape[1]
         self._row_names = [f"row {number}" for number in range(self.cav_count)]
         self._accelerations: list[list[float]] = []
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Start at the first moment, without a history."""
+        """Start with the first recorded step, without a history."""
         self._accelerations = []
 
     @property
     def has_ended(self) -> bool:
-        """Whether all moments have passed."""
+        """Whether all recorded steps have passed."""
         return len(self._accelerations) == len(self.states.speed)
 
     def local_state(self) -> LocalState:
-        """Return the state at this moment, read-only; at the end, that of the last moment."""
-        moment = min(len(self._accelerations), len(self.states.speed) - 1)
-        return self.states.select(moment).as_read_only()
+        """Return the state of the present step, read-only; after the end, that of the last step."""
+        step = min(len(self._accelerations), len(self.states.speed) - 1)
+        return self.states.select(step).as_read_only()
 
     def advance(self, command: Command | None) -> None:
-        """Record the commands and go on to the next moment."""
+        """Record the commands, and advance to the next recorded step."""
         self._accelerations.append(
             commanded_accelerations(command, self.limits, self._row_names, len(self._accelerations))
         )
