@@ -33,7 +33,7 @@ INVALID_DATA_ERRORS = (
 )
 """errors of reading JSON and arrays that unjam did not write"""
 UNREADABLE_ERRORS = (*INVALID_DATA_ERRORS, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
-"""errors of reading a damaged file; `RuntimeError`: of a kind that zipfile does not know"""
+"""errors of reading a damaged file; zipfile raises `RuntimeError` for an unknown kind of compression"""
 
 APPEND_FLAGS = os.O_WRONLY | os.O_APPEND | os.O_CREAT
 """flags of `open_in_place`: append to a file, and create a missing one"""
@@ -96,7 +96,7 @@ def write_new_file(path: Path, content: bytes, mode: int) -> None:
 
 
 def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
-    """Write a complete folder of files or none, by renaming; what has its name is removed first."""
+    """Write a complete folder of files or none, by renaming; an existing file or folder with its name is removed."""
     remove(folder)
     make_folder(folder.parent)
     with _replacement(folder) as (parent, temporary):
@@ -108,7 +108,7 @@ def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
 
 
 def is_leftover(path: Path) -> bool:
-    """Return whether a file is the unfinished one of a process that was killed."""
+    """Return whether a file is an unfinished one, which a killed process has left."""
     return path.name.startswith(".") and path.name.endswith(".part")
 
 

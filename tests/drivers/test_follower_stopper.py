@@ -13,24 +13,25 @@ def test_flows_reference_values() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gap", "wanted"), [(4.0, 0.0), (4.5, 0.0), (4.875, 2.0), (5.25, 4.0), (5.625, 6.0), (6.0, 8.0), (50.0, 8.0)]
+    ("gap", "expected_speed"),
+    [(4.0, 0.0), (4.5, 0.0), (4.875, 2.0), (5.25, 4.0), (5.625, 6.0), (6.0, 8.0), (50.0, 8.0)],
 )
-def test_commanded_speed_in_each_region_at_equal_speeds(gap: float, wanted: float) -> None:
+def test_commanded_speed_in_each_region_at_equal_speeds(gap: float, expected_speed: float) -> None:
     driver = FollowerStopper(desired_speed=8.0, time_constant=0)
     found, _ = driver.act(state_of([4.0], [4.0], [gap]), driver.initial_memory(1))
-    assert found[0] * 0.1 + 4.0 == pytest.approx(wanted, abs=1e-12)
+    assert found[0] * 0.1 + 4.0 == pytest.approx(expected_speed, abs=1e-12)
 
 
 def test_borders_grow_with_the_square_of_the_closing_speed() -> None:
     driver = FollowerStopper(desired_speed=8.0, time_constant=0)
     closing = 3.0
     border = 4.5 + closing**2 / (2 * 1.5)
-    for gap, stands in ((border - 0.01, True), (border + 0.3, False)):
+    for gap, is_stopped in ((border - 0.01, True), (border + 0.3, False)):
         found, _ = driver.act(state_of([5.0], [2.0], [gap]), driver.initial_memory(1))
-        assert bool(found[0] * 0.1 + 5.0 < 1e-9) is stands
+        assert bool(found[0] * 0.1 + 5.0 < 1e-9) is is_stopped
 
 
-def test_desired_speed_is_the_leaders_mean_by_default_so_that_it_sets_off() -> None:
+def test_default_desired_speed_is_the_mean_speed_of_the_leader() -> None:
     driver, memory, speed = FollowerStopper(), None, 0.0
     memory = driver.initial_memory(1)
     for _ in range(200):
@@ -39,7 +40,7 @@ def test_desired_speed_is_the_leaders_mean_by_default_so_that_it_sets_off() -> N
     assert speed == pytest.approx(4.0, abs=1e-6)
 
 
-def test_recalls_the_leaders_speed() -> None:
+def test_history_of_the_warm_up_determines_the_desired_speed() -> None:
     driver = FollowerStopper(time_constant=0)
     history = np.full((1, 380), 3.0)
     memory = driver.recall(driver.initial_memory(1), LocalState(*([history] * 7)))

@@ -18,15 +18,18 @@ FAULTS: dict[str, Fault] = {
         "controller damaged: bits flipped, cut off, doubled, swapped", controllers, quick_count=60, long_count=1000
     ),
     "configurations": Fault(
-        "configuration with a nonsensical value, an unknown name, a line twice, torn", configurations, 40, 200
+        "configuration with an invalid value, an unknown name, a repeated line, or cut off", configurations, 40, 200
     ),
     "results": Fault(
-        "folder of results damaged: torn, empty, missing, nested, a value gone or another", results, 10, 300
+        "folder of results damaged: files cut off, empty, missing, nested, a value removed or replaced",
+        results,
+        10,
+        300,
     ),
     "full disk": Fault("disk full after some bytes of a checkpoint", full_disks, quick_count=20, long_count=200),
     "networks": Fault("network, demand or configuration of SUMO broken", networks, quick_count=6, long_count=500),
     "hostile files": Fault(
-        "network of others that wants SUMO to write, to listen or to read another file", hostile, 8, 200
+        "network of another user that makes SUMO write, listen or read another file", hostile, 8, 200
     ),
     "sandbox": Fault(
         "program next to the reader of networks, and SUMO, that write or open a socket", sandboxes, 12, 300
@@ -40,7 +43,7 @@ FAULTS: dict[str, Fault] = {
         long_count=300,
     ),
     "drivers that change": Fault(
-        "driver that changes all that it is shown, on every kind of road", cheats, quick_count=5, long_count=200
+        "driver that modifies its observations, on every kind of road", cheats, quick_count=5, long_count=200
     ),
     "crash points": Fault(
         "run killed, or the disk full, before, within or after each thing that it does to its folder",
@@ -67,8 +70,8 @@ FAULTS: dict[str, Fault] = {
         long_count=1000,
     ),
     "inputs": Fault(
-        "command line with names too long, odd or no text, configurations without end, NUL, special files, "
-        "weights that are none; with a closed output, in a removed folder, with few file descriptors",
+        "command line with long or unusual names, bytes that are not UTF-8, deeply nested configurations, NUL, special "
+        "files, invalid weights; with a closed output, in a removed folder, with few file descriptors",
         inputs,
         quick_count=6,
         long_count=200,

@@ -20,13 +20,13 @@ def draw_road(seed: int = 0, **changes: Any) -> MergeRoad:
 
 
 def entries(road: MergeRoad) -> list[dict[str, str]]:
-    """Attributes of the vehicles in SUMO's file, in their order."""
+    """Return the attributes of the vehicles in SUMO's file, in their order."""
     written = ElementTree.fromstring(sumo_inputs(Merge(), road).traffic_xml)
     return [vehicle.attrib for vehicle in written.iter("vehicle")]
 
 
-def cavs(road: MergeRoad) -> list[int]:
-    """Which of the highway's vehicles are CAVs, sorted."""
+def cav_numbers(road: MergeRoad) -> list[int]:
+    """Return the numbers of the highway's vehicles that are CAVs, sorted."""
     return sorted(int(name.removeprefix("cav_")) for name in road.cav_ids)
 
 
@@ -74,45 +74,45 @@ def test_without_standing_vehicles_the_road_is_empty() -> None:
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_cavs_are_drawn_independently(seed: int, cav_share: float) -> None:
-    count = len(cavs(draw_road(seed, penetration_rate=cav_share)))
+    count = len(cav_numbers(draw_road(seed, penetration_rate=cav_share)))
     spread = np.sqrt(333 * cav_share * (1 - cav_share))
     assert abs(count - 333 * cav_share) <= 5.5 * spread + 1e-9
 
 
 @pytest.mark.parametrize("spacing", ["random", "even"])
 def test_none_or_all_of_the_highways_vehicles_are_cavs(spacing: str) -> None:
-    assert cavs(draw_road(penetration_rate=0.0, cav_spacing=spacing)) == []
-    assert cavs(draw_road(penetration_rate=1.0, cav_spacing=spacing)) == list(range(333))
+    assert cav_numbers(draw_road(penetration_rate=0.0, cav_spacing=spacing)) == []
+    assert cav_numbers(draw_road(penetration_rate=1.0, cav_spacing=spacing)) == list(range(333))
 
 
 def test_even_spacing_is_each_tenth_vehicle_in_every_episode() -> None:
     for seed in range(3):
-        assert cavs(draw_road(seed, cav_spacing="even")) == list(range(0, 333, 10))
+        assert cav_numbers(draw_road(seed, cav_spacing="even")) == list(range(0, 333, 10))
 
 
 @given(st.floats(0, 1))
 def test_even_spacing_spreads_cavs_evenly(cav_share: float) -> None:
-    found = cavs(draw_road(penetration_rate=cav_share, cav_spacing="even"))
+    found = cav_numbers(draw_road(penetration_rate=cav_share, cav_spacing="even"))
     assert abs(len(found) - 333 * cav_share) <= 1.0
     assert len(np.unique(np.diff(found))) <= 2
 
 
 def test_random_cavs_differ_from_episode_to_episode() -> None:
-    found = [tuple(cavs(draw_road(seed))) for seed in range(6)]
+    found = [tuple(cav_numbers(draw_road(seed))) for seed in range(6)]
     assert len(set(found)) == 6
-    assert found[0] == tuple(cavs(draw_road(0)))
+    assert found[0] == tuple(cav_numbers(draw_road(0)))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 166))
 def test_the_set_number_of_cavs_enters_in_the_first_half(seed: int, count: int) -> None:
     road = draw_road(seed, cavs=count)
-    assert len(cavs(road)) == count
-    assert max(cavs(road)) * 1.8 < 300.0
+    assert len(cav_numbers(road)) == count
+    assert max(cav_numbers(road)) * 1.8 < 300.0
 
 
 def test_cav_ids_are_among_the_possible_ones() -> None:
-    some: list[dict[str, Any]] = [{}, {"cavs": 5}, {"penetration_rate": 1.0}, {"inflow": 700.0}]
-    for changes in some:
+    all_changes: list[dict[str, Any]] = [{}, {"cavs": 5}, {"penetration_rate": 1.0}, {"inflow": 700.0}]
+    for changes in all_changes:
         assert draw_road(**changes).cav_ids <= set(Merge(**changes).possible_cav_ids())
 
 
@@ -132,23 +132,23 @@ def test_lanes_across_the_junction_are_those_of_the_network_file() -> None:
 
 
 def plain_highway(flow: float, vehicles: int = 120, step: float = 0.2) -> float:
-    """Mean speed of the last of many human drivers on 724.6 m with the same reaction time, by Eq. 5-6."""
-    length, every = 700.1 + JUNCTION_LENGTHS[0], round(3600.0 / flow / step)
-    position, speed, taken = (np.full(vehicles, value) for value in (np.nan, 10.0, 0.0))
-    clock = 0
+    """Return the mean speed of the last of many human drivers on the highway, by Eq. 5-6 [m/s]."""
+    length, entry_interval = 700.1 + JUNCTION_LENGTHS[0], round(3600.0 / flow / step)
+    position, speed, travel_time = (np.full(vehicles, value) for value in (np.nan, 10.0, 0.0))
+    step_number = 0
     while not position[-1] >= length:
-        there = np.arange(vehicles) * every <= clock
-        position[there & np.isnan(position)] = 0.0
+        has_entered = np.arange(vehicles) * entry_interval <= step_number
+        position[has_entered & np.isnan(position)] = 0.0
         leader = np.where(position[:-1] >= length, np.inf, position[:-1])  # a vehicle that has left is no leader
         gap = np.append(np.inf, leader - position[1:] - 5.0)
         closing = np.append(0.0, speed[1:] - speed[:-1])
-        wanted = 2.0 + np.maximum(speed + speed * closing / (2 * np.sqrt(1.5)), 0.0)
-        pushed = np.maximum(speed + step * (1.0 - (speed / 30.0) ** 4 - (wanted / gap) ** 2), 0.0)
-        speed[there] = pushed[there]
-        taken[there & (position < length)] += step
-        position[there] += step * speed[there]
-        clock += 1
-    return length / taken[-1]
+        desired_gap = 2.0 + np.maximum(speed + speed * closing / (2 * np.sqrt(1.5)), 0.0)
+        next_speed = np.maximum(speed + step * (1.0 - (speed / 30.0) ** 4 - (desired_gap / gap) ** 2), 0.0)
+        speed[has_entered] = next_speed[has_entered]
+        travel_time[has_entered & (position < length)] += step
+        position[has_entered] += step * speed[has_entered]
+        step_number += 1
+    return length / travel_time[-1]
 
 
 @pytest.mark.parametrize("flow", [1200.0, 2000.0])

@@ -1,4 +1,4 @@
-"""D_a, the environment data: what models are fitted to, and the states from which rollouts start."""
+"""Environment data (D_a in the paper): models are fitted to them, and rollouts start from their states."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
@@ -22,7 +22,7 @@ from unjam.worlds.world import RecordedWorld
 StartIndices = NDArray[np.int64]
 """n recorded states as rows (recording, control step), shape (n, 2)"""
 GOLDEN_RATIO = (5**0.5 - 1) / 2
-"""its multiples modulo 1 cover the unit interval evenly from the first one on, without a period"""
+"""golden ratio; the fractional parts of its multiples cover the unit interval evenly, for any number of them"""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Transitions(NamedTuple):
 
     states: LocalState
     acceleration: Floats
-    """applied [m/s2]"""
+    """applied acceleration [m/s2]"""
     drawn_values: Floats
-    """shape (R, m)"""
+    """scaled values that the episode drew, shape (R, m)"""
     next_states: LocalState
     reward: Floats
     crashed: NDArray[np.bool_]
@@ -55,13 +55,13 @@ class Transitions(NamedTuple):
 
 @dataclass
 class EnvironmentData:
-    """The newest trajectories: whole episodes with at least `capacity` control steps, once there are as many."""
+    """The trajectories of the newest episodes; old ones are dropped as long as `capacity` control steps remain."""
 
     capacity: int
     recordings: list[Recording] = field(default_factory=list)
-    """oldest first"""
+    """stored trajectories, the oldest first"""
     episode_count: int = 0
-    """number of episodes that were ever added"""
+    """number of episodes that were added, including dropped ones"""
 
     def __len__(self) -> int:
         """Return the number of stored control steps."""
@@ -101,14 +101,21 @@ class EnvironmentData:
         )
 
     def holdout_masks(self, holdout: float) -> list[NDArray[np.bool_]]:
-        """Return holdout steps of each recording: always the same episodes; if these are all or none, last parts."""
+        """Return which steps of each recording are held out, an array of booleans for each.
+
+        Whole episodes are held out, always the same ones. If these would be all episodes or none, the last part of each
+        recording is held out instead.
+        """
         masks = [np.full(len(r.reward), is_holdout_episode(r.episode, holdout)) for r in self.recordings]
         if np.concatenate(masks).all() or not np.concatenate(masks).any():
             return [np.arange(len(mask)) >= max(1, (1 - holdout) * len(mask)) for mask in masks]
         return masks
 
     def start_indices(self, min_control_steps: int = 1, first_episode: int = 0) -> StartIndices:
-        """Return where a residual was due and `min_control_steps` follow, in episodes from `first_episode` on."""
+        """Return the steps in which a new residual was computed and after which `min_control_steps` are recorded.
+
+        Only episodes with the number `first_episode` or a larger one are used.
+        """
         due = {
             index: np.arange(0, len(recording.reward) - min_control_steps + 1, recording.action_repeat)
             for index, recording in enumerate(self.recordings)

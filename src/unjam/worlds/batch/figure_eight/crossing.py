@@ -54,7 +54,7 @@ COMMANDED_SPEED_TOLERANCE = 1e-9
 
 
 class CrossingMemory(NamedTuple):
-    """The state that one step leaves to the next; shape (vehicles, W), or (vehicles,) of one road."""
+    """State of the vehicles that is kept between steps, shape (vehicles, W); for one road (vehicles,)."""
 
     waiting_time: Array
     """time that a vehicle has waited [s]"""
@@ -179,7 +179,7 @@ class FigureEightMovement:
     def _next_speeds(
         self, speed: Array, position: Array, leader: Leader, commanded_speed: Array, is_commanded: Array
     ) -> Array:
-        """Return the speeds after a step [m/s], and update the memory; arguments as of `leaders`, and commands."""
+        """Return the speeds after a step [m/s], shape (vehicles, W), and update the memory."""
         xp, models = namespace(speed), self._models
         free_speed = xp.where(is_commanded, models.clip_speed(speed, commanded_speed), models.max_speed(speed))
         look_ahead = models.look_ahead_distance(speed)
@@ -374,7 +374,7 @@ def may_follow_commands(
     motion: tuple[Floats, Floats],
     commanded_speeds: Floats,
 ) -> NDArray[np.bool_]:
-    """Return whether the right of way lets vehicles follow their commands; all have the shape (moments, vehicles).
+    """Return whether the right of way lets vehicles follow their commands; all have the shape (steps, vehicles).
 
     `memories` are those of `crossing_memories`; `motion` is speeds [m/s] and positions [m].
     """
