@@ -17,6 +17,7 @@ def test_the_page_has_six_worked_examples_of_ten_changes() -> None:
     assert len(re.findall(r"^\| [^|]+ \| \d \|", table, flags=re.M)) == 10
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("title", EXAMPLES)
 def test_an_example_of_the_architecture_runs(title: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -326,7 +326,7 @@ CHANGES_THE_PROCESS = {
     "trust": "for the length of a block that the user writes, under a lock",
     "child_processes": "in the command line, and while Ray or multiprocessing starts processes",
     "training/train": "for the length of a training, under a lock, and restored",
-    "learners/algorithm_1": "within training/train",
+    "learners/algorithm": "within training/train",
     "training/model_facts": "within training/train, or in the command line",
     "training/benchmark": "in the command line",
     "following/networks": "in the command line",

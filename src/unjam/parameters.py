@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from unjam.errors import InputError, invalid_value, spelling_hint
 
@@ -28,6 +28,13 @@ def as_range(value: Any) -> Any:
     return (value, value) if isinstance(value, int | float) else value
 
 
+def _without_tuples(options: dict[str, Any]) -> dict[str, Any]:
+    """Return options as a TOML file gives them back, so that a stored configuration equals the original."""
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in options.items()}
+
+
+Options = Annotated[dict[str, Any], AfterValidator(_without_tuples)]
+"""arguments by name, of a class that the configuration names"""
 NumberOrRange = BeforeValidator(as_range)
 """allows a single number for a parameter that is a range"""
 MAX_INTEGER_BITS = 63

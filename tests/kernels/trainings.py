@@ -39,7 +39,7 @@ def hashes(learners: list[str]) -> dict[str, str]:
             )
             run = learn_with(workers, Path(folder) / learner, config)
             total = hashlib.sha256()
-            tensors = run.training.state()[1].items()
+            tensors = run.algorithm.state()[1].items()
             for name, tensor in sorted(
                 (hashed_name(name), value) for name, value in tensors if not name.startswith(DATA)
             ):

@@ -15,8 +15,8 @@ from tests.learners.toy_task import (
     sloped_target,
 )
 from unjam.errors import UnjamError
-from unjam.learners.algorithm_1 import environment_experience, return_after_exit, seed_iteration
-from unjam.learners.experience import make_experience
+from unjam.learners.algorithm import seed_iteration
+from unjam.learners.experience import environment_experience, make_experience, return_after_exit
 from unjam.learners.settings import (
     AGENT_NAMES,
     LearnerSettings,
@@ -64,11 +64,11 @@ def test_environment_steps_count_control_steps_and_not_actions(agent: str, actio
 def test_training_ends_with_the_iteration_that_reaches_the_budget(agent: str) -> None:
     task = Toy(agent=agent, episodes=3)
     task.run(301)
-    assert task.training.environment_steps == 600
+    assert task.collector.environment_steps == 600
     task.run(600)
     assert len(task.iterations) == 2
     task.run(601)
-    assert task.training.environment_steps == 900
+    assert task.collector.environment_steps == 900
 
 
 @every_learner
@@ -86,7 +86,7 @@ def test_iteration_has_the_values_of_progress(agent: str) -> None:
     (iteration,) = Toy(agent=agent).learn(1).iterations
     assert iteration.log
     assert all(type(value) is float and np.isfinite(value) for value in iteration.log.values())
-    assert set(iteration.seconds) == {"collect", "update"}
+    assert set(iteration.seconds) == {"update"}
     assert min(iteration.seconds.values()) > 0.0
     assert iteration.model_steps == 0
     assert len(iteration.episodes[0]) == 8
@@ -97,7 +97,7 @@ def test_iteration_has_the_values_of_progress(agent: str) -> None:
 def test_only_the_critic_gets_the_drawn_values(agent: str, is_privileged: bool) -> None:
     policy = PolicySettings(hidden=(8,), privileged_critic=is_privileged)
     task = Toy(policy, agent=agent, episodes=2)
-    rows = environment_experience(task.training, task.collect(task.learner.network(), 1))
+    rows = environment_experience(task.spec, task.collect(task.learner.network(), 1), 1)
     assert rows.observations.shape == (2 * CONTROL_STEPS, INPUTS + is_privileged)
     if is_privileged:
         assert set(rows.observations[:, INPUTS]) == {-1.0, 1.0}

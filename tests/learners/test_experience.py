@@ -10,16 +10,8 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from tests.learners.toy_task import make_policy, shake
 from unjam.drivers import LocalState
 from unjam.drivers.local_state import COMMON_FIELDS
-from unjam.learners.experience import (
-    Experience,
-    add_to_replay_buffer,
-    discounted_returns,
-    fill_rollout_buffer,
-    join_experience,
-    make_experience,
-    shift_rewards,
-)
-from unjam.learners.learner import policy_spaces
+from unjam.learners.experience import Experience, discounted_returns, join_experience, make_experience
+from unjam.learners.sb3_learner import add_to_replay_buffer, fill_rollout_buffer, policy_spaces, shift_rewards
 from unjam.learners.trpo_ppo import ResidualPolicy
 from unjam.worlds.record import Trajectory
 

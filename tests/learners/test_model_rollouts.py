@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from tests.conftest import random_network
-from tests.learners.toy_task import same
+from tests.learners.toy_task import Iteration, iteration_of, same
 from unjam.drivers import PISaturation
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
-from unjam.learners.algorithm_1 import Iteration, TaskEpisodes, algorithm_1, start_training
-from unjam.learners.experience import join_experience
+from unjam.learners.agent import AgentSpec
+from unjam.learners.algorithm import Collector, TaskEpisodes, run_iterations
+from unjam.learners.algorithm_1 import Algorithm1, make_algorithm
 from unjam.learners.learner import Update
 from unjam.learners.model_rollouts import ExperienceFactory, RolloutPlan, RowRollouts, rollout_experience
 from unjam.learners.settings import AGENT_NAMES, PolicySettings, PPOSettings, SACSettings, TD3Settings, TRPOSettings
@@ -48,6 +49,13 @@ def driver_of(network: Network) -> ResidualDriver:
     return ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, POLICY.action_repeat(0.1))
 
 
+def algorithm_of(agent: str, model: ModelSettings) -> Algorithm1:
+    settings = SETTINGS[agent]
+    made = make_algorithm(agent, settings, AgentSpec([TASK], POLICY, model, settings.gamma, 0))
+    assert isinstance(made, Algorithm1)
+    return made
+
+
 class Trained:
     """A learner on a small ring in SUMO, and its iterations."""
 
@@ -66,13 +74,16 @@ class Trained:
                 ]
             ]
 
-        self.collect = collect
-        self.training = start_training([TASK], POLICY, SETTINGS[agent], model or FREE, 0)
-        self.learner: Any = self.training.learner
+        self.algorithm = algorithm_of(agent, model or FREE)
+        self.collector = Collector(collect)
+        self.learner: Any = self.algorithm.learner
 
     def learn(self, iterations: int) -> "Trained":
         budget = iterations * 2 * RING.horizon
-        algorithm_1(self.training, budget, self.collect, lambda _: None, lambda done, _: self.iterations.append(done))
+        run_iterations(
+            *(self.algorithm, self.collector, budget, 0),
+            lambda log: self.iterations.append(iteration_of(self.collector, log)),
+        )
         return self
 
 
@@ -107,9 +118,10 @@ def test_resumed_learner_has_the_same_model_and_data(agent: str, update: str, sh
     expected = Trained(shared, agent, model).learn(3)
     stopped = Trained(shared, agent, model).learn(1)
     resumed = Trained(shared, agent, model)
-    resumed.training.restore(*stopped.training.state())
+    resumed.algorithm.restore(*stopped.algorithm.state())
+    resumed.collector.iteration, resumed.collector.environment_steps = 1, stopped.collector.environment_steps
     resumed.learn(3)
-    assert same(resumed.training.state()[1], expected.training.state()[1])
+    assert same(resumed.algorithm.state()[1], expected.algorithm.state()[1])
     assert resumed.iterations[-1].model == expected.iterations[-1].model
     assert resumed.iterations[-1].model_steps == expected.iterations[-1].model_steps
 
@@ -121,9 +133,7 @@ def test_the_ratio_is_exactly_one_before_each_update(agent: str, shared: Simulat
     updates: list[Update] = []
 
     def learn(update: Update) -> None:
-        learner.fill_buffer(
-            join_experience([part for part in (update.environment_rows, update.model_rows) if part is not None])
-        )
+        learner.fill_buffer(update.rows)
         buffer = learner.sb3.rollout_buffer
         observations, actions = (torch.as_tensor(part[:, 0]) for part in (buffer.observations, buffer.actions))
         _, log_prob, _ = learner.sb3.policy.evaluate_actions(observations, actions)
@@ -217,7 +227,7 @@ def test_k_star_of_zero_gives_no_model_rows(shared: Simulation) -> None:
 
 
 def test_real_ratio_mixes_environment_and_model_rows() -> None:
-    sac: Any = start_training([TASK], POLICY, SETTINGS["sac"], FREE, 0).learner
+    sac: Any = algorithm_of("sac", FREE).learner
     buffer = sac.buffer
     environment, model = (
         rollout_experience(rollouts, rollouts.drawn_values.numpy())
@@ -239,7 +249,7 @@ def test_facts_of_the_model_are_complete(shared: Simulation) -> None:
     assert {"k_star", "eps_m", "eps_m_by_estimator", "one_step", "bound", "return_model", "return_environment"} <= set(
         model
     )
-    assert set(iteration.seconds) == {"collect", "fit", "roll_out", "update"}
+    assert set(iteration.seconds) == {"fit", "roll_out", "update"}
     assert 0 < iteration.log["eps_pi_mean"] <= iteration.log["eps_pi_max"] <= 1
     assert model["bound"] > abs(model["return_model"] - model["return_environment"])
 

@@ -12,7 +12,7 @@ from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.learners.experience import discounted_returns, make_experience
-from unjam.learners.learner import policy_spaces
+from unjam.learners.sb3_learner import policy_spaces
 from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
 from unjam.learners.trpo_ppo import ResidualPolicy
 from unjam.scenarios import Ring

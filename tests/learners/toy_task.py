@@ -14,9 +14,12 @@ from stable_baselines3.common.policies import BasePolicy
 from unjam.drivers import LocalState, PISaturation
 from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.drivers.network import Network
-from unjam.learners.algorithm_1 import Iteration, TaskEpisodes, Training, ValidationReturns, algorithm_1
-from unjam.learners.learner import AgentSpec, make_learner, policy_spaces
+from unjam.learners.agent import AgentSpec, make_agent
+from unjam.learners.algorithm import Collector, IterationLog, TaskEpisodes, run_iterations
+from unjam.learners.algorithm_1 import Algorithm1
+from unjam.learners.sb3_learner import policy_spaces
 from unjam.learners.settings import LearnerSettings, PolicySettings, PPOSettings, SACSettings, TD3Settings, TRPOSettings
+from unjam.models.settings import ModelSettings
 from unjam.scenarios import Ring
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Trajectory
@@ -81,6 +84,30 @@ def episode_of(network: Network, seed: tuple[int, ...], action_repeat: int, targ
 
 
 @dataclass
+class Iteration:
+    """The result of an iteration, numbered from 1; steps are totals of all iterations so far."""
+
+    number: int
+    environment_steps: int
+    episodes: TaskEpisodes
+    log: dict[str, float]
+    model_steps: int
+    model: Any
+    seconds: dict[str, float]
+
+
+def iteration_of(collect: Collector, log: IterationLog) -> Iteration:
+    steps = collect.iteration, collect.environment_steps
+    return Iteration(*steps, collect.episodes, dict(log.values), log.model_steps, log.model, dict(log.seconds))
+
+
+class ToySpec(AgentSpec):
+    @property
+    def inputs(self) -> int:
+        return INPUTS
+
+
+@dataclass
 class Toy:
     """A learner of the task, and its iterations."""
 
@@ -95,9 +122,12 @@ class Toy:
     networks: list[Network] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        spec = AgentSpec(INPUTS, int(self.policy.privileged_critic), 1.0, self.policy, self.seed)
-        self.learner = make_learner(self.settings or QUICK[self.agent], spec)
-        self.training = Training([Task(Ring(), PISaturation())], self.policy, self.seed, self.learner)
+        settings = self.settings or QUICK[self.agent]
+        model = ModelSettings(model_ratio=0.0)
+        self.spec = ToySpec([Task(Ring(), PISaturation())], self.policy, model, settings.gamma, self.seed)
+        self.learner = make_agent(self.agent, settings, self.spec)
+        self.algorithm = Algorithm1(self.spec, self.learner)
+        self.collector = Collector(self.collect)
 
     def collect(self, network: Network, iteration: int) -> TaskEpisodes:
         self.networks.append(network)
@@ -109,17 +139,23 @@ class Toy:
         ]
 
     def run(self, environment_steps: int) -> None:
-        algorithm_1(self.training, environment_steps, self.collect, lambda _: None, self.write)
+        run_iterations(self.algorithm, self.collector, environment_steps, self.seed, self.write)
 
-    def write(self, iteration: Iteration, _: ValidationReturns) -> None:
-        self.iterations.append(iteration)
+    def write(self, log: IterationLog) -> None:
+        self.iterations.append(iteration_of(self.collector, log))
+
+    def resume(self, state: Any, iteration: int) -> None:
+        """Continue from a state after a number of iterations."""
+        self.algorithm.restore(*state)
+        self.collector.iteration = iteration
+        self.collector.environment_steps = iteration * self.episodes * CONTROL_STEPS
 
     def learn(self, iterations: int) -> "Toy":
         self.run(iterations * self.episodes * CONTROL_STEPS)
         return self
 
     def parameters(self) -> dict[str, torch.Tensor]:
-        return self.training.state()[1]
+        return self.algorithm.state()[1]
 
 
 def mean_return(iteration: Iteration) -> float:

@@ -29,6 +29,7 @@ COMMANDS = {
     "train with it as expert": ("train", "ring", "--expert", "run", "--steps", "100"),
     "train with its configuration": ("train", "--config", "run/config.toml", "--out", "new"),
     "train with its best configuration": ("train", "--config", "run/best.toml", "--out", "new"),
+    "train with it as agent": ("train", "--config", "run/agent.toml", "--out", "new"),
     "resume": ("train", "--resume", "run"),
     "search": ("search", "ring", "--expert", "run", "--vary", VARY, "--out", "new"),
     "search with its configuration": ("search", "--config", "run/config.toml", "--vary", VARY, "--out", "new"),
@@ -46,6 +47,7 @@ def ran(tmp_path: Path) -> Path:
     run, code, ran = tmp_path / "run", tmp_path / "run" / "code.py", tmp_path / "ran"
     create_run_folder(run, small_config(expert=f"{code}:gentle", scenario_options__horizon=20))
     (run / "best.toml").write_text((run / "config.toml").read_text())
+    (run / "agent.toml").write_text(to_toml(small_config(agent=f"{code}:Agent")))
     code.write_text(DRIVER)
     driver = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
     (run / "controller.unjam").write_bytes(controller_bytes(driver, {}))

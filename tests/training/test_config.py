@@ -86,7 +86,7 @@ def test_merging_does_not_change_its_arguments() -> None:
         ({"trpo.gamma": float("nan")}, "trpo.gamma: nan is not allowed"),
         ({"trpo": 3}, "trpo: 3 is not allowed"),
         ({"trpo.gamma.x": 3}, "trpo.gamma: {'x': 3} is not allowed"),
-        ({"agent": "magic"}, "agent: 'magic' is not allowed; allowed: 'trpo', 'ppo', 'sac' or 'td3'"),
+        ({"agent": "magic"}, "agent: 'magic' is not allowed; allowed: 'trpo', 'ppo', 'sac', 'td3' or 'path.py:Class'"),
         ({"ppo.clip_range": 2.0}, "ppo.clip_range: 2.0 is not allowed; allowed: less than 1"),
         ({"sac.start_policy": "slowly"}, "sac.start_policy: 'slowly' is not allowed; allowed: 'expert' or 'uniform'"),
         ({"sac.gama": 0.9}, "sac.gama: unknown name"),

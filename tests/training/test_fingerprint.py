@@ -71,6 +71,11 @@ def of_reward(folder: Path) -> RunConfig:
     return small_config(reward=f"{folder}/mine.py:gold")
 
 
+def of_agent(folder: Path) -> RunConfig:
+    (folder / "mine.py").write_text("class Mine:\n    pass\n")
+    return small_config(agent=f"{folder}/mine.py:Mine")
+
+
 def of_network(folder: Path) -> RunConfig:
     path = straight(folder, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     road = {"penetration_rate": 0.5, "horizon": 100}
@@ -78,7 +83,8 @@ def of_network(folder: Path) -> RunConfig:
 
 
 @pytest.mark.parametrize(
-    ("make", "file"), [(of_expert, "mine.py"), (of_reward, "mine.py"), (of_network, "demand.rou.xml")]
+    ("make", "file"),
+    [(of_expert, "mine.py"), (of_reward, "mine.py"), (of_agent, "mine.py"), (of_network, "demand.rou.xml")],
 )
 def test_changed_files_of_a_training_are_refused(make: Callable[[Path], RunConfig], file: str, tmp_path: Path) -> None:
     config, run = make(tmp_path), tmp_path / "run"

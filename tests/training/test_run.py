@@ -15,7 +15,7 @@ from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.errors import InputError
-from unjam.learners.algorithm_1 import TaskEpisodes
+from unjam.learners.algorithm import TaskEpisodes
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config
 from unjam.training.run_folder import (
@@ -156,7 +156,7 @@ def test_progress_row_is_complete(uninterrupted_run: Path) -> None:
 def test_steps_are_rounded_up_to_whole_iterations(tmp_path: Path, learn: Learn) -> None:
     run = learn(tmp_path / "run", small_config(trpo__steps_per_iteration=101, steps=201))
     assert [row["environment_steps"] for row in progress(tmp_path / "run")] == [200, 400]
-    assert run.training.environment_steps == 400
+    assert run.collector.environment_steps == 400
 
 
 @pytest.mark.long
@@ -328,7 +328,7 @@ def test_last_policy_is_the_controller_without_validations(tmp_path: Path, learn
     assert {row["return_validation"] for row in progress(tmp_path / "run")} == {None}
     loaded = load_controller(tmp_path / "run")
     assert isinstance(loaded, ResidualDriver)
-    for found, expected in zip(loaded.network.layers, run.training.learner.network().layers, strict=True):
+    for found, expected in zip(loaded.network.layers, run.network().layers, strict=True):
         np.testing.assert_array_equal(found[0], expected[0])
         np.testing.assert_array_equal(found[1], expected[1])
     assert controller_manifest(tmp_path / "run")["iteration"] == 2
@@ -377,7 +377,7 @@ def test_training_explores_and_validation_does_not(
     run = learn(tmp_path / "run", small_config(policy__exploration_std=0.3))
     (trajectory,) = episodes[-1].trajectories
     assert np.std(trajectory.residual) > 0.1
-    again = run.make_drivers(run.training.learner.network())
+    again = run.make_drivers(run.network())
     assert run.validation_returns(again) == [progress(tmp_path / "run")[-1]["return_validation"]]
 
 

@@ -12,7 +12,8 @@ from tests.training.test_run import Stop, collected_episodes, learn_with, outcom
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
-from unjam.learners.algorithm_1 import environment_experience
+from unjam.learners.algorithm_1 import Algorithm1
+from unjam.learners.experience import environment_experience
 from unjam.learners.settings import AGENT_NAMES
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config, planned_steps, to_toml
@@ -103,7 +104,7 @@ def test_interrupted_mixture_ends_unchanged(agent: str, tmp_path: Path, monkeypa
         assert found[0] == found[1]
     found = [outcome_of(place) for place in places]
     assert found[0] == found[1]
-    assert {"model", "model-1"} <= found[0][0].keys()
+    assert {"model", "model-1"} <= found[0][0]["algorithm"].keys()
 
 
 def outcome_of(folder: Path) -> tuple[Any, ...]:
@@ -128,17 +129,18 @@ def test_progress_covers_the_run_and_each_task(tmp_path: Path) -> None:
 def test_privileged_critic_has_task_and_drawn_values(tmp_path: Path, sees_road: bool) -> None:
     with WorkerPool(1) as workers:
         trainer = Trainer(tmp_path, mixture(policy__privileged_critic=sees_road), workers)
-        training = trainer.training
-        episodes = trainer.collect(training.learner.network(), 1)
-        rows = environment_experience(training, episodes)
-    privileged = rows.observations[:, training.learner.spec.inputs :]
-    assert training.learner.sb3.observation_space.shape == rows.observations.shape[1:]
+        episodes = trainer.collect(trainer.network(), 1)
+        rows = environment_experience(trainer.spec, episodes, 1)
+    privileged = rows.observations[:, trainer.spec.inputs :]
+    assert isinstance(trainer.algorithm, Algorithm1)
+    learner: Any = trainer.algorithm.learner
+    assert learner.sb3.observation_space.shape == rows.observations.shape[1:]
     if not sees_road:
         assert privileged.shape[1] == 0
         return
     scaled = [
         task.scenario.scale_drawn_values(driven[-1].drawn_values)[0]
-        for task, driven in zip(training.tasks, episodes, strict=True)
+        for task, driven in zip(trainer.tasks, episodes, strict=True)
     ]
     np.testing.assert_allclose(privileged[0, 1:], [0.0, 1.0, 0.0])
     np.testing.assert_allclose(privileged[-1], [0.0, scaled[1], 0.0, 1.0], rtol=1e-6)
@@ -210,7 +212,7 @@ def test_unsupported_tasks_run_in_sumo(tmp_path: Path) -> None:
     for world, folder in folders.items():
         with WorkerPool(1) as workers:
             trainer = Trainer(folder, load_config(changes=small | {"simulator": world}), workers)
-            driven[world] = trainer.collect(trainer.training.learner.network(), 1)
+            driven[world] = trainer.collect(trainer.network(), 1)
     for one, other in zip(driven["sumo"], driven["batch"], strict=True):
         assert [episode.seed for episode in one] == [episode.seed for episode in other]
         for actual, found in zip(one, other, strict=True):
@@ -222,7 +224,7 @@ def test_regret_increases_the_episodes_of_a_task(tmp_path: Path, monkeypatch: py
     """The short road can be driven far better than it is; a run that was stopped knows, too."""
 
     def validated(trainer: Trainer, drivers: Any) -> list[float]:
-        return [1.0, 1.0 if trainer.training.iteration else 1e6]  # the expert's were better
+        return [1.0, 1.0 if trainer.collector.iteration else 1e6]  # the expert's were better
 
     monkeypatch.setattr(Trainer, "validation_returns", validated)
     config = mixture(task_sampling="regret", tasks=[{}, SHORT], trpo__steps_per_iteration=600, steps=1800)
@@ -256,7 +258,7 @@ def test_network_output_respects_the_narrowest_limits(tmp_path: Path) -> None:
     )
     with WorkerPool(1) as workers:
         trainer = Trainer(tmp_path, config, workers)
-        strong, gentle = trainer.make_drivers(trainer.training.learner.network())
+        strong, gentle = trainer.make_drivers(trainer.network())
     assert isinstance(strong, ResidualDriver)
     assert isinstance(gentle, ResidualDriver)
     assert (strong.action_limit, gentle.action_limit) == (2.0, 0.5)

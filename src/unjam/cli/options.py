@@ -157,7 +157,7 @@ def training_options(
     ] = None,
     steps: Annotated[int | None, Option(min=1, help="Environment steps to train for.")] = None,
     seed: Annotated[int | None, Option(min=0, help="Seed of the whole run.")] = None,
-    agent: Annotated[str | None, Option(help=f"Learner: {', '.join(AGENT_NAMES)}.")] = None,
+    agent: Annotated[str | None, Option(help=f"Learner: {', '.join(AGENT_NAMES)}, or path.py:Class.")] = None,
     expert: Annotated[
         str | None, Option(help="Driver that the residual is added to, as in drive --driver; none: no expert.")
     ] = None,

@@ -1,17 +1,14 @@
-"""Experience: trajectories in the form in which learners take them, and how SB3's buffers are filled with it."""
+"""Experience: trajectories in the form in which learners take them, and how it is made of episodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from unjam.worlds.record import Trajectory
+from unjam.errors import InputError, UnjamError
+from unjam.learners.agent import AgentSpec
+from unjam.worlds.record import Episode, Trajectory
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -85,82 +82,6 @@ def join_experience(parts: Sequence[Experience]) -> Experience:
     return Experience(**joined)
 
 
-@torch.no_grad()
-def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
-    """Fill `buffer` with rows and compute their advantages; to truncated trajectories gamma V of their end is added.
-
-    Values and log-probabilities are computed in one batch, so that the ratio before the first update is exactly 1.
-    """
-    actions, observations = rows.actions[:, None], torch.as_tensor(rows.observations)
-    values, log_probs, _ = policy.evaluate_actions(observations, torch.as_tensor(actions))
-    last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
-    rewards = rows.rewards.astype(np.float32)
-    rewards[rows.last_rows] += buffer.gamma * np.where(rows.terminated, 0.0, last_values).astype(np.float32)
-
-    buffer.buffer_size = len(rewards)
-    buffer.reset()
-    buffer.observations[:, 0] = rows.observations
-    buffer.actions[:, 0] = actions
-    buffer.rewards[:, 0] = rewards
-    buffer.episode_starts[rows.starts, 0] = 1.0
-    buffer.values[:, 0] = values.numpy().ravel()
-    buffer.log_probs[:, 0] = log_probs.numpy()
-    buffer.pos, buffer.full = len(rewards), True
-    buffer.compute_returns_and_advantage(torch.zeros(1), np.ones(1, bool))
-
-
-def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Float64) -> None:
-    """Add rows to the buffer, in place of the oldest ones if it is full; only collisions set `dones`.
-
-    SB3 stores actions as shares of their bounds, here of the `authority` [m/s2].
-    """
-    done = np.zeros(len(rewards), np.float32)
-    done[rows.last_rows] = rows.terminated
-    indices = (buffer.pos + np.arange(len(rewards))) % buffer.buffer_size
-    buffer.observations[indices, 0] = rows.observations
-    buffer.next_observations[indices, 0] = rows.next_observations
-    buffer.actions[indices, 0, 0] = rows.actions / np.float32(authority)
-    buffer.rewards[indices, 0] = rewards
-    buffer.dones[indices, 0] = done
-    end = buffer.pos + len(rewards)
-    buffer.full = buffer.full or end >= buffer.buffer_size
-    buffer.pos = end % buffer.buffer_size
-
-
-class MixedReplayBuffer(ReplayBuffer):
-    """SB3's replay buffer of environment rows; while it has model rows too, batches are mixed."""
-
-    model_buffer: ReplayBuffer | None = None
-    real_ratio = 1.0
-    """share of environment rows in a batch"""
-
-    def new_model_buffer(self, rows: int) -> ReplayBuffer:
-        """Return an empty buffer for a number of model rows, which replaces the previous one."""
-        spaces = self.observation_space, self.action_space
-        self.model_buffer = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
-        return self.model_buffer
-
-    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
-        """Return a random batch."""
-        if self.model_buffer is None:
-            return super().sample(batch_size, env)
-        real = round(self.real_ratio * batch_size)
-        parts = [super().sample(real)] if real else []
-        if real < batch_size:
-            parts.append(self.model_buffer.sample(batch_size - real))
-        return ReplayBufferSamples(*(torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)))
-
-
-def shift_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
-    """Return the rewards minus `offset`, shape (rows,), so that all values decrease by offset / (1 - gamma).
-
-    At a collision, which no reward follows, the last reward decreases by the missing part.
-    """
-    rewards = rows.rewards - offset
-    rewards[rows.last_rows] -= np.where(rows.terminated, offset * gamma / (1.0 - gamma), 0.0)
-    return rewards
-
-
 def discounted_returns(rows: Experience, gamma: float) -> Float64:
     """Return discounted rewards from each row on, (rows,); truncated trajectories continue with their mean reward."""
     returns = np.empty(len(rows.rewards))
@@ -169,3 +90,37 @@ def discounted_returns(rows: Experience, gamma: float) -> Float64:
         for row in range(last, first - 1, -1):
             later = returns[row] = rows.rewards[row] + gamma * later
     return returns
+
+
+def environment_experience(spec: AgentSpec, episodes: Sequence[Sequence[Episode]], iteration: int) -> Experience:
+    """Return the experience of the episodes of all tasks; raise `UnjamError` if some of it is not finite."""
+    rows = join_experience([task_experience(spec, index, each) for index, each in enumerate(episodes)])
+    for name in ("observations", "rewards"):
+        if not np.isfinite(getattr(rows, name)).all():
+            raise UnjamError(f"learner: {name} of iteration {iteration} are not finite")
+    return rows
+
+
+def task_experience(spec: AgentSpec, task_index: int, episodes: Sequence[Episode]) -> Experience:
+    """Return the experience of episodes of a task; raise `InputError` if no CAV was on the road."""
+    policy, scenario = spec.policy, spec.tasks[task_index].scenario
+    pairs = [(episode, trajectory) for episode in episodes for trajectory in episode.trajectories]
+    if not pairs:
+        raise InputError(f"no CAV was on the road in {len(episodes)} episodes: increase the share of CAVs")
+    drawn_values = np.array([scenario.scale_drawn_values(episode.drawn_values) for episode, _ in pairs])
+    critic_inputs, later = spec.privileged_inputs(task_index, drawn_values), None
+    if policy.reward_after_exit:
+        entry_times = [trajectory.start_step / scenario.horizon for _, trajectory in pairs]
+        critic_inputs = np.column_stack([critic_inputs, entry_times])
+        later = [return_after_exit(*pair, spec.gamma, scenario.horizon) for pair in pairs]
+    return make_experience([trajectory for _, trajectory in pairs], critic_inputs, later)
+
+
+def return_after_exit(episode: Episode, trajectory: Trajectory, gamma: float, horizon: int) -> float | None:
+    """Return rewards after a CAV left, discounted to its last action; None if it stayed or the episode is truncated."""
+    end = trajectory.step_slice.stop
+    goes_on = episode.status != "collision" and not np.isnan(episode.speeds[-1]).all()
+    if end >= episode.control_steps or trajectory.terminated or (goes_on and episode.control_steps < horizon):
+        return None
+    rewards = np.add.reduceat(episode.reward[end:], np.arange(0, episode.control_steps - end, trajectory.action_repeat))
+    return float(rewards @ gamma ** np.arange(1, len(rewards) + 1))

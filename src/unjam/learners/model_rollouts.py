@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver
 from unjam.following.calibration import calibrate_human_drivers
+from unjam.learners.algorithm import Tensors, tensors_with_prefix
 from unjam.learners.experience import Experience
-from unjam.learners.learner import Tensors, tensors_with_prefix
 from unjam.learners.settings import PolicySettings
 from unjam.models.comparison import mean_returns
 from unjam.models.ensemble import Ensemble, ModelFit, Seed, torch_generator

@@ -16,8 +16,18 @@ from torch.distributions import Normal
 
 from unjam.adam import Adam
 from unjam.drivers.network import Network
-from unjam.learners.experience import Experience, MixedReplayBuffer, add_to_replay_buffer, shift_rewards
-from unjam.learners.learner import AgentSpec, Learner, Tensors, Update, network_layers, zero_layer
+from unjam.learners.agent import AgentSpec
+from unjam.learners.algorithm import Tensors
+from unjam.learners.experience import Experience
+from unjam.learners.learner import Update
+from unjam.learners.sb3_learner import (
+    MixedReplayBuffer,
+    SB3Learner,
+    add_to_replay_buffer,
+    network_layers,
+    shift_rewards,
+    zero_layer,
+)
 from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings, TD3Settings
 
 UNIFORM_STD = 0.85
@@ -106,7 +116,7 @@ class DeterministicResidualPolicy(OffPolicyResidualMixin, TD3Policy):
         return Network(network_layers(self.actor.mu), self.authority, self.exploration_std)
 
 
-class OffPolicyLearner(Learner):
+class OffPolicyLearner(SB3Learner):
     """A learner that also learns from earlier iterations, which are in a replay buffer."""
 
     def __init__(
@@ -169,15 +179,15 @@ class OffPolicyLearner(Learner):
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all that it needs to resume, including the replay buffer."""
-        counters, tensors = super().state()
-        counters |= {name: getattr(self.buffer, name) for name in REPLAY_POSITION}
-        return counters, tensors | self._shared_tensors()
+        values, tensors = super().state()
+        values |= {name: getattr(self.buffer, name) for name in REPLAY_POSITION}
+        return values, tensors | self._shared_tensors()
 
-    def restore(self, counters: dict[str, Any], tensors: Tensors) -> None:
+    def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
         """Resume from what `state` of a learner with the same configuration returned."""
-        super().restore(counters, tensors)
+        super().restore(values, tensors)
         for name in REPLAY_POSITION:
-            setattr(self.buffer, name, counters[name])
+            setattr(self.buffer, name, values[name])
         for name, tensor in self._shared_tensors().items():
             tensor.detach().copy_(tensors[name])
 

@@ -1,16 +1,18 @@
 """Settings of policies and learners. Free of torch, so that a wrong value is refused at once.
 
-A new learner needs a file that makes it, its settings here, which name it, and their field in `AgentSettings`.
+A new learner of the package needs a file that makes it, its settings here, which name it, and their field in
+`AgentSettings`; one of a user's own needs none of this: `agent = "path.py:Class"`.
 """
 
 from dataclasses import field
-from typing import Annotated, ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.observation import FeatureName
-from unjam.parameters import STRICT, IntAboveOne, NonNegative, NonNegativeInt, Positive, PositiveInt
+from unjam.drivers.user_driver import is_file_reference
+from unjam.parameters import STRICT, IntAboveOne, NonNegative, NonNegativeInt, Options, Positive, PositiveInt
 
 Discount = Annotated[float, Field(gt=0, lt=1)]
 UnitInterval = Annotated[float, Field(ge=0, le=1)]
@@ -160,8 +162,26 @@ class TD3Settings(OffPolicySettings):
     """largest such noise, as a share of the authority"""
 
 
-AgentName = Literal["trpo", "ppo", "sac", "td3"]
-AGENT_NAMES: tuple[AgentName, ...] = get_args(AgentName)
+@dataclass(frozen=True, config=STRICT)
+class UserAgentSettings(LearnerSettings):
+    """Settings of an agent of the user's own."""
+
+    options: Options = field(default_factory=dict)
+    """keyword arguments of its class"""
+
+
+AGENT_NAMES = ("trpo", "ppo", "sac", "td3")
+"""the learners of the package"""
+
+
+def _check_agent_name(name: str) -> str:
+    if name not in AGENT_NAMES and not is_file_reference(name):
+        raise ValueError(f"{', '.join(map(repr, AGENT_NAMES))} or 'path.py:Class'")
+    return name
+
+
+AgentName = Annotated[str, AfterValidator(_check_agent_name)]
+"""one of `AGENT_NAMES`, or `path.py:Class`"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -169,13 +189,14 @@ class AgentSettings:
     """The chosen learner, and the settings of each one in the table of its name."""
 
     agent: AgentName = "trpo"
-    """the learner"""
+    """the learner, or `path.py:Class`: a learner or a whole algorithm of the user's own"""
     trpo: TRPOSettings = field(default_factory=TRPOSettings)
     ppo: PPOSettings = field(default_factory=PPOSettings)
     sac: SACSettings = field(default_factory=SACSettings)
     td3: TD3Settings = field(default_factory=TD3Settings)
+    user: UserAgentSettings = field(default_factory=UserAgentSettings)
 
     @property
     def learner(self) -> LearnerSettings:
-        """The settings of the chosen learner."""
-        return getattr(self, self.agent)
+        """The settings of the chosen agent."""
+        return getattr(self, self.agent if self.agent in AGENT_NAMES else "user")

@@ -14,8 +14,10 @@ from torch.distributions import Normal
 
 from unjam.adam import Adam
 from unjam.drivers.network import Network, append_ones
-from unjam.learners.experience import Experience, discounted_returns, fill_rollout_buffer, join_experience
-from unjam.learners.learner import AgentSpec, Learner, Update, network_layers, zero_layer
+from unjam.learners.agent import AgentSpec
+from unjam.learners.experience import Experience, discounted_returns
+from unjam.learners.learner import Update
+from unjam.learners.sb3_learner import SB3Learner, fill_rollout_buffer, network_layers, zero_layer
 from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
 
 
@@ -129,7 +131,7 @@ class ResidualPolicy(ActorCriticPolicy):
         return Network(layers, self.authority, std, self.settings.episode_noise)
 
 
-class OnPolicyLearner(Learner):
+class OnPolicyLearner(SB3Learner):
     """A learner that learns from the rows of the current policy alone."""
 
     def set_value_scale(self, environment_rows: Experience) -> None:
@@ -146,8 +148,7 @@ class OnPolicyLearner(Learner):
 
     def learn(self, update: Update) -> None:
         """Update policy and value network with environment and model rows together."""
-        parts = [part for part in (update.environment_rows, update.model_rows) if part is not None]
-        self.fill_buffer(join_experience(parts))
+        self.fill_buffer(update.rows)
         self.sb3.train()
 
     def fill_buffer(self, rows: Experience) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import ArgsKwargs
 
@@ -23,6 +23,7 @@ from unjam.models.settings import ModelSettings
 from unjam.parameters import (
     STRICT,
     NonNegativeInt,
+    Options,
     Positive,
     PositiveInt,
     build_dataclass,
@@ -43,14 +44,6 @@ from unjam.worlds.episode import Task
 
 CONFIG_FILE = "config.toml"
 """the configuration in the folder of a run or of a search"""
-
-
-def _without_tuples(options: dict[str, Any]) -> dict[str, Any]:
-    """Return options as a TOML file gives them back, so that a stored configuration equals the original."""
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in options.items()}
-
-
-ScenarioOptions = Annotated[dict[str, Any], AfterValidator(_without_tuples)]
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -77,7 +70,7 @@ class TaskConfig:
     """One of several roads of a training; missing and empty entries are those of the run."""
 
     scenario: str = ""
-    scenario_options: ScenarioOptions = field(default_factory=dict)
+    scenario_options: Options = field(default_factory=dict)
     """changes to the scenario's parameters, in addition to the run's"""
     expert: str = ""
     reward: str = ""
@@ -92,7 +85,7 @@ class RunConfig(AgentSettings):
     """One training run. Every key can be set in a TOML file, by `--set key=value`, and in Python."""
 
     scenario: str = "ring"
-    scenario_options: ScenarioOptions = field(default_factory=dict)
+    scenario_options: Options = field(default_factory=dict)
     """changes to the scenario's parameters"""
     expert: str = "pi"
     """driver to which the residual is added: a name, `path.py:name`, a run folder, a .unjam file; `none`: the network
@@ -140,7 +133,7 @@ class RunConfig(AgentSettings):
         device, patience, exploration = self.model.device, evaluation.patience, policy.exploration
         no_memory = policy.history_features and not has_memory
         no_validation = patience and not evaluation.validation_interval
-        no_noise = policy.episode_noise and self.agent not in ("trpo", "ppo")
+        no_noise = policy.episode_noise and self.agent in ("sac", "td3")
         pairs = "per_step, per_episode, because these model rollouts have no antithetic pairs"
         weights = "weights, except for several validated tasks"
         checks = (

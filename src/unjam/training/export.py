@@ -30,7 +30,7 @@ from unjam.trust import expecting_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 if TYPE_CHECKING:
-    from unjam.learners.learner import Tensors
+    from unjam.learners.algorithm import Tensors
 
 ControllerKind = Literal["best", "latest"]
 

@@ -30,7 +30,7 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
     `settings` has all but steps and workers, by name; `files` the hashes of the experts and of the user's code and
     networks; `packages` and `kernels` the numerical environment.
     """
-    files: dict[str, str] = {}
+    files = file_hashes((config.agent,))
     for each, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):
         recipe, arrays = driver_recipe(task.expert)
         weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))

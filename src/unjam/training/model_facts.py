@@ -13,8 +13,8 @@ import torch
 
 from unjam.errors import InputError, resume_hint
 from unjam.files import atomic_write, to_json
+from unjam.learners.algorithm import tensors_with_prefix
 from unjam.learners.algorithm_1 import model_rollouts_class
-from unjam.learners.learner import tensors_with_prefix
 from unjam.learners.model_rollouts import RowRollouts
 from unjam.learners.whole_road_rollouts import WholeRoadRollouts
 from unjam.models.comparison import one_step_errors, open_loop_errors, recorded_states, replay_accelerations
@@ -53,7 +53,7 @@ def update_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
 
     Raise `InputError` if the run has no model that is measured, or no checkpoint yet.
     """
-    if reason := no_facts_reason(config):
+    if reason := no_facts_reason(folder, config):
         raise InputError(f"run: {str(folder)!r} {reason}")
     facts, progress = read_model_facts(folder), read_progress(folder)
     if facts is None or not progress or facts.get("iteration") != progress[-1]["iteration"]:
@@ -63,12 +63,14 @@ def update_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
     return facts
 
 
-def no_facts_reason(config: RunConfig) -> str:
+def no_facts_reason(folder: Path, config: RunConfig) -> str:
     """Return why there are no facts about the model of a run; empty if there are."""
     if config.tasks:
         return "has several tasks; allowed: a run of one road"
     if config.model.model_ratio == 0:
         return "has no model: its model.model_ratio is 0; allowed: > 0"
+    if (progress := read_progress(folder)) and not progress[-1]["model"]:
+        return f"has no model: {config.agent} learns none; allowed: an agent that does"
     return ""
 
 
@@ -87,7 +89,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     settings = replace(config.model, device="cpu")
     (task,) = config.make_tasks()
     rollouts = model_rollouts_class(settings, task)(settings, task, config.policy, config.seed)
-    rollouts.restore(state[rollouts.name], tensors_with_prefix(f"{rollouts.name}/", tensors))
+    rollouts.restore(state["algorithm"][rollouts.name], tensors_with_prefix(f"algorithm/{rollouts.name}/", tensors))
     facts = {"iteration": state["iteration"], "base": settings.base, "members": settings.members}
     if settings.kind == "road":
         run = _run_in_batch if config.simulator == "batch" else _run_in_sumo
@@ -195,11 +197,11 @@ def _replay_facts(rollouts: RowRollouts, scenario: Scenario, generator: np.rando
 
 
 def _bound_facts(rollouts: RowRollouts, progress_row: dict[str, Any], gamma: float) -> dict[str, Any] | None:
-    """Return the bound C by rollout length for the newest row of progress; None without an eps_m."""
+    """Return the bound C by rollout length for the newest row of progress; None without eps_m or eps_pi."""
     eps_m = progress_row["model"]["eps_m_by_estimator"].get("transitions")
-    if eps_m is None:
+    eps_pi = progress_row["learner"].get("eps_pi_max")
+    if eps_m is None or eps_pi is None:
         return None
-    eps_pi = progress_row["learner"]["eps_pi_max"]
     discount = rollouts.step_discount(gamma)
     return {
         "eps_pi": eps_pi,

@@ -16,6 +16,7 @@ from unjam.controller.file import sha256_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.drivers.registry import driver_recipe
+from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
 from unjam.files import (
     INVALID_DATA_ERRORS,
@@ -40,9 +41,9 @@ from unjam.worlds.episode import check_can_drive, check_policy_inputs, check_tim
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
-    from unjam.learners.learner import Tensors
+    from unjam.learners.algorithm import Tensors
 
-CHECKPOINT_FORMAT = 5
+CHECKPOINT_FORMAT = 6
 """format of run folders and their checkpoints; other formats are refused"""
 MAX_CHECKPOINTS = 2
 MANIFEST_FILE, PROGRESS_FILE = "manifest.json", "progress.jsonl"
@@ -70,6 +71,10 @@ def check_config(config: RunConfig) -> None:
 
             check_road_model(scenario, config.model)
     config.make_tasks()
+    if is_file_reference(config.agent):
+        from unjam.learners.agent import check_agent  # its file may import torch
+
+        check_agent(config.agent)
 
 
 def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> None:

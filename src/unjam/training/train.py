@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -19,7 +19,16 @@ from unjam.drivers.network import Network
 from unjam.errors import UnjamError
 from unjam.files import append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
-from unjam.learners.algorithm_1 import Iteration, TaskEpisodes, ValidationReturns, algorithm_1, start_training
+from unjam.learners.agent import AgentSpec, check_network, check_state, reporting_user_errors
+from unjam.learners.algorithm import (
+    Collector,
+    IterationLog,
+    TaskEpisodes,
+    run_iterations,
+    seed_iteration,
+    tensors_with_prefix,
+)
+from unjam.learners.algorithm_1 import make_algorithm
 from unjam.learners.model_rollouts import full_policy
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate
@@ -57,6 +66,10 @@ PROGRESS_METRICS = (
 )
 """metrics of progress: means over the episodes of an iteration"""
 PROGRESS_RETURNS = ("return_mean", "return_expert", "return_validation")
+ALGORITHM_PREFIX = "algorithm/"
+"""of the tensors of the algorithm in checkpoints"""
+ValidationReturns = Sequence[float] | None
+"""return on the validation seeds of each task; None without a validation"""
 _training_lock = threading.Lock()
 
 
@@ -169,7 +182,7 @@ def train_in_process(
             for name, task in config.task_configs().items():
                 task_progress = partial(_report_task_progress, progress, name) if progress else None
                 rows[name] = evaluate_run(folder / name, task, workers, task_progress).rows
-        if not no_facts_reason(config):
+        if not no_facts_reason(folder, config):
             write_model_facts(folder, config)
         write_report_page([folder / name for name in rows], folder / "report.html")
     return rows
@@ -181,7 +194,7 @@ def _report_task_progress(progress: EvaluationProgress, name: str, episode: tupl
 
 
 class Trainer:
-    """Runs Algorithm 1 with episodes from the workers, validation and the run's folder.
+    """Runs an algorithm with episodes from the workers, validation and the run's folder.
 
     Each of several tasks has its own folder in that of the run, with controller and progress. Returns of the whole
     run, which also select the controllers, are then weighted means over the tasks.
@@ -194,7 +207,11 @@ class Trainer:
         self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
         self.folders = [folder / task.name for task in self.tasks]
-        self.training = start_training(self.tasks, config.policy, config.learner, config.model, config.seed)
+        self.spec = AgentSpec(self.tasks, config.policy, config.model, config.learner.gamma, config.seed)
+        self.collector = Collector(self.collect)
+        seed_iteration(config.seed, 0)
+        with reporting_user_errors(config.agent):
+            self.algorithm = make_algorithm(config.agent, config.learner, self.spec)
         self._on_iteration = on_iteration or (lambda row: None)
         self._best_validation, self._expert_returns = -np.inf, [float("nan")] * len(self.tasks)
         self._sampler = TaskSampler(self.tasks, config.task_sampling, self._expert_returns)
@@ -204,7 +221,10 @@ class Trainer:
             state, tensors = checkpoint
             is_finished = state["environment_steps"] >= config.steps or should_stop_early(config, read_progress(folder))
             self._controllers.restore(tensors, is_finished)
-            self.training.restore(state, tensors)
+            self.collector.iteration = state["iteration"]
+            self.collector.environment_steps = state["environment_steps"]
+            with reporting_user_errors(config.agent):
+                self.algorithm.restore(state["algorithm"], tensors_with_prefix(ALGORITHM_PREFIX, tensors))
             self._best_validation = state["best_validation"]
             self._expert_returns = state["expert_returns"]
             self._sampler.restore(state["sampler"])
@@ -216,13 +236,21 @@ class Trainer:
             for folder, task in zip(self.folders, self.config.task_configs().values(), strict=True):
                 make_folder(folder)
                 atomic_write(folder / CONFIG_FILE, to_toml(task))
-        if self.training.iteration == 0:
+        if self.collector.iteration == 0:
             self._expert_returns = self.validation_returns([task.expert for task in self.tasks])
             self._sampler.best_returns = self._expert_returns
-            self._save_controllers(self.training.learner.network(), is_best=True)
+            self._save_controllers(self.network(), is_best=True)
             self._best_validation = self._sampler.weighted_mean(self._expert_returns)
         if not should_stop_early(self.config, read_progress(self.folder)):
-            algorithm_1(self.training, self.config.steps, self.collect, self.validate, self.write_progress)
+            with reporting_user_errors(self.config.agent):
+                run_iterations(
+                    self.algorithm, self.collector, self.config.steps, self.config.seed, self.finish_iteration
+                )
+
+    def network(self) -> Network:
+        """Return the present policy."""
+        with reporting_user_errors(self.config.agent):
+            return check_network(self.config.agent, self.algorithm.network(), self.spec)
 
     def make_drivers(self, network: Network) -> list[Driver]:
         """Return the full policy of each task: its expert plus this residual."""
@@ -230,18 +258,20 @@ class Trainer:
 
     def collect(self, network: Network, iteration: int) -> TaskEpisodes:
         """Return the episodes of an iteration, at least one of each task, as many as the sampler says."""
-        steps, remaining = self.config.learner.steps_per_iteration, self.config.steps - self.training.environment_steps
+        check_network(self.config.agent, network, self.spec)
+        steps = self.config.learner.steps_per_iteration
+        remaining = self.config.steps - self.collector.environment_steps
         counts = self._sampler.episode_counts(steps)
         iterations = warm_up_iterations(iteration, remaining, steps, self.tasks, counts)
         seeds = ((self.config.seed, each) for each in iterations)
         return self._run_episodes(self.make_drivers(network), counts, self.config.policy.exploration_signs, *seeds)
 
-    def validate(self, iteration: Iteration, has_ended: bool = False) -> ValidationReturns:
+    def validate(self, has_ended: bool = False) -> ValidationReturns:
         """Run the validation seeds after some iterations and at the end, and save the best controller."""
-        started, returns = time.perf_counter(), None
-        network, interval = self.training.learner.network(), self.config.evaluation.validation_interval
-        is_last = has_ended or iteration.environment_steps >= self.config.steps
-        is_scheduled = interval > 0 and iteration.number % interval == 0
+        returns: ValidationReturns = None
+        network, interval = self.network(), self.config.evaluation.validation_interval
+        is_last = has_ended or self.collector.environment_steps >= self.config.steps
+        is_scheduled = interval > 0 and self.collector.iteration % interval == 0
         if is_scheduled or (interval and is_last):
             returns = self.validation_returns(self.make_drivers(network))
             mean = self._sampler.weighted_mean(returns)
@@ -253,28 +283,46 @@ class Trainer:
                 self._sampler.update(returns)
         elif is_last:
             self._save_controllers(network, is_best=False)
-        iteration.seconds["validation"] = time.perf_counter() - started
         return returns
 
-    def write_progress(self, iteration: Iteration, validation: ValidationReturns) -> bool:
-        """Write a row of progress, of the whole run and of each task, and a checkpoint.
+    def finish_iteration(self, log: IterationLog) -> bool:
+        """Validate if it is due; write a row of progress, of the whole run and of each task, and a checkpoint.
 
         Return whether to stop: by `on_iteration` or by `should_stop_early`.
         """
-        whole, *tasks = self._progress_rows(iteration, validation)
+        started, validation = time.perf_counter(), self.validate()
+        seconds = {"collect": self.collector.seconds, **log.seconds, "validation": time.perf_counter() - started}
+        log = replace(log, seconds=seconds)
+        whole, *tasks = self._progress_rows(log, validation)
         early = should_stop_early(self.config, [*read_progress(self.folder), whole])
         if early and validation is None:
-            whole, *tasks = self._progress_rows(iteration, self.validate(iteration, has_ended=True))
+            started, validation = time.perf_counter(), self.validate(has_ended=True)
+            seconds["validation"] += time.perf_counter() - started
+            whole, *tasks = self._progress_rows(log, validation)
         for folder, row in [*zip(self.folders, tasks, strict=False), (self.folder, whole)]:
             append_line(folder / PROGRESS_FILE, to_json(row))
-        counters, tensors = self.training.state()
-        state = {**counters, "fingerprint": self._fingerprint, "sampler": self._sampler.state()}
-        state |= {"best_validation": self._best_validation, "expert_returns": self._expert_returns}
-        save_checkpoint(self.folder / "checkpoint", state, {**tensors, **self._controllers.tensors()})
+        self._save_checkpoint()
         stopped = self._on_iteration(whole) is False
         if stopped and validation is None and not early:
-            self.validate(iteration, has_ended=True)
+            self.validate(has_ended=True)
         return stopped or early
+
+    def _save_checkpoint(self) -> None:
+        values, tensors = check_state(self.config.agent, self.algorithm.state())
+        state = {
+            **self._counters,
+            "algorithm": values,
+            "fingerprint": self._fingerprint,
+            "sampler": self._sampler.state(),
+            "best_validation": self._best_validation,
+            "expert_returns": self._expert_returns,
+        }
+        own = {f"{ALGORITHM_PREFIX}{name}": tensor for name, tensor in tensors.items()}
+        save_checkpoint(self.folder / "checkpoint", state, own | self._controllers.tensors())
+
+    @property
+    def _counters(self) -> dict[str, int]:
+        return {"iteration": self.collector.iteration, "environment_steps": self.collector.environment_steps}
 
     def validation_returns(self, drivers: Sequence[Driver]) -> list[float]:
         """Return the mean validation return of each task with its driver."""
@@ -301,9 +349,9 @@ class Trainer:
         raise_failure([measure(episode) for episode in episodes if not episode.has_run])
         return [episodes[end - count : end] for end, count in zip(np.cumsum(counts), counts, strict=True)]
 
-    def _progress_rows(self, iteration: Iteration, validation: ValidationReturns) -> list[dict[str, Any]]:
+    def _progress_rows(self, log: IterationLog, validation: ValidationReturns) -> list[dict[str, Any]]:
         """Return the row of progress of the whole run, then those of its tasks if it has several."""
-        rows = [self._progress_row(iteration, validation, index) for index in range(len(self.tasks))]
+        rows = [self._progress_row(log, validation, index) for index in range(len(self.tasks))]
         if not self.config.tasks:
             return rows
         names = [*PROGRESS_RETURNS, *PROGRESS_METRICS] if validation else [*PROGRESS_RETURNS[:-1], *PROGRESS_METRICS]
@@ -319,16 +367,15 @@ class Trainer:
         }
         return [whole, *rows]
 
-    def _progress_row(self, iteration: Iteration, validation: ValidationReturns, index: int) -> dict[str, Any]:
+    def _progress_row(self, log: IterationLog, validation: ValidationReturns, index: int) -> dict[str, Any]:
         """Return the row of progress of one task."""
-        measured = [measure(episode) for episode in iteration.episodes[index]]
-        model = iteration.model[index] if iteration.model else {}
+        measured = [measure(episode) for episode in self.collector.episodes[index]]
+        model = log.model[index] if log.model else {}
         means = {name: float(np.mean([row[name] for row in measured])) for name in ("return", *PROGRESS_METRICS)}
         return {
-            "iteration": iteration.number,
-            "environment_steps": iteration.environment_steps,
+            **self._counters,
             "episodes": len(measured),
-            "model_steps": iteration.model_steps,
+            "model_steps": log.model_steps,
             "k_star": model.get("k_star"),
             "eps_m": model.get("eps_m"),
             "return_mean": means.pop("return"),
@@ -336,15 +383,14 @@ class Trainer:
             "return_validation": validation[index] if validation else None,
             **means,
             "collisions": sum(row["collisions"] for row in measured),
-            "learner": iteration.log,
+            "learner": {name: float(value) for name, value in log.values.items()},
             "model": model,
-            "seconds": iteration.seconds,
+            "seconds": log.seconds,
         }
 
     def _save_controllers(self, network: Network, is_best: bool) -> None:
-        counters = {"iteration": self.training.iteration, "environment_steps": self.training.environment_steps}
         contents = [
-            controller_bytes(driver, {**controller_origin(task.scenario, task.expert), **counters})
+            controller_bytes(driver, {**controller_origin(task.scenario, task.expert), **self._counters})
             for task, driver in zip(self.tasks, self.make_drivers(network), strict=True)
         ]
         self._controllers.save(contents, is_best)

@@ -1,0 +1,152 @@
+"""What an agent is made for, and where it comes from: a learner of the package, or a class of the user's own."""
+
+import inspect
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from traceback import extract_tb
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unjam.drivers.network import Network
+from unjam.drivers.observation import observation_size
+from unjam.drivers.user_driver import FileReference, is_file_reference
+from unjam.errors import InputError, UnjamError
+from unjam.learners.settings import LearnerSettings, PolicySettings, UserAgentSettings
+from unjam.models.settings import ModelSettings
+from unjam.worlds.episode import Task
+from unjam.worlds.record import Floats
+
+
+@dataclass(frozen=True)
+class AgentSpec:
+    """What an agent is made for: its tasks, the inputs of its networks, and the bounds of the residual."""
+
+    tasks: Sequence[Task]
+    policy: PolicySettings
+    model: ModelSettings
+    gamma: float
+    """discount from one action of the network to the next"""
+    seed: int
+    """of the whole run"""
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs of the policy."""
+        return observation_size(self.policy.inputs, self.tasks[0].expert)
+
+    @property
+    def critic_inputs(self) -> int:
+        """Number of additional inputs of the critic."""
+        drawn_values = np.zeros((1, len(self.tasks[0].scenario.drawn_ranges)))
+        return self.privileged_inputs(0, drawn_values).shape[1] + self.policy.reward_after_exit
+
+    @property
+    def action_limit(self) -> float:
+        """Largest acceleration of a CAV on all roads [m/s2]."""
+        return min(task.scenario.action_limit for task in self.tasks)
+
+    @property
+    def authority(self) -> float:
+        """Largest residual [m/s2]."""
+        return self.policy.authority * self.action_limit
+
+    @property
+    def exploration_std(self) -> float:
+        """Initial standard deviation of the exploration noise [m/s2]."""
+        return self.policy.exploration_std * self.action_limit
+
+    def privileged_inputs(self, task_index: int, drawn_values: Floats) -> Floats:
+        """Return the inputs of the critic alone in rows of a task with `drawn_values`, shape (rows, m).
+
+        With several tasks these are the values that each of them draws, zeros for the others, and a one-hot task index.
+        """
+        if not self.policy.privileged_critic:
+            return drawn_values[:, :0]
+        if len(self.tasks) == 1:
+            return drawn_values
+        columns = [np.zeros((len(drawn_values), len(task.scenario.drawn_ranges))) for task in self.tasks]
+        columns[task_index] = drawn_values
+        return np.hstack([*columns, np.tile(np.eye(len(self.tasks))[task_index], (len(drawn_values), 1))])
+
+
+def make_agent(name: str, settings: LearnerSettings, spec: AgentSpec) -> Any:
+    """Return a new agent: a `Learner` of the class that its settings name, or an object of the user's class."""
+    if isinstance(settings, UserAgentSettings):
+        kind = _user_class(name)
+        try:
+            inspect.signature(kind).bind(spec, **settings.options)
+        except TypeError as error:
+            raise InputError(f"user.options: {FileReference.parse(name)}: {error}") from None
+        return kind(spec, **settings.options)
+    module, _, class_name = settings.learner_class.partition(":")
+    return getattr(import_module(module), class_name)(spec, settings)
+
+
+def is_algorithm(agent: Any) -> bool:
+    """Return whether an agent, or its class, is an `Algorithm` and no `Learner`."""
+    return callable(getattr(agent, "iterate", None))
+
+
+def check_agent(name: str) -> None:
+    """Raise `InputError` if `path.py:Class` is not a class of learners or algorithms; the file runs for it."""
+    if not is_file_reference(name):
+        return
+    found = _user_class(name)
+    required = ("network", "state", "restore", "iterate" if is_algorithm(found) else "learn")
+    if missing := [f"{each}()" for each in required if not callable(getattr(found, each, None))]:
+        allowed = (
+            "allowed: a class with network(), state(), restore() and iterate(), an algorithm, or learn(), a learner"
+        )
+        raise InputError(f"agent: {FileReference.parse(name)} has no {', '.join(missing)}; {allowed}")
+
+
+def check_network(name: str, network: Any, spec: AgentSpec) -> Network:
+    """Return the network of an agent; raise `InputError` if it is none that workers can drive."""
+    if not isinstance(network, Network):
+        allowed = "allowed: an unjam.drivers.network.Network"
+        raise InputError(f"agent: network() of {name} returns {type(network).__name__}; {allowed}")
+    if network.input_size != spec.inputs:
+        allowed = f"allowed: {spec.inputs}, those of policy.inputs"
+        raise InputError(f"agent: the network of {name} has {network.input_size} inputs; {allowed}")
+    return network
+
+
+def check_state(name: str, state: Any) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return copies of the values and tensors of an agent; raise `InputError` if a checkpoint cannot store them."""
+    try:
+        values, tensors = state
+        copies = {key: torch.as_tensor(each).detach().clone().contiguous() for key, each in tensors.items()}
+        return json.loads(json.dumps(values)), copies
+    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
+        allowed = "allowed: (values for JSON, tensors or arrays by name)"
+        raise InputError(f"agent: state() of {name} cannot be stored: {error}; {allowed}") from None
+
+
+@contextmanager
+def reporting_user_errors(name: str) -> Iterator[None]:
+    """Raise `InputError` with the last executed line if code of the user's agent fails within the block."""
+    try:
+        yield
+    except UnjamError:
+        raise
+    except (Exception, SystemExit) as error:
+        reference = FileReference.parse(name) if is_file_reference(name) else None
+        frames = extract_tb(error.__traceback__) if reference else ()
+        lines = [str(frame.lineno) for frame in frames if reference and frame.filename == str(reference.path)]
+        if not lines:
+            raise
+        raise InputError(f"agent: {reference}: {type(error).__name__}: {error} (line {lines[-1]})") from error
+
+
+def _user_class(name: str) -> type[Any]:
+    reference = FileReference.parse(name)
+    found = reference.load_object()
+    if not inspect.isclass(found):
+        raise InputError(f"agent: {reference} is not a class; allowed: a class of learners or algorithms")
+    return found

@@ -1,0 +1,182 @@
+"""Learners of Stable-Baselines3: its algorithms with a `train()` that learns from whole episodes, and their buffers."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch import nn
+
+from unjam.drivers.network import Network
+from unjam.errors import UnjamError
+from unjam.learners.agent import AgentSpec
+from unjam.learners.algorithm import Tensors, tensors_with_prefix
+from unjam.learners.experience import Experience, Float64
+from unjam.learners.learner import Learner
+
+
+class SB3Learner(Learner):
+    """An algorithm of SB3 for residuals; subclasses make it and fill its buffer."""
+
+    gamma: float
+    """discount from one action of the network to the next"""
+    sb3: Any
+    """SB3's algorithm: its `train()` needs a filled buffer, a logger, and the spaces of an environment"""
+
+    def __init__(
+        self, spec: AgentSpec, algorithm: type[BaseAlgorithm], policy: type[BasePolicy], **kwargs: Any
+    ) -> None:
+        """Make SB3's algorithm; `kwargs` are its own."""
+        env = gymnasium.Env[np.ndarray, np.ndarray]()  # SB3 reads its spaces; it is never stepped
+        env.observation_space, env.action_space = policy_spaces(spec.inputs, spec.critic_inputs, spec.authority)
+        self.spec, self.gamma = spec, kwargs["gamma"]
+        residual = {"settings": spec.policy, "inputs": spec.inputs, "action_limit": spec.action_limit}
+        kwargs["policy_kwargs"] = residual | kwargs.get("policy_kwargs", {})
+        self.sb3 = algorithm(policy=policy, env=env, seed=spec.seed, device="cpu", **kwargs)
+        self.sb3.set_logger(Logger(None, []))
+
+    def network(self) -> Network:
+        """Return the policy as a NumPy network."""
+        return self.sb3.policy.network()
+
+    def log(self) -> dict[str, float]:
+        """Return what SB3 logs about its updates."""
+        return {key.partition("/")[2]: float(value) for key, value in self.sb3.logger.name_to_value.items()}
+
+    def check_parameters(self, iteration: int) -> None:
+        """Raise `UnjamError` if a parameter is not finite, or the exploration noise has vanished."""
+        for name, parameter in self.sb3.policy.named_parameters():
+            if not parameter.isfinite().all():
+                raise UnjamError(f"learner: {name} is not finite in iteration {iteration}")
+            if name == "log_std" and not parameter.exp().all():
+                raise UnjamError(f"learner: exploration has ended in iteration {iteration}: a smaller step helps")
+
+    def state(self) -> tuple[dict[str, Any], Tensors]:
+        """Return values and tensors to resume exactly; there is no random state, since each update is seeded."""
+        tensors: Tensors = {}
+        for part, state in self.sb3.get_parameters().items():
+            if "param_groups" in state:  # an optimizer
+                for index, entry in state["state"].items():
+                    tensors |= {f"{part}/{index}/{name}": tensor for name, tensor in entry.items()}
+            else:
+                tensors |= {f"{part}/{name}": tensor for name, tensor in state.items()}
+        return {"updates": self.sb3._n_updates}, tensors
+
+    def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
+        """Resume from what `state` of a learner with the same configuration returned."""
+        parts = self.sb3.get_parameters()
+        self.sb3.set_parameters({part: _restored_state(part, state, tensors) for part, state in parts.items()})
+        self.sb3._n_updates = values["updates"]
+
+
+def _restored_state(part: str, initial_state: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
+    """Return the stored state of a part of a learner in torch's form; `initial_state` is that of a new one."""
+    stored = tensors_with_prefix(f"{part}/", tensors)
+    if "param_groups" not in initial_state:
+        return stored
+    entries: dict[int, Tensors] = {}
+    for name, tensor in stored.items():
+        index, _, key = name.partition("/")
+        entries.setdefault(int(index), {})[key] = tensor
+    return {"state": entries, "param_groups": initial_state["param_groups"]}
+
+
+def policy_spaces(inputs: int, critic_inputs: int, authority: float) -> tuple[spaces.Box, spaces.Box]:
+    """Return observation and action space; `authority` [m/s2] bounds the mean, and noise may exceed it."""
+    actions = spaces.Box(-authority, authority, (1,), np.float32)
+    return spaces.Box(-np.inf, np.inf, (inputs + critic_inputs,), np.float32), actions
+
+
+def network_layers(module: nn.Module) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Return weight and bias of each linear layer as a `Network` takes them: float64 copies, inputs first."""
+    linear = [(layer.weight, layer.bias) for layer in module.modules() if isinstance(layer, nn.Linear)]
+    arrays = [[tensor.detach().cpu().numpy().astype(np.float64) for tensor in pair] for pair in linear]
+    return tuple((weight.T.copy(), bias) for weight, bias in arrays)
+
+
+def zero_layer(layer: nn.Linear) -> None:
+    """Set weights and bias of a layer to zero."""
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+
+
+@torch.no_grad()
+def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
+    """Fill `buffer` with rows and compute their advantages; to truncated trajectories gamma V of their end is added.
+
+    Values and log-probabilities are computed in one batch, so that the ratio before the first update is exactly 1.
+    """
+    actions, observations = rows.actions[:, None], torch.as_tensor(rows.observations)
+    values, log_probs, _ = policy.evaluate_actions(observations, torch.as_tensor(actions))
+    last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
+    rewards = rows.rewards.astype(np.float32)
+    rewards[rows.last_rows] += buffer.gamma * np.where(rows.terminated, 0.0, last_values).astype(np.float32)
+
+    buffer.buffer_size = len(rewards)
+    buffer.reset()
+    buffer.observations[:, 0] = rows.observations
+    buffer.actions[:, 0] = actions
+    buffer.rewards[:, 0] = rewards
+    buffer.episode_starts[rows.starts, 0] = 1.0
+    buffer.values[:, 0] = values.numpy().ravel()
+    buffer.log_probs[:, 0] = log_probs.numpy()
+    buffer.pos, buffer.full = len(rewards), True
+    buffer.compute_returns_and_advantage(torch.zeros(1), np.ones(1, bool))
+
+
+def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Float64) -> None:
+    """Add rows to the buffer, in place of the oldest ones if it is full; only collisions set `dones`.
+
+    SB3 stores actions as shares of their bounds, here of the `authority` [m/s2].
+    """
+    done = np.zeros(len(rewards), np.float32)
+    done[rows.last_rows] = rows.terminated
+    indices = (buffer.pos + np.arange(len(rewards))) % buffer.buffer_size
+    buffer.observations[indices, 0] = rows.observations
+    buffer.next_observations[indices, 0] = rows.next_observations
+    buffer.actions[indices, 0, 0] = rows.actions / np.float32(authority)
+    buffer.rewards[indices, 0] = rewards
+    buffer.dones[indices, 0] = done
+    end = buffer.pos + len(rewards)
+    buffer.full = buffer.full or end >= buffer.buffer_size
+    buffer.pos = end % buffer.buffer_size
+
+
+class MixedReplayBuffer(ReplayBuffer):
+    """SB3's replay buffer of environment rows; while it has model rows too, batches are mixed."""
+
+    model_buffer: ReplayBuffer | None = None
+    real_ratio = 1.0
+    """share of environment rows in a batch"""
+
+    def new_model_buffer(self, rows: int) -> ReplayBuffer:
+        """Return an empty buffer for a number of model rows, which replaces the previous one."""
+        spaces = self.observation_space, self.action_space
+        self.model_buffer = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
+        return self.model_buffer
+
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
+        """Return a random batch."""
+        if self.model_buffer is None:
+            return super().sample(batch_size, env)
+        real = round(self.real_ratio * batch_size)
+        parts = [super().sample(real)] if real else []
+        if real < batch_size:
+            parts.append(self.model_buffer.sample(batch_size - real))
+        return ReplayBufferSamples(*(torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)))
+
+
+def shift_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
+    """Return the rewards minus `offset`, shape (rows,), so that all values decrease by offset / (1 - gamma).
+
+    At a collision, which no reward follows, the last reward decreases by the missing part.
+    """
+    rewards = rows.rewards - offset
+    rewards[rows.last_rows] -= np.where(rows.terminated, offset * gamma / (1.0 - gamma), 0.0)
+    return rewards
