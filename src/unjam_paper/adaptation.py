@@ -110,7 +110,7 @@ def _measure_speeds(name: str, driver: str) -> dict[str, list[Any]]:
     ring, world = ROAD_CHANGES[name]
     rings = [ring.stratum(number, ADAPTATION_EPISODES) for number in range(ADAPTATION_EPISODES)]
     changing = world(rings, make_test_seeds(ADAPTATION_EPISODES))
-    episodes = finish_drive(start_batch_drive(changing, make_driver(driver, ring.control_step))).episodes
+    episodes = finish_drive(start_batch_drive(changing, make_driver(driver, ring.control_step)))
     speeds = [episode.speeds[1:].mean(1).reshape(-1, STEPS_PER_SECOND).mean(1) for episode in episodes]
     after = replace(ring, humans=world.humans_after)
     limits = [after.limit_speed(episode.drawn_values[after.size_parameter]) for episode in episodes]

@@ -99,7 +99,7 @@ def estimated_seconds(run: PlannedRun) -> float:
     config, kind = run.config, _scenario_kind(run.road)
     seconds, ratio = TRAINING_SECONDS[config.agent][kind], config.model.model_ratio
     model = seconds * ratio if config.model.kind == "road" else MODEL_ROLLOUT_SECONDS * min(1.0, ratio)
-    in_sumo = SUMO_ON_RAMP_SECONDS if kind == "on-ramp" and config.simulator == "sumo" else 0.0
+    in_sumo = SUMO_ON_RAMP_SECONDS if kind == "on-ramp" and config.backend == "sumo" else 0.0
     return config.steps / 300_000 * (seconds + in_sumo + model)
 
 

@@ -41,7 +41,7 @@ def reduced_step_variants(
     the model. `common_changes` apply to all three.
     """
     few, double = (
-        {"simulator": "batch", **common_changes, "trpo.steps_per_iteration": times * batch_steps} for times in (1, 2)
+        {"backend": "batch", **common_changes, "trpo.steps_per_iteration": times * batch_steps} for times in (1, 2)
     )
     model = {"model.model_ratio": 7.0, "model.kind": "road", "model.rollout_starts": "first", "model.k_max": horizon}
     return {
@@ -55,7 +55,7 @@ NO_MODEL = {
     **{f"model.{name}": getattr(ModelSettings, name) for name in ("kind", "rollout_starts", "k_max", "update_mode")},
     "model.model_ratio": 0.0,
 }
-WEAK_EXPERT = {"expert": "jam-ahead:speed_margin=2,margin_by_penetration=0", "simulator": "sumo"}
+WEAK_EXPERT = {"expert": "jam-ahead:speed_margin=2,margin_by_penetration=0", "backend": "sumo"}
 """an expert without effect on the on-ramp: the tuned one leaves little to learn"""
 ON_RAMP_VARIANTS = reduced_step_variants("ramp", 9_600, 86_400, horizon=2400, **WEAK_EXPERT, **NO_MODEL)
 SMALL_ITERATIONS = {
@@ -64,7 +64,7 @@ SMALL_ITERATIONS = {
 }
 """twice as many updates from the same steps: as many as alternating updates make with three times their steps"""
 LONG_TRAINING = {
-    **{"expert": ON_RAMP_JAM_AHEAD, "simulator": "batch", "trpo.steps_per_iteration": 153_600, **NO_MODEL},
+    **{"expert": ON_RAMP_JAM_AHEAD, "backend": "batch", "trpo.steps_per_iteration": 153_600, **NO_MODEL},
     **{"evaluation.validation_interval": 10, "evaluation.validation_episodes": 128},
 }
 NO_EXPERT = {"expert": "none", "model.model_ratio": 0.0}
@@ -115,7 +115,7 @@ VARIANTS: dict[str, Variant] = {
     "ramp-alternating": Variant("ours, alternating updates", "best", {}, None),
     "ramp-long": Variant("ours, on the expert tuned with the larger budget", "best", LONG_TRAINING, 4_608_000),
     "ramp-small": Variant("ours, few steps in small iterations", "best", SMALL_ITERATIONS, 86_400),
-    "best-in-batches": Variant("ours, all steps", "best", {"simulator": "batch"}, None),
+    "best-in-batches": Variant("ours, all steps", "best", {"backend": "batch"}, None),
     "first-150-seconds": Variant("residual", "best", FIRST_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EPISODES_PER_ROAD, None),
     "shared-rings": Variant("residual", "shared-rings", TWO_EPISODES_PER_ROAD, None),

@@ -38,7 +38,7 @@ def early_change(monkeypatch: pytest.MonkeyPatch) -> None:
 def speeds_on(world: type[RingBatch], ring: Ring = RING, driver: str = "pi") -> Floats:
     """Speeds of all vehicles, shape (control steps + 1, vehicles)."""
     made = start_batch_drive(world([ring], [(1,)]), driver_from_name(driver, ring.control_step))
-    return finish_drive(made).episodes[0].speeds
+    return finish_drive(made)[0].speeds
 
 
 @pytest.mark.usefixtures("early_change")

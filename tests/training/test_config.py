@@ -130,12 +130,12 @@ def test_merging_does_not_change_its_arguments() -> None:
             "scenario ring.simulation_step: 0.0333 is not allowed; allowed: a whole number of milliseconds",
         ),
         (
-            {"scenario": "merge", "simulator": "batch"},
-            "simulator: batch is not allowed; allowed: sumo (merge is not a ring)",
+            {"scenario": "merge", "backend": "batch"},
+            "backend: batch is not allowed; allowed: sumo (merge is not a ring)",
         ),
         (
-            {"simulator": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},
-            "simulator: batch is not allowed; allowed: sumo (figure-eight is not a ring)",
+            {"backend": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},
+            "backend: batch is not allowed; allowed: sumo (figure-eight is not a ring)",
         ),
         (
             {"evaluation.patience": 5, "evaluation.validation_interval": 0},

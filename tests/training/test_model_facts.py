@@ -154,7 +154,7 @@ RAMP: dict[str, Any] = {
     "scenario": "on-ramp",
     "scenario_options": {"horizon": 30, "penetration_rate": 0.5, "peak": [0, 30]},
     "expert": "jam-ahead",
-    "simulator": "batch",
+    "backend": "batch",
     "policy__inputs": ["local"],
     "policy__exploration": "antithetic",
     "policy__reward_after_exit": True,
@@ -167,7 +167,7 @@ RAMP: dict[str, Any] = {
 @pytest.mark.parametrize("world", ["batch", "sumo"])
 def test_on_ramp_model_has_waves_by_lane(world: str, tmp_path: Path) -> None:
     changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__members": 2, **RAMP}
-    config = small_config(**{**changes, "simulator": world}, steps=STEPS)
+    config = small_config(**{**changes, "backend": world}, steps=STEPS)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "run", config)
     found = json.loads(to_json(measure_model(tmp_path / "run", config)))

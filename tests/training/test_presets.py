@@ -38,9 +38,9 @@ def test_preset_changes_only_its_keys(name: str) -> None:
 
 def test_demo_on_the_jammed_ring_is_short() -> None:
     made = load_config(preset="demo", changes={"scenario": "ring-jammed"})
-    assert (made.scenario, made.simulator, made.steps) == ("ring-jammed", "batch", 288_000)
+    assert (made.scenario, made.backend, made.steps) == ("ring-jammed", "batch", 288_000)
     assert made.evaluation.baselines[0] == "human"
-    assert load_config(preset="demo").simulator == "sumo"
+    assert load_config(preset="demo").backend == "sumo"
 
 
 def test_paper_exact_preset_has_no_additions() -> None:

@@ -182,7 +182,7 @@ def test_batch_training_equals_training_in_sumo(agent: str, exploration: str, tm
     runs = {}
     for world in ("sumo", "batch"):
         with WorkerPool(1) as workers:
-            how = {"simulator": world, "agent": agent, "policy.exploration": exploration}
+            how = {"backend": world, "agent": agent, "policy.exploration": exploration}
             how |= {"model.model_ratio": 0.0} if exploration == "antithetic" else {}
             learn_with(workers, tmp_path / world, small_config(**mixture, **how))
         runs[world] = read_progress(tmp_path / world)
@@ -211,7 +211,7 @@ def test_unsupported_tasks_run_in_sumo(tmp_path: Path) -> None:
     driven = {}
     for world, folder in folders.items():
         with WorkerPool(1) as workers:
-            trainer = Trainer(folder, load_config(changes=small | {"simulator": world}), workers)
+            trainer = Trainer(folder, load_config(changes=small | {"backend": world}), workers)
             driven[world] = trainer.collect(trainer.network(), 1)
     for one, other in zip(driven["sumo"], driven["batch"], strict=True):
         assert [episode.seed for episode in one] == [episode.seed for episode in other]

@@ -85,10 +85,9 @@ def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
 
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     from unjam.drivers.observation import FEATURES
-    from unjam.scenarios.user_network import UserNetwork
 
     seconds = scenario.warmup * scenario.simulation_step
-    end = "in training, a collision of a CAV" if isinstance(scenario, UserNetwork) else "a collision"
+    end = "in training, a collision of a CAV" if scenario.reads_user_files else "a collision"
     return [
         ("episode", f"{scenario.horizon:,} control steps of {scenario.control_step:g} s; {end} ends it"),
         ("warm-up", f"{scenario.warmup} human-only steps ({seconds:g} s) before control, not counted"),

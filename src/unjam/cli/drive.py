@@ -47,6 +47,7 @@ def drive_command(
     ] = False,
     changes: dict[str, Any],
     reward: opt.RewardOption = "",
+    backend: opt.BackendOption = "sumo",
     settings: opt.ScenarioSettingsOption = None,
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     out: opt.OutOption = None,
@@ -80,7 +81,8 @@ def drive_command(
     total = make_scenario(scenario, changes).horizon * episodes * len(driver)
     folder = opt.new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with ProgressReporter(f"driving {Path(scenario).name}", "steps", total) as progress:
-        result = drive(scenario, driver, episodes, seed, changes, reward, workers, folder, progress.update, test_seeds)
+        options = workers, folder, progress.update, test_seeds, backend
+        result = drive(scenario, driver, episodes, seed, changes, reward, *options)
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):

@@ -33,7 +33,8 @@ from unjam.worlds.batch.human_idm import HumanSpeedModel
 from unjam.worlds.batch.on_ramp.traffic import LearnedCorrection
 from unjam.worlds.batch.on_ramp.world import MotorwayBatch, ReplayOptions
 from unjam.worlds.batch.ring.world import RingBatch
-from unjam.worlds.batch.run import MAX_BATCH_MOTORWAYS, start_batch_drive
+from unjam.worlds.batch.run import start_batch_drive
+from unjam.worlds.batch.support import BATCH_KINDS
 from unjam.worlds.drive import DriveLoop, finish_drive
 from unjam.worlds.episode import add_reward_terms
 from unjam.worlds.record import Episode, Floats
@@ -142,10 +143,8 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
         world = RingBatch(
             [with_size(common, each.size) for each in samples],
             [(*seed, number) for number in range(len(samples))],  # of sensors alone: everything else is given
-            reward=self._task.reward,
             draw=np.random.default_rng(list(seed)).standard_normal,
             human_model=human_model,
-            allow_statistical=True,
         )
         world.place_vehicles(
             np.stack([each.speeds[row] for each, row in pairs], 1),
@@ -155,7 +154,7 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
                 for each, row in pairs
             ],
         )
-        return finish_drive(start_batch_drive(world, driver, explore=True, memory=memory)).episodes
+        return finish_drive(start_batch_drive(world, driver, explore=True, memory=memory))
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
         """Return a recorded holdout episode, and its CAVs' accelerations replayed in model and base with new noise."""
@@ -209,8 +208,9 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
 
     def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
         signs = self._policy.exploration_signs
-        for first in range(0, len(plan.starts), MAX_BATCH_MOTORWAYS):
-            samples = plan.starts[first : first + MAX_BATCH_MOTORWAYS]
+        size = BATCH_KINDS[type(self.scenario)].max_roads
+        for first in range(0, len(plan.starts), size):
+            samples = plan.starts[first : first + size]
             numbers = range(first, first + len(samples))
             groups = [number // len(signs) for number in numbers]
             seeds = [((*plan.noise_seed, group), (*plan.exploration_seed, group)) for group in groups]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, field, fields, replace
 from math import ceil
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tomli_w
 from pydantic import Field, model_validator
@@ -39,6 +39,7 @@ from unjam.training.presets import preset_values
 from unjam.training.seeds import TRAINING_SEED_LIMIT
 from unjam.training.task_sampling import TaskSampling, count_episodes, weight_shares
 from unjam.trust import check_trusted_values
+from unjam.worlds.backend import check_backend_name
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import Task
 
@@ -97,10 +98,11 @@ class RunConfig(AgentSettings):
     seed: Annotated[int, Field(ge=0, lt=TRAINING_SEED_LIMIT)] = 0
     """seed of the whole run; larger numbers are reserved for validation, tuning and test seeds"""
     workers: PositiveInt = 2
-    simulator: Literal["sumo", "batch"] = "sumo"
-    """where training and validation episodes run: in SUMO, or all episodes of an iteration at once in the batch
-    simulator, which is faster for large iterations. On rings it equals SUMO except for rounding; a single figure eight
-    or on-ramp equals SUMO in distribution. Other roads of a mixture run in SUMO, as does the final evaluation"""
+    backend: Annotated[str, AfterValidator(check_backend_name)] = "sumo"
+    """the simulator: `sumo`, `batch`, or your own, `path.py:name`. `batch` runs all episodes of an iteration, or of a
+    validation, at once, which is faster for large iterations. On rings it equals SUMO except for rounding; a single
+    figure eight or on-ramp equals SUMO in distribution. Other roads of a mixture run in SUMO, as does the final
+    evaluation"""
     stratified: bool = True
     """whether the episodes of an iteration or validation cover the range of drawn values (the ring's length) evenly"""
     policy: PolicySettings = field(default_factory=PolicySettings)
@@ -137,7 +139,7 @@ class RunConfig(AgentSettings):
         pairs = "per_step, per_episode, because these model rollouts have no antithetic pairs"
         weights = "weights, except for several validated tasks"
         checks = (
-            (self.simulator == "batch" and all(reasons), "simulator: batch", f"sumo ({reasons[0]})"),
+            (self.backend == "batch" and all(reasons), "backend: batch", f"sumo ({reasons[0]})"),
             (policy.reward_after_exit and model == "row", "policy.reward_after_exit: true", "false with a row model"),
             (no_memory, "policy.history_features: true", "false without the input expert_memory"),
             (no_validation, f"evaluation.patience: {patience}", "0 without validations"),
@@ -150,6 +152,11 @@ class RunConfig(AgentSettings):
             if is_wrong:
                 raise ValueError(f"{value} is not allowed; allowed: {allowed}")
         return self
+
+    @property
+    def episode_backend(self) -> str:
+        """The backend of single episodes, as in the final evaluation: SUMO instead of the batch."""
+        return "sumo" if self.backend == "batch" else self.backend
 
     def task_configs(self) -> dict[str, "RunConfig"]:
         """Return the configuration of each task by the name of its folder; a single road has an empty name."""
@@ -171,10 +178,10 @@ class RunConfig(AgentSettings):
                 reward=task.reward or self.reward,
                 tasks=(),
                 task_sampling="weights",
-                simulator="sumo",
+                backend="sumo",
             )
-            batched = self.simulator == "batch" and not unsupported_reason(road.make_scenario())
-            configs[name] = replace(road, simulator="batch") if batched else road
+            in_sumo = self.backend == "batch" and unsupported_reason(road.make_scenario())
+            configs[name] = road if in_sumo else replace(road, backend=self.backend)
         return configs
 
     def make_tasks(self) -> list[Task]:

@@ -293,7 +293,7 @@ def evaluate_run(
     """
     scenario, drivers = config.make_scenario(), drivers_to_compare(config, folder)
     seeds = make_test_seeds(config.evaluation.episodes)
-    evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress)
+    evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress, config.episode_backend)
     metadata = {
         "scenario": Path(config.scenario).name,
         "reward": config.reward or scenario.reward,

@@ -5,6 +5,7 @@ They are measured on holdout episodes, from which no network learned, and stored
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -92,7 +93,7 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     rollouts.restore(state["algorithm"][rollouts.name], tensors_with_prefix(f"algorithm/{rollouts.name}/", tensors))
     facts = {"iteration": state["iteration"], "base": settings.base, "members": settings.members}
     if settings.kind == "road":
-        run = _run_in_batch if config.simulator == "batch" else _run_in_sumo
+        run = _run_in_batch if config.backend == "batch" else partial(_run_alone, config.backend)
         return _round_values(facts | cast(WholeRoadRollouts[Any], rollouts).waves(run))
     return _round_values(facts | _row_facts(cast(RowRollouts, rollouts), config, progress[-1]))
 
@@ -101,8 +102,8 @@ def _run_in_batch(task: EpisodeTask) -> Episode:
     return run_batch([task], allow_statistical=True)[0]
 
 
-def _run_in_sumo(task: EpisodeTask) -> Episode:
-    return run_episode(task.scenario, task.driver, task.seed)
+def _run_alone(backend: str, task: EpisodeTask) -> Episode:
+    return run_episode(task.scenario, task.driver, task.seed, backend=backend)
 
 
 def _row_facts(rollouts: RowRollouts, config: RunConfig, progress_row: dict[str, Any]) -> dict[str, Any]:

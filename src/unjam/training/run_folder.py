@@ -37,6 +37,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, read_toml, to_toml
 from unjam.training.early_stopping import should_stop_early
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
+from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.episode import check_can_drive, check_policy_inputs, check_time_step
 from unjam.worlds.reward import make_reward
 
@@ -53,7 +54,7 @@ ROW_MODEL_FIELDS = {"distance_to_crossing", "penetration_rate"}
 
 
 def check_config(config: RunConfig) -> None:
-    """Raise `InputError` if an expert, an input of the network, a reward, a baseline or the model is not possible."""
+    """Raise `InputError` if an expert, an input, a reward, the backend, a baseline or the model is not possible."""
     for task in config.task_configs().values():
         scenario = task.make_scenario()
         check_policy_inputs(task.policy.inputs, scenario, "policy.inputs")
@@ -62,6 +63,8 @@ def check_config(config: RunConfig) -> None:
         driver_recipe(expert)  # workers build it
         observation_size(task.policy.inputs, expert)
         make_reward(task.reward or scenario.reward)
+        with open_backend(task.episode_backend) as backend:
+            check_support(backend, scenario)
         for name in task.evaluation.baselines:
             check_time_step(make_driver(name, scenario.control_step), scenario, name)
         if config.model.model_ratio > 0 and config.model.kind == "row":

@@ -341,11 +341,11 @@ class Trainer:
             )
             for seed in seeds
         )
-        if self.config.simulator == "batch":
+        if self.config.backend == "batch":
             later, is_single = list(chain(*upcoming)), not self.config.tasks
             episodes = run_batched_if_supported(now, self.workers.run, later, allow_statistical=is_single)
         else:
-            episodes = self.workers.run(now)
+            episodes = self.workers.run([replace(task, backend=self.config.backend) for task in now])
         raise_failure([measure(episode) for episode in episodes if not episode.has_run])
         return [episodes[end - count : end] for end, count in zip(np.cumsum(counts), counts, strict=True)]
 

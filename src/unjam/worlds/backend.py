@@ -10,7 +10,7 @@ from unjam.errors import InputError, unknown_name
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.road_world import RoadWorld
 
-BACKEND_NAMES = ("sumo", "sumo-gui")
+BACKEND_NAMES = ("sumo", "sumo-gui", "batch")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Backend(Protocol):
 
 
 BackendLike = str | Backend
-"""a backend or its name: `sumo`, `sumo-gui` with SUMO's window, or `path.py:name` of a class or an object"""
+"""a backend or its name: `sumo`, `sumo-gui` with SUMO's window, `batch`, or `path.py:name` of a class or object"""
 
 
 @contextmanager
@@ -66,11 +66,20 @@ def _make_backend(name: str) -> Backend:
     if is_file_reference(name):
         found = FileReference.parse(name).load_object()
         return check_backend(found() if isinstance(found, type) else found, name)
-    if name in ("sumo", "sumo-gui"):
-        from unjam.worlds.sumo.backend import SumoBackend
+    if check_backend_name(name) == "batch":
+        from unjam.worlds.batch.backend import BatchBackend
 
-        return SumoBackend(transport="gui" if name == "sumo-gui" else None)
-    raise unknown_name("backend", name, [*BACKEND_NAMES, "path.py:name"])
+        return BatchBackend()
+    from unjam.worlds.sumo.backend import SumoBackend
+
+    return SumoBackend(transport="gui" if name == "sumo-gui" else None)
+
+
+def check_backend_name(name: str) -> str:
+    """Return the name of a backend; raise `InputError` for an unknown one, without reading a file."""
+    if name not in BACKEND_NAMES and not is_file_reference(name):
+        raise unknown_name("backend", name, [*BACKEND_NAMES, "path.py:name"])
+    return name
 
 
 def check_backend(backend: Backend, label: str) -> Backend:

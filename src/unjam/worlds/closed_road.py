@@ -1,5 +1,7 @@
 """Closed roads with one lane: neighbors, the log of an episode, and the record made from it."""
 
+from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -12,6 +14,7 @@ from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import OVERRIDE_TOLERANCE, Audit, braking_statistics, following_statistics
 from unjam.worlds.record import Episode, Floats, Trajectory, make_trajectory
+from unjam.worlds.road_world import RoadScene
 from unjam.worlds.world import DriverLog
 
 MAX_RECALL_SECONDS = 60.0
@@ -205,3 +208,33 @@ class ClosedRoadLog:
             return np.zeros_like(moved)
         commanded = np.minimum(self.commanded_speeds, self.scenario.top_speed)
         return (commanded - moved) / self.scenario.simulation_step
+
+
+class ClosedRoadRecorder:
+    """Collects the rows of a `ClosedRoadLog` while an episode runs; `series` has them by name, one after the other."""
+
+    def __init__(self, scenario: Scenario, road: ClosedRoad, start_positions: Floats, speeds: Iterable[float]) -> None:
+        """Start with the positions of front bumpers, not wrapped [m], and the speeds [m/s] of all vehicles."""
+        self._arguments = scenario, road, start_positions
+        names = "noise_free_speeds", "requested_accelerations", "safe_accelerations", "commanded_speeds"
+        self.series = {name: array("d") for name in names} | {"speeds": array("d", speeds)}
+
+    def make_log(self, **fields: Any) -> ClosedRoadLog:
+        """Return the log so far, with other `fields`."""
+        _, road, _ = self._arguments
+        widths: dict[str, int] = dict.fromkeys(("noise_free_speeds", "speeds"), len(road.vehicle_ids))
+        for name, values in self.series.items():
+            fields[name] = np.array(values).reshape(-1, widths.get(name, len(road.cav_ids)))
+        return ClosedRoadLog(*self._arguments, **fields)
+
+    def last_applied_acceleration(self) -> Floats:
+        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
+        scenario, road, _ = self._arguments
+        count = len(road.cav_ids) * scenario.steps_per_control_step
+        return np.array(self.series["safe_accelerations"][-count:]).reshape(-1, len(road.cav_ids)).mean(0)
+
+
+def loop_scene(road: ClosedRoad, positions: Floats, speeds: Any) -> RoadScene:
+    """Return a picture of all vehicles with positions along the road, not wrapped [m], and speeds [m/s]."""
+    poses, is_cav = poses_along(road.center_line, positions, road.loop_length), np.isin(road.vehicle_ids, road.cav_ids)
+    return RoadScene(road.center_line[:, 1:], poses, np.array(speeds), is_cav)

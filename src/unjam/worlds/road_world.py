@@ -84,14 +84,14 @@ class SimulatedRoad(RoadWorld):
         self.stop_reason = ""
         """why the simulator's own rules end the episode early; empty: they do not"""
         self.control_steps = self.entered_count = 0
-        self._is_controlled = False
+        self.is_controlled = False
         braking, step = scenario.safety.leader_braking, scenario.simulation_step
         self._sensor_readings = (
             None if scenario.sensors.is_exact else SensorReadings(scenario.sensors, braking, step, sensor_seed)
         )
         self._cav_actuation = CAVActuation(scenario.safety, scenario.actuator, step)
         self._sensed_state: tuple[int, LocalState] | None = None
-        self._noise_generator = np.random.default_rng(noise_seed)
+        self.noise_generator = np.random.default_rng(noise_seed)
         self._exploration_generator = np.random.default_rng(exploration_seed)
         self._episode_noise: Floats | None = None
 
@@ -119,7 +119,7 @@ class SimulatedRoad(RoadWorld):
         """Return the exact local state of the CAVs now."""
         raise NotImplementedError
 
-    def _apply_acceleration(self, name: str, acceleration: float, state: FollowingState) -> tuple[float, float]:
+    def filtered_acceleration(self, name: str, acceleration: float, state: FollowingState) -> tuple[float, float]:
         """Return the acceleration of a CAV after the safety filter, and its actual acceleration [m/s2]."""
         sensed = state if self._sensor_readings is None else self._sensor_readings.read_for_filter(name, state)
         return self._cav_actuation.apply(name, acceleration, sensed)
@@ -132,11 +132,11 @@ class SimulatedRoad(RoadWorld):
             self._episode_noise = self._exploration_generator.standard_normal(episode_noise_size)
         return self._episode_noise if self.is_scalar else np.tile(self._episode_noise, (len(self.cav_ids), 1))
 
-    def _limited_accelerations(self, command: Command | None) -> list[float]:
+    def limited_accelerations(self, command: Command | None) -> list[float]:
         """Return the CAVs' commands within the limits [m/s2]; raise `InputError` if one is invalid."""
         return commanded_accelerations(command, self.limits, self.cav_ids, self.control_steps)
 
-    def _common_fields(self) -> dict[str, Any]:
+    def record_fields(self) -> dict[str, Any]:
         """Return the common fields of all records."""
         return {
             "seed": self.seed,

@@ -166,6 +166,6 @@ def test_it_is_no_exact_road_and_driven_only_where_that_is_asked_for() -> None:
 
 
 def test_a_training_on_it_may_be_batched() -> None:
-    assert RunConfig(scenario="figure-eight", simulator="batch").simulator == "batch"
-    with pytest.raises(ValueError, match="simulator"):
-        RunConfig(scenario="merge", simulator="batch")
+    assert RunConfig(scenario="figure-eight", backend="batch").backend == "batch"
+    with pytest.raises(ValueError, match="backend"):
+        RunConfig(scenario="merge", backend="batch")

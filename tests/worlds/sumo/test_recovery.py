@@ -10,12 +10,12 @@ from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metrics import measure
 from unjam.scenarios import OnRamp, make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
+from unjam.worlds import multi_lane_log
 from unjam.worlds.audit import FollowingStatistics
 from unjam.worlds.batch.on_ramp.record import MotorwayLog
 from unjam.worlds.batch.on_ramp.traffic import make_vehicles
 from unjam.worlds.batch.on_ramp.vehicles import MotorwayVehicles
 from unjam.worlds.episode import run_episode
-from unjam.worlds.sumo import multi_lane
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam_paper.open_test_roads import OpenTestRoad, RoadSection, write_road_files
 
@@ -34,7 +34,7 @@ def test_an_acc_that_restores_its_gap_after_cut_ins_is_feasible(
     assert 1.0 <= recovered.min_time_gap < 1.3
     assert recovered.share_short_time_gap == 0.0
     assert measure(episode)["feasibility"] == FEASIBLE
-    monkeypatch.setattr(multi_lane, "is_recovering", lambda *arguments: False)
+    monkeypatch.setattr(multi_lane_log, "is_recovering", lambda *arguments: False)
     without_exclusion = run_episode(scenario, driver, (1,), backend=sumo).audit.following
     assert without_exclusion.min_time_gap < 0.8
     assert without_exclusion.share_short_time_gap > 0.001

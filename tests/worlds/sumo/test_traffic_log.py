@@ -14,11 +14,10 @@ from unjam.measures.metrics import measure
 from unjam.reports.html import replay_data
 from unjam.reports.results import pack_episode, to_plot_episode, unpack_episode
 from unjam.reports.space_time import lane_map_figure
-from unjam.worlds import reward
+from unjam.worlds import open_road_log, reward
+from unjam.worlds.open_road_log import TrafficLog
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import REWARDS, episode_reward_terms, make_reward
-from unjam.worlds.sumo import open_log
-from unjam.worlds.sumo.open_log import TrafficLog
 
 Stays = list[tuple[int, int]]
 """of each vehicle its first moment, and how many more it stays"""
@@ -28,9 +27,9 @@ Stays = list[tuple[int, int]]
 def small() -> Iterator[None]:
     """Limits that a minute of traffic is beyond."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(open_log, "MAX_UNSHARED_CELLS", 1000)
-        patch.setattr(open_log, "MAX_SNAPSHOT_VEHICLES", 1500)
-        patch.setattr(open_log, "SHARED_COLUMN_FRAMES", 20)
+        patch.setattr(open_road_log, "MAX_UNSHARED_CELLS", 1000)
+        patch.setattr(open_road_log, "MAX_SNAPSHOT_VEHICLES", 1500)
+        patch.setattr(open_road_log, "SHARED_COLUMN_FRAMES", 20)
         patch.setattr(reward, "MAX_REWARD_CELLS", 500)
         yield
 
@@ -49,8 +48,8 @@ def thinned_episode(whole: Episode, small: None) -> Episode:
 def test_every_speed_is_in_a_column_of_its_group(stays: Stays, most: int) -> None:
     moments = max((first + more for first, more in stays), default=0) + 1
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(open_log, "MAX_UNSHARED_CELLS", 0)
-        patch.setattr(open_log, "MAX_SNAPSHOT_VEHICLES", most)
+        patch.setattr(open_road_log, "MAX_UNSHARED_CELLS", 0)
+        patch.setattr(open_road_log, "MAX_SNAPSHOT_VEHICLES", most)
         log = TrafficLog()
         for time in range(moments):
             there = [number for number, (first, more) in enumerate(stays) if first <= time <= first + more]

@@ -14,13 +14,11 @@ from unjam.drivers.residual import RESIDUAL_AGE_KEY
 from unjam.drivers.wrappers import DRIVER_INDEX_KEY, MixedDriver
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
-from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.ring import LoopScenario
 from unjam.tree import map_leaves
 from unjam.worlds.batch import support
 from unjam.worlds.batch.noise import ArrayFactory
 from unjam.worlds.batch.on_ramp.world import MotorwayBatch
-from unjam.worlds.batch.ring.record import RingResults
 from unjam.worlds.batch.ring.warm_up import WarmUpCache, WarmUpState
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.drive import DriveLoop, finish_drive
@@ -32,14 +30,10 @@ from unjam.worlds.worker_pool import EpisodeTask
 _WarmUpKey = tuple[LoopScenario, tuple[int, ...], frozenset[str]]
 """a scenario, the seed of an episode, and the fields that the driver measures"""
 WARM_UP_CACHE = WarmUpCache[_WarmUpKey]()
-MAX_BATCH_ROADS = 128
-"""maximum number of rings in a batch that keeps whole episodes: some 130 MB for 22 vehicles each"""
-MAX_BATCH_MOTORWAYS = 64
-"""maximum number of motorways in a batch; each takes some 40 MB"""
 
 
 def start_batch_drive(
-    world: RingBatch,
+    world: RingBatch | MotorwayBatch,
     driver: Driver,
     to_array: ArrayFactory = np.asarray,
     explore: float = 0.0,
@@ -51,13 +45,14 @@ def start_batch_drive(
     Without a `memory`, the driver remembers only the warm-up.
     """
     world.measured_fields = driver.measured_fields
-    if memory is None:  # the driver of each CAV of a ring does not depend on the other rings
+    has_fixed_rows = world.cav_count > 0  # otherwise CAVs enter later
+    if memory is None and has_fixed_rows:  # the driver of each CAV of a ring does not depend on the other rings
         rings = len(world.roads)
         ring_memory = driver.initial_memory(world.cav_count // rings)
         memory = map_leaves(lambda values: np.repeat(values, rings, axis=0), ring_memory)
     loop = DriveLoop(world, driver, explore, memory)
     loop.memory = map_leaves(to_array, loop.memory)
-    if driver.action_repeat > 1 and RESIDUAL_AGE_KEY in loop.memory:
+    if has_fixed_rows and driver.action_repeat > 1 and RESIDUAL_AGE_KEY in loop.memory:
         loop.memory[RESIDUAL_AGE_KEY] = 0.0  # equal for all rows: no network is called while residuals are held
     return loop
 
@@ -86,30 +81,24 @@ def _run_at_once(
     tasks: Sequence[EpisodeTask], to_array: ArrayFactory, upcoming: Sequence[EpisodeTask], allow_statistical: bool
 ) -> Sequence[Episode]:
     """Return the episodes of tasks without rewards; arguments as of `run_batch`."""
-    first = tasks[0]
+    first, scenarios = tasks[0], [task.scenario for task in tasks]
     for task in tasks:
         check_can_drive(task.driver, task.scenario)
-    if isinstance(first.scenario, OnRamp):
-        support.check_batch_scenarios([task.scenario for task in tasks], allow_statistical)
-        depends = any(_depends_on_entry_order(task.driver) for task in tasks)
-        if len(tasks) > 1 and depends:  # the order must be that of one road
-            return [episode for task in tasks for episode in _run_at_once([task], to_array, (), allow_statistical)]
-        explore = [task.explore for task in tasks]
-        motorways = MotorwayBatch(first.scenario, [task.seed for task in tasks], explore=explore)
-        driver = _combined_driver(tasks, lambda indices: indices[motorways.cav_roads])
-        motorways.measured_fields = driver.measured_fields
-        episodes = finish_drive(DriveLoop(motorways, driver, float(any(explore))))
-        for episode in episodes:
-            check_has_cavs(episode, driver)
-        return episodes
-    scenarios, seeds = [cast(LoopScenario, task.scenario) for task in tasks], [task.seed for task in tasks]
-    world = RingBatch(scenarios, seeds, to_array, first.reward, allow_statistical=allow_statistical)
-    if world.scenario.warmup > 0:
+    support.check_batch_scenarios(scenarios, allow_statistical)
+    kind = support.BATCH_KINDS[type(first.scenario)]
+    if kind.has_own_drivers and len(tasks) > 1 and any(_depends_on_entry_order(task.driver) for task in tasks):
+        # the order must be that of one road
+        return [episode for task in tasks for episode in _run_at_once([task], to_array, (), allow_statistical)]
+    world = kind.world.from_tasks(tasks, to_array)
+    if first.scenario.warmup > 0:
         keys, upcoming_keys = (list(map(_warm_up_key, each)) for each in (tasks, upcoming))
-        world.warm_up_states = WARM_UP_CACHE.get_states(keys, upcoming_keys, _warm_up)
-    driver = _combined_driver(tasks, lambda indices: to_array(np.tile(indices, world.cav_count // len(indices))))
-    rings: RingResults = finish_drive(start_batch_drive(world, driver, to_array, first.explore))
-    return rings.episodes
+        cast(RingBatch, world).warm_up_states = WARM_UP_CACHE.get_states(keys, upcoming_keys, _warm_up)
+    driver = _combined_driver(tasks, world.values_of_cavs)
+    explore = float(any(task.explore for task in tasks)) if kind.has_own_drivers else first.explore
+    episodes = finish_drive(start_batch_drive(world, driver, to_array, explore))
+    for episode in episodes:
+        check_has_cavs(episode, driver)
+    return episodes
 
 
 @dataclass(frozen=True)
@@ -150,12 +139,12 @@ def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
 
 
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
-    """Return the states of rings after their warm-up, simulated in batches of `MAX_BATCH_ROADS`."""
-    states: dict[_WarmUpKey, WarmUpState] = {}
-    for first in range(0, len(keys), MAX_BATCH_ROADS):
-        batch = keys[first : first + MAX_BATCH_ROADS]
+    """Return the states of rings of one class after their warm-up, simulated in batches."""
+    states, size = dict[_WarmUpKey, WarmUpState](), support.BATCH_KINDS[type(keys[0][0])].max_roads
+    for first in range(0, len(keys), size):
+        batch = keys[first : first + size]
         scenarios, seeds, (measured_fields, *_) = zip(*batch, strict=True)
-        world = RingBatch(scenarios, seeds, keep_record=False, allow_statistical=True)
+        world = RingBatch(scenarios, seeds, keep_record=False)
         world.measured_fields = measured_fields
         states |= zip(batch, world.run_warm_up(), strict=True)
     return states
@@ -167,7 +156,7 @@ def run_batches(
     """Return the episodes of tasks of any kinds, in their order; similar ones share batches, see `run_batch`."""
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
-        size = MAX_BATCH_MOTORWAYS if isinstance(task.scenario, OnRamp) else MAX_BATCH_ROADS
+        size = support.BATCH_KINDS[type(task.scenario)].max_roads
         suitable = (each for each in batches if len(each) < size and _can_share_batch(task, next(iter(each.values()))))
         batch = next(suitable, None)
         if batch is None:
@@ -199,11 +188,12 @@ def run_batched_if_supported(
 def _shared_settings(task: EpisodeTask) -> tuple[object, ...]:
     """Return the settings that tasks must have in common to be simulated at once."""
     is_indivisible = task.driver.is_native or task.driver.network_inputs is not None
-    explore = task.explore != 0.0 if isinstance(task.scenario, OnRamp) else task.explore
+    kind = support.BATCH_KINDS.get(type(task.scenario))
+    explore = task.explore != 0.0 if kind and kind.has_own_drivers else task.explore
     return task.driver if is_indivisible else None, task.reward, explore
 
 
 def _can_share_batch(first: EpisodeTask, second: EpisodeTask) -> bool:
-    has_equal_drivers = isinstance(first.scenario, OnRamp) or first.driver == second.driver
+    has_equal_drivers = support.BATCH_KINDS[type(first.scenario)].has_own_drivers or first.driver == second.driver
     has_equal_settings = _shared_settings(first) == _shared_settings(second)
     return has_equal_drivers and has_equal_settings and support.differ_only_in_size(first.scenario, second.scenario)

@@ -1,15 +1,18 @@
-"""Which scenarios a batch can simulate as SUMO does, and which of them can share a batch."""
+"""Which scenarios a batch can simulate as SUMO does, in which world, and which of them can share a batch."""
 
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from operator import attrgetter
+from typing import Any
 
 from unjam.errors import InputError
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.on_ramp import OnRamp
-from unjam.scenarios.ring import LoopScenario, Ring
+from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.human_idm import MIN_LOOK_AHEAD
+from unjam.worlds.batch.on_ramp.world import MotorwayBatch
+from unjam.worlds.batch.ring.world import RingBatch
 
 MAX_SIMULATION_STEP = 0.37
 """longest simulation step that SUMO's IDM does not divide into several [s]"""
@@ -17,12 +20,26 @@ ON_RAMP_SIMULATION_STEP = 0.5
 """simulation step of on-ramps, which SUMO's EIDM divides into two [s]"""
 
 
+@dataclass(frozen=True)
+class BatchKind:
+    """How batches simulate the scenarios of one class."""
+
+    world: type[RingBatch] | type[MotorwayBatch]
+    reason: Callable[[Any], str]
+    """returns why a batch cannot simulate a scenario of this class; empty if it can"""
+    is_exact: bool = False
+    """whether episodes equal SUMO's except for rounding; otherwise they do in distribution"""
+    max_roads: int = 128
+    """maximum number of roads in a batch that keeps whole episodes: some 130 MB for rings of 22 vehicles"""
+    has_own_drivers: bool = False
+    """whether each road of a batch can have its own driver and exploration"""
+
+
 def unsupported_reason(scenario: Scenario) -> str:
     """Return why a batch cannot reproduce SUMO's episodes of a scenario exactly; empty if it can."""
-    if type(scenario) is not Ring:  # a subclass may have another road
-        return _kind_reason(scenario) or f"{scenario.title} is not a ring"
-    is_native = "human_control", scenario.human_control == "native", "native"
-    return _first_reason(scenario, is_native, *_controls(scenario))
+    if (kind := BATCH_KINDS.get(type(scenario))) and not kind.is_exact:
+        return f"{scenario.title} is not a ring"
+    return statistically_unsupported_reason(scenario)
 
 
 def statistically_unsupported_reason(scenario: Scenario) -> str:
@@ -32,23 +49,19 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     decision about the right of way changes the order of the queue, so that only distributions agree. On on-ramps,
     human drivers follow as in SUMO, but all vehicles change lanes at once, and drivers' errors are other draws.
     """
-    if reason := _kind_reason(scenario):
-        return reason
-    if isinstance(scenario, OnRamp):
-        return _first_reason(
-            scenario,
-            ("actuation", scenario.actuation == "cruise", "cruise"),
-            ("safety.active", not scenario.safety.active, "False: CAVs have their own ACC"),
-            ("cruise.keep_right", scenario.cruise.keep_right is None, "None: CAVs change lanes as human drivers do"),
-            ("cruise.speed_gain", scenario.cruise.speed_gain is None, "None: CAVs change lanes as human drivers do"),
-            ("simulation_step", scenario.simulation_step == ON_RAMP_SIMULATION_STEP, f"{ON_RAMP_SIMULATION_STEP:g} s"),
-            ("sensors.is_exact", scenario.sensors.is_exact, "True"),
-            ("actuator.is_instant", scenario.actuator.is_instant, "True"),
-            ("warmup", scenario.warmup == 0, "0"),
-            ("roadside.loss_rate", scenario.roadside.loss_rate == 0, "0"),
-        )
-    if not isinstance(scenario, FigureEight):
-        return unsupported_reason(scenario)
+    if kind := BATCH_KINDS.get(type(scenario)):
+        return kind.reason(scenario)
+    if issubclass(type(scenario), tuple(BATCH_KINDS)):  # a batch has its own formulas of the roads that it knows
+        return f"{type(scenario).__name__} may have another road than {scenario.title}; allowed: backend=sumo"
+    return f"{scenario.title} is not a ring"
+
+
+def _ring_reason(scenario: Ring) -> str:
+    is_native = "human_control", scenario.human_control == "native", "native"
+    return _first_reason(scenario, is_native, *_controls(scenario))
+
+
+def _figure_eight_reason(scenario: FigureEight) -> str:
     return _first_reason(
         scenario,
         ("human_control", scenario.human_control == "commanded", "commanded"),
@@ -61,12 +74,19 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     )
 
 
-def _kind_reason(scenario: Scenario) -> str:
-    """Return why a class of scenarios is not supported: a batch has its own formulas of the roads that it knows."""
-    known = (Ring, FigureEight, OnRamp)
-    if type(scenario) in known or not isinstance(scenario, known):
-        return ""
-    return f"{type(scenario).__name__} may have another road than {scenario.title}; allowed: simulator=sumo"
+def _motorway_reason(scenario: OnRamp) -> str:
+    return _first_reason(
+        scenario,
+        ("actuation", scenario.actuation == "cruise", "cruise"),
+        ("safety.active", not scenario.safety.active, "False: CAVs have their own ACC"),
+        ("cruise.keep_right", scenario.cruise.keep_right is None, "None: CAVs change lanes as human drivers do"),
+        ("cruise.speed_gain", scenario.cruise.speed_gain is None, "None: CAVs change lanes as human drivers do"),
+        ("simulation_step", scenario.simulation_step == ON_RAMP_SIMULATION_STEP, f"{ON_RAMP_SIMULATION_STEP:g} s"),
+        ("sensors.is_exact", scenario.sensors.is_exact, "True"),
+        ("actuator.is_instant", scenario.actuator.is_instant, "True"),
+        ("warmup", scenario.warmup == 0, "0"),
+        ("roadside.loss_rate", scenario.roadside.loss_rate == 0, "0"),
+    )
 
 
 def _controls(scenario: Scenario) -> tuple[tuple[str, bool, str], ...]:
@@ -83,9 +103,16 @@ def _first_reason(scenario: Scenario, *checks: tuple[str, bool, str]) -> str:
     return next((f"{name}: {attrgetter(name)(scenario)}; allowed: {allowed}" for name, allowed in failed), "")
 
 
+BATCH_KINDS: dict[type[Scenario], BatchKind] = {
+    Ring: BatchKind(RingBatch, _ring_reason, is_exact=True),
+    FigureEight: BatchKind(RingBatch, _figure_eight_reason),
+    OnRamp: BatchKind(MotorwayBatch, _motorway_reason, max_roads=64, has_own_drivers=True),
+}
+
+
 def differ_only_in_size(first: Scenario, second: Scenario) -> bool:
     """Return whether scenarios differ at most in the size of their roads, so that they can share a batch."""
-    size = first.size_parameter if isinstance(first, LoopScenario) else ""
+    size = getattr(first, "size_parameter", "")
     shared = (each.name for each in fields(first) if each.name != size)
     return type(first) is type(second) and all(getattr(first, name) == getattr(second, name) for name in shared)
 

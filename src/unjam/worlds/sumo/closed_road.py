@@ -4,7 +4,6 @@ The inner loop works on lists of plain floats. Between two steps of SUMO the cac
 numbers then takes longer than a list comprehension.
 """
 
-from array import array
 from collections.abc import Sequence
 from itertools import compress
 from operator import add
@@ -70,12 +69,10 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._noise_rows: list[list[float]] = []
 
     def _reset_log(self) -> None:
-        names = "noise_free_speeds", "requested_accelerations", "safe_accelerations", "commanded_speeds"
-        self._series = {name: array("d") for name in names}
-        """arrays of a `ClosedRoadLog`, row after row"""
-        self._series["speeds"] = array("d", self.speeds)
+        start = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
+        self._recorder = closed_road.ClosedRoadRecorder(self.scenario, self.road, start, self.speeds)
+        self._series = self._recorder.series
         self._fuel: list[Sequence[float]] = []
-        self._start_distances = self._simulation.distances(self.road.vehicle_ids)
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Run the warm-up, then hand the CAVs to the driver unless they stay human (`is_controlled` false).
@@ -94,7 +91,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             series = self.speeds_and_positions()
             history = closed_road.loop_state(*series, self._neighbors, *self._loop_arguments)
             history = history.select(np.s_[:, moments[::-1]])
-        self._is_controlled = is_controlled
+        self.is_controlled = is_controlled
         if is_controlled:
             self._simulation.take_control(road.cav_ids, scenario.actuation, scenario.right_of_way)
             self._set_human_vehicles([name for name in road.vehicle_ids if name not in road.cav_ids])
@@ -114,10 +111,10 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def advance(self, command: Command | None) -> None:
         """Simulate one control step; None: the CAVs stay human."""
         self._simulation.check()
-        accelerations = self._limited_accelerations(command) if self._is_controlled else []
+        accelerations = self.limited_accelerations(command) if self.is_controlled else []
         self._series["requested_accelerations"].fromlist(accelerations)
         for _ in range(self.scenario.steps_per_control_step):
-            if self._is_controlled:
+            if self.is_controlled:
                 self._drive_cavs(accelerations)
             self._simulate()
         self.control_steps += 1
@@ -126,7 +123,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def _drive_cavs(self, accelerations: list[float]) -> None:
         speeds, positions, step = self.speeds, self._tracked_positions, self.scenario.simulation_step
-        loop, last, apply_acceleration = self.road.loop_length, len(speeds) - 1, self._apply_acceleration
+        loop, last, apply_acceleration = self.road.loop_length, len(speeds) - 1, self.filtered_acceleration
         safe, commanded = [], []
         for name, index, acceleration in zip(self.cav_ids, self._cav_indices, accelerations, strict=True):
             speed, leader = speeds[index], index + 1 if index < last else 0
@@ -209,22 +206,15 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def _next_speed_noise(self) -> list[float]:
         """Return the noise of each speed in this step [m/s]; zero for CAVs."""
         if not self._noise_rows:
-            draws = self._noise_generator.standard_normal((closed_road.NOISE_BLOCK_STEPS, len(self._human_mask)))
+            draws = self.noise_generator.standard_normal((closed_road.NOISE_BLOCK_STEPS, len(self._human_mask)))
             scale = self.scenario.noise_per_step * self.scenario.simulation_step
             self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
         return self._noise_rows.pop()
 
     def _make_log(self) -> closed_road.ClosedRoadLog:
-        widths = {name: len(self.road.vehicle_ids) for name in ("noise_free_speeds", "speeds")}
-        return closed_road.ClosedRoadLog(
-            self.scenario,
-            self.road,
-            start_positions=self.road.start_positions + np.array(self._start_distances),
-            has_crashed=self.has_crashed,
-            fuel=np.array(self._fuel) if self.options.record_details else np.zeros((0, 0)),
-            penetration_rate=self._penetration_rate,
-            **{name: np.array(row).reshape(-1, widths.get(name, self.cav_count)) for name, row in self._series.items()},
-        )
+        fuel = np.array(self._fuel) if self.options.record_details else np.zeros((0, 0))
+        rate = self._penetration_rate
+        return self._recorder.make_log(has_crashed=self.has_crashed, fuel=fuel, penetration_rate=rate)
 
     def speeds_and_positions(self) -> tuple[Floats, Floats]:
         """Return those of the log in every simulation step, after checking positions against SUMO's odometer."""
@@ -233,20 +223,16 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         return speeds, positions
 
     def _make_record(self, driver_log: DriverLog) -> Episode:
-        fields = {**self._common_fields(), "collisions": len(self._collided_vehicles)}
+        fields = {**self.record_fields(), "collisions": len(self._collided_vehicles)}
         rows = None if self.is_scalar else np.arange(len(self.cav_ids))
         return self._make_log().episode(self.speeds_and_positions(), fields, driver_log, rows)
 
     def last_applied_acceleration(self) -> Floats:
         """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
-        count = self.cav_count * self.scenario.steps_per_control_step
-        return np.array(self._series["safe_accelerations"][-count:]).reshape(-1, self.cav_count).mean(0)
+        return self._recorder.last_applied_acceleration()
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""
         self._simulation.check()
-        road = self.road
-        positions = road.start_positions + np.array(self._simulation.distances(road.vehicle_ids))
-        poses = closed_road.poses_along(road.center_line, positions, road.loop_length)
-        is_cav = np.isin(np.arange(len(self.speeds)), self._cav_indices)
-        return RoadScene(road.center_line[:, 1:], poses, np.array(self.speeds), is_cav)
+        positions = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
+        return closed_road.loop_scene(self.road, positions, self.speeds)

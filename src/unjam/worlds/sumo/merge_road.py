@@ -139,7 +139,7 @@ class MergingTraffic(OpenTraffic[MergeRoad]):
         acceleration = idm_acceleration(speeds, leader_speeds, gaps, humans)
         acceleration = apply_population(scenario.driver_population, acceleration, speeds, leader_speeds, gaps)
         if scenario.noise > 0:
-            noise = self._noise_generator.standard_normal(len(speeds))
+            noise = self.noise_generator.standard_normal(len(speeds))
             acceleration = acceleration + scenario.noise_per_step * noise
         commanded = next_speed(speeds, acceleration, scenario.simulation_step)
         commanded[streams.is_on_junction(self.road.junction_lengths)] = NO_SPEED_COMMAND

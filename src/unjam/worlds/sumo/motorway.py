@@ -12,9 +12,10 @@ from unjam.drivers.roadside import RoadSections, RoadsideMessages
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.road import MotorwayRoad
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
+from unjam.worlds.multi_lane_log import TrackedLeader
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.inputs import motorway_inputs
-from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
+from unjam.worlds.sumo.multi_lane import MultiLaneTraffic
 from unjam.worlds.sumo.open_road import neighbor_state
 
 
@@ -33,7 +34,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         self._closing_edge_lanes = {number for number, lane in enumerate(road.edge_lanes) if lane.is_merging}
         self._speed_factors = {entry.name: types[entry.vehicle_type].speed_factor for entry in road.entries}
         self._road_sections = RoadSections(int(self._edge_lane_indices.max()) + 1, road.length)
-        self._messages = RoadsideMessages(road.roadside, self.scenario.control_step, self._noise_generator)
+        self._messages = RoadsideMessages(road.roadside, self.scenario.control_step, self.noise_generator)
         self._entered_is_cav: list[bool] = []
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:

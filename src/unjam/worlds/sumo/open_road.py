@@ -13,11 +13,11 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.safety import FollowingState
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.road import BuiltRoad
+from unjam.worlds.open_road_log import OpenRoadLog
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.road_world import RoadScene
 from unjam.worlds.sumo.inputs import lane_change_parameters
 from unjam.worlds.sumo.networks import network_file, network_geometry
-from unjam.worlds.sumo.open_log import OpenRoadLog
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.traffic import OpenRoadT, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
@@ -176,7 +176,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._update_active_vehicles()
         self._log = self._make_log()
         self._warm_up(lambda: self._simulate({}), on_progress)
-        self._is_controlled = is_controlled
+        self.is_controlled = is_controlled
         self._vehicles.arrivals = self._vehicles.teleports = 0
         self._vehicles.collided.clear()
         self._log = self._make_log()
@@ -191,7 +191,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._simulation.check()
         scenario, names, trips = self.scenario, self.cav_ids, self._log.trips
         is_exact = scenario.actuation != "cruise"
-        requested = self._limited_accelerations(command) if self._is_controlled else []
+        requested = self.limited_accelerations(command) if self.is_controlled else []
         before = trips.states[-1].speed
         shield = dict.fromkeys(names, 0.0)
         reductions: dict[str, list[float]] = {name: [] for name in names}
@@ -214,7 +214,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
                 break
         self.control_steps += 1
         self._log_moment()
-        if not (self._is_controlled and is_exact):  # the actual accelerations, zero for vehicles that have left
+        if not (self.is_controlled and is_exact):  # the actual accelerations, zero for vehicles that have left
             after = dict(zip(self._log.traffic.names, self.speeds, strict=True))
             changes = (after.get(name, speed) - speed for name, speed in zip(names, before, strict=True))
             requested = [change / scenario.control_step for change in changes]
@@ -229,7 +229,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         """Return the CAVs' speeds after this step [m/s], and their accelerations after the safety filter [m/s2]."""
         speeds, safe = dict[str, float](), dict[str, float]()
         for name, state in zip(accelerations, self._following_states(list(accelerations)), strict=True):
-            safe[name], actual = self._apply_acceleration(name, accelerations[name], state)
+            safe[name], actual = self.filtered_acceleration(name, accelerations[name], state)
             speeds[name] = next_speed(state.speed, actual, self.scenario.simulation_step)
         return speeds, safe
 
@@ -239,7 +239,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._command_cavs(cav_speeds)
         self._simulation.step()
         self._update_active_vehicles()
-        self._log.add_step(*self._names_and_speeds(), self.cav_ids if self._is_controlled else ())
+        self._log.add_step(*self._names_and_speeds(), self.cav_ids if self.is_controlled else ())
         colliding, ends_episode = self._collisions()
         if colliding:
             self._vehicles.add_collision(colliding, self._simulation)
@@ -258,7 +258,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         if self.remaining_rows is not None:
             self.cav_ids = [*(self.cav_ids[row] for row in rows), *new]
         self.entered_count += len(new)
-        if self._is_controlled:
+        if self.is_controlled:
             new = [name for name in new if name not in self._controlled_cavs]
             self._controlled_cavs.update(new)
             changes = lane_change_parameters(scenario)
@@ -288,7 +288,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
             "planned_duration": self.scenario.horizon * self.scenario.control_step,
             "lane_lines": network_geometry(self._network_file()).lane_lines if details else np.zeros((0, 2)),
         }
-        return Episode(**{**self._common_fields(), **fields, **self._snapshot_fields(columns)})
+        return Episode(**{**self.record_fields(), **fields, **self._snapshot_fields(columns)})
 
     def last_applied_acceleration(self) -> Floats:
         """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""

@@ -18,9 +18,10 @@ from unjam.drivers.safety import FollowingState
 from unjam.scenarios.road import UserNetworkRoad
 from unjam.scenarios.user_network import UserNetwork
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
+from unjam.worlds.multi_lane_log import TrackedLeader
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, user_network_inputs, vehicle_class_by_type
-from unjam.worlds.sumo.multi_lane import MultiLaneTraffic, TrackedLeader
+from unjam.worlds.sumo.multi_lane import MultiLaneTraffic
 from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.sections import RoadsideService
 from unjam.worlds.sumo.simulation import VehicleLimits
@@ -55,7 +56,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         self._roadside_service = None
         step = self.scenario.control_step
         if "lane_speeds" in self.options.measured_fields:
-            messages = RoadsideMessages(self.road.roadside, step, self._noise_generator)
+            messages = RoadsideMessages(self.road.roadside, step, self.noise_generator)
             self._roadside_service = RoadsideService(self._simulation, messages, step)
         self._fuel_interval = max(1, int(FUEL_INTERVAL_SECONDS / step))
 
@@ -127,8 +128,9 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
     def _acc_limits(self, names: Sequence[str]) -> tuple[Floats, Floats]:
         return self._vehicle_limits(names)[:2]
 
-    def _limited_accelerations(self, command: Command | None) -> list[float]:
-        accelerations = super()._limited_accelerations(command)
+    def limited_accelerations(self, command: Command | None) -> list[float]:
+        """Return the commands within the limits of scenario and vehicles [m/s2]."""
+        accelerations = super().limited_accelerations(command)
         if self.scenario.actuation == "cruise":
             return accelerations
         acceleration, _, deceleration = self._vehicle_limits(self.cav_ids)
@@ -169,7 +171,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         Human-only traffic, the baseline, has no CAVs.
         """
         colliding = dict.fromkeys(self._simulation.colliding_vehicles())
-        if not self._is_controlled:
+        if not self.is_controlled:
             return list(colliding), False
         for name, (leader, _, gap, *_) in self._cached_neighbors.items():
             if leader and gap <= 0.0 and self._simulation.is_in_contact(name, leader):

@@ -46,7 +46,7 @@ class MotorwayLog:
         self.end_steps = np.full(len(roads), NO_END_STEP)
         """control step after which vehicles touched on each road, or `NO_END_STEP`"""
         self._placements, self._states = list[_Placements](), list[LocalState]()
-        self._backlogs, self._cav_numbers = list[Integers](), list[Integers]()
+        self.backlogs, self._cav_numbers = list[Integers](), list[Integers]()
         self._arrivals, self._braking = np.zeros(len(roads), np.intp), audit.BrakingLog(1.0)
         shape = len(roads), max(len(road.entries) for road in roads)
         self._leader, self._leader_since = np.full((2, *shape), -1)
@@ -90,7 +90,7 @@ class MotorwayLog:
         """Record the positions of all vehicles after a control step, and what the CAVs observe."""
         step_index = np.full(len(gaps), len(self._placements))
         self._placements.append(_Placements(step_index, *vehicles[:5], gaps))
-        self._backlogs.append(backlog)
+        self.backlogs.append(backlog)
         self._cav_numbers.append(cav_numbers)
         self._states.append(states)
 
@@ -98,7 +98,7 @@ class MotorwayLog:
         """Return the record of each road."""
         trips = self._trips(driver_log)
         steady = np.concatenate(self._steady_following, 1) if self._steady_following else np.zeros((5, 0))
-        backlogs = np.stack(self._backlogs, 1).astype(np.float64)
+        backlogs = np.stack(self.backlogs, 1).astype(np.float64)
         every = _Placements(*(np.concatenate(values) for values in zip(*self._placements, strict=True)))
         order = np.argsort(every.road, kind="stable")
         starts = np.searchsorted(every.road[order], np.arange(len(self._roads) + 1))

@@ -4,7 +4,7 @@ The rows of CAVs are in the order in which they entered, regardless of their roa
 """
 
 from collections.abc import Collection, Sequence
-from typing import NamedTuple, cast
+from typing import NamedTuple, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from unjam.drivers.command import Command, batch_commanded_accelerations, commanded_time_gaps
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import RoadSections, RoadsideMessages
-from unjam.physics.arrays import Floats
+from unjam.physics.arrays import Array, Floats
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.on_ramp import OnRamp
 from unjam.scenarios.road import MotorwayRoad
 from unjam.worlds.batch.human_idm import CONTACT_GAP
+from unjam.worlds.batch.noise import ArrayFactory
 from unjam.worlds.batch.on_ramp.record import MotorwayLog
 from unjam.worlds.batch.on_ramp.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
 from unjam.worlds.batch.on_ramp.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers
 from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 
@@ -98,10 +100,19 @@ class MotorwayBatch:
         self._is_controlled = is_controlled
         self._update_cavs()
 
+    @classmethod
+    def from_tasks(cls, tasks: Sequence[EpisodeTask], to_array: ArrayFactory) -> Self:
+        """Return the motorways of tasks."""
+        scenario, explore = cast(OnRamp, tasks[0].scenario), [task.explore for task in tasks]
+        return cls(scenario, [task.seed for task in tasks], explore=explore)
+
     @property
-    def cav_roads(self) -> NDArray[np.intp]:
-        """The road of each CAV, shape (CAVs,)."""
+    def _cav_roads(self) -> NDArray[np.intp]:
         return self._cav_numbers // NUMBERS_PER_ROAD
+
+    def values_of_cavs(self, values: Array) -> Array:
+        """Return for each CAV the value of its road; values have the shape (W,)."""
+        return values[self._cav_roads]
 
     @property
     def has_ended(self) -> bool:
@@ -211,7 +222,7 @@ class MotorwayBatch:
 
     def noise(self, episode_noise_size: int = 0) -> Floats:
         """Return standard normal noise for one action, shape (CAVs,), or of the episode, see `World.noise`."""
-        roads, generators = self.cav_roads, self._exploration_generators
+        roads, generators = self._cav_roads, self._exploration_generators
         if episode_noise_size:
             if self._episode_noise is None:
                 self._episode_noise = np.stack([each.standard_normal(episode_noise_size) for each in generators])

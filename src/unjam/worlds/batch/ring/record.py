@@ -1,4 +1,4 @@
-"""The record of a batch of rings: sums of each ring, and whole episodes if they are kept."""
+"""The record of a batch of rings."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,26 +14,6 @@ from unjam.worlds.batch.human_idm import CONTACT_GAP
 from unjam.worlds.closed_road import ClosedRoadLog
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.world import DriverLog
-
-
-@dataclass(frozen=True)
-class RingResults:
-    """Results of W rings; arrays of shape (W,)."""
-
-    control_steps: Floats
-    """until the end or a collision"""
-    has_crashed: Floats
-    """1 after a collision, else 0"""
-    reward_terms: dict[str, Floats]
-    """sums over the control steps"""
-    mean_speed: Floats
-    """mean speed of all vehicles after each control step [m/s]"""
-    min_time_gap: Floats
-    """minimum of the CAVs above 1 m/s over all simulation steps [s]; infinite if they never drive that fast"""
-    max_braking: Floats
-    """maximum of the CAVs over all simulation steps [m/s2]"""
-    episodes: tuple[Episode, ...] = ()
-    """records without rewards; empty if they are not kept"""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ the first CAV of every ring, then of the second one, and so on.
 from collections.abc import Collection, Sequence
 from functools import reduce
 from itertools import product
-from typing import cast
+from typing import Self, cast
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
-from unjam.worlds.audit import MIN_TIME_GAP_SPEED
 from unjam.worlds.batch.figure_eight.crossing import CrossingMemory, FigureEightMovement, figure_eight_contacts
 from unjam.worlds.batch.human_idm import (
     CONTACT_GAP,
@@ -34,11 +33,11 @@ from unjam.worlds.batch.human_idm import (
     ring_contacts,
 )
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, QuickNoise, SeededNoise, WorldSeeds
-from unjam.worlds.batch.ring.record import RingLog, RingResults, as_numpy
+from unjam.worlds.batch.ring.record import RingLog, as_numpy
 from unjam.worlds.batch.ring.warm_up import WarmUpState
-from unjam.worlds.batch.support import check_batch_scenarios
 from unjam.worlds.closed_road import MAX_RECALL_SECONDS
-from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 
@@ -52,6 +51,8 @@ class RingBatch:
     is_scalar, remaining_rows = False, None
     measured_fields: Collection[str] = ()
     """optional fields of `LocalState` that the driver reads; others are not provided"""
+    safe_accelerations: Sequence[Array] = ()
+    """the CAVs' accelerations after the safety filter in each simulation step of the last control step [m/s2]"""
     warm_up_states: Sequence[WarmUpState] = ()
     """state of each ring after its warm-up, if that was simulated before"""
 
@@ -60,22 +61,18 @@ class RingBatch:
         scenarios: Sequence[LoopScenario],
         seeds: Sequence[Sequence[int]],
         to_array: ArrayFactory = np.asarray,
-        reward: RewardLike = "",
         keep_record: bool = True,
         draw: DrawNormal | None = None,
         human_model: HumanSpeedModel | None = None,
-        allow_statistical: bool = False,
     ) -> None:
         """Put the vehicles on the roads, at rest; the scenarios differ only in their lengths.
 
         Args:
             to_array: makes the arrays of the simulation, for instance NumPy's or torch's, in any precision.
-            reward: name, or a function; empty: that of the scenario.
             keep_record: whether to keep whole episodes, some 16 bytes for each vehicle and step in float64.
             draw: draws all noise; None: each road draws the same noise as SUMO's episode.
             human_model: of human drivers away from junctions, instead of SUMO's IDM.
         """
-        check_batch_scenarios(scenarios, allow_statistical)
         scenario = self.scenario = scenarios[0]
         drawn = [each.draw_from_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
         roads, generator_seeds = [cast(ClosedRoad, road) for road, _ in drawn], [others for _, others in drawn]
@@ -108,8 +105,18 @@ class RingBatch:
             if draw is None
             else QuickNoise(draw, vehicles, cavs, len(roads))
         )
-        self._reward, self._has_quick_noise = make_reward(reward or scenario.reward), draw is not None
+        self._has_quick_noise = draw is not None
         self._reset_log()
+
+    @classmethod
+    def from_tasks(cls, tasks: Sequence[EpisodeTask], to_array: ArrayFactory) -> Self:
+        """Return the rings of tasks."""
+        scenarios = [cast(LoopScenario, task.scenario) for task in tasks]
+        return cls(scenarios, [task.seed for task in tasks], to_array)
+
+    def values_of_cavs(self, values: Array) -> Array:
+        """Return for each CAV the value of its road; values have the shape (W,)."""
+        return self._to_array(np.tile(values, self._shape[0]))
 
     def _set_motion(self, speeds: Array, positions: Array, loop_lengths: Array) -> None:
         """Set speeds, positions and gaps; NumPy arrays of shapes (vehicles, W) [m/s], (vehicles, W) and (W,) [m]."""
@@ -122,10 +129,8 @@ class RingBatch:
         series = {"speeds": [self._speed[:-1]], **{name: [] for name in ("noise_free_speeds", *cav_series)}}
         start, self._series = as_numpy(self._position), series
         self._log = RingLog(self._scenarios, self.roads, self._seeds, start, self._find_contacts, series)
-        zeros, cav_zeros = self._loop_lengths * 0.0, self._cav_loop_lengths.reshape(self._shape) * 0.0
+        zeros = self._loop_lengths * 0.0
         self._is_running, self._has_crashed, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
-        self._reward_sums, self._mean_speed_sums = dict[str, Array](), zeros
-        self._min_time_gap, self._max_braking = cav_zeros + np.inf, cav_zeros
 
     def place_vehicles(self, speeds: Array, positions: Array, memories: Sequence[CrossingMemory | None]) -> None:
         """Move vehicles before the start [m/s, m], (vehicles, W); `memories` are those of figure eights."""
@@ -158,7 +163,7 @@ class RingBatch:
         for remaining in range(scenario.warmup, 0, -1):
             control_steps, rest = divmod(remaining, scenario.steps_per_control_step)
             if rest == 0 and control_steps <= max_count:
-                states.append(self._exact_state().map(as_numpy))
+                states.append(self.exact_state().map(as_numpy))
             self._simulate(None)
         if not states or not scenario.remember_warmup:
             return None
@@ -196,12 +201,13 @@ class RingBatch:
 
     def local_state(self) -> LocalState:
         """Return what the CAVs observe now: arrays of shape (CAVs * W,)."""
-        state = self._exact_state()
+        state = self.exact_state()
         if isinstance(state.speed, np.ndarray):  # parts of which belong to the world
             state = state.as_read_only()
         return self._readings.read_for_drivers(self.control_steps, state)
 
-    def _exact_state(self) -> LocalState:
+    def exact_state(self) -> LocalState:
+        """Return the exact local state of the CAVs now."""
         loop, position = self._cav_loop_lengths, self._rows_of(self._position, self._cav_indices)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
         distances = [(start - position) % loop for start in self._crossing_starts]
@@ -225,27 +231,14 @@ class RingBatch:
 
     def advance(self, command: Command | None) -> None:
         """Simulate one control step with the same command throughout; None: the CAVs stay human."""
-        scenario, before = self.scenario, self._rows_of(self._speed, self._cav_indices)
         requested = None
         if self._is_controlled:
             requested = batch_commanded_accelerations(command, self.limits, self.cav_count, self.control_steps)
             if self._keep_record:
                 self._series["requested_accelerations"].append(requested)
-        safe = [self._simulate(requested) for _ in range(scenario.steps_per_control_step)]
+        self.safe_accelerations = [self._simulate(requested) for _ in range(self.scenario.steps_per_control_step)]
         self.control_steps += 1
-        after, _, gap = self._following_state()
-        applied: Array = (after - before) / scenario.control_step if requested is None else sum(safe) / len(safe)
-        outcome = Outcome(
-            speeds=self._speed[:-1].T,
-            accelerations=applied.reshape(self._shape).T,
-            time_gaps=time_gap(gap, after).reshape(self._shape).T,
-            has_crashed=self._has_crashed,
-            backlog=self._is_running * 0.0,
-        )
-        for name, term in self._reward(outcome).items():
-            self._reward_sums[name] = self._reward_sums.get(name, 0.0) + term * self._is_running
         self._control_step_counts = self._control_step_counts + self._is_running
-        self._mean_speed_sums = self._mean_speed_sums + outcome.speeds.mean(-1) * self._is_running
         self._is_running = self._is_running * ~self._has_crashed
 
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
@@ -279,9 +272,6 @@ class RingBatch:
         if self._keep_record:
             self._series["noise_free_speeds"].append(moved)
             self._series["speeds"].append(speeds)
-        braking = ((state.speed - self._rows_of(self._speed, self._cav_indices)) / step).reshape(self._shape)
-        self._max_braking = xp.maximum(self._max_braking, braking * self._is_running)
-        self._min_time_gap = self._update_min_time_gap(state)
         return safe
 
     def _next_speeds(self, speed: Array, leader: Leader, cav_speeds: Array | None) -> tuple[Array, Array]:
@@ -298,31 +288,17 @@ class RingBatch:
             return moved, clamp_min(moved + self._noise.human_noise() * self._noise_scale, 0.0)
         return moved, moved
 
-    def _update_min_time_gap(self, state: FollowingState) -> Array:
-        speed, gap = (each.reshape(self._shape) for each in (state.speed, state.gap))
-        xp, is_counted = namespace(speed), (speed > MIN_TIME_GAP_SPEED) * (self._is_running > 0)
-        time_gaps = xp.minimum(self._min_time_gap, gap / clamp_min(speed, MIN_TIME_GAP_SPEED))
-        return xp.where(is_counted, time_gaps, self._min_time_gap)
-
     def noise(self, episode_noise_size: int = 0) -> Array:
         """Return standard normal noise of this control step, shape (CAVs * W,), or of the episode: see `World`."""
         if episode_noise_size:
             return self._noise.episode_noise(episode_noise_size)
         return self._noise.exploration_noise(self.control_steps)
 
-    def record(self, driver_log: DriverLog) -> RingResults:
-        """Return what happened since the start."""
+    def record(self, driver_log: DriverLog) -> tuple[Episode, ...]:
+        """Return the record of each ring since the start, without rewards; none if records are not kept."""
         steps, crashed = as_numpy(self._control_step_counts), 1.0 - as_numpy(self._is_running)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
-        return RingResults(
-            control_steps=steps,
-            has_crashed=crashed,
-            reward_terms={name: as_numpy(total) for name, total in self._reward_sums.items()},
-            mean_speed=as_numpy(self._mean_speed_sums) / steps,
-            min_time_gap=as_numpy(self._update_min_time_gap(self._following_state())).min(0),
-            max_braking=as_numpy(self._max_braking).max(0),
-            episodes=self._log.make_episodes(steps, crashed, driver_log, rate) if self._keep_record else (),
-        )
+        return self._log.make_episodes(steps, crashed, driver_log, rate) if self._keep_record else ()
 
 
 class RingReadings:

@@ -1,0 +1,144 @@
+"""The batch as a backend: batches of one road, which can be inspected."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from unjam.drivers.command import Command
+from unjam.drivers.local_state import LocalState
+from unjam.errors import UnjamError
+from unjam.physics.arrays import Floats
+from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.ring import LoopScenario
+from unjam.scenarios.scenario import Scenario
+from unjam.worlds.backend import WorldOptions
+from unjam.worlds.batch.on_ramp.record import NO_END_STEP
+from unjam.worlds.batch.on_ramp.vehicles import NUMBERS_PER_ROAD
+from unjam.worlds.batch.on_ramp.world import MotorwayBatch
+from unjam.worlds.batch.ring.world import RingBatch
+from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason
+from unjam.worlds.closed_road import loop_scene
+from unjam.worlds.record import Episode
+from unjam.worlds.road_world import RoadScene, RoadWorld
+from unjam.worlds.world import DriverLog
+
+
+class BatchBackend:
+    """The batch, with one road at a time; `run_batches` simulates many at once."""
+
+    def supports(self, scenario: Scenario) -> str:
+        """Return why a batch cannot simulate a scenario, at least with SUMO's distribution; empty if it can."""
+        return statistically_unsupported_reason(scenario)
+
+    @contextmanager
+    def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[RoadWorld]:
+        """Yield the road of an episode."""
+        world = SINGLE_ROADS[BATCH_KINDS[type(scenario)].world](scenario, seed)
+        world.measured_fields = options.measured_fields
+        yield world
+
+
+class SingleRing(RingBatch):
+    """One closed road of a batch."""
+
+    backlog, expects_cavs = 0, False
+
+    def __init__(self, scenario: LoopScenario, seed: Sequence[int]) -> None:
+        super().__init__([scenario], [seed])
+        self.road = self.roads[0]
+        self.cav_ids = self.road.cav_ids
+
+    @property
+    def speeds(self) -> Floats:
+        """Of all vehicles [m/s]."""
+        return self._speed[:-1, 0]
+
+    @property
+    def has_crashed(self) -> bool:
+        """Whether there was a collision, which ends the episode."""
+        return bool(self._has_crashed[0])
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the horizon is reached, or there was a collision."""
+        return self.has_crashed or super().has_ended
+
+    def last_applied_acceleration(self) -> Floats:
+        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2]."""
+        return np.mean(self.safe_accelerations, axis=0)
+
+    def scene(self) -> RoadScene:
+        """Return the current state of the road for pictures."""
+        return loop_scene(self.road, self._position[:, 0], self.speeds)
+
+    def record(self, driver_log: DriverLog) -> Episode:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return the record since the start."""
+        return super().record(driver_log)[0]
+
+
+class SingleMotorway(MotorwayBatch):
+    """One motorway of a batch."""
+
+    def __init__(self, scenario: OnRamp, seed: Sequence[int]) -> None:
+        super().__init__(scenario, [seed])
+        self.road = self.roads[0]
+
+    @property
+    def cav_ids(self) -> list[str]:
+        """The CAVs on the road now, in order of entry."""
+        return [self.road.entries[number % NUMBERS_PER_ROAD].name for number in self._cav_numbers.tolist()]
+
+    @property
+    def speeds(self) -> Floats:
+        """Of all vehicles [m/s]."""
+        return self._traffic.vehicles.speed
+
+    @property
+    def has_crashed(self) -> bool:
+        """Whether vehicles touched, which ends the episode."""
+        return bool(self._log.end_steps[0] < NO_END_STEP)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the horizon is reached, or vehicles touched."""
+        return self.has_crashed or super().has_ended
+
+    @property
+    def backlog(self) -> int:
+        """The insertion backlog now."""
+        return int(self._log.backlogs[-1][0])
+
+    @property
+    def expects_cavs(self) -> bool:
+        """Whether a CAV may still enter."""
+        return self.entered_count < len(self.road.cav_ids)
+
+    def advance(self, command: Command | None) -> None:
+        """Simulate one control step with the same command throughout; None: the CAVs stay human."""
+        before = dict(zip(self.cav_ids, self._local_state.speed, strict=True))
+        super().advance(command)
+        after = before | dict(zip(self.cav_ids, self._local_state.speed, strict=True))
+        self._last_applied = (
+            np.array([after[name] - speed for name, speed in before.items()]) / self.scenario.control_step
+        )
+
+    def exact_state(self) -> LocalState:
+        """Return the exact local state of the CAVs now."""
+        return self._local_state
+
+    def last_applied_acceleration(self) -> Floats:
+        """Return the CAVs' accelerations in the last control step [m/s2]; zero for those that have left."""
+        return self._last_applied
+
+    def scene(self) -> RoadScene:
+        """Raise `UnjamError`: a batch has no geometry of motorways."""
+        raise UnjamError("render: the batch draws no pictures of motorways; allowed: backend='sumo'")
+
+    def record(self, driver_log: DriverLog) -> Episode:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return the record since the start."""
+        return super().record(driver_log)[0]
+
+
+SINGLE_ROADS: dict[type, Any] = {RingBatch: SingleRing, MotorwayBatch: SingleMotorway}

@@ -1,0 +1,142 @@
+"""Backends: SUMO, the batch, and one of a user's own, which docs/architecture.md shows."""
+
+import sys
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import unjam
+from tests.test_architecture import EXAMPLES
+from unjam.drivers import IDM, Constant, Human, PISaturation
+from unjam.drivers.user_driver import FileReference
+from unjam.environments.gymnasium_env import RoadEnv
+from unjam.errors import InputError, UnjamError
+from unjam.scenarios import Merge, OnRamp, Ring
+from unjam.training.config import load_config
+from unjam.worlds.episode import run_episode
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+
+RING = Ring(horizon=60, length=(230, 230))
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> str:
+    """The file of the page with a user's backend, as `path.py:name`."""
+    (tmp_path / "idm_rings.py").write_text(EXAMPLES["A backend"].split("'''")[1])
+    return f"{tmp_path / 'idm_rings.py'}:IDMRings"
+
+
+def backend_object(reference: str) -> Any:
+    return FileReference.parse(reference).load_object()()
+
+
+def test_a_users_backend_runs_the_same_episode_by_name_as_an_object_and_in_a_worker(own: str) -> None:
+    ring = replace(RING, warmup=20, cavs=2)
+    here = run_episode(ring, PISaturation(), 3, backend=own)
+    with WorkerPool(1) as workers:
+        (there,) = workers.run([EpisodeTask(ring, PISaturation(), (3,), backend=own)])
+    for episode in (run_episode(ring, PISaturation(), 3, backend=backend_object(own)), there):
+        np.testing.assert_array_equal(episode.speeds, here.speeds)
+    assert (here.status, here.control_steps, len(here.trajectories)) == ("completed", 60, 2)
+    assert here.audit.cav_braking.samples == 2 * 60
+    assert not np.array_equal(here.speeds, run_episode(ring, PISaturation(), 3).speeds)  # other human drivers
+
+
+def test_environments_step_the_episodes_of_a_users_backend(own: str) -> None:
+    expected = run_episode(RING, Constant(acceleration=0.3), 7, backend=own)
+    rewards = []
+    with closing(gymnasium.make("unjam/Ring-v0", length=230, horizon=60, backend=backend_object(own))) as environment:
+        environment.reset(seed=7)
+        truncated = False
+        while not truncated:
+            _, reward, _, truncated, _ = environment.step(np.array([0.3]))
+            rewards.append(reward)
+    np.testing.assert_allclose(rewards, expected.trajectories[0].reward, atol=1e-12)
+    with closing(unjam.parallel_env("ring", cavs=2, backend=own)) as several:
+        assert sorted(several.reset(seed=0)[0]) == several.agents
+
+
+def test_a_users_backend_drives_in_this_process_as_an_object(own: str) -> None:
+    options: dict[str, Any] = {"scenario_options": {"horizon": 20}, "workers": 1}
+    by_name, as_object = (
+        unjam.drive("ring", "pi", 2, backend=each, **options).rows["pi"] for each in (own, backend_object(own))
+    )
+    assert [row["mean_speed"] for row in by_name] == [row["mean_speed"] for row in as_object]
+
+
+@pytest.mark.parametrize(
+    ("backend", "message"),
+    [
+        ("carla", r"backend: 'carla' is not allowed; allowed: sumo, sumo-gui, batch, path\.py:name"),
+        (object(), r"backend: object has no supports\(\) and no open\(\)"),
+        ("missing.py:Backend", "is not a file"),
+    ],
+)
+def test_what_is_no_backend_is_refused_in_one_line(backend: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        run_episode(RING, IDM(), 0, backend=backend)
+
+
+def test_a_scenario_that_a_backend_does_not_support_is_refused_with_its_reason(own: str) -> None:
+    for attempt in (
+        lambda: run_episode(Merge(), Human(), 0, backend=own),
+        lambda: RoadEnv("merge", cavs=1, backend=own),
+        lambda: unjam.drive("merge", "idm", 1, backend=own),
+        lambda: unjam.train(load_config(changes={"scenario": "figure-eight", "backend": own}), "run"),
+    ):
+        with pytest.raises(InputError, match=r"scenario: (merge|figure-eight) is not a ring"):
+            attempt()
+
+
+def test_a_training_refuses_an_unknown_backend_at_once() -> None:
+    with pytest.raises(InputError, match=r"backend: 'bach' is not allowed; .* did you mean 'batch'"):
+        load_config(changes={"backend": "bach"})
+
+
+def test_another_backend_has_no_window(own: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("unjam.environments.gymnasium_env.has_display", lambda: True)
+    with pytest.raises(InputError, match="render_mode: 'human' is not allowed; allowed: rgb_array"):
+        RoadEnv("ring", render_mode="human", backend=own)
+    with closing(RoadEnv("ring", render_mode="rgb_array", backend=own)) as environment:
+        environment.reset(seed=0)
+        with pytest.raises(UnjamError, match="this backend draws no pictures"):
+            environment.render()
+
+
+def test_a_users_backend_needs_no_sumo(own: str) -> None:
+    before = set(sys.modules)
+    run_episode(replace(RING, horizon=2), IDM(), 0, backend=own)
+    assert not {name for name in set(sys.modules) - before if name.startswith(("libsumo", "traci"))}
+
+
+def test_a_ring_of_the_batch_is_that_of_sumo() -> None:
+    ring = replace(RING, warmup=30)
+    batch, sumo = (run_episode(ring, PISaturation(), 3, backend=backend) for backend in ("batch", "sumo"))
+    np.testing.assert_allclose(batch.speeds, sumo.speeds, atol=1e-9)
+    seen = []
+    for backend in ("batch", "sumo"):
+        with closing(RoadEnv("ring", length=230, horizon=20, backend=backend, render_mode="rgb_array")) as environment:
+            environment.reset(seed=2)
+            steps = [environment.step(np.array([0.2]))[:2] for _ in range(19)]
+            seen.append([*(np.append(*each) for each in steps), environment.render().mean()])
+    np.testing.assert_allclose(seen[0][:-1], seen[1][:-1], atol=1e-6)
+    assert seen[0][-1] == pytest.approx(seen[1][-1], abs=1e-3)
+
+
+def test_an_on_ramp_of_the_batch_is_stepped_as_an_environment() -> None:
+    scenario = OnRamp(peak=(0.0, 60.0), horizon=60, penetration_rate=0.3)
+    episode = run_episode(scenario, Constant(acceleration=0.2), 1, backend="batch")
+    options: dict[str, Any] = {"peak": (0.0, 60.0), "horizon": 60, "penetration_rate": 0.3}
+    with closing(unjam.parallel_env("on-ramp", backend="batch", **options)) as environment:
+        environment.reset(seed=1)
+        while environment.agents:
+            environment.step({agent: np.array([0.2]) for agent in environment.agents})
+        world = environment._road.world
+        assert (world.control_steps, world.has_crashed) == (episode.control_steps, episode.status == "collision")
+        speeds = episode.speeds[-1]
+        np.testing.assert_allclose(np.sort(world.speeds), np.sort(speeds[~np.isnan(speeds)]))
