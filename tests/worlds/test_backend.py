@@ -12,12 +12,14 @@ import pytest
 
 import unjam
 from tests.test_architecture import EXAMPLES
+from unjam.controller.file import sha256_of_file
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.user_driver import FileReference
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError, UnjamError
 from unjam.scenarios import Merge, OnRamp, Ring
 from unjam.training.config import load_config
+from unjam.training.fingerprint import fingerprint
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -91,6 +93,11 @@ def test_a_scenario_that_a_backend_does_not_support_is_refused_with_its_reason(o
     ):
         with pytest.raises(InputError, match=r"scenario: (merge|figure-eight) is not a ring"):
             attempt()
+
+
+def test_the_code_of_a_backend_belongs_to_the_fingerprint_of_a_training(own: str) -> None:
+    files = fingerprint(load_config(changes={"backend": own}))["files"]
+    assert files[own.partition(":")[0]] == sha256_of_file(Path(own.partition(":")[0]))
 
 
 def test_a_training_refuses_an_unknown_backend_at_once() -> None:

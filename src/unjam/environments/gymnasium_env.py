@@ -144,6 +144,7 @@ class RoadStepper:
             self._seed = int(generator.integers(2**31))
         numbers = (self._seed, self._episode_count) if self._episode_count else (self._seed,)
         self._episode_count += 1
+        self._world = None  # also if the next one cannot be opened
         self._world_context.close()
         if self._opened is None:
             self._opened = self._backend_context.enter_context(open_backend(self._backend))

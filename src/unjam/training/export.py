@@ -127,7 +127,8 @@ def export_controller(source: str | Path, out: str | Path, onnx: bool = False, s
         driver = FilteredDriver(driver, max_acceleration, road.safety, road.control_step)
     low, high = driver.limits or road.acceleration_limits
     limit = max(-low, high)
-    states, graph = _sample_states(road, driver), dict[str, bytes]()
+    backend = read_config(source).episode_backend if source.is_dir() else "sumo"
+    states, graph = _sample_states(road, driver, backend), dict[str, bytes]()
     if onnx:
         import_optional("torch")
         from unjam.controller.onnx_graph import onnx_graph  # imported late: torch.onnx is slow to import
@@ -199,10 +200,10 @@ def _test_metrics(folder: Path) -> dict[str, Any] | None:
     return metrics
 
 
-def _sample_states(scenario: Scenario, driver: Driver) -> LocalState:
+def _sample_states(scenario: Scenario, driver: Driver, backend: str) -> LocalState:
     """Return the local states of the CAV with the longest trip in a test episode, arrays of shape (T,)."""
     with WorkerPool(1) as workers:
-        (episode,) = workers.run([EpisodeTask(scenario, driver, make_test_seeds(1)[0])])
+        (episode,) = workers.run([EpisodeTask(scenario, driver, make_test_seeds(1)[0], backend=backend)])
     raise_failure([measure(episode)] if not episode.has_run else [])
     longest = max(episode.trajectories, key=lambda trajectory: len(trajectory.applied_acceleration))
     states = longest.states.select(slice(min(len(longest.applied_acceleration), MAX_SAMPLE_STEPS)))
