@@ -6,7 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.training.test_run import STEPS, Stop, collected, learn_with, outcome, progress, small_config, stop_after
+from tests.training.test_run import (
+    STEPS,
+    Stop,
+    collected_episodes,
+    learn_with,
+    outcome,
+    progress,
+    small_config,
+    stop_after,
+)
 from unjam.controller import load_controller
 from unjam.errors import InputError, UnjamError
 from unjam.training.config import RunConfig
@@ -53,7 +62,7 @@ def test_user_agent_learns_and_a_resumed_run_repeats_bit_for_bit(
 def test_further_collections_of_an_iteration_have_the_same_seeds_and_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    episodes = collected(monkeypatch)
+    episodes = collected_episodes(monkeypatch)
     with WorkerPool(1) as workers:
         run = learn_with(workers, tmp_path / "run", config_of("EvolutionStrategy", user__options={"pairs": 1}))
     seeds = [episode.seed for episode in episodes]
