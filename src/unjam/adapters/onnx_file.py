@@ -1,6 +1,6 @@
 """An ONNX file of a third party as a driver, with a description of its inputs and outputs in TOML.
 
-The description stands beside the graph (`policy.toml` for `policy.onnx`), or in the metadata of the graph itself. It
+The description is next to the graph (`policy.toml` for `policy.onnx`), or in the metadata of the graph itself. It
 names data only: the graph in its own folder, and an expert among the drivers with names.
 """
 
@@ -36,7 +36,7 @@ def onnx_driver(
 
     Args:
         file: the graph (.onnx), or its description (.toml).
-        description: of inputs and outputs; None: that in the file beside the graph, or in its metadata.
+        description: of inputs and outputs; None: that in the file next to the graph, or in its metadata.
         expert: a driver to which the accelerations are added; None: that of the description, if it has one.
         time_step: control step of the road [s].
 
@@ -58,19 +58,19 @@ def onnx_driver(
 
 def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:
     """Return a graph and the table of its description."""
-    beside = path.with_suffix(DESCRIPTION_SUFFIX)
-    if os.path.lexists(beside):
-        table = _parse_description(_read(beside, MAX_DESCRIPTION_BYTES), beside.name)
+    description_file = path.with_suffix(DESCRIPTION_SUFFIX)
+    if os.path.lexists(description_file):
+        table = _parse_description(_read(description_file, MAX_DESCRIPTION_BYTES), description_file.name)
         name = table.pop("graph", path.with_suffix(GRAPH_SUFFIX).name)
         if not isinstance(name, str) or Path(name).name != name or not name.endswith(GRAPH_SUFFIX):
             allowed = f"the name of a file in its folder that ends in {GRAPH_SUFFIX}"
-            raise invalid_value(f"driver {beside.name}: graph", name, allowed)
+            raise invalid_value(f"driver {description_file.name}: graph", name, allowed)
         graph = path if path.suffix == GRAPH_SUFFIX else path.with_name(name)
         return _read(graph, MAX_MODEL_BYTES), table
     content = _read(path, MAX_MODEL_BYTES)
     texts = {each.key: each.value for each in parse_model(content).metadata_props}
     if DESCRIPTION_KEY not in texts:
-        needed = f"{beside.name}, with the inputs and the output of the graph"
+        needed = f"{description_file.name}, with the inputs and the output of the graph"
         raise InputError(f"driver {path.name}: its description is missing; needed: {needed}")
     return content, _parse_description(texts[DESCRIPTION_KEY].encode(), path.name)
 
