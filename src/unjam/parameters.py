@@ -157,11 +157,19 @@ def _split_commas(text: str) -> list[str]:
 
 
 def merge_changes(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Return `values` with `changes`; tables are merged key by key."""
+    """Return `values` with `changes`; tables are merged key by key, and entries of a list by their number, from 0."""
     merged = dict(values)
     for key, value in changes.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = merge_changes(merged[key], value) if both else value
+        known = merged.get(key)
+        if isinstance(value, dict) and isinstance(known, list | tuple):
+            entries = merge_changes({str(number): entry for number, entry in enumerate(known)}, value)
+            if unknown := entries.keys() - set(map(str, range(len(known)))):
+                allowed = f"allowed: 0 to {len(known) - 1}" if known else "it has no entries"
+                raise InputError(f"{key}.{min(unknown)}: unknown entry; {allowed}")
+            value = [*entries.values()]
+        elif isinstance(value, dict) and isinstance(known, dict):
+            value = merge_changes(known, value)
+        merged[key] = value
     return merged
 
 

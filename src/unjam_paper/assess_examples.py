@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +14,7 @@ import pandas as pd
 
 from unjam.measures.recommendation import ControllerResult
 from unjam.measures.statistics import Estimate, format_difference
-from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.motorway import ON_RAMP
 from unjam.training.assess import Assessment, assess, make_request
 from unjam.worlds.sumo.backend import sumo_inputs
 from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE
@@ -45,7 +45,7 @@ GRID_FLOW, TURNING_FLOW = 300.0, 60.0
 """flow on each straight route through the grid, and on each that turns [veh/h]"""
 MOTORWAY_FLOW, RAMP_FLOW = 3000.0, 500.0
 """flow on the motorway with SUMO's default vehicles, and on its ramp [veh/h]"""
-ON_RAMP_DEMAND = OnRamp(peak=(100.0, 700.0), horizon=int(EPISODE_SECONDS))
+ON_RAMP_DEMAND = replace(ON_RAMP, peak=(100.0, 700.0), horizon=int(EPISODE_SECONDS))
 DEMAND_SEED = 1
 """the built-in scenario that is exported, and the seed of its demand"""
 

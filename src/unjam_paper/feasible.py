@@ -30,7 +30,7 @@ from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.physics.arrays import Floats
 from unjam.scenarios.figure_eight import FigureEight
-from unjam.scenarios.on_ramp import ON_RAMP, OnRamp
+from unjam.scenarios.motorway import ON_RAMP, Motorway, Ramp
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.training.export import export_controller
@@ -298,10 +298,11 @@ def envelope_figure_eights() -> Iterator[tuple[str, FigureEight]]:
         yield f"radius {low} to {high} m", FigureEight(radius=(low, high))
 
 
-def envelope_lanes() -> Iterator[tuple[str, OnRamp]]:
+def envelope_lanes() -> Iterator[tuple[str, Motorway]]:
     """Yield motorway lanes by name on which the safety filter is active and the checks of SUMO are not."""
     for name, changes in LANE_CONDITIONS.items():
-        lane = OnRamp(lanes=1, ramp_flow=0.0, off_peak_ramp_flow=0.0, horizon=900)
+        ramp = Ramp(position=2000.0, inflow=0.0, off_peak_inflow=0.0)
+        lane = Motorway(lanes=1, ramps=(ramp,), horizon=900)
         yield name, replace(lane, actuation="raw", safety=SafetyFilter(), **changes)
 
 

@@ -26,8 +26,8 @@ from unjam_paper.study import STUDY_ROADS, PlannedRun, Study, StudyFolder, study
 from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES
 
 TRAINING_SECONDS: dict[str, dict[str, float]] = {
-    "trpo": {"ring": 45, "figure-eight": 80, "merge": 900, "on-ramp": 170},
-    "ppo": {"ring": 75, "figure-eight": 110, "merge": 930, "on-ramp": 190},
+    "trpo": {"ring": 45, "figure-eight": 80, "merge": 900, "motorway": 170},
+    "ppo": {"ring": 75, "figure-eight": 110, "merge": 930, "motorway": 190},
     "sac": {"ring": 450, "figure-eight": 480, "merge": 1300},
 }
 """duration of 300,000 environment steps without a model, on one core of the machine of results/ [s]; on the on-ramp in
@@ -36,7 +36,7 @@ SUMO_ON_RAMP_SECONDS = 1150.0
 """additional duration where episodes of the on-ramp run in SUMO [s]"""
 MODEL_ROLLOUT_SECONDS = 60.0
 """additional duration with a model of rows, for a model ratio up to one [s]"""
-REFERENCE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0, "on-ramp": 1500.0}
+REFERENCE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0, "motorway": 1500.0}
 """duration of the reference drivers on a road [s]"""
 
 
@@ -99,7 +99,7 @@ def estimated_seconds(run: PlannedRun) -> float:
     config, kind = run.config, _scenario_kind(run.road)
     seconds, ratio = TRAINING_SECONDS[config.agent][kind], config.model.model_ratio
     model = seconds * ratio if config.model.kind == "road" else MODEL_ROLLOUT_SECONDS * min(1.0, ratio)
-    in_sumo = SUMO_ON_RAMP_SECONDS if kind == "on-ramp" and config.backend == "sumo" else 0.0
+    in_sumo = SUMO_ON_RAMP_SECONDS if kind == "motorway" and config.backend == "sumo" else 0.0
     return config.steps / 300_000 * (seconds + in_sumo + model)
 
 

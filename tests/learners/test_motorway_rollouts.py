@@ -19,8 +19,8 @@ from unjam.models.motorway_model import learned_correction, motorway_samples
 from unjam.models.road_model import RoadModel
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Floats
-from unjam.scenarios.on_ramp import ON_RAMP
-from unjam.worlds.batch.on_ramp.world import MotorwayBatch, ReplayOptions
+from unjam.scenarios.motorway import MOTORWAY_SCENARIOS, ON_RAMP, Motorway
+from unjam.worlds.batch.motorway.world import MotorwayBatch, ReplayOptions
 from unjam.worlds.batch.run import run_batch
 from unjam.worlds.drive import DriveLoop, finish_drive
 from unjam.worlds.episode import Task, run_episode
@@ -28,6 +28,7 @@ from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask
 
 ROAD = replace(ON_RAMP, horizon=160, peak=(20.0, 160.0), penetration_rate=0.2)
+TWO_RAMPS = replace(MOTORWAY_SCENARIOS["two-ramps"], horizon=160, peak=(20.0, 160.0), penetration_rate=0.2)
 EXPERT = driver_from_name("jam-ahead", 1.0)
 POLICY = PolicySettings(hidden=(8,), inputs=("local",), action_duration=5.0, exploration="antithetic")
 MODEL = ModelSettings(kind="road", rollout_starts="first", k_max=160, model_ratio=1.0, max_fit_rows=2000)
@@ -42,11 +43,6 @@ FACTORY = ExperienceFactory(
 @pytest.fixture(scope="module")
 def batch_episodes() -> list[Episode]:
     return run_batch([EpisodeTask(ROAD, EXPERT, (seed,)) for seed in range(4)], allow_statistical=True)
-
-
-@pytest.fixture(scope="module")
-def sumo_episodes() -> list[Episode]:
-    return [run_episode(ROAD, EXPERT, (seed,)) for seed in range(4)]
 
 
 @pytest.fixture
@@ -85,8 +81,10 @@ def test_correction_changes_speeds_per_control_step() -> None:
 
 
 @pytest.mark.usefixtures("short_sample_interval")
-def test_base_step_differs_from_the_record_by_perception_errors(batch_episodes: list[Episode]) -> None:
-    samples = motorway_samples(batch_episodes[0], 0, ROAD)
+@pytest.mark.parametrize("road", [ROAD, pytest.param(TWO_RAMPS, marks=pytest.mark.long)])
+def test_base_step_differs_from_the_record_by_perception_errors(road: Motorway) -> None:
+    (episode,) = run_batch([EpisodeTask(road, EXPERT, (0,))], allow_statistical=True)
+    samples = motorway_samples(episode, 0, road)
     errors = samples.human_rows.next_speed - samples.human_rows.base_speed
     assert len(errors) > 200
     change = float((samples.human_rows.next_speed - samples.human_rows.speed).std())
@@ -207,12 +205,16 @@ def test_unsupported_settings_are_refused(settings: ModelSettings, words: str) -
 
 
 @pytest.mark.long
-def test_base_predicts_drivers_in_sumo_as_well_as_in_the_batch(
-    batch_episodes: list[Episode], sumo_episodes: list[Episode], short_sample_interval: None
-) -> None:
+@pytest.mark.usefixtures("short_sample_interval")
+@pytest.mark.parametrize("road", [ROAD, TWO_RAMPS])
+def test_base_predicts_drivers_in_sumo_as_well_as_in_the_batch(road: Motorway) -> None:
     squares, counts, noises = list[float](), list[int](), list[float]()
-    for episodes in (batch_episodes, sumo_episodes):
-        samples = [motorway_samples(episode, 0, ROAD) for episode in episodes]
+    tasks = [EpisodeTask(road, EXPERT, (seed,)) for seed in range(4)]
+    for episodes in (
+        run_batch(tasks, allow_statistical=True),
+        [run_episode(road, EXPERT, each.seed) for each in tasks],
+    ):
+        samples = [motorway_samples(episode, 0, road) for episode in episodes]
         errors = np.concatenate([one.human_rows.next_speed - one.human_rows.base_speed for one in samples])
         squares.append(float(np.square(errors).mean()))
         counts.append(len(errors))
@@ -222,6 +224,6 @@ def test_base_predicts_drivers_in_sumo_as_well_as_in_the_batch(
     assert squares[1] < 1.3 * squares[0]
 
 
-def test_record_that_skips_steps_is_refused(sumo_episodes: list[Episode]) -> None:
+def test_record_that_skips_steps_is_refused(batch_episodes: list[Episode]) -> None:
     with pytest.raises(InputError, match="skips steps"):
-        motorway_samples(replace(sumo_episodes[0], snapshot_stride=2), 0, ROAD)
+        motorway_samples(replace(batch_episodes[0], snapshot_stride=2), 0, ROAD)

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from unjam.controller import PACKAGED_PREFIX, certificate, packaged_names
-from unjam.scenarios import OnRamp, Ring
+from unjam.scenarios import Motorway, Ring
 from unjam_paper import feasible
 from unjam_paper.feasible import ENVELOPE
 from unjam_paper.study import StudyFolder
@@ -41,7 +41,7 @@ def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     short = Ring(length=(60, 60), vehicles=5, horizon=60)
     for name in ("envelope_rings", "envelope_figure_eights"):
         monkeypatch.setattr(feasible, name, lambda **changes: iter([("a short ring", short)]))
-    monkeypatch.setattr(feasible, "envelope_lanes", lambda: iter([("a short lane", OnRamp(lanes=1, horizon=60))]))
+    monkeypatch.setattr(feasible, "envelope_lanes", lambda: iter([("a short lane", Motorway(lanes=1, horizon=60))]))
     monkeypatch.setattr(feasible, "impaired_rings", lambda warmup: iter([("late", short)]))
     monkeypatch.setattr(certificate, "ATTACK_GENERATIONS", 1)
     monkeypatch.setattr(certificate, "STRING_SPEED_RATIOS", ())

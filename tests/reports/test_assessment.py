@@ -16,7 +16,7 @@ from unjam.measures.metrics import METRICS
 from unjam.measures.recommendation import AccResult, ControllerResult, assessment_headline, recommended_result
 from unjam.measures.statistics import Estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, effect_figure, render_assessment, write_assessment
-from unjam.scenarios import OnRamp, Ring, scenario_recipe
+from unjam.scenarios import Motorway, Ring, scenario_recipe
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode
 
@@ -104,7 +104,7 @@ def test_page_describes_the_acc_of_cavs(tmp_path: Path, page: str) -> None:
     assert "its own ACC" not in page
     folder = assessment_folder(tmp_path, [HELPS])
     document = json.loads((folder / ASSESSMENT_FILE).read_text())
-    document["road"] = {**scenario_recipe(OnRamp()), "cav_classes": ["passenger"]}
+    document["road"] = {**scenario_recipe(Motorway()), "cav_classes": ["passenger"]}
     (folder / ASSESSMENT_FILE).write_text(json.dumps(document, default=float).replace("NaN", "null"))
     text = " ".join(render_assessment(folder).split())
     assert "Each CAV has its own ACC, with a time gap of 1.1 s and at most 2.5 m/s²" in text

@@ -9,8 +9,9 @@ from unjam.drivers.network import Network
 from unjam.errors import InputError
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios import make_scenario, scenario_from_recipe, scenario_recipe
+from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.scenarios.population import Population, read_population, write_population
-from unjam.scenarios.road import BuiltRoad, MotorwayRoad
+from unjam.scenarios.road import BuiltRoad
 from unjam.worlds.sumo.backend import sumo_inputs
 
 DRIVERS = (IDMParameters(time_headway=0.8, desired_speed=35.0), IDMParameters(time_headway=1.6, minimum_gap=4.0))
@@ -115,7 +116,7 @@ def test_an_unknown_packaged_population_is_refused_with_the_known_ones() -> None
 
 
 def test_on_a_motorway_only_car_following_is_calibrated(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="population: one with a residual network is not allowed on the on-ramp"):
+    with pytest.raises(InputError, match="population: one with a residual network is not allowed on a motorway"):
         make_scenario("on-ramp", {"population": str(written(tmp_path, NETWORK))})
     road = make_scenario("on-ramp", {"population": str(written(tmp_path))}).draw(np.random.default_rng(0))
     assert isinstance(road, MotorwayRoad)

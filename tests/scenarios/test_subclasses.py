@@ -7,7 +7,7 @@ import pytest
 
 from unjam.drivers import Human
 from unjam.errors import InputError
-from unjam.scenarios import FigureEight, Merge, OnRamp, Ring, scenario_recipe
+from unjam.scenarios import FigureEight, Merge, Motorway, Ring, scenario_recipe
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.run import run_batch
@@ -44,14 +44,14 @@ def test_a_subclass_is_simulated_in_one_process_and_refused_in_others(scenario: 
         workers.run([EpisodeTask(scenario, Human(), (1,))])
 
 
-@pytest.mark.parametrize("kind", [Ring, FigureEight, Merge, OnRamp])
+@pytest.mark.parametrize("kind", [Ring, FigureEight, Merge, Motorway])
 def test_no_subclass_becomes_its_base_class_in_a_file(kind: type[Scenario]) -> None:
     for members in ({}, {"title": "other"}):
         with pytest.raises(InputError, match=f"Other{kind.__name__} is not allowed"):
             scenario_recipe(subclass_of(kind, **members))
 
 
-@pytest.mark.parametrize("kind", [Ring, FigureEight, OnRamp])
+@pytest.mark.parametrize("kind", [Ring, FigureEight, Motorway])
 def test_no_subclass_is_simulated_in_a_batch(kind: type[Scenario]) -> None:
     scenario = subclass_of(kind)
     assert unsupported_reason(scenario)

@@ -182,7 +182,7 @@ def test_the_acc_has_the_limits_of_its_vehicle_by_default(tmp_path: Path) -> Non
 
     assert cruise() == cruise(**{"cruise.time_gap": 2.0}) == (None, None)
     assert cruise(**{"cruise.acceleration": 1.5}) == (1.5, None)
-    with pytest.raises(InputError, match=r"cruise.acceleration: None is not allowed on on-ramp; allowed: > 0"):
+    with pytest.raises(InputError, match=r"cruise.acceleration: None is not allowed on motorway; allowed: > 0"):
         make_scenario("on-ramp", {"cruise.acceleration": None})
 
 

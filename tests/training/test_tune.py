@@ -16,7 +16,7 @@ from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.gain import MAX_GAIN, MEAN_GAIN, MIN_GAIN
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring
-from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.scenarios.motorway import ON_RAMP
 from unjam.training import tune as tuning
 from unjam.training.search_space import (
     Categorical,

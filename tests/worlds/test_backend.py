@@ -17,7 +17,8 @@ from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.user_driver import FileReference
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError, UnjamError
-from unjam.scenarios import Merge, OnRamp, Ring
+from unjam.scenarios import Merge, Ring
+from unjam.scenarios.motorway import ON_RAMP
 from unjam.training.config import load_config
 from unjam.training.fingerprint import fingerprint
 from unjam.worlds.episode import run_episode
@@ -136,7 +137,7 @@ def test_a_ring_of_the_batch_is_that_of_sumo() -> None:
 
 
 def test_an_on_ramp_of_the_batch_is_stepped_as_an_environment() -> None:
-    scenario = OnRamp(peak=(0.0, 60.0), horizon=60, penetration_rate=0.3)
+    scenario = replace(ON_RAMP, peak=(0.0, 60.0), horizon=60, penetration_rate=0.3)
     episode = run_episode(scenario, Constant(acceleration=0.2), 1, backend="batch")
     options: dict[str, Any] = {"peak": (0.0, 60.0), "horizon": 60, "penetration_rate": 0.3}
     with closing(unjam.parallel_env("on-ramp", backend="batch", **options)) as environment:

@@ -30,7 +30,8 @@ from unjam.drivers.wrappers import (
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError
 from unjam.physics.idm import IDMParameters
-from unjam.scenarios import Merge, OnRamp, Ring, Scenario
+from unjam.scenarios import Merge, Ring, Scenario
+from unjam.scenarios.motorway import ON_RAMP
 from unjam.training.config import load_config
 from unjam.training.run_folder import check_config
 from unjam.worlds.batch.run import run_batch
@@ -129,13 +130,13 @@ def test_certification_refuses_a_controller_with_another_time_step_than_its_filt
         certify_driver(driver, states, IDMParameters())
 
 
-@pytest.mark.parametrize("scenario", [Merge(), OnRamp(), Ring()])
+@pytest.mark.parametrize("scenario", [Merge(), ON_RAMP, Ring()])
 def test_only_drivers_that_a_road_selects_need_its_control_step(scenario: Scenario) -> None:
     switch = make_driver("unjam:best", scenario.control_step)
     check_can_drive(switch, scenario)
     with pytest.raises(InputError, match="allowed: 1 s"):
         check_can_drive(switch, Ring(steps_per_control_step=10))
     motorway = RoadTypeSwitch(PISaturation(time_step=1.0), Constant(), Constant(), PISaturation(time_step=0.3))
-    check_can_drive(motorway, OnRamp())
+    check_can_drive(motorway, ON_RAMP)
     with pytest.raises(InputError, match=r"time_step 0\.3 s is not allowed on merge; allowed: 1 s"):
         check_can_drive(motorway, Merge())

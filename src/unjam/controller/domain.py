@@ -21,6 +21,8 @@ IRRELEVANT_PARAMETERS = {"horizon", "emission_class", "remember_warmup", "popula
 """scenario parameters that do not make it another scenario"""
 KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")
 """parameters that distinguish scenarios of a kind in a short description"""
+TABLE_LISTS = ("ramps",)
+"""parameters that are lists of tables"""
 MAX_LISTED_PARAMETERS = 3
 """maximum number of parameters in a note"""
 OUTSIDE_DOMAIN_THRESHOLD = 0.05
@@ -67,7 +69,7 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     made = "tuned" if "tuning" in manifest else "trained"
     if trained.get("kind") != road["kind"]:
         return f"was {made} on the {_printable(trained.get('kind'))}, not on the {road['kind']}"
-    before, now = flatten_keys(trained), flatten_keys(road)
+    before, now = _flatten_recipe(trained), _flatten_recipe(road)
     known = [name for name in now if name in before and name not in IRRELEVANT_PARAMETERS]
     differ = [name for name in known if not _is_within(before[name], now[name])]
     if not differ:
@@ -76,6 +78,12 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     words = [f"{name} {_printable(now[name])} (there {_printable(before[name])})" for name in listed]
     more = [f"{len(differ) - len(listed)} more"] if len(differ) > len(listed) else []
     return f"was {made} on another {road['kind']}: {', '.join(words + more)}"
+
+
+def _flatten_recipe(recipe: dict[str, Any]) -> dict[str, Any]:
+    """Return a recipe with dotted keys, and the number of entries of each list of tables."""
+    tables = {name: recipe[name] for name in TABLE_LISTS if isinstance(recipe.get(name), list | tuple)}
+    return flatten_keys(recipe | {name: {"count": len(each), **dict(enumerate(each))} for name, each in tables.items()})
 
 
 def road_description(manifest: dict[str, Any]) -> str:

@@ -21,7 +21,7 @@ from unjam.learners.model_rollouts import ExperienceFactory, ModelRollouts, RowR
 from unjam.learners.settings import LearnerSettings
 from unjam.learners.whole_road_rollouts import MotorwayRollouts, RoadRollouts
 from unjam.models.settings import ModelSettings
-from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.motorway import Motorway
 from unjam.worlds.episode import Task
 
 MAX_COMPARED_ROWS = 2000
@@ -145,7 +145,7 @@ def model_rollouts_class(model: ModelSettings, task: Task) -> type[ModelRollouts
     """Return the kind of model rollouts for a task with these settings."""
     if model.kind == "row":
         return RowRollouts
-    return MotorwayRollouts if isinstance(task.scenario, OnRamp) else RoadRollouts
+    return MotorwayRollouts if isinstance(task.scenario, Motorway) else RoadRollouts
 
 
 @contextmanager

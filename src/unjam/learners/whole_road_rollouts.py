@@ -25,13 +25,13 @@ from unjam.models.road_model import (
     road_samples,
     with_size,
 )
-from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.tree import map_leaves
 from unjam.worlds.batch.figure_eight.crossing import CrossingMemory
 from unjam.worlds.batch.human_idm import HumanSpeedModel
-from unjam.worlds.batch.on_ramp.traffic import LearnedCorrection
-from unjam.worlds.batch.on_ramp.world import MotorwayBatch, ReplayOptions
+from unjam.worlds.batch.motorway.traffic import LearnedCorrection
+from unjam.worlds.batch.motorway.world import MotorwayBatch, ReplayOptions
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.batch.support import BATCH_KINDS
@@ -188,7 +188,7 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
     stored_types: ClassVar = {"data": EnvironmentData, "samples": list[MotorwaySamples]}
 
     def _sample_episode(self, episode: Episode, number: int) -> MotorwaySamples:
-        return motorway_samples(episode, number, cast(OnRamp, self.scenario), self.model.base)
+        return motorway_samples(episode, number, cast(Motorway, self.scenario), self.model.base)
 
     def _fit_model(self, seed: Seed) -> ModelFit:
         group_size = len(self._policy.exploration_signs)
@@ -248,7 +248,7 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
     ) -> list[Episode]:
         """Return recorded episodes with the same vehicles, and seeds of human drivers' errors and of exploration."""
         replay = ReplayOptions(seeds, control_steps, self.settings.add_noise, correction)
-        road, vehicle_seeds = cast(OnRamp, self.scenario), [each.seed for each in samples]
+        road, vehicle_seeds = cast(Motorway, self.scenario), [each.seed for each in samples]
         world = MotorwayBatch(road, vehicle_seeds, explore=exploration_scales, replay=replay)
         world.measured_fields = driver.measured_fields
         return finish_drive(DriveLoop(world, driver, 0.0 if exploration_scales is None else 1.0))

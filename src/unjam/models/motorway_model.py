@@ -1,4 +1,4 @@
-"""The road model of on-ramps: the batch's human drivers with known entry times, plus what networks learn.
+"""The road model of motorways: the batch's human drivers with known entry times, plus what networks learn.
 
 The base is the batch: each vehicle's own driver model and lane changes. Perception errors are noise, drawn anew. One
 ensemble learns the rest, where vehicles keep their lane, from samples of environment episodes: vehicles are stepped
@@ -19,18 +19,18 @@ from unjam.models.ensemble import ModelFit, Seed
 from unjam.models.road_model import HumanRows, RoadModel, fit_human_model, residual_function
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Floats
-from unjam.scenarios.on_ramp import RAMP_SPEED_LIMIT, OnRamp
-from unjam.scenarios.road import MotorwayRoad
-from unjam.worlds.batch.on_ramp.traffic import (
+from unjam.scenarios.motorway import Motorway
+from unjam.scenarios.motorway_road import MotorwayRoad
+from unjam.worlds.batch.motorway.traffic import (
     BatchMotorways,
     LearnedCorrection,
     driver_columns,
     enable_acc,
     make_vehicles,
 )
-from unjam.worlds.batch.on_ramp.vehicles import (
+from unjam.worlds.batch.motorway.vehicles import (
     MotorwayVehicles,
-    find_neighbors,
+    find_road_neighbors,
     find_rows,
     neighbors_on_lane,
     vehicle_numbers,
@@ -50,7 +50,7 @@ PERCEPTION_ERROR_STD = 0.5
 
 @dataclass(frozen=True)
 class MotorwaySamples:
-    """Human drivers on an on-ramp at some steps of an environment episode."""
+    """Human drivers on a motorway at some steps of an environment episode."""
 
     episode: int
     """number of the episode"""
@@ -63,7 +63,7 @@ class MotorwaySamples:
     """mean square of what perception errors add to a speed in a control step [m2/s2]"""
 
 
-def motorway_samples(episode: Episode, number: int, scenario: OnRamp, base: str = "idm") -> MotorwaySamples:
+def motorway_samples(episode: Episode, number: int, scenario: Motorway, base: str = "idm") -> MotorwaySamples:
     """Return the samples of an environment episode; `InputError` if its record skips steps, as long ones do."""
     if episode.snapshot_stride > 1:
         raise InputError("road: its record skips steps; allowed: a shorter horizon, with model.kind road")
@@ -79,11 +79,11 @@ def motorway_samples(episode: Episode, number: int, scenario: OnRamp, base: str 
     noisy = before._replace(**perception, driving_error=errors[2])
     base_speed = _speeds_after_step(before, road, scenario, len(steps), np.zeros)
     noisy_speed = _speeds_after_step(noisy, road, scenario, len(steps), generator.standard_normal)
-    leader = neighbors_on_lane(find_neighbors(before, len(road.lane_names)).leaders, before.lane)
+    leader = neighbors_on_lane(find_road_neighbors(before, road.geometry).leaders, before.lane)
     next_speed = episode.speeds[later]
     keeps_lane = episode.lane_indices[later] == episode.lane_indices[now]
     is_used = (leader >= 0) & before.is_eidm & keeps_lane & ~np.isnan(base_speed + noisy_speed + next_speed)
-    gap = before.position[leader] - road.vehicle_length - before.position
+    gap = before.position[leader] - road.geometry.vehicle_length - before.position
     noise_variance = float(np.square(noisy_speed - base_speed)[is_used].mean()) if is_used.any() else 0.0
     if base == "none":
         base_speed = before.speed
@@ -107,17 +107,18 @@ def _sample_vehicles(episode: Episode, steps: Index) -> tuple[Index, Index, Inde
 
 
 def _batch_vehicles(
-    episode: Episode, road: MotorwayRoad, scenario: OnRamp, at: tuple[Index, Index], sample: Index, vehicle: Index
+    episode: Episode, road: MotorwayRoad, scenario: Motorway, at: tuple[Index, Index], sample: Index, vehicle: Index
 ) -> MotorwayVehicles:
     """Return vehicles as a batch has them, without errors or memory; `at` is their index in the record."""
     numbers = {entry.name: number for number, entry in enumerate(road.entries)}
     entries = np.array([numbers[name] for name in episode.vehicle_ids])
     types = [road.vehicle_types[road.entries[number].vehicle_type] for number in entries.tolist()]
     *parameters, speed_factor, is_eidm = np.array([driver_columns(each) for each in types])[vehicle].T
-    lane = (len(road.lane_names) - 1 - episode.lane_indices[at]).astype(np.intp)
-    position, speed = episode.positions[at] + road.merge_position, episode.speeds[at]
+    geometry = road.geometry
+    lane = (geometry.lane_count - episode.lane_indices[at]).astype(np.intp)
+    position, speed = episode.positions[at] + geometry.origin, episode.speeds[at]
     acceleration = np.nan_to_num(speed - episode.speeds[at[0] - 1, at[1]]) / episode.control_step
-    limit = np.where((lane == 0) & (position < road.merge_position), RAMP_SPEED_LIMIT, road.limit_speed)
+    limit = geometry.speed_limits(lane, geometry.sections(lane, position))
     moving = sample, entries[vehicle], lane, position, speed, acceleration
     vehicles = make_vehicles(*moving, *parameters, speed_factor, is_eidm, limit * speed_factor)
     is_cav = np.isin(np.array(episode.vehicle_ids), episode.cav_ids)
@@ -125,7 +126,11 @@ def _batch_vehicles(
 
 
 def _speeds_after_step(
-    vehicles: MotorwayVehicles, road: MotorwayRoad, scenario: OnRamp, road_count: int, draw_noise: Callable[..., Floats]
+    vehicles: MotorwayVehicles,
+    road: MotorwayRoad,
+    scenario: Motorway,
+    road_count: int,
+    draw_noise: Callable[..., Floats],
 ) -> Floats:
     """Return the speeds after a control step [m/s]; NaN for vehicles that changed lanes or left."""
     empty = [replace(road, entries=())] * road_count

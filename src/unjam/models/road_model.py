@@ -36,7 +36,7 @@ from unjam.models.row_model import BASE_DRIVERS
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Array, clamp_min
 from unjam.physics.kinematics import gap_on_loop, next_speed
-from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
@@ -47,7 +47,7 @@ from unjam.worlds.batch.figure_eight.crossing import (
     may_follow_commands,
 )
 from unjam.worlds.batch.human_idm import HumanSpeedModel, human_idm_speed
-from unjam.worlds.batch.on_ramp.traffic import LearnedCorrection
+from unjam.worlds.batch.motorway.traffic import LearnedCorrection
 from unjam.worlds.batch.support import statistically_unsupported_reason
 from unjam.worlds.record import Episode, Floats
 
@@ -96,7 +96,7 @@ def check_road_model(scenario: Scenario, settings: ModelSettings) -> None:
         (f"base: {settings.base}", settings.base in ("idm", "none"), "idm, each vehicle's own driver model, or none"),
         ("calibrate_base: true", not settings.calibrate_base, "false"),
     ):
-        if isinstance(scenario, OnRamp) and not is_allowed:
+        if isinstance(scenario, Motorway) and not is_allowed:
             raise InputError(f"model.{setting} is not allowed; allowed: {allowed}, on on-ramps")
 
 

@@ -7,14 +7,14 @@ from unjam.errors import InputError, unknown_name
 from unjam.parameters import build_dataclass, merge_changes, nest_keys
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
-from unjam.scenarios.on_ramp import ON_RAMP_SCENARIOS, OnRamp
+from unjam.scenarios.motorway import MOTORWAY_SCENARIOS, Motorway, Ramp
 from unjam.scenarios.population import read_population
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork, load_user_network
 
-__all__ = ["SCENARIOS", "FigureEight", "Merge", "OnRamp", "Ring", "Road", "Scenario", "make_scenario"]
+__all__ = ["SCENARIOS", "FigureEight", "Merge", "Motorway", "Ramp", "Ring", "Road", "Scenario", "make_scenario"]
 
 SCENARIOS: dict[str, Scenario] = {
     "ring": Ring(),
@@ -23,12 +23,12 @@ SCENARIOS: dict[str, Scenario] = {
     "figure-eight": FigureEight(),
     "figure-eight-30": FigureEight(radius=(30, 30)),
     "merge": Merge(),
-    **ON_RAMP_SCENARIOS,
+    **MOTORWAY_SCENARIOS,
 }
 
 EXAMPLE_PENETRATION_RATE = 0.1
 """penetration rate of a user network as an example"""
-SCENARIO_KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, OnRamp, UserNetwork)}
+SCENARIO_KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, Motorway, UserNetwork)}
 """all kinds of road, by title"""
 
 

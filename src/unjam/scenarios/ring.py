@@ -56,7 +56,6 @@ class LoopScenario(Scenario):
     """of the road, with braces for the sizes"""
     limit_description: ClassVar[str]
     """definition of its limit speed"""
-    provided_fields: ClassVar[tuple[str, ...]] = ("penetration_rate",)
     is_first_leading: ClassVar[bool] = False
     """whether vehicle 0 leads the queue; otherwise it is the last one"""
 
@@ -106,6 +105,11 @@ class LoopScenario(Scenario):
             drawn_values={self.size_parameter: size},
             human_parameters=self.draw_humans(ids, generator),
         )
+
+    @property
+    def provided_fields(self) -> tuple[str, ...]:
+        """Optional fields of a `LocalState` that this road provides."""
+        return ("penetration_rate",)
 
     @property
     def drawn_ranges(self) -> dict[str, tuple[float, float]]:

@@ -164,7 +164,9 @@ class EdgeLane(NamedTuple):
     start: float
     speed_limit: float
     is_merging: bool = False
-    """whether it is part of the merging section, where no vehicle is commanded"""
+    """whether it is part of a merging section, where no vehicle is commanded"""
+    ramp: int = 0
+    """number of the ramp to which a lane with index 0 belongs"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,30 +195,6 @@ class MergeRoad(BuiltRoad, OpenRoad):
     junction_lengths: tuple[float, float]
     """lengths of the lanes across the junction up to the merge point, of main road and ramp [m]; on them SUMO itself
     drives commanded human drivers"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MotorwayRoad(BuiltRoad, OpenRoad):
-    """A main road with lanes that ramps join; human drivers differ, and overtake."""
-
-    vehicle_types: dict[str, VehicleType]
-    """the types of human drivers, by name"""
-    edge_lanes: tuple[EdgeLane, ...]
-    """of all edges"""
-    lane_names: tuple[str, ...]
-    """names of the lanes of the road, from right to left"""
-    merge_position: float
-    """begin of the merging section along the main road [m]"""
-    length: float
-    """of the main road [m]"""
-    vehicle_length: float
-    """of every vehicle [m]"""
-    peak: tuple[float, float]
-    """begin and end of the peak of demand [s]"""
-    free_flow_time: float
-    """mean travel time of human drivers in free flow [s]"""
-    roadside: RoadsideSettings
-    """the roadside information that CAVs receive"""
 
 
 @dataclass(frozen=True, kw_only=True)

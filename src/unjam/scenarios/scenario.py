@@ -123,8 +123,6 @@ class Scenario:
     """whether the road is a loop"""
     has_coordinate: ClassVar[bool] = True
     """whether vehicles have a position along the road"""
-    provided_fields: ClassVar[tuple[str, ...]] = ()
-    """optional fields of a `LocalState` that this road provides"""
     has_vehicle_types: ClassVar[bool] = False
     """whether the user defines vehicle types; a CAV keeps the properties of its type"""
     reads_user_files: ClassVar[bool] = False
@@ -188,6 +186,11 @@ class Scenario:
             if self.safety.active and known < largest:
                 raise ValueError(f"safety.{name}: {known:g} is not allowed; allowed: >= sensors.{name}, {largest:g}")
         return self
+
+    @property
+    def provided_fields(self) -> tuple[str, ...]:
+        """Optional fields of a `LocalState` that this road provides."""
+        return ()
 
     @property
     def notes(self) -> list[str]:

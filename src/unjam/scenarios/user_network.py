@@ -63,7 +63,6 @@ class UserNetwork(Scenario):
     has_coordinate: ClassVar[bool] = False
     has_vehicle_types: ClassVar[bool] = True
     reads_user_files: ClassVar[bool] = True
-    provided_fields: ClassVar[tuple[str, ...]] = ("allowed_speed", "lane_speeds", "penetration_rate", "congestion")
 
     file: str = ""
     """the .sumocfg file"""
@@ -115,6 +114,11 @@ class UserNetwork(Scenario):
         if self.population and not passenger_types(files):
             raise ValueError(f"population: no vehicle is a passenger car; its types are {used}")
         return self
+
+    @property
+    def provided_fields(self) -> tuple[str, ...]:
+        """Optional fields of a `LocalState` that this road provides."""
+        return ("allowed_speed", "lane_speeds", "penetration_rate", "congestion")
 
     def draw(self, generator: np.random.Generator) -> UserNetworkRoad:
         """Return the network; the choice of CAVs and of calibrated drivers is random."""

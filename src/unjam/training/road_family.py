@@ -84,7 +84,7 @@ FAMILY: dict[str, FamilyRoad] = {
     "ring-22-ngsim-idm": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=NGSIM_IDM), "axis"),
     "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38)}, "axis"),
     "on-ramp-10-more-demand": FamilyRoad(
-        "on-ramp", {"penetration_rate": 0.1, "inflow": 3400.0, "ramp_flow": 600.0}, "axis"
+        "on-ramp", {"penetration_rate": 0.1, "inflow": 3400.0, "ramps.0.inflow": 600.0}, "axis"
     ),
     "one-lane-10": FamilyRoad("on-ramp-1", {"penetration_rate": 0.1}, "axis"),
     "ring-22-long-delay": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, actuator=LONG_ACTUATOR_LATENCY), "axis"),
@@ -94,10 +94,10 @@ FAMILY: dict[str, FamilyRoad] = {
     "figure-eight-ngsim": FamilyRoad("figure-eight", NGSIM_DRIVERS, "axis"),
     "figure-eight-astazero": FamilyRoad("figure-eight", ASTAZERO_DRIVERS, "axis"),
     "on-ramp-10-ngsim": FamilyRoad(
-        "on-ramp", {"penetration_rate": 0.1, "inflow": 2600.0, "ramp_flow": 400.0, **NGSIM_DRIVERS}, "axis"
+        "on-ramp", {"penetration_rate": 0.1, "inflow": 2600.0, "ramps.0.inflow": 400.0, **NGSIM_DRIVERS}, "axis"
     ),
     "on-ramp-10-astazero": FamilyRoad(
-        "on-ramp", {"penetration_rate": 0.1, "inflow": 2200.0, "ramp_flow": 350.0, **ASTAZERO_DRIVERS}, "axis"
+        "on-ramp", {"penetration_rate": 0.1, "inflow": 2200.0, "ramps.0.inflow": 350.0, **ASTAZERO_DRIVERS}, "axis"
     ),
 }
 """all roads by name"""

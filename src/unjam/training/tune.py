@@ -23,7 +23,7 @@ from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_fe
 from unjam.measures.gain import MEAN_GAIN, EpisodeRows, normalized_gain, performance_bound
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
-from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
 from unjam.training.fingerprint import file_hashes
@@ -147,7 +147,7 @@ def tune(
     trials: list[TuningTrial] = []
     sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True)
     study = optuna.create_study(direction="maximize", sampler=sampler)
-    has_motorways = any(isinstance(roads[road], OnRamp) for road in screened)  # many take as long as few
+    has_motorways = any(isinstance(roads[road], Motorway) for road in screened)  # many take as long as few
     batch_size = SCREENING_BATCH_SIZE if screen or has_motorways else 1
     for first in range(0, trial_count, batch_size):
         asked = [study.ask() for _ in range(first, min(first + batch_size, trial_count))]
@@ -218,7 +218,7 @@ def _run_in_batch(tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
     import torch
 
     all_tasks = [*chain(*tasks)]
-    if isinstance(all_tasks[0].scenario, OnRamp):
+    if isinstance(all_tasks[0].scenario, Motorway):
         episodes = iter(run_batches(all_tasks, allow_statistical=True))
     else:
         to_array = torch.as_tensor if all(task.driver.accepts_tensors for task in all_tasks) else np.asarray

@@ -16,11 +16,11 @@ from unjam.errors import InputError
 from unjam.measures.metrics import mean_travel_time
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMArrays
-from unjam.scenarios import OnRamp
-from unjam.scenarios.on_ramp import ON_RAMP
+from unjam.scenarios.motorway import MOTORWAY_SCENARIOS, ON_RAMP, Motorway
+from unjam.scenarios.motorway_road import MotorwayGeometry
 from unjam.scenarios.road import Edge, Node, RoadNetwork
-from unjam.worlds.batch.on_ramp import eidm
-from unjam.worlds.batch.on_ramp.eidm import (
+from unjam.worlds.batch.motorway import eidm
+from unjam.worlds.batch.motorway.eidm import (
     DriverErrors,
     LeaderMotion,
     eidm_effective_gap,
@@ -28,17 +28,18 @@ from unjam.worlds.batch.on_ramp.eidm import (
     eidm_speed_bounds,
     finalize_eidm_speed,
 )
-from unjam.worlds.batch.on_ramp.lane_changes import MotorwayGeometry, change_lanes
-from unjam.worlds.batch.on_ramp.traffic import BatchMotorways
-from unjam.worlds.batch.on_ramp.vehicles import (
+from unjam.worlds.batch.motorway.lane_changes import change_lanes
+from unjam.worlds.batch.motorway.traffic import BatchMotorways
+from unjam.worlds.batch.motorway.vehicles import (
     NO_ADVICE,
     MotorwayDrivers,
     MotorwayVehicles,
     find_neighbors,
+    find_road_neighbors,
     neighbors_on_lane,
     sort_vehicles,
 )
-from unjam.worlds.batch.on_ramp.world import MotorwayBatch
+from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.run import run_batch, run_batched_if_supported
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import run_episode
@@ -51,6 +52,7 @@ from unjam.worlds.worker_pool import EpisodeTask
 
 STEP, LIMIT, LENGTH = 0.5, 27.78, 4.8
 SHORT = replace(ON_RAMP, horizon=320, peak=(60.0, 300.0))
+TWO_RAMPS = replace(MOTORWAY_SCENARIOS["two-ramps"], horizon=320, peak=(60.0, 300.0))
 
 
 def rows_of(drawn: Floats) -> IDMArrays:
@@ -154,7 +156,7 @@ def test_who_changes_lanes_is_who_does_in_sumo(simulation: Simulation) -> None:
     drawn = people(160, generator)
     names = load(simulation, drawn, np.cumsum(generator.uniform(0.6, 1.6, 160)), 2)
     time_headway, most, braking, gap, factor = drawn.T
-    road = MotorwayGeometry(4000.0, 4000.0, 4000.0, LIMIT, LIMIT, 2, LENGTH)
+    road = MotorwayGeometry(4000.0, LIMIT, 2, LENGTH)
     nothing, free = np.zeros(160), np.full(160, NO_ADVICE)
     wishes = dict.fromkeys(("speed_gain", "keep_right", "look_ahead_speed"), nothing)
     before = {"speed": nothing, "way": nothing - 1.0}
@@ -207,7 +209,7 @@ def seeds_of(count: int) -> list[tuple[int, ...]]:
     return [(11, number) for number in range(count)]
 
 
-def tasks_of(road: OnRamp, driver: Driver, count: int) -> list[EpisodeTask]:
+def tasks_of(road: Motorway, driver: Driver, count: int) -> list[EpisodeTask]:
     return [EpisodeTask(road, driver, seed) for seed in seeds_of(count)]
 
 
@@ -215,7 +217,7 @@ def driver_of(name: str) -> Driver:
     return driver_from_name(name, SHORT.control_step)
 
 
-def batch_of(road: OnRamp, name: str, count: int) -> list[Episode]:
+def batch_of(road: Motorway, name: str, count: int) -> list[Episode]:
     return run_batch(tasks_of(road, driver_of(name), count), allow_statistical=True)
 
 
@@ -238,13 +240,42 @@ def about(episode: Episode) -> list[float]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [pytest.param("human", marks=pytest.mark.slow), "jam-ahead"])
-def test_episodes_are_sumos_in_the_mean(name: str, driven: dict[str, list[Episode]], sumo: SumoBackend) -> None:
-    ours = np.array([about(episode) for episode in driven[name]])
+@pytest.mark.parametrize("road", [SHORT, TWO_RAMPS, replace(SHORT, ramps=())], ids=["one", "two", "none"])
+@pytest.mark.parametrize("name", [pytest.param("human", marks=pytest.mark.slow), "cruise"])
+def test_episodes_are_sumos_in_the_mean(name: str, road: Motorway, sumo: SumoBackend) -> None:
+    ours = np.array([about(episode) for episode in batch_of(road, name, 4)])
     theirs = np.array(
-        [about(run_episode(SHORT, driver_of(name), seed, record_details=True, backend=sumo)) for seed in seeds_of(4)]
+        [about(run_episode(road, driver_of(name), seed, record_details=True, backend=sumo)) for seed in seeds_of(4)]
     )
     assert ours.mean(0) == pytest.approx(theirs.mean(0), rel=0.08)
+
+
+@pytest.mark.long
+def test_vehicles_slow_down_at_both_ramps_as_in_sumo(sumo: SumoBackend) -> None:
+    driver = driver_of("jam-ahead")
+    ours = batch_of(TWO_RAMPS, "jam-ahead", 4)
+    theirs = [run_episode(TWO_RAMPS, driver, seed, backend=sumo) for seed in seeds_of(4)]
+    for begin, end in ((-500, 0), (0, 300), (1000, 1500), (1500, 1800), (1800, 2500)):
+        means = [
+            np.mean([each.speeds[(each.positions > begin) & (each.positions < end)].mean() for each in episodes])
+            for episodes in (ours, theirs)
+        ]
+        assert means[0] == pytest.approx(means[1], rel=0.08)
+    for episode in ours:
+        assert episode.status == "completed"
+        assert np.nanmin(episode.gaps) > 0.0
+        assert set(episode.branches) == {"motorway", "ramp", "ramp2"}
+
+
+def test_vehicles_of_different_ramps_are_no_neighbors_on_the_lane_of_ramps() -> None:
+    geometry, count = TWO_RAMPS.geometry, 4
+    lane, position = np.array([0, 0, 0, 1]), np.array([3300.0, 3200.0, 2200.0, 2100.0])
+    columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(count))
+    vehicles = MotorwayVehicles(**columns | {"road": np.zeros(count, int), "lane": lane, "position": position})
+    neighbors = find_road_neighbors(vehicles, geometry)
+    np.testing.assert_array_equal(neighbors_on_lane(neighbors.leaders, lane), [-1, 0, -1, -1])
+    np.testing.assert_array_equal(neighbors_on_lane(neighbors.followers, lane), [1, -1, -1, -1])
+    assert neighbors.leaders[0, 3] == 2  # adjacent on the right
 
 
 @pytest.mark.long
@@ -374,6 +405,7 @@ def test_a_control_step_does_not_change_earlier_records_of_vehicles() -> None:
 
 
 REFUSED: dict[str, dict[str, Any]] = {
+    "lanes": {"lanes": 3},
     "actuation": {"actuation": "shielded"},
     "simulation_step": {"simulation_step": 0.25, "steps_per_control_step": 4},
     "warmup": {"warmup": 100},

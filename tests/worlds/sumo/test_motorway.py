@@ -12,18 +12,18 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import MAX_OBSERVED_GAP
 from unjam.drivers.road_experts import Cruise, JamAhead
 from unjam.measures.metrics import measure
-from unjam.scenarios import OnRamp
-from unjam.worlds.batch.on_ramp.world import MotorwayBatch
+from unjam.scenarios.motorway import ON_RAMP, Motorway
+from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.motorway import MotorwayTraffic
 from unjam.worlds.sumo.simulation import Simulation
 
-BUSY = OnRamp(peak=(0.0, 240.0), penetration_rate=0.2, horizon=240)
+BUSY = replace(ON_RAMP, peak=(0.0, 240.0), penetration_rate=0.2, horizon=240)
 
 
-def motorway(simulation: Simulation, scenario: OnRamp = BUSY) -> MotorwayTraffic:
+def motorway(simulation: Simulation, scenario: Motorway = BUSY) -> MotorwayTraffic:
     traffic = make_traffic(scenario, (3,), simulation)
     assert isinstance(traffic, MotorwayTraffic)
     traffic.start(is_controlled=True)
@@ -233,7 +233,7 @@ def test_the_message_is_the_mean_speed_of_the_lane_ahead(simulation: Simulation)
 
 def test_human_only_traffic_does_not_depend_on_the_penetration_rate(sumo: SumoBackend) -> None:
     one, other = (
-        run_episode(OnRamp(peak=(0.0, 60.0), horizon=60, penetration_rate=share), Human(), (1,), backend=sumo)
+        run_episode(replace(ON_RAMP, peak=(0.0, 60.0), horizon=60, penetration_rate=share), Human(), (1,), backend=sumo)
         for share in (0.05, 0.5)
     )
     np.testing.assert_array_equal(one.speeds, other.speeds)
@@ -266,7 +266,7 @@ def test_branches_and_demand_peak_are_recorded(capped: Episode) -> None:
 @pytest.mark.long
 def test_a_cav_with_a_cap_still_brakes_as_hard_as_its_own_acc(sumo: SumoBackend) -> None:
     """SUMO limits vehicles with a commanded speed to comfortable braking: they would run into the tail of a jam."""
-    road = OnRamp(penetration_rate=0.3, horizon=800)
+    road = replace(ON_RAMP, penetration_rate=0.3, horizon=800)
     episode = run_episode(road, AdaptiveACC(time_step=1.0), (2,), backend=sumo)
     assert (episode.status, episode.collisions) == ("completed", 0)
     assert road.cruise.deceleration is not None

@@ -8,13 +8,14 @@ import pytest
 from unjam.controller import make_driver
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metrics import measure
-from unjam.scenarios import OnRamp, make_scenario
+from unjam.scenarios import make_scenario
+from unjam.scenarios.motorway import ON_RAMP
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.worlds import multi_lane_log
 from unjam.worlds.audit import FollowingStatistics
-from unjam.worlds.batch.on_ramp.record import MotorwayLog
-from unjam.worlds.batch.on_ramp.traffic import make_vehicles
-from unjam.worlds.batch.on_ramp.vehicles import MotorwayVehicles
+from unjam.worlds.batch.motorway.record import MotorwayLog
+from unjam.worlds.batch.motorway.traffic import make_vehicles
+from unjam.worlds.batch.motorway.vehicles import MotorwayVehicles
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam_paper.open_test_roads import OpenTestRoad, RoadSection, write_road_files
@@ -46,9 +47,9 @@ def following_statistics(gaps: list[float], speeds: list[float]) -> FollowingSta
 
     `gaps` [m] and `speeds` [m/s] of the CAV have one value per simulation step.
     """
-    roads = [OnRamp().draw(np.random.default_rng(1))] * 2
-    log = MotorwayLog(roads, OnRamp())
-    length = roads[0].vehicle_length
+    roads = [ON_RAMP.draw(np.random.default_rng(1))] * 2
+    log = MotorwayLog(roads, ON_RAMP)
+    length = roads[0].geometry.vehicle_length
     for gap, speed in zip(gaps, speeds, strict=True):
         zeros = np.zeros(2)
         properties = (zeros + 1.4, zeros + 1.3, zeros + 2.0, zeros + 2.0, zeros + 1.0, zeros)

@@ -10,13 +10,13 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.errors import UnjamError
 from unjam.physics.arrays import Floats
-from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import WorldOptions
-from unjam.worlds.batch.on_ramp.record import NO_END_STEP
-from unjam.worlds.batch.on_ramp.vehicles import NUMBERS_PER_ROAD
-from unjam.worlds.batch.on_ramp.world import MotorwayBatch
+from unjam.worlds.batch.motorway.record import NO_END_STEP
+from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD
+from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason
 from unjam.worlds.closed_road import loop_scene
@@ -81,7 +81,7 @@ class SingleRing(RingBatch):
 class SingleMotorway(MotorwayBatch):
     """One motorway of a batch."""
 
-    def __init__(self, scenario: OnRamp, seed: Sequence[int]) -> None:
+    def __init__(self, scenario: Motorway, seed: Sequence[int]) -> None:
         super().__init__(scenario, [seed])
         self.road = self.roads[0]
 

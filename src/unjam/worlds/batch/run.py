@@ -17,8 +17,8 @@ from unjam.physics.arrays import Array
 from unjam.scenarios.ring import LoopScenario
 from unjam.tree import map_leaves
 from unjam.worlds.batch import support
+from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.noise import ArrayFactory
-from unjam.worlds.batch.on_ramp.world import MotorwayBatch
 from unjam.worlds.batch.ring.warm_up import WarmUpCache, WarmUpState
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.drive import DriveLoop, finish_drive

@@ -7,17 +7,19 @@ from typing import Any
 
 from unjam.errors import InputError
 from unjam.scenarios.figure_eight import FigureEight
-from unjam.scenarios.on_ramp import OnRamp
+from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.human_idm import MIN_LOOK_AHEAD
-from unjam.worlds.batch.on_ramp.world import MotorwayBatch
+from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.ring.world import RingBatch
 
 MAX_SIMULATION_STEP = 0.37
 """longest simulation step that SUMO's IDM does not divide into several [s]"""
-ON_RAMP_SIMULATION_STEP = 0.5
-"""simulation step of on-ramps, which SUMO's EIDM divides into two [s]"""
+MOTORWAY_STEP = 0.5
+"""simulation step of motorways, which SUMO's EIDM divides into two [s]"""
+MAX_BATCH_LANES = 2
+"""of a motorway: from each lane a batch considers one change"""
 
 
 @dataclass(frozen=True)
@@ -74,14 +76,15 @@ def _figure_eight_reason(scenario: FigureEight) -> str:
     )
 
 
-def _motorway_reason(scenario: OnRamp) -> str:
+def _motorway_reason(scenario: Motorway) -> str:
     return _first_reason(
         scenario,
         ("actuation", scenario.actuation == "cruise", "cruise"),
         ("safety.active", not scenario.safety.active, "False: CAVs have their own ACC"),
         ("cruise.keep_right", scenario.cruise.keep_right is None, "None: CAVs change lanes as human drivers do"),
         ("cruise.speed_gain", scenario.cruise.speed_gain is None, "None: CAVs change lanes as human drivers do"),
-        ("simulation_step", scenario.simulation_step == ON_RAMP_SIMULATION_STEP, f"{ON_RAMP_SIMULATION_STEP:g} s"),
+        ("simulation_step", scenario.simulation_step == MOTORWAY_STEP, f"{MOTORWAY_STEP:g} s"),
+        ("lanes", scenario.lanes <= MAX_BATCH_LANES, "1, 2"),
         ("sensors.is_exact", scenario.sensors.is_exact, "True"),
         ("actuator.is_instant", scenario.actuator.is_instant, "True"),
         ("warmup", scenario.warmup == 0, "0"),
@@ -106,7 +109,7 @@ def _first_reason(scenario: Scenario, *checks: tuple[str, bool, str]) -> str:
 BATCH_KINDS: dict[type[Scenario], BatchKind] = {
     Ring: BatchKind(RingBatch, _ring_reason, is_exact=True),
     FigureEight: BatchKind(RingBatch, _figure_eight_reason),
-    OnRamp: BatchKind(MotorwayBatch, _motorway_reason, max_roads=64, has_own_drivers=True),
+    Motorway: BatchKind(MotorwayBatch, _motorway_reason, max_roads=64, has_own_drivers=True),
 }
 
 

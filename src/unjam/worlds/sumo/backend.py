@@ -5,7 +5,8 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from unjam.errors import EpisodeError, SumoInputError, UnjamError, as_unjam_error
-from unjam.scenarios.road import ClosedRoad, MergeRoad, MotorwayRoad, Road, UserNetworkRoad
+from unjam.scenarios.motorway_road import MotorwayRoad
+from unjam.scenarios.road import ClosedRoad, MergeRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import DEFAULT_OPTIONS, WorldOptions
 from unjam.worlds.sumo.closed_road import ClosedTraffic

@@ -6,7 +6,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from unjam.physics.idm import IDMParameters
-from unjam.scenarios.road import BuiltRoad, MotorwayRoad, UserNetworkRoad
+from unjam.scenarios.motorway_road import MotorwayRoad
+from unjam.scenarios.road import BuiltRoad, UserNetworkRoad
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, UNLIMITED_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.scenarios.user_network import PASSENGER_CLASS
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE, is_harmless_attribute, is_harmless_parameter
@@ -109,7 +110,7 @@ def _motorway_types_xml(scenario: Scenario, road: MotorwayRoad) -> list[str]:
     """Return the XML of each vehicle type, and of the CAV that may replace it, with the same desired speed."""
     lines = []
     for name, kind in road.vehicle_types.items():
-        common = {"length": road.vehicle_length, "emissionClass": scenario.emission_class}
+        common = {"length": road.geometry.vehicle_length, "emissionClass": scenario.emission_class}
         common |= {"speedFactor": kind.speed_factor, "speedDev": 0.0, "emergencyDecel": 9.0}
         model = {"carFollowModel": kind.model, "tau": kind.time_headway, "minGap": kind.minimum_gap}
         model |= {"accel": kind.acceleration, "decel": kind.deceleration}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import RoadSections, RoadsideMessages
 from unjam.drivers.safety import FollowingState
-from unjam.scenarios.road import MotorwayRoad
+from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 from unjam.worlds.multi_lane_log import TrackedLeader
 from unjam.worlds.record import Floats
@@ -27,13 +27,15 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
 
     def _prepare(self) -> None:
         super()._prepare()
-        road, types = self.road, self.road.vehicle_types
-        self._edge_lane_indices, self._edge_lane_starts, self._edge_lane_speed_limits = (
-            np.array(each) for each in zip(*(lane[1:4] for lane in road.edge_lanes), strict=True)
+        road, types, self._geometry = self.road, self.road.vehicle_types, self.road.geometry
+        edge_lanes = self._geometry.edge_lanes
+        self._lane_of_edge_lane, self._edge_lane_starts, self._edge_lane_speed_limits, _, self._edge_lane_ramps = (
+            np.array(each) for each in zip(*(lane[1:] for lane in edge_lanes), strict=True)
         )
-        self._closing_edge_lanes = {number for number, lane in enumerate(road.edge_lanes) if lane.is_merging}
+        self._edge_lane_names = [lane.name for lane in edge_lanes]
+        self._closing_edge_lanes = {number for number, lane in enumerate(edge_lanes) if lane.is_merging}
         self._speed_factors = {entry.name: types[entry.vehicle_type].speed_factor for entry in road.entries}
-        self._road_sections = RoadSections(int(self._edge_lane_indices.max()) + 1, road.length)
+        self._road_sections = RoadSections(1 + self._geometry.lane_count, self._geometry.length)
         self._messages = RoadsideMessages(road.roadside, self.scenario.control_step, self.noise_generator)
         self._entered_is_cav: list[bool] = []
 
@@ -41,17 +43,17 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         """Find leaders and followers from the vehicles on SUMO's lanes, which form lanes of the whole road."""
         self._entered_is_cav += [name in self.road.cav_ids for name in entered_names]
         simulation, names, edge_lanes = self._simulation, list[str](), list[int]()
-        for number, edge_lane in enumerate(self.road.edge_lanes):
-            on_lane = simulation.vehicles_on_lane(edge_lane.name)
+        for number, name in enumerate(self._edge_lane_names):
+            on_lane = simulation.vehicles_on_lane(name)
             names += on_lane
             edge_lanes += [number] * len(on_lane)
         self._names, self._edge_lanes = names, edge_lanes
         self._row_of_name = {name: row for row, name in enumerate(names)}
         self._speed = np.array(simulation.speeds(names), np.float64)
-        self._lane = self._edge_lane_indices[edge_lanes]
+        self._lane, ramp = self._lane_of_edge_lane[edge_lanes], self._edge_lane_ramps[edge_lanes]
         self._position = self._edge_lane_starts[edge_lanes] + np.array(simulation.lane_offsets(names), np.float64)
         self._order = order = np.lexsort((self._position, self._lane))
-        is_same_lane = self._lane[order[1:]] == self._lane[order[:-1]]
+        is_same_lane = (self._lane[order[1:]] == self._lane[order[:-1]]) & (ramp[order[1:]] == ramp[order[:-1]])
         self._leader, self._follower = np.full((2, len(names)), -1)
         self._leader[order[:-1][is_same_lane]] = order[1:][is_same_lane]
         self._follower[order[1:][is_same_lane]] = order[:-1][is_same_lane]
@@ -67,17 +69,17 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         return list(map(TrackedLeader, leader_names, *(each.tolist() for each in values)))
 
     def _leader_gaps(self, rows: Any, leaders: Any) -> Floats:
-        return self._position[leaders] - self.road.vehicle_length - self._position[rows]
+        return self._position[leaders] - self._geometry.vehicle_length - self._position[rows]
 
     def _snapshot(self, names: Sequence[str]) -> dict[str, Any]:
         leaders = self._leader
         gaps = np.where(leaders >= 0, self._leader_gaps(np.arange(len(leaders)), leaders), np.nan)
-        positions = self._position - self.road.merge_position  # as on the merge: zero at the merge point
-        return {"positions": positions, "gaps": gaps, "lane_indices": len(self.road.lane_names) - 1 - self._lane}
+        positions = self._position - self._geometry.origin  # as on the merge: zero at the merge point
+        return {"positions": positions, "gaps": gaps, "lane_indices": self._geometry.lane_count - self._lane}
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
-        road, sections = self.road, self._road_sections
-        self._messages.send(sections.mean_speeds(self._lane, self._position, self._speed, road.limit_speed))
+        geometry, sections = self._geometry, self._road_sections
+        self._messages.send(sections.mean_speeds(self._lane, self._position, self._speed, geometry.speed_limit))
         rows = np.array([self._row_of_name[name] for name in names], np.intp)
         leaders, followers, position = self._leader[rows], self._follower[rows], self._position[rows]
         state = neighbor_state(rows, leaders, followers, self._position, self._speed, self._leader_gaps)
@@ -85,9 +87,9 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         lane_speeds, road_speeds = sections.speeds_ahead(self._messages.latest, self._lane[rows], position)
         adjacent_gaps, adjacent_speeds = self._adjacent_vehicles(rows)
         return state._replace(
-            route_position=position - road.merge_position,
+            route_position=position - geometry.origin,
             allowed_speed=self._edge_lane_speed_limits[[self._edge_lanes[row] for row in rows]] * factors,
-            distance_to_merge=road.merge_position - position,
+            distance_to_merge=geometry.distance_to_merge(self._lane[rows], position),
             lane_speeds=lane_speeds,
             road_speeds=road_speeds,
             adjacent_gaps=adjacent_gaps,
@@ -97,14 +99,14 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
 
     def _adjacent_vehicles(self, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return gaps and speeds of the neighbors on adjacent lanes, as in `LocalState`."""
-        order, lane_offset = self._order, 2.0 * self.road.length  # lanes one after the other on one axis
+        order, lane_offset = self._order, 2.0 * self._geometry.length  # lanes one after the other on one axis
         along = self._lane[order] * lane_offset + self._position[order]
         gaps, speeds = list[Floats](), list[Floats]()
         for lane in (self._lane[rows] + 1, self._lane[rows] - 1):  # left, right
             first_ahead = np.searchsorted(along, lane * lane_offset + self._position[rows])
             for index, sign in ((first_ahead, 1.0), (first_ahead - 1, -1.0)):
                 other = order[index.clip(0, len(order) - 1)]
-                gap = sign * (self._position[other] - self._position[rows]) - self.road.vehicle_length
+                gap = sign * (self._position[other] - self._position[rows]) - self._geometry.vehicle_length
                 is_near = (index >= 0) & (index < len(order)) & (self._lane[other] == lane) & (gap < MAX_OBSERVED_GAP)
                 gaps.append(np.where(is_near, gap, MAX_OBSERVED_GAP))
                 speeds.append(np.where(is_near, self._speed[other], self._speed[rows]))
@@ -129,4 +131,4 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         begin, end = (max(0.0, time - warmup) for time in self.road.peak)
         lanes = self._log.traffic.snapshots("lane_indices", columns)
         fields = {"demand_peak": (begin, end), "free_flow_time": self.road.free_flow_time, "lane_indices": lanes}
-        return {**super()._snapshot_fields(columns), **fields, "lane_names": self.road.lane_names[::-1]}
+        return {**super()._snapshot_fields(columns), **fields, "lane_names": self._geometry.lane_names[::-1]}

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
 from unjam.physics.arrays import Floats
-from unjam.scenarios.on_ramp import OnRamp
-from unjam.scenarios.road import MotorwayRoad
+from unjam.scenarios.motorway import Motorway
+from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds import audit
-from unjam.worlds.batch.on_ramp.vehicles import NUMBERS_PER_ROAD, MotorwayVehicles
+from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, MotorwayVehicles
 from unjam.worlds.record import SHARED_COLUMN_FRAMES, Episode, Trajectory, assign_columns, make_trajectory
 from unjam.worlds.world import DriverLog
 
@@ -41,7 +41,7 @@ class _Placements(NamedTuple):
 class MotorwayLog:
     """All control steps of W motorways, with the braking and car following of every simulation step."""
 
-    def __init__(self, roads: Sequence[MotorwayRoad], scenario: OnRamp) -> None:
+    def __init__(self, roads: Sequence[MotorwayRoad], scenario: Motorway) -> None:
         self._roads, self._scenario = roads, scenario
         self.end_steps = np.full(len(roads), NO_END_STEP)
         """control step after which vehicles touched on each road, or `NO_END_STEP`"""
@@ -73,7 +73,7 @@ class MotorwayLog:
         kind = np.full(len(road), audit.HUMAN_DRIVER)
         kind[cav_rows] = np.where(duration < audit.CUT_IN_SECONDS, audit.CAV_AFTER_CUT_IN, audit.CAV_DRIVER)
         is_steady = (leader >= 0) & (duration > audit.STEADY_FOLLOWING_SECONDS) & is_running[own[0]]
-        gap = vehicles.position[leader] - self._roads[0].vehicle_length - vehicles.position[cav_rows]
+        gap = vehicles.position[leader] - self._roads[0].geometry.vehicle_length - vehicles.position[cav_rows]
         pair = audit.FollowingPair(vehicles.speed[cav_rows], vehicles.speed[leader], gap)
         previous = audit.FollowingPair(*self._following_pairs[:, *own])
         recovers = audit.is_recovering(self._is_recovering[own], duration, previous, pair) & (leader >= 0)
@@ -146,6 +146,7 @@ class MotorwayLog:
         steady_following: Floats,
     ) -> Episode:
         road, steps, control_step = self._roads[road_index], placements.step_index, self._scenario.control_step
+        geometry = road.geometry
         moments = min(len(backlog), int(self.end_steps[road_index]) + 1)
         has_crashed = self.end_steps[road_index] < len(backlog)
         numbers, first_rows, inverse = np.unique(placements.entry, return_index=True, return_inverse=True)
@@ -176,10 +177,10 @@ class MotorwayLog:
             vehicle_columns=tuple(columns.tolist()),
             branches=tuple(branches[column] for column in sorted(branches)),
             speeds=as_table(placements.speed),
-            positions=as_table(placements.position - road.merge_position),
+            positions=as_table(placements.position - geometry.origin),
             gaps=as_table(placements.gap),
-            lane_indices=as_table(len(road.lane_names) - 1.0 - placements.lane.astype(np.float64)),
-            lane_names=road.lane_names[::-1],
+            lane_indices=as_table(geometry.lane_count - placements.lane.astype(np.float64)),
+            lane_names=geometry.lane_names[::-1],
             arrivals=int(self._arrivals[road_index]),
             backlog=backlog[:moments],
             planned_duration=self._scenario.horizon * control_step,

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, running_maximum, square_root
 from unjam.physics.idm import IDMArrays, desired_gap, fast_power, idm_acceleration
 from unjam.physics.kinematics import next_speed, stopping_distance
+from unjam.scenarios.motorway_road import MotorwayGeometry
 from unjam.worlds.batch.human_idm import SUMO_MIN_GAP
-from unjam.worlds.batch.on_ramp import eidm
-from unjam.worlds.batch.on_ramp.eidm import DesiredSpeed, DriverErrors, LeaderMotion
+from unjam.worlds.batch.motorway import eidm
+from unjam.worlds.batch.motorway.eidm import DesiredSpeed, DriverErrors, LeaderMotion
 
 NO_VEHICLE = -1
 """row or lane of a vehicle or lane that does not exist"""
@@ -223,6 +224,20 @@ def find_neighbors(vehicles: MotorwayVehicles, lane_count: int) -> LaneNeighbors
         reverse = xp.flip(_previous_row(xp.flip(is_on_lane, (0,)), rows, xp.flip(road, (0,))), (0,))
         followers.append(xp.where(reverse >= 0, len(road) - 1 - reverse, NO_VEHICLE))
     return LaneNeighbors(xp.stack(leaders), xp.stack(followers))
+
+
+def find_road_neighbors(vehicles: MotorwayVehicles, geometry: MotorwayGeometry) -> LaneNeighbors:
+    """Return the neighbors of sorted vehicles on all lanes; on lane 0, vehicles of different ramps are none."""
+    found = find_neighbors(vehicles, geometry.lane_count + 1)
+    if len(geometry.ramps) < 2 or not len(vehicles.lane):
+        return found
+    xp, ramp = namespace(vehicles.position), geometry.sections(vehicles.lane, vehicles.position).ramp
+
+    def without_other_ramps(rows: Array) -> Array:
+        is_other = (vehicles.lane == 0) & (ramp[rows[0]] != ramp)
+        return xp.concatenate([xp.where(is_other, NO_VEHICLE, rows[0])[None], rows[1:]])
+
+    return LaneNeighbors(*map(without_other_ramps, found))
 
 
 def _previous_row(is_on_lane: Array, rows: Array, road: Array) -> Array:

@@ -1,4 +1,4 @@
-"""W motorways with a ramp as one world: CAVs reduce the set speeds of their own ACCs, as in SUMO.
+"""W motorways as one world: CAVs reduce the set speeds of their own ACCs, as in SUMO.
 
 The rows of CAVs are in the order in which they entered, regardless of their road.
 """
@@ -14,13 +14,13 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import RoadSections, RoadsideMessages
 from unjam.physics.arrays import Array, Floats
 from unjam.physics.kinematics import next_speed
-from unjam.scenarios.on_ramp import OnRamp
-from unjam.scenarios.road import MotorwayRoad
+from unjam.scenarios.motorway import Motorway
+from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds.batch.human_idm import CONTACT_GAP
+from unjam.worlds.batch.motorway.record import MotorwayLog
+from unjam.worlds.batch.motorway.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
+from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers
 from unjam.worlds.batch.noise import ArrayFactory
-from unjam.worlds.batch.on_ramp.record import MotorwayLog
-from unjam.worlds.batch.on_ramp.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
-from unjam.worlds.batch.on_ramp.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam.worlds.world import DriverLog, ProgressCallback
@@ -40,7 +40,7 @@ class ReplayOptions(NamedTuple):
 
 
 class MotorwayBatch:
-    """W on-ramps of one kind, each with its own seed; they equal SUMO's in distribution."""
+    """W motorways of one kind, each with its own seed; they equal SUMO's in distribution."""
 
     is_scalar = False
     measured_fields: Collection[str] = ()
@@ -49,7 +49,7 @@ class MotorwayBatch:
 
     def __init__(
         self,
-        scenario: OnRamp,
+        scenario: Motorway,
         seeds: Sequence[Sequence[int]],
         dtype: type = np.float64,
         explore: Sequence[float] | None = None,
@@ -71,7 +71,7 @@ class MotorwayBatch:
         for number, road in enumerate(self.roads):
             self._is_cav[number, : len(road.entries)] = [entry.name in road.cav_ids for entry in road.entries]
         first = self.roads[0]
-        self._road_sections = RoadSections(len(first.lane_names), first.length, len(seeds))
+        self._road_sections = RoadSections(first.geometry.lane_count + 1, first.geometry.length, len(seeds))
         self._messages = RoadsideMessages(first.roadside, scenario.control_step, self._human_generators[0])
         self.limits, self.control_steps = scenario.acceleration_limits, 0
         self.entered_count, self.cav_count = 0, 0
@@ -103,7 +103,7 @@ class MotorwayBatch:
     @classmethod
     def from_tasks(cls, tasks: Sequence[EpisodeTask], to_array: ArrayFactory) -> Self:
         """Return the motorways of tasks."""
-        scenario, explore = cast(OnRamp, tasks[0].scenario), [task.explore for task in tasks]
+        scenario, explore = cast(Motorway, tasks[0].scenario), [task.explore for task in tasks]
         return cls(scenario, [task.seed for task in tasks], explore=explore)
 
     @property
@@ -151,15 +151,15 @@ class MotorwayBatch:
             self._traffic.vehicles = self._traffic.vehicles.replace_rows(rows, time_headway=time_gaps)
 
     def _apply_set_speeds(self, accelerations: Floats) -> None:
-        """Set the set speed of each CAV's ACC; it has no cap next to the ramp's lane."""
+        """Set the set speed of each CAV's ACC; it has no cap in a merging section."""
         vehicles, geometry, step = self._traffic.vehicles, self._traffic.geometry, self.scenario.simulation_step
         rows = find_rows(self._cav_numbers, vehicles)
         is_present = rows >= 0
         rows, accelerations = rows[is_present], accelerations[is_present]
-        speed, position = vehicles.speed[rows].astype(np.float64), vehicles.position[rows]
+        speed = vehicles.speed[rows].astype(np.float64)
         commanded = next_speed(speed, accelerations, step)
         set_speed = self.scenario.cruise.set_speed(speed, commanded, self.limits.highest, step)
-        is_merging = (position >= geometry.merge_start) & (position < geometry.merge_end)
+        is_merging = geometry.sections(vehicles.lane[rows], vehicles.position[rows]).is_merging
         cap = np.where(is_merging, NO_SPEED_CAP, np.minimum(set_speed, NO_SPEED_CAP))
         self._traffic.vehicles = vehicles.replace_rows(rows, speed_cap=cap)
 
@@ -180,7 +180,7 @@ class MotorwayBatch:
         self._messages.send(self._road_sections.mean_speeds(*motion, traffic.geometry.speed_limit, vehicles.road))
         self._local_state = self._exact_state()
         row = neighbors_on_lane(traffic.neighbors.leaders, vehicles.lane)
-        gaps = vehicles.position[row] - self.roads[0].vehicle_length - vehicles.position
+        gaps = vehicles.position[row] - traffic.geometry.vehicle_length - vehicles.position
         gaps = np.where(row >= 0, gaps, np.nan)
         touching = vehicles.road[gaps < CONTACT_GAP]
         self._log.end_steps[touching] = np.minimum(self._log.end_steps[touching], self.control_steps)
@@ -188,30 +188,29 @@ class MotorwayBatch:
         self._log.record_control_step(vehicles, gaps, backlog, self._cav_numbers, self._local_state)
 
     def _exact_state(self) -> LocalState:
-        traffic, vehicles, road = self._traffic, self._traffic.vehicles, self.roads[0]
+        traffic, vehicles = self._traffic, self._traffic.vehicles
         rows, neighbors, geometry = find_rows(self._cav_numbers, vehicles), traffic.neighbors, traffic.geometry
         roads, _, lane, position, speed = (each[rows] for each in vehicles[:5])
 
         def neighbor_state(neighbors: NDArray[np.intp], lane_offset: int, direction: float) -> tuple[Floats, Floats]:
             row = neighbors_on_lane(neighbors, vehicles.lane + lane_offset)[rows]
-            gap = direction * (vehicles.position[row] - position) - road.vehicle_length
+            gap = direction * (vehicles.position[row] - position) - geometry.vehicle_length
             is_near = (row >= 0) & (gap < MAX_OBSERVED_GAP)
             return np.where(is_near, vehicles.speed[row], speed), np.where(is_near, gap, MAX_OBSERVED_GAP)
 
         sides = ((neighbors.leaders, 1.0), (neighbors.followers, -1.0))
         own, left, right = ([neighbor_state(each, offset, sign) for each, sign in sides] for offset in (0, 1, -1))
-        is_on_ramp = (lane == 0) & (position < road.merge_position)
-        limit = np.where(is_on_ramp, geometry.ramp_speed_limit, geometry.speed_limit)
+        limit = geometry.speed_limits(lane, geometry.sections(lane, position))
         lane_speeds, road_speeds = self._road_sections.speeds_ahead(self._messages.latest, lane, position, roads)
         penetration_rate = self._cav_entry_counts / traffic.insertion_queue.entry_counts.clip(1)
         state = LocalState(
             speed,
             *own[0],
             *own[1],
-            position - road.merge_position,
+            position - geometry.origin,
             np.full(len(rows), np.nan),
             allowed_speed=limit * vehicles.speed_factor[rows],
-            distance_to_merge=road.merge_position - position,
+            distance_to_merge=geometry.distance_to_merge(lane, position),
             lane_speeds=lane_speeds,
             road_speeds=road_speeds,
             adjacent_gaps=np.stack([gap for _, gap in left + right], -1),

@@ -1,4 +1,4 @@
-"""SUMO's lane changes of human drivers on a motorway with a ramp, all in one step.
+"""SUMO's lane changes of human drivers on a motorway, all in one step.
 
 SUMO decides for one vehicle after the other, from front to back. Here, vehicles on the ramp's lane, which must change,
 come first, and then all that gain by a change, which agrees in distribution. From each lane, only one change is
@@ -11,7 +11,8 @@ Sources: SUMO's MSLaneChanger (`getRealLeader`, `getRealFollower`, `checkChange`
 from typing import NamedTuple
 
 from unjam.physics.arrays import Array, clamp_min, namespace, scatter_minimum
-from unjam.worlds.batch.on_ramp.vehicles import (
+from unjam.scenarios.motorway_road import MotorwayGeometry, MotorwaySections
+from unjam.worlds.batch.motorway.vehicles import (
     ADVICE_FIELDS,
     NO_ADVICE,
     NO_VEHICLE,
@@ -19,6 +20,7 @@ from unjam.worlds.batch.on_ramp.vehicles import (
     MotorwayVehicles,
     copy_array,
     find_neighbors,
+    find_road_neighbors,
     neighbors_on_lane,
 )
 
@@ -50,21 +52,6 @@ OVERTAKING_LOOK_AHEAD = 8.0
 """time before necessary braking at which a vehicle starts to overtake [s]"""
 
 
-class MotorwayGeometry(NamedTuple):
-    """A motorway with a ramp: positions and lengths along the road [m], speeds [m/s]."""
-
-    merge_start: float
-    """where the ramp's lane starts to run next to the road"""
-    merge_end: float
-    """where that lane ends"""
-    length: float
-    speed_limit: float
-    ramp_speed_limit: float
-    lane_count: int
-    """of the motorway"""
-    vehicle_length: float
-
-
 class Neighbor(NamedTuple):
     """A neighbor of each vehicle."""
 
@@ -91,26 +78,26 @@ class LaneChangeContext(NamedTuple):
     is_leader_blocking: Array
     """whether the target leader prevents a change"""
     is_follower_blocking: Array
+    sections: MotorwaySections
     step: float
 
 
 def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: float) -> LaneChangeContext:
     """Return what each vehicle looks at, in a simulation with a `step` [s]."""
     xp, lane, position, speed = namespace(vehicles.speed), vehicles.lane, vehicles.position, vehicles.speed
-    is_past_start, is_past_end = position >= geometry.merge_start, position >= geometry.merge_end
-    is_merging = is_past_start & ~is_past_end
+    sections = geometry.sections(lane, position)
+    is_merging = sections.is_merging
     target_lane = xp.where((lane == 0) & is_merging, 1, NO_VEHICLE)
     if geometry.lane_count > 1:
         target_lane = xp.where(lane == 1, 2, xp.where(lane == 2, 1, target_lane))
-    neighbors = find_neighbors(vehicles, geometry.lane_count + 1)
+    neighbors = find_road_neighbors(vehicles, geometry)
     drivers, length = vehicles.drivers, geometry.vehicle_length
-    section = 1.0 * is_past_start + 1.0 * is_past_end
-    section_end = xp.where(is_merging, geometry.merge_end, geometry.length)
-    section_end = xp.where(is_past_start, section_end, geometry.merge_start)
+    section_end = xp.where(is_merging, sections.merge_end, geometry.length)
+    section_end = xp.where(sections.is_before, sections.merge_start, section_end)
     sees_past_end = drivers.brake_gap(speed, step) + vehicles.minimum_gap >= section_end - position
 
     def neighbor_ahead(row: Array) -> Neighbor:
-        is_visible = sees_past_end | (section[row] == section) | (position[row] - length < section_end)
+        is_visible = sees_past_end | (sections.start[row] == sections.start) | (position[row] - length < section_end)
         is_present = (row >= 0) & is_visible
         gap = xp.where(is_present, position[row] - length - position - vehicles.minimum_gap, NO_NEIGHBOR_GAP)
         return Neighbor(row, is_present, speed[row], gap)
@@ -121,7 +108,8 @@ def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, 
     behind, followers = Neighbor(row, row >= 0, speed[row], gap), drivers.select(row)
     by_leader = ahead.is_present & (ahead.gap < clamp_min(drivers.secure_gap(speed, ahead.speed), 0.0))
     by_follower = behind.is_present & (behind.gap < clamp_min(followers.secure_gap(behind.speed, speed), 0.0))
-    return LaneChangeContext(drivers, target_lane, leader, ahead, behind, followers, by_leader, by_follower, step)
+    blocked = by_leader, by_follower
+    return LaneChangeContext(drivers, target_lane, leader, ahead, behind, followers, *blocked, sections, step)
 
 
 def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: float) -> MotorwayVehicles:
@@ -156,14 +144,14 @@ def mandatory_lane_changes(
     """Return the vehicles with advice, whether each must change now, and whether it is asked to make room."""
     xp, position, step = namespace(vehicles.speed), vehicles.position, context.step
     is_on_lane = (vehicles.lane == 0) & (context.target_lane != NO_VEHICLE)
-    occupies = (vehicles.lane == 1) & (position >= geometry.merge_start)
+    occupies = (vehicles.lane == 1) & (position >= geometry.origin)  # those ahead of vehicles that merge
     lengths = xp.where(occupies, vehicles.minimum_gap + geometry.vehicle_length, 0.0 * position)
     total = lengths.cumsum(0)
     first = xp.searchsorted(vehicles.road, vehicles.road)
     occupied = total - xp.where(first > 0, total[first - 1], 0.0 * position)
     needed = vehicles.look_ahead_speed * (MERGE_LOOK_AHEAD_TIME * LEFT_LOOK_AHEAD_FACTOR)
     needed = needed + 2.0 * (vehicles.minimum_gap + geometry.vehicle_length)
-    is_urgent = is_on_lane & (geometry.merge_end - position - occupied < needed)
+    is_urgent = is_on_lane & (context.sections.merge_end - position - occupied < needed)
     is_asked = vehicles.speed < 0.0
     rows = xp.arange(len(position))[is_urgent]
     if len(rows) == 0:
@@ -193,7 +181,7 @@ class _MergingVehicles:
         self, vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry, rows: Array
     ) -> None:
         self.speed, self._step = vehicles.speed[rows], context.step
-        self._remaining_distance = geometry.merge_end - vehicles.position[rows]
+        self._remaining_distance = context.sections.merge_end[rows] - vehicles.position[rows]
         self._vehicle_length, self._minimum_gap = geometry.vehicle_length, vehicles.minimum_gap[rows]
         self.leader = Neighbor(*(each[rows] for each in context.target_leader))
         self.follower = Neighbor(*(each[rows] for each in context.target_follower))
@@ -273,14 +261,15 @@ def _yield_to_stuck(
     if len(stuck_rows) == 0:
         return vehicles
     xp, position, speed = namespace(vehicles.position), vehicles.position, vehicles.speed
-    is_adjacent = (vehicles.lane == 1) & (position >= geometry.merge_start) & (position < geometry.merge_end)
-    crawls = is_adjacent & (speed < vehicles.braking)
+    sections = context.sections
+    crawls = (vehicles.lane == 1) & sections.is_merging & (speed < vehicles.braking)
     if not bool(crawls.any()):
         return vehicles
     index = xp.searchsorted(stuck_rows, xp.arange(len(position))) - 1
     stuck = stuck_rows[clamp_min(index, 0)]
     gap = position[stuck] - geometry.vehicle_length - position - vehicles.minimum_gap
     yields = crawls & (index >= 0) & (vehicles.road[stuck] == vehicles.road) & (gap > SUMO_POSITION_TOLERANCE)
+    yields = yields & (sections.ramp[stuck] == sections.ramp)
     if not bool(yields.any()):
         return vehicles
     gap = (gap + vehicles.minimum_gap)[yields] - SUMO_POSITION_TOLERANCE
@@ -292,20 +281,18 @@ def _speed_gain_changes(
     vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry, may_change: Array
 ) -> tuple[MotorwayVehicles, Array]:
     """Return the vehicles with their gains, and whether each wants to change for its gain or to keep right."""
-    xp, speed, position, step = namespace(vehicles.speed), vehicles.speed, vehicles.position, context.step
+    xp, speed, step = namespace(vehicles.speed), vehicles.speed, context.step
     ahead, leader, drivers, speed_limit = context.target_leader, context.leader, context.drivers, geometry.speed_limit
     is_left = context.target_lane > vehicles.lane
 
     def allowed_speed(limit: Array, rows: Array) -> Array:
         return xp.minimum(limit * vehicles.speed_factor[rows], vehicles.speed_cap[rows])
 
-    every, is_before = slice(None), position < geometry.merge_start
+    every, sections = slice(None), context.sections
     target_speed = allowed_speed(speed_limit, every)
-    own_limit = xp.where((vehicles.lane == 0) & is_before, geometry.ramp_speed_limit, speed_limit)
-    own_speed = allowed_speed(own_limit, every)
-    remaining = xp.where(is_before, geometry.length, geometry.length - geometry.merge_start)
-    remaining = xp.where(position < geometry.merge_end, remaining, geometry.length - geometry.merge_end)
-    own_remaining = xp.where(vehicles.lane == 0, geometry.merge_end - geometry.merge_start, remaining)
+    own_speed = allowed_speed(geometry.speed_limits(vehicles.lane, sections), every)
+    remaining = geometry.length - sections.start
+    own_remaining = xp.where(vehicles.lane == 0, sections.merge_end - sections.merge_start, remaining)
     gain, keep, is_fast = vehicles.speed_gain, vehicles.keep_right, speed >= UNCONGESTED_SPEED
     # Vehicles do not pass on the right: behind a slower vehicle on the left lane, they slow down or change to the left.
     difference = xp.maximum(own_speed - allowed_speed(speed_limit, ahead.row), speed - ahead.speed)

@@ -1,6 +1,6 @@
-"""W motorways with a ramp, stepped at once: vehicles enter, move, change lanes and leave.
+"""W motorways, stepped at once: vehicles enter, move, change lanes and leave.
 
-They equal SUMO's on-ramp, with the same vehicles entering at the same times, except for the order in which vehicles
+They equal SUMO's, with the same vehicles entering at the same times, except for the order in which vehicles
 change lanes and for the random numbers, so that whole episodes agree in distribution. Positions are along the motorway.
 Sources: SUMO's MSVehicle (`planMoveInternal`), MSLane (`insertVehicle`), MSLCM_LC2013 (`_patchSpeed`).
 """
@@ -10,22 +10,22 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from unjam.physics.arrays import Array, clamp_min, namespace
-from unjam.scenarios.on_ramp import DOWNSTREAM_LENGTH, MERGING_LENGTH, RAMP_LENGTH, RAMP_SPEED_LIMIT, UPSTREAM_LENGTH
-from unjam.scenarios.road import MotorwayRoad, VehicleType
+from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayRoad
+from unjam.scenarios.road import VehicleType
 from unjam.scenarios.scenario import CruiseControl
-from unjam.worlds.batch.noise import ArrayFactory, DrawNormal
-from unjam.worlds.batch.on_ramp import eidm
-from unjam.worlds.batch.on_ramp.lane_changes import MotorwayGeometry, change_lanes
-from unjam.worlds.batch.on_ramp.vehicles import (
+from unjam.worlds.batch.motorway import eidm
+from unjam.worlds.batch.motorway.lane_changes import change_lanes
+from unjam.worlds.batch.motorway.vehicles import (
     ADVICE_FIELDS,
     NO_ADVICE,
     LaneNeighbors,
     MotorwayVehicles,
     copy_array,
-    find_neighbors,
+    find_road_neighbors,
     neighbors_on_lane,
     sort_vehicles,
 )
+from unjam.worlds.batch.noise import ArrayFactory, DrawNormal
 
 LONG_BEFORE_START = -1000.0
 """long before an episode starts [s]"""
@@ -46,20 +46,26 @@ difference of the speed after that step [m/s]; arrays of shape (n,)"""
 
 
 class InsertionQueue:
-    """The vehicles of W roads that wait to enter, by lane in the order of their entry times."""
+    """The vehicles of W equal roads that wait to enter, by origin in the order of their entry times.
+
+    Origins are the ramps from upstream to downstream, and then the lanes of the main road from right to left.
+    """
 
     def __init__(self, roads: Sequence[MotorwayRoad], to_array: ArrayFactory) -> None:
-        self._roads, self._to_array = roads, to_array
-        shape = len(roads[0].lane_names), len(roads)
+        self._roads, self._to_array, self._geometry = roads, to_array, roads[0].geometry
+        ramp_of_route = {name: number - 1 for number, name in enumerate(self._geometry.route_names)}
+        self._ramp_count = len(self._geometry.ramps)
+        shape = self._ramp_count + self._geometry.lane_count, len(roads)
         self._entry_times = np.full((*shape, 1 + max(len(road.entries) for road in roads)), np.inf)
         self._entry_numbers = np.zeros(self._entry_times.shape, np.intp)
         counts = np.zeros(shape, np.intp)
         for index, road in enumerate(roads):
             for number, entry in enumerate(road.entries):
-                lane = 0 if entry.route == "ramp" else 1 + int(entry.lane)
-                self._entry_times[lane, index, counts[lane, index]] = entry.time
-                self._entry_numbers[lane, index, counts[lane, index]] = number
-                counts[lane, index] += 1
+                is_main = entry.route == MAIN_ROUTE
+                origin = self._ramp_count + entry.lane if is_main else ramp_of_route[entry.route]
+                self._entry_times[origin, index, counts[origin, index]] = entry.time
+                self._entry_numbers[origin, index, counts[origin, index]] = number
+                counts[origin, index] += 1
         self._next = np.zeros(shape, np.intp)
 
     @property
@@ -76,25 +82,29 @@ class InsertionQueue:
         is_due = np.take_along_axis(self._entry_times, self._next[..., None], 2)[..., 0] <= time + 1e-9
         if not is_due.any():
             return vehicles
-        new, last = list[tuple[float, ...]](), np.full(is_due.shape, -1)
+        new, last, geometry = list[tuple[float, ...]](), np.full(is_due.shape, -1), self._geometry
         road, lane, position, speed = (np.asarray(each) for each in vehicles[:1] + vehicles[2:5])
-        upstream = np.flatnonzero(position < UPSTREAM_LENGTH)
-        last[lane[upstream], road[upstream]] = upstream  # sorted: the last assignment is the last vehicle on the lane
+        sections = geometry.sections(lane, position)
+        is_on_first_edge = sections.is_before & ((lane == 0) | (sections.ramp == 0))
+        upstream = np.flatnonzero(is_on_first_edge)
+        origin = np.where(lane == 0, sections.ramp, self._ramp_count + lane - 1)
+        last[origin[upstream], road[upstream]] = upstream  # sorted: the last assignment is the last vehicle there
         for number, index in np.argwhere(is_due).tolist():
             built, row = self._roads[index], last[number, index]
-            start = UPSTREAM_LENGTH - RAMP_LENGTH if number == 0 else 0.0
-            start = start + built.vehicle_length + INSERTION_OFFSET
+            ramp = geometry.ramps[number] if number < self._ramp_count else None
+            start = (ramp.start if ramp else 0.0) + geometry.vehicle_length + INSERTION_OFFSET
             entry_number = int(self._entry_numbers[number, index, self._next[number, index]])
             entry = built.entries[entry_number]
             vehicle_type = built.vehicle_types[entry.vehicle_type]
-            room = position[row] - built.vehicle_length - start if row >= 0 else np.inf
+            room = position[row] - geometry.vehicle_length - start if row >= 0 else np.inf
             if room < vehicle_type.minimum_gap:
                 continue
-            allowed = (RAMP_SPEED_LIMIT if number == 0 else built.limit_speed) * vehicle_type.speed_factor
+            allowed = (ramp or geometry).speed_limit * vehicle_type.speed_factor
             desired = allowed if entry.speed == "last" else float(entry.speed)
             if entry.speed == "last" and row >= 0:
                 desired = min(desired, float(speed[row]))
-            motion = index, entry_number, number, start, min(desired, allowed), 0.0
+            number_of_lane = 0 if ramp else number - self._ramp_count + 1
+            motion = index, entry_number, number_of_lane, start, min(desired, allowed), 0.0
             new.append((*motion, *driver_columns(vehicle_type), allowed))
             self._next[number, index] += 1
         if not new:
@@ -143,10 +153,7 @@ class BatchMotorways:
     ) -> None:
         """Take empty roads; `correction` is that of a control step."""
         self._correction, self._steps_per_control_step = correction, steps_per_control_step
-        merge_end, first = UPSTREAM_LENGTH + MERGING_LENGTH, roads[0]
-        limits, lane_count = (first.limit_speed, RAMP_SPEED_LIMIT), len(first.lane_names) - 1
-        lengths = UPSTREAM_LENGTH, merge_end, merge_end + DOWNSTREAM_LENGTH
-        self.geometry = MotorwayGeometry(*lengths, *limits, lane_count, first.vehicle_length)
+        self.geometry = roads[0].geometry
         empty = to_array(np.zeros(0))
         integers = namespace(empty).zeros(0, dtype=namespace(empty).int64)
         columns = dict.fromkeys(MotorwayVehicles._fields, empty) | {"is_eidm": empty > 0.0}
@@ -161,7 +168,7 @@ class BatchMotorways:
         """The neighbors of the vehicles."""
         lane = self.vehicles.lane  # a new column if vehicles enter, leave, change lanes or are sorted
         if self._cached_neighbors is None or self._cached_neighbors[0] is not lane:
-            self._cached_neighbors = lane, find_neighbors(self.vehicles, self.geometry.lane_count + 1)
+            self._cached_neighbors = lane, find_road_neighbors(self.vehicles, self.geometry)
         return self._cached_neighbors[1]
 
     def step(self) -> MotorwayVehicles:
@@ -181,12 +188,12 @@ class BatchMotorways:
         if not len(speed):
             return vehicles
         row = neighbors_on_lane(self.neighbors.leaders, vehicles.lane)
-        has_leader, is_before = row >= 0, position < geometry.merge_start
-        is_on_ramp, is_on_lane = (vehicles.lane == 0) & is_before, (vehicles.lane == 0) & ~is_before
-        limit, ramp_limit = (each * vehicles.speed_factor for each in (geometry.speed_limit, geometry.ramp_speed_limit))
-        allowed = xp.where(is_on_ramp, geometry.ramp_speed_limit, geometry.speed_limit) * vehicles.speed_factor
+        sections, has_leader = geometry.sections(vehicles.lane, position), row >= 0
+        is_on_ramp, is_on_lane = (vehicles.lane == 0) & sections.is_before, (vehicles.lane == 0) & ~sections.is_before
+        limit, ramp_limit = (each * vehicles.speed_factor for each in (geometry.speed_limit, sections.ramp_speed_limit))
+        allowed = geometry.speed_limits(vehicles.lane, sections) * vehicles.speed_factor
         allowed = xp.minimum(allowed, vehicles.speed_cap)
-        adapted = vehicles.desired_speed + (limit - ramp_limit) * step / LIMIT_ADAPTATION_TIME
+        adapted = vehicles.desired_speed + clamp_min(limit - ramp_limit, 0.0) * step / LIMIT_ADAPTATION_TIME
         eidm_desired = xp.minimum(xp.where(is_on_ramp, ramp_limit, limit), adapted)
         vehicles = vehicles._replace(desired_speed=xp.where(vehicles.is_eidm, eidm_desired, allowed))
         drivers = vehicles.drivers
@@ -211,7 +218,7 @@ class BatchMotorways:
         effective_gap = xp.where(is_free, FREE_DRIVING_GAP, eidm.eidm_effective_gap(gap, drivers.parameters))
         leader_speed = xp.where(is_free, next_allowed, leader_speed)
         if bool(is_on_lane.any()):
-            remaining = clamp_min(geometry.merge_end - position[is_on_lane], 0.0)
+            remaining = clamp_min((sections.merge_end - position)[is_on_lane], 0.0)
             stop_speed = drivers.select(is_on_lane).stop_speed(speed[is_on_lane], remaining, step)
             must_stop = stop_speed < safe[is_on_lane]
             safe[is_on_lane] = xp.minimum(safe[is_on_lane], stop_speed)

@@ -1,0 +1,316 @@
+"""Motorways with any number of lanes and on-ramps, a peak of demand, and different human drivers that overtake."""
+
+from collections.abc import Iterator
+from dataclasses import field, replace
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from unjam.drivers.roadside import RoadsideSettings
+from unjam.drivers.safety import SafetyFilter
+from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt
+from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayGeometry, MotorwayRoad, RampGeometry
+from unjam.scenarios.road import Entry, VehicleType
+from unjam.scenarios.scenario import Actuation, Scenario
+
+MAX_LANES = 5
+MIN_RAMP_HEADWAY = 2.0
+"""smallest time between two vehicles that want to enter a ramp [s]"""
+SPEED_FACTOR_RANGE = 0.8, 1.2
+"""of human drivers: desired speed / speed limit"""
+HUMAN_TYPE_COUNT = 200
+"""number of different human drivers"""
+Arrival = tuple[float, str, int, float | Literal["last"]]
+Interval = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
+
+
+MIN_END_LENGTH = 50.0
+"""minimum length of the road downstream of the last merging section [m]"""
+Section = Annotated[float, Field(ge=50)]
+"""length of a part of the road [m]"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class Ramp:
+    """An on-ramp of a motorway, with its demand."""
+
+    position: Positive
+    """where its acceleration lane begins, from the entrance of the motorway [m]"""
+    merging_length: Section = 300.0
+    """of the acceleration lane, along which vehicles merge [m]"""
+    length: Section = 400.0
+    """upstream of the acceleration lane [m]"""
+    speed_limit: Positive = 22.22
+    """upstream of the acceleration lane [m/s]"""
+    entry_speed: Positive = 15.0
+    """of vehicles that enter the ramp [m/s]"""
+    inflow: NonNegative = 500.0
+    """demand in the peak [veh/h]"""
+    off_peak_inflow: NonNegative = 250.0
+    """demand before and after the peak [veh/h]"""
+
+    @property
+    def geometry(self) -> RampGeometry:
+        """The geometry of the ramp."""
+        merge_end = self.position + self.merging_length
+        return RampGeometry(self.position, merge_end, self.length, self.speed_limit)
+
+
+@dataclass(frozen=True, config=STRICT)
+class Motorway(Scenario):
+    """A motorway with any number of on-ramps, and a peak of demand.
+
+    Human drivers follow SUMO's extended IDM, each with other parameters, and change lanes. If the demand of the peak is
+    above capacity, a jam forms at a ramp and sends waves upstream. A CAV replaces a human-driven vehicle and desires
+    the same speed; its own ACC follows, and its driver can reduce the set speed upstream of a ramp.
+    """
+
+    title: ClassVar[str] = "motorway"
+    reward: ClassVar[str] = "travel-time"
+    is_closed: ClassVar[bool] = False
+
+    length: Section = 3000.0
+    """[m]"""
+    lanes: Annotated[int, Field(ge=1, le=MAX_LANES)] = 2
+    """without acceleration lanes"""
+    speed_limit: Positive = 27.78
+    """[m/s]"""
+    ramps: tuple[Ramp, ...] = ()
+    """from upstream to downstream"""
+    inflow: Positive = 3200.0
+    """demand at the entrance of the motorway in the peak [veh/h]"""
+    off_peak_inflow: NonNegative = 1800.0
+    """demand at the entrance before and after the peak [veh/h]"""
+    peak: Interval = (300.0, 1500.0)
+    """its begin and end [s]"""
+    min_entry_headway: NonNegative = 1.1
+    """smallest time between two vehicles that want to enter a lane of the motorway [s]"""
+    penetration_rate: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """share of CAVs among all vehicles; the CAVs of a smaller share are part of those of a larger one"""
+    cavs: PositiveInt | None = None
+    """exact number of CAVs instead of a share, among the vehicles of the first half"""
+    car_following: Literal["EIDM", "IDM"] = "EIDM"
+    """SUMO's car-following model of human drivers"""
+    time_headways: Interval = (1.0, 1.8)
+    """range among human drivers [s]"""
+    accelerations: Interval = (1.0, 1.5)
+    """range among human drivers [m/s2]"""
+    decelerations: Interval = (1.5, 2.0)
+    """range of comfortable decelerations among human drivers [m/s2]"""
+    minimum_gaps: Interval = (2.0, 2.5)
+    """range among human drivers, in a standing queue [m]"""
+    speed_factor_std: NonNegative = 0.1
+    """standard deviation of desired speed / speed limit, with mean 1; at most 0.2 from the mean"""
+    vehicle_length: Positive = 4.8
+    """[m]"""
+    roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
+    """latency and smoothing of the speeds ahead that CAVs receive"""
+    simulation_step: Positive = 0.5
+    steps_per_control_step: PositiveInt = 2
+    horizon: PositiveInt = 2400
+    """control steps in an episode"""
+    action_limit: Positive = 2.5
+    actuation: Actuation = "cruise"
+    safety: SafetyFilter = field(default_factory=lambda: SafetyFilter(active=False))
+    """inactive: the CAV's own ACC keeps its distance"""
+    noise: Annotated[float, Field(ge=0, le=0)] = 0.0
+    """none: the car-following model has its own"""
+    emission_class: str = "HBEFA4/PC_petrol_Euro-6d"
+
+    @model_validator(mode="after")
+    def _check_settings(self) -> Self:
+        for name in ("time_headways", "accelerations", "decelerations", "minimum_gaps", "peak"):
+            low, high = getattr(self, name)
+            if not 0 <= low <= high or (high == 0 and name != "peak"):
+                raise ValueError(f"{name}: ({low:g}, {high:g}) is not allowed; allowed: 0 < low <= high")
+        capacity = 3600.0 * self.lanes / max(self.min_entry_headway, 1e-9)
+        sources = (
+            ("", self, capacity, ", by min_entry_headway"),
+            *((f"ramps.{number}.", ramp, 3600.0 / MIN_RAMP_HEADWAY, "") for number, ramp in enumerate(self.ramps)),
+        )
+        for prefix, source, most, reason in sources:
+            for name in ("inflow", "off_peak_inflow"):
+                if (flow := getattr(source, name)) >= most:
+                    raise ValueError(f"{prefix}{name}: {flow:g} is not allowed; allowed: < {most:.0f}{reason}")
+        self._check_ramps()
+        self.check_native_humans("on a motorway")
+        return self
+
+    def _check_ramps(self) -> None:
+        """Raise `ValueError` if ramps overlap or reach beyond the road, or vehicles enter one too fast."""
+        upstream, what = 0.0, "the entrance"
+        for number, ramp in enumerate(self.ramps):
+            geometry, name, position = ramp.geometry, f"ramps.{number}", f"{ramp.position:g}"
+            if geometry.start < upstream:
+                allowed = f">= {upstream + ramp.length:g}, its length downstream of {what}"
+                raise ValueError(f"{name}.position: {position} is not allowed; allowed: {allowed}")
+            if geometry.merge_end > self.length - MIN_END_LENGTH:
+                allowed = f"<= {self.length - MIN_END_LENGTH - ramp.merging_length:g}, upstream of the end of the road"
+                raise ValueError(f"{name}.position: {position} is not allowed; allowed: {allowed}")
+            if ramp.entry_speed > (most := SPEED_FACTOR_RANGE[0] * ramp.speed_limit):
+                allowed = f"<= {most:g}, the speed of the slowest drivers"
+                raise ValueError(f"{name}.entry_speed: {ramp.entry_speed:g} is not allowed; allowed: {allowed}")
+            upstream, what = geometry.merge_end, f"the merging section of {name}"
+
+    def draw(self, generator: np.random.Generator) -> MotorwayRoad:
+        """Return the road with its demand; random are the human drivers, their entry times and the choice of CAVs."""
+        types = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
+        entries, draws = list[Entry](), dict[str, float]()
+        for number, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
+            name, vehicle_type = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
+            draws[name] = generator.random()
+            entries.append(Entry(name, route, 0.0, speed, time, lane, vehicle_type))
+        geometry = self.geometry
+        return MotorwayRoad(
+            geometry=geometry,
+            network=geometry.network,
+            routes=geometry.routes,
+            entries=tuple(entries),
+            limit_speed=self.speed_limit,
+            vehicle_types=types,
+            cav_ids=self._select_cavs(draws),
+            peak=self.peak,
+            free_flow_time=self.free_flow_time,
+            roadside=self.roadside,
+        )
+
+    @property
+    def geometry(self) -> MotorwayGeometry:
+        """The geometry of the road, which all simulators read."""
+        ramps = tuple(ramp.geometry for ramp in self.ramps)
+        return MotorwayGeometry(self.length, self.speed_limit, self.lanes, self.vehicle_length, ramps)
+
+    @property
+    def free_flow_time(self) -> float:
+        """Mean travel time of human drivers in free flow [s]: as measured, or at the speed limits.
+
+        At the speed limits, it is the mean of all routes, weighted with their demand before and after the peak.
+        """
+        geometry = self.geometry
+        if measured := FREE_FLOW_TIMES.get(geometry._replace(vehicle_length=0.0)):
+            return measured
+        times, flows = [self.length / self.speed_limit], [self.off_peak_inflow]
+        for ramp in self.ramps:
+            times.append(ramp.length / ramp.speed_limit + (self.length - ramp.position) / self.speed_limit)
+            flows.append(ramp.off_peak_inflow)
+        return float(np.average(times, weights=flows if sum(flows) else None))
+
+    @property
+    def provided_fields(self) -> tuple[str, ...]:
+        """Optional fields of a `LocalState`; without ramps, there is no distance to a merge."""
+        to_merge = ("distance_to_merge",) if self.ramps else ()
+        neighbors = "adjacent_gaps", "adjacent_speeds", "penetration_rate"
+        return ("allowed_speed", *to_merge, "lane_speeds", "road_speeds", *neighbors)
+
+    def _select_cavs(self, draws: dict[str, float]) -> frozenset[str]:
+        """Return the CAVs: the vehicles with the lowest draws."""
+        if self.cavs is None:
+            return frozenset(name for name, draw in draws.items() if draw < self.penetration_rate)
+        early = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
+        return frozenset(early[: self.cavs])
+
+    def _draw_human_type(self, generator: np.random.Generator) -> VehicleType:
+        def draw_uniform(interval: tuple[float, float]) -> float:
+            return round(float(generator.uniform(*interval)), 4)
+
+        human = VehicleType(
+            model=self.car_following,
+            time_headway=draw_uniform(self.time_headways),
+            acceleration=draw_uniform(self.accelerations),
+            deceleration=draw_uniform(self.decelerations),
+            minimum_gap=draw_uniform(self.minimum_gaps),
+            speed_factor=round(float(np.clip(generator.normal(1.0, self.speed_factor_std), *SPEED_FACTOR_RANGE)), 4),
+        )
+        if self.driver_population is None:
+            return human
+        (one,) = self.driver_population.draw(1, generator)
+        # Only following is calibrated: recordings of jams say nothing about desired speeds.
+        return human._replace(
+            model="IDM",
+            time_headway=one.time_headway,
+            acceleration=one.max_acceleration,
+            deceleration=one.comfortable_deceleration,
+            minimum_gap=one.minimum_gap,
+        )
+
+    def _arrivals(self, generator: np.random.Generator) -> Iterator[Arrival]:
+        """Yield time, route, lane and speed of vehicles that want to enter."""
+        for lane in range(self.lanes):
+            flows = self.off_peak_inflow / self.lanes, self.inflow / self.lanes
+            for time in self._entry_times(generator, *flows, self.min_entry_headway):
+                yield time, MAIN_ROUTE, lane, "last"
+        for ramp, route in zip(self.ramps, self.geometry.route_names[1:], strict=True):
+            for time in self._entry_times(generator, ramp.off_peak_inflow, ramp.inflow, MIN_RAMP_HEADWAY):
+                yield time, route, 0, ramp.entry_speed
+
+    def _entry_times(
+        self, generator: np.random.Generator, off_peak: float, peak: float, min_headway: float
+    ) -> Iterator[float]:
+        """Yield times with shifted exponential headways, period by period [s]; flows in veh/h."""
+        begin = 0.0
+        for end, flow in ((self.peak[0], off_peak), (self.peak[1], peak), (self.max_duration, off_peak)):
+            time = begin
+            while flow:
+                time += min_headway + float(generator.exponential(3600.0 / flow - min_headway))
+                if time >= min(end, self.max_duration):
+                    break
+                yield round(time, 2)
+            begin = max(begin, end)
+
+    @property
+    def top_speed(self) -> float:
+        """The speed limit of the motorway [m/s]."""
+        return self.speed_limit
+
+    @property
+    def human_description(self) -> str:
+        """How human drivers drive, as one phrase."""
+        model = f"as {self.population_description}" if self.driver_population else self.car_following
+        return f"{HUMAN_TYPE_COUNT} different human drivers, {model}, with SUMO's lane changes"
+
+    def possible_cav_ids(self) -> tuple[str, ...]:
+        """Return the ids of all vehicles: each can be a CAV."""
+        flow = sum(max(each.inflow, each.off_peak_inflow) for each in (self, *self.ramps))
+        most = int(self.max_duration / 3600.0 * 2.0 * flow)
+        return tuple(f"vehicle_{number}" for number in range(most))
+
+    def _fact_values(self) -> tuple[str, str, str, str]:
+        lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
+        ramps = {0: "without ramps", 1: "with a ramp"}.get(len(self.ramps), f"with {len(self.ramps)} ramps")
+        peak, off_peak = (
+            " + ".join(f"{getattr(each, name):g}" for each in (self, *self.ramps))
+            for name in ("inflow", "off_peak_inflow")
+        )
+        peak = f"{peak} veh/h from {self.peak[0]:g} to {self.peak[1]:g} s"
+        vehicles = f"{peak}, else {off_peak} ({100 * self.penetration_rate:g} % CAV)"
+        road = f"motorway of {self.length / 1000:g} km, {lanes}, {ramps}"
+        return road, vehicles, f"{self.speed_limit:.2f} m/s", "the speed limit of the motorway"
+
+
+ON_RAMP = Motorway(ramps=(Ramp(position=2000.0),))
+_ON_RAMP_1 = replace(
+    ON_RAMP,
+    lanes=1,
+    inflow=1400.0,
+    off_peak_inflow=900.0,
+    ramps=(Ramp(position=2000.0, inflow=350.0, off_peak_inflow=125.0),),
+)
+MOTORWAY_SCENARIOS = {
+    "on-ramp": ON_RAMP,
+    "on-ramp-1": _ON_RAMP_1,
+    "on-ramp-steady": replace(ON_RAMP, peak=(300.0, 2400.0)),
+    "two-ramps": replace(
+        ON_RAMP,
+        length=4500.0,
+        inflow=2900.0,
+        off_peak_inflow=1600.0,
+        ramps=(Ramp(position=2000.0, inflow=400.0), Ramp(position=3500.0, inflow=400.0)),
+    ),
+}
+"""the named roads of this kind"""
+FREE_FLOW_TIMES = {
+    each.geometry._replace(vehicle_length=0.0): time for each, time in ((_ON_RAMP_1, 113.0), (ON_RAMP, 106.6))
+}
+"""mean travel time in human-only traffic without a peak, of six seeds [s]"""

@@ -1,0 +1,209 @@
+"""A motorway with on-ramps: its geometry, which all simulators read, and one episode's traffic on it.
+
+Positions are along the main road from its entrance [m]. Lane 0 is that of the ramps with their
+acceleration lanes; the lanes of the main road follow from right to left.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from unjam.drivers.roadside import RoadsideSettings
+from unjam.physics.arrays import Array, namespace
+from unjam.scenarios.road import BuiltRoad, Connection, Edge, EdgeLane, Node, OpenRoad, RoadNetwork, Route, VehicleType
+
+MAIN_ROUTE = "motorway"
+"""route, and first edge, of vehicles that enter the main road"""
+RAMP_OFFSET = 60.0
+"""distance between the main road and the nodes where ramps begin [m]"""
+
+
+class RampGeometry(NamedTuple):
+    """An on-ramp, whose lane continues next to the main road and ends there."""
+
+    merge_start: float
+    """where its lane starts to run next to the main road"""
+    merge_end: float
+    """where that lane ends"""
+    length: float
+    """upstream of the merging section"""
+    speed_limit: float
+    """upstream of the merging section [m/s]"""
+
+    @property
+    def start(self) -> float:
+        """Where it begins."""
+        return self.merge_start - self.length
+
+
+class MotorwaySections(NamedTuple):
+    """What is near each of n vehicles: arrays (n,).
+
+    The next ramp is the first one of which the merging section has not ended; for the vehicles downstream of all, it is
+    the last one.
+    """
+
+    ramp: Array
+    """index of the next ramp"""
+    merge_start: Array
+    merge_end: Array
+    """of the merging section of the next ramp"""
+    ramp_speed_limit: Array
+    """of the next ramp"""
+    start: Array
+    """of the section: the entrance, or the last begin or end of a merging section"""
+    is_before: Array
+    """whether the vehicle is upstream of the merging section"""
+    is_merging: Array
+    """whether it is in the merging section"""
+
+
+class MotorwayGeometry(NamedTuple):
+    """A motorway with any number of ramps, from upstream to downstream; no two of them overlap."""
+
+    length: float
+    speed_limit: float
+    lane_count: int
+    """of the main road"""
+    vehicle_length: float
+    ramps: tuple[RampGeometry, ...] = ()
+
+    @property
+    def origin(self) -> float:
+        """Zero of recorded positions: the first merging section, or the entrance of a road without ramps."""
+        return self.ramps[0].merge_start if self.ramps else 0.0
+
+    @property
+    def lane_names(self) -> tuple[str, ...]:
+        """Names of the lanes from right to left; a road without ramps has no lane 0."""
+        inner = [f"lane {number}" for number in range(2, self.lane_count)]
+        inner = ["middle lane"] if len(inner) == 1 else inner
+        main = ["motorway"] if self.lane_count == 1 else ["right lane", *inner, "left lane"]
+        return (*(["ramp"] if self.ramps else []), *main)
+
+    @property
+    def route_names(self) -> tuple[str, ...]:
+        """Names of the routes from the entrance and from each ramp to the end."""
+        return (MAIN_ROUTE, *(_numbered("ramp", number) for number in range(len(self.ramps))))
+
+    def sections(self, lane: Array, position: Array) -> MotorwaySections:
+        """Return what is near each of n vehicles, given their lanes and positions, arrays (n,)."""
+        xp = namespace(position)
+        first, *others = self.ramps or (RampGeometry(self.length, self.length, 0.0, self.speed_limit),)
+        ramp, start = 0 * lane, 0.0 * position
+        merge_start, merge_end, limit = (0.0 * position + each for each in (first[0], first[1], first.speed_limit))
+        upstream = first
+        for number, each in enumerate(others, 1):
+            # A vehicle that stands at the end of an acceleration lane is not yet on the next ramp.
+            begin = xp.where(lane == 0, each.start + self.vehicle_length, upstream.merge_end)
+            is_next = position >= begin
+            ramp = xp.where(is_next, number, ramp)
+            start = xp.where(is_next, upstream.merge_end, start)
+            merge_start, merge_end = (
+                xp.where(is_next, new, old) for new, old in zip(each[:2], (merge_start, merge_end), strict=True)
+            )
+            limit = xp.where(is_next, each.speed_limit, limit)
+            upstream = each
+        is_before, is_past = position < merge_start, position >= merge_end
+        start = xp.where(is_before, start, xp.where(is_past, merge_end, merge_start))
+        return MotorwaySections(ramp, merge_start, merge_end, limit, start, is_before, ~is_before & ~is_past)
+
+    def distance_to_merge(self, lane: Array, position: Array) -> Array | None:
+        """Return the distance of n vehicles to the merging section of their next ramp [m]; None without ramps.
+
+        It is negative in the section, and downstream of the last one.
+        """
+        return self.sections(lane, position).merge_start - position if self.ramps else None
+
+    def speed_limits(self, lane: Array, sections: MotorwaySections) -> Array:
+        """Return the speed limit where each of n vehicles is [m/s]."""
+        is_on_ramp = (lane == 0) & sections.is_before
+        return namespace(sections.merge_start).where(is_on_ramp, sections.ramp_speed_limit, self.speed_limit)
+
+    @property
+    def network(self) -> RoadNetwork:
+        """The network; its x axis has its zero at `origin`."""
+        lanes, origin, main = self.lane_count, self.origin, self._main_edges()
+        nodes, edges = [Node("entrance", 0.0 - origin, 0.0)], [_edge(main[0], ("entrance", "joins"), lanes)]
+        connections = list[Connection]()
+        for number, (name, ramp) in enumerate(zip(self.route_names[1:], self.ramps, strict=True)):
+            before, merging, after = main[2 * number : 2 * number + 3]
+            last = number == len(self.ramps) - 1
+            entrance, joins, closes = (_numbered(each, number) for each in ("ramp_entrance", "joins", "closes"))
+            nodes += [
+                Node(entrance, ramp.start - origin + 1.0, -RAMP_OFFSET),
+                Node(joins, ramp.merge_start - origin, 0.0),
+                Node(closes, ramp.merge_end - origin, 0.0),
+            ]
+            edges += [
+                Edge(name, entrance, joins, ramp.length, speed_limit=ramp.speed_limit),
+                _edge(merging, (joins, closes), lanes + 1),
+                _edge(after, (closes, "exit" if last else _numbered("joins", number + 1)), lanes),
+            ]
+            connections += [
+                *(Connection(before[0], merging[0], lane, lane + 1) for lane in range(lanes)),
+                Connection(name, merging[0], 0, 0),
+                *(Connection(merging[0], after[0], lane + 1, lane) for lane in range(lanes)),
+            ]
+        nodes.append(Node("exit", self.length - origin, 0.0))
+        if not self.ramps:
+            edges = [_edge(main[0], ("entrance", "exit"), lanes)]
+        return RoadNetwork(
+            tuple(nodes), tuple(edges), self.speed_limit, has_internal_links=False, connections=tuple(connections)
+        )
+
+    @property
+    def routes(self) -> tuple[Route, ...]:
+        """The routes in the order of `route_names`."""
+        names = [name for name, *_ in self._main_edges()]
+        ramps = enumerate(self.route_names[1:])
+        return (Route(MAIN_ROUTE, tuple(names)), *(Route(name, (name, *names[2 * i + 1 :])) for i, name in ramps))
+
+    @property
+    def edge_lanes(self) -> tuple[EdgeLane, ...]:
+        """All lanes of all edges."""
+        main, result = self._main_edges(), list[EdgeLane]()
+        for number, (name, ramp) in enumerate(zip(self.route_names[1:], self.ramps, strict=True)):
+            merging = main[2 * number + 1][0]
+            result += [
+                EdgeLane(f"{name}_0", 0, ramp.start, ramp.speed_limit, ramp=number),
+                EdgeLane(f"{merging}_0", 0, ramp.merge_start, self.speed_limit, is_merging=True, ramp=number),
+            ]
+        for lane in range(self.lane_count):
+            for index, (name, start, _) in enumerate(main):
+                merges = index % 2
+                own = f"{name}_{lane + merges}"
+                result.append(EdgeLane(own, lane + 1, start, self.speed_limit, is_merging=bool(merges)))
+        return tuple(result)
+
+    def _main_edges(self) -> list[tuple[str, float, float]]:
+        """Return name, start and end of the edges of the main road; every second one is a merging section."""
+        names = [MAIN_ROUTE]
+        for number in range(len(self.ramps)):
+            names += [_numbered("merging", number), _numbered("after", number)]
+        points = [0.0, *(point for ramp in self.ramps for point in ramp[:2]), self.length]
+        return list(zip(names, points[:-1], points[1:], strict=True))
+
+
+def _edge(part: tuple[str, float, float], nodes: tuple[str, str], lanes: int) -> Edge:
+    name, start, end = part
+    return Edge(name, *nodes, end - start, lanes=lanes)
+
+
+def _numbered(name: str, number: int) -> str:
+    """Return a name for what belongs to a ramp: of the first one, without a number."""
+    return f"{name}{number + 1}" if number else name
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotorwayRoad(BuiltRoad, OpenRoad):
+    """A motorway with the vehicles that enter it; human drivers differ, and overtake."""
+
+    geometry: MotorwayGeometry
+    vehicle_types: dict[str, VehicleType]
+    """the types of human drivers, by name"""
+    peak: tuple[float, float]
+    """begin and end of the peak of demand [s]"""
+    free_flow_time: float
+    """mean travel time of human drivers in free flow [s]"""
+    roadside: RoadsideSettings
+    """the roadside information that CAVs receive"""
