@@ -1,7 +1,9 @@
 """Check the values of unjam's frozen dataclasses: types, ranges, unknown names."""
 
+import os
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
@@ -116,6 +118,18 @@ def parse_toml(text: str) -> dict[str, Any]:
     if _DEEP_KEY.search(text):
         raise ValueError(f"a key of more than {MAX_KEY_PARTS} parts")
     return tomllib.loads(text)
+
+
+def read_toml(path: Path, context: str = "config file") -> dict[str, Any]:
+    """Return the content of a TOML file; raise `InputError` if it is missing or not TOML."""
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise InputError(f"{context} {path}: not a file: a directory, a pipe or a device")
+    try:
+        return parse_toml(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{context} {path}: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:  # also for too long numbers and NUL in the path
+        raise InputError(f"{context} {path}: not TOML: {error}") from None
 
 
 def parse_value(text: str) -> Any:

@@ -11,8 +11,8 @@ from unjam.drivers import PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.errors import InputError
 from unjam.learners.settings import AGENT_NAMES, PolicySettings, TRPOSettings
-from unjam.parameters import merge_changes
-from unjam.training.config import EvaluationSettings, RunConfig, load_config, read_toml, to_toml
+from unjam.parameters import merge_changes, read_toml
+from unjam.training.config import EvaluationSettings, RunConfig, load_config, to_toml
 from unjam.training.presets import preset_values
 from unjam.training.seeds import TEST_SEED, VALIDATION_SEED
 

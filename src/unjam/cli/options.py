@@ -19,7 +19,7 @@ from unjam.training.executors import Executor
 from unjam.trust import TRUST_CODE_OPTION, trusting_code
 
 ScenarioArgument = Annotated[
-    str, Argument(help="Name of a scenario (`unjam scenarios` lists them), or your own .sumocfg file.")
+    str, Argument(help="A scenario (`unjam scenarios` lists them), your own .sumocfg or .toml file, or path.py:name.")
 ]
 RewardOption = Annotated[
     str, Option("--reward", help="Name of a reward, or your own: path.py:name.", show_default="the scenario's")

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import RLock
 from traceback import extract_tb
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -110,7 +111,7 @@ class FileReference:
     def parse(cls, text: str) -> "FileReference":
         """Return the reference for `path.py:name`."""
         if "\0" in text:
-            raise InputError(f"driver file: {text!r} is not allowed; allowed: path.py:name")
+            raise InputError(f"Python file: {text!r} is not allowed; allowed: path.py:name")
         path, _, name = text.rpartition(":")
         return cls(Path(path).resolve(), name)
 
@@ -127,27 +128,30 @@ class FileReference:
         Raise `InputError` if it is missing, unreadable or not Python, or imports a compiled module of its folder.
         """
         if not os.path.isfile(self.path):
-            raise InputError(f"driver file: {str(self.path)!r} is not a file")
+            raise InputError(f"Python file: {str(self.path)!r} is not a file")
         if self.path.suffix != ".py":
-            raise InputError(f"driver file: {str(self.path)!r} is not a Python file")
+            raise InputError(f"Python file: {str(self.path)!r} is not a Python file")
         try:
             return read_code(self.path)
         except OSError as error:
-            raise InputError(f"driver file: {str(error.filename)!r}: {error.strerror}") from None
+            raise InputError(f"Python file: {str(error.filename)!r}: {error.strerror}") from None
 
     def load_object(self, code: UserCode | None = None) -> Any:
-        """Run the file, from `code` if given, and return the object with the name.
+        """Run the file, from `code` if given, and return the object with the name; raise `InputError` as both parts."""
+        return self.find_object(self.run_file(code or self.read_code()))
 
-        Raise `InputError` as `read_code`, and if the file fails when run, or has no such name.
-        """
-        code = code or self.read_code()
+    def run_file(self, code: UserCode) -> ModuleType:
+        """Run the code of the file and return its module; raise `InputError` if it fails."""
         check_code_unchanged(code)
         remember_trusted(code.path, code.sha256)  # references in run folders were checked before this call
         try:
             with _module_lock, redirect_user_output():
-                module = code.run()
+                return code.run()
         except (Exception, SystemExit) as error:  # any error of the user's code is the user's to fix
             raise InputError(f"{self.path.name}: {type(error).__name__} when loading it: {error}") from error
+
+    def find_object(self, module: ModuleType) -> Any:
+        """Return the object of a module with the name; raise `InputError` if it has none."""
         if not hasattr(module, self.name):
             public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
             raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public}")

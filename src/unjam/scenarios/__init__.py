@@ -1,9 +1,11 @@
 """Scenarios: roads, traffic, how an episode starts and ends."""
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
-from unjam.errors import InputError, unknown_name
+from unjam.drivers.user_driver import is_file_reference, object_label
+from unjam.errors import invalid_value, unknown_name
 from unjam.parameters import build_dataclass, merge_changes, nest_keys
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
@@ -13,6 +15,7 @@ from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork, load_user_network
+from unjam.scenarios.user_scenario import CODE_ENTRY, class_recipe, load_class, load_python_scenario, load_toml_scenario
 
 __all__ = ["SCENARIOS", "FigureEight", "Merge", "Motorway", "Ramp", "Ring", "Road", "Scenario", "make_scenario"]
 
@@ -28,29 +31,55 @@ SCENARIOS: dict[str, Scenario] = {
 
 EXAMPLE_PENETRATION_RATE = 0.1
 """penetration rate of a user network as an example"""
-SCENARIO_KINDS = {kind.title: kind for kind in (Ring, FigureEight, Merge, Motorway, UserNetwork)}
-"""all kinds of road, by title"""
+TOML_KINDS: dict[str, type[Scenario]] = {kind.title: kind for kind in (Ring, FigureEight, Merge, Motorway)}
+"""kinds of road that a TOML file describes, by title"""
+SCENARIO_KINDS = {**TOML_KINDS, UserNetwork.title: UserNetwork}
+"""all kinds of road"""
 
 
-def make_scenario(name: str, changes: dict[str, Any] | None = None) -> Scenario:
-    """Return the scenario `name`, or that of a .sumocfg file, with `changes` to its parameters.
+ScenarioLike = str | Scenario | type[Scenario]
+"""a scenario, its class, or its name: of a built-in one, a .sumocfg or .toml file, or `path.py:name`"""
 
-    A dot in a name leads into a group of parameters: `{"safety.time_gap": 1.5}`. Raise `InputError` for an unknown
-    scenario or parameter, or a value out of range.
+
+def make_scenario(scenario: ScenarioLike, changes: dict[str, Any] | None = None) -> Scenario:
+    """Return a scenario with `changes` to its parameters.
+
+    A dot in a name leads into a group of parameters: `{"safety.time_gap": 1.5, "ramps.0.inflow": 600}`. Raise
+    `InputError` for an unknown scenario or parameter, or a value out of range.
     """
     changes = nest_keys(changes or {})
-    if name.endswith(".sumocfg"):
-        return load_user_network(name, changes)
-    if name not in SCENARIOS:
-        raise unknown_name("scenario", name, [*SCENARIOS, "a .sumocfg file"])
-    scenario = SCENARIOS[name]
+    if isinstance(scenario, str) and scenario.endswith(".sumocfg"):
+        return load_user_network(scenario, changes)
+    base, name = _base_scenario(scenario), scenario if isinstance(scenario, str) else object_label(scenario)
     if not changes:
-        return scenario
+        return base
     if file := changes.get("population"):  # typical parameters, and what computes the motion, follow from it
         population = read_population(str(file))
         commanded = {"human_control": "commanded"} if population.residual else {}
         changes = {"humans": asdict(population.typical), **commanded, **changes}
-    return build_dataclass(type(scenario), merge_changes(asdict(scenario), changes), f"scenario {name}")
+    return build_dataclass(type(base), merge_changes(asdict(base), changes), f"scenario {name}")
+
+
+def _base_scenario(scenario: ScenarioLike) -> Scenario:
+    """Return a scenario before any changes; not for .sumocfg files."""
+    if isinstance(scenario, Scenario):
+        return scenario
+    if isinstance(scenario, type):
+        return build_dataclass(scenario, {}, f"scenario {scenario.__name__}")
+    if is_file_reference(scenario):
+        return load_python_scenario(scenario)
+    if scenario.endswith(".toml"):
+        return load_toml_scenario(Path(scenario), TOML_KINDS)
+    if scenario not in SCENARIOS:
+        raise unknown_name("scenario", scenario, [*SCENARIOS, "a .sumocfg or .toml file", "path.py:name"])
+    return SCENARIOS[scenario]
+
+
+def default_scenario(name: str) -> Scenario | type[Scenario]:
+    """Return the scenario or class that a configuration with this scenario starts from; the base class if unknown."""
+    if name.endswith(".sumocfg"):
+        return UserNetwork
+    return _base_scenario(name) if name in SCENARIOS or name.endswith(".toml") or is_file_reference(name) else Scenario
 
 
 def example_scenario(name: str) -> Scenario:
@@ -61,19 +90,17 @@ def example_scenario(name: str) -> Scenario:
 def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
     """Return a scenario as JSON; the inverse of `scenario_from_recipe`.
 
-    Raise `InputError` for a class that `scenario_from_recipe` does not know, as a subclass of the user's.
+    Raise `InputError` for a class that another process cannot import: neither built in nor from a `path.py:name`.
     """
     kind = type(scenario)
-    if SCENARIO_KINDS.get(kind.title) is not kind:
-        known = ", ".join(each.__name__ for each in SCENARIO_KINDS.values())
-        raise InputError(
-            f"scenario: {kind.__name__} is not allowed in a file or another process; allowed: {known} themselves, and "
-            "any class with run_episode in one process"
-        )
-    return {"kind": scenario.title, **asdict(scenario)}
+    code = {} if SCENARIO_KINDS.get(kind.title) is kind else {CODE_ENTRY: class_recipe(kind)}
+    return {"kind": kind.title, **code, **asdict(scenario)}
 
 
 def scenario_from_recipe(recipe: dict[str, Any]) -> Scenario:
-    """Return the scenario of a recipe."""
-    values = {key: value for key, value in recipe.items() if key != "kind"}
-    return build_dataclass(SCENARIO_KINDS[recipe["kind"]], values, "scenario")
+    """Return the scenario of a recipe; the Python file of a user's class runs, and must be as it was."""
+    values = dict(recipe)
+    title, code = values.pop("kind", ""), values.pop(CODE_ENTRY, None)
+    if code is None and title not in SCENARIO_KINDS:
+        raise invalid_value("scenario.kind", title, ", ".join(SCENARIO_KINDS))
+    return build_dataclass(SCENARIO_KINDS[title] if code is None else load_class(code), values, "scenario")

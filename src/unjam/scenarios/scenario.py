@@ -1,9 +1,10 @@
 """What all scenarios share: the settings of a road's traffic, how an episode starts and when it ends."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import field
 from functools import cached_property
 from math import inf
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -13,12 +14,14 @@ from pydantic.dataclasses import dataclass
 from unjam.drivers.command import Limits
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
+from unjam.drivers.user_driver import UserFunction
 from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
 from unjam.physics.idm import IDMArrays, IDMParameters, desired_speed_from_acceleration, idm_acceleration
 from unjam.physics.kinematics import next_speed
-from unjam.scenarios.population import Population, read_population
+from unjam.scenarios.population import Population, population_file, read_population
 from unjam.scenarios.road import Road
+from unjam.user_code import USER_MODULE_PREFIX
 
 UNLIMITED_ACCELERATION = 20.0
 """acceleration limit of a CAV's vehicle type in SUMO [m/s2]: far above any command, so that only safety clips"""
@@ -193,6 +196,11 @@ class Scenario:
         return ()
 
     @property
+    def user_files(self) -> list[Path]:
+        """Files with data that episodes depend on, apart from the code of a user's class."""
+        return [population_file(self.population)] if self.population else []
+
+    @property
     def notes(self) -> list[str]:
         """What a user must know about this road in addition to the results."""
         return []
@@ -287,7 +295,10 @@ class Scenario:
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
         """Return the road of an episode's seed, and the seeds of noise, exploration, simulator and sensors."""
         road, *others = _spawn_seeds(seed)
-        return self.draw(np.random.default_rng(road)), others
+        draw: Callable[[np.random.Generator], Road] = self.draw
+        if type(self).__module__.startswith(USER_MODULE_PREFIX):  # an error is reported with its line
+            draw = UserFunction(draw, type(self).__name__, type(self).draw.__code__.co_filename)
+        return draw(np.random.default_rng(road)), others
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of all CAVs that an episode can have."""

@@ -116,6 +116,11 @@ class UserNetwork(Scenario):
         return self
 
     @property
+    def user_files(self) -> list[Path]:
+        """The files of the network and of its traffic, and that of calibrated drivers."""
+        return [*read_sumo_files(Path(self.file)).sources, *super().user_files]
+
+    @property
     def provided_fields(self) -> tuple[str, ...]:
         """Optional fields of a `LocalState` that this road provides."""
         return ("allowed_speed", "lane_speeds", "penetration_rate", "congestion")

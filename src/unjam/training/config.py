@@ -1,6 +1,5 @@
 """The validated configuration of a training run, from TOML, command-line options and Python."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, field, fields, replace
 from math import ceil
@@ -30,9 +29,9 @@ from unjam.parameters import (
     flatten_keys,
     merge_changes,
     nest_keys,
-    parse_toml,
+    read_toml,
 )
-from unjam.scenarios import SCENARIOS, make_scenario
+from unjam.scenarios import default_scenario, make_scenario
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
@@ -233,7 +232,7 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
         check_trusted_values(f"config file {file}", file_values)
     user_values = merge_changes(file_values, nest_keys(changes or {}))
     scenario_name = str(user_values.get("scenario", RunConfig.scenario))
-    scenario = SCENARIOS.get(scenario_name, Scenario)
+    scenario = default_scenario(scenario_name)
     for name in user_values.keys() - {each.name for each in fields(RunConfig)}:
         if hasattr(scenario, name):
             raise InputError(f"{name}: unknown name; did you mean 'scenario_options.{name}'?")
@@ -281,18 +280,6 @@ def _check_preset_conflicts(preset: str, tasks: Sequence[dict[str, Any]], user_v
     for name, value in flatten_keys({key: value for key, value in user_values.items() if key in names}).items():
         if all(flatten_keys(task).get(name, "") not in ("", value) for task in tasks):
             raise invalid_value(name, value, f"none with the preset {preset}: its roads have their own")
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return the content of a TOML file; raise `InputError` if it is missing or not TOML."""
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise InputError(f"config file {path}: not a file: a directory, a pipe or a device")
-    try:
-        return parse_toml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"config file {path}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # also for too long numbers and NUL in the path
-        raise InputError(f"config file {path}: not TOML: {error}") from None
 
 
 def to_toml(config: RunConfig) -> str:

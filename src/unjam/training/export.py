@@ -23,10 +23,11 @@ from unjam.processes import PrivateFolder
 from unjam.reports.results import EVALUATION_FILE, read_evaluation
 from unjam.scenarios import example_scenario, scenario_from_recipe
 from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.user_scenario import CODE_ENTRY
 from unjam.training.evaluate import TRAINED_LABEL, raise_failure
 from unjam.training.run_folder import controller_origin, read_config
 from unjam.training.seeds import make_test_seeds
-from unjam.trust import expecting_code
+from unjam.trust import check_trusted, expecting_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 if TYPE_CHECKING:
@@ -179,12 +180,21 @@ def _read_driver_origin(driver_name: str, scenario: str) -> tuple[Scenario, Driv
     if file is not None:
         controller = read_controller(file)
         metadata = {name: controller.manifest[name] for name in PROVENANCE_ENTRIES if name in controller.manifest}
-        road = scenario_from_recipe(metadata["scenario"]) if "scenario" in metadata else example_scenario("ring")
+        road = _read_scenario(file, metadata.get("scenario"))
         return road, controller.driver, metadata
     road = example_scenario(scenario or "ring")
     driver = make_driver(driver_name, road.control_step)
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
     return road, driver, controller_origin(road, expert)
+
+
+def _read_scenario(file: Path, recipe: dict[str, Any] | None) -> Scenario:
+    """Return the scenario that a controller's file names; its Python file runs only if its code is trusted."""
+    if recipe is None:
+        return example_scenario("ring")
+    if code := recipe.get(CODE_ENTRY):
+        check_trusted(f"controller {file.name}", Path(str(code.get("path"))))
+    return scenario_from_recipe(recipe)
 
 
 def _test_metrics(folder: Path) -> dict[str, Any] | None:

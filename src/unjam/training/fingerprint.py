@@ -15,10 +15,9 @@ from unjam.files import to_json
 from unjam.kernels import kernel_info
 from unjam.manifest import package_versions
 from unjam.parameters import flatten_keys
-from unjam.scenarios.population import population_file
+from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_network import UserNetwork
-from unjam.sumo_files import read_sumo_files
+from unjam.scenarios.user_scenario import CODE_ENTRY
 from unjam.training.config import RunConfig
 
 _LOG = logging.getLogger(__name__)
@@ -62,11 +61,9 @@ def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: 
 def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
     """Return hashes of the code that `names` refer to and of the files of scenarios, by path."""
     codes = [FileReference.parse(name).read_code() for name in names if is_file_reference(name)]
-    paths = list[Path]()
+    paths, hashes = list[Path](), {str(code.path): code.sha256 for code in codes}
     for scenario in scenarios:
-        if isinstance(scenario, UserNetwork):
-            paths += read_sumo_files(Path(scenario.file)).sources
-        if scenario.population:
-            paths.append(population_file(scenario.population))
-    hashes = {str(code.path): code.sha256 for code in codes}
+        paths += scenario.user_files
+        if code := scenario_recipe(scenario).get(CODE_ENTRY):
+            hashes[code["path"]] = code["sha256"]
     return hashes | {str(path): sha256_of_file(path) for path in paths}

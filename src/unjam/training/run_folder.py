@@ -29,12 +29,12 @@ from unjam.files import (
     write_folder,
 )
 from unjam.manifest import manifest, package_versions
-from unjam.parameters import build_dataclass
+from unjam.parameters import build_dataclass, read_toml
 from unjam.processes import LOCK_FILE, lock_folder
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.training.config import CONFIG_FILE, RunConfig, load_config, read_toml, to_toml
+from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
 from unjam.training.early_stopping import should_stop_early
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
 from unjam.worlds.backend import check_support, open_backend

@@ -1,0 +1,76 @@
+"""The user's own scenarios: classes and instances in Python files, `path.py:name`, and settings in TOML files.
+
+Python files run as `unjam.user_code` says, only when the user names them. TOML files have settings alone.
+"""
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from unjam.drivers.user_driver import FileReference, object_label, object_reference
+from unjam.errors import InputError, invalid_value
+from unjam.parameters import build_dataclass, read_toml
+from unjam.scenarios.scenario import Scenario
+from unjam.user_code import USER_MODULE_PREFIX
+
+CODE_ENTRY = "code"
+"""entry of a recipe with path, name and hash of the user's class"""
+_modules: dict[tuple[Path, str], ModuleType] = {}
+"""by path and hash of the code: running a file again would make other classes"""
+_class_recipes: dict[type[Scenario], dict[str, Any]] = {}
+"""path, name and hash of the classes that Python files define"""
+
+
+def load_python_scenario(text: str) -> Scenario:
+    """Return the scenario `path.py:name`; a class has its default settings. Raise `InputError` if it is none."""
+    found = _load_object(FileReference.parse(text))
+    return build_dataclass(found, {}, text) if isinstance(found, type) else found
+
+
+def _load_object(reference: FileReference, sha256: str = "") -> Scenario | type[Scenario]:
+    """Return the class or instance with a name, of a file that must have the hash if one is given."""
+    code = reference.read_code()
+    if sha256 not in ("", code.sha256):
+        raise InputError(f"{reference}: its file has changed since; allowed: as it was when it was first loaded")
+    key = reference.path, code.sha256
+    if key not in _modules:
+        _modules[key] = reference.run_file(code)
+    found: Any = reference.find_object(_modules[key])
+    kind: type[Any] = found if isinstance(found, type) else type(found)
+    if not issubclass(kind, Scenario):
+        raise InputError(f"{reference}: is neither a class nor an instance of unjam.scenarios.Scenario")
+    if kind.__module__.startswith(USER_MODULE_PREFIX):
+        _class_recipes[kind] = reference.file_recipe(code.sha256)
+    return found
+
+
+def class_recipe(kind: type[Scenario]) -> dict[str, Any]:
+    """Return path, name and hash of a class that was loaded from a Python file.
+
+    Raise `InputError` for other classes, which other processes cannot import.
+    """
+    if kind in _class_recipes:
+        return _class_recipes[kind]
+    reference = object_reference(kind)
+    hint = f"; did you mean {reference!r}?" if reference else ", of a class in a Python file"
+    reason = "is not allowed in a file or another process, which must import it"
+    raise InputError(f"scenario: the class {object_label(kind)} {reason}; allowed: path.py:name{hint}")
+
+
+def load_class(code: dict[str, Any]) -> type[Scenario]:
+    """Return the class of a recipe; raise `InputError` if its file has changed."""
+    try:
+        reference, sha256 = FileReference(Path(code["path"]), code["name"]), code["sha256"]
+    except (KeyError, TypeError):
+        raise invalid_value("scenario.code", code, "a table with path, name and sha256") from None
+    found = _load_object(reference, sha256)
+    return found if isinstance(found, type) else type(found)
+
+
+def load_toml_scenario(path: Path, kinds: dict[str, type[Scenario]]) -> Scenario:
+    """Return the scenario of a TOML file: the settings of its `kind`, by default a motorway."""
+    values = read_toml(path, "scenario file")
+    kind = values.pop("kind", "motorway")
+    if kind not in kinds:
+        raise invalid_value(f"scenario file {path}: kind", kind, ", ".join(kinds))
+    return build_dataclass(kinds[kind], values, path.name)
