@@ -32,7 +32,7 @@ EVERYWHERE = {
 ALLOWED = {
     "adapters": {"physics", "drivers"},
     "controller": {"adapters", "physics", "drivers", "worlds"},
-    "following": {"physics", "drivers", "scenarios"},
+    "following": {"sumo_files", "physics", "drivers", "scenarios"},
     "reports": {"physics", "drivers", "scenarios", "worlds", "measures"},
     "learners": {"following"},
     "training": {"controller", "reports"},

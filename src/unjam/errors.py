@@ -87,6 +87,8 @@ class LostWorkerError(EpisodeError):
     """The process that ran an episode was lost; the same episode may succeed when repeated."""
 
 
+MAX_LISTED_NAMES = 20
+"""names that a message lists of a list from a file"""
 DISK_ERRNOS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS),
     *(errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR),
@@ -131,6 +133,13 @@ def unknown_name(field: str, value: object, names: Iterable[str]) -> InputError:
     """Return the error for a name that is not among `names`, with a suggestion."""
     known = list(names)
     return invalid_value(field, value, f"{', '.join(known)}{spelling_hint(value, known)}")
+
+
+def shorten_list(names: Iterable[str]) -> str:
+    """Return the names joined by commas, without those after the first `MAX_LISTED_NAMES`."""
+    known = list(names)
+    more = len(known) - MAX_LISTED_NAMES
+    return ", ".join(known[:MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def resume_hint(folder: object) -> str:

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from tests.following.synthetic_trajectories import idm_driver
@@ -92,6 +93,19 @@ def test_file_is_fitted_to_a_population(data: Path) -> None:
     assert fit.population.metadata["data"] == ["data.parquet"]
     assert "one IDM for all" in fit.report_lines()[0]
     assert fit.facts()["drivers"] == 3
+
+
+@pytest.mark.long
+def test_trajectories_with_different_time_steps_are_fitted_at_the_longest(data: Path, tmp_path: Path) -> None:
+    rows = pd.read_parquet(data)
+    slower = rows.assign(pair=rows["pair"] + 3, t=2 * rows["t"])
+    pd.concat([rows, slower]).to_parquet(tmp_path / "both.parquet")
+    fit = fit_drivers_from_files([tmp_path / "both.parquet"], CHANGES)
+    assert fit.notes[:2] == [
+        "both.parquet: 6 trajectories with 1,446 of 1,446 rows",
+        "trajectories with a shorter time step are interpolated to 0.2 s",
+    ]
+    assert len(fit.population.drivers) == 6
 
 
 @pytest.mark.long

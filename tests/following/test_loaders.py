@@ -1,4 +1,6 @@
+import gzip
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,9 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.worlds.sumo.user_networks import straight
+from tests.worlds.sumo.user_networks import built
 from unjam.errors import InputError
 from unjam.following.loaders import METERS_PER_FOOT, ReadOptions, read_trajectories
+from unjam.following.tables import NGSIM_COLUMN_ORDER
 from unjam.worlds.sumo.networks import sumo_program
 
 SHORT = ReadOptions(min_seconds=1.0)
@@ -62,6 +65,14 @@ def write_reconstructed(path: Path, header: bool) -> Path:
     return path
 
 
+def write_ngsim_text(path: Path) -> Path:
+    """Write the public format as NGSIM's text files have it: columns of equal width without a header."""
+    frame = pd.read_csv(write_ngsim(path)).rename(columns=str.lower)
+    frame.reindex(columns=list(NGSIM_COLUMN_ORDER), fill_value=0).to_csv(path, sep=" ", index=False, header=False)
+    path.write_text("".join(f"   {line}\n" for line in path.read_text().replace(" ", "   ").splitlines()))
+    return path
+
+
 def write_openacc(path: Path) -> Path:
     """Write a platoon of three vehicles, of which the third is driven by ACC."""
     times = 0.1 * np.arange(SAMPLES)
@@ -110,17 +121,29 @@ def test_standing_vehicle_on_highd_keeps_its_position(tmp_path: Path, sign: int)
     assert np.abs(np.diff(trajectory.gap)).max() < 0.04 * max(SPEED, LEADER) + 1e-6
 
 
-def test_fcd_output_of_sumo_has_consistent_gaps(tmp_path: Path) -> None:
-    flow = '<flow id="f" type="van" route="along" begin="0" end="20" period="4"/>'
+def test_fcd_output_of_sumo_has_consistent_gaps_across_edges(tmp_path: Path) -> None:
+    nodes = "".join(f'<node id="{number}" x="{150 * number}" y="0"/>' for number in range(6))
+    edges = "".join(
+        f'<edge id="e{number}" from="{number}" to="{number + 1}" numLanes="{1 + number % 2}" speed="15"/>'
+        for number in range(5)
+    )
+    flow = '<route id="along" edges="e0 e1 e2 e3 e4"/><flow id="f" route="along" begin="0" end="20" period="4"/>'
+    file = built(tmp_path, nodes, edges, flow, '<end value="60"/><step-length value="0.1"/>')
     options = ["--fcd-output", "fcd.csv", "--fcd-output.max-leader-distance", "200"]
-    command = [sumo_program("sumo"), "-c", str(straight(tmp_path, flow)), *options]
-    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True)
+    for name in ("fcd.csv", "fcd.xml", "fcd.xml.gz"):
+        options[1] = name
+        subprocess.run([sumo_program("sumo"), "-c", str(file), *options], cwd=tmp_path, capture_output=True, check=True)
     result = read_trajectories(tmp_path / "fcd.csv")
     assert {each.driver for each in result.trajectories} == {f"f.{number}" for number in range(1, 5)}
-    for trajectory in result.trajectories:
-        gap_changes = np.cumsum(trajectory.leader_speed - trajectory.speed)[1:] * trajectory.time_step
-        np.testing.assert_allclose(trajectory.gap[1:] - trajectory.gap[0], gap_changes, atol=0.6)
-        assert trajectory.gap.min() > 20
+    assert len(result.trajectories) == 4, "one each, over all edges"
+    for each in result.trajectories:
+        assert each.seconds > 30
+        gap_changes = np.cumsum(each.leader_speed - each.speed)[1:] * each.time_step
+        np.testing.assert_allclose(each.gap[1:] - each.gap[0], gap_changes, atol=0.6)
+    for name in ("fcd.xml", "fcd.xml.gz"):
+        for one, other in zip(read_trajectories(tmp_path / name).trajectories, result.trajectories, strict=True):
+            assert (one.driver, one.time_step) == (other.driver, other.time_step)
+            np.testing.assert_array_equal(one.gap, other.gap)
     frame = pd.read_csv(tmp_path / "fcd.csv", sep=";")
     frame.drop(columns="vehicle_leaderSpeed").to_csv(tmp_path / "without.csv", sep=";", index=False)
     with pytest.raises(InputError, match="no column 'vehicle_leaderSpeed'"):
@@ -140,10 +163,8 @@ def test_plain_table_is_read(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize(
     "make",
     [
-        write_ngsim,
-        lambda path: write_reconstructed(path, True),
-        lambda path: write_reconstructed(path, False),
-        write_openacc,
+        *(write_ngsim, write_ngsim_text, write_openacc),
+        *(lambda path: write_reconstructed(path, True), lambda path: write_reconstructed(path, False)),
     ],
 )
 def test_public_formats_are_converted_to_si_units(tmp_path: Path, make) -> None:
@@ -202,7 +223,8 @@ def table_with_bad_value(path: Path, row: int, column: str, value: object) -> Pa
 @pytest.mark.parametrize(
     ("column", "value", "words"),
     [
-        ("gap", "near", r"line 7: gap: nan is not allowed; allowed: 0 to 1000"),
+        ("gap", "near", r"line 7: gap: 'near' is not allowed; allowed: 0 to 1000"),
+        ("time", "2005-04-13 16:00", r"line 7: time: '2005-04-13 16:00' is not allowed; allowed: finite"),
         ("speed", -3, r"line 7: speed: -3 is not allowed; allowed: 0 to 70"),
         ("leader_speed", 300, r"line 7: leader_speed: 300 is not allowed"),
         ("time", 0.3, r"line 7: time: 0.3 occurs twice in its pair"),
@@ -231,21 +253,108 @@ def test_short_trajectories_are_counted(tmp_path: Path) -> None:
     assert result.skipped_rows == {"trajectories shorter than 1.5 s": 10}
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda path: path / "none.csv", "does not exist"),
-        (lambda path: write_table_file(path / "t.csv").rename(path / "t.parquet"), "cannot be read"),
-        (lambda path: write_openacc(path / "t.csv"), "no column 'pair'; it has: Time"),
-    ],
-)
-def test_unreadable_files_are_refused(tmp_path: Path, make, words: str) -> None:
+CONTENTS: dict[str, tuple[bytes, str]] = {
+    "broken Parquet": (b"PAR1 and no more", "cannot be read"),
+    "broken gzip": (gzip.compress(b"pair,time" * 99)[:-9], "cannot be read"),
+    "JSON in one line": (
+        b'[{"pair": "a", "speed": 1.0}' + b', {"pair": "a"}' * 200_000 + b"]",
+        "it is JSON; allowed: CSV",
+    ),
+    "XML": (b'<?xml version="1.0"?><routes/>', "it is XML, but not SUMO's FCD output"),
+    "broken FCD output": (b"<fcd-export><timestep", "cannot be read: unclosed token"),
+    "entities": (b'<!DOCTYPE a [<!ENTITY b "c">]><fcd-export/>', "a document type .* is not allowed"),
+    "one line": (b"pair," * 99_999, "its first line is longer than 65,536 bytes"),
+    "UTF-16": ("pair,time".encode("utf-16"), "it is not text in UTF-8"),
+    "numbers alone": (b"1,2.5,3\n1,2.6,3\n", "its first line is not the names of its columns"),
+    "nothing": (b"", "cannot be read: No columns"),
+    "many columns": (
+        ",".join(f"c{number}" for number in range(999)).encode(),
+        r"it has: c0, .*, c19 and 979 more; req",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONTENTS)
+def test_content_that_is_no_table_is_refused_at_once(name: str, tmp_path: Path) -> None:
+    content, words = CONTENTS[name]
+    (tmp_path / "t.csv").write_bytes(content)
     with pytest.raises(InputError, match=words):
-        read_trajectories(make(tmp_path), "table", SHORT)
+        read_trajectories(tmp_path / "t.csv")
+
+
+def test_missing_file_and_another_format_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_trajectories(tmp_path / "none.csv", "table")
+    with pytest.raises(InputError, match="no column 'pair'; it has: Time"):
+        read_trajectories(write_openacc(tmp_path / "t.csv"), "table")
+
+
+WRITERS: dict[str, Callable[[pd.DataFrame, Path], object]] = {
+    "gzip": lambda frame, path: path.write_bytes(gzip.compress(frame.to_csv(index=False).encode())),
+    "semicolons": lambda frame, path: frame.to_csv(path, index=False, sep=";"),
+    "tabs": lambda frame, path: frame.to_csv(path, index=False, sep="\t"),
+    "spaces": lambda frame, path: path.write_text(frame.to_string(index=False)),
+    "decimal commas": lambda frame, path: frame.to_csv(path, index=False, sep=";", decimal=","),
+    "a byte-order mark": lambda frame, path: frame.to_csv(path, index=False, encoding="utf-8-sig"),
+    "commas between thousands": lambda frame, path: frame.assign(
+        time=[f"{1_118_847 + time:,.1f}" for time in frame["time"]]
+    ).to_csv(path, index=False),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_tables_are_read_in_every_form(name: str, tmp_path: Path) -> None:
+    expected = read_trajectories(write_table_file(tmp_path / "plain.csv"), options=SHORT).trajectories
+    WRITERS[name](pd.read_csv(tmp_path / "plain.csv"), tmp_path / "t.csv")
+    found = read_trajectories(tmp_path / "t.csv", options=SHORT).trajectories
+    for one, other in zip(found, expected, strict=True):
+        assert (one.name, one.time_step) == (other.name, other.time_step)
+        np.testing.assert_allclose(one.gap, other.gap)
+
+
+def waves(times: np.ndarray, stamps: np.ndarray, pair: str = "a") -> pd.DataFrame:
+    """A pair in waves of half a minute, the samples of which have other time stamps than their times."""
+    leader, speed = 12 + 3 * np.sin(times / 5), 12 + 3 * np.sin((times - 1.2) / 5)
+    gap = 40 + 15 * (np.cos((times - 1.2) / 5) - np.cos(times / 5))
+    return pd.DataFrame({"pair": pair, "time": stamps, "speed": speed, "leader_speed": leader, "gap": gap})
+
+
+@pytest.mark.parametrize("rate", [5, 12, 15, 24, 25, 29.97, 30, 60])
+@pytest.mark.parametrize("decimals", [2, 3, 4])
+def test_rows_with_rounded_time_stamps_are_read_unchanged(rate: float, decimals: int, tmp_path: Path) -> None:
+    times = np.arange(0, 40, 1 / rate)
+    rows = waves(times, times.round(decimals) + 1_118_847_000)
+    rows.to_csv(tmp_path / "t.csv", index=False)
+    (found,) = read_trajectories(tmp_path / "t.csv").trajectories
+    assert found.time_step == pytest.approx(1 / rate, rel=5e-4)
+    for name in ("speed", "leader_speed", "gap"):
+        np.testing.assert_array_equal(getattr(found, name), rows[name])
+
+
+@pytest.mark.parametrize("rate", [10, 30])
+def test_samples_of_an_irregular_clock_are_interpolated(rate: float, tmp_path: Path) -> None:
+    times = np.arange(0, 40, 1 / rate)
+    times = np.sort(times + np.random.default_rng(0).uniform(-0.2, 0.2, len(times)) / rate)
+    waves(times, times).to_csv(tmp_path / "t.csv", index=False)
+    (found,) = read_trajectories(tmp_path / "t.csv").trajectories
+    assert found.time_step == pytest.approx(1 / rate, rel=1e-3)
+    even = times[0] + found.time_step * np.arange(len(found.speed))
+    np.testing.assert_allclose(found.speed, waves(even, even)["speed"], atol=0.001)
+    assert found.seconds == pytest.approx(40, abs=0.3)
+
+
+def test_each_pair_has_its_own_time_step_and_a_missing_row_ends_a_trajectory(tmp_path: Path) -> None:
+    fast, slow = np.arange(0, 60, 1 / 30), np.arange(0, 30, 0.1)
+    rows = pd.concat([waves(fast, fast.round(3), "a"), waves(slow, slow, "b")])
+    rows.drop(index=[900]).to_csv(tmp_path / "t.csv", index=False)
+    found = read_trajectories(tmp_path / "t.csv").trajectories
+    assert [(each.name, len(each.speed)) for each in found] == [("a", 900), ("a/2", 899), ("b", 300)]
+    assert [each.time_step for each in found] == [found[0].time_step] * 2 + [0.1]
+    assert found[0].time_step == pytest.approx(1 / 30, rel=1e-4)
 
 
 def test_table_with_only_short_trajectories_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no trajectory lasts 20 s"):
+    with pytest.raises(InputError, match=r"no trajectory lasts 20 s; the longest lasts 2\.9 s"):
         read_trajectories(write_table_file(tmp_path / "t.csv"))
 
 

@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.network import Network
-from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.errors import InputError, invalid_value, shorten_list, unknown_name
 from unjam.files import check_parent_folder
 from unjam.following.calibration import (
     CALIBRATED_PARAMETERS,
@@ -141,10 +141,14 @@ def fit_drivers_from_files(
     for name, value in (filters or {}).items():
         if name not in FILTER_FIELDS:
             raise unknown_name("select", name, FILTER_FIELDS)
-        known = ", ".join(sorted({str(getattr(each, name)) for each in trajectories} - {""})) or "none"
+        known = shorten_list(sorted({str(getattr(each, name)) for each in trajectories} - {""})) or "none"
         trajectories = [each for each in trajectories if getattr(each, name) == value]
         if not trajectories:
             raise InputError(f"select: no trajectory has the {name} {value!r}; available: {known}")
+    time_step = max(each.time_step for each in trajectories)
+    if any(each.time_step != time_step for each in trajectories):
+        notes.append(f"trajectories with a shorter time step are interpolated to {time_step:g} s")
+        trajectories = [each if each.time_step == time_step else each.resample(time_step) for each in trajectories]
     notes += unit_warnings(trajectories)
     population = fit_drivers(trajectories, settings, on_progress)
     origin = manifest()

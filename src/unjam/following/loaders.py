@@ -2,15 +2,18 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from unjam.errors import InputError, unknown_name
-from unjam.following.trajectories import FollowingTrajectory
+from unjam.errors import InputError, shorten_list, unknown_name
+from unjam.following.tables import read_table
+from unjam.following.trajectories import FollowingTrajectory, even_times
+from unjam.physics.arrays import Floats
 
 TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
 """required columns of a plain table; `pair` identifies follower and leader, the others are in s, m/s, m/s and m"""
@@ -21,7 +24,11 @@ COLUMN_ALIASES = {"t": "time", "v_foll": "speed", "v_lead": "leader_speed"}
 VALUE_LIMITS = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.0)}
 """smallest and largest allowed value of a column [m/s, m/s, m]; other values are errors, or have another unit"""
 TIME_STEP_TOLERANCE = 0.01
-"""largest relative difference between the interval of two rows and the time step of the file"""
+"""largest relative difference between intervals of rows that are equal, and between time steps that are"""
+MISSING_ROW_INTERVAL = 1.5
+"""shortest interval in which a row is missing, relative to the usual one"""
+MAX_TIME_DECIMALS = 6
+"""most decimals of time stamps that are taken for rounded"""
 METERS_PER_FOOT = 0.3048
 MEDIAN_LENGTH_LIMITS = (3.0, 8.0)
 """smallest and largest plausible median of the vehicle lengths in a file [m]"""
@@ -40,13 +47,10 @@ MAX_VEHICLE_ABSENCE = 60.0
 FCD_COLUMNS = ("timestep_time", "vehicle_speed", "vehicle_leaderSpeed", "vehicle_leaderGap")
 """names of `TABLE_COLUMNS[1:]` in SUMO's FCD output as CSV, which contains leaders with the option
 --fcd-output.max-leader-distance"""
-RECONSTRUCTED_COLUMN_ORDER = (
-    *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
-    *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
-)
-"""columns of the reconstructed NGSIM files, which have no header, in their order"""
-MAX_LISTED_ROWS = 5
-"""maximum number of bad rows that a message lists"""
+GROUPED_NUMBER = re.compile(r"-?\d{1,3}(,\d{3})+(\.\d+)?")
+"""a number with commas between thousands"""
+MAX_LISTED_ROWS, MAX_TEXT_LENGTH = 5, 40
+"""maximum number of bad rows, and of characters of a value, in a message"""
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ class ReadResult:
 
 
 def read_trajectories(path: Path, format: str = "", options: ReadOptions | None = None) -> ReadResult:
-    """Return the trajectories of a .parquet or .csv file.
+    """Return the trajectories of a file, see `tables.read_table`.
 
     `format` is a name in `FILE_FORMATS`; empty: it is detected from the columns.
 
@@ -95,7 +99,7 @@ def read_trajectories(path: Path, format: str = "", options: ReadOptions | None 
     """
     if format and format not in FILE_FORMATS:
         raise unknown_name("format", format, FILE_FORMATS)
-    frame = _read_file(path)
+    frame = read_table(path)
     return FILE_FORMATS[format or _detect_format(frame)](frame, path, options or ReadOptions())
 
 
@@ -141,8 +145,11 @@ def _convert_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
 
 
 def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of SUMO's FCD output: one for each combination of vehicle, leader and lane."""
-    key = ("vehicle_id", "vehicle_leaderID", "vehicle_lane")
+    """Return the trajectories of SUMO's FCD output: one for each combination of vehicle and leader.
+
+    Both may change their edge or lane meanwhile.
+    """
+    key = ("vehicle_id", "vehicle_leaderID")
     vehicles = _select_columns(frame, FCD_COLUMNS, TABLE_COLUMNS[1:], path)
     _check_columns(frame, key, path)
     is_free = vehicles["gap"] < 0
@@ -218,41 +225,6 @@ FILE_FORMATS: dict[str, Callable[[pd.DataFrame, Path, ReadOptions], ReadResult]]
 }
 
 
-def _read_file(path: Path) -> pd.DataFrame:
-    """Return the table of a file with a column `line`; its `attrs` have the lines above the header, by first word."""
-    if not path.is_file():
-        raise InputError(f"data: {str(path)!r} does not exist")
-    header, attributes = 0, dict[Hashable, str]()
-    try:
-        if path.suffix == ".parquet":
-            frame = pd.read_parquet(path)
-        else:
-            header, attributes = _find_header(path)
-            columns = {"names": list(RECONSTRUCTED_COLUMN_ORDER), "header": None} if header < 0 else {}
-            with open(path, encoding="utf-8-sig") as file:
-                separator = ";" if file.readline().startswith("timestep_") else ","  # ; only in SUMO's files
-            frame = pd.read_csv(path, sep=separator, skiprows=max(0, header), skipinitialspace=True, **columns)
-    except (ValueError, OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
-    frame = frame.assign(line=np.arange(len(frame)) + header + 2)
-    frame.attrs = attributes
-    return frame
-
-
-def _find_header(path: Path) -> tuple[int, dict[Hashable, str]]:
-    """Return the number of lines above the header of a CSV file (-1: no header), and their content."""
-    with open(path, encoding="utf-8-sig") as file:
-        lines = [file.readline().strip() for _ in range(20)]
-    first = lines[0].split(",")
-    if len(first) == len(RECONSTRUCTED_COLUMN_ORDER) and all(re.fullmatch(r"\s*-?[\d.eE+-]+", cell) for cell in first):
-        return -1, {}
-    for number, line in enumerate(lines):
-        if re.match(r"time\s*,\s*speed1\b", line, re.IGNORECASE):
-            above = [line.partition(",") for line in lines[:number]]
-            return number, {key.strip(" :").lower(): value.strip(",\" '") for key, _, value in above}
-    return 0, {}
-
-
 def _detect_format(frame: pd.DataFrame) -> str:
     names = set(map(str, frame.columns))
     if {name.lower() for name in names}.issuperset(NGSIM_COLUMNS):
@@ -279,7 +251,7 @@ def _select_columns(
 def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> None:
     missing = [name for name in required if name not in frame]
     if missing:
-        columns = ", ".join(str(name) for name in frame.columns if name != "line")
+        columns = shorten_list(str(name) for name in frame.columns if name != "line")
         raise InputError(f"{path.name}: no column {missing[0]!r}; it has: {columns}; required: {', '.join(required)}")
 
 
@@ -295,8 +267,23 @@ def _join_columns(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
 
 
 def _to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
-    """Return the table with these columns as numbers; other values become NaN, which makes their rows bad."""
-    return frame.assign(**{name: pd.to_numeric(frame[name], errors="coerce") for name in names})
+    """Return the table with these columns as numbers; other values become NaN, which makes their rows bad.
+
+    A number may have commas between thousands. The column `not_numeric` has the first other value of each row.
+    """
+    columns, not_numeric = dict[str, pd.Series](), pd.Series("", frame.index)
+    for name in names:
+        columns[name] = pd.Series(pd.to_numeric(frame[name], errors="coerce"), frame.index)
+        is_text = columns[name].isna() & frame[name].notna()
+        texts = frame.loc[is_text, name].map(lambda value: str(value).strip())
+        if texts.empty:
+            continue
+        is_grouped = texts.map(lambda text: bool(GROUPED_NUMBER.fullmatch(text)))
+        numbers = texts[is_grouped].map(lambda text: float(text.replace(",", "")))
+        columns[name] = columns[name].astype(np.float64).fillna(numbers)
+        others = f"{name}: " + texts[~is_grouped].map(lambda text: repr(text[:MAX_TEXT_LENGTH]))
+        not_numeric = not_numeric.where(not_numeric != "", others.reindex(frame.index).fillna(""))
+    return frame.assign(**columns, not_numeric=not_numeric)
 
 
 def _split_trajectories(
@@ -304,8 +291,8 @@ def _split_trajectories(
 ) -> ReadResult:
     """Return the trajectories of a table with the columns `line`, `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`.
 
-    A trajectory consists of the rows of one pair at equal intervals; after a missing row another trajectory starts.
-    Rows may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by reason.
+    A trajectory consists of rows of one pair, between which none is missing. Its time step is that of its pair. Rows
+    may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by reason.
 
     Raises:
         InputError: a row is bad, or no trajectory remains.
@@ -316,27 +303,66 @@ def _split_trajectories(
         line, reason = next(iter(bad_rows.items()))
         raise InputError(f"{path.name}: line {line}: {reason}{more}; --drop-bad-rows leaves them out")
     good = frame.loc[~is_bad].sort_values(by=["pair", "time"], kind="stable")
-    steps = good.groupby("pair", sort=False, dropna=False)["time"].diff()
-    if steps.isna().all():
+    groups = [rows for _, rows in good.groupby("pair", sort=False, dropna=False) if len(rows) > 1]
+    if not groups:
         raise InputError("time: no pair has two rows")
-    step = round(float(steps.median()), 4)  # the precision of times in single precision
-    starts = ~((steps - step).abs() <= TIME_STEP_TOLERANCE * step)
-    trajectories, part_counts, short_count = list[FollowingTrajectory](), Counter[str](), 0
-    for _, rows in good.groupby(starts.cumsum(), sort=False):
-        if (len(rows) - 1) * step < options.min_seconds or len(rows) < 2:
-            short_count += len(rows)
-            continue
-        pair = str(rows["pair"].iloc[0])
-        speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in TABLE_COLUMNS[2:])
-        known = {name: rows[name].head(1).dropna() for name in OPTIONAL_COLUMNS if name in rows}
-        driver, kind, split = ("".join(map(str, known.get(name, ()))) for name in OPTIONAL_COLUMNS)
-        part_counts[pair] += 1
-        name = pair if part_counts[pair] == 1 else f"{pair}/{part_counts[pair]}"
-        trajectories.append(FollowingTrajectory(name, driver or pair, step, speed, leader_speed, gap, kind, split))
+    intervals = [np.diff(rows["time"].to_numpy(np.float64)) for rows in groups]
+    has_missing = [each > MISSING_ROW_INTERVAL * np.median(each) for each in intervals]
+    regular = [each[~missing] for each, missing in zip(intervals, has_missing, strict=True)]
+    steps = _common_time_steps([float(each.mean()) for each in regular], [float(each.sum()) for each in regular])
+    trajectories, part_counts, short_count = list[FollowingTrajectory](), Counter[str](), len(good)
+    longest = 0.0
+    for rows, missing, step in zip(groups, has_missing, steps, strict=True):
+        for first, last in pairwise([0, *(np.flatnonzero(missing) + 1).tolist(), len(rows)]):
+            seconds = (last - first - 1) * step
+            longest = max(longest, seconds)
+            if seconds < options.min_seconds - step / 2 or last - first < 2:
+                continue
+            part = rows.iloc[first:last]
+            short_count -= len(part)
+            pair = str(part["pair"].iloc[0])
+            speed, leader_speed, gap = _at_even_times(part, step)
+            known = {name: part[name].head(1).dropna() for name in OPTIONAL_COLUMNS if name in part}
+            driver, kind, split = ("".join(map(str, known.get(name, ()))) for name in OPTIONAL_COLUMNS)
+            part_counts[pair] += 1
+            name = pair if part_counts[pair] == 1 else f"{pair}/{part_counts[pair]}"
+            trajectories.append(FollowingTrajectory(name, driver or pair, step, speed, leader_speed, gap, kind, split))
     if not trajectories:
-        raise InputError(f"{path.name}: no trajectory lasts {options.min_seconds:g} s")
+        raise InputError(
+            f"{path.name}: no trajectory lasts {options.min_seconds:g} s; the longest lasts {longest:.3g} s"
+        )
     reasons = {**skipped_rows, f"trajectories shorter than {options.min_seconds:g} s": short_count}
     return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
+
+
+def _common_time_steps(steps: Sequence[float], seconds: Sequence[float]) -> list[float]:
+    """Return the mean interval of each pair [s], where nearly equal ones become their mean weighted by `seconds`."""
+    common = np.array(steps)
+    order = np.argsort(common, kind="stable")
+    starts = np.flatnonzero(np.diff(common[order], prepend=0.0) > TIME_STEP_TOLERANCE * common[order])
+    for numbers in np.split(order, starts[1:]):
+        mean = float(np.average(common[numbers], weights=np.array(seconds)[numbers]))
+        short = round(mean, 4)  # the precision of times in single precision
+        common[numbers] = short if abs(mean - short) <= 1e-4 * mean else round(mean, MAX_TIME_DECIMALS)
+    return common.tolist()
+
+
+def _at_even_times(rows: pd.DataFrame, step: float) -> list[Floats]:
+    """Return speed, leader speed and gap of rows at equal intervals.
+
+    Rows at equal intervals with rounded time stamps are unchanged; between others values are interpolated.
+    """
+    times, *values = (rows[name].to_numpy(np.float64) for name in TABLE_COLUMNS[1:])
+    times = times - times[0]
+    if np.all(np.abs(np.diff(times) - step) <= TIME_STEP_TOLERANCE * step):
+        return values
+    numbers = np.arange(len(times))
+    deviation = np.abs(times - np.polyval(np.polyfit(numbers, times, 1), numbers)).max()
+    decimals = (10.0**-digits for digits in range(MAX_TIME_DECIMALS + 1))
+    resolution = next((each for each in decimals if np.all(np.abs(times / each - np.round(times / each)) < 0.01)), 0.0)
+    if deviation <= 0.75 * resolution:  # half of it, except for the error of the fitted line
+        return values
+    return [np.interp(even_times(times[-1], step), times, each) for each in values]
 
 
 def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
@@ -349,8 +375,8 @@ def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
         is_wrong = ~np.isfinite(values) | (values < low) | (values > high)
         allowed = f"{low:g} to {high:g}" if name in VALUE_LIMITS else "finite"
         is_bad |= is_wrong
-        for line, value in zip(frame["line"][is_wrong], values[is_wrong], strict=True):
-            reasons.setdefault(int(line), f"{name}: {value:g} is not allowed; allowed: {allowed}")
+        for line, value, text in zip(*frame.loc[is_wrong, ["line", name, "not_numeric"]].to_numpy().T, strict=True):
+            reasons.setdefault(int(line), f"{text or f'{name}: {value:g}'} is not allowed; allowed: {allowed}")
     is_repeated = frame.assign(time=frame["time"].round(6)).duplicated(["pair", "time"])
     for line, time in zip(frame["line"][is_repeated], frame["time"][is_repeated], strict=True):
         reasons.setdefault(int(line), f"time: {time:g} occurs twice in its pair")

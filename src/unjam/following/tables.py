@@ -1,0 +1,118 @@
+"""Read tables of recorded traffic: CSV with any separator, Parquet, and SUMO's FCD output as XML; compressed or not."""
+
+import gzip
+import re
+import zlib
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+import pandas as pd
+
+from unjam.errors import InputError
+from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
+
+HEAD_BYTES = 1 << 16
+"""first bytes of a file, from which its form is detected before a table is parsed; no line of a table is longer"""
+HEAD_LINES = 20
+"""first lines of a table, among which its header is"""
+RECONSTRUCTED_COLUMN_ORDER = (
+    *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
+    *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
+)
+"""columns of the reconstructed NGSIM files, which have no header, in their order"""
+NGSIM_COLUMN_ORDER = (
+    *("vehicle_id", "frame_id", "total_frames", "global_time", "local_x", "local_y", "global_x", "global_y"),
+    *("v_length", "v_width", "v_class", "v_vel", "v_acc", "lane_id", "preceding", "following"),
+    *("space_headway", "time_headway"),
+)
+"""columns of NGSIM's text files, which have no header, in their order"""
+HEADERLESS_COLUMNS = {len(names): list(names) for names in (RECONSTRUCTED_COLUMN_ORDER, NGSIM_COLUMN_ORDER)}
+"""by their number"""
+FCD_ATTRIBUTES = ("id", "speed", "leaderID", "leaderSpeed", "leaderGap")
+"""attributes of a vehicle in SUMO's FCD output that are read; as CSV, their names begin with `vehicle_`"""
+ALLOWED_FILES = "CSV with a line for each row, Parquet, or SUMO's FCD output"
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Return the table of a file with a column `line`; its `attrs` have the lines above the header, by first word.
+
+    Raises:
+        InputError: the file is missing or cannot be read, or is no table.
+    """
+    if not path.is_file():
+        raise InputError(f"data: {str(path)!r} does not exist")
+    try:
+        with path.open("rb") as raw:
+            is_packed = raw.read(2) == b"\x1f\x8b"
+        with gzip.open(path) if is_packed else path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+            file.seek(0)
+            if head.startswith(b"PAR1"):
+                return pd.read_parquet(path).assign(line=lambda frame: np.arange(len(frame)) + 2)
+            if head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
+                return _read_fcd_xml(path, file, head)
+            return _read_csv(path, file, head)
+    except (ValueError, OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
+    except BrokenFileError as error:
+        raise InputError(str(error)) from None
+
+
+def _refused_file(path: Path, reason: str) -> InputError:
+    return InputError(f"{path.name}: cannot be read: {reason}; allowed: {ALLOWED_FILES}")
+
+
+def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
+    """Return SUMO's FCD output with the columns that it has as CSV."""
+    if b"<fcd-export" not in head:
+        raise _refused_file(path, "it is XML, but not SUMO's FCD output")
+    parser, time, rows = expat.ParserCreate(), "", list[dict[str, Any]]()
+
+    def on_start(tag: str, attributes: XmlAttributes) -> None:
+        nonlocal time
+        if tag == "timestep":
+            time = attributes.get("time", "")
+        elif tag == "vehicle":
+            values = {f"vehicle_{name}": attributes[name] for name in FCD_ATTRIBUTES if name in attributes}
+            rows.append({"timestep_time": time, **values, "line": parser.CurrentLineNumber})
+
+    parser.StartElementHandler = on_start
+    parse_xml(path, parser, iter(lambda: file.read(HEAD_BYTES), b""))
+    return pd.DataFrame(rows)
+
+
+def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
+    lines = head.decode("utf-8-sig", errors="ignore").splitlines()[:HEAD_LINES] or [""]
+    if b"\0" in head:
+        raise _refused_file(path, "it is not text in UTF-8")
+    if lines[0].lstrip().startswith(("{", "[")):
+        raise _refused_file(path, "it is JSON")
+    if len(lines) == 1 and len(head) == HEAD_BYTES:
+        raise _refused_file(path, f"its first line is longer than {HEAD_BYTES:,} bytes")
+    header, attributes = _find_header(lines)
+    separator = max(",;\t", key=lines[header].count)
+    separator = separator if separator in lines[header] else r"\s+"
+    cells, options = re.split(separator, lines[header].strip()), dict[str, Any](skiprows=header)
+    if all(re.fullmatch(r"\s*-?[\d.eE+-]+\s*", cell) for cell in cells):
+        if len(cells) not in HEADERLESS_COLUMNS:
+            raise _refused_file(path, "its first line is not the names of its columns")
+        header, options = -1, {"names": HEADERLESS_COLUMNS[len(cells)], "header": None}
+    rows = "\n".join(lines[header + 1 :])
+    if separator != "," and re.search(r"\d,\d", rows) and not re.search(r"\d\.\d", rows):
+        options["decimal"] = ","
+    frame = pd.read_csv(file, sep=separator, encoding="utf-8-sig", skipinitialspace=True, **options)
+    frame = pd.concat([frame, pd.Series(np.arange(len(frame)) + header + 2, frame.index, name="line")], axis=1)
+    frame.attrs = attributes
+    return frame
+
+
+def _find_header(lines: list[str]) -> tuple[int, dict[Hashable, str]]:
+    """Return the number of lines above the header of a CSV file, and their content; only OpenACC's files have some."""
+    for number, line in enumerate(lines):
+        if re.match(r"time\s*[,;\t]\s*speed1\b", line.strip(), re.IGNORECASE):
+            above = [line.strip().partition(",") for line in lines[:number]]
+            return number, {key.strip(" :").lower(): value.strip(",\" '") for key, _, value in above}
+    return 0, {}
