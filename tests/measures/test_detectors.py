@@ -41,7 +41,10 @@ measurements = st.builds(
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(rows=st.lists(measurements, min_size=1, max_size=5), kind=st.sampled_from(["edge", "lane"]))
+@given(
+    rows=st.lists(measurements, min_size=1, max_size=5, unique_by=lambda row: row.place),
+    kind=st.sampled_from(["edge", "lane"]),
+)
 def test_written_measurements_are_read_back(rows: list[Measurement], kind: str, tmp_path: Path) -> None:
     texts = [["" if isnan(value) else repr(value) for value in list(vars(row).values())[1:]] for row in rows]
     lines = [",".join([row.place, *values]) for row, values in zip(rows, texts, strict=True)]
@@ -71,6 +74,10 @@ def test_additional_columns_any_order_and_a_byte_order_mark_are_accepted(tmp_pat
         ([HEAD, "a,inf,0,60,5,20"], "position: 'inf'"),
         ([HEAD, "a,1,60,60,5,20"], "end: 60.0 is not allowed; allowed: after begin, 60 s"),
         ([HEAD, ",1,0,60,5,20"], "edge: ''"),
+        (
+            [HEAD, "a,1,0,60,5,20", "a,1,60,90,5,", "a,1.0,0,60,9,21"],
+            "line 4: has the place and time of line 2; allowed",
+        ),
     ],
 )
 def test_error_message_has_the_line_of_the_wrong_value(lines: list[str], words: str, tmp_path: Path) -> None:

@@ -74,12 +74,12 @@ def test_the_reader_needs_only_the_standard_library(tmp_path: Path) -> None:
 
 def test_lanes_are_read_with_their_edges(tmp_path: Path) -> None:
     path = tmp_path / "road.net.xml"
-    lane = '<lane id="a_b_0" length="10.5" shape="0,0 10.5,1,3"/>'
+    lane = '<lane id="a_b_0" length="10.5" speed="13.9" shape="0,0 10.5,1,3"/>'
     path.write_text(f'<net version="1"><edge id="a_b">{lane}</edge></net>')
-    assert read_lanes(path) == [("a_b", 10.5, [(0.0, 0.0), (10.5, 1.0)])]
+    assert read_lanes(path) == [("a_b", 10.5, 13.9, [(0.0, 0.0), (10.5, 1.0)])]
 
 
-@pytest.mark.parametrize("lane", ['<lane id="a_0"/>', '<lane id="a_0" length="1" shape="0"/>'])
+@pytest.mark.parametrize("lane", ['<lane id="a_0"/>', '<lane id="a_0" length="1" speed="1" shape="0"/>'])
 def test_invalid_lanes_are_refused(lane: str, tmp_path: Path) -> None:
     path = tmp_path / "road.net.xml"
     path.write_text(f'<net version="1"><edge id="a">{lane}</edge></net>')

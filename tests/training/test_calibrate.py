@@ -200,6 +200,21 @@ def test_detector_off_the_network_is_refused(kind: str, row: str, words: str, tm
     assert words in str(error.value)
 
 
+@pytest.mark.parametrize("unit", [1.0, 2.2369, 3.6])
+def test_speeds_in_another_unit_are_refused(unit: float, tmp_path: Path) -> None:
+    """On the road with a limit of 20 m/s: free flow at times, a jam at others, and one interval without vehicles."""
+    file, speeds = tmp_path / "detectors.csv", (19.0, 18.5, 5.0)
+    rows = [f"road,5,{60 * number},{60 * number + 60},9,{unit * speed:.1f}" for number, speed in enumerate(speeds)]
+    file.write_text("\n".join([f"edge,{','.join(DETECTOR_COLUMNS)}", *rows, "road,5,180,240,0,"]))
+    if unit == 1.0:
+        assert len(load_corridor(str(road(tmp_path / "road")), file).measurements) == 4
+        return
+    with pytest.raises(
+        InputError, match=r"detectors.csv: speed: .* times the speed limit is not allowed; allowed: m/s"
+    ):
+        load_corridor(str(road(tmp_path / "road")), file)
+
+
 def test_intervals_outside_the_simulated_time_are_excluded(tmp_path: Path) -> None:
     file = tmp_path / "detectors.csv"
     rows = [f"road_0,5,{begin},{begin + 60},1,1" for begin in range(0, 360, 60)]

@@ -59,7 +59,8 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
     """Return whether a CSV file names places by `edge` or by `lane`, and its measurements.
 
     It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown, and other columns are ignored. Raise
-    `InputError` if a value is wrong, with its line, and if the file, a column or all rows are missing.
+    `InputError` if a value is wrong or a row is there twice, with its line, and if the file, a column or all rows are
+    missing.
     """
     if not path.is_file():  # reading a device would never end
         raise InputError(f"detectors: {str(path)!r} is not a file; allowed: a CSV file")
@@ -71,13 +72,18 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
             if len(kinds) != 1 or not set(DETECTOR_COLUMNS) <= set(columns):
                 allowed = f"edge or lane, {', '.join(DETECTOR_COLUMNS)}"
                 raise invalid_value(f"{path.name}: columns", ", ".join(columns), allowed)
-            rows = [_parse_measurement(path.name, reader.line_num, kinds[0], row) for row in reader]
+            lines = [(reader.line_num, _parse_measurement(path.name, reader.line_num, kinds[0], row)) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise InputError(f"detectors: {str(path)!r} cannot be read: {reason}") from None
-    if not rows:
+    if not lines:
         raise InputError(f"{path.name}: has no rows; allowed: one measurement at least")
-    return kinds[0], rows
+    first_lines: dict[tuple[str, float, float, float], int] = {}
+    for line, row in lines:
+        first = first_lines.setdefault((row.place, row.position, row.begin, row.end), line)
+        if first != line:
+            raise InputError(f"{path.name}: line {line}: has the place and time of line {first}; allowed: each once")
+    return kinds[0], [row for _, row in lines]
 
 
 def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | None]) -> Measurement:

@@ -20,8 +20,8 @@ READER_PROGRAM = Path(__file__).with_name("reader_program.py")
 MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120
 """maximum memory [bytes] and time [s] of the reader process"""
 
-LaneShape = tuple[str, float, list[tuple[float, float]]]
-"""id of the edge, length [m], and points (x, y) of the center line [m]"""
+LaneShape = tuple[str, float, float, list[tuple[float, float]]]
+"""id of the edge, length [m], speed limit [m/s], and points (x, y) of the center line [m]"""
 _PASSED = """
 begin end junction-taz weight-attribute step-method.ballistic extrapolate-departpos lateral-resolution route-steps
 no-internal-links ignore-junction-blocker ignore-route-errors ignore-accidents intermodal-collision.action
@@ -182,7 +182,7 @@ def classify_option(file: str, name: str, value: str) -> Literal["passed", "igno
 
 def read_lanes(path: Path) -> list[LaneShape]:
     """Return all lanes of a network file; raise `InputError` if it is broken or too large."""
-    return [(edge, length, [(x, y) for x, y in line]) for edge, length, line in _run_reader("lanes", path)]
+    return [(edge, *numbers, [(x, y) for x, y in line]) for edge, *numbers, line in _run_reader("lanes", path)]
 
 
 def write_harmless_copy(path: Path, copy: Path, types: Path | None = None) -> None:

@@ -152,14 +152,14 @@ def _substitute_variables(text: str) -> str:
     return re.sub(r"\$\{(.+?)\}", lambda match: os.environ.get(match[1], ""), home)
 
 
-def _read_lanes(path: Path) -> list[tuple[str, float, list[tuple[float, float]]]]:
-    """Return edge, length [m] and center line [(x, y), m] of all lanes of a network file."""
-    lanes: list[tuple[str, float, list[tuple[float, float]]]] = []
+def _read_lanes(path: Path) -> list[tuple[str, float, float, list[tuple[float, float]]]]:
+    """Return edge, length [m], speed limit [m/s] and center line [(x, y), m] of all lanes of a network file."""
+    lanes: list[tuple[str, float, float, list[tuple[float, float]]]] = []
 
     def add_lane(attributes: XmlAttributes) -> None:
-        edge, length, shape = (attributes.get(name, "") for name in ("id", "length", "shape"))
+        edge, length, speed, shape = (attributes.get(name, "") for name in ("id", "length", "speed", "shape"))
         line = [tuple(map(float, point.split(",")[:2])) for point in shape.split()]
-        lanes.append((edge.rpartition("_")[0], float(length), [(x, y) for x, y in line]))
+        lanes.append((edge.rpartition("_")[0], float(length), float(speed), [(x, y) for x, y in line]))
 
     XmlReader({"lane": add_lane}).read(path)
     return lanes

@@ -7,7 +7,7 @@ between vehicle types remain. Tuning seeds select the factors, test seeds evalua
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from math import inf
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,8 @@ FACTOR_RANGES: SearchSpace = {
 """factors on the attributes of passenger vehicle types, and on flows"""
 SUMO_TYPE_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
 """defaults of passenger types"""
+SPEED_PERCENTILE, MAX_LIMIT_RATIO = 95, 1.6
+"""percentile of the measured speeds relative to the speed limits, and its maximum: speeds in mph would have 2.2"""
 NORMAL_DISTRIBUTION = re.compile(r"(normc?)\(([^()]*)\)")
 """a speed factor that is drawn for each vehicle"""
 
@@ -129,6 +131,7 @@ def load_corridor(file: str, detectors: Path, begin: float | None = None, end: f
         known = ", ".join(sorted(files.used_types))
         raise InputError(f"{files.path.name}: no vehicle type is a passenger car; its types are {known}")
     row_loops = [_detector_loops(files.network, kind, row) for row in used]
+    _check_speed_unit(files.network, kind, used, detectors.name)
     numbers = {loop: number for number, loop in enumerate(dict.fromkeys(loop for each in row_loops for loop in each))}
     loop_numbers = tuple(tuple(numbers[loop] for loop in each) for each in row_loops)
     end_time = max(row.end for row in used)
@@ -136,9 +139,22 @@ def load_corridor(file: str, detectors: Path, begin: float | None = None, end: f
     return Corridor(files, detectors, first, end_time, tuple(used), excluded, tuple(numbers), loop_numbers)
 
 
+def _check_speed_unit(network: Path, kind: str, rows: Sequence[Measurement], file: str) -> None:
+    """Raise `InputError` if measured speeds are so far above the speed limits that they have another unit."""
+    limits = network_geometry(network).speed_limits
+    edges = [row.place if kind == "edge" else row.place.rpartition("_")[0] for row in rows]
+    ratios = [row.speed / limits[edge] for row, edge in zip(rows, edges, strict=True) if isfinite(row.speed)]
+    ratio = float(np.percentile(ratios, SPEED_PERCENTILE)) if ratios else 0.0
+    if ratio > MAX_LIMIT_RATIO:
+        raise InputError(
+            f"{file}: speed: {ratio:.2g} times the speed limit is not allowed; allowed: m/s, up to {MAX_LIMIT_RATIO:g} "
+            "times the limit; multiply km/h by 0.2778, mph by 0.447"
+        )
+
+
 def _detector_loops(network: Path, kind: str, row: Measurement) -> list[InductionLoop]:
     """Return the loops of a detector; raise `InputError` if the network has no such place."""
-    _, lengths, counts = network_geometry(network)
+    _, lengths, counts, _ = network_geometry(network)
     edge = row.place if kind == "edge" else row.place.rpartition("_")[0]
     all_lanes = [f"{edge}_{number}" for number in range(counts.get(edge, 0))]
     lanes = all_lanes if kind == "edge" else [lane for lane in all_lanes if lane == row.place]

@@ -123,12 +123,14 @@ def network_file(network: RoadNetwork) -> Path:
 
 
 class NetworkGeometry(NamedTuple):
-    """Geometry of a network file, for figures and services; lengths [m]."""
+    """Geometry and speed limits of a network file; lengths [m]."""
 
     lane_lines: Floats
     """center lines of all lanes: rows (x, y) [m], a row of NaN between two lines"""
     edge_lengths: dict[str, float]
     lane_counts: dict[str, int]
+    speed_limits: dict[str, float]
+    """largest of the lanes of an edge [m/s]"""
 
 
 def network_geometry(path: Path) -> NetworkGeometry:
@@ -139,9 +141,10 @@ def network_geometry(path: Path) -> NetworkGeometry:
 @lru_cache(8)
 def _read_geometry(path: Path, stamp: tuple[int, int]) -> NetworkGeometry:
     lanes = read_lanes(path)
-    rows = [point for _, _, points in lanes for point in (*points, (float("nan"), float("nan")))]
-    lengths, counts = {edge: length for edge, length, _ in lanes}, Counter(edge for edge, _, _ in lanes)
-    return NetworkGeometry(np.array(rows, np.float64).reshape(-1, 2), lengths, dict(counts))
+    rows = [point for *_, points in lanes for point in (*points, (float("nan"), float("nan")))]
+    lengths, counts = {edge: length for edge, length, *_ in lanes}, Counter(edge for edge, *_ in lanes)
+    limits = {edge: limit for edge, _, limit, _ in sorted(lanes, key=lambda lane: lane[2])}
+    return NetworkGeometry(np.array(rows, np.float64).reshape(-1, 2), lengths, dict(counts), limits)
 
 
 def _edge_attributes(edge: Edge, speed: float) -> XMLAttributes:

@@ -266,7 +266,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         fields = {"gaps": gaps, "poses": poses, "positions": np.full(edge.shape, np.nan), "limit_speed": limit}
         if not self._route_counts:
             return fields
-        _, lengths, counts = network_geometry(self.road.files.network)
+        _, lengths, counts, _ = network_geometry(self.road.files.network)
         planned: Counter[str] = Counter()  # planned routes, so that the figures of all drivers show the same route
         for edges, count in self._route_counts.items():
             planned.update(dict.fromkeys(edges, count))
