@@ -34,7 +34,7 @@ ALLOWED = {
     "controller": {"adapters", "physics", "drivers", "worlds"},
     "following": {"sumo_files", "physics", "drivers", "scenarios"},
     "reports": {"physics", "drivers", "scenarios", "worlds", "measures"},
-    "learners": {"following"},
+    "models": {"following"},
     "training": {"controller", "reports"},
     "cli": {"controller", "following", "reports"},
     "unjam_paper": {"controller", "following", "reports"},

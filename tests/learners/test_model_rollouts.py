@@ -17,10 +17,12 @@ from unjam.learners.agent import AgentSpec
 from unjam.learners.algorithm import Collector, TaskEpisodes, run_iterations
 from unjam.learners.algorithm_1 import Algorithm1, make_algorithm
 from unjam.learners.learner import Update
-from unjam.learners.model_rollouts import ExperienceFactory, RolloutPlan, RowRollouts, rollout_experience
+from unjam.learners.model_rollouts import ModelRollouts, rollout_experience
 from unjam.learners.settings import AGENT_NAMES, PolicySettings, PPOSettings, SACSettings, TD3Settings, TRPOSettings
 from unjam.models.rollouts import RolloutBatch
+from unjam.models.row_world_model import RowWorldModel
 from unjam.models.settings import ModelSettings
+from unjam.models.world_model import RolloutPlan
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Ring
 from unjam.worlds.episode import Task, run_episode
@@ -49,9 +51,13 @@ def driver_of(network: Network) -> ResidualDriver:
     return ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, POLICY.action_repeat(0.1))
 
 
+def spec_of(model: ModelSettings, gamma: float = 0.99) -> AgentSpec:
+    return AgentSpec([TASK], POLICY, model, gamma, 0)
+
+
 def algorithm_of(agent: str, model: ModelSettings) -> Algorithm1:
     settings = SETTINGS[agent]
-    made = make_algorithm(agent, settings, AgentSpec([TASK], POLICY, model, settings.gamma, 0))
+    made = make_algorithm(agent, settings, spec_of(model, settings.gamma))
     assert isinstance(made, Algorithm1)
     return made
 
@@ -192,7 +198,8 @@ def test_truncated_rollouts_are_bootstrapped(shared: Simulation) -> None:
 def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
     shared: Simulation, rollout_starts: Any, start_episodes: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rollouts = RowRollouts(replace(MODEL, model_ratio=3.0, rollout_starts=rollout_starts), TASK, POLICY, 0)
+    rollouts = ModelRollouts(spec_of(replace(MODEL, model_ratio=3.0, rollout_starts=rollout_starts)))
+    world_model: Any = rollouts.world_model
     network = random_network(INPUTS, scale=0.1)
     driver = ResidualDriver(PISaturation(), network, 1.0, POLICY.inputs, 10)
     for iteration in (1, 2):
@@ -201,17 +208,15 @@ def test_rollouts_start_in_the_set_episodes_with_the_set_ratio(
         ]
         rollouts.learn(episodes, iteration)
     plans, batches = list[RolloutPlan](), list[RolloutBatch]()
-    simulate = rollouts.simulate
+    simulate = world_model.simulate
 
     def recorded(plan: RolloutPlan) -> RolloutBatch:
         plans.append(plan)
         batches.append(simulate(plan))
         return batches[-1]
 
-    monkeypatch.setattr(rollouts, "simulate", recorded)
-    rows = rollouts.roll_out(
-        network, 2, 0, 1, ExperienceFactory(lambda drawn: drawn, lambda _: pytest.fail("rows have no episodes"))
-    )
+    monkeypatch.setattr(world_model, "simulate", recorded)
+    rows = rollouts.roll_out(network, 2)
     assert rows is not None
     (batch,) = batches
     assert rollouts.k_star == 30
@@ -255,7 +260,7 @@ def test_facts_of_the_model_are_complete(shared: Simulation) -> None:
 
 
 def test_state_and_restore_keep_calibrated_humans(shared: Simulation) -> None:
-    one, other = (RowRollouts(MODEL, TASK, POLICY, 0) for _ in range(2))
+    one, other = (RowWorldModel(MODEL, TASK, [1.0], (0,)) for _ in range(2))
     humans = IDMParameters(time_headway=1.3, max_acceleration=0.8)
     one.scenario = replace(RING, humans=humans)
     one.data.add([run_episode(RING, PISaturation(), (0,), backend=SumoBackend(shared))], RING)

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from tests.learners.test_road_rollouts import network_of
 from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError
-from unjam.learners.experience import join_experience, make_experience
-from unjam.learners.model_rollouts import ExperienceFactory, full_policy
+from unjam.learners.agent import AgentSpec
+from unjam.learners.model_rollouts import ModelRollouts, full_policy
 from unjam.learners.settings import PolicySettings
-from unjam.learners.whole_road_rollouts import MotorwayRollouts
 from unjam.models import motorway_model
 from unjam.models.ensemble import torch_generator
 from unjam.models.motorway_model import learned_correction, motorway_samples
 from unjam.models.road_model import RoadModel
 from unjam.models.settings import ModelSettings
+from unjam.models.whole_road_models import MotorwayModel
 from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import MOTORWAY_SCENARIOS, ON_RAMP, Motorway
 from unjam.worlds.batch.motorway.world import MotorwayBatch, ReplayOptions
@@ -32,12 +32,13 @@ TWO_RAMPS = replace(MOTORWAY_SCENARIOS["two-ramps"], horizon=160, peak=(20.0, 16
 EXPERT = driver_from_name("jam-ahead", 1.0)
 POLICY = PolicySettings(hidden=(8,), inputs=("local",), action_duration=5.0, exploration="antithetic")
 MODEL = ModelSettings(kind="road", rollout_starts="first", k_max=160, model_ratio=1.0, max_fit_rows=2000)
-FACTORY = ExperienceFactory(
-    lambda drawn: drawn,
-    lambda episodes: join_experience(
-        [make_experience(each.trajectories, np.zeros((len(each.trajectories), 0))) for each in episodes]
-    ),
-)
+TASK = Task(ROAD, EXPERT)
+
+
+def rollouts_of(settings: ModelSettings, task: Task = TASK) -> tuple[ModelRollouts, MotorwayModel]:
+    model_rollouts = ModelRollouts(AgentSpec([task], POLICY, settings, 0.99, 0))
+    assert isinstance(model_rollouts.world_model, MotorwayModel)
+    return model_rollouts, model_rollouts.world_model
 
 
 @pytest.fixture(scope="module")
@@ -105,27 +106,27 @@ def test_base_predicts_drivers_without_errors_except_for_their_memory() -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("short_sample_interval")
 def test_rollouts_have_the_set_ratio_in_antithetic_pairs(batch_episodes: list[Episode]) -> None:
-    task = Task(ROAD, EXPERT)
-    model_rollouts = MotorwayRollouts(replace(MODEL, model_ratio=2.0), task, POLICY, 0)
+    model_rollouts, model = rollouts_of(replace(MODEL, model_ratio=2.0))
     model_rollouts.learn(batch_episodes, 1)
     assert model_rollouts.k_star == 160
     network = replace(network_of(0.05, POLICY), episode_noise=True)
-    found = model_rollouts.roll_out(network, 1, 0, 1, FACTORY)
+    found = model_rollouts.roll_out(network, 1)
     assert found is not None
     assert model_rollouts.model_steps == 2 * len(batch_episodes) * 160
     assert model_rollouts.facts["return_model"] == pytest.approx(model_rollouts.facts["return_environment"], rel=0.1)
     assert model_rollouts.facts["crash_share"] == 0.0
     facts, tensors = model_rollouts.state()
-    other = MotorwayRollouts(replace(MODEL, model_ratio=2.0), task, POLICY, 0)
+    other, _ = rollouts_of(replace(MODEL, model_ratio=2.0))
     other.restore(facts, tensors)
-    other._first_new_episode, other.k_star = 0, model_rollouts.k_star
-    repeated = other.roll_out(network, 1, 0, 1, FACTORY)
+    other.k_star, other._first_new_episode = model_rollouts.k_star, 0
+    other._new_steps = model_rollouts._new_steps
+    repeated = other.roll_out(network, 1)
     assert repeated is not None
     np.testing.assert_array_equal(repeated.observations, found.observations)
     np.testing.assert_array_equal(repeated.rewards, found.rewards)
-    driver = full_policy(task, POLICY, network)
+    driver = full_policy(TASK, POLICY, network)
     seeds = [((1,), (2,)), ((1,), (2,))]
-    one, antithetic = model_rollouts.simulate(driver, model_rollouts.samples[:1] * 2, 20, None, seeds, [1.0, -1.0])
+    one, antithetic = model.simulate(driver, model.samples[:1] * 2, 20, None, seeds, [1.0, -1.0])
     first, second = one.trajectories[0], antithetic.trajectories[0]
     without = network(first.observations[:1])
     assert first.residual[0] + second.residual[0] == pytest.approx(2.0 * without[0])
@@ -133,13 +134,13 @@ def test_rollouts_have_the_set_ratio_in_antithetic_pairs(batch_episodes: list[Ep
 
 @pytest.mark.usefixtures("short_sample_interval")
 def test_shorter_rollouts_are_more_and_none_without_cavs(batch_episodes: list[Episode]) -> None:
-    model_rollouts = MotorwayRollouts(replace(MODEL, k_max=80), Task(ROAD, EXPERT), POLICY, 0)
+    model_rollouts, _ = rollouts_of(replace(MODEL, k_max=80))
     model_rollouts.learn(batch_episodes[:2], 1)
     network = replace(network_of(0.05, POLICY), episode_noise=True)
-    assert model_rollouts.roll_out(network, 1, 0, 1, FACTORY) is not None
+    assert model_rollouts.roll_out(network, 1) is not None
     assert model_rollouts.model_steps == 2 * 160
     model_rollouts.k_star = 5
-    assert model_rollouts.roll_out(network, 2, 0, 64, FACTORY) is None
+    assert model_rollouts.roll_out(network, 2, 0, 64) is None
 
 
 def test_antithetic_pairs_are_held_out_together(batch_episodes: list[Episode], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,8 +174,7 @@ def test_base_none_predicts_constant_speed() -> None:
 def test_networks_are_used_only_if_the_base_is_wrong(batch_episodes: list[Episode]) -> None:
     others = {"time_headways": (1.6, 1.6), "accelerations": (0.73, 0.73), "decelerations": (1.67, 1.67)}
     for humans, learned in (({}, []), (others, ["speed"])):
-        model_rollouts = MotorwayRollouts(replace(MODEL, epochs=60), Task(ROAD, EXPERT), POLICY, 0)
-        model_rollouts.scenario = replace(ROAD, **humans)
+        model_rollouts, _ = rollouts_of(replace(MODEL, epochs=60), Task(replace(ROAD, **humans), EXPERT))
         model_rollouts.learn(batch_episodes, 1)
         assert model_rollouts.facts["learned_targets"] == learned
 
@@ -183,7 +183,7 @@ def test_networks_are_used_only_if_the_base_is_wrong(batch_episodes: list[Episod
 @pytest.mark.usefixtures("short_sample_interval")
 def test_networks_without_base_learn_car_following(batch_episodes: list[Episode]) -> None:
     settings = replace(MODEL, base="none", epochs=60)
-    model_rollouts = MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
+    model_rollouts, _ = rollouts_of(settings)
     model_rollouts.learn(batch_episodes, 1)
     step = model_rollouts.facts["one_step"]["speed"]
     assert model_rollouts.facts["learned_targets"] == ["speed"]
@@ -201,7 +201,7 @@ def test_networks_without_base_learn_car_following(batch_episodes: list[Episode]
 )
 def test_unsupported_settings_are_refused(settings: ModelSettings, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        MotorwayRollouts(settings, Task(ROAD, EXPERT), POLICY, 0)
+        rollouts_of(settings)
 
 
 @pytest.mark.long

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +12,13 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.sensors import Sensors
-from unjam.learners.experience import Experience, make_experience
-from unjam.learners.model_rollouts import ExperienceFactory, full_policy
+from unjam.learners.agent import AgentSpec
+from unjam.learners.model_rollouts import ModelRollouts, full_policy
 from unjam.learners.settings import PolicySettings
-from unjam.learners.whole_road_rollouts import RoadRollouts
 from unjam.models.comparison import ReplayDriver
 from unjam.models.road_model import base_human_model
 from unjam.models.settings import ModelSettings
+from unjam.models.whole_road_models import ClosedRoadModel
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.ring import LoopScenario
 from unjam.worlds.batch.run import run_batch
@@ -46,26 +45,16 @@ def network_of(exploration_std: float, policy: PolicySettings = POLICY) -> Netwo
     return Network(tuple(layers), 1.0, exploration_std)
 
 
-def experience_factory(road: LoopScenario) -> ExperienceFactory:
-    """Convert episodes to experience, with the drawn values as inputs of the critic."""
-
-    def of_episodes(episodes: Sequence[Episode]) -> Experience:
-        pairs = [(episode, each) for episode in episodes for each in episode.trajectories]
-        drawn = np.array([road.scale_drawn_values(episode.drawn_values) for episode, _ in pairs])
-        return make_experience([each for _, each in pairs], drawn)
-
-    return ExperienceFactory(lambda drawn: drawn, of_episodes)
-
-
-def learned_rollouts(road: LoopScenario, network: Network) -> tuple[RoadRollouts, list[Episode]]:
-    """A model that is fitted to four episodes, and these."""
+def learned_rollouts(road: LoopScenario, network: Network) -> tuple[ModelRollouts, ClosedRoadModel, list[Episode]]:
+    """Rollouts of a model that is fitted to four episodes, this model, and these episodes."""
     task = Task(road, PISaturation())
-    model_rollouts = RoadRollouts(MODEL, task, POLICY, 0)
+    model_rollouts = ModelRollouts(AgentSpec([task], POLICY, MODEL, 0.99, 0))
     driver = full_policy(task, POLICY, network)
     tasks = [EpisodeTask(road, driver, (seed,), explore=True) for seed in range(4)]
     episodes = run_batch(tasks, allow_statistical=True)
     model_rollouts.learn(episodes, 1)
-    return model_rollouts, episodes
+    assert isinstance(model_rollouts.world_model, ClosedRoadModel)
+    return model_rollouts, model_rollouts.world_model, episodes
 
 
 @pytest.mark.long
@@ -73,14 +62,14 @@ def learned_rollouts(road: LoopScenario, network: Network) -> tuple[RoadRollouts
     "road", [RING, replace(RING, warmup=300), EIGHT], ids=["a ring", "a ring with a wave", "a figure eight"]
 )
 def test_rollouts_without_noise_equal_the_recording(road: LoopScenario) -> None:
-    model_rollouts, episodes = learned_rollouts(replace(road, noise=0.0), network_of(0.0))
+    _, model, episodes = learned_rollouts(replace(road, noise=0.0), network_of(0.0))
     humans = base_human_model("idm", road)
     memory = ReplayDriver(np.zeros((0, 2))).initial_memory(2)
     for recording, start_step in ((0, 0), (2, 130), (4, 20), (6, 290)):  # each with the next one, two CAVs
         accelerations = [
-            model_rollouts.data.recordings[row].applied_acceleration[start_step:] for row in (recording, recording + 1)
+            model.data.recordings[row].applied_acceleration[start_step:] for row in (recording, recording + 1)
         ]
-        (found,) = model_rollouts.simulate(
+        (found,) = model.simulate(
             *(ReplayDriver(np.stack(accelerations, 1)), memory, np.array([[recording, start_step]])),
             CONTROL_STEPS,
             humans,
@@ -93,9 +82,9 @@ def test_rollouts_without_noise_equal_the_recording(road: LoopScenario) -> None:
 
 def test_rollouts_continue_with_the_recorded_memory() -> None:
     network = network_of(0.0)
-    model_rollouts, episodes = learned_rollouts(replace(RING, noise=0.0), network)
+    model_rollouts, _, episodes = learned_rollouts(replace(RING, noise=0.0), network)
     model_rollouts.k_star = CONTROL_STEPS
-    found = model_rollouts.roll_out(network, 1, 0, 1, experience_factory(RING))
+    found = model_rollouts.roll_out(network, 1)
     assert found is not None
     recorded = [each.actions_and_rewards[1] for episode in episodes for each in episode.trajectories]
     equal_count = 0
@@ -109,8 +98,8 @@ def test_rollouts_continue_with_the_recorded_memory() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("road", [RING, INEXACT, EIGHT], ids=["exact sensors", "wrong sensors", "a figure eight"])
 def test_rollouts_with_noise_have_the_returns_of_the_road(road: LoopScenario) -> None:
-    model_rollouts, _ = learned_rollouts(road, network_of(0.05))
-    found = model_rollouts.roll_out(network_of(0.05), 1, 0, 1, experience_factory(road))
+    model_rollouts, _, _ = learned_rollouts(road, network_of(0.05))
+    found = model_rollouts.roll_out(network_of(0.05), 1)
     assert found is not None
     assert len(found.rewards) == 2 * 4 * 400 / 10
     assert found.observations.shape[1] == observation_size(POLICY.inputs, PISaturation()) + 1
@@ -121,23 +110,23 @@ def test_rollouts_with_noise_have_the_returns_of_the_road(road: LoopScenario) ->
 
 
 def test_each_rollout_has_its_own_sensor_errors() -> None:
-    model_rollouts, _ = learned_rollouts(replace(INEXACT, noise=0.0), network_of(0.0))
+    _, model, _ = learned_rollouts(replace(INEXACT, noise=0.0), network_of(0.0))
     starts, humans = np.array([[0, 0], [0, 0]]), base_human_model("idm", RING)
-    one, other = model_rollouts.simulate(IDM(), {}, starts, CONTROL_STEPS, humans, (1,))
+    one, other = model.simulate(IDM(), {}, starts, CONTROL_STEPS, humans, (1,))
     assert np.abs(one.speeds - other.speeds).max() > 0.01
 
 
 def test_too_short_k_star_gives_no_rollouts() -> None:
-    model_rollouts, _ = learned_rollouts(RING, network_of(0.0))
+    model_rollouts, _, _ = learned_rollouts(RING, network_of(0.0))
     model_rollouts.k_star = 9
-    assert model_rollouts.roll_out(network_of(0.0), 1, 0, 1, experience_factory(RING)) is None
+    assert model_rollouts.roll_out(network_of(0.0), 1) is None
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("road", [RING, EIGHT], ids=["a ring", "a figure eight"])
 def test_state_and_restore_keep_samples_and_noise(road: LoopScenario) -> None:
-    one, _ = learned_rollouts(road, network_of(0.05))
-    other = RoadRollouts(MODEL, Task(road, PISaturation()), POLICY, 0)
+    _, one, _ = learned_rollouts(road, network_of(0.05))
+    other = ClosedRoadModel(MODEL, Task(road, PISaturation()), [1.0], (0,))
     facts, tensors = one.state()
     other.restore(json.loads(json.dumps(facts)), tensors)
     assert len(other.samples) == 4
@@ -145,4 +134,4 @@ def test_state_and_restore_keep_samples_and_noise(road: LoopScenario) -> None:
         np.testing.assert_array_equal(restored.speeds, stored.speeds)
         assert restored.size == stored.size
         np.testing.assert_equal(restored.crossing_memory, stored.crossing_memory)
-    assert float(other.model.noise) == float(one.model.noise) > 0.0
+    assert float(other.ensemble.noise) == float(one.ensemble.noise) > 0.0

@@ -4,18 +4,15 @@ import pytest
 from tests.conftest import random_network
 from tests.models.toy_dynamics import RING, ToyDynamics, environment_data
 from unjam.drivers import IDM, ResidualDriver
-from unjam.models.comparison import (
-    mean_returns,
-    one_step_errors,
-    open_loop_errors,
-    recorded_states,
-    replay_accelerations,
-)
+from unjam.models.comparison import one_step_errors, open_loop_errors, recorded_states, replay_accelerations
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import EnvironmentData
 from unjam.models.rollouts import prepare_starts, roll_out
 from unjam.models.row_model import STATE_FIELDS, RowModel, fit_row_model
+from unjam.models.row_world_model import RowWorldModel
 from unjam.models.settings import ModelSettings
+from unjam.models.world_model import RolloutPlan
+from unjam.worlds.episode import Task
 
 DRIVER = ResidualDriver(IDM(), random_network(), 1.0, action_repeat=3)
 SETTINGS = ModelSettings(members=3, hidden=(32,), epochs=20, batch_size=128, learning_rate=1e-2)
@@ -109,10 +106,10 @@ def returns_of(driver: ResidualDriver, world: ToyDynamics, data: EnvironmentData
     indices = data.start_indices(20)
     starts = prepare_starts(data, indices, driver.expert, "cpu")
     rollouts = roll_out(driver, world, starts, 20, torch_generator((1,), "cpu"))
-    model, environment = mean_returns(rollouts.rewards.sum(1).double().numpy(), indices, data, control_steps=18)
-    assert model is not None
-    assert environment is not None
-    return model, environment
+    world_model = RowWorldModel(ModelSettings(), Task(RING, driver.expert), [1.0], (0,))
+    world_model.data = data
+    recorded = world_model.recorded_returns(RolloutPlan(driver, indices, 18, (0,), (0,)), 0)
+    return float(rollouts.rewards.sum(1).double().mean()), float(recorded.mean())
 
 
 def test_exact_dynamics_have_the_returns_of_the_environment() -> None:

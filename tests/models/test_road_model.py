@@ -8,14 +8,8 @@ import torch
 from unjam.drivers import PISaturation
 from unjam.errors import InputError
 from unjam.models.ensemble import ModelFit, torch_generator
-from unjam.models.road_model import (
-    RoadModel,
-    base_human_model,
-    check_road_model,
-    fit_road_model,
-    learned_human_model,
-    road_samples,
-)
+from unjam.models.registry import world_model_class
+from unjam.models.road_model import RoadModel, base_human_model, fit_road_model, learned_human_model, road_samples
 from unjam.models.settings import ModelSettings
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.ring import LoopScenario
@@ -102,8 +96,9 @@ def test_samples_are_recorded_states_and_next_states(episodes: list[Episode]) ->
     [(Merge(), "merge is not a ring"), (replace(RING, steps_per_control_step=2), "steps_per_control_step is 2")],
 )
 def test_unsupported_roads_are_refused(road: Any, why: str) -> None:
+    settings = ModelSettings(kind="road")
     with pytest.raises(InputError, match=f"model.kind: road is not allowed; allowed: row, for .*{why}"):
-        check_road_model(road, ModelSettings(kind="road"))
+        world_model_class(road, settings).check(road, settings)
 
 
 def test_learned_human_model_on_tensors_equals_arrays(episodes: list[Episode]) -> None:

@@ -7,7 +7,6 @@ environment experience and D_v model experience, k* the rollout length of Eq. 15
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import torch
@@ -15,14 +14,10 @@ import torch
 from unjam.drivers.network import Network
 from unjam.learners.agent import AgentSpec, is_algorithm, make_agent
 from unjam.learners.algorithm import Algorithm, Collector, IterationLog, Tensors, seed_iteration, tensors_with_prefix
-from unjam.learners.experience import Experience, environment_experience, join_experience, task_experience
+from unjam.learners.experience import Experience, environment_experience, join_experience
 from unjam.learners.learner import Learner, Update, policy_distance
-from unjam.learners.model_rollouts import ExperienceFactory, ModelRollouts, RowRollouts
+from unjam.learners.model_rollouts import ModelRollouts
 from unjam.learners.settings import LearnerSettings
-from unjam.learners.whole_road_rollouts import MotorwayRollouts, RoadRollouts
-from unjam.models.settings import ModelSettings
-from unjam.scenarios.motorway import Motorway
-from unjam.worlds.episode import Task
 
 MAX_COMPARED_ROWS = 2000
 """maximum number of visited states at which the policy is compared before and after an update"""
@@ -34,11 +29,8 @@ class Algorithm1:
     def __init__(self, spec: AgentSpec, learner: Learner) -> None:
         """Line 1: pi_theta and its value network, in `learner`; pi_H is the tasks'. Line 2: T and an empty D_a."""
         self.spec, self.learner = spec, learner
-        tasks = enumerate(spec.tasks if spec.model.model_ratio > 0 else ())
-        self.model_rollouts: list[ModelRollouts[Any]] = [
-            model_rollouts_class(spec.model, task)(spec.model, task, spec.policy, spec.seed, index)
-            for index, task in tasks
-        ]
+        tasks = range(len(spec.tasks) if spec.model.model_ratio > 0 else 0)
+        self.model_rollouts = [ModelRollouts(spec, index) for index in tasks]
         """of each task, with its model and D_a; empty: model-free"""
 
     def network(self) -> Network:
@@ -91,7 +83,7 @@ class Algorithm1:
         log |= {"eps_pi_mean": float(eps_pi.mean()), "eps_pi_max": float(eps_pi.max())}
         for each in model_rollouts:
             eps_m = each.facts["eps_m_by_estimator"]["transitions"]
-            each.facts["bound"] = each.bound(each.k_star, log["eps_pi_max"], eps_m, self.spec.gamma)
+            each.facts["bound"] = each.bound(each.k_star, log["eps_pi_max"], eps_m)
         model_steps = sum(each.model_steps for each in model_rollouts)
         return IterationLog(log, model_steps, [each.facts for each in model_rollouts], seconds)
 
@@ -111,12 +103,8 @@ class Algorithm1:
 
     def _model_experience(self, iteration: int, part: int, parts: int) -> Experience | None:
         """Return one of `parts` of the experience of the present policy in all models, if there is any."""
-        network, results = self.network(), []
-        for index, each in enumerate(self.model_rollouts):
-            factory = ExperienceFactory(
-                partial(self.spec.privileged_inputs, index), partial(task_experience, self.spec, index)
-            )
-            results.append(each.roll_out(network, iteration, part, parts, factory))
+        network = self.network()
+        results = [each.roll_out(network, iteration, part, parts) for each in self.model_rollouts]
         rows = [each for each in results if each is not None]
         return join_experience(rows) if rows else None
 
@@ -139,13 +127,6 @@ def make_algorithm(agent: str, settings: LearnerSettings, spec: AgentSpec) -> Al
     """Return the algorithm of an agent: the user's own, or Algorithm 1 with the learner."""
     made = make_agent(agent, settings, spec)
     return made if is_algorithm(made) else Algorithm1(spec, made)
-
-
-def model_rollouts_class(model: ModelSettings, task: Task) -> type[ModelRollouts[Any]]:
-    """Return the kind of model rollouts for a task with these settings."""
-    if model.kind == "row":
-        return RowRollouts
-    return MotorwayRollouts if isinstance(task.scenario, Motorway) else RoadRollouts
 
 
 @contextmanager

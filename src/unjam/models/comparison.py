@@ -1,6 +1,5 @@
 """Comparison of model and environment: replayed accelerations, one-step errors, returns, and waves."""
 
-import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -97,19 +96,3 @@ def one_step_errors(model: RowModel, transitions: Transitions, scenario: Scenari
     inputs = torch.as_tensor(model_inputs(transitions.states, transitions.acceleration, transitions.drawn_values))
     predictions = model.member_predictions(inputs.to(model.input_mean.device))
     return OneStepErrors(targets, predictions * model.output_mask.cpu().numpy(), change)
-
-
-def mean_returns(
-    model_returns: Floats, start_indices: StartIndices, data: EnvironmentData, control_steps: int
-) -> tuple[float, float] | tuple[None, None]:
-    """Return the mean of `model_returns`, (n,), and that of the recorded returns from the same starts.
-
-    The comparison is fair if the same policy drove both, with exploration. Returns are undiscounted sums of rewards up
-    to the last step or a crash. Rows with fewer than `control_steps` recorded steps are skipped; None if none is left.
-    """
-    rewards = [data.recordings[index].reward[at : at + control_steps] for index, at in start_indices]
-    is_complete = [len(each) == control_steps for each in rewards]
-    if not any(is_complete):
-        return None, None
-    environment = np.array([each.sum() for each in itertools.compress(rewards, is_complete)])
-    return float(model_returns[is_complete].mean()), float(environment.mean())

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
-from unjam.errors import InputError
 from unjam.models.ensemble import (
     MIN_CHANGE,
     Ensemble,
@@ -36,7 +35,6 @@ from unjam.models.row_model import BASE_DRIVERS
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Array, clamp_min
 from unjam.physics.kinematics import gap_on_loop, next_speed
-from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
@@ -48,7 +46,6 @@ from unjam.worlds.batch.figure_eight.crossing import (
 )
 from unjam.worlds.batch.human_idm import HumanSpeedModel, human_idm_speed
 from unjam.worlds.batch.motorway.traffic import LearnedCorrection
-from unjam.worlds.batch.support import statistically_unsupported_reason
 from unjam.worlds.record import Episode, Floats
 
 ROAD_MODEL_INPUTS = 4
@@ -82,22 +79,6 @@ class RoadSamples:
     """speeds after that step"""
     crossing_memory: CrossingMemory | None
     """waiting times and entry steps on a road that crosses itself"""
-
-
-def check_road_model(scenario: Scenario, settings: ModelSettings) -> None:
-    """Raise `InputError` if the road model does not support a scenario with these settings."""
-    reason = statistically_unsupported_reason(scenario)
-    if isinstance(scenario, LoopScenario) and scenario.steps_per_control_step > 1:
-        reason = f"{scenario.title}: steps_per_control_step is {scenario.steps_per_control_step}"
-    if reason:
-        raise InputError(f"model.kind: road is not allowed; allowed: row, for {reason}")
-    for setting, is_allowed, allowed in (
-        (f"rollout_starts: {settings.rollout_starts}", settings.rollout_starts == "first", "first"),
-        (f"base: {settings.base}", settings.base in ("idm", "none"), "idm, each vehicle's own driver model, or none"),
-        ("calibrate_base: true", not settings.calibrate_base, "false"),
-    ):
-        if isinstance(scenario, Motorway) and not is_allowed:
-            raise InputError(f"model.{setting} is not allowed; allowed: {allowed}, on on-ramps")
 
 
 def with_size(scenario: LoopScenario, size: int) -> LoopScenario:

@@ -69,6 +69,7 @@ class Motorway(Scenario):
 
     title: ClassVar[str] = "motorway"
     reward: ClassVar[str] = "travel-time"
+    road_model: ClassVar[str] = "motorway"
     is_closed: ClassVar[bool] = False
 
     length: Section = 3000.0

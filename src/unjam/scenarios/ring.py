@@ -56,6 +56,7 @@ class LoopScenario(Scenario):
     """of the road, with braces for the sizes"""
     limit_description: ClassVar[str]
     """definition of its limit speed"""
+    road_model: ClassVar[str] = "closed"
     is_first_leading: ClassVar[bool] = False
     """whether vehicle 0 leads the queue; otherwise it is the last one"""
 

@@ -124,6 +124,8 @@ class Scenario:
     """the default reward"""
     is_closed: ClassVar[bool] = True
     """whether the road is a loop"""
+    road_model: ClassVar[str] = ""
+    """its world model of whole roads, a key of `unjam.models.registry`; empty: none"""
     has_coordinate: ClassVar[bool] = True
     """whether vehicles have a position along the road"""
     has_vehicle_types: ClassVar[bool] = False

@@ -14,15 +14,15 @@ import torch
 
 from unjam.errors import InputError, resume_hint
 from unjam.files import atomic_write, to_json
+from unjam.learners.agent import AgentSpec
 from unjam.learners.algorithm import tensors_with_prefix
-from unjam.learners.algorithm_1 import model_rollouts_class
-from unjam.learners.model_rollouts import RowRollouts
-from unjam.learners.whole_road_rollouts import WholeRoadRollouts
+from unjam.learners.model_rollouts import ModelRollouts
 from unjam.models.comparison import one_step_errors, open_loop_errors, recorded_states, replay_accelerations
 from unjam.models.ensemble import root_mean_square
 from unjam.models.row_model import STATE_FIELDS, TARGET_NAMES, OneStepErrors, RowModel
+from unjam.models.whole_road_models import WholeRoadModel
+from unjam.models.world_model import WorldModel
 from unjam.reports.results import MODEL_FILE, read_model_facts, read_progress
-from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.run_folder import load_checkpoint
 from unjam.worlds.batch.run import run_batch
@@ -88,14 +88,14 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     torch.set_num_threads(1)  # small networks are slower with more threads
     state, tensors = checkpoint
     settings = replace(config.model, device="cpu")
-    (task,) = config.make_tasks()
-    rollouts = model_rollouts_class(settings, task)(settings, task, config.policy, config.seed)
+    spec = AgentSpec(config.make_tasks(), config.policy, settings, config.learner.gamma, config.seed)
+    rollouts = ModelRollouts(spec)
     rollouts.restore(state["algorithm"][rollouts.name], tensors_with_prefix(f"algorithm/{rollouts.name}/", tensors))
     facts = {"iteration": state["iteration"], "base": settings.base, "members": settings.members}
     if settings.kind == "road":
         run = _run_in_batch if config.backend == "batch" else partial(_run_alone, config.backend)
-        return _round_values(facts | cast(WholeRoadRollouts[Any], rollouts).waves(run))
-    return _round_values(facts | _row_facts(cast(RowRollouts, rollouts), config, progress[-1]))
+        return _round_values(facts | cast(WholeRoadModel[Any], rollouts.world_model).waves(run))
+    return _round_values(facts | _row_facts(rollouts, config, progress[-1]))
 
 
 def _run_in_batch(task: EpisodeTask) -> Episode:
@@ -106,20 +106,20 @@ def _run_alone(backend: str, task: EpisodeTask) -> Episode:
     return run_episode(task.scenario, task.driver, task.seed, backend=backend)
 
 
-def _row_facts(rollouts: RowRollouts, config: RunConfig, progress_row: dict[str, Any]) -> dict[str, Any]:
+def _row_facts(rollouts: ModelRollouts, config: RunConfig, progress_row: dict[str, Any]) -> dict[str, Any]:
     """Return the errors of the row model on holdout episodes."""
-    scenario, generator = rollouts.scenario, np.random.default_rng(config.seed)
-    transitions = rollouts.data.transitions(config.model.holdout)
+    model, generator = rollouts.world_model, np.random.default_rng(config.seed)
+    scenario, transitions = model.scenario, model.data.transitions(config.model.holdout)
     holdout = transitions.select(generator.permutation(np.flatnonzero(transitions.is_holdout))[:MAX_ERROR_ROWS])
-    errors = one_step_errors(rollouts.model, holdout, scenario, config.reward)
+    errors = one_step_errors(model.ensemble, holdout, scenario, config.reward)
     return {
         "control_step": scenario.control_step,
         "k_star": progress_row["k_star"],
         "validation_steps": int(transitions.is_holdout.sum()),
         "one_step": {name: each._asdict() for name, each in errors.rmse_by_target().items()},
         "by_state": {name: _errors_by_bin(getattr(holdout.states, name), errors) for name in BINNED_FIELDS},
-        "replay": _replay_facts(rollouts, scenario, generator),
-        "bound": _bound_facts(rollouts, progress_row, config.learner.gamma),
+        "replay": _replay_facts(model, generator),
+        "bound": _bound_facts(rollouts, progress_row),
     }
 
 
@@ -152,15 +152,15 @@ def replay_length(trip_lengths: Sequence[int]) -> int:
     return min(MAX_REPLAY_STEPS, max(1, int(np.median(trip_lengths)) // 2))
 
 
-def _replay_facts(rollouts: RowRollouts, scenario: Scenario, generator: np.random.Generator) -> dict[str, Any]:
+def _replay_facts(world_model: WorldModel[RowModel, Any], generator: np.random.Generator) -> dict[str, Any]:
     """Return the errors of replays of recorded accelerations in the model without noise, and some examples."""
-    data, model = rollouts.data, rollouts.model
-    masks = data.holdout_masks(rollouts.settings.holdout)
+    data, model, scenario = world_model.data, world_model.ensemble, world_model.scenario
+    masks = data.holdout_masks(world_model.settings.holdout)
     steps = replay_length([int(mask.sum()) for mask in masks if mask.any()])
     starts = data.start_indices(steps)
     starts = starts[[masks[recording][index] for recording, index in starts]]
     starts = starts[np.sort(generator.permutation(len(starts))[:MAX_REPLAYS])]
-    single = replace(rollouts.settings, members=1, error_estimator="unexplained_variance")
+    single = replace(world_model.settings, members=1, error_estimator="unexplained_variance")
     base_model = RowModel(single, len(scenario.drawn_ranges), (0,))
     times = np.unique(np.linspace(0, steps - 1, MAX_REPLAY_TIMES).round().astype(int))
     errors, base_errors = (open_loop_errors(each, data, starts, steps, scenario) for each in (model, base_model))
@@ -197,20 +197,20 @@ def _replay_facts(rollouts: RowRollouts, scenario: Scenario, generator: np.rando
     }
 
 
-def _bound_facts(rollouts: RowRollouts, progress_row: dict[str, Any], gamma: float) -> dict[str, Any] | None:
+def _bound_facts(rollouts: ModelRollouts, progress_row: dict[str, Any]) -> dict[str, Any] | None:
     """Return the bound C by rollout length for the newest row of progress; None without eps_m or eps_pi."""
     eps_m = progress_row["model"]["eps_m_by_estimator"].get("transitions")
     eps_pi = progress_row["learner"].get("eps_pi_max")
     if eps_m is None or eps_pi is None:
         return None
-    discount = rollouts.step_discount(gamma)
+    max_reward = rollouts.world_model.max_reward
     return {
         "eps_pi": eps_pi,
         "eps_m": eps_m,
-        "max_reward": rollouts.max_reward,
-        "largest_return": rollouts.max_reward / (1.0 - discount),
+        "max_reward": max_reward,
+        "largest_return": max_reward / (1.0 - rollouts.step_discount),
         "k": ROLLOUT_LENGTHS,
-        "bound": [rollouts.bound(k, eps_pi, eps_m, gamma) for k in ROLLOUT_LENGTHS],
+        "bound": [rollouts.bound(k, eps_pi, eps_m) for k in ROLLOUT_LENGTHS],
     }
 
 

@@ -70,9 +70,9 @@ def check_config(config: RunConfig) -> None:
         if config.model.model_ratio > 0 and config.model.kind == "row":
             _check_row_model(task, scenario, expert)
         elif config.model.model_ratio > 0:
-            from unjam.models.road_model import check_road_model  # which needs torch
+            from unjam.models.registry import world_model_class  # which needs torch
 
-            check_road_model(scenario, config.model)
+            world_model_class(scenario, config.model).check(scenario, config.model)
     config.make_tasks()
     if is_file_reference(config.agent):
         from unjam.learners.agent import check_agent  # its file may import torch

@@ -1,32 +1,33 @@
-"""Model rollouts on whole roads: closed roads continue from recorded states, on-ramps are replayed from the start."""
+"""World models of whole roads: closed roads continue from recorded states, motorways are replayed from the start."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import nan
-from typing import Any, ClassVar, Generic, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import EXPERT_KEY
-from unjam.learners.experience import Experience, join_experience
-from unjam.learners.model_rollouts import FIT_SEED, ExperienceFactory, ModelRollouts, RolloutPlan, RolloutResult
+from unjam.errors import InputError
 from unjam.models.comparison import ReplayDriver
 from unjam.models.ensemble import ModelFit, Seed, torch_generator
-from unjam.models.environment_data import EnvironmentData, StartIndices, is_holdout_episode, reconstruct_memory
+from unjam.models.environment_data import StartIndices, is_holdout_episode, reconstruct_memory
 from unjam.models.motorway_model import MotorwaySamples, fit_motorway_model, learned_correction, motorway_samples
 from unjam.models.road_model import (
     RoadModel,
     RoadSamples,
     base_human_model,
-    check_road_model,
     fit_road_model,
     learned_human_model,
     road_samples,
     with_size,
 )
+from unjam.models.settings import ModelSettings
+from unjam.models.world_model import RolloutPlan, Rollouts, StartRequest, WorldModel
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
+from unjam.scenarios.scenario import Scenario
 from unjam.tree import map_leaves
 from unjam.worlds.batch.figure_eight.crossing import CrossingMemory
 from unjam.worlds.batch.human_idm import HumanSpeedModel
@@ -34,7 +35,7 @@ from unjam.worlds.batch.motorway.traffic import LearnedCorrection
 from unjam.worlds.batch.motorway.world import MotorwayBatch, ReplayOptions
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
-from unjam.worlds.batch.support import BATCH_KINDS
+from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason
 from unjam.worlds.drive import DriveLoop, finish_drive
 from unjam.worlds.episode import add_reward_terms
 from unjam.worlds.record import Episode, Floats
@@ -47,22 +48,24 @@ Facts = dict[str, Any]
 SamplesT = TypeVar("SamplesT", RoadSamples, MotorwaySamples)
 
 
-class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
-    """The learned model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
+class WholeRoadModel(WorldModel[RoadModel, SamplesT]):
+    """A world model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        check_road_model(self.scenario, self.settings)
-        self.samples: list[SamplesT] = []
-        """samples of the episodes in D_a, the oldest first"""
+    @classmethod
+    def check(cls, scenario: Scenario, settings: ModelSettings) -> None:
+        """Raise `InputError` if the batch simulator does not support the scenario."""
+        reason = statistically_unsupported_reason(scenario)
+        if scenario.is_closed and scenario.steps_per_control_step > 1:
+            reason = f"{scenario.title}: steps_per_control_step is {scenario.steps_per_control_step}"
+        if reason:
+            raise InputError(f"model.kind: road is not allowed; allowed: row, for {reason}")
 
-    def _new_model(self) -> RoadModel:
-        return RoadModel(self.settings, self._seed(FIT_SEED))
+    def new_ensemble(self) -> RoadModel:
+        """Return the ensemble before any fit."""
+        return RoadModel(self.settings, self.seed)
 
-    def _sample_episode(self, episode: Episode, number: int) -> SamplesT:
-        raise NotImplementedError
-
-    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+    def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+        """Yield the episodes of a plan without rewards, batch by batch."""
         raise NotImplementedError
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
@@ -72,53 +75,46 @@ class WholeRoadRollouts(ModelRollouts[RoadModel], Generic[SamplesT]):
         """
         raise NotImplementedError
 
-    def _run(self, plan: RolloutPlan, experience_factory: ExperienceFactory) -> RolloutResult:
-        steps, returns, crashed, parts = 0, list[float](), list[bool](), list[Experience]()
-        reward = make_reward(self._task.reward or self.scenario.reward)
-        for batch in self._simulate_batches(plan):
+    def roll_out(self, plan: RolloutPlan) -> Iterator[Rollouts]:
+        """Yield the rollouts of a plan, batch by batch."""
+        reward = make_reward(self.task.reward or self.scenario.reward)
+        for batch in self.simulate_batches(plan):
             episodes = [add_reward_terms(episode, reward) for episode in batch]
-            steps += sum(episode.control_steps for episode in episodes)
-            returns += [float(episode.reward.sum()) for episode in episodes]
-            crashed += [episode.status == "collision" for episode in episodes]
-            if any(episode.trajectories for episode in episodes):
-                parts.append(experience_factory.from_episodes(episodes))
-        experience = join_experience(parts) if parts else None
-        return RolloutResult(experience, steps, np.array(returns), {"crash_share": float(np.mean(crashed))})
+            returns = np.array([float(episode.reward.sum()) for episode in episodes])
+            crashed = [episode.status == "collision" for episode in episodes]
+            yield Rollouts(sum(episode.control_steps for episode in episodes), returns, crashed, episodes=episodes)
 
     @property
-    def _holdout_samples(self) -> SamplesT:
+    def holdout_samples(self) -> SamplesT:
         """The newest holdout episode, or the newest one if there is none."""
-        holdout, group_size = self.settings.holdout, len(self._policy.exploration_signs)
+        holdout, group_size = self.settings.holdout, len(self.exploration_signs)
         held_out = [each for each in self.samples if is_holdout_episode(each.episode // group_size, holdout)]
         return (held_out or self.samples)[-1]
 
-    def _store_episodes(self, episodes: Sequence[Episode]) -> None:
-        first = self.data.episode_count
-        new = [self._sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
-        super()._store_episodes(episodes)
-        oldest = self.data.recordings[0].episode
-        self.samples = [each for each in (*self.samples, *new) if each.episode >= oldest]
 
+class ClosedRoadModel(WholeRoadModel[RoadSamples]):
+    """The world model of closed roads."""
 
-class RoadRollouts(WholeRoadRollouts[RoadSamples]):
-    """The learned model of whole closed roads."""
+    samples_type: ClassVar = RoadSamples
 
-    stored_types: ClassVar = {"data": EnvironmentData, "samples": list[RoadSamples]}
+    @property
+    def cavs_per_start(self) -> int:
+        """Number of CAVs of a rollout: all of its road."""
+        return len(self.scenario.possible_cav_ids())
 
-    def _sample_episode(self, episode: Episode, number: int) -> RoadSamples:
+    def sample_episode(self, episode: Episode, number: int) -> RoadSamples:
+        """Return the samples of an episode with this number."""
         return road_samples(episode, number, cast(LoopScenario, self.scenario))
 
-    def _fit_model(self, seed: Seed) -> ModelFit:
-        return fit_road_model(self.model, self.samples, self.settings, self.scenario, seed)
+    def fit(self, seed: Seed) -> ModelFit:
+        """Fit the ensemble further to all samples."""
+        return fit_road_model(self.ensemble, self.samples, self.settings, self.scenario, seed)
 
-    def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> StartIndices:
-        cavs_per_road = len(self.scenario.possible_cav_ids())
-        return super()._draw_starts(parts * cavs_per_road, seed, control_steps)
-
-    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
-        rows = len(self.scenario.possible_cav_ids()) * len(plan.starts)
+    def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+        """Yield the episodes of a plan, whose starts are `StartIndices`, in one batch."""
+        rows = self.cavs_per_start * len(plan.starts)
         memory = plan.driver.initial_memory(rows) | {EXPERT_KEY: self._expert_memory(plan.starts)}
-        human_model = learned_human_model(self.model, self.scenario, torch_generator(plan.noise_seed, "cpu"))
+        human_model = learned_human_model(self.ensemble, self.scenario, torch_generator(plan.noise_seed, "cpu"))
         yield self.simulate(plan.driver, memory, plan.starts, plan.control_steps, human_model, plan.exploration_seed)
 
     def simulate(
@@ -138,7 +134,7 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
         by_episode = {each.episode: each for each in self.samples}
         samples = [by_episode[self.data.recordings[index].episode] for index, _ in start_indices]
         pairs = [(each, at // each.interval) for each, (_, at) in zip(samples, start_indices, strict=True)]
-        noise = float(self.model.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
+        noise = float(self.ensemble.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
         common = replace(road, horizon=control_steps, noise=noise if self.settings.add_noise else 0.0, population="")
         world = RingBatch(
             [with_size(common, each.size) for each in samples],
@@ -158,11 +154,11 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
         """Return a recorded holdout episode, and its CAVs' accelerations replayed in model and base with new noise."""
-        samples, recordings = self._holdout_samples, self.data.recordings
+        samples, recordings = self.holdout_samples, self.data.recordings
         rows = [index for index, each in enumerate(recordings) if each.episode == samples.episode]
         driver = ReplayDriver(np.stack([recordings[row].applied_acceleration for row in rows], 1))
         human_models = {
-            "model": learned_human_model(self.model, self.scenario, torch_generator((0,), "cpu")),
+            "model": learned_human_model(self.ensemble, self.scenario, torch_generator((0,), "cpu")),
             "base": base_human_model(self.settings.base, self.scenario),
         }
         lanes, cav_columns = np.zeros((0, 0)), np.flatnonzero(samples.is_human == 0.0).tolist()
@@ -175,39 +171,58 @@ class RoadRollouts(WholeRoadRollouts[RoadSamples]):
 
     def _expert_memory(self, start_indices: StartIndices) -> Memory:
         """Return the expert's memory: all rows of the first CAV, then of the second."""
-        cavs = len(self.scenario.possible_cav_ids())  # each episode has as many recordings
+        cavs = self.cavs_per_start  # each episode has as many recordings
         first = start_indices[:, 0] // cavs * cavs
         starts = [np.column_stack([first + cav, start_indices[:, 1]]) for cav in range(cavs)]
-        memories = [reconstruct_memory(self._task.expert, self.data.recordings, each) for each in starts]
+        memories = [reconstruct_memory(self.task.expert, self.data.recordings, each) for each in starts]
         return map_leaves(lambda *values: np.concatenate(values), *memories)
 
 
-class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
-    """The learned model of an on-ramp."""
+class MotorwayModel(WholeRoadModel[MotorwaySamples]):
+    """The world model of motorways."""
 
-    stored_types: ClassVar = {"data": EnvironmentData, "samples": list[MotorwaySamples]}
+    samples_type: ClassVar = MotorwaySamples
 
-    def _sample_episode(self, episode: Episode, number: int) -> MotorwaySamples:
-        return motorway_samples(episode, number, cast(Motorway, self.scenario), self.model.base)
-
-    def _fit_model(self, seed: Seed) -> ModelFit:
-        group_size = len(self._policy.exploration_signs)
-        return fit_motorway_model(self.model, self.samples, self.settings, seed, group_size)
+    @classmethod
+    def check(cls, scenario: Scenario, settings: ModelSettings) -> None:
+        """Raise `InputError` if the scenario or a setting is not supported."""
+        super().check(scenario, settings)
+        for setting, is_allowed, allowed in (
+            (f"rollout_starts: {settings.rollout_starts}", settings.rollout_starts == "first", "first"),
+            (
+                f"base: {settings.base}",
+                settings.base in ("idm", "none"),
+                "idm, each vehicle's own driver model, or none",
+            ),
+            ("calibrate_base: true", not settings.calibrate_base, "false"),
+        ):
+            if not is_allowed:
+                raise InputError(f"model.{setting} is not allowed; allowed: {allowed}, on on-ramps")
 
     @property
-    def _max_control_steps(self) -> int:
-        return min(self.k_star, self.scenario.horizon)
+    def max_control_steps(self) -> int:
+        """Largest number of control steps of a rollout: an episode."""
+        return self.scenario.horizon
 
-    def _draw_starts(self, parts: int, seed: Seed, control_steps: int) -> list[MotorwaySamples]:
+    def sample_episode(self, episode: Episode, number: int) -> MotorwaySamples:
+        """Return the samples of an episode with this number."""
+        return motorway_samples(episode, number, cast(Motorway, self.scenario), self.ensemble.base)
+
+    def fit(self, seed: Seed) -> ModelFit:
+        """Fit the ensemble further to all samples."""
+        return fit_motorway_model(self.ensemble, self.samples, self.settings, seed, len(self.exploration_signs))
+
+    def draw_starts(self, request: StartRequest) -> list[MotorwaySamples]:
         """Return random samples, each of them once for each sign of the exploration."""
-        new_episodes, signs = self.data.episode_count - self._first_new_episode, self._policy.exploration_signs
-        episodes = self.settings.model_ratio * new_episodes * self.scenario.horizon / control_steps
-        count = max(1, round(episodes / parts / len(signs)))
-        indices = np.random.default_rng(list(seed)).integers(len(self.samples), size=count).tolist()
+        new_episodes, signs = self.data.episode_count - request.first_new_episode, self.exploration_signs
+        episodes = self.settings.model_ratio * new_episodes * self.scenario.horizon / request.control_steps
+        count = max(1, round(episodes / request.parts / len(signs)))
+        indices = np.random.default_rng(list(request.seed)).integers(len(self.samples), size=count).tolist()
         return [self.samples[index] for index in indices for _ in signs]
 
-    def _simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
-        signs = self._policy.exploration_signs
+    def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
+        """Yield the episodes of a plan, whose starts are samples."""
+        signs = self.exploration_signs
         size = BATCH_KINDS[type(self.scenario)].max_roads
         for first in range(0, len(plan.starts), size):
             samples = plan.starts[first : first + size]
@@ -215,23 +230,22 @@ class MotorwayRollouts(WholeRoadRollouts[MotorwaySamples]):
             groups = [number // len(signs) for number in numbers]
             seeds = [((*plan.noise_seed, group), (*plan.exploration_seed, group)) for group in groups]
             scales = [signs[number % len(signs)] for number in numbers]
-            correction = self._correction(self.model, seeds[0][0])
+            correction = self._correction(self.ensemble, seeds[0][0])
             yield self.simulate(plan.driver, samples, plan.control_steps, correction, seeds, scales)
 
-    def _compare_returns(self, plan: RolloutPlan, returns: Floats) -> tuple[float | None, float | None]:
-        is_new = [samples.episode >= self._first_new_episode for samples in plan.starts]
-        if plan.control_steps < self.scenario.horizon or not any(is_new):
-            return None, None
-        recorded = np.array([samples.episode_return for samples in plan.starts])
-        return float(returns[is_new].mean()), float(recorded[is_new].mean())
+    def recorded_returns(self, plan: RolloutPlan, first_episode: int) -> Floats:
+        """Return the returns of the recorded episodes, NaN for those before `first_episode` or for shorter rollouts."""
+        is_whole = plan.control_steps == self.scenario.horizon
+        known = [is_whole and samples.episode >= first_episode for samples in plan.starts]
+        return np.where(known, [samples.episode_return for samples in plan.starts], nan)
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
         """Return a holdout episode, run again, and what model and base make of its vehicles; the expert drives CAVs."""
-        road, expert, samples = self.scenario, self._task.expert, self._holdout_samples
+        road, expert, samples = self.scenario, self.task.expert, self.holdout_samples
         recorded = run_episode(EpisodeTask(road, expert, samples.seed))
         interval = max(1, round(WAVE_INTERVAL / road.control_step))
         roads = {"recorded": _episode_facts(recorded, interval)}
-        for label, model in (("model", self.model), ("base", self._new_model())):
+        for label, model in (("model", self.ensemble), ("base", self.new_ensemble())):
             correction = self._correction(model, (0,))
             (episode,) = self.simulate(expert, [samples], road.horizon, correction, [((1,), (2,))])
             roads[label] = _episode_facts(episode, interval)

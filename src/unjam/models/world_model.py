@@ -1,0 +1,175 @@
+"""World models: what is learned of a task's road, and the worlds in which a policy is rolled out."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from math import ceil, inf, nan
+from types import MappingProxyType
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unjam.drivers.residual import ResidualDriver
+from unjam.following.calibration import calibrate_human_drivers
+from unjam.models.ensemble import Ensemble, ModelFit, Seed
+from unjam.models.environment_data import EnvironmentData
+from unjam.models.rollouts import RolloutBatch, check_device, draw_starts
+from unjam.models.settings import ModelSettings
+from unjam.physics.idm import IDMParameters
+from unjam.scenarios.scenario import Scenario
+from unjam.tree import pack, unpack
+from unjam.worlds.episode import Task
+from unjam.worlds.record import Episode, Floats
+
+EnsembleT = TypeVar("EnsembleT", bound=Ensemble)
+SamplesT = TypeVar("SamplesT", bound=Any)
+
+
+class StartRequest(NamedTuple):
+    """The starts that one of several parts of an iteration's rollouts needs."""
+
+    control_steps: int
+    """of a rollout"""
+    parts: int
+    seed: Seed
+    first_new_episode: int
+    """number of the first episode of the iteration"""
+    new_steps: int
+    """control steps of all CAVs in the iteration"""
+
+
+class RolloutPlan(NamedTuple):
+    """Model rollouts of a driver from starts that the world model has drawn."""
+
+    driver: ResidualDriver
+    starts: Any
+    control_steps: int
+    noise_seed: Seed
+    exploration_seed: Seed
+
+
+class Rollouts(NamedTuple):
+    """Model rollouts, either rows or whole episodes."""
+
+    control_steps: int
+    """total number"""
+    returns: Floats
+    """of each rollout"""
+    crashed: Sequence[bool]
+    """whether it ended in a collision"""
+    rows: RolloutBatch | None = None
+    episodes: Sequence[Episode] = ()
+    facts: Mapping[str, Any] = MappingProxyType({})
+    """other facts about them"""
+
+
+class WorldModel(Generic[EnsembleT, SamplesT]):
+    """An ensemble that is fitted to the environment data D_a of a task, and worlds made of it; subclasses are kinds."""
+
+    samples_type: ClassVar[Any] = None
+    """type of the samples of each episode to which the ensemble is fitted; None: it is fitted to D_a itself"""
+
+    def __init__(self, settings: ModelSettings, task: Task, exploration_signs: Sequence[float], seed: Seed) -> None:
+        """Start with the base alone and without data; `InputError` if scenario or settings are not supported.
+
+        Consecutive episodes with the same vehicles explore with `exploration_signs`.
+        """
+        check_device(settings.device, "model.device")
+        self.check(task.scenario, settings)
+        self.settings, self.task, self.exploration_signs, self.seed = settings, task, exploration_signs, seed
+        self.scenario = task.scenario
+        """the road, with calibrated IDM parameters if the settings ask for them"""
+        self.data = EnvironmentData(settings.buffer_size)
+        self.samples: list[SamplesT] = []
+        """of the episodes in D_a, oldest first"""
+        self.ensemble = self.new_ensemble()
+
+    @classmethod
+    def check(cls, scenario: Scenario, settings: ModelSettings) -> None:
+        """Raise `InputError` if a scenario or a setting is not supported."""
+
+    @property
+    def max_control_steps(self) -> float:
+        """Largest number of control steps of a rollout."""
+        return inf
+
+    @property
+    def cavs_per_start(self) -> int:
+        """Number of CAVs of a rollout."""
+        return 1
+
+    def new_ensemble(self) -> EnsembleT:
+        """Return the ensemble before any fit: the base alone."""
+        raise NotImplementedError
+
+    def sample_episode(self, episode: Episode, number: int) -> SamplesT:
+        """Return the samples of an episode with this number."""
+        raise NotImplementedError
+
+    def fit(self, seed: Seed) -> ModelFit:
+        """Fit the ensemble further to the present data."""
+        raise NotImplementedError
+
+    def roll_out(self, plan: RolloutPlan) -> Iterator[Rollouts]:
+        """Yield the rollouts of a plan, batch by batch."""
+        raise NotImplementedError
+
+    def add(self, episodes: Sequence[Episode]) -> None:
+        """Add environment episodes to D_a; the first ones calibrate the IDM of the base if the settings ask for it."""
+        first = self.data.episode_count
+        if self.samples_type:
+            self.samples += [self.sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
+        self.data.add(episodes, self.scenario)
+        self.samples = [each for each in self.samples if each.episode >= self.data.recordings[0].episode]
+        if self.settings.calibrate_base and first == 0:
+            states = (recording.states for recording in self.data.recordings)
+            self.scenario = replace(self.scenario, humans=calibrate_human_drivers(states, self.scenario))
+
+    def draw_starts(self, request: StartRequest) -> Any:
+        """Return random recorded states: rollouts have `model_ratio` times as many steps as the episodes."""
+        parts, kind = request.parts * self.cavs_per_start, self.settings.rollout_starts
+        count = ceil(self.settings.model_ratio * request.new_steps / parts / request.control_steps)
+        first_episode = request.first_new_episode if kind == "newest" else 0
+        return draw_starts(self.data, count, 1, request.seed, first_episode, episode_starts_only=kind == "first")
+
+    def recorded_returns(self, plan: RolloutPlan, first_episode: int) -> Floats:
+        """Return the returns of D_a from the starts on, NaN for those before `first_episode` or with too few steps.
+
+        Compared with the rollouts they are fair if the same policy drove both, with exploration. They are undiscounted
+        sums of rewards up to the last step or a crash.
+        """
+        rewards = [self.data.recordings[index].reward[at : at + plan.control_steps] for index, at in plan.starts]
+        is_new = [self.data.recordings[index].episode >= first_episode for index in plan.starts[:, 0]]
+        is_known = [new and len(each) == plan.control_steps for new, each in zip(is_new, rewards, strict=True)]
+        return np.array([each.sum() if known else nan for known, each in zip(is_known, rewards, strict=True)])
+
+    @property
+    def max_reward(self) -> float:
+        """R_max: the largest |reward| of a control step in D_a."""
+        return max(float(np.abs(recording.reward).max()) for recording in self.data.recordings)
+
+    def _stored_parts(self) -> dict[str, Any]:
+        samples = {"samples": list[self.samples_type]} if self.samples_type else {}
+        return {"data": EnvironmentData} | samples
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """Return data and weights, as JSON and tensors."""
+        values: dict[str, Any] = {"humans": asdict(self.scenario.humans)}
+        tensors = {name: tensor.cpu() for name, tensor in self.ensemble.state_dict().items()}
+        for name in self._stored_parts():
+            values[name], arrays = pack(getattr(self, name))
+            tensors |= {f"{name}/{path}": torch.from_numpy(np.array(array)) for path, array in arrays.items()}
+        return values, tensors
+
+    def restore(self, values: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+        """Continue from what `state` returned."""
+        for name, kind in self._stored_parts().items():
+            arrays = {
+                key.removeprefix(f"{name}/"): t.numpy().copy()
+                for key, t in tensors.items()
+                if key.startswith(f"{name}/")
+            }
+            setattr(self, name, unpack(kind, values[name], arrays))
+        self.scenario = replace(self.scenario, humans=IDMParameters(**values["humans"]))
+        self.ensemble.load_state_dict({name: tensor for name, tensor in tensors.items() if "/" not in name})
