@@ -52,7 +52,8 @@ def own(simulation: Simulation, file: Path, seed: int = 0, **changes: Any) -> Us
 
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_in_process_and_in_workers(file: Path, sumo: SumoBackend) -> None:
-    task = EpisodeTask(scenario_of(file, horizon=80), PISaturation(), (3,))
+    scenario = scenario_of(file, horizon=80)
+    task = EpisodeTask(scenario, PISaturation(time_step=scenario.control_step), (3,))
     here = run_episode(task.scenario, task.driver, task.seed, backend=sumo)
     run_episode(task.scenario, Constant(0.4), (4,), backend=sumo)
     with WorkerPool(1) as workers:
