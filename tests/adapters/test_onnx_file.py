@@ -1,4 +1,5 @@
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -325,6 +326,21 @@ def test_a_description_can_lie_in_the_graph_and_is_needed(tmp_path: Path) -> Non
     made.metadata_props.add(key="unjam", value=DESCRIPTION)
     path.write_bytes(made.SerializeToString())
     np.testing.assert_allclose(answers(onnx_driver(path)), expected(STATE), atol=1e-6)
+
+
+def test_the_examples_of_the_documentation_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "own-driver.md").read_text()
+    section = page.partition("### An ONNX file")[2].partition("\n### ")[0]
+    (description,), (code,) = (re.findall(f"```{kind}\n(.*?)```", section, re.S) for kind in ("toml", "python"))
+    monkeypatch.chdir(tmp_path)
+    driver = onnx_driver(write(tmp_path, linear(3, [1.0, 0.5, 0.25]), description))
+    unjam.check_driver(driver)
+    assert driver.action_repeat == 5
+    (tmp_path / "policy.toml").unlink()
+    found: dict[str, Any] = {}
+    exec(compile(code, "own-driver.md", "exec"), found)
+    numbers = np.array(STATE[:3]).T @ [1.0, 0.5, 0.25]
+    np.testing.assert_allclose(answers(found["driver"]), (numbers / 3.6 - STATE.speed) / 0.1, atol=1e-4)
 
 
 def test_only_regular_files_of_a_limited_size_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.adapters.onnx_policies import follower, write
 from tests.following.synthetic_trajectories import write_table
 from tests.system.conftest import ROOT, Run
 from tests.worlds.sumo.user_networks import straight
@@ -54,6 +55,7 @@ def files(tmp_path: Path) -> None:
     page = (ROOT / "docs/own-driver.md").read_text()
     (own,) = re.findall(r"```python\n(# my_driver.py\n.*?)```", page, re.DOTALL)
     (tmp_path / "my_driver.py").write_text(own)
+    write(tmp_path, follower())
     vehicles = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
     straight(tmp_path, vehicles).rename(tmp_path / "my.sumocfg")
     write_table(tmp_path / "trajectories.csv")
@@ -78,6 +80,9 @@ def test_all_unjam_commands_of_the_readme_run_in_order(
     answers: dict[str, Any] = {}
     exec(graph, answers)  # reads the exported ring.unjam
     assert np.isfinite(answers["acceleration"]).all()
+    exec(next(snippet for snippet in snippets if "TRPO.load" in snippet), answers)  # reads the exported ring.zip
+    answers["environment"].close()
+    assert answers["environment"].action_space.contains(answers["action"])
 
 
 def test_targets_and_packages_of_the_readme_exist() -> None:

@@ -2,11 +2,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
+import onnx
 import pytest
 
 from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
+from unjam.adapters import onnx_driver
+from unjam.adapters.stable_baselines3_export import stable_baselines3_bytes
 from unjam.controller import load_controller, packaged_file
 from unjam.controller.file import (
     GRAPH_PART,
@@ -15,11 +19,14 @@ from unjam.controller.file import (
     SAMPLE_PART,
     WEIGHTS_PART,
     read_sample,
+    replay_states,
     unpack_parts,
 )
 from unjam.drivers import PISaturation, ResidualDriver
+from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
+from unjam.onnx_models import remove_texts
 from unjam.training.export import export_controller
 from unjam.training.train import train
 
@@ -93,11 +100,55 @@ def test_exported_driver_has_step_and_bounds_of_the_scenario(tmp_path: Path) -> 
 
 @pytest.mark.long
 def test_graph_is_in_the_controller_and_in_its_own_file(run: Path, tmp_path: Path) -> None:
-    pytest.importorskip("onnxscript")
-    pytest.importorskip("onnxruntime")
     done = export_controller(run, tmp_path / "ring.unjam", onnx=True)
     assert done.graph == tmp_path / "ring.onnx"
-    assert (tmp_path / "ring.onnx").read_bytes() == unpack_parts(done.file)[GRAPH_PART]
+    described = onnx.load_model_from_string((tmp_path / "ring.onnx").read_bytes())
+    assert described.graph.input[0].doc_string == "[m/s]"
+    remove_texts(described)
+    plain = onnx.load_model_from_string(unpack_parts(done.file)[GRAPH_PART])
+    remove_texts(plain)
+    assert described == plain
+
+
+@pytest.mark.long
+def test_the_graph_describes_itself_and_drives_as_the_controller(run: Path, tmp_path: Path) -> None:
+    done = export_controller(run, tmp_path / "ring.unjam", onnx=True)
+    assert done.graph is not None
+    states, answers = read_sample(unpack_parts(done.file)[SAMPLE_PART])
+    driver = onnx_driver(done.graph)
+    assert driver.limits is not None
+    found = replay_states(driver, states, driver.limits.highest)
+    np.testing.assert_allclose(found, answers, atol=1e-9)
+    np.testing.assert_allclose(replay_states(driver_from_recipe(*driver_recipe(driver)), states, 1.0), found, atol=1e-9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("agent", ["trpo", "ppo", "sac", "td3"])
+def test_stable_baselines3_loads_the_residual(agent: str, run: Path, tmp_path: Path) -> None:
+    from sb3_contrib import TRPO
+    from stable_baselines3 import PPO, SAC, TD3
+
+    controller, path = load_controller(run), tmp_path / "ring.zip"
+    assert isinstance(controller, ResidualDriver)
+    if agent == "trpo":  # that of the run
+        assert export_controller(run, tmp_path / "ring.unjam", stable_baselines3=True).model == path
+    else:
+        path.write_bytes(stable_baselines3_bytes(controller, agent))
+    algorithms: dict[str, Any] = {"trpo": TRPO, "ppo": PPO, "sac": SAC, "td3": TD3}
+    model = algorithms[agent].load(path, device="cpu")
+    made = gymnasium.make(
+        "unjam/Ring-v0", length=(120, 120), vehicles=8, expert=model.unjam["expert"], features=model.unjam["features"]
+    )
+    assert (model.observation_space, model.action_space) == (made.observation_space, made.action_space)
+    observations = np.random.default_rng(0).uniform(-2.0, 2.0, (50, controller.network.input_size)).astype(np.float32)
+    actions, _ = model.predict(observations, deterministic=True)
+    np.testing.assert_allclose(actions[:, 0], controller.network(observations.astype(np.float64)), atol=1e-5)
+    assert np.abs(actions).max() > 0.0
+
+
+def test_a_formula_is_no_model_of_stable_baselines3(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="stable_baselines3: 'pi' is not allowed; allowed: a residual, such as a"):
+        export_controller("pi", tmp_path / "pi.unjam", stable_baselines3=True)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,9 @@ def export_command(
     onnx: Annotated[
         bool, Option("--onnx", help="Add the ONNX graph of the whole controller, also as a separate file.")
     ] = False,
+    stable_baselines3: Annotated[
+        bool, Option("--sb3", help="Write the residual as a model of Stable-Baselines3, too: a .zip file.")
+    ] = False,
     scenario: Annotated[
         str, Option(help="Scenario that defines control step and limits of a plain driver.", show_default="ring")
     ] = "",
@@ -34,7 +37,7 @@ def export_command(
     Examples:
 
     - unjam export runs/ring-001 --out ring.unjam
-    - unjam export runs/ring-001 --out ring.unjam --onnx
+    - unjam export runs/ring-001 --out ring.unjam --onnx --sb3
     - unjam export pi:window=30 --scenario merge --out pi.unjam
     """
     from unjam.training.export import export_controller
@@ -42,12 +45,13 @@ def export_command(
     if onnx:  # messages of the exporter are of no use to users
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    result = export_controller(source, out, onnx, scenario)
+    result = export_controller(source, out, onnx, scenario, stable_baselines3)
     if json:
-        files = {"file": str(result.file), "onnx": str(result.graph) if result.graph else None}
-        print_json({**files, "driver": result.driver, "control_steps": result.sample_steps})
+        files = {"file": result.file, "onnx": result.graph, "stable_baselines3": result.model}
+        names = {name: str(file) if file else None for name, file in files.items()}
+        print_json({**names, "driver": result.driver, "control_steps": result.sample_steps})
         return
-    for file in filter(None, (result.file, result.graph)):
+    for file in filter(None, (result.file, result.graph, result.model)):
         console.print(f"{file}: {file.stat().st_size:,} bytes")
     if result.graph is None and (older := out.with_suffix(".onnx")).exists():
         err_console.print(f"{older} is older: it is not the graph of this controller; --onnx writes the graph")

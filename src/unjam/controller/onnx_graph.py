@@ -2,18 +2,23 @@
 
 from collections.abc import Callable
 from functools import partial
+from math import nan
 from typing import Any
 
 import numpy as np
+import tomli_w
 import torch
 from torch import Tensor, nn
 
+from unjam.adapters.onnx_file import DESCRIPTION_KEY
 from unjam.controller.graph import ONNX_OPSET, graph_names
+from unjam.controller.manifest import driver_interface
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState, state_of_ones
 from unjam.drivers.speed_history import CircularWindow
 from unjam.errors import InputError, import_optional
+from unjam.onnx_models import parse_model
 from unjam.tree import leaves, replace_leaves
 
 
@@ -91,6 +96,37 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
     for value in (*proto.graph.input, *proto.graph.output, *proto.graph.value_info):
         value.ClearField("metadata_props")  # `ClearMetadataAndDocStringPass` clears only those of nodes
     return proto.SerializeToString()
+
+
+def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: float) -> bytes:
+    """Return a graph of `onnx_graph` with texts for its users: units of inputs and outputs, and a description.
+
+    The description is that of `unjam.adapters.onnx_driver`, as TOML in the metadata `unjam`; `time_step` is the control
+    step [s].
+    """
+    interface = driver_interface(driver, action_limit)
+    action, memory = interface["action"], interface["memory"]
+    description = {
+        "inputs": [{"quantity": each["name"]} for each in interface["observation"]],
+        "output": {"tensor": action["name"], "limits": [float(action["low"]), float(action["high"])]},
+        "time_step": time_step,
+        "memory": [
+            {
+                "input": f"memory.{each['name']}",
+                "output": f"next.{each['name']}",
+                "initial": nan if each["initial"] is None else each["initial"],
+            }
+            for each in memory
+        ],
+    }
+    model = parse_model(part)
+    model.doc_string = f"{driver.describe()}: a control step of {time_step:g} s; the first axis is the row of the CAV"
+    model.metadata_props.add(key=DESCRIPTION_KEY, value=tomli_w.dumps(description))
+    units = {each["name"]: each["unit"] for each in (*interface["observation"], action)}
+    for value in (*model.graph.input, *model.graph.output):
+        state = "state, given back in the next control step; initial values are in the metadata"
+        value.doc_string = f"[{units[value.name]}]" if value.name in units else state
+    return model.SerializeToString()
 
 
 def _simplify(model: Any) -> None:

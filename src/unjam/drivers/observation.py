@@ -38,6 +38,8 @@ from unjam.user_code import UserCode
 RELATIVE_SPEED_SCALE = 5.0
 GAP_SCALE = 20.0
 MERGE_DISTANCE_SCALE = 1000.0
+MAX_OBSERVATION = 50.0
+"""bound of the observations of environments; larger values are clipped"""
 PROXIMITY_DISTANCES = (0.0, 250.0, 500.0, 1000.0, 2000.0)
 """distances to the merge at which one component of the feature `merge_proximity` is one [m]"""
 

@@ -16,6 +16,7 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import (
+    MAX_OBSERVATION,
     FeatureInputs,
     FeatureLike,
     NetworkInput,
@@ -36,9 +37,6 @@ from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap, vali
 from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
-
-MAX_OBSERVATION = 50.0
-"""bound of all observations; larger values are clipped"""
 
 
 class ExternalDriver(Driver):

@@ -86,15 +86,19 @@ class ExportResult:
 
     file: Path
     graph: Path | None
-    """the ONNX graph; it is also in the controller's file"""
+    """the ONNX graph with its description as metadata; without it, the graph is also in the controller's file"""
+    model: Path | None
+    """the model of Stable-Baselines3"""
     driver: str
     sample_steps: int
     """length of the recorded sample"""
 
 
 @expecting_code()
-def export_controller(source: str | Path, out: str | Path, onnx: bool = False, scenario: str = "") -> ExportResult:
-    """Write a controller into a self-contained file `.unjam`, and optionally an ONNX graph.
+def export_controller(
+    source: str | Path, out: str | Path, onnx: bool = False, scenario: str = "", stable_baselines3: bool = False
+) -> ExportResult:
+    """Write a controller into a self-contained file `.unjam`, and optionally an ONNX graph and a model of others.
 
     One test episode is run for its recorded sample. The controller includes the road's safety filter, if there is one.
 
@@ -103,10 +107,12 @@ def export_controller(source: str | Path, out: str | Path, onnx: bool = False, s
         out: the file, ending in `.unjam`; the graph has the same name with `.onnx`.
         onnx: whether to write the graph of the whole controller.
         scenario: the scenario for time step and bounds of a driver; a run and a controller's file have their own.
+        stable_baselines3: whether to write the residual as a model of Stable-Baselines3, with the same name and `.zip`.
 
     Raises:
-        InputError: there is no such controller, or it is Python code, or, with `onnx`, it has no graph.
-        MissingPartError: with `onnx`, a package for graphs is not installed.
+        InputError: there is no such controller, or it is Python code; with `onnx` it has no graph; with
+            `stable_baselines3` it is no residual.
+        MissingPartError: a package for graphs, or Stable-Baselines3, is needed and not installed.
     """
     source, out = Path(source), Path(out)
     if out.suffix != SUFFIX:
@@ -120,6 +126,7 @@ def export_controller(source: str | Path, out: str | Path, onnx: bool = False, s
     if driver.is_native or code:
         reason = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
         raise InputError(f"export: {driver.describe()} is not allowed: {reason}; allowed: drivers without Python code")
+    model = _residual_model(driver, metadata) if stable_baselines3 else None
     if road.safety.active and not road.actuator.is_instant:
         latency = f"actuator.delay {road.actuator.delay:g}, actuator.lag {road.actuator.lag:g}"
         raise InputError(f"export: {latency} is not allowed: the filter of a file ignores them; allowed: 0 and 0")
@@ -147,8 +154,25 @@ def export_controller(source: str | Path, out: str | Path, onnx: bool = False, s
     atomic_write(out, content)  # an earlier file stays until then
     graph_file = out.with_suffix(".onnx") if graph else None
     if graph_file is not None:
-        atomic_write(graph_file, graph[GRAPH_PART])
-    return ExportResult(out, graph_file, driver.describe(), len(states.speed))
+        from unjam.controller.onnx_graph import describe_graph
+
+        atomic_write(graph_file, describe_graph(graph[GRAPH_PART], driver, limit, road.control_step))
+    model_file = None if model is None else out.with_suffix(".zip")
+    if model is not None and model_file is not None:
+        atomic_write(model_file, model)
+    return ExportResult(out, graph_file, model_file, driver.describe(), len(states.speed))
+
+
+def _residual_model(driver: Driver, metadata: dict[str, Any]) -> bytes:
+    """Return the residual of a controller as a model of the algorithm that trained it; SAC if that is unknown."""
+    from unjam.adapters.stable_baselines3_export import ALGORITHMS, stable_baselines3_bytes
+
+    if isinstance(driver, FilteredDriver):
+        driver = driver.driver
+    if not isinstance(driver, ResidualDriver):
+        raise invalid_value("stable_baselines3", driver.describe(), "a residual, such as a training run")
+    agent = metadata.get("run", {}).get("agent")
+    return stable_baselines3_bytes(driver, agent if agent in ALGORITHMS else "sac")
 
 
 def _is_signed(file: Path) -> bool:
