@@ -128,7 +128,7 @@ def test_the_graph_takes_any_number_of_vehicles_and_names_nothing_of_this_machin
     driver = LACC()
     part = onnx_graph(driver, 0.5)
     states = perceived(7)
-    seen = {name: getattr(states, name) for name in driver.input_fields}
+    seen = {name: getattr(states, name) for name in driver.requirements().input_fields}
     fed = {**seen, "memory.acceleration": np.zeros(7)}
     session = onnxruntime.InferenceSession(part, providers=["CPUExecutionProvider"])
     found, after = session.run(None, fed)

@@ -85,7 +85,7 @@ def test_the_on_ramps_adds_to_its_expert_where_a_ramp_joins_and_drives_nowhere_e
     of_expert, of_trained = (effect_of(found.rows[name], found.rows["human"]) for name in (expert, trained))
     assert of_trained.travel_time != of_expert.travel_time
     assert of_trained.feasibility == FEASIBLE
-    with pytest.raises(InputError, match="'merge_proximity' is not allowed on ring"):
+    with pytest.raises(InputError, match="is not allowed on ring: it needs distance_to_merge"):
         run_episode(Ring(horizon=10), make_driver(trained, 0.1), 1)
 
 

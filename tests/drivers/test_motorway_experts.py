@@ -117,13 +117,14 @@ def test_nobody_makes_room_who_is_not_told_of_it() -> None:
 
 
 def test_it_says_what_it_must_be_told() -> None:
-    assert JamAhead().input_fields == (*COMMON_FIELDS, *JamAhead.required_fields)
-    assert Cruise().input_fields == COMMON_FIELDS
+    known = ("allowed_speed", "distance_to_merge", "lane_speeds", "road_speeds", "penetration_rate")
+    assert JamAhead().requirements().input_fields == (*COMMON_FIELDS, *known)
+    assert Cruise().requirements().input_fields == COMMON_FIELDS
 
 
 def test_a_network_may_see_who_drives_beside() -> None:
     driver = ResidualDriver(Cruise(), random_network(8), 2.5, ("adjacent_lanes",))
-    assert driver.input_fields == (*COMMON_FIELDS, "adjacent_gaps", "adjacent_speeds")
+    assert driver.requirements().input_fields == (*COMMON_FIELDS, "adjacent_gaps", "adjacent_speeds")
     gaps, speeds = np.array([[10.0, 100.0, -2.0, 40.0]]), np.array([[25.0, 20.0, 15.0, 20.0]])
     near = state(20.0, 20.0)._replace(adjacent_gaps=gaps, adjacent_speeds=speeds)
     seen = driver.observation(near, driver.initial_memory(1))

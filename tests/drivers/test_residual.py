@@ -58,7 +58,7 @@ def test_plain_numbers_give_what_arrays_give(expert: Driver, hold: int) -> None:
     generator = np.random.default_rng(2)
     memory = driver.initial_memory(1)
     numbers = scalar_memory(memory)
-    assert driver.accepts_floats
+    assert not driver.requirements().needs_arrays
     for _ in range(25):
         state = random_state(generator, 1)
         expected, memory = driver.act(state, memory)
@@ -71,7 +71,7 @@ def test_tensors_give_what_arrays_give(hold: int) -> None:
     inner = ResidualDriver(PISaturation(), random_network(), 1.0, action_repeat=2)
     network = random_network(observation_size(ALL_PARTS, inner))
     driver = ResidualDriver(inner, network, 1.0, ALL_PARTS, hold)
-    assert driver.accepts_tensors
+    assert not driver.requirements().needs_numpy
     generator = np.random.default_rng(5)
     memory = driver.initial_memory(6)
     tensors = map_leaves(torch.tensor, memory)

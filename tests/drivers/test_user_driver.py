@@ -18,7 +18,7 @@ from unjam.worlds.episode import run_episode
 def test_a_function_becomes_a_driver(my_drivers: Path) -> None:
     driver = make_driver(f"{my_drivers}:gentle", 0.1)
     check_driver(driver)
-    assert not driver.accepts_floats
+    assert driver.requirements().needs_arrays
 
 
 def test_a_class_takes_parameters_and_the_time_step(my_drivers: Path) -> None:

@@ -68,7 +68,7 @@ class AsksForTwoSeconds:
 
 def test_it_drives_tensors_as_it_drives_arrays() -> None:
     mixed, state = MixedDriver((PI, IDM())), random_state(np.random.default_rng(1), 4)
-    assert mixed.accepts_tensors
+    assert not mixed.requirements().needs_numpy
     expected, _ = mixed.act(state, mixed.initial_memory(4))
     tensors = state.map(lambda values: torch.as_tensor(values))
     memory = map_leaves(torch.as_tensor, mixed.initial_memory(4))

@@ -278,8 +278,12 @@ def test_rewards_are_for_what_happens_and_not_for_what_sensors_read() -> None:
 @pytest.mark.parametrize(
     ("name", "shown", "words"),
     [
-        ("merge", "lap_position", "features: 'lap_position' is not allowed on a road with ends"),
-        ("ring", "distance_to_merge", "features: 'distance_to_merge' is not allowed on ring"),
+        ("merge", "lap_position", "features: 'lap_position' is not allowed on merge: it needs a closed road"),
+        (
+            "ring",
+            "distance_to_merge",
+            "features: 'distance_to_merge' is not allowed on ring: it needs distance_to_merge",
+        ),
     ],
 )
 def test_what_the_road_does_not_tell_is_not_shown(name: str, shown: str, words: str) -> None:

@@ -57,7 +57,7 @@ def replay(has_errors: bool, correction: float = 0.0, seed: int = 9) -> Episode:
 
     options = ReplayOptions([((seed,), (8,))], ROAD.horizon, has_errors, learned if correction else None)
     world = MotorwayBatch(ROAD, [(0,)], replay=options)
-    world.measured_fields = EXPERT.measured_fields
+    world.measured_fields = EXPERT.requirements().measured_fields
     (episode,) = finish_drive(DriveLoop(world, EXPERT))
     return episode
 

@@ -37,7 +37,7 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     "text for a number": ("time_constant: 'fast'", ["drive ring --driver pi:time_constant=fast"]),
     "negative parameter": ("time_constant: -1", ["drive ring --driver pi:time_constant=-1"]),
     "controller for another control step": (
-        "driver unjam:ring-tuned: time_step 0.1 s is not allowed on ring; allowed: 0.3 s, its control step",
+        "driver unjam:ring-tuned is not allowed on ring: its time_step is 0.1 s; allowed: 0.3 s, the control step",
         ["drive ring --driver pi --driver unjam:ring-tuned --set steps_per_control_step=3"],
     ),
     "no episodes": ("episodes", ["drive ring --driver pi --episodes 0"]),

@@ -84,7 +84,7 @@ def test_acc_property_is_compared_with_unchanged_vehicles(name: str, file: str) 
         ({"minutes": 0.0}, "minutes: 0.0"),
         ({"precision": 1.0}, "precision: 1.0"),
         ({"drivers": ["human"]}, "driver: 'human' is not allowed; allowed: the human baseline is always included"),
-        ({"drivers": ["pacer"]}, "driver: 'pacer' is not allowed; allowed: one that needs no closed road"),
+        ({"drivers": ["pacer"]}, "driver pacer is not allowed on user-network: it needs a closed road"),
         ({"drivers": ["ghost"]}, "driver: 'ghost'"),
         ({"options": {"penetration_rate": 0.5}}, "penetration_rate: it is not allowed here"),
         ({"options": {"cavs": 1}}, "cavs: it is not allowed here"),

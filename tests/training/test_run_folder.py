@@ -58,7 +58,7 @@ def test_simulator_is_refused_as_an_expert() -> None:
 def test_user_networks_have_no_route_position(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     changes = {"scenario": str(file), "scenario_options.cav_types": ["car"], "policy.inputs": ["route_position"]}
-    with pytest.raises(InputError, match="'route_position' is not allowed on a user's network"):
+    with pytest.raises(InputError, match="'route_position' is not allowed on user-network: it needs positions"):
         check_config(load_config(changes=changes))
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from unjam.controller.file import SAMPLE_PART, Controller, Floats, read_sample
-from unjam.drivers.driver import other_time_steps
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, FollowingState
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
@@ -145,10 +145,10 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
     `InputError` if a part of the controller assumes another control step than its filter.
     """
     loop = float(visited_states.loop_length[0])
-    provided_fields = [name for name, values in visited_states._asdict().items() if values is not None]
-    if others := other_time_steps(driver, driver.time_step, not np.isnan(loop), provided_fields):
-        allowed = f"{driver.time_step:g} s, as of its filter"
-        raise InputError(f"certify: time_step {others[0]:g} s of the driver is not allowed; allowed: {allowed}")
+    fields = frozenset(name for name, values in visited_states._asdict().items() if values is not None)
+    road = RoadInterface("the road of its filter", not np.isnan(loop), True, fields, driver.time_step)
+    if reason := driver.requirements(road).unmet_reason(road):
+        raise InputError(f"certify: the driver is not allowed on {road.title}: {reason}")
 
     def simulate(initial_states: FollowingState, leader_accelerations: Floats) -> CarFollowingRecord:
         world = CarFollowingWorld(initial_states, leader_accelerations, driver.limits, driver.time_step, loop)

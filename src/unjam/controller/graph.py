@@ -1,7 +1,5 @@
 """The ONNX graph of a controller: its inputs and outputs, their check, and its execution."""
 
-from typing import Any
-
 import numpy as np
 
 from unjam.controller.file import ACTION_NAME
@@ -22,7 +20,7 @@ BATCH_TOLERANCE = 1e-9
 def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
     """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
     memory = [name for name, _ in leaves(driver.initial_memory(1))]
-    inputs = [*driver.input_fields, *(f"memory.{name}" for name in memory)]
+    inputs = [*driver.requirements().input_fields, *(f"memory.{name}" for name in memory)]
     return inputs, [ACTION_NAME, *(f"next.{name}" for name in memory)]
 
 
@@ -47,11 +45,11 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
     different answers, `MissingPartError` if onnxruntime is not installed.
     """
     (inputs, _), answers, is_equal = graph_names(driver), np.zeros(len(states.speed)), True
-    memory: list[Any] = [rows for _, rows in leaves(driver.initial_memory(rows))]
+    fields, memory = driver.requirements().input_fields, [rows for _, rows in leaves(driver.initial_memory(rows))]
     session = open_session(part)
     for step in range(len(answers)):
         now = states.select(np.full(rows, step))
-        values = [*(getattr(now, name) for name in driver.input_fields), *memory]
+        values = [*(getattr(now, name) for name in fields), *memory]
         acceleration, *memory = run_session(session, None, dict(zip(inputs, values, strict=True)))
         answers[step] = acceleration[0]
         is_equal &= np.shape(acceleration) == (rows,)

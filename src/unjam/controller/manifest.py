@@ -117,7 +117,7 @@ def driver_interface(driver: Driver, action_limit: float | None = None) -> JsonO
     """
     low, high = driver.limits or (None if action_limit is None else -action_limit, action_limit)
     return {
-        "observation": [{"name": name, "unit": STATE_UNITS[name]} for name in driver.input_fields],
+        "observation": [{"name": name, "unit": STATE_UNITS[name]} for name in driver.requirements().input_fields],
         "networks": _network_inputs(driver),
         "memory": [_memory_entry(name, value[0]) for name, value in leaves(driver.initial_memory(1))],
         "action": {"name": "acceleration", "unit": "m/s2", "low": low, "high": high},

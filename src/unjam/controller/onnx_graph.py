@@ -30,11 +30,12 @@ class ControllerModule(nn.Module):
         self.driver = driver
         self.limits = Limits.symmetric(action_limit)
         self.initial_memory = driver.initial_memory(1)
+        self.names = driver.requirements().input_fields
         self.memory_names = [name for name, _ in leaves(self.initial_memory)]
 
     def forward(self, *arrays: Tensor) -> tuple[Tensor, ...]:
         """Return the acceleration [m/s2] and the new memory, for state and memory in `arrays`."""
-        names = self.driver.input_fields
+        names = self.names
         state = LocalState(**dict(zip(names, arrays[: len(names)], strict=True)))
         memory: dict[str, Any] = dict(zip(self.memory_names, arrays[len(names) :], strict=True))
         for name in self.memory_names:
@@ -66,12 +67,12 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
     and `next.NAME`. The first axis of each is the row of the CAV. Raise `InputError` if the driver does not consist of
     formulas for torch, `MissingPartError` if onnxscript is not installed.
     """
-    if not driver.accepts_tensors or driver.is_native:
+    if driver.requirements().needs_numpy or driver.is_native:
         raise InputError(f"onnx: {driver.describe()} is not allowed; allowed: drivers that run on tensors")
     exact = {torch.ops.aten.scalar_tensor.default: _float64_constant()}
     inputs, outputs = graph_names(driver)
     example_rows = 2  # the exported graph takes any number of rows
-    state = state_of_ones(driver.input_fields, partial(torch.ones, dtype=torch.float64), example_rows)
+    state = state_of_ones(driver.requirements().input_fields, partial(torch.ones, dtype=torch.float64), example_rows)
     memory = driver.initial_memory(example_rows)
     arrays = [value for value in state if value is not None]
     arrays += [torch.as_tensor(value, dtype=torch.float64) for _, value in leaves(memory)]

@@ -20,7 +20,6 @@ from unjam.controller.file import Controller, Floats, read_controller, read_samp
 from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.manifest import PROVENANCE_ENTRIES, driver_interface, first_difference, short_text
 from unjam.drivers.check import random_state
-from unjam.drivers.driver import other_time_steps
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
 from unjam.errors import InputError, MissingPartError
@@ -160,8 +159,8 @@ def _describe_provenance(controller: Controller) -> list[PartCheck]:
     checks = [PartCheck("origin", "stated", f"{names}: the maker's statement: nothing in the file can prove it")]
     if road := road_description(manifest):
         step = manifest.get("time_step")
-        steps = [] if step is None else other_time_steps(controller.driver, step)
-        mismatch = f"; a part of the driver was made for a time_step of {steps[0]:g} s, not {step:g} s" if steps else ""
+        others = [] if step is None else controller.driver.requirements().other_time_steps(step)
+        mismatch = f"; a part of the driver has a time_step of {others[0]:g} s, not {step:g} s" if others else ""
         checks.append(PartCheck("road", "stated", f"made for the {road}{mismatch}"))
     return checks
 

@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, SPEED_SCALE, LocalState, ScaledInput
+from unjam.drivers.requirements import Requirements
 from unjam.drivers.speed_history import empty_window, fill_window, slide_window, window_mean_speed
 from unjam.parameters import STRICT, NonNegative, Positive
 from unjam.physics.arrays import Array, clamp_min, clip, namespace, stack_columns
@@ -278,8 +279,10 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
     """
 
     name: ClassVar[str] = "adaptive-acc"
-    required_fields: ClassVar[tuple[str, ...]] = ("allowed_speed", "distance_to_merge")
-    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
+    own_requirements: ClassVar[Requirements] = Requirements(
+        used_fields=frozenset({"allowed_speed", "distance_to_merge"})
+    )
+    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
         ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
         ScaledInput("leaves a jam", 1.0, ""),
     )

@@ -6,7 +6,7 @@ import numpy as np
 
 from unjam.drivers.command import answer_as_array
 from unjam.drivers.driver import Driver, Memory
-from unjam.drivers.local_state import ADJACENT_POSITIONS, SECTIONS_AHEAD, LocalState
+from unjam.drivers.local_state import ADJACENT_POSITIONS, COMMON_FIELDS, SECTIONS_AHEAD, LocalState
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError
 from unjam.tree import leaves, map_leaves
@@ -26,7 +26,8 @@ def check_driver(
     motorways provide. Raise `InputError` with one line that names the violation and its step.
     """
     driver = as_driver(driver)
-    generator, optional_fields = np.random.default_rng(seed), optional_fields or bool(driver.required_fields)
+    reads_optional_fields = set(driver.requirements().input_fields) > set(COMMON_FIELDS)
+    generator, optional_fields = np.random.default_rng(seed), optional_fields or reads_optional_fields
     memory, *single = (driver.initial_memory(count) for count in (rows, *[1] * rows))
     if not isinstance(memory, dict):
         raise InputError(f"driver: initial_memory({rows}) returns {memory!r}; allowed: a dict of arrays")

@@ -1,14 +1,16 @@
 """The interface of drivers, which decide for their vehicles from observation and memory."""
 
 from array import array
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, fields, is_dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from unjam.drivers.command import Command, Limits
-from unjam.drivers.local_state import COMMON_FIELDS, LocalState, ScaledInput
+from unjam.drivers.local_state import LocalState, ScaledInput
+from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface, merge_requirements
 from unjam.physics.arrays import Array
 from unjam.tree import Arrays, map_leaves
 
@@ -17,8 +19,6 @@ Memory = dict[str, Any]
 contains another driver keeps the memory of that driver within its own."""
 Recipe = dict[str, Any]
 """Specification of a driver as JSON; the weights of its networks are stored separately as arrays."""
-STEP_TOLERANCE = 1e-9
-"""difference up to which control steps are equal [s]"""
 NoiseSampler = Callable[[], Array]
 """returns standard normal noise for one evaluation of a network, one number for each row"""
 
@@ -50,27 +50,14 @@ class Driver:
 
     name: ClassVar[str] = ""
     """name for `--driver`; empty for drivers without one"""
-    accepts_floats: ClassVar[bool] = False
-    """whether `act` also takes a single CAV as plain floats (memory: `scalar_memory`) and returns a float, which is
-    several times faster than arrays of one row"""
-    accepts_tensors: ClassVar[bool] = False
-    """whether `act` also takes torch tensors, as in a learned model; otherwise NumPy arrays are used there, slower"""
-    needs_loop: ClassVar[bool] = False
-    """whether it needs the position on a closed road"""
-    required_fields: ClassVar[tuple[str, ...]] = ()
-    """fields of `LocalState` that it reads and that only some roads provide"""
-    policy_inputs: ClassVar[tuple[str, ...]] = ()
-    """names of the features that its networks read, on any road"""
-    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
-    """description of `memory_features`, in order"""
+    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
+    """what it needs, without the drivers that it contains"""
+    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
+    """description of its own `memory_features`, in order"""
     is_native: ClassVar[bool] = False
     """whether the simulator itself drives (a human driver): `act` is then not called"""
     action_repeat: int = 1
     """control steps for which one residual is repeated"""
-    episode_noise_size: int = 0
-    """count of exploration noise numbers that stay constant for an episode; 0: new noise in each control step"""
-    limits: Limits | None = None
-    """limits of its own acceleration [m/s2]; None: those of the road"""
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of `n` CAVs before their first step: NumPy arrays of shape (n, ...)."""
@@ -109,38 +96,43 @@ class Driver:
 
     # The description of a driver for the registry, workers and controller files.
 
-    @property
+    @cached_property
     def inner_drivers(self) -> dict[str, "Driver"]:
         """The drivers that it contains, by the names of their memories, which prefix their networks' weights."""
         return {}
+
+    @cached_property
+    def limits(self) -> Limits | None:
+        """Limits of its own acceleration [m/s2]; None: those of the road."""
+        return None
+
+    @property
+    def episode_noise_size(self) -> int:
+        """Count of exploration noise numbers that stay constant for an episode; 0: new noise in each control step."""
+        return 0
+
+    @property
+    def memory_inputs(self) -> tuple[ScaledInput, ...]:
+        """Description of `memory_features`, in order."""
+        return self.own_memory_inputs
 
     @property
     def network_inputs(self) -> tuple[ScaledInput, ...] | None:
         """Inputs of its own network, in order; None without a network."""
         return None
 
-    @property
-    def input_fields(self) -> tuple[str, ...]:
-        """The fields of `LocalState` that it receives."""
-        inner = (driver.input_fields for driver in self.inner_drivers.values())
-        names = {*COMMON_FIELDS, *self.required_fields}.union(*inner)
-        return tuple(name for name in LocalState._fields if name in names)
+    def requirements(self, road: RoadInterface | None = None) -> Requirements:
+        """Return what it and the drivers that it contains need; with `road`, only those that drive there count.
 
-    @property
-    def measured_fields(self) -> frozenset[str]:
-        """The fields of `LocalState` that a road must measure for it and for the drivers that it contains."""
-        return frozenset(self.input_fields).union(*(inner.measured_fields for inner in self.inner_drivers.values()))
+        If it has an attribute `time_step`, its formulas assume this control step.
+        """
+        step = getattr(self, "time_step", None)
+        own = self.own_requirements._replace(time_steps=frozenset(() if step is None else (step,)))
+        return merge_requirements(own, *(driver.requirements(road) for driver in self.active_drivers(road)))
 
-    def active_drivers(self, is_closed: bool, provided_fields: Collection[str]) -> Iterable["Driver"]:
-        """Return the inner drivers that can drive on a road; arguments are properties of its `Scenario`."""
+    def active_drivers(self, road: RoadInterface | None) -> Iterable["Driver"]:
+        """Return the drivers that it contains and that drive on a road; None: on any."""
         return self.inner_drivers.values()
-
-    def time_steps(self, is_closed: bool, provided_fields: Collection[str]) -> frozenset[float]:
-        """Return the control steps [s] that its formulas and those of its active drivers assume; empty: any step."""
-        own = getattr(self, "time_step", None)
-        inner = self.active_drivers(is_closed, provided_fields)
-        assumed = (driver.time_steps(is_closed, provided_fields) for driver in inner)
-        return frozenset(() if own is None else (own,)).union(*assumed)
 
     def describe(self) -> str:
         """Return its name and the parameters that differ from the defaults."""
@@ -166,20 +158,7 @@ class Driver:
 class FormulaDriver(Driver):
     """A driver with one formula for arrays, tensors and plain numbers (see `unjam.physics.arrays`)."""
 
-    accepts_floats: ClassVar[bool] = True
-    accepts_tensors: ClassVar[bool] = True
-
-
-def other_time_steps(
-    driver: Driver, step: float, is_closed: bool | None = None, provided_fields: Collection[str] = ()
-) -> list[float]:
-    """Return the control steps [s] that a driver assumes and that differ from `step`, in order.
-
-    The other arguments are those of `Driver.time_steps`; with None for `is_closed`, all roads are regarded.
-    """
-    kinds = (True, False) if is_closed is None else (is_closed,)
-    steps = frozenset[float]().union(*(driver.time_steps(kind, provided_fields) for kind in kinds))
-    return sorted(each for each in steps if abs(each - step) > STEP_TOLERANCE)
+    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
 
 def label_with_parameters(name: str, parameters: dict[str, Any]) -> str:

@@ -10,7 +10,7 @@ from unjam.physics.arrays import Array
 class LocalState(NamedTuple):
     """The surroundings of n CAVs, one row each; NumPy arrays or torch tensors of shape (n,), SI units.
 
-    Drivers with `Driver.accepts_floats` may also be given floats, for a single CAV. Without a vehicle ahead (or
+    Drivers that do not need arrays may also be given floats, for a single CAV. Without a vehicle ahead (or
     behind), the gap is `MAX_OBSERVED_GAP` and the speed of the leader (follower) is that of the CAV.
     """
 

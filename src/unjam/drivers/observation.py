@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
 from operator import attrgetter
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator
@@ -29,6 +29,7 @@ from unjam.drivers.local_state import (
     lap_angle,
     state_of_ones,
 )
+from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import STRICT
@@ -63,14 +64,8 @@ class Feature:
     """returns them, about unit size, shape (n, m); a tuple of m for plain numbers; None if there are none"""
     inputs: tuple[ScaledInput, ...] | None
     """their description, in order; None: `Driver.memory_inputs` of the expert describes them"""
-    road_requirement: Literal["", "loop", "coordinate"] = ""
-    """required road: `loop` is a closed one, `coordinate` one with positions along it"""
-    required_fields: tuple[str, ...] = ()
-    """fields of `LocalState` that it reads and that only some roads provide (`Scenario.provided_fields`)"""
-    accepts_floats: bool = True
-    """whether it takes plain numbers and tensors; otherwise it is called with NumPy arrays"""
-    reads_any_field: bool = False
-    """whether it may read any field of `LocalState`, because only the user's code determines which"""
+    requirements: Requirements = NO_REQUIREMENTS
+    """what it needs of a road, and whether it takes plain numbers"""
 
 
 def local_observation(state: LocalState) -> Array:
@@ -102,8 +97,7 @@ def _section_speed_feature(field: str, location: str) -> Feature:
     return Feature(
         lambda inputs: (getattr(inputs.state, field) - inputs.state.speed[..., None]) / SPEED_SCALE,
         tuple(ScaledInput(f"mean speed {location} {each} ahead - own speed", SPEED_SCALE, "m/s") for each in distances),
-        required_fields=(field,),
-        accepts_floats=False,
+        Requirements(frozenset({field}), needs_arrays=True),
     )
 
 
@@ -126,14 +120,15 @@ def _adjacent_lane_features(state: LocalState) -> Array:
 
 
 def _field_feature(
-    field: str, description: ScaledInput, value: Callable[[LocalState], Array] | None = None, **options: Any
+    field: str,
+    description: ScaledInput,
+    value: Callable[[LocalState], Array] | None = None,
+    requirements: Requirements = NO_REQUIREMENTS,
 ) -> Feature:
     """Return the feature of a field of `LocalState`, or of a `value` that depends on it, divided by its scale."""
     compute, scale = value or attrgetter(field), description.scale
-    required = () if field in COMMON_FIELDS else (field,)
-    return Feature(
-        lambda inputs: as_column(compute(inputs.state) / scale), (description,), required_fields=required, **options
-    )
+    requirements = requirements._replace(required_fields=frozenset({field}).difference(COMMON_FIELDS))
+    return Feature(lambda inputs: as_column(compute(inputs.state) / scale), (description,), requirements)
 
 
 FEATURES: dict[str, Feature] = {
@@ -151,14 +146,16 @@ FEATURES: dict[str, Feature] = {
         lambda inputs: as_column(inputs.expert_acceleration), (ScaledInput("expert acceleration", 1.0, "m/s2"),)
     ),
     "expert_memory": Feature(lambda inputs: inputs.expert.memory_features(inputs.memory), None),
-    "loop_length": _field_feature("loop_length", ScaledInput("loop length", 250.0, "m"), road_requirement="loop"),
+    "loop_length": _field_feature(
+        "loop_length", ScaledInput("loop length", 250.0, "m"), requirements=Requirements(needs_loop=True)
+    ),
     "lap_position": Feature(
         lambda inputs: lap_position(inputs.state),
         (ScaledInput("cosine of lap position", 1.0, ""), ScaledInput("sine of lap position", 1.0, "")),
-        road_requirement="loop",
+        Requirements(needs_loop=True),
     ),
     "route_position": _field_feature(
-        "route_position", ScaledInput("route position", 100.0, "m"), road_requirement="coordinate"
+        "route_position", ScaledInput("route position", 100.0, "m"), requirements=Requirements(needs_coordinate=True)
     ),
     "allowed_speed": _field_feature(
         "allowed_speed",
@@ -173,8 +170,7 @@ FEATURES: dict[str, Feature] = {
     "merge_proximity": Feature(
         lambda inputs: merge_proximity(inputs.state),
         tuple(ScaledInput(f"proximity to {each:g} m before the merge", 1.0, "") for each in PROXIMITY_DISTANCES),
-        required_fields=("distance_to_merge",),
-        accepts_floats=False,
+        Requirements(frozenset({"distance_to_merge"}), needs_arrays=True),
     ),
     "lane_speeds": _section_speed_feature("lane_speeds", "in own lane"),
     "road_speeds": _section_speed_feature("road_speeds", "on all lanes"),
@@ -185,8 +181,7 @@ FEATURES: dict[str, Feature] = {
             *(ScaledInput(f"speed {each} - own speed", RELATIVE_SPEED_SCALE, "m/s") for each in ADJACENT_POSITIONS),
             *(ScaledInput(f"gap {each}", GAP_SCALE, "m") for each in ADJACENT_POSITIONS),
         ),
-        required_fields=("adjacent_gaps", "adjacent_speeds"),
-        accepts_floats=False,
+        Requirements(frozenset({"adjacent_gaps", "adjacent_speeds"}), needs_arrays=True),
     ),
 }
 """all features of networks; `local` has the five numbers of the paper"""
@@ -253,13 +248,13 @@ class PolicyInput:
             value = ((value - inputs.state.speed if is_relative else value) * factor - self.offset) / self.scale
             return value if name in FIELD_SIZES else as_column(value)
 
+        known = FEATURES[name].requirements if name in FEATURES else NO_REQUIREMENTS
+        requirements = known._replace(needs_arrays=name in FIELD_SIZES)
         label = f"{self.quantity} - {self.offset:g} {unit}" if self.offset else self.quantity
         return Feature(
             compute,
             (ScaledInput(label, self.scale, unit),) * FIELD_SIZES.get(name, 1),
-            FEATURES[name].road_requirement if name in FEATURES else "",
-            () if name in COMMON_FIELDS else (name,),
-            accepts_floats=name not in FIELD_SIZES,
+            requirements._replace(required_fields=frozenset({name}).difference(COMMON_FIELDS)),
         )
 
 
@@ -320,15 +315,7 @@ def _user_feature(function: UserFunction) -> Feature:
         allowed = "allowed: (n,) or (n, m) for n CAVs"
         raise InputError(f"{function.label}: returns shape {found.shape} for one CAV; {allowed}")
     entries = (ScaledInput(f"{function.label} {number}", 1.0, "") for number in range(found.shape[1]))
-    return Feature(compute, tuple(entries), accepts_floats=False, reads_any_field=True)
-
-
-def feature_fields(names: Sequence[NetworkInput]) -> frozenset[str]:
-    """Return the fields of `LocalState` that features read; for a user's own feature all, as its code decides."""
-    features = [feature(name) for name in names]
-    if any(each.reads_any_field for each in features):
-        return frozenset(LocalState._fields)
-    return frozenset(field for each in features for field in each.required_fields)
+    return Feature(compute, tuple(entries), Requirements(reads_any_field=True, needs_arrays=True))
 
 
 def compute_observation(names: Sequence[NetworkInput], inputs: FeatureInputs) -> Array:

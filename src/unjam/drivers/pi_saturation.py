@@ -25,7 +25,7 @@ class PISaturation(FormulaDriver):
     """
 
     name: ClassVar[str] = "pi"
-    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
+    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
         ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
         ScaledInput("commanded speed", SPEED_SCALE, "m/s"),
     )

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import field
+from functools import cached_property
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
@@ -22,10 +23,10 @@ from unjam.drivers.observation import (
     Scale,
     compute_observation,
     feature,
-    feature_fields,
     observation_inputs,
     unit_factor,
 )
+from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
 from unjam.drivers.residual import EXPERT_KEY
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import STRICT, Positive, build_dataclass
@@ -151,28 +152,17 @@ class PolicyDriver(Driver):
     """control step of the road [s]; None: any, as neither the output nor the action repeat depends on it"""
     action_repeat: int = 1
     """control steps for which one action is repeated"""
-    limits: Limits | None = None
+    limits: Limits | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """limits of the expert and of the sum [m/s2]; None: those of the road"""
 
-    @property
+    @cached_property
     def inner_drivers(self) -> dict[str, Driver]:
         """The expert."""
         return {EXPERT_KEY: self.expert}
 
-    @property
-    def required_fields(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Those of the inputs."""
-        return tuple(name for each in self.inputs for name in feature(each).required_fields)
-
-    @property
-    def policy_inputs(self) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Its inputs, and those of networks in its expert."""
-        return (*self.inputs, *self.expert.policy_inputs)
-
-    @property
-    def measured_fields(self) -> frozenset[str]:
-        """Those of the expert and of the inputs; for the user's own features all fields."""
-        return super().measured_fields | feature_fields(self.inputs)
+    def requirements(self, road: RoadInterface | None = None) -> Requirements:
+        """Return those of the expert and of the inputs."""
+        return merge_requirements(super().requirements(road), *(feature(each).requirements for each in self.inputs))
 
     @property
     def network_inputs(self) -> tuple[ScaledInput, ...]:

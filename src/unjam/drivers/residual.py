@@ -10,14 +10,8 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, Recipe
 from unjam.drivers.local_state import LocalState, ScaledInput
 from unjam.drivers.network import Network, network_weights
-from unjam.drivers.observation import (
-    FeatureInputs,
-    compute_observation,
-    feature,
-    feature_fields,
-    observation_inputs,
-    user_files,
-)
+from unjam.drivers.observation import FeatureInputs, compute_observation, feature, observation_inputs, user_files
+from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
 from unjam.drivers.wrappers import DriverWrapper
 from unjam.physics.arrays import Array, namespace
 from unjam.tree import Arrays
@@ -45,34 +39,18 @@ class ResidualDriver(DriverWrapper):
     """control steps for which one residual is repeated; the expert decides in each of them"""
 
     @cached_property
-    def limits(self) -> Limits:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def limits(self) -> Limits:
         """Limits of the expert and of the sum."""
         return Limits.symmetric(self.action_limit)
 
-    @cached_property
-    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Whether expert and features take plain numbers."""
-        return self.expert.accepts_floats and all(feature(name).accepts_floats for name in self.inputs)
-
     @property
-    def episode_noise_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def episode_noise_size(self) -> int:
         """That of its network."""
         return self.network.episode_noise_size
 
-    @property
-    def required_fields(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Those of the features."""
-        return tuple(field for name in self.inputs for field in feature(name).required_fields)
-
-    @property
-    def policy_inputs(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The features of its network, and of networks in its expert."""
-        return (*self.inputs, *self.expert.policy_inputs)
-
-    @property
-    def measured_fields(self) -> frozenset[str]:
-        """Those of the expert and of the features; for the user's own features all fields."""
-        return super().measured_fields | feature_fields(self.inputs)
+    def requirements(self, road: RoadInterface | None = None) -> Requirements:
+        """Return those of the expert and of the features."""
+        return merge_requirements(super().requirements(road), *(feature(name).requirements for name in self.inputs))
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the expert and, with an action repeat, the residual and its age."""

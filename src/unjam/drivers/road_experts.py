@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState, ScaledInput, lap_angle
+from unjam.drivers.requirements import Requirements
 from unjam.parameters import STRICT, NonNegative, Positive
 from unjam.physics.arrays import Array, as_column, clamp_min, namespace
 
@@ -63,8 +64,8 @@ class Pacer(FormulaDriver):
     """
 
     name: ClassVar[str] = "pacer"
-    needs_loop: ClassVar[bool] = True
-    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("queue has gathered", 1.0, ""),)
+    own_requirements: ClassVar[Requirements] = Requirements(needs_loop=True)
+    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("queue has gathered", 1.0, ""),)
 
     lap_time: Positive = 69.0
     """time for a lap [s]; the default gives 6.5 m/s at a radius of 32 m and 7.1 m/s at 35 m"""
@@ -162,7 +163,7 @@ class JamAbsorber(FormulaDriver):
     """
 
     name: ClassVar[str] = "jam-absorber"
-    memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("waits for the jam to dissolve", 1.0, ""),)
+    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("waits for the jam to dissolve", 1.0, ""),)
 
     jam_speed: NonNegative = 10.0
     """speed of the leader below which it counts as jammed [m/s]"""
@@ -235,13 +236,13 @@ class JamAhead(FormulaDriver):
 
     Without a map of ramps it slows down only for sections that the roadside service reports as congested: dense free
     traffic may be far slower than the speed limit. Without such a report it never slows down. `congestion` is not in
-    `required_fields`: graphs and manifests describe the road with a map, on which it is not used.
+    `used_fields`: graphs and manifests describe the road with a map, on which it is not used.
     """
 
     name: ClassVar[str] = "jam-ahead"
-    accepts_floats: ClassVar[bool] = False
-    required_fields: ClassVar[tuple[str, ...]] = (
-        *("allowed_speed", "distance_to_merge", "lane_speeds", "road_speeds", "penetration_rate"),
+    own_requirements: ClassVar[Requirements] = Requirements(
+        used_fields=frozenset({"allowed_speed", "distance_to_merge", "lane_speeds", "road_speeds", "penetration_rate"}),
+        needs_arrays=True,
     )
 
     first_section: SectionIndex = 0
@@ -300,7 +301,9 @@ class GapMaker(JamAhead):
     """
 
     name: ClassVar[str] = "gap-maker"
-    required_fields: ClassVar[tuple[str, ...]] = (*JamAhead.required_fields, "adjacent_gaps")
+    own_requirements: ClassVar[Requirements] = JamAhead.own_requirements._replace(
+        used_fields=JamAhead.own_requirements.used_fields | {"adjacent_gaps"}
+    )
 
     merge_time_gap: Positive = 2.0
     """time gap while it opens a gap [s]"""

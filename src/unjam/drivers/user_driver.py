@@ -6,7 +6,7 @@ Such a file is executed as code: use only files that you trust.
 import inspect
 import os
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import RLock
@@ -19,6 +19,7 @@ import numpy as np
 from unjam.drivers.command import answer_as_array
 from unjam.drivers.driver import Driver, Memory, Recipe, label_with_parameters
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.requirements import Requirements, RoadInterface
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.processes import redirect_user_output
@@ -174,17 +175,14 @@ class UserDriver(Driver):
 
     implementation: Any
 
-    @property
-    def measured_fields(self) -> frozenset[str]:
-        """All fields, because only the user's code determines which it reads."""
-        return frozenset(LocalState._fields)
-
-    def time_steps(self, is_closed: bool, provided_fields: Collection[str]) -> frozenset[float]:
-        """Return the attribute `time_step` of the user's driver; those of a `Driver` as it returns them."""
+    def requirements(self, road: RoadInterface | None = None) -> Requirements:
+        """Return that it may read any field, and the attribute `time_step` of the user's driver."""
         if isinstance(self.implementation, Driver):
-            return self.implementation.time_steps(is_closed, provided_fields)
-        own = getattr(self.implementation, "time_step", None)
-        return frozenset({float(own)} if isinstance(own, int | float) else ())
+            steps = self.implementation.requirements(road).time_steps
+        else:
+            own = getattr(self.implementation, "time_step", None)
+            steps = frozenset({float(own)} if isinstance(own, int | float) else ())
+        return self.own_requirements._replace(reads_any_field=True, time_steps=steps)
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return the result of the user's function."""
@@ -248,11 +246,12 @@ class FileDriver(FileReference, UserDriver):
             raise InputError(f"{self}: takes no parameters; only a class does")
         return as_implementation(found, str(self))
 
-    def time_steps(self, is_closed: bool, provided_fields: Collection[str]) -> frozenset[float]:
-        """Return those of the user's driver; of a class without this attribute the argument that it received."""
-        stored = super().time_steps(is_closed, provided_fields)
-        is_argument = not stored and _takes_time_step(type(self.implementation))
-        return frozenset({self.parameters.get("time_step", self.time_step)}) if is_argument else stored
+    def requirements(self, road: RoadInterface | None = None) -> Requirements:
+        """Return those of the user's driver; a class without `time_step` assumes the argument that it received."""
+        found = super().requirements(road)
+        if found.time_steps or not _takes_time_step(type(self.implementation)):
+            return found
+        return found._replace(time_steps=frozenset({self.parameters.get("time_step", self.time_step)}))
 
     def describe(self) -> str:
         """Return the names of file and driver, and the given parameters."""

@@ -1,11 +1,10 @@
 """Drivers that contain other drivers: mixtures and switches, impaired sensing, the safety filter, history features."""
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property
-from itertools import chain
 from math import exp
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydantic import ConfigDict, model_validator
@@ -14,6 +13,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory, Recipe
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
+from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface
 from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION
 from unjam.drivers.safety import FollowingState, SafetyFilter
 from unjam.drivers.sensors import MIN_SENSED_GAP
@@ -49,23 +49,15 @@ MIN_SHARED_PENETRATION_RATE = 0.06
 because the rate does not give their number"""
 
 
-def _combine_inner(name: str, combine: Callable[[Iterable[Any]], Any]) -> Any:
-    """Return the property that combines the attribute `name` of all inner drivers."""
-    return property(lambda self: combine(getattr(inner, name) for inner in self.inner_drivers.values()))
-
-
 class CompositeDriver(Driver):
     """A driver that contains other drivers in fields of a dataclass; the field `driver` has the memory name `inner`."""
 
     kind: ClassVar[str] = ""
     """kind of its recipe"""
-    accepts_floats = _combine_inner("accepts_floats", all)
-    accepts_tensors = _combine_inner("accepts_tensors", all)
-    needs_loop = _combine_inner("needs_loop", any)
-    policy_inputs = _combine_inner("policy_inputs", lambda inner: tuple(chain.from_iterable(inner)))
+    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
     @cached_property
-    def inner_drivers(self) -> dict[str, Driver]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def inner_drivers(self) -> dict[str, Driver]:
         """The drivers in its fields, in order."""
         drivers = ((field.name, getattr(self, field.name)) for field in fields(self))  # pyright: ignore[reportArgumentType]
         return {INNER_KEY if name == "driver" else name: each for name, each in drivers if isinstance(each, Driver)}
@@ -87,7 +79,7 @@ class DriverWrapper(CompositeDriver):
     inner_key: ClassVar[str] = INNER_KEY
 
     @property
-    def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def memory_inputs(self) -> tuple[ScaledInput, ...]:
         """Those of the inner driver."""
         return self.inner_drivers[self.inner_key].memory_inputs
 
@@ -107,7 +99,7 @@ class MixedDriver(CompositeDriver):
     After the last driver it starts again with the first; CAVs that enter an open road count in order of entry.
     """
 
-    accepts_floats: ClassVar[bool] = False
+    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
 
     drivers: tuple[Driver, ...]
 
@@ -157,8 +149,7 @@ class ImpairedDriver(DriverWrapper):
     """Drives as another driver does with noisy gaps and delayed commands."""
 
     kind: ClassVar[str] = "impaired"
-    accepts_tensors: ClassVar[bool] = False
-    accepts_floats: ClassVar[bool] = False
+    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
 
     driver: Driver
     delay: NonNegative = 0.0
@@ -223,7 +214,7 @@ class FilteredDriver(DriverWrapper):
     """control step [s]"""
 
     @cached_property
-    def limits(self) -> Limits:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def limits(self) -> Limits:
         """Limits of the result: those of the driver, and the brakes of the vehicle."""
         return Limits(-max(self.action_limit, self.safety.braking), self.action_limit)
 
@@ -252,7 +243,7 @@ class HistoryDriver(DriverWrapper):
     """control step [s]"""
 
     @property
-    def memory_inputs(self) -> tuple[ScaledInput, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def memory_inputs(self) -> tuple[ScaledInput, ...]:
         """Those of the inner driver, and its own."""
         own = (
             entry
@@ -325,8 +316,7 @@ class QueueFallback(CompositeDriver):
     """control step [s]"""
 
     kind: ClassVar[str] = "queue-fallback"
-    accepts_tensors: ClassVar[bool] = False
-    needs_loop: ClassVar[bool] = True
+    own_requirements: ClassVar[Requirements] = Requirements(needs_loop=True, needs_numpy=True)
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memories of both, without elapsed time, queue and switch."""
@@ -373,10 +363,9 @@ class RoadTypeSwitch(CompositeDriver):
     """
 
     kind: ClassVar[str] = "road-type-switch"
-    accepts_tensors: ClassVar[bool] = False
-    needs_loop: ClassVar[bool] = False
-    policy_inputs: ClassVar[tuple[str, ...]] = ()
-    required_fields: ClassVar[tuple[str, ...]] = ("distance_to_crossing", "penetration_rate")
+    own_requirements: ClassVar[Requirements] = Requirements(
+        used_fields=frozenset({"distance_to_crossing", "penetration_rate"}), needs_numpy=True
+    )
 
     motorway: Driver
     """driver on roads with measured speeds of the lanes ahead"""
@@ -390,17 +379,13 @@ class RoadTypeSwitch(CompositeDriver):
     """driver on closed roads without a crossing and with a penetration rate of at least `MIN_SHARED_PENETRATION_RATE`;
     None: `loop`"""
 
-    @property
-    def accepts_floats(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether those of closed roads take plain numbers, which no other road uses."""
-        closed = (self.crossing_loop, self.loop, self.shared_loop or self.loop)
-        return all(driver.accepts_floats for driver in closed)
-
-    def active_drivers(self, is_closed: bool, provided_fields: Collection[str]) -> Iterable[Driver]:
+    def active_drivers(self, road: RoadInterface | None) -> Iterable[Driver]:
         """Return the driver of an open road, or all drivers of closed roads."""
-        if is_closed:
+        if road is None:
+            return self.inner_drivers.values()
+        if road.is_closed:
             return self.crossing_loop, self.loop, self.shared_loop or self.loop
-        return (self.motorway if "lane_speeds" in provided_fields else self.open_road,)
+        return (self.motorway if "lane_speeds" in road.provided_fields else self.open_road,)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration by the driver for this road type, and the new memory."""

@@ -22,9 +22,10 @@ from unjam.drivers.observation import (
     NetworkInput,
     as_features,
     compute_observation,
-    feature_fields,
+    feature,
     observation_size,
 )
+from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
@@ -48,10 +49,11 @@ class ExternalDriver(Driver):
         self.actions: Any = np.zeros(0)
         """additions to the accelerations [m/s2], shape (CAVs,)"""
 
-    @property
-    def measured_fields(self) -> frozenset[str]:
-        """Those of the expert and of the features."""
-        return self.expert.measured_fields | feature_fields(self.features)
+    def requirements(self, road: RoadInterface | None = None) -> Requirements:
+        """Return those of the expert and of the features."""
+        return merge_requirements(
+            self.expert.requirements(road), *(feature(each).requirements for each in self.features)
+        )
 
     def initial_memory(self, n: int) -> Memory:
         """Return that of the expert."""
@@ -146,7 +148,8 @@ class RoadStepper:
         self._world_context.close()
         if self._opened is None:
             self._opened = self._backend_context.enter_context(open_backend(self._backend))
-        opening = self._opened.open(self.scenario, numbers, WorldOptions(self._driver.measured_fields))
+        fields = self._driver.requirements(self.scenario.interface).measured_fields
+        opening = self._opened.open(self.scenario, numbers, WorldOptions(fields))
         self._world = world = self._world_context.enter_context(opening)
         self._drive_loop = DriveLoop(world, self._driver)
         self._control_steps = iter(self._drive_loop)

@@ -13,6 +13,7 @@ from unjam.drivers.check import check_acceleration
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import EXPERT_KEY, RESIDUAL_AGE_KEY, RESIDUAL_KEY, ResidualDriver
 from unjam.drivers.safety import FollowingState
 from unjam.drivers.user_driver import is_file_reference
@@ -69,7 +70,7 @@ def tensor_reward(text: str) -> Reward:
 
 def tensor_driver(driver: Driver, device: torch.device | str) -> Driver:
     """Return a driver that takes tensors on `device`: the same, or an adapter that calls it with NumPy arrays."""
-    return driver if driver.accepts_tensors else NumPyDriverAdapter(driver, torch.device(device))
+    return NumPyDriverAdapter(driver, torch.device(device)) if driver.requirements().needs_numpy else driver
 
 
 def tensor_memory(driver: Driver, memory: Memory, device: torch.device | str) -> Memory:
@@ -81,7 +82,7 @@ def tensor_memory(driver: Driver, memory: Memory, device: torch.device | str) ->
 class NumPyDriverAdapter(Driver):
     """Calls a driver that does not take tensors with NumPy arrays; its memory stays in NumPy."""
 
-    accepts_tensors: ClassVar[bool] = True
+    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
     driver: Driver
     device: torch.device
 

@@ -264,7 +264,7 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
         replay = ReplayOptions(seeds, control_steps, self.settings.add_noise, correction)
         road, vehicle_seeds = cast(Motorway, self.scenario), [each.seed for each in samples]
         world = MotorwayBatch(road, vehicle_seeds, explore=exploration_scales, replay=replay)
-        world.measured_fields = driver.measured_fields
+        world.measured_fields = driver.requirements().measured_fields
         return finish_drive(DriveLoop(world, driver, 0.0 if exploration_scales is None else 1.0))
 
     def _correction(self, model: RoadModel, seed: Sequence[int]) -> LearnedCorrection | None:

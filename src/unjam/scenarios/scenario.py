@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.command import Limits
+from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.drivers.user_driver import UserFunction
@@ -201,6 +202,12 @@ class Scenario:
     def user_files(self) -> list[Path]:
         """Files with data that episodes depend on, apart from the code of a user's class."""
         return [population_file(self.population)] if self.population else []
+
+    @property
+    def interface(self) -> RoadInterface:
+        """What it provides to drivers."""
+        fields = frozenset(self.provided_fields)
+        return RoadInterface(self.title, self.is_closed, self.has_coordinate, fields, self.control_step)
 
     @property
     def notes(self) -> list[str]:

@@ -49,7 +49,7 @@ from unjam.training.selection import (
     min_verdict_episodes,
     select_controllers,
 )
-from unjam.worlds.episode import can_drive, check_time_step
+from unjam.worlds.episode import check_can_drive
 from unjam.worlds.worker_pool import WorkerPool
 
 DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
@@ -141,10 +141,9 @@ def make_request(
     assert isinstance(road, UserNetwork)
     controllers = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
     for name, driver in controllers.items():
-        if driver.is_native or not can_drive(driver, road):
-            allowed = "the human baseline is always included" if driver.is_native else "one that needs no closed road"
-            raise invalid_value("driver", name, allowed)
-        check_time_step(driver, road, name)
+        if driver.is_native:
+            raise invalid_value("driver", name, "the human baseline is always included")
+        check_can_drive(driver, road, f"driver {name}")
     request = AssessmentRequest(file, road, controllers, rates, episodes, minutes, precision)
     minimum = min_episodes(len(rates), len(controllers), request.has_acc_properties) + PLOT_EPISODE_COUNT
     if episodes < minimum:

@@ -173,7 +173,8 @@ def _episode_rate(scenario: Scenario, driver: ResidualDriver, seed: int, simulat
 
 def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulation) -> float:
     """Return control steps per second of the driving loop alone."""
-    traffic = make_traffic(scenario, (1,), simulation, WorldOptions(accepts_floats=driver.accepts_floats))
+    options = WorldOptions(accepts_floats=not driver.requirements().needs_arrays)
+    traffic = make_traffic(scenario, (1,), simulation, options)
     return steps_per_second(lambda: deque(DriveLoop(traffic, driver, explore=True), maxlen=0), scenario.horizon)
 
 

@@ -34,7 +34,7 @@ from unjam.training.config import RunConfig
 from unjam.training.run_folder import lock_new_folder
 from unjam.training.seeds import TRAINING_SEED_LIMIT, make_test_seeds
 from unjam.worlds.backend import BackendLike, check_support, open_backend
-from unjam.worlds.episode import can_drive, check_time_step, run_episode
+from unjam.worlds.episode import can_drive, check_can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import RewardLike, make_reward, reward_label
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -320,7 +320,8 @@ def gain_over_expert(config: RunConfig, rows: RowsByDriver) -> Estimate | None:
 
 def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
     """Return whether a driver uses the speeds ahead to limit the ACC of CAVs on a road where they have none."""
-    uses_lane_speeds = "lane_speeds" in driver.input_fields and "lane_speeds" in scenario.provided_fields
+    road = scenario.interface
+    uses_lane_speeds = "lane_speeds" in driver.requirements(road).input_fields and "lane_speeds" in road.provided_fields
     return uses_lane_speeds and scenario.actuation != "cruise"
 
 
@@ -380,7 +381,7 @@ def drive(
             made = as_driver(entry, road.control_step)
             drivers[unique_label(made, drivers)] = made
     for name, one in drivers.items():
-        check_time_step(one, road, name)
+        check_can_drive(one, road, f"driver {name}")
     if not drivers:
         raise invalid_value("driver", driver, driver_names())
     make_reward(reward or road.reward)

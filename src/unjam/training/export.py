@@ -141,7 +141,7 @@ def export_controller(
         import_optional("torch")
         from unjam.controller.onnx_graph import onnx_graph  # imported late: torch.onnx is slow to import
 
-        missing = [name for name in driver.input_fields if getattr(states, name) is None]
+        missing = [name for name in driver.requirements().input_fields if getattr(states, name) is None]
         if missing:  # the graph has all inputs of the driver
             reason = f"{road.title} does not provide {', '.join(missing)}; allowed: --scenario of a road that does"
             raise InputError(f"onnx: {driver.describe()} is not allowed: {reason}")
@@ -241,4 +241,5 @@ def _sample_states(scenario: Scenario, driver: Driver, backend: str) -> LocalSta
     raise_failure([measure(episode)] if not episode.has_run else [])
     longest = max(episode.trajectories, key=lambda trajectory: len(trajectory.applied_acceleration))
     states = longest.states.select(slice(min(len(longest.applied_acceleration), MAX_SAMPLE_STEPS)))
-    return LocalState(**{name: values for name, values in states._asdict().items() if name in driver.input_fields})
+    fields = driver.requirements().input_fields
+    return LocalState(**{name: values for name, values in states._asdict().items() if name in fields})

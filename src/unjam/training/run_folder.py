@@ -16,6 +16,7 @@ from unjam.controller.file import sha256_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.drivers.registry import driver_recipe
+from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
 from unjam.files import (
@@ -38,7 +39,7 @@ from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
 from unjam.training.early_stopping import should_stop_early
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
 from unjam.worlds.backend import check_support, open_backend
-from unjam.worlds.episode import check_can_drive, check_policy_inputs, check_time_step
+from unjam.worlds.episode import can_drive, check_can_drive, check_policy_inputs
 from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
@@ -66,7 +67,9 @@ def check_config(config: RunConfig) -> None:
         with open_backend(task.episode_backend) as backend:
             check_support(backend, scenario)
         for name in task.evaluation.baselines:
-            check_time_step(make_driver(name, scenario.control_step), scenario, name)
+            baseline = make_driver(name, scenario.control_step)
+            if can_drive(baseline, scenario):
+                check_can_drive(baseline, scenario, f"driver {name}")
         if config.model.model_ratio > 0 and config.model.kind == "row":
             _check_row_model(task, scenario, expert)
         elif config.model.model_ratio > 0:
@@ -82,7 +85,8 @@ def check_config(config: RunConfig) -> None:
 
 def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> None:
     """Raise `InputError` if the row model cannot continue an input, or the actuation of the scenario."""
-    inputs = set(expert.measured_fields).union(*(feature(name).required_fields for name in config.policy.inputs))
+    features = merge_requirements(*(feature(name).requirements for name in config.policy.inputs))
+    inputs = expert.requirements(scenario.interface).measured_fields | features.required_fields
     missing = sorted(inputs & set(scenario.provided_fields) - ROW_MODEL_FIELDS)
     reason = f"{expert.describe()} and the network use {', '.join(missing)}" if missing else ""
     if scenario.actuation == "cruise":

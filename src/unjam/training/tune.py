@@ -221,7 +221,8 @@ def _run_in_batch(tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
     if isinstance(all_tasks[0].scenario, Motorway):
         episodes = iter(run_batches(all_tasks, allow_statistical=True))
     else:
-        to_array = torch.as_tensor if all(task.driver.accepts_tensors for task in all_tasks) else np.asarray
+        needs_numpy = any(task.driver.requirements().needs_numpy for task in all_tasks)
+        to_array = np.asarray if needs_numpy else torch.as_tensor
         episodes = iter(run_batch(all_tasks, to_array, allow_statistical=True))
     return [[measure(next(episodes)) for _ in each] for each in tasks]
 

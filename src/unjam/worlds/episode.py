@@ -7,8 +7,9 @@ from typing import SupportsIndex
 
 import numpy as np
 
-from unjam.drivers.driver import Driver, other_time_steps
+from unjam.drivers.driver import Driver
 from unjam.drivers.observation import NetworkInput, feature
+from unjam.drivers.requirements import Requirements
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.scenarios.scenario import Scenario
@@ -33,7 +34,7 @@ class Task:
     """name in progress reports, tables and folders; empty for a single task"""
 
     def __post_init__(self) -> None:
-        check_time_step(self.expert, self.scenario)
+        check_can_drive(self.expert, self.scenario)
 
 
 def run_episode(
@@ -76,7 +77,8 @@ def run_episode(
     driver, seed = as_driver(driver, scenario.control_step), as_seed(seed)
     check_can_drive(driver, scenario)
     reward_function = make_reward(reward or scenario.reward)
-    options = WorldOptions(driver.measured_fields, record_details, driver.accepts_floats, stop_at_contact)
+    needs = driver.requirements(scenario.interface)
+    options = WorldOptions(needs.measured_fields, record_details, not needs.needs_arrays, stop_at_contact)
     with open_backend(backend) as simulator:
         check_support(simulator, scenario)
         with simulator.open(scenario, seed, options) as world:
@@ -93,34 +95,20 @@ def as_seed(seed: SupportsIndex | Sequence[int]) -> tuple[int, ...]:
     return integers
 
 
-def check_can_drive(driver: Driver, scenario: Scenario) -> None:
-    """Raise `InputError` if a driver cannot drive on a scenario's road."""
-    if not can_drive(driver, scenario):
-        raise InputError(f"driver: it is not allowed on {scenario.title}: it needs a closed road")
-    check_policy_inputs(driver.policy_inputs, scenario, "driver: its network's feature")
-    check_time_step(driver, scenario)
-
-
-def check_time_step(driver: Driver, scenario: Scenario, label: str = "") -> None:
-    """Raise `InputError` if the formulas of a driver assume another control step than a scenario has."""
-    step = scenario.control_step
-    others = other_time_steps(driver, step, scenario.is_closed, scenario.provided_fields)
-    if others:
-        context = f"driver {label}" if label else "driver"
-        found = f"time_step {others[0]:g} s is not allowed on {scenario.title}"
-        raise InputError(f"{context}: {found}; allowed: {step:g} s, its control step")
+def check_can_drive(driver: Driver, scenario: Scenario, label: str = "driver: it") -> None:
+    """Raise `InputError` if a scenario does not meet the requirements of a driver, which is called `label`."""
+    _check_requirements(driver.requirements(scenario.interface), scenario, label)
 
 
 def check_policy_inputs(features: Sequence[NetworkInput], scenario: Scenario, context: str) -> None:
-    """Raise `InputError` if features use fields that a scenario's road does not provide."""
+    """Raise `InputError` if a scenario does not meet the requirements of a feature."""
     for name in features:
-        requirement, fields = feature(name).road_requirement, feature(name).required_fields
-        if requirement == "loop" and not scenario.is_closed:
-            raise InputError(f"{context}: {name!r} is not allowed on a road with ends")
-        if not set(fields) <= set(scenario.provided_fields):
-            raise InputError(f"{context}: {name!r} is not allowed on {scenario.title}")
-        if requirement == "coordinate" and not scenario.has_coordinate:
-            raise InputError(f"{context}: {name!r} is not allowed on a user's network")
+        _check_requirements(feature(name).requirements, scenario, f"{context}: {name!r}")
+
+
+def _check_requirements(requirements: Requirements, scenario: Scenario, label: str) -> None:
+    if reason := requirements.unmet_reason(scenario.interface):
+        raise InputError(f"{label} is not allowed on {scenario.title}: {reason}")
 
 
 def check_has_cavs(episode: Episode, driver: Driver) -> None:
@@ -131,7 +119,7 @@ def check_has_cavs(episode: Episode, driver: Driver) -> None:
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:
     """Return whether a driver can drive a scenario: some need a loop."""
-    return scenario.is_closed or not driver.needs_loop
+    return scenario.is_closed or not driver.requirements(scenario.interface).needs_loop
 
 
 def add_reward_terms(episode: Episode, reward: Reward) -> Episode:

@@ -17,6 +17,7 @@ from unjam.drivers.command import Command
 from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_from_name
+from unjam.drivers.requirements import Requirements
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.errors import InputError
@@ -111,7 +112,7 @@ RINGS: dict[str, tuple[Ring, str]] = {
 class ByShare(Driver):
     """Brakes by the penetration rate that it receives."""
 
-    required_fields: ClassVar[tuple[str, ...]] = ("penetration_rate",)
+    own_requirements: ClassVar[Requirements] = Requirements(used_fields=frozenset({"penetration_rate"}))
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         return -state.penetration_rate, memory

@@ -8,6 +8,7 @@ import pytest
 
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation
 from unjam.drivers.local_state import COMMON_FIELDS
+from unjam.drivers.requirements import NO_REQUIREMENTS
 from unjam.drivers.safety import SafetyFilter
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
@@ -66,7 +67,7 @@ class Answers(Driver):
 
 
 class PlainAnswers(Answers):
-    accepts_floats = True
+    own_requirements = NO_REQUIREMENTS
 
 
 def moves(episode: Episode) -> Floats:

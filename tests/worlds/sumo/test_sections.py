@@ -114,7 +114,7 @@ def jammed_network(tmp_path: Path) -> Any:
 
 
 def roadside_state(scenario: Any, simulation: Simulation) -> tuple[UserNetworkTraffic, Any]:
-    traffic = make_traffic(scenario, (1,), simulation, WorldOptions(JamAhead().measured_fields))
+    traffic = make_traffic(scenario, (1,), simulation, WorldOptions(JamAhead().requirements().measured_fields))
     assert isinstance(traffic, UserNetworkTraffic)
     traffic.start(is_controlled=True)
     return traffic, traffic.local_state()

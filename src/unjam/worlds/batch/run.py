@@ -44,7 +44,7 @@ def start_batch_drive(
     `to_array` makes the world's arrays, which the driver must accept; `explore` is the factor of exploration noise.
     Without a `memory`, the driver remembers only the warm-up.
     """
-    world.measured_fields = driver.measured_fields
+    world.measured_fields = driver.requirements().measured_fields
     has_fixed_rows = world.cav_count > 0  # otherwise CAVs enter later
     if memory is None and has_fixed_rows:  # the driver of each CAV of a ring does not depend on the other rings
         rings = len(world.roads)
@@ -135,7 +135,7 @@ def _combined_driver(tasks: Sequence[EpisodeTask], to_cavs: Callable[[Array], Ar
 
 
 def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
-    return cast(LoopScenario, task.scenario), task.seed, frozenset(task.driver.measured_fields)
+    return cast(LoopScenario, task.scenario), task.seed, task.driver.requirements().measured_fields
 
 
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
