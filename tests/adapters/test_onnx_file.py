@@ -375,5 +375,5 @@ def test_a_closed_road_is_needed_for_its_length(tmp_path: Path) -> None:
     path = tmp_path / "length.onnx"
     path.write_bytes(linear(1, [1.0]).SerializeToString())
     driver = onnx_driver(path, PolicyDescription((PolicyInput("loop_length"),)))
-    with pytest.raises(InputError, match="it is not allowed on on-ramp: it needs a closed road"):
+    with pytest.raises(InputError, match="not allowed on motorway: it needs a closed road"):
         unjam.run_episode(unjam.make_scenario("on-ramp"), driver, 0)

@@ -51,12 +51,12 @@ def short_sample_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(motorway_model, "MAX_SAMPLE_INTERVAL", 10)
 
 
-def replay(has_errors: bool, correction: float = 0.0, seed: int = 9) -> Episode:
+def replay(has_errors: bool, correction: float = 0.0, seed: int = 9, road: Motorway = ROAD) -> Episode:
     def learned(speed: Floats, leader_speed: Floats, gap: Floats, known: Floats) -> Floats:
         return np.full(len(speed), correction)
 
-    options = ReplayOptions([((seed,), (8,))], ROAD.horizon, has_errors, learned if correction else None)
-    world = MotorwayBatch(ROAD, [(0,)], replay=options)
+    options = ReplayOptions([((seed,), (8,))], road.horizon, has_errors, learned if correction else None)
+    world = MotorwayBatch(road, [(0,)], replay=options)
     world.measured_fields = EXPERT.requirements().measured_fields
     (episode,) = finish_drive(DriveLoop(world, EXPERT))
     return episode
@@ -82,10 +82,8 @@ def test_correction_changes_speeds_per_control_step() -> None:
 
 
 @pytest.mark.usefixtures("short_sample_interval")
-@pytest.mark.parametrize("road", [ROAD, pytest.param(TWO_RAMPS, marks=pytest.mark.long)])
-def test_base_step_differs_from_the_record_by_perception_errors(road: Motorway) -> None:
-    (episode,) = run_batch([EpisodeTask(road, EXPERT, (0,))], allow_statistical=True)
-    samples = motorway_samples(episode, 0, road)
+def test_base_step_differs_from_the_record_by_perception_errors(batch_episodes: list[Episode]) -> None:
+    samples = motorway_samples(batch_episodes[0], 0, ROAD)
     errors = samples.human_rows.next_speed - samples.human_rows.base_speed
     assert len(errors) > 200
     change = float((samples.human_rows.next_speed - samples.human_rows.speed).std())
@@ -95,8 +93,9 @@ def test_base_step_differs_from_the_record_by_perception_errors(road: Motorway) 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("short_sample_interval")
-def test_base_predicts_drivers_without_errors_except_for_their_memory() -> None:
-    samples = motorway_samples(replace(replay(False), seed=(0,), trajectories=()), 0, ROAD)
+@pytest.mark.parametrize("road", [ROAD, TWO_RAMPS])
+def test_base_predicts_drivers_without_errors_except_for_their_memory(road: Motorway) -> None:
+    samples = motorway_samples(replace(replay(False, road=road), seed=(0,), trajectories=()), 0, road)
     errors = np.abs(samples.human_rows.next_speed - samples.human_rows.base_speed)
     # What they remember of lane changes, and when they last began to start, is not in the record.
     assert float(np.median(errors)) < 1e-3

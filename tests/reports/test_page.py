@@ -148,10 +148,10 @@ class Opener:
 @pytest.mark.parametrize(
     ("report", "figures"),
     [
-        pytest.param("driven", 2, marks=pytest.mark.slow),
-        pytest.param("merged", 2, marks=pytest.mark.slow),
-        ("trained", 7),
-        ("assessed", 2),
+        pytest.param("drive_report", 2, marks=pytest.mark.slow),
+        pytest.param("merge_report", 2, marks=pytest.mark.slow),
+        ("training_report", 7),
+        ("assessment_report", 2),
     ],
 )
 def test_page_has_every_figure(
@@ -167,7 +167,7 @@ def test_page_has_every_figure(
 @pytest.mark.parametrize(
     "size", [PHONE, *map(mark_slow, (LAPTOP, (320, 640), (820, 1180)))], ids=lambda size: str(size[0])
 )
-@pytest.mark.parametrize("report", ["driven", "merged", "trained", "assessed"])
+@pytest.mark.parametrize("report", ["drive_report", "merge_report", "training_report", "assessment_report"])
 def test_page_is_not_wider_than_the_screen(
     open_page: Opener, request: pytest.FixtureRequest, report: str, size: tuple[int, int]
 ) -> None:
@@ -418,7 +418,7 @@ def test_replay_adapts_to_the_size_of_the_window(open_page: Opener, drive_report
     assert all(len(picture) > 2000 for picture in open_page.visits[0].canvases())
 
 
-@pytest.mark.parametrize("report", ["driven", "assessed"])
+@pytest.mark.parametrize("report", ["drive_report", "assessment_report"])
 def test_every_figure_and_table_can_be_downloaded(
     open_page: Opener, request: pytest.FixtureRequest, report: str, tmp_path: Path
 ) -> None:

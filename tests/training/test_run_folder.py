@@ -41,7 +41,7 @@ def test_impossible_configuration_is_refused_before_writing(tmp_path: Path, chan
 def test_row_model_is_refused_for_inputs_that_it_cannot_continue(tmp_path: Path) -> None:
     assert load_config(changes={"scenario": "on-ramp"}).model.model_ratio == 0.0
     assert load_config(changes={"scenario": "on-ramp", "model.kind": "road"}).model.model_ratio > 0.0
-    with pytest.raises(InputError, match="not allowed on on-ramp, where CAVs use their own ACC"):
+    with pytest.raises(InputError, match="not allowed on motorway, where CAVs use their own ACC"):
         check_config(load_config(changes={"scenario": "on-ramp", "model.model_ratio": 5.0}))
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
     asked = {"scenario": str(file), "scenario_options.penetration_rate": 0.5, "expert": "jam-ahead"}

@@ -23,7 +23,7 @@ from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
 
 EnsembleT = TypeVar("EnsembleT", bound=Ensemble)
-SamplesT = TypeVar("SamplesT", bound=Any)
+EpisodeSamplesT = TypeVar("EpisodeSamplesT", bound=Any)
 
 
 class StartRequest(NamedTuple):
@@ -64,7 +64,7 @@ class Rollouts(NamedTuple):
     """other facts about them"""
 
 
-class WorldModel(Generic[EnsembleT, SamplesT]):
+class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
     """An ensemble that is fitted to the environment data D_a of a task, and worlds made of it; subclasses are kinds."""
 
     samples_type: ClassVar[Any] = None
@@ -81,7 +81,7 @@ class WorldModel(Generic[EnsembleT, SamplesT]):
         self.scenario = task.scenario
         """the road, with calibrated IDM parameters if the settings ask for them"""
         self.data = EnvironmentData(settings.buffer_size)
-        self.samples: list[SamplesT] = []
+        self.samples: list[EpisodeSamplesT] = []
         """of the episodes in D_a, oldest first"""
         self.ensemble = self.new_ensemble()
 
@@ -103,7 +103,7 @@ class WorldModel(Generic[EnsembleT, SamplesT]):
         """Return the ensemble before any fit: the base alone."""
         raise NotImplementedError
 
-    def sample_episode(self, episode: Episode, number: int) -> SamplesT:
+    def sample_episode(self, episode: Episode, number: int) -> EpisodeSamplesT:
         """Return the samples of an episode with this number."""
         raise NotImplementedError
 

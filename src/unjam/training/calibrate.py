@@ -59,7 +59,7 @@ FACTOR_RANGES: SearchSpace = {
 """factors on the attributes of passenger vehicle types, and on flows"""
 SUMO_TYPE_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
 """defaults of passenger types"""
-SPEED_PERCENTILE, MAX_LIMIT_RATIO = 95, 1.6
+SPEED_PERCENTILE, MAX_SPEED_LIMIT_RATIO = 95, 1.6
 """percentile of the measured speeds relative to the speed limits, and its maximum: speeds in mph would have 2.2"""
 NORMAL_DISTRIBUTION = re.compile(r"(normc?)\(([^()]*)\)")
 """a speed factor that is drawn for each vehicle"""
@@ -145,10 +145,10 @@ def _check_speed_unit(network: Path, kind: str, rows: Sequence[Measurement], fil
     edges = [row.place if kind == "edge" else row.place.rpartition("_")[0] for row in rows]
     ratios = [row.speed / limits[edge] for row, edge in zip(rows, edges, strict=True) if isfinite(row.speed)]
     ratio = float(np.percentile(ratios, SPEED_PERCENTILE)) if ratios else 0.0
-    if ratio > MAX_LIMIT_RATIO:
+    if ratio > MAX_SPEED_LIMIT_RATIO:
         raise InputError(
-            f"{file}: speed: {ratio:.2g} times the speed limit is not allowed; allowed: m/s, up to {MAX_LIMIT_RATIO:g} "
-            "times the limit; multiply km/h by 0.2778, mph by 0.447"
+            f"{file}: speed: {ratio:.2g} times the speed limit is not allowed; allowed: m/s, up to "
+            f"{MAX_SPEED_LIMIT_RATIO:g} times the limit; multiply km/h by 0.2778, mph by 0.447"
         )
 
 
