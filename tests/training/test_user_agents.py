@@ -25,6 +25,7 @@ from unjam.training.run_folder import check_config, read_config
 from unjam.worlds.worker_pool import WorkerPool
 
 FILE = Path(__file__).with_name("user_agents.py")
+MBPO = Path(__file__).parents[2] / "examples/mbpo.py"
 
 
 def config_of(name: str, file: Path = FILE, **changes: Any) -> RunConfig:
@@ -37,6 +38,10 @@ def config_of(name: str, file: Path = FILE, **changes: Any) -> RunConfig:
     [
         ("Reinforce", {"user__options": {"learning_rate": 0.1}, "model__members": 2, "model__epochs": 2}),
         ("EvolutionStrategy", {"steps": 8 * STEPS}),
+        (
+            "MBPO",
+            {"file": MBPO, "user__options": {"rounds": 2, "rollout_steps": 20, "gradient_steps": 5, "batch_size": 32}},
+        ),
     ],
 )
 def test_user_agent_learns_and_a_resumed_run_repeats_bit_for_bit(
@@ -56,7 +61,9 @@ def test_user_agent_learns_and_a_resumed_run_repeats_bit_for_bit(
     assert list(evaluation.rows) == ["human", "pi", "trained"]
     exported = export_controller(tmp_path / "whole", tmp_path / "mine.unjam")
     assert load_controller(exported.file).describe().startswith("pi + residual")
-    assert len(progress(tmp_path / "whole")) == 2
+    rows = progress(tmp_path / "whole")
+    assert len(rows) == 2
+    assert (rows[-1]["model_steps"] > 0) == (name != "EvolutionStrategy")
 
 
 def test_further_collections_of_an_iteration_have_the_same_seeds_and_count(
