@@ -203,7 +203,7 @@ def test_unsupported_settings_are_refused(settings: ModelSettings, words: str) -
         rollouts_of(settings)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_sample_interval")
 @pytest.mark.parametrize("road", [ROAD, TWO_RAMPS])
 def test_base_predicts_drivers_in_sumo_as_well_as_in_the_batch(road: Motorway) -> None:

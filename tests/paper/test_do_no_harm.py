@@ -116,7 +116,7 @@ def travel_time(road: OpenTestRoad, driver: str, seconds: float, folder: Path, s
     return measure(run_episode(scenario, made, (1,), backend=SumoBackend(simulation)))["travel_time"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_set_speed_is_reduced_in_dense_free_flow_far_below_the_limit(
     tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,7 +66,7 @@ def test_the_estimated_time_is_proportional_to_the_steps() -> None:
     assert long == pytest.approx(short * 4_000_000 / 300_000)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_study_writes_trainings_results_figure_and_manifest(reproduced: Made) -> None:
     folder, messages = reproduced
     for variant in ("plain", "with-model"):

@@ -143,7 +143,7 @@ class Opener:
         return visit
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
 @pytest.mark.parametrize(
     ("report", "figures"),

@@ -101,7 +101,7 @@ def test_drive_prints_a_table_and_the_path_of_a_report(unjam: Run, tmp_path: Pat
     assert (tmp_path / "mine" / "report.html").is_file()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_drive_counts_up_its_folders(unjam: Run, tmp_path: Path) -> None:
     (tmp_path / "runs" / "drive-ring-001").mkdir(parents=True)
     assert unjam("drive", "ring", "--driver", "pi", "-n", 1, *SMALL, pictures=False).returncode == 0
@@ -187,7 +187,7 @@ def test_assess_prints_text_and_json_and_writes_a_page(unjam: Run, tmp_path: Pat
     assert unjam("report", "answer", pictures=False).returncode == 0, "it can read the rows"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "first_words"),
     [

@@ -26,7 +26,7 @@ from unjam.worlds.sumo.networks import sumo_program
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "argument", "words"),
     [
@@ -68,7 +68,7 @@ def write_controller(driver: Driver, path: Path, states: LocalState, limit: floa
     return path
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
     drivers = [driver_from_name(name, 0.1) for name in EXPERTS if name.partition(":")[0] not in UNREAD]
     drivers += [

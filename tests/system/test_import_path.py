@@ -69,7 +69,7 @@ def check_nothing_ran(folder: Path) -> None:
     assert ran == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [

@@ -87,7 +87,7 @@ def test_overlaps_at_junctions_that_sumo_ignores_do_not_end_the_baseline(unjam: 
     assert [few[name] for name in traffic] == [half[name] for name in traffic]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_assess_refuses_a_baseline_that_a_limit_of_teleports_ends(unjam: Run, tmp_path: Path) -> None:
     options = TELEPORTS + '<max-num-teleports value="0"/>'
     straight(tmp_path, STANDING, end=120.0, step=0.5, options=options)

@@ -43,7 +43,7 @@ def test_a_graph_drives_in_workers_and_is_filtered_and_audited(unjam: Run, tmp_p
         assert all(row["contacts"] == 0 and row["cav_max_braking"] < 6.0 for row in driver["episodes"])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_exported_policy_is_filtered_verified_and_certified(unjam: Run, tmp_path: Path) -> None:
     write(tmp_path, follower())
     for arguments in (["export", "policy.toml", "--scenario", "ring", "--out", "it.unjam"], ["certify", "it.unjam"]):

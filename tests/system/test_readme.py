@@ -63,7 +63,7 @@ def files(tmp_path: Path) -> None:
     (tmp_path / "detectors.csv").write_text("\n".join(measured))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_all_unjam_commands_of_the_readme_run_in_order(
     unjam: Run, files: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,7 +46,7 @@ def run_without(tmp_path: Path) -> RunWithout:
     return run
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [

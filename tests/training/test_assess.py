@@ -151,7 +151,7 @@ def test_result_does_not_depend_on_the_number_of_workers(
     assert again.document["candidates"] == answer.document["candidates"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "vehicle",
     ['<vType id="own" sigma="0"/>', '<vType id="own" vClass="truck" accel="0.5" maxSpeed="18" sigma="0"/>'],

@@ -85,7 +85,7 @@ def done(corridor: Corridor, tmp_path_factory: pytest.TempPathFactory) -> tuple[
         return folder, calibrate(corridor, folder, counting, SPACE, TRIALS, seeds_per_trial=1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_calibration_improves_the_agreement(corridor: Corridor, done: tuple[Path, CalibrationResult]) -> None:
     folder, found = done
     estimates = found.estimates()

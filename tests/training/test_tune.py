@@ -68,7 +68,7 @@ def test_trials_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     assert tried[0] == tried[1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_interrupted_tuning_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with WorkerPool(1) as workers:
         whole = tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path / "whole", workers)

@@ -239,7 +239,7 @@ def about(episode: Episode) -> list[float]:
     ]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("road", [SHORT, TWO_RAMPS, replace(SHORT, ramps=())], ids=["one", "two", "none"])
 @pytest.mark.parametrize("name", [pytest.param("human", marks=pytest.mark.slow), "cruise"])
 def test_episodes_are_sumos_in_the_mean(name: str, road: Motorway, sumo: SumoBackend) -> None:
@@ -250,7 +250,7 @@ def test_episodes_are_sumos_in_the_mean(name: str, road: Motorway, sumo: SumoBac
     assert ours.mean(0) == pytest.approx(theirs.mean(0), rel=0.08)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_vehicles_slow_down_at_both_ramps_as_in_sumo(sumo: SumoBackend) -> None:
     driver = driver_of("jam-ahead")
     ours = batch_of(TWO_RAMPS, "jam-ahead", 4)
@@ -278,7 +278,7 @@ def test_vehicles_of_different_ramps_are_no_neighbors_on_the_lane_of_ramps() -> 
     assert neighbors.leaders[0, 3] == 2  # adjacent on the right
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_road_is_the_same_alone_and_among_others(driven: dict[str, list[Episode]]) -> None:
     (alone,) = run_batch([EpisodeTask(SHORT, driver_of("jam-ahead"), seeds_of(4)[2])], allow_statistical=True)
     among = driven["jam-ahead"][2]

@@ -161,7 +161,7 @@ QUEUE = (
 """free flow, then a vehicle that stands and a queue behind it, and a CAV that arrives"""
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_cav_slows_down_for_congestion_beyond_its_sensors(tmp_path: Path, sumo: SumoBackend) -> None:
     changes = {"cav_types": ("van",), "horizon": 5000, "actuation": "cruise", "safety.active": False}
     scenario = make_scenario(str(straight(tmp_path, QUEUE, 2500.0, 500.0)), changes)
