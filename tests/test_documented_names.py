@@ -8,9 +8,12 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
+CODE = [*PAGES, *sorted((ROOT / "docs").glob("*.ipynb")), *sorted((ROOT / "examples").glob("*.py"))]
 FOLDERS = ("src", "tests", "docs", "results", "examples")
 FILE = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]*\w)/?`")
 NAME = re.compile(r"`(?!unjam\.cdx\.json)(unjam(?:_paper)?(?:\.\w+)+)(?:\(\))?`")
+
+IMPORT = re.compile(r"from (unjam(?:_paper)?[\w.]*) import ([\w, ]+)")
 
 
 def is_importable(name: str) -> bool:
@@ -28,3 +31,10 @@ def test_files_and_names_of_a_page_exist(page: Path) -> None:
     missing = [path for path in FILE.findall(text) if not (ROOT / path).exists()]
     missing += [name for name in NAME.findall(text) if not is_importable(name)]
     assert missing == []
+
+
+@pytest.mark.parametrize("file", CODE, ids=lambda file: file.name)
+def test_imports_of_documented_code_exist(file: Path) -> None:
+    imports = IMPORT.findall(file.read_text(encoding="utf-8"))
+    names = [f"{module}.{name.split(' as ')[0].strip()}" for module, listed in imports for name in listed.split(",")]
+    assert [name for name in names if not is_importable(name)] == []
