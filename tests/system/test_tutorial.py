@@ -13,4 +13,4 @@ def test_tutorial_runs(tmp_path: Path) -> None:
     NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
     text = "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ()))
     assert "pi     mean speed" in text
-    assert "return beyond the expert" in text
+    assert "return, difference to the expert" in text
