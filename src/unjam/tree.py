@@ -5,18 +5,24 @@ converts it, and `unpack` restores it by the declared types of its records. Noth
 fit the declared types is refused.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+ValueT = TypeVar("ValueT")
 Arrays = dict[str, np.ndarray]
 """arrays by path in the tree, such as `trajectories.0.states.speed`"""
 ARRAY_KEY = "array"
 """key of the JSON object that represents an array; its value is the path"""
+
+
+def select_prefix(prefix: str, values: Mapping[str, ValueT]) -> dict[str, ValueT]:
+    """Return the values with names that begin with `prefix`, without it."""
+    return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
 
 
 def pack(tree: Any, path: str = "") -> tuple[Any, Arrays]:

@@ -23,7 +23,7 @@ from unjam.drivers.user_driver import FileDriver, FileReference, is_file_referen
 from unjam.drivers.wrappers import COMPOSITE_CLASSES, INNER_KEY, MixedDriver
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, build_dataclass, split_parameters
-from unjam.tree import Arrays
+from unjam.tree import Arrays, select_prefix
 
 _DRIVER_CLASSES = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
@@ -103,9 +103,7 @@ def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
     """Return the driver for a recipe of `driver_recipe`; raise `InputError` if the recipe is not valid."""
 
     def build_inner(recipe: Any, name: str) -> Driver:
-        prefix = f"{name}."
-        inner = {key.removeprefix(prefix): array for key, array in weights.items() if key.startswith(prefix)}
-        return driver_from_recipe(recipe, inner)
+        return driver_from_recipe(recipe, select_prefix(f"{name}.", weights))
 
     kind = recipe.get("kind") if isinstance(recipe, dict) else recipe
     if kind not in RECIPE_BUILDERS:

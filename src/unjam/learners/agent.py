@@ -84,10 +84,11 @@ def make_agent(name: str, settings: LearnerSettings, spec: AgentSpec) -> Any:
         except TypeError as error:
             raise InputError(f"user.options: {FileReference.parse(name)}: {error}") from None
         return kind(spec, **settings.options)
-    return _learner_class(settings)(spec, settings)
+    return learner_class(settings)(spec, settings)
 
 
-def _learner_class(settings: LearnerSettings) -> type[Any]:
+def learner_class(settings: LearnerSettings) -> type[Any]:
+    """Return the class of the package's learner with these settings; `ImportError` if a package is missing."""
     module, _, class_name = settings.learner_class.partition(":")
     return getattr(import_module(module), class_name)
 
@@ -97,14 +98,8 @@ def is_algorithm(agent: Any) -> bool:
     return callable(getattr(agent, "iterate", None))
 
 
-def check_agent(name: str, settings: LearnerSettings) -> None:
-    """Raise `InputError` if `path.py:Class` is not a class of learners or algorithms; the file runs for it.
-
-    A package that an agent needs and that is not installed is an `ImportError` here already.
-    """
-    if not isinstance(settings, UserAgentSettings):
-        _learner_class(settings)
-        return
+def check_agent(name: str) -> None:
+    """Raise `InputError` if `path.py:Class` is not a class of learners or algorithms; the file runs for it."""
     found = _user_class(name)
     required = ("network", "state", "restore", "iterate" if is_algorithm(found) else "learn")
     if missing := [f"{each}()" for each in required if not callable(getattr(found, each, None))]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
+from unjam.tree import select_prefix
 from unjam.worlds.record import Episode
 
 Tensors = dict[str, Tensor]
@@ -126,4 +127,4 @@ def seed_iteration(run_seed: int, iteration: int, part: int | None = None) -> No
 
 def tensors_with_prefix(prefix: str, tensors: Tensors) -> Tensors:
     """Return copies of the tensors with names that begin with `prefix`, without it."""
-    return {name.removeprefix(prefix): t.clone() for name, t in tensors.items() if name.startswith(prefix)}
+    return {name: tensor.clone() for name, tensor in select_prefix(prefix, tensors).items()}

@@ -18,7 +18,7 @@ from unjam.models.rollouts import RolloutBatch, check_device, draw_starts
 from unjam.models.settings import ModelSettings
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.scenario import Scenario
-from unjam.tree import pack, unpack
+from unjam.tree import pack, select_prefix, unpack
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
 
@@ -165,11 +165,7 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
     def restore(self, values: dict[str, Any], tensors: dict[str, Tensor]) -> None:
         """Continue from what `state` returned."""
         for name, kind in self._stored_parts().items():
-            arrays = {
-                key.removeprefix(f"{name}/"): t.numpy().copy()
-                for key, t in tensors.items()
-                if key.startswith(f"{name}/")
-            }
+            arrays = {path: tensor.numpy().copy() for path, tensor in select_prefix(f"{name}/", tensors).items()}
             setattr(self, name, unpack(kind, values[name], arrays))
         self.scenario = replace(self.scenario, humans=IDMParameters(**values["humans"]))
         self.ensemble.load_state_dict({name: tensor for name, tensor in tensors.items() if "/" not in name})

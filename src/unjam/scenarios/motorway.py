@@ -19,15 +19,13 @@ MAX_LANES = 5
 MIN_RAMP_HEADWAY = 2.0
 """smallest time between two vehicles that want to enter a ramp [s]"""
 SPEED_FACTOR_RANGE = 0.8, 1.2
-"""of human drivers: desired speed / speed limit"""
+"""range of desired speed / speed limit among human drivers"""
+MIN_END_LENGTH = 50.0
+"""minimum length of the road downstream of the last merging section [m]"""
 HUMAN_TYPE_COUNT = 200
 """number of different human drivers"""
 Arrival = tuple[float, str, int, float | Literal["last"]]
 Interval = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
-
-
-MIN_END_LENGTH = 50.0
-"""minimum length of the road downstream of the last merging section [m]"""
 Section = Annotated[float, Field(ge=50)]
 """length of a part of the road [m]"""
 
@@ -39,13 +37,13 @@ class Ramp:
     position: Positive
     """where its acceleration lane begins, from the entrance of the motorway [m]"""
     merging_length: Section = 300.0
-    """of the acceleration lane, along which vehicles merge [m]"""
+    """length of the acceleration lane, along which vehicles merge [m]"""
     length: Section = 400.0
-    """upstream of the acceleration lane [m]"""
+    """length of the ramp upstream of the acceleration lane [m]"""
     speed_limit: Positive = 22.22
-    """upstream of the acceleration lane [m/s]"""
+    """speed limit of the ramp upstream of the acceleration lane [m/s]"""
     entry_speed: Positive = 15.0
-    """of vehicles that enter the ramp [m/s]"""
+    """speed of vehicles that enter the ramp [m/s]"""
     inflow: NonNegative = 500.0
     """demand in the peak [veh/h]"""
     off_peak_inflow: NonNegative = 250.0
@@ -75,11 +73,11 @@ class Motorway(Scenario):
     length: Section = 3000.0
     """[m]"""
     lanes: Annotated[int, Field(ge=1, le=MAX_LANES)] = 2
-    """without acceleration lanes"""
+    """number of lanes, without acceleration lanes"""
     speed_limit: Positive = 27.78
     """[m/s]"""
     ramps: tuple[Ramp, ...] = ()
-    """from upstream to downstream"""
+    """the on-ramps, from upstream to downstream"""
     inflow: Positive = 3200.0
     """demand at the entrance of the motorway in the peak [veh/h]"""
     off_peak_inflow: NonNegative = 1800.0
@@ -141,11 +139,11 @@ class Motorway(Scenario):
 
     def _check_ramps(self) -> None:
         """Raise `ValueError` if ramps overlap or reach beyond the road, or vehicles enter one too fast."""
-        upstream, what = 0.0, "the entrance"
+        upstream_end, upstream_part = 0.0, "the entrance"
         for number, ramp in enumerate(self.ramps):
             geometry, name, position = ramp.geometry, f"ramps.{number}", f"{ramp.position:g}"
-            if geometry.start < upstream:
-                allowed = f">= {upstream + ramp.length:g}, its length downstream of {what}"
+            if geometry.start < upstream_end:
+                allowed = f">= {upstream_end + ramp.length:g}, its length downstream of {upstream_part}"
                 raise ValueError(f"{name}.position: {position} is not allowed; allowed: {allowed}")
             if geometry.merge_end > self.length - MIN_END_LENGTH:
                 allowed = f"<= {self.length - MIN_END_LENGTH - ramp.merging_length:g}, upstream of the end of the road"
@@ -153,7 +151,7 @@ class Motorway(Scenario):
             if ramp.entry_speed > (most := SPEED_FACTOR_RANGE[0] * ramp.speed_limit):
                 allowed = f"<= {most:g}, the speed of the slowest drivers"
                 raise ValueError(f"{name}.entry_speed: {ramp.entry_speed:g} is not allowed; allowed: {allowed}")
-            upstream, what = geometry.merge_end, f"the merging section of {name}"
+            upstream_end, upstream_part = geometry.merge_end, f"the merging section of {name}"
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
         """Return the road with its demand; random are the human drivers, their entry times and the choice of CAVs."""

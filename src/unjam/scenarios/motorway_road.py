@@ -21,36 +21,36 @@ class RampGeometry(NamedTuple):
     """An on-ramp, whose lane continues next to the main road and ends there."""
 
     merge_start: float
-    """where its lane starts to run next to the main road"""
+    """position where its lane starts to run next to the main road [m]"""
     merge_end: float
-    """where that lane ends"""
+    """position where that lane ends [m]"""
     length: float
-    """upstream of the merging section"""
+    """length upstream of the merging section [m]"""
     speed_limit: float
-    """upstream of the merging section [m/s]"""
+    """speed limit upstream of the merging section [m/s]"""
 
     @property
     def start(self) -> float:
-        """Where it begins."""
+        """Position where it begins [m]."""
         return self.merge_start - self.length
 
 
 class MotorwaySections(NamedTuple):
-    """What is near each of n vehicles: arrays (n,).
+    """The sections where n vehicles are, and their next ramps; arrays of shape (n,).
 
-    The next ramp is the first one of which the merging section has not ended; for the vehicles downstream of all, it is
-    the last one.
+    The next ramp of a vehicle is the first one with a merging section that ends downstream of the vehicle; downstream
+    of all merging sections, it is the last ramp.
     """
 
     ramp: Array
     """index of the next ramp"""
     merge_start: Array
     merge_end: Array
-    """of the merging section of the next ramp"""
+    """positions where the merging section of the next ramp starts and ends [m]"""
     ramp_speed_limit: Array
-    """of the next ramp"""
+    """speed limit of the next ramp [m/s]"""
     start: Array
-    """of the section: the entrance, or the last begin or end of a merging section"""
+    """position where the section starts: the entrance, or the last start or end of a merging section [m]"""
     is_before: Array
     """whether the vehicle is upstream of the merging section"""
     is_merging: Array
@@ -63,7 +63,7 @@ class MotorwayGeometry(NamedTuple):
     length: float
     speed_limit: float
     lane_count: int
-    """of the main road"""
+    """number of lanes of the main road"""
     vehicle_length: float
     ramps: tuple[RampGeometry, ...] = ()
 
@@ -86,7 +86,7 @@ class MotorwayGeometry(NamedTuple):
         return (MAIN_ROUTE, *(_numbered("ramp", number) for number in range(len(self.ramps))))
 
     def sections(self, lane: Array, position: Array) -> MotorwaySections:
-        """Return what is near each of n vehicles, given their lanes and positions, arrays (n,)."""
+        """Return the sections of n vehicles with these lanes and positions [m], arrays of shape (n,)."""
         xp = namespace(position)
         first, *others = self.ramps or (RampGeometry(self.length, self.length, 0.0, self.speed_limit),)
         ramp, start = 0 * lane, 0.0 * position
@@ -190,7 +190,7 @@ def _edge(part: tuple[str, float, float], nodes: tuple[str, str], lanes: int) ->
 
 
 def _numbered(name: str, number: int) -> str:
-    """Return a name for what belongs to a ramp: of the first one, without a number."""
+    """Return the name of a part of a ramp, with the number of the ramp unless it is the first."""
     return f"{name}{number + 1}" if number else name
 
 

@@ -17,6 +17,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
+from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
 from unjam.files import (
     INVALID_DATA_ERRORS,
@@ -76,9 +77,10 @@ def check_config(config: RunConfig) -> None:
 
             world_model_class(scenario, config.model).check(scenario, config.model)
     config.make_tasks()
-    from unjam.learners.agent import check_agent  # it needs torch, and the file of a user's agent may, too
+    if is_file_reference(config.agent):
+        from unjam.learners.agent import check_agent  # its file may import torch
 
-    check_agent(config.agent, config.learner)
+        check_agent(config.agent)
 
 
 def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> None:

@@ -16,10 +16,11 @@ import torch
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
+from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import UnjamError
 from unjam.files import append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
-from unjam.learners.agent import AgentSpec, check_network, check_state, reporting_user_errors
+from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
 from unjam.learners.algorithm import (
     Collector,
     IterationLog,
@@ -167,6 +168,8 @@ def train_in_process(
 ) -> dict[str, RowsByDriver]:
     """Train in this process, as `train` does; return the rows of the evaluation by task and driver."""
     check_config(config)  # before anything is written
+    if not is_file_reference(config.agent):
+        learner_class(config.learner)  # a package that is missing is reported before anything is written
     if resume:
         read_config(folder)
     else:

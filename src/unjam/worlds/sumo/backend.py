@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
-from unjam.errors import EpisodeError, SumoInputError, UnjamError, as_unjam_error
+from unjam.errors import EpisodeError, InputError, SumoInputError, UnjamError, as_unjam_error
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.scenarios.road import ClosedRoad, MergeRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import Scenario
@@ -27,6 +27,13 @@ TRAFFIC_CLASSES: dict[type[Road], type[Traffic[Any]]] = {
 }
 
 
+def _unsupported_reason(road_class: type[Road]) -> str:
+    """Return why SUMO cannot simulate roads of a class; empty if it can."""
+    allowed = ", ".join(each.__name__ for each in TRAFFIC_CLASSES)
+    reason = f"{road_class.__name__} is not allowed as the road of SUMO; allowed: {allowed}"
+    return "" if road_class in TRAFFIC_CLASSES else reason
+
+
 class SumoBackend(AbstractContextManager["SumoBackend"]):
     """SUMO: a given simulation, or one that the first episode opens and the others reuse.
 
@@ -39,14 +46,14 @@ class SumoBackend(AbstractContextManager["SumoBackend"]):
         self._given = simulation
         self._transport: Transport | None = transport
         self._opened: Simulation | None = None
+        self._road_classes: dict[type[Scenario], type[Road]] = {}
 
     def supports(self, scenario: Scenario) -> str:
         """Return why SUMO cannot simulate a scenario; empty if it can."""
-        road, _ = scenario.draw_from_seed((0,))
-        if type(road) in TRAFFIC_CLASSES:
-            return ""
-        allowed = ", ".join(each.__name__ for each in TRAFFIC_CLASSES)
-        return f"{type(road).__name__} is not allowed as the road of SUMO; allowed: {allowed}"
+        kind = type(scenario)
+        if kind not in self._road_classes:  # drawing the roads of large networks takes time
+            self._road_classes[kind] = type(scenario.draw_from_seed((0,))[0])
+        return _unsupported_reason(self._road_classes[kind])
 
     @contextmanager
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[Traffic[Any]]:
@@ -98,6 +105,8 @@ def make_traffic(
 ) -> Traffic[Any]:
     """Put the vehicles of a seed on the road; nothing moves yet."""
     drawn = scenario.draw_from_seed(seed)
+    if reason := _unsupported_reason(type(drawn[0])):
+        raise InputError(f"scenario: {reason}")
     return TRAFFIC_CLASSES[type(drawn[0])](scenario, seed, simulation, options, drawn)
 
 
