@@ -10,41 +10,21 @@ from typing import Any
 
 from unjam.errors import InputError, import_optional, invalid_value, one_line
 
-ALLOWED_OPERATORS: dict[str, dict[str, str]] = {
-    **{
-        name: {}
-        for name in (
-            *("Abs", "Add", "And", "Ceil", "Cos", "Div", "Equal", "Erf", "Exp", "Expand", "Floor", "Greater"),
-            *("GreaterOrEqual", "HardSwish", "Identity", "IsNaN", "Less", "LessOrEqual", "Log", "MatMul", "Max"),
-            *("Mean", "Min", "Mish", "Mul", "Neg", "Not", "Or", "PRelu", "Pow", "Reciprocal", "Relu", "Round"),
-            *("Sigmoid", "Sign", "Sin", "Slice", "Softplus", "Softsign", "Sqrt", "Sub", "Sum", "Tan", "Tanh", "Where"),
-        )
-    },
-    **{name: {"alpha": "f"} for name in ("Elu", "LeakyRelu", "ThresholdedRelu")},
-    **{name: {"axis": "i"} for name in ("Concat", "Flatten", "Gather", "GatherElements", "LogSoftmax", "Softmax")},
-    **{
-        name: {"axes": "ints", "keepdims": "i", "noop_with_empty_axes": "i"}
-        for name in ("ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum")
-    },
-    **{name: {"axes": "ints"} for name in ("Squeeze", "Unsqueeze")},
-    "BatchNormalization": {"epsilon": "f", "momentum": "f", "training_mode": "i"},
-    "Cast": {"to": "i"},
-    "Clip": {"max": "f", "min": "f"},
-    "Constant": {"value": "t", "value_float": "f", "value_int": "i"},
-    "GatherND": {"batch_dims": "i"},
-    "Gelu": {"approximate": "s"},
-    "Gemm": {"alpha": "f", "beta": "f", "transA": "i", "transB": "i"},
-    "HardSigmoid": {"alpha": "f", "beta": "f"},
-    "LayerNormalization": {"axis": "i", "epsilon": "f", "stash_type": "i"},
-    "Mod": {"fmod": "i"},
-    "Reshape": {"allowzero": "i"},
-    "ScatterElements": {"axis": "i", "reduction": "s"},
-    "Selu": {"alpha": "f", "gamma": "f"},
-    "Shape": {"end": "i", "start": "i"},
-    "Split": {"axis": "i", "num_outputs": "i", "split": "ints"},
-    "Transpose": {"perm": "ints"},
+ALLOWED_OPERATORS = {
+    *("Abs", "Add", "And", "BatchNormalization", "Cast", "Ceil", "Clip", "Concat", "Constant", "Cos", "Div"),
+    *("Elu", "Equal", "Erf", "Exp", "Expand", "Flatten", "Floor", "Gather", "GatherElements", "GatherND", "Gelu"),
+    *("Gemm", "Greater", "GreaterOrEqual", "HardSigmoid", "HardSwish", "Identity", "IsNaN", "LayerNormalization"),
+    *("LeakyRelu", "Less", "LessOrEqual", "Log", "LogSoftmax", "MatMul", "Max", "Mean", "Min", "Mish", "Mod"),
+    *("Mul", "Neg", "Not", "Or", "PRelu", "Pow", "Reciprocal", "ReduceMax", "ReduceMean", "ReduceMin"),
+    *("ReduceSum", "Relu", "Reshape", "Round", "ScatterElements", "Selu", "Shape", "Sigmoid", "Sign", "Sin"),
+    *("Slice", "Softmax", "Softplus", "Softsign", "Split", "Sqrt", "Squeeze", "Sub", "Sum", "Tan", "Tanh"),
+    *("ThresholdedRelu", "Transpose", "Unsqueeze", "Where"),
 }
-"""all allowed operators: arithmetic, without subgraphs; with the field that stores each of their attributes"""
+"""all allowed operators: arithmetic, without subgraphs"""
+VALUE_FIELDS = {"INT": "i", "FLOAT": "f", "STRING": "s", "TENSOR": "t", "INTS": "ints"}
+"""field that stores the value of an attribute, by the allowed types of attributes"""
+REFUSED_ATTRIBUTES = {"value_string", "value_ints", "saturate", "round_mode"}
+"""attributes of allowed operators that no policy needs"""
 ALLOWED_FIELDS = {
     "ModelProto": {"ir_version", "producer_name", "producer_version", "opset_import", "graph"},
     "OperatorSetIdProto": {"domain", "version"},
@@ -107,9 +87,8 @@ def check_model(model: Any, size: int, opsets: range, ir_versions: range) -> Non
     graph = model.graph
     if fixed := {each.name for each in graph.initializer} & {each.name for each in graph.input}:
         raise invalid_value("graph: initializer", min(fixed), "constants, not inputs")
-    attribute_types = import_optional("onnx").AttributeProto
     for node in graph.node:
-        _check_node(node, attribute_types)
+        _check_node(node, imported[0][1])
 
 
 def _check_fields(message: Any) -> None:
@@ -127,22 +106,23 @@ def _check_fields(message: Any) -> None:
         raise invalid_value(f"graph: shape of constant {message.name!r}", [*message.dims], allowed)
 
 
-def _check_node(node: Any, types: Any) -> None:
-    if node.domain not in ONNX_DOMAINS or node.op_type not in ALLOWED_OPERATORS:
+def _check_node(node: Any, opset: int) -> None:
+    schemas = import_optional("onnx").defs
+    if node.domain not in ONNX_DOMAINS or node.op_type not in ALLOWED_OPERATORS or not schemas.has(node.op_type, opset):
         operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
         raise InputError(f"graph: operator {operator!r} is not allowed; allowed: arithmetic")
-    allowed, seen = ALLOWED_OPERATORS[node.op_type], set[str]()
-    types_of = {"i": types.INT, "f": types.FLOAT, "s": types.STRING, "t": types.TENSOR, "ints": types.INTS}
+    attributes = schemas.get_schema(node.op_type, opset).attributes.items()
+    types = {name: each.type for name, each in attributes if name not in REFUSED_ATTRIBUTES}
+    types = {name: kind for name, kind in types.items() if kind.name in VALUE_FIELDS}
+    seen = set[str]()
     for attribute in node.attribute:
-        value_field = allowed.get(attribute.name)
+        name, kind = attribute.name, types.get(attribute.name)
         fields = {each.name for each, _ in attribute.ListFields()}
-        if value_field is None or attribute.name in seen or fields != {"name", "type", value_field}:
-            names = ", ".join(allowed) or "none"
-            raise invalid_value(f"graph: attribute of {node.op_type}", attribute.name, f"{names}, each once")
-        if attribute.type != types_of[value_field]:
-            field = f"graph: type of {node.op_type}.{attribute.name}"
-            raise invalid_value(field, attribute.type, types_of[value_field])
-        seen.add(attribute.name)
+        if kind is None or name in seen or fields != {"name", "type", VALUE_FIELDS[kind.name]}:
+            raise invalid_value(f"graph: attribute of {node.op_type}", name, f"{', '.join(types) or 'none'}, each once")
+        if attribute.type != kind.value:
+            raise invalid_value(f"graph: type of {node.op_type}.{name}", attribute.type, kind.value)
+        seen.add(name)
 
 
 def open_session(content: bytes) -> Any:

@@ -9,8 +9,7 @@ from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import unjam
-from unjam.adapters import PolicyOutput
-from unjam.adapters.stable_baselines3 import stable_baselines3_driver
+from unjam.adapters import PolicyOutput, policy_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.pi_saturation import PISaturation
@@ -57,7 +56,7 @@ def returns_in_environment(model: Any, **arguments: Any) -> tuple[list[float], l
 @pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3, TRPO])
 def test_a_model_drives_as_in_its_environment(algorithm: Any) -> None:
     model = small(algorithm, Space())
-    driver = stable_baselines3_driver(model)
+    driver = policy_driver(model)
     unjam.check_driver(driver)
     assert driver.describe() == algorithm.__name__
     rewards, speeds = returns_in_environment(model)
@@ -69,7 +68,7 @@ def test_a_model_drives_as_in_its_environment(algorithm: Any) -> None:
 
 def test_actions_are_added_to_an_expert() -> None:
     model = small(PPO, Space(8))
-    driver = stable_baselines3_driver(model, WITH_EXPERT, PISaturation())
+    driver = policy_driver(model, WITH_EXPERT, PISaturation())
     unjam.check_driver(driver)
     rewards, _ = returns_in_environment(model, expert="pi", features=WITH_EXPERT)
     episode = unjam.run_episode(unjam.make_scenario("ring", SHORT), driver, 7)
@@ -78,7 +77,7 @@ def test_actions_are_added_to_an_expert() -> None:
 
 
 def test_a_driver_of_several_cavs_is_measured_beside_drivers_with_names() -> None:
-    driver = stable_baselines3_driver(small(SAC, Space()))
+    driver = policy_driver(small(SAC, Space()))
     found = unjam.drive("ring", [driver, "pi"], episodes=1, scenario_options={"horizon": 40, "cavs": 3}, workers=1)
     assert list(found.rows) == ["SAC", "pi"]
     assert found.rows["SAC"][0]["status"] == "completed"
@@ -89,7 +88,7 @@ def test_features_are_functions_and_actions_have_a_scale() -> None:
         return state.leader_gap / 20.0
 
     model = small(TD3, Space(1))
-    driver, half = (stable_baselines3_driver(model, (gap,), output=PolicyOutput(scale=scale)) for scale in (1.0, 0.5))
+    driver, half = (policy_driver(model, (gap,), output=PolicyOutput(scale=scale)) for scale in (1.0, 0.5))
     state = LocalState(*(np.full(2, 7.0) for _ in range(7)))
     expected = model.predict(np.full((2, 1), 0.35, np.float32), deterministic=True)[0][:, 0]
     np.testing.assert_allclose(driver.act(state, driver.initial_memory(2))[0], expected, atol=1e-6)
@@ -101,7 +100,7 @@ def test_observations_are_normalized_as_in_training() -> None:
     environment.obs_rms.mean, environment.obs_rms.var = np.full(5, 0.7), np.full(5, 4.0)  # pyright: ignore
     model = small(PPO, environment)
     state = LocalState(*(np.full(1, 7.0) for _ in range(7)))
-    driver: Driver = stable_baselines3_driver(model)
+    driver: Driver = policy_driver(model)
     raw = np.array([[0.7, 0.0, 0.35, 0.0, 0.35]], np.float32)
     expected, _ = model.predict(environment.normalize_obs(raw), deterministic=True)
     np.testing.assert_allclose(driver.act(state, driver.initial_memory(1))[0], expected[:, 0], atol=1e-6)
@@ -118,12 +117,12 @@ def test_observations_are_normalized_as_in_training() -> None:
 )
 def test_a_model_that_does_not_fit_is_refused(environment: Any, algorithm: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        stable_baselines3_driver(small(algorithm, environment))
+        policy_driver(small(algorithm, environment))
 
 
 def test_recurrent_and_exploring_policies_are_refused() -> None:
     with pytest.raises(InputError, match="RecurrentPPO: a recurrent policy is not allowed"):
-        stable_baselines3_driver(RecurrentPPO("MlpLstmPolicy", Space(), seed=0, device="cpu"))
-    driver = stable_baselines3_driver(small(PPO, Space()))
+        policy_driver(RecurrentPPO("MlpLstmPolicy", Space(), seed=0, device="cpu"))
+    driver = policy_driver(small(PPO, Space()))
     with pytest.raises(InputError, match="explore: "):
         unjam.run_episode(unjam.make_scenario("ring", SHORT), driver, 0, explore=1.0)

@@ -14,8 +14,7 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 
 import unjam
 from tests.adapters.test_stable_baselines3 import Space
-from unjam.adapters.stable_baselines3 import stable_baselines3_driver
-from unjam.adapters.stable_baselines3_file import read_stable_baselines3
+from unjam.adapters import policy_driver
 from unjam.controller import make_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.pi_saturation import PISaturation
@@ -48,16 +47,16 @@ def change(file: Path, **parts: Callable[[bytes], bytes]) -> None:
 def test_a_file_drives_as_its_model(algorithm: Any, options: dict[str, Any], tmp_path: Path) -> None:
     space = Space(action=spaces.Box(-0.7, 1.5, (1,), np.float32))
     model = algorithm("MlpPolicy", space, policy_kwargs=options, seed=1, device="cpu")
-    read = read_stable_baselines3(save(model, tmp_path))
+    read = policy_driver(save(model, tmp_path))
     unjam.check_driver(read)
     state = random_state(np.random.default_rng(0), 200)
-    expected, _ = stable_baselines3_driver(model).act(state, read.initial_memory(200))
+    expected, _ = policy_driver(model).act(state, read.initial_memory(200))
     np.testing.assert_allclose(read.act(state, read.initial_memory(200))[0], expected, atol=2e-6)
 
 
 def test_features_and_expert_are_given_in_python_and_local_features_by_name(tmp_path: Path) -> None:
     with_expert = save(PPO("MlpPolicy", Space(6), seed=1, device="cpu"), tmp_path)
-    driver = read_stable_baselines3(with_expert, ("local", "expert_acceleration"), PISaturation())
+    driver = policy_driver(with_expert, ("local", "expert_acceleration"), PISaturation())
     assert driver.describe() == "pi + model.zip"
     with pytest.raises(InputError, match=r"inputs: 5 numbers are not allowed; allowed: 6, the inputs of model\.zip"):
         make_driver(str(with_expert), 0.1)
@@ -81,7 +80,7 @@ def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
     torch.save({"action_net.weight": Runs(trap)}, content)
     change(file, policy_pth=lambda _: content.getvalue())
     with pytest.raises(InputError, match=r"driver model\.zip: UnpicklingError: "):
-        read_stable_baselines3(file)
+        policy_driver(file)
     assert not trap.exists()
     torch.load(io.BytesIO(content.getvalue()), weights_only=False)
     assert trap.exists()  # the trap works
@@ -98,7 +97,7 @@ def test_serialized_parts_of_the_data_are_not_read(tmp_path: Path) -> None:
         return json.dumps(data).encode()
 
     change(file, data=spoil)
-    unjam.check_driver(read_stable_baselines3(file))
+    unjam.check_driver(policy_driver(file))
 
 
 @pytest.mark.parametrize(
@@ -120,7 +119,7 @@ def test_serialized_parts_of_the_data_are_not_read(tmp_path: Path) -> None:
 )
 def test_other_models_are_refused_in_one_line(make: Callable[[], Any], words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=rf"^driver model\.zip: ValueError: .*{words}.*; allowed: ") as error:
-        read_stable_baselines3(save(make(), tmp_path))
+        policy_driver(save(make(), tmp_path))
     assert "\n" not in str(error.value)
 
 
@@ -139,10 +138,10 @@ def test_damaged_files_are_refused_in_one_line(parts: Any, tmp_path: Path) -> No
     file = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)
     change(file, **parts)
     with pytest.raises(InputError, match=r"^driver model\.zip: \w+: ") as error:
-        read_stable_baselines3(file)
+        policy_driver(file)
     assert "\n" not in str(error.value)
     file.write_bytes(b"no archive")
     with pytest.raises(InputError, match=r"driver model\.zip: BadZipFile: "):
-        read_stable_baselines3(file)
+        policy_driver(file)
     with pytest.raises(InputError, match=r"driver: '.*none\.zip' does not exist"):
         make_driver(str(tmp_path / "none.zip"), 0.1)

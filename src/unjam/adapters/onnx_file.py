@@ -11,7 +11,7 @@ from typing import Any
 
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
-from unjam.drivers.onnx_policy import OnnxDriver, make_onnx_driver
+from unjam.drivers.onnx_policy import OnnxDriver
 from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.drivers.user_driver import DriverLike, as_driver
@@ -53,7 +53,7 @@ def onnx_driver(
     inner = _expert(table.pop("expert", ""), time_step) if expert is None else as_driver(expert, time_step)
     if description is None:
         description = build_dataclass(PolicyDescription, table, f"driver {path.name}")
-    return make_onnx_driver(content, description, inner, path.name, time_step)
+    return OnnxDriver(path.name, description, inner, time_step, graph=content)
 
 
 def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:

@@ -1,46 +1,95 @@
-"""The driver around a policy of another library that is an object of this process."""
+"""Policies of Stable-Baselines3 and torch, and functions, as drivers of this process."""
 
+import sys
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.adapters.stable_baselines3_file import read_policy
 from unjam.drivers.car_following import Constant
 from unjam.drivers.observation import FeatureLike, as_features, observation_size
-from unjam.drivers.policy import MemorylessPolicy, PolicyDriver, PolicyOutput, action_limits, assumed_time_step
-from unjam.drivers.user_driver import DriverLike, UserFunction, as_driver
-from unjam.errors import InputError
+from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyOutput
+from unjam.drivers.user_driver import DriverLike, UserFunction, as_driver, object_label
+from unjam.errors import InputError, invalid_value
 
 
 def policy_driver(
-    policy: Callable[[NDArray[np.float64]], Any],
-    label: str,
-    inputs: Sequence[FeatureLike],
-    expert: DriverLike | None,
-    output: PolicyOutput,
-    time_step: float,
-    input_size: int | None = None,
+    policy: Any,
+    inputs: Sequence[FeatureLike] = ("local",),
+    expert: DriverLike | None = None,
+    output: PolicyOutput = PolicyOutput(),  # noqa: B008 - frozen
+    time_step: float = 0.1,
 ) -> PolicyDriver:
-    """Return the driver around a policy with `input_size` inputs (None: unknown); arguments as `torch_driver`.
+    """Return a policy as a driver that runs in this process, without exploration.
 
-    Raise `InputError` if they do not fit together.
+    With the features of its Gymnasium environment as `inputs`, and the same expert, a model of Stable-Baselines3 drives
+    as in that environment. Observations are clipped to its observation space, and normalized by its `VecNormalize`
+    environment if it has one. Expert and sum are limited as its actions. Its further training changes the driver, too.
+
+    Args:
+        policy: a function of observations of n CAVs, shape (n, inputs), that returns numbers, shape (n,) or (n, 1); a
+            `torch.nn.Module`, of which a copy in evaluation mode is such a function, in the precision and on the device
+            of its parameters; an algorithm or a policy of Stable-Baselines3 whose actions are a `Box` of one number; or
+            the path of the .zip file of a model, which is read without unpickling. The file does not contain the
+            statistics of `VecNormalize`.
+        inputs: its observation in order: names of features such as `local`, `PolicyInput`s, or functions of a
+            `LocalState`.
+        expert: a driver to which the accelerations are added; None: the policy drives alone.
+        output: what its numbers mean; without limits, those of a model's action space.
+        time_step: control step of the road [s].
+
+    Raises:
+        InputError: the policy does not take these inputs, returns another shape, has other actions, or is recurrent;
+            or the file is missing, damaged or no `MlpPolicy` with continuous actions, without state-dependent
+            exploration.
+        MissingPartError: torch is not installed, or cannot read weights safely.
     """
+    label, function, size, torch = object_label(policy), policy, None, sys.modules.get("torch")
+    if isinstance(policy, str | Path):
+        label, policy = Path(policy).name, read_policy(Path(policy))
+    if hasattr(policy, "predict"):
+        _check_model(label, policy)
+        function, output, size = _predict(policy), _limit_output(output, policy), policy.observation_space.shape[0]
+    elif torch is not None and isinstance(policy, torch.nn.Module):
+        function = deepcopy(policy).eval()
+    function = replace(UserFunction.from_object(function, "observations"), label=label)
     inner, features = Constant() if expert is None else as_driver(expert, time_step), as_features(inputs)
-    size = observation_size(features, inner)
-    if input_size not in (None, size):
-        raise InputError(f"inputs: {size} numbers are not allowed; allowed: {input_size}, the inputs of {label}")
-    function, limits = MemorylessPolicy(UserFunction(policy, label)), action_limits(output, inner)
-    step = assumed_time_step(output, None, time_step)
-    driver = PolicyDriver(function, label, features, output, inner, step, limits=limits)
-    driver.evaluate(np.zeros((2, size)), {})
+    described = observation_size(features, inner)
+    if size not in (None, described):
+        raise InputError(f"inputs: {described} numbers are not allowed; allowed: {size}, the inputs of {label}")
+    description = PolicyDescription(features, output)
+    driver = PolicyDriver(lambda rows, memory: (function(rows), memory), label, description, inner, time_step)
+    driver.evaluate(np.zeros((2, described)), {})
     return driver
 
 
-def limited_output(output: PolicyOutput, low: float, high: float) -> PolicyOutput:
-    """Return an output with the limits of an action space, unless it has its own."""
-    if output.limits is not None or not np.isfinite([low, high]).all():
-        return output
-    ends = sorted(float(number) * output.scale + output.offset for number in (low, high))
-    return replace(output, limits=(ends[0], ends[1]))
+def _check_model(label: str, model: Any) -> None:
+    observed, acted = model.observation_space, model.action_space
+    for name, space, allowed in (("observation", observed, "(n,)"), ("action", acted, "(1,)")):
+        is_box = type(space).__name__ == "Box" and len(space.shape) == 1
+        if not is_box or (space is acted and space.shape != (1,)):
+            raise invalid_value(f"{label}: {name} space", space, f"Box of shape {allowed}")
+    if model.predict(np.zeros((1, *observed.shape), observed.dtype), deterministic=True)[1] is not None:
+        raise InputError(f"{label}: a recurrent policy is not allowed; allowed: policies without memory")
+
+
+def _predict(model: Any) -> Callable[[NDArray[np.float64]], Any]:
+    space, normalization = model.observation_space, getattr(model, "get_vec_normalize_env", lambda: None)()
+
+    def act(observations: NDArray[np.float64]) -> Any:
+        clipped = observations.clip(space.low, space.high).astype(space.dtype)
+        normalized = clipped if normalization is None else normalization.normalize_obs(clipped)
+        return model.predict(normalized, deterministic=True)[0]
+
+    return act
+
+
+def _limit_output(output: PolicyOutput, model: Any) -> PolicyOutput:
+    ends = (model.action_space.low[0], model.action_space.high[0])
+    low, high = sorted(float(number) * output.scale + output.offset for number in ends)
+    return output if output.limits or not np.isfinite([low, high]).all() else replace(output, limits=(low, high))

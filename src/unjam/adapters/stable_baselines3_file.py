@@ -1,4 +1,4 @@
-"""A file of a Stable-Baselines3 model as a driver, without unpickling: only its JSON and its weights are read.
+"""The policy of a file of Stable-Baselines3, without unpickling: only its JSON and its weights are read.
 
 `PPO.load` and its siblings unpickle parts of the file, which can run any code. Here these parts are ignored, and the
 network is rebuilt from the names of its weights.
@@ -15,12 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from gymnasium.spaces import Box
 
-from unjam.adapters.policies import limited_output, policy_driver
-from unjam.drivers.observation import FeatureLike
-from unjam.drivers.policy import PolicyDriver, PolicyOutput
-from unjam.drivers.user_driver import DriverLike
 from unjam.errors import InputError, MissingPartError, import_optional, one_line
 from unjam.physics.arrays import Floats
 
@@ -67,24 +63,28 @@ ACTORS = (
 """actors of PPO, A2C and TRPO; of SAC and TQC; of TD3 and DDPG"""
 
 
-def read_stable_baselines3(
-    file: Path | str,
-    inputs: Sequence[FeatureLike] = ("local",),
-    expert: DriverLike | None = None,
-    output: PolicyOutput = PolicyOutput(),  # noqa: B008 - frozen
-    time_step: float = 0.1,
-) -> PolicyDriver:
-    """Return the model of a .zip file as a driver that runs in this process, without unpickling; float64.
+@dataclass(frozen=True)
+class SavedPolicy:
+    """The deterministic policy of a file, float64."""
 
-    Arguments as `stable_baselines3_driver`. The file does not contain the statistics of `VecNormalize`: a model that
-    was trained with them needs `stable_baselines3_driver`.
+    observation_space: Box
+    action_space: Box
+    layers: list[tuple[Floats, Floats]]
+    """weight, shape (outputs, inputs), and bias of each"""
+    activation: Callable[[Floats], Floats]
+    is_squashed: bool
 
-    Raises:
-        InputError: the file is missing, damaged or no such model, or its policy is not an `MlpPolicy` of an algorithm
-            with continuous actions, without state-dependent exploration.
-        MissingPartError: torch is not installed, or cannot read weights safely.
-    """
-    path = Path(file)
+    def predict(self, observation: Floats, *, deterministic: bool = True) -> tuple[Floats, None]:
+        """Return actions, shape (n, 1), and no state."""
+        units, low, high = observation, self.action_space.low, self.action_space.high
+        for weight, bias in self.layers[:-1]:
+            units = self.activation(units @ weight.T + bias)
+        units = units @ self.layers[-1][0].T + self.layers[-1][1]
+        return low + 0.5 * (np.tanh(units) + 1.0) * (high - low) if self.is_squashed else units.clip(low, high), None
+
+
+def read_policy(path: Path) -> SavedPolicy:
+    """Return the policy of a .zip file; raise errors as `policy_driver`."""
     if not os.path.isfile(path):
         raise InputError(f"driver: {str(path)!r} does not exist")
     try:
@@ -95,24 +95,16 @@ def read_stable_baselines3(
         actor = _find_actor(weights)
         activation = _read_activation(data, actor)
         layers = _read_layers(weights, actor)
-        if acted[0].shape != (1,) or layers[-1][1].shape != (1,):
+        if acted.shape != (1,) or layers[-1][1].shape != (1,):
             raise ValueError("its actions are not one number")
+        if observed.shape != (layers[0][0].shape[1],):
+            raise ValueError("its observations are not the inputs of its network")
     except (InputError, MissingPartError):
         raise
     except Exception as error:  # damaged files cause any error, also in torch
         hint = "allowed: an MlpPolicy of Stable-Baselines3 with a Box of one action; others as Python objects"
         raise InputError(f"driver {path.name}: {type(error).__name__}: {one_line(error)}; {hint}") from None
-    (low, high), bounds = acted, observed
-
-    def act(observations: Floats) -> Any:
-        units = observations.clip(*bounds)
-        for weight, bias in layers[:-1]:
-            units = activation(units @ weight.T + bias)
-        units = units @ layers[-1][0].T + layers[-1][1]
-        return low + 0.5 * (np.tanh(units) + 1.0) * (high - low) if actor.is_squashed else units.clip(low, high)
-
-    output = limited_output(output, low[0], high[0])
-    return policy_driver(act, path.name, inputs, expert, output, time_step, layers[0][0].shape[1])
+    return SavedPolicy(observed, acted, layers, activation, actor.is_squashed)
 
 
 def _read_parts(content: bytes, names: Sequence[str] = ()) -> dict[str, bytes]:
@@ -140,14 +132,14 @@ def _read_weights(content: bytes) -> dict[str, Floats]:
     return weights
 
 
-def _read_box(space: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and the highest values of a `Box` with one axis."""
+def _read_box(space: dict[str, Any]) -> Box:
+    """Return a `Box` with one axis."""
     if not space[":type:"].endswith(".Box'>"):
         raise ValueError(f"{space[':type:']} is not a Box")
     low, high = (np.array(space[name].strip("[]").split(), np.float64) for name in ("low", "high"))
     if not [*low.shape] == [*high.shape] == space["_shape"]:
         raise ValueError("a space does not have one axis")
-    return low, high
+    return Box(low, high, dtype=np.float64)
 
 
 def _find_actor(weights: dict[str, Floats]) -> _Actor:
@@ -174,7 +166,6 @@ def _read_activation(data: dict[str, Any], actor: _Actor) -> Callable[[Floats], 
 
 
 def _read_layers(weights: dict[str, Floats], actor: _Actor) -> list[tuple[Floats, Floats]]:
-    """Return weight, shape (outputs, inputs), and bias of each layer."""
     inner = [name.removeprefix(actor.hidden) for name in weights if name.startswith(actor.hidden)]
     numbers = sorted({int(name.partition(".")[0]) for name in inner})
     names = [*(f"{actor.hidden}{number}." for number in numbers), *filter(None, (actor.output,))]

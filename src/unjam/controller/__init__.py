@@ -6,22 +6,28 @@ weights in safetensors and, in exported files, a recorded sample and an ONNX gra
 
 import os
 import re
-from importlib.resources import files
 from pathlib import Path
 
-from unjam.controller.file import SUFFIX, controller_bytes, controller_file, load_controller, sha256_of
+from unjam.controller.file import (
+    SUFFIX,
+    controller_bytes,
+    controller_file,
+    load_controller,
+    packaged_file,
+    packaged_names,
+    sha256_of,
+)
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.drivers.user_driver import DriverLike, as_driver, is_file_reference
 from unjam.drivers.wrappers import MixedDriver
-from unjam.errors import invalid_value, unknown_name
+from unjam.errors import invalid_value
 from unjam.files import PACKAGED_PREFIX
 
 __all__ = ["controller_bytes", "load_controller", "make_driver", "make_expert", "packaged_file", "packaged_names"]
 
 DEFAULT_DRIVER = "unjam:best"
 """driver of commands without `--driver`: the controller for all roads"""
-PACKAGED_FOLDER = Path(str(files("unjam") / "controllers"))
 _MIXTURE_SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")
 """+ between two drivers of a mixture, but not that in 1e+5"""
 
@@ -41,12 +47,12 @@ def make_driver(name: str, time_step: float) -> Driver:
     if len(parts) > 1:
         return MixedDriver(tuple(make_driver(part, time_step) for part in parts))
     if name.startswith(PACKAGED_PREFIX):
-        return load_controller(packaged_file(name.removeprefix(PACKAGED_PREFIX)))
+        return load_controller(name)
     is_folder = os.path.isdir(name)  # a folder is never a file with code, whatever its name
     if name.endswith(".zip") and not is_folder:
-        from unjam.adapters.stable_baselines3_file import read_stable_baselines3
+        from unjam.adapters.policies import policy_driver
 
-        return read_stable_baselines3(name)
+        return policy_driver(name)
     if name.endswith((".onnx", ".toml")) and not is_folder:
         from unjam.adapters.onnx_file import onnx_driver
 
@@ -70,8 +76,7 @@ def make_expert(name: str | DriverLike, time_step: float) -> Driver:
 
 def controller_path(driver_name: str) -> Path | None:
     """Return the file of the controller with a driver's name; None if the driver is none."""
-    is_packaged = driver_name.startswith(PACKAGED_PREFIX)
-    path = packaged_file(driver_name.removeprefix(PACKAGED_PREFIX)) if is_packaged else controller_file(driver_name)
+    path = controller_file(driver_name)
     return path if path.suffix == SUFFIX and os.path.isfile(path) else None
 
 
@@ -79,16 +84,3 @@ def controller_hash(driver_name: str) -> str | None:
     """Return the SHA-256 of the controller with a driver's name; None if the driver is none."""
     path = controller_path(driver_name)
     return None if path is None else sha256_of(path.read_bytes())
-
-
-def packaged_names() -> list[str]:
-    """Return the names of the controllers in the package: `ring-best`."""
-    return sorted(path.stem for path in PACKAGED_FOLDER.glob(f"*{SUFFIX}"))
-
-
-def packaged_file(name: str) -> Path:
-    """Return the file of a packaged controller; raise `InputError` for another name."""
-    if name not in packaged_names():
-        known = [f"{PACKAGED_PREFIX}{name}" for name in packaged_names()]
-        raise unknown_name("driver", f"{PACKAGED_PREFIX}{name}", known)
-    return PACKAGED_FOLDER / f"{name}{SUFFIX}"

@@ -1,14 +1,12 @@
 """The intended use of a controller: its training scenario, its certified domain, and notes on other scenarios."""
 
 import json
-import os
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from unjam.controller import PACKAGED_PREFIX, packaged_file
+from unjam.controller import controller_path
 from unjam.controller.certificate import OperatingDomain
 from unjam.controller.file import CERTIFICATE_PART, Controller, read_controller
 from unjam.drivers.local_state import LocalState
@@ -50,10 +48,8 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
 
 def _find_controller(driver_name: str) -> Controller | None:
     """Return the controller with a driver's name; None if the driver is none, or it cannot be read."""
-    is_packaged = driver_name.startswith(PACKAGED_PREFIX)
-    path = packaged_file(driver_name.removeprefix(PACKAGED_PREFIX)) if is_packaged else Path(driver_name)
     try:
-        return read_controller(path) if os.path.exists(path) and not driver_name.endswith(".py") else None
+        return read_controller(driver_name) if controller_path(driver_name) else None
     except InputError:
         return None
 

@@ -6,6 +6,7 @@ import os
 import stat
 import zipfile
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +19,8 @@ from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, LocalState
 from unjam.drivers.registry import driver_from_recipe, driver_recipe, user_code_recipes
-from unjam.errors import InputError, invalid_value
-from unjam.files import UNREADABLE_ERRORS, atomic_write, to_json
+from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.files import PACKAGED_PREFIX, UNREADABLE_ERRORS, atomic_write, to_json
 from unjam.physics.arrays import Floats
 from unjam.trust import check_trusted
 from unjam.user_code import read_code
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from unjam.controller.signature import Ed25519PrivateKey
 
 SUFFIX = ".unjam"
+PACKAGED_FOLDER = Path(str(files("unjam") / "controllers"))
 MANIFEST_PART, WEIGHTS_PART = "manifest.json", "weights.safetensors"
 SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART = "sample.safetensors", "controller.onnx", "certificate.json"
 SIGNATURE_PART = "signature.json"
@@ -100,7 +102,7 @@ def _ordered_parts(parts: dict[str, bytes]) -> dict[str, bytes]:
 
 
 def load_controller(path: Path | str) -> Driver:
-    """Return the driver of a `.unjam` file, or of a run folder with one.
+    """Return the driver of a `.unjam` file, of a run folder with one, or of a packaged controller.
 
     Raise `InputError` if it does not exist, is damaged or not a controller, or if a file outside of a run folder refers
     to Python code.
@@ -133,8 +135,23 @@ def read_controller(path: Path | str) -> Controller:
 
 
 def controller_file(path: Path | str) -> Path:
-    """Return the file of a controller: that in a run folder, or the path itself."""
+    """Return the file of a controller: a packaged one (`unjam:ring-best`), that in a run folder, or the path itself."""
+    if str(path).startswith(PACKAGED_PREFIX):
+        return packaged_file(str(path).removeprefix(PACKAGED_PREFIX))
     return Path(path, f"controller{SUFFIX}") if os.path.isdir(path) else Path(path)
+
+
+def packaged_names() -> list[str]:
+    """Return the names of the controllers in the package: `ring-best`."""
+    return sorted(path.stem for path in PACKAGED_FOLDER.glob(f"*{SUFFIX}"))
+
+
+def packaged_file(name: str) -> Path:
+    """Return the file of a packaged controller; raise `InputError` for another name."""
+    if name not in packaged_names():
+        known = [f"{PACKAGED_PREFIX}{name}" for name in packaged_names()]
+        raise unknown_name("driver", f"{PACKAGED_PREFIX}{name}", known)
+    return PACKAGED_FOLDER / f"{name}{SUFFIX}"
 
 
 def sha256_of(part: bytes) -> str:

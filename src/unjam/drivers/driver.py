@@ -139,15 +139,14 @@ class Driver:
         if not self.name:
             return type(self).__name__
         default = {field.name: field.default for field in fields(self)}  # pyright: ignore[reportArgumentType]
-        parameters = self.recipe()["parameters"]
-        changed = {key: value for key, value in parameters.items() if value != default[key] and key != "time_step"}
+        parameters = asdict(self).items()  # pyright: ignore[reportArgumentType]
+        changed = {key: value for key, value in parameters if value != default[key] and key != "time_step"}
         return label_with_parameters(self.name, changed)
 
     def recipe(self) -> Recipe:
-        """Return its specification, without `weights`."""
-        parameters = asdict(self) if is_dataclass(self) else {}
-        own = vars(type(self)).get("name", "")  # not the name of a base class
-        return {"kind": "named", "name": own, "parameters": parameters}
+        """Return its specification, without `weights`; without an own name, other processes cannot build it."""
+        name = vars(type(self)).get("name", "")  # not the name of a base class
+        return {"kind": "named", "name": name, "parameters": asdict(self) if name and is_dataclass(self) else {}}
 
     def weights(self) -> Arrays:
         """Return the weights of its networks, with prefixes for those of inner drivers."""

@@ -1,6 +1,6 @@
 """An ONNX graph of a third party as a driver: data, which workers and controller files carry."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -8,16 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.driver import Driver, Memory, Recipe
-from unjam.drivers.observation import PolicyInput, observation_size
-from unjam.drivers.policy import (
-    PolicyDescription,
-    PolicyDriver,
-    PolicyMemory,
-    action_limits,
-    action_repeat,
-    assumed_time_step,
-)
-from unjam.errors import InputError, MissingPartError, invalid_value, unknown_name
+from unjam.drivers.observation import Feature, PolicyInput, observation_size
+from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyMemory
+from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session
 from unjam.tree import Arrays
 
@@ -91,44 +84,38 @@ def _cached_session(graph: bytes) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class OnnxDriver(PolicyDriver):
-    """A policy from an ONNX graph, alone or added to an expert."""
+    """A policy from an ONNX graph, alone or added to an expert.
 
-    policy: OnnxPolicy
-    description: PolicyDescription | None = None
+    Raise `InputError` if the graph is not allowed, or does not fit its description, `MissingPartError` if a package is
+    not installed.
+    """
+
+    policy: Any = field(init=False)  # an `OnnxPolicy`
+    graph: bytes = field(kw_only=True, repr=False)
+
+    def __post_init__(self) -> None:
+        try:
+            super().__post_init__()
+            object.__setattr__(self, "policy", _read_policy(self.graph, self.description, self.expert))
+            _probe(self)
+        except InputError as error:
+            prefix = f"driver {self.label}: "
+            raise InputError(f"{prefix}{str(error).removeprefix(prefix)}") from None
+
+    def policy_memory(self, n: int) -> Memory:
+        """Return the initial recurrent state of the graph for `n` CAVs."""
+        return self.policy.initial_memory(n)
 
     def recipe(self) -> Recipe:
-        """Return its specification, without the graph."""
-        description = asdict(self.description)  # pyright: ignore[reportArgumentType]
-        fields = {"label": self.label, "description": description, "time_step": self.time_step}
+        """Return its specification, without the graph; other processes cannot build one that reads Python functions."""
+        if any(isinstance(each, Feature) for each in self.inputs):
+            return super().recipe()
+        fields = {"label": self.label, "description": asdict(self.description), "time_step": self.time_step}  # pyright: ignore[reportArgumentType]
         return {"kind": "onnx", **fields, "expert": self.expert.recipe()}
 
     def weights(self) -> Arrays:
         """Return the graph as bytes and, with their prefix, the weights of its expert."""
         return {**super().weights(), GRAPH_WEIGHTS: np.frombuffer(self.policy.graph, np.uint8)}
-
-
-def make_onnx_driver(
-    graph: bytes, description: PolicyDescription, expert: Driver, label: str, time_step: float | None
-) -> OnnxDriver:
-    """Return the driver of a graph on roads with this control step [s]; None if it does not depend on it.
-
-    Raise `InputError` if the graph is not allowed, or does not fit its description, `MissingPartError` if a package is
-    not installed.
-    """
-    try:
-        limits = action_limits(description.output, expert)
-        step = None if time_step is None else assumed_time_step(description.output, description.time_step, time_step)
-        repeat = 1 if step is None else action_repeat(description.time_step, step)
-        policy = _read_policy(graph, description, expert)
-        inputs, output = description.inputs, description.output
-        driver = OnnxDriver(policy, label, inputs, output, expert, step, repeat, limits, description)
-        _probe(driver, sum(map(len, policy.columns.values())))
-    except MissingPartError:
-        raise
-    except InputError as error:
-        prefix = f"driver {label}: "
-        raise InputError(f"{prefix}{str(error).removeprefix(prefix)}") from None
-    return driver
 
 
 def _read_policy(content: bytes, description: PolicyDescription, expert: Driver) -> OnnxPolicy:
@@ -211,13 +198,15 @@ def _shape_text(shape: tuple[int, ...] | None) -> str:
     return "unknown" if shape is None else f"({', '.join(str(length or 'n') for length in shape)})"
 
 
-def _probe(driver: PolicyDriver, size: int) -> None:
+def _probe(driver: OnnxDriver) -> None:
     """Raise `InputError` unless a graph runs, returns numbers, and treats each row by itself."""
+    size = observation_size(driver.inputs, driver.expert)
     observation = np.random.default_rng(0).uniform(0.0, 1.0, (PROBE_ROWS, size))
-    together, after = driver.evaluate(observation, driver.policy.initial_memory(PROBE_ROWS))
-    for name, rows in driver.policy.initial_memory(PROBE_ROWS).items():
+    initial = driver.policy_memory(PROBE_ROWS)
+    together, after = driver.evaluate(observation, initial)
+    for name, rows in initial.items():
         if np.shape(after[name]) != rows.shape:
             raise InputError(f"memory {name!r}: returns shape {np.shape(after[name])}; allowed: {rows.shape}")
-    alone = [driver.evaluate(row[None], driver.policy.initial_memory(1))[0][0] for row in observation]
+    alone = [driver.evaluate(row[None], driver.policy_memory(1))[0][0] for row in observation]
     if not np.allclose(together, alone, rtol=0.0, atol=MAX_PROBE_DIFFERENCE * max(1.0, np.abs(together).max())):
         raise InputError("graph: CAVs influence each other; allowed: rows that are computed independently")

@@ -14,7 +14,7 @@ from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, AdaptiveACC, C
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.network import network_from_weights
 from unjam.drivers.observation import FEATURES, FeatureName, check_user_files, observation_size
-from unjam.drivers.onnx_policy import GRAPH_WEIGHTS, make_onnx_driver
+from unjam.drivers.onnx_policy import GRAPH_WEIGHTS, OnnxDriver
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
@@ -136,7 +136,7 @@ def _build_onnx(recipe: Recipe, weights: Arrays, build_inner: InnerDriverBuilder
     if graph is None or graph.dtype != np.uint8 or graph.ndim != 1:
         raise InputError(f"driver recipe: weights {GRAPH_WEIGHTS!r} are not bytes")
     expert = build_inner(found.expert, EXPERT_KEY)
-    return make_onnx_driver(graph.tobytes(), found.description, expert, found.label, found.time_step)
+    return OnnxDriver(found.label, found.description, expert, found.time_step, graph=graph.tobytes())
 
 
 def _build_composite(

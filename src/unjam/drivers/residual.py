@@ -1,7 +1,7 @@
 """An expert plus a learned residual: the full policy of the paper, Eq. 8."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,22 +12,76 @@ from unjam.drivers.local_state import LocalState, ScaledInput
 from unjam.drivers.network import Network, network_weights
 from unjam.drivers.observation import FeatureInputs, compute_observation, feature, observation_inputs, user_files
 from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
-from unjam.drivers.wrappers import DriverWrapper
+from unjam.drivers.wrappers import DriverWrapper, select_rows
 from unjam.physics.arrays import Array, namespace
-from unjam.tree import Arrays
+from unjam.tree import Arrays, map_leaves
 
 EXPERT_KEY, RESIDUAL_KEY, RESIDUAL_AGE_KEY = "expert", "residual", "age"
 """names in the memory: memory of the expert; the repeated residual, and its control steps so far"""
 
 
+class ExpertWrapper(DriverWrapper):
+    """Adds a residual to the acceleration of an expert, within the limits, and may repeat it for some control steps."""
+
+    inner_key: ClassVar[str] = EXPERT_KEY
+
+    expert: Driver
+    inputs: Any
+    """features that determine the residual"""
+
+    def requirements(self, road: RoadInterface | None = None) -> Requirements:
+        """Return those of the expert and of the features."""
+        return merge_requirements(super().requirements(road), *(feature(each).requirements for each in self.inputs))
+
+    @property
+    def network_inputs(self) -> tuple[ScaledInput, ...]:
+        """Its features, in order."""
+        return observation_inputs(self.inputs, self.expert)
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return the memory of the expert and, with an action repeat, the residual and its age."""
+        own = {} if self.action_repeat == 1 else {RESIDUAL_KEY: np.zeros(n), RESIDUAL_AGE_KEY: np.zeros(n)}
+        return {**super().initial_memory(n), **own}
+
+    def residual(
+        self, observation: Any, state: LocalState, memory: Memory, noise: NoiseSampler | None
+    ) -> tuple[Array, Memory]:
+        """Return the residual [m/s2], and the own memory after it."""
+        raise NotImplementedError
+
+    def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
+        """Return the decision with its components; with `noise`, the residual explores."""
+        acceleration, expert_memory = self.expert.act(state, memory[EXPERT_KEY])
+        limits, repeat, after = self.limits, self.action_repeat, {}
+        expert = acceleration if limits is None else limits.clip(acceleration)
+        is_due: Any = True if repeat == 1 else memory[RESIDUAL_AGE_KEY] % repeat == 0
+        if is_due is False:  # only for plain numbers: the residual is not computed
+            observation, residual = (), memory[RESIDUAL_KEY]
+        else:
+            observation = compute_observation(self.inputs, FeatureInputs(state, expert, self.expert, expert_memory))
+            residual, after = self.residual(observation, state, memory, noise)
+            if is_due is not True:
+                residual = namespace(residual).where(is_due, residual, memory[RESIDUAL_KEY])
+                after = map_leaves(partial(select_rows, is_due), after, memory)
+        after = {EXPERT_KEY: expert_memory, **after}
+        if repeat > 1:
+            after |= {RESIDUAL_KEY: residual, RESIDUAL_AGE_KEY: memory[RESIDUAL_AGE_KEY] + 1.0}
+        total = expert + residual
+        command = Command(total if limits is None else limits.clip(total), self.time_gaps(state, memory))
+        return Decision(command, expert, residual, observation, after)
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the deterministic acceleration, clip(expert + residual), and the new memory."""
+        decision = self.decide(state, memory)
+        return decision.command.acceleration, decision.memory
+
+
 @dataclass(frozen=True)
-class ResidualDriver(DriverWrapper):
+class ResidualDriver(ExpertWrapper):
     """Adds the output of a network to an expert, within the action limit: Eq. 8 of the paper.
 
     Any driver can be the expert, including another `ResidualDriver`.
     """
-
-    inner_key: ClassVar[str] = EXPERT_KEY
 
     expert: Driver
     network: Network
@@ -48,50 +102,17 @@ class ResidualDriver(DriverWrapper):
         """That of its network."""
         return self.network.episode_noise_size
 
-    def requirements(self, road: RoadInterface | None = None) -> Requirements:
-        """Return those of the expert and of the features."""
-        return merge_requirements(super().requirements(road), *(feature(name).requirements for name in self.inputs))
-
-    def initial_memory(self, n: int) -> Memory:
-        """Return the memory of the expert and, with an action repeat, the residual and its age."""
-        own = {} if self.action_repeat == 1 else {RESIDUAL_KEY: np.zeros(n), RESIDUAL_AGE_KEY: np.zeros(n)}
-        return {**super().initial_memory(n), **own}
-
-    def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
-        """Return the decision with its components; with `noise`, the network explores."""
-        acceleration, expert_memory = self.expert.act(state, memory[EXPERT_KEY])
-        limits, repeat = self.limits, self.action_repeat
-        expert = limits.clip(acceleration)
-        is_due: Any = True if repeat == 1 else memory[RESIDUAL_AGE_KEY] % repeat == 0
-        if is_due is False:  # only for plain numbers: the network is not evaluated
-            observation, residual = (), memory[RESIDUAL_KEY]
-        else:
-            observation = compute_observation(self.inputs, FeatureInputs(state, expert, self.expert, expert_memory))
-            network = self.network
-            residual = network(observation) if noise is None else network.explore(observation, noise())
-            if is_due is not True:
-                residual = namespace(residual).where(is_due, residual, memory[RESIDUAL_KEY])
-        after = {EXPERT_KEY: expert_memory}
-        if repeat > 1:
-            after |= {RESIDUAL_KEY: residual, RESIDUAL_AGE_KEY: memory[RESIDUAL_AGE_KEY] + 1.0}
-        command = Command(limits.clip(expert + residual), self.time_gaps(state, memory))
-        return Decision(command, expert, residual, observation, after)
+    def residual(
+        self, observation: Any, state: LocalState, memory: Memory, noise: NoiseSampler | None
+    ) -> tuple[Array, Memory]:
+        """Return the output of the network, which has no memory."""
+        return self.network(observation) if noise is None else self.network.explore(observation, noise()), {}
 
     def observation(self, state: LocalState, memory: Memory) -> Array:
         """Return the current input of the network, also while its residual is repeated."""
         acceleration, after = self.expert.act(state, memory[EXPERT_KEY])
         inputs = FeatureInputs(state, self.limits.clip(acceleration), self.expert, after)
         return compute_observation(self.inputs, inputs)
-
-    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the deterministic acceleration, clip(expert + residual), and the new memory."""
-        decision = self.decide(state, memory)
-        return decision.command.acceleration, decision.memory
-
-    @property
-    def network_inputs(self) -> tuple[ScaledInput, ...]:
-        """Inputs of its own network, in order."""
-        return observation_inputs(self.inputs, self.expert)
 
     def describe(self) -> str:
         """Return the description of the expert, and that there is a residual."""

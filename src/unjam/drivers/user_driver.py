@@ -69,20 +69,16 @@ class UserFunction:
 
     def __call__(self, *arguments: Any) -> Any:
         """Return the result of the function; raise `InputError` with its last executed line if it fails."""
-        return _call_user_code(self.label, self.file, self.function, *arguments)
-
-
-def _call_user_code(label: str, file: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    try:
-        return function(*arguments)
-    except (Exception, SystemExit) as error:
-        lines = [str(frame.lineno) for frame in extract_tb(error.__traceback__) if frame.filename == file]
-        line = f" (line {lines[-1]})" if lines else ""
-        raise InputError(f"{label}: {type(error).__name__}: {error}{line}") from error
+        try:
+            return self.function(*arguments)
+        except (Exception, SystemExit) as error:
+            lines = [str(frame.lineno) for frame in extract_tb(error.__traceback__) if frame.filename == self.file]
+            line = f" (line {lines[-1]})" if lines else ""
+            raise InputError(f"{self.label}: {type(error).__name__}: {error}{line}") from error
 
 
 def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of a named tuple of arrays; a `torch.nn.Module` receives NumPy arrays as its own tensors."""
+    """Return a function of an array, or of a named tuple of arrays; a `torch.nn.Module` receives them as tensors."""
     torch: Any = sys.modules.get("torch")  # it is imported where its modules exist; workers run without it
     module: Any = function
     if torch is None or not isinstance(module, torch.nn.Module):
@@ -92,10 +88,14 @@ def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
         if isinstance(rows[0], torch.Tensor):
             return module(rows)
         like = next(module.parameters(), torch.zeros(()))
-        tensors = (None if values is None else torch.tensor(values, device=like.device) for values in rows)
-        typed = (each.to(like.dtype) if each is not None and each.is_floating_point() else each for each in tensors)
+        if isinstance(rows, np.ndarray):
+            tensors = torch.as_tensor(rows, dtype=like.dtype, device=like.device)
+        else:
+            found = (None if values is None else torch.tensor(values, device=like.device) for values in rows)
+            tensors = (each.to(like.dtype) if each is not None and each.is_floating_point() else each for each in found)
+            tensors = type(rows)(*tensors)
         with torch.no_grad():
-            return map_leaves(lambda tensor: tensor.cpu().numpy(), module(type(rows)(*typed)))
+            return map_leaves(lambda tensor: tensor.cpu().numpy(), module(tensors))
 
     return call
 
@@ -165,10 +165,6 @@ class FileReference:
             raise InputError(f"{self}: is not a function of {argument}")
         return UserFunction(_as_numpy_function(found), str(self), str(self.path))
 
-    def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return the result of a function of the file; raise `InputError` with its last executed line if it fails."""
-        return _call_user_code(str(self), str(self.path), function, *arguments)
-
 
 class UserDriver(Driver):
     """A user's own driver: `implementation` is any object with `act` and `initial_memory`."""
@@ -188,20 +184,24 @@ class UserDriver(Driver):
         """Return the result of the user's function."""
         return function(*arguments)
 
+    def _call_method(self, name: str, *arguments: Any) -> Any:
+        """Return the result of a method of the user's driver; that of `Driver` if it has no such method."""
+        method = getattr(self.implementation, name, None) or getattr(super(), name)
+        return self.call_user_code(method, *arguments)
+
     def initial_memory(self, n: int) -> Memory:
         """Return the initial memory of the user's driver."""
-        return self.call_user_code(self.implementation.initial_memory, n)
+        return self._call_method("initial_memory", n)
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return the memory of the user's driver after the warm-up, if it has `recall`."""
-        recall = getattr(self.implementation, "recall", None)
-        return self.call_user_code(recall, memory, history) if recall else memory
+        return self._call_method("recall", memory, history) if hasattr(self.implementation, "recall") else memory
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the user's acceleration and memory; raise `InputError` if the user's code fails."""
         if np.size(state.speed) == 0:  # the user's code may need a row: the minimum of an empty array is an error
             return np.zeros(0), memory
-        found = self.call_user_code(self.implementation.act, state, memory)
+        found = self._call_method("act", state, memory)
         if not (isinstance(found, tuple) and len(found) == 2):
             raise InputError(f"{self.describe()}: act() returns {found!r:.60}; allowed: (accelerations, memory)")
         accelerations, memory = found
@@ -211,13 +211,11 @@ class UserDriver(Driver):
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gaps of the user's driver, if it has `time_gaps`."""
-        time_gaps = getattr(self.implementation, "time_gaps", None)
-        return self.call_user_code(time_gaps, state, memory) if time_gaps and np.size(state.speed) else None
+        return self._call_method("time_gaps", state, memory) if np.size(state.speed) else None
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the memory features of the user's driver, if it has `memory_features`."""
-        features = getattr(self.implementation, "memory_features", None)
-        return self.call_user_code(features, memory) if features else None
+        return self._call_method("memory_features", memory)
 
 
 @dataclass(frozen=True)
@@ -235,16 +233,13 @@ class FileDriver(FileReference, UserDriver):
         code = self.read_code()
         if self.sha256 and self.sha256 != code.sha256:
             raise InputError(f"{self}: its file has changed since; allowed: as it was when it was first loaded")
-        object.__setattr__(self, "implementation", self._build_implementation(code))
+        made = _make_implementation(self.load_object(code), self.time_step, str(self), self.parameters)
+        object.__setattr__(self, "implementation", made)
         object.__setattr__(self, "sha256", code.sha256)
 
-    def _build_implementation(self, code: UserCode) -> Any:
-        found = self.load_object(code)
-        if inspect.isclass(found):
-            found = _instantiate(found, self.parameters, self.time_step, str(self))
-        elif self.parameters:
-            raise InputError(f"{self}: takes no parameters; only a class does")
-        return as_implementation(found, str(self))
+    def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return the result of a function of the file; raise `InputError` with its last executed line if it fails."""
+        return UserFunction(function, str(self), str(self.path))(*arguments)
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return those of the user's driver; a class without `time_step` assumes the argument that it received."""
@@ -263,13 +258,15 @@ class FileDriver(FileReference, UserDriver):
 
 
 @dataclass(frozen=True)
-class FunctionDriver(Driver):
-    """A plain function `state -> acceleration` as a driver."""
+class _FunctionImplementation:
+    """A plain function `state -> acceleration` with the methods of a driver."""
 
     function: Callable[[LocalState], Array]
 
+    def initial_memory(self, n: int) -> Memory:
+        return {}
+
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the function's acceleration."""
         return self.function(state), memory
 
 
@@ -283,10 +280,6 @@ class PythonDriver(UserDriver):
     def describe(self) -> str:
         """Return the name of the function or the class."""
         return self.label
-
-    def recipe(self) -> Recipe:
-        """Return the recipe of a driver without a name, which cannot be built from it."""
-        return {"kind": "named", "name": "", "parameters": {}}
 
 
 class DriverProtocol(Protocol):
@@ -311,31 +304,31 @@ def as_driver(driver: DriverLike, time_step: float = FileDriver.time_step) -> Dr
     Raise `InputError` if it is not a driver.
     """
     name = object_label(driver)
-    if inspect.isclass(driver):
-        driver = _instantiate(driver, {}, time_step, f"driver {name}")
-    return driver if isinstance(driver, Driver) else PythonDriver(as_implementation(driver, f"driver {name}"), name)
+    made = driver if isinstance(driver, Driver) else _make_implementation(driver, time_step, f"driver {name}")
+    return made if isinstance(made, Driver) else PythonDriver(made, name)
 
 
-def _instantiate(kind: type[Any], parameters: dict[str, Any], time_step: float, label: str) -> Any:
-    """Return an object of a user's class; a parameter `time_step` gets the control step of the road [s]."""
-    try:
-        if _takes_time_step(kind):
-            parameters = {"time_step": time_step, **parameters}
-        return kind(**parameters)
-    except Exception as error:
-        raise InputError(f"{label}: {type(error).__name__} when made: {error}") from error
+def _make_implementation(candidate: Any, time_step: float, label: str, parameters: dict[str, Any] | None = None) -> Any:
+    """Return an object with `act` and `initial_memory` from one, from a class with `parameters`, or from a function.
+
+    A parameter `time_step` of a class gets the control step of the road [s].
+    """
+    if inspect.isclass(candidate):
+        try:
+            steps = {"time_step": time_step} if _takes_time_step(candidate) else {}
+            candidate = candidate(**steps | (parameters or {}))
+        except Exception as error:
+            raise InputError(f"{label}: {type(error).__name__} when made: {error}") from error
+    elif parameters:
+        raise InputError(f"{label}: takes no parameters; only a class does")
+    if callable(getattr(candidate, "act", None)):
+        if not callable(getattr(candidate, "initial_memory", None)):
+            raise InputError(f"{label}: has act() but no initial_memory(n)")
+        return candidate
+    if callable(candidate):
+        return _FunctionImplementation(_as_numpy_function(candidate))
+    raise InputError(f"{label}: is neither a function nor a class with act(state, memory)")
 
 
 def _takes_time_step(kind: type[Any]) -> bool:
     return "time_step" in inspect.signature(kind).parameters
-
-
-def as_implementation(candidate: Any, context: str) -> Any:
-    """Return an object with `act` and `initial_memory`; raise `InputError` if `candidate` is none, and no function."""
-    if callable(getattr(candidate, "act", None)):
-        if not callable(getattr(candidate, "initial_memory", None)):
-            raise InputError(f"{context}: has act() but no initial_memory(n)")
-        return candidate
-    if callable(candidate):
-        return FunctionDriver(_as_numpy_function(candidate))
-    raise InputError(f"{context}: is neither a function nor a class with act(state, memory)")

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from math import exp
 from typing import ClassVar
 
@@ -47,6 +47,11 @@ ROAD_TYPES = ("motorway", "crossing_loop", "loop", "open_road", "shared_loop")
 MIN_SHARED_PENETRATION_RATE = 0.06
 """penetration rate from which a closed road counts as shared by several CAVs; one CAV among 16 vehicles counts, too,
 because the rate does not give their number"""
+
+
+def select_rows(condition: Array, if_true: Array, if_false: Array) -> Array:
+    """Return the rows of one of two arrays of any equal shape, by a condition of shape (n,)."""
+    return np.where(condition.reshape(-1, *[1] * (np.ndim(if_true) - 1)), if_true, if_false)
 
 
 class CompositeDriver(Driver):
@@ -333,13 +338,9 @@ class QueueFallback(CompositeDriver):
             return acceleration, after
         acceleration, after[PRIMARY_KEY] = self.primary.act(state, memory[PRIMARY_KEY])
         fallback_acceleration, fallback_memory = self.fallback.act(state, memory[FALLBACK_KEY])
-
-        def select_rows(if_given_up: Array, if_not_given_up: Array) -> Array:
-            rows = (gave_up > 0.0).reshape(-1, *[1] * (np.ndim(if_given_up) - 1))
-            return np.where(rows, if_given_up, if_not_given_up)
-
-        after[FALLBACK_KEY] = map_leaves(select_rows, fallback_memory, memory[FALLBACK_KEY])
-        return select_rows(fallback_acceleration, acceleration), after
+        select = partial(select_rows, gave_up > 0.0)
+        after[FALLBACK_KEY] = map_leaves(select, fallback_memory, memory[FALLBACK_KEY])
+        return select(fallback_acceleration, acceleration), after
 
     def _update_memory(self, state: LocalState, memory: Memory) -> Memory:
         free, elapsed = state.leader_gap / state.loop_length, memory[ELAPSED_KEY] + self.time_step

@@ -11,7 +11,7 @@ from tests.worlds.test_record import fingerprint, serialize_and_restore
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
 from unjam.drivers.command import Command
 from unjam.drivers.observation import local_observation
-from unjam.drivers.user_driver import FunctionDriver
+from unjam.drivers.user_driver import as_driver
 from unjam.errors import InputError
 from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode
@@ -190,7 +190,7 @@ def test_exploration_does_not_change_the_traffic_noise(sumo: SumoBackend) -> Non
 
 
 def test_a_driver_without_memory_drives_all_cavs(sumo: SumoBackend) -> None:
-    function = FunctionDriver(lambda state: 0.1 * (state.leader_speed - state.speed))
+    function = as_driver(lambda state: 0.1 * (state.leader_speed - state.speed))
     episode = run_episode(MERGE, function, (2,), backend=sumo)
     for trajectory in episode.trajectories:
         states = trajectory.states.select(slice(-1))
@@ -263,7 +263,7 @@ def test_remaining_rows_follow_leaving_and_entering_cavs(simulation: Simulation)
 def test_a_wrong_answer_is_refused_with_its_step(answer: Any, words: str, sumo: SumoBackend) -> None:
     everyone = Merge(penetration_rate=1.0, standing_vehicles=0, horizon=20)
     with pytest.raises(InputError, match=f"driver: step \\d+: {words}"):
-        run_episode(everyone, FunctionDriver(answer), (0,), backend=sumo)
+        run_episode(everyone, as_driver(answer), (0,), backend=sumo)
 
 
 def test_recording_fuel_and_poses_is_optional_and_changes_nothing_else(sumo: SumoBackend) -> None:

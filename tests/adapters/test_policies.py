@@ -5,8 +5,7 @@ import pytest
 import torch
 
 import unjam
-from unjam.adapters import PolicyInput, PolicyOutput
-from unjam.adapters.torch_module import torch_driver
+from unjam.adapters import PolicyInput, PolicyOutput, policy_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import local_observation
@@ -25,7 +24,7 @@ def network() -> torch.nn.Module:
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 def test_a_network_reads_features_and_returns_accelerations(network: torch.nn.Module, kind: torch.dtype) -> None:
     network = network.to(kind)
-    driver = torch_driver(network, output=PolicyOutput(scale=2.0))
+    driver = policy_driver(network, output=PolicyOutput(scale=2.0))
     unjam.check_driver(driver)
     state = random_state(np.random.default_rng(0), 6)
     found, _ = driver.act(state, driver.initial_memory(6))
@@ -35,7 +34,7 @@ def test_a_network_reads_features_and_returns_accelerations(network: torch.nn.Mo
 
 
 def test_a_network_is_added_to_an_expert_within_the_limit(network: torch.nn.Module) -> None:
-    driver = torch_driver(network, expert=PISaturation(), output=PolicyOutput(scale=100.0, limits=(-0.5, 0.5)))
+    driver = policy_driver(network, expert=PISaturation(), output=PolicyOutput(scale=100.0, limits=(-0.5, 0.5)))
     state = random_state(np.random.default_rng(0), 50)
     found, _ = driver.act(state, driver.initial_memory(50))
     assert np.abs(found).max() == 0.5
@@ -47,15 +46,25 @@ def test_quantities_and_units_are_described_as_for_onnx() -> None:
     with torch.no_grad():
         network.weight.copy_(torch.tensor([[1.0, 2.0]]))
     inputs = PolicyInput("speed", "km/h", scale=10.0, offset=36.0), PolicyInput("leader_relative_speed")
-    driver = torch_driver(network, inputs, output=PolicyOutput("desired_speed", "km/h", limits=(0.0, 54.0)))
+    driver = policy_driver(network, inputs, output=PolicyOutput("desired_speed", "km/h", limits=(0.0, 54.0)))
     state = LocalState(*(np.array(each) for each in ([20.0, 20.0], [25.0, 60.0], *[[5.0, 5.0]] * 5)))
     found, _ = driver.act(state, driver.initial_memory(2))
     desired = np.array([(72.0 - 36.0) / 10.0 + 2.0 * 5.0, 54.0]) / 3.6
     np.testing.assert_allclose(found, (desired - 20.0) / 0.1)
 
 
+def test_a_function_of_observations_is_a_policy() -> None:
+    driver = policy_driver(lambda rows: rows[:, 0] - 0.1, [PolicyInput("leader_relative_speed")])
+    unjam.check_driver(driver)
+    state = random_state(np.random.default_rng(0), 6)
+    found, _ = driver.act(state, driver.initial_memory(6))
+    np.testing.assert_allclose(found, state.leader_speed - state.speed - 0.1)
+    with pytest.raises(InputError, match="<lambda>: ZeroDivisionError: division by zero"):
+        policy_driver(lambda rows: 1 / 0)
+
+
 def test_training_a_network_further_does_not_change_its_driver(network: torch.nn.Module) -> None:
-    driver = torch_driver(network)
+    driver = policy_driver(network)
     state = random_state(np.random.default_rng(0), 3)
     before, _ = driver.act(state, driver.initial_memory(3))
     with torch.no_grad():
@@ -65,7 +74,7 @@ def test_training_a_network_further_does_not_change_its_driver(network: torch.nn
 
 
 def test_a_network_drives_in_this_process(network: torch.nn.Module) -> None:
-    driver = torch_driver(network)
+    driver = policy_driver(network)
     found = unjam.drive("ring", driver, episodes=1, scenario_options=SHORT)
     episode = unjam.run_episode(unjam.make_scenario("ring", SHORT), driver, 0)
     assert float(episode.reward.sum()) == found.rows["Sequential"][0]["return"]
@@ -80,7 +89,7 @@ def test_a_network_drives_in_this_process(network: torch.nn.Module) -> None:
 )
 def test_a_network_that_does_not_fit_is_refused(module: torch.nn.Module, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        torch_driver(module)
+        policy_driver(module)
 
 
 def test_single_precision_is_no_excuse_for_rows_that_influence_each_other() -> None:
@@ -89,7 +98,7 @@ def test_single_precision_is_no_excuse_for_rows_that_influence_each_other() -> N
             return observation[:, :1] - observation[:, :1].mean()
 
     with pytest.raises(InputError, match=r"alone and .* among 8 rows"):
-        unjam.check_driver(torch_driver(Mixes()))
+        unjam.check_driver(policy_driver(Mixes()))
 
     def rounds(state: LocalState) -> Any:
         return (0.1 * state.speed).astype(np.float32) + np.float32(1e-7 * len(state.speed))
