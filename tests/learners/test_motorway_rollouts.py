@@ -117,8 +117,7 @@ def test_rollouts_have_the_set_ratio_in_antithetic_pairs(batch_episodes: list[Ep
     facts, tensors = model_rollouts.state()
     other, _ = rollouts_of(replace(MODEL, model_ratio=2.0))
     other.restore(facts, tensors)
-    other.k_star, other._first_new_episode = model_rollouts.k_star, 0
-    other._new_steps = model_rollouts._new_steps
+    other.k_star = model_rollouts.k_star
     repeated = other.roll_out(network, 1)
     assert repeated is not None
     np.testing.assert_array_equal(repeated.observations, found.observations)

@@ -108,7 +108,7 @@ def returns_of(driver: ResidualDriver, world: ToyDynamics, data: EnvironmentData
     rollouts = roll_out(driver, world, starts, 20, torch_generator((1,), "cpu"))
     world_model = RowWorldModel(ModelSettings(), Task(RING, driver.expert), [1.0], (0,))
     world_model.data = data
-    recorded = world_model.recorded_returns(RolloutPlan(driver, indices, 18, (0,), (0,)), 0)
+    recorded = world_model.recorded_returns(RolloutPlan(driver, indices, 18, (0,), (0,)))
     return float(rollouts.rewards.sum(1).double().mean()), float(recorded.mean())
 
 

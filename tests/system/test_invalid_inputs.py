@@ -75,6 +75,9 @@ INVALID: dict[str, tuple[str, list[str]]] = {
         ["drive ring --driver pi --reward ends.py:gentle"],
     ),
     "an endless episode": ("horizon: 1000000000", ["drive ring --driver pi --set horizon=1000000000"]),
+    "another backend in the window": ("backend: 'batch'", ["watch ring -d pi --backend batch"]),
+    "a backend that cannot tune": ("merge is not a ring", ["tune merge --backend batch"]),
+    "a backend that cannot be watched": ("is not a ring", ["watch merge -d pi --backend batch --video a.gif"]),
     "two drivers in one window": ("driver: 'pi, acc'", ["watch ring -d pi -d acc --video video.gif"]),
     "report that overwrites another file": ("allowed: a file that ends in .html", ["report full --out mine.py"]),
     "certificate that overwrites another file": (

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from optuna.distributions import FloatDistribution
 
 from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import PISaturation
@@ -25,7 +26,6 @@ from unjam.training.calibrate import (
     parse_factor_space,
     scale_vehicle_types,
 )
-from unjam.training.search_space import NumericRange
 from unjam.training.seeds import make_test_seeds
 from unjam.training.trial_log import REQUEST_FILE, TRIALS_FILE
 from unjam.worlds.episode import run_episode
@@ -237,7 +237,7 @@ def test_network_without_passenger_cars_is_refused(tmp_path: Path) -> None:
 
 def test_factor_space_needs_known_names_and_positive_ranges() -> None:
     assert parse_factor_space([]) == FACTOR_RANGES
-    assert parse_factor_space(["tau=1..2"]) == {"tau": NumericRange(1.0, 2.0)}
+    assert parse_factor_space(["tau=1..2"]) == {"tau": FloatDistribution(1.0, 2.0)}
     for text, words in (
         ("tua=1..2", "did you mean 'tau'"),
         ("tau=0..2", "factors > 0"),

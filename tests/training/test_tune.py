@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation
@@ -18,13 +19,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.motorway import ON_RAMP
 from unjam.training import tune as tuning
-from unjam.training.search_space import (
-    Categorical,
-    NumericRange,
-    SearchSpace,
-    default_search_space,
-    expert_search_space,
-)
+from unjam.training.search_space import SearchSpace, default_search_space, expert_search_space
 from unjam.training.seeds import TUNING_SEED, tuning_seeds
 from unjam.training.trial_log import TRIALS_FILE
 from unjam.training.tune import TUNING_EPISODES, TUNING_EPISODES_PER_ROAD, TUNING_FILE, TUNING_FINALISTS, tune
@@ -36,8 +31,11 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 SMALL = Ring(horizon=60)
 FINAL = (TUNING_FINALISTS + 1) * 2 * TUNING_EPISODES * 60
 STEPS = FINAL + 4 * TUNING_EPISODES * 60
-RAMP_SPACE: SearchSpace = {"speed_margin": NumericRange(-4.0, 4.0)}
-SPACE = {"catch_up_speed": NumericRange(0.5, 3.0), "safe_gap_rule": Categorical(("constant", "closing"))}
+RAMP_SPACE: SearchSpace = {"speed_margin": FloatDistribution(-4.0, 4.0)}
+SPACE: SearchSpace = {
+    "catch_up_speed": FloatDistribution(0.5, 3.0),
+    "safe_gap_rule": CategoricalDistribution(("constant", "closing")),
+}
 
 
 @pytest.mark.long
@@ -139,6 +137,22 @@ def test_on_ramps_are_screened_in_batches(tmp_path: Path, monkeypatch: pytest.Mo
         assert setting.score == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-12)
 
 
+def test_trials_of_another_backend_are_not_screened(tmp_path: Path) -> None:
+    with WorkerPool(1) as workers, pytest.raises(InputError, match="screen: trials run in batch"):
+        tune({"ring": SMALL}, "pi", SPACE, 10**9, tmp_path, workers, backend="batch", screen=True)
+
+
+@pytest.mark.long
+def test_trials_run_in_the_backend(tmp_path: Path) -> None:
+    with WorkerPool(1) as workers:
+        found, driven = (
+            tune({"ring": SMALL}, "pi", SPACE, STEPS, tmp_path / backend, workers, backend=backend)
+            for backend in ("batch", "sumo")
+        )
+    assert [one.score for one in found.trials] == pytest.approx([one.score for one in driven.trials])
+    assert found.batch_steps == 0
+
+
 def test_too_few_steps_are_refused(tmp_path: Path) -> None:
     with WorkerPool(1) as workers, pytest.raises(InputError, match=f"steps: {FINAL} is not allowed; allowed: >= "):
         tune({"ring": SMALL}, "pi", SPACE, FINAL, tmp_path, workers)
@@ -146,14 +160,12 @@ def test_too_few_steps_are_refused(tmp_path: Path) -> None:
 
 def test_default_space_has_numbers_words_and_booleans() -> None:
     space = default_search_space("pi", 0.1)
-    assert space["catch_up_speed"] == NumericRange(0.25, 4.0, log=True)
-    assert space["safe_gap_rule"] == Categorical(("constant", "closing"))
+    assert space["catch_up_speed"] == FloatDistribution(0.25, 4.0, log=True)
+    assert space["safe_gap_rule"] == CategoricalDistribution(("constant", "closing"))
     assert "time_step" not in space
-    assert default_search_space("pacer", 0.1)["use_tuned"] == Categorical((False, True))
+    assert default_search_space("pacer", 0.1)["use_tuned"] == CategoricalDistribution((False, True))
     first = default_search_space("jam-ahead", 1.0)["first_section"]  # zero by default
-    assert first == NumericRange(0, 4)
-    assert isinstance(first, NumericRange)
-    assert first.is_integer
+    assert first == IntDistribution(0, 4)
     for name in ("human", "nonesuch"):
         with pytest.raises(InputError):
             default_search_space(name, 0.1)
@@ -162,14 +174,12 @@ def test_default_space_has_numbers_words_and_booleans() -> None:
 def test_integer_limits_of_a_float_parameter_are_floats() -> None:
     asked = ["gathering_speed=1..3", "use_tuned=true,false"]
     space = expert_search_space(asked, default_search_space("pacer", 0.1))
-    assert space == {"gathering_speed": NumericRange(1.0, 3.0), "use_tuned": Categorical((True, False))}
-    first, speed = (
-        expert_search_space(["first_section=1..3"], default_search_space("jam-ahead", 1.0))["first_section"],
-        space["gathering_speed"],
-    )
-    assert isinstance(first, NumericRange)
-    assert isinstance(speed, NumericRange)
-    assert (first.is_integer, speed.is_integer) == (True, False)
+    assert space == {
+        "gathering_speed": FloatDistribution(1.0, 3.0),
+        "use_tuned": CategoricalDistribution((True, False)),
+    }
+    defaults = default_search_space("jam-ahead", 1.0)
+    assert expert_search_space(["first_section=1..3"], defaults) == {"first_section": IntDistribution(1, 3)}
 
 
 def test_finalists_use_new_seeds() -> None:
@@ -214,7 +224,7 @@ def test_only_supported_roads_are_screened(tmp_path: Path) -> None:
 
 def test_unknown_parameter_is_refused(tmp_path: Path) -> None:
     with WorkerPool(1) as workers, pytest.raises(InputError, match="vary: 'catch_up' is not allowed"):
-        tune({"ring": SMALL}, "pi", {"catch_up": NumericRange(0.5, 3.0)}, STEPS, tmp_path, workers)
+        tune({"ring": SMALL}, "pi", {"catch_up": FloatDistribution(0.5, 3.0)}, STEPS, tmp_path, workers)
 
 
 @pytest.mark.long
@@ -240,7 +250,7 @@ def test_finalists_are_different_and_run_once(tmp_path: Path, monkeypatch: pytes
         return actual(roads, drivers, *rest)
 
     monkeypatch.setattr(tuning, "_run_drivers", noted)
-    two: SearchSpace = {"safe_gap_rule": Categorical(("constant", "closing"))}
+    two: SearchSpace = {"safe_gap_rule": CategoricalDistribution(("constant", "closing"))}
     with WorkerPool(1) as workers:
         found = tune({"ring": SMALL}, "pi", two, STEPS, tmp_path, workers)
     assert len(found.trials) == 4

@@ -44,6 +44,7 @@ def tune_command(
     changes: dict[str, Any],
     settings: opt.ScenarioSettingsOption = None,
     reward: opt.RewardOption = "",
+    backend: opt.BackendOption = "sumo",
     seed: opt.OptunaSeedOption = 0,
     screen: Annotated[
         bool | None,
@@ -91,7 +92,7 @@ def tune_command(
     folder = opt.new_folder(out, f"tune-{Path(scenario).stem}")
     on_message = (lambda line: None) if json else err_console.print
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), WorkerPool(workers) as pool:
-        result = tune(roads, expert, space, steps, folder, pool, reward, seed, on_message, screen)
+        result = tune(roads, expert, space, steps, folder, pool, reward, seed, backend, on_message, screen)
     best, default = result.best, result.default
     if json:
         counts = {"environment_steps": result.environment_steps, "batch_steps": result.batch_steps}
@@ -129,6 +130,7 @@ def calibrate_command(
 
     Optuna searches factors for tau, accel, decel, minGap and speedFactor of the passenger types, and for the
     flows. The best trial and the unchanged network are evaluated on separate seeds. Your files are not modified.
+    There is no --backend: only SUMO has detectors.
     To continue a stopped calibration, also with more trials, repeat the command with the same --out.
 
     Examples:

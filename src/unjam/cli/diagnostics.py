@@ -217,7 +217,6 @@ def bench_command(
 
 
 def _bench_batches(device: Literal["cpu", "cuda"], json: bool) -> None:
-    """Measure batches of increasing size on a device, and print the results."""
     from unjam.training.benchmark import benchmark_batches
 
     rates = benchmark_batches(device, err_console.print)

@@ -112,6 +112,7 @@ def watch_command(
     seed: opt.SeedOption = 0,
     video: Annotated[Path | None, Option(help="Write a video instead: a .gif, .webp or .mp4 file.")] = None,
     pace: Annotated[float, Option(min=0.1, max=1000.0, help="Playback speed relative to real time.")] = 10.0,
+    backend: opt.BackendOption = "sumo",
     changes: dict[str, Any],
     settings: opt.ScenarioSettingsOption = None,
     json: opt.JsonOption = False,
@@ -131,10 +132,13 @@ def watch_command(
     from unjam.reports.video import check_video_format, write_video
     from unjam.scenarios import make_scenario, scenario_recipe
     from unjam.training.evaluate import raise_failure
+    from unjam.worlds.backend import check_support, open_backend
     from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
     if len(drivers) > 1:
         raise invalid_value("driver", ", ".join(drivers), "one")
+    if video is None and backend != "sumo":
+        raise invalid_value("backend", backend, "sumo, whose window is shown; others with --video")
     (name,) = drivers
     road = make_scenario(scenario, opt.merge_settings(changes, opt.parse_settings(settings)))
     driver = make_driver(name, road.control_step)
@@ -144,9 +148,11 @@ def watch_command(
     else:
         check_video_format(video)
         check_parent_folder(video)
+        with open_backend(backend) as simulator:
+            check_support(simulator, road)
         err_console.print("driving")
         with WorkerPool(1) as pool:
-            episode = pool.run([EpisodeTask(road, driver, (seed,), record_details=True)])[0]
+            episode = pool.run([EpisodeTask(road, driver, (seed,), record_details=True, backend=backend)])[0]
     row = measure(episode)
     print_notes(episode_notes({name: [row]}))
     if episode.has_run and video is not None:
@@ -208,7 +214,8 @@ def assess_command(
 
     For each penetration rate a controller is selected on tuning seeds and evaluated on test seeds. It is
     recommended only if travel time is shown to be shorter than with human drivers and than with ACC vehicles,
-    flow is not lower, the CAVs are feasible, and human drivers do not brake hard more often.
+    flow is not lower, the CAVs are feasible, and human drivers do not brake hard more often. There is no --backend:
+    only SUMO simulates your network.
 
     Examples:
 
@@ -237,7 +244,6 @@ def assess_command(
 
 
 def _parse_rates(text: str) -> list[float]:
-    """Return the numbers of a list like 0.02,0.1."""
     try:
         return [float(word) for word in text.split(",")]
     except ValueError:

@@ -15,7 +15,7 @@ from unjam.learners.settings import PolicySettings
 from unjam.models.ensemble import Seed
 from unjam.models.registry import world_model_class
 from unjam.models.rollouts import RolloutBatch, return_bound, rollout_length
-from unjam.models.world_model import RolloutPlan, Rollouts, StartRequest
+from unjam.models.world_model import RolloutPlan, Rollouts
 from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
 
@@ -51,8 +51,6 @@ class ModelRollouts:
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
-        self._first_new_episode = self.world_model.data.episode_count
-        self._new_steps = sum(len(each.reward) for episode in episodes for each in episode.trajectories)
         self.world_model.add(episodes)
         fit = self.world_model.fit(self._seed(iteration, FIT_SEED))
         eps_m = fit.errors[self.spec.model.error_estimator]
@@ -74,8 +72,7 @@ class ModelRollouts:
         model, driver = self.world_model, full_policy(self.task, self.spec.policy, network)
         control_steps = int(min(self.k_star, model.max_control_steps)) // driver.action_repeat * driver.action_repeat
         seed, *seeds = (self._seed(iteration, purpose, part) for purpose in (STARTS_SEED, NOISE_SEED, EXPLORATION_SEED))
-        request = StartRequest(control_steps, parts, seed, self._first_new_episode, self._new_steps)
-        starts = model.draw_starts(request) if control_steps else ()
+        starts = model.draw_starts(control_steps, parts, seed) if control_steps else ()
         if len(starts) == 0:
             return None
         plan = RolloutPlan(driver, starts, control_steps, *seeds)
@@ -88,7 +85,7 @@ class ModelRollouts:
             facts = batch.facts
             experience += self._experience(batch)
         if part == 0:
-            recorded = model.recorded_returns(plan, self._first_new_episode)
+            recorded = model.recorded_returns(plan)
             is_known = ~np.isnan(recorded)
             pair = (np.concatenate(returns)[is_known], recorded[is_known]) if is_known.any() else (None, None)
             model_return, environment_return = (None if each is None else float(each.mean()) for each in pair)

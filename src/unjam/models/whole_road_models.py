@@ -24,7 +24,7 @@ from unjam.models.road_model import (
     with_size,
 )
 from unjam.models.settings import ModelSettings
-from unjam.models.world_model import RolloutPlan, Rollouts, StartRequest, WorldModel
+from unjam.models.world_model import RolloutPlan, Rollouts, WorldModel
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.scenario import Scenario
@@ -55,6 +55,8 @@ class WholeRoadModel(WorldModel[RoadModel, SamplesT]):
     def check(cls, scenario: Scenario, settings: ModelSettings) -> None:
         """Raise `InputError` if the batch simulator does not support the scenario."""
         reason = statistically_unsupported_reason(scenario)
+        if not scenario.road_model:
+            reason = reason or f"{scenario.title}, which has no road model"
         if scenario.is_closed and scenario.steps_per_control_step > 1:
             reason = f"{scenario.title}: steps_per_control_step is {scenario.steps_per_control_step}"
         if reason:
@@ -212,12 +214,12 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
         """Fit the ensemble further to all samples."""
         return fit_motorway_model(self.ensemble, self.samples, self.settings, seed, len(self.exploration_signs))
 
-    def draw_starts(self, request: StartRequest) -> list[MotorwaySamples]:
+    def draw_starts(self, control_steps: int, parts: int, seed: Seed) -> list[MotorwaySamples]:
         """Return random samples, each of them once for each sign of the exploration."""
-        new_episodes, signs = self.data.episode_count - request.first_new_episode, self.exploration_signs
-        episodes = self.settings.model_ratio * new_episodes * self.scenario.horizon / request.control_steps
-        count = max(1, round(episodes / request.parts / len(signs)))
-        indices = np.random.default_rng(list(request.seed)).integers(len(self.samples), size=count).tolist()
+        new_episodes, signs = self.data.episode_count - self.first_new_episode, self.exploration_signs
+        episodes = self.settings.model_ratio * new_episodes * self.scenario.horizon / control_steps
+        count = max(1, round(episodes / parts / len(signs)))
+        indices = np.random.default_rng(list(seed)).integers(len(self.samples), size=count).tolist()
         return [self.samples[index] for index in indices for _ in signs]
 
     def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
@@ -233,10 +235,10 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
             correction = self._correction(self.ensemble, seeds[0][0])
             yield self.simulate(plan.driver, samples, plan.control_steps, correction, seeds, scales)
 
-    def recorded_returns(self, plan: RolloutPlan, first_episode: int) -> Floats:
-        """Return the returns of the recorded episodes, NaN for those before `first_episode` or for shorter rollouts."""
+    def recorded_returns(self, plan: RolloutPlan) -> Floats:
+        """Return the returns of the recorded episodes, NaN for older than the newest ones or for shorter rollouts."""
         is_whole = plan.control_steps == self.scenario.horizon
-        known = [is_whole and samples.episode >= first_episode for samples in plan.starts]
+        known = [is_whole and samples.episode >= self.first_new_episode for samples in plan.starts]
         return np.where(known, [samples.episode_return for samples in plan.starts], nan)
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:

@@ -26,19 +26,6 @@ EnsembleT = TypeVar("EnsembleT", bound=Ensemble)
 EpisodeSamplesT = TypeVar("EpisodeSamplesT", bound=Any)
 
 
-class StartRequest(NamedTuple):
-    """The starts that one of several parts of an iteration's rollouts needs."""
-
-    control_steps: int
-    """of a rollout"""
-    parts: int
-    seed: Seed
-    first_new_episode: int
-    """number of the first episode of the iteration"""
-    new_steps: int
-    """control steps of all CAVs in the iteration"""
-
-
 class RolloutPlan(NamedTuple):
     """Model rollouts of a driver from starts that the world model has drawn."""
 
@@ -83,6 +70,8 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
         self.data = EnvironmentData(settings.buffer_size)
         self.samples: list[EpisodeSamplesT] = []
         """of the episodes in D_a, oldest first"""
+        self.first_new_episode, self.new_steps = 0, 0
+        """number of the first of the newest episodes, and control steps of all CAVs in them"""
         self.ensemble = self.new_ensemble()
 
     @classmethod
@@ -117,7 +106,8 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
 
     def add(self, episodes: Sequence[Episode]) -> None:
         """Add environment episodes to D_a; the first ones calibrate the IDM of the base if the settings ask for it."""
-        first = self.data.episode_count
+        self.first_new_episode = first = self.data.episode_count
+        self.new_steps = sum(len(each.reward) for episode in episodes for each in episode.trajectories)
         if self.samples_type:
             self.samples += [self.sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
         self.data.add(episodes, self.scenario)
@@ -126,21 +116,24 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
             states = (recording.states for recording in self.data.recordings)
             self.scenario = replace(self.scenario, humans=calibrate_human_drivers(states, self.scenario))
 
-    def draw_starts(self, request: StartRequest) -> Any:
-        """Return random recorded states: rollouts have `model_ratio` times as many steps as the episodes."""
-        parts, kind = request.parts * self.cavs_per_start, self.settings.rollout_starts
-        count = ceil(self.settings.model_ratio * request.new_steps / parts / request.control_steps)
-        first_episode = request.first_new_episode if kind == "newest" else 0
-        return draw_starts(self.data, count, 1, request.seed, first_episode, episode_starts_only=kind == "first")
+    def draw_starts(self, control_steps: int, parts: int, seed: Seed) -> Any:
+        """Return random recorded states for one of several parts of the rollouts, each of so many control steps.
 
-    def recorded_returns(self, plan: RolloutPlan, first_episode: int) -> Floats:
-        """Return the returns of D_a from the starts on, NaN for those before `first_episode` or with too few steps.
+        All rollouts together have `model_ratio` times as many steps as the newest episodes.
+        """
+        kind = self.settings.rollout_starts
+        count = ceil(self.settings.model_ratio * self.new_steps / (parts * self.cavs_per_start) / control_steps)
+        first_episode = self.first_new_episode if kind == "newest" else 0
+        return draw_starts(self.data, count, 1, seed, first_episode, episode_starts_only=kind == "first")
+
+    def recorded_returns(self, plan: RolloutPlan) -> Floats:
+        """Return the returns of D_a from the starts on, NaN for older than the newest episodes or with too few steps.
 
         Compared with the rollouts they are fair if the same policy drove both, with exploration. They are undiscounted
         sums of rewards up to the last step or a crash.
         """
         rewards = [self.data.recordings[index].reward[at : at + plan.control_steps] for index, at in plan.starts]
-        is_new = [self.data.recordings[index].episode >= first_episode for index in plan.starts[:, 0]]
+        is_new = [self.data.recordings[index].episode >= self.first_new_episode for index in plan.starts[:, 0]]
         is_known = [new and len(each) == plan.control_steps for new, each in zip(is_new, rewards, strict=True)]
         return np.array([each.sum() if known else nan for known, each in zip(is_known, rewards, strict=True)])
 

@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
@@ -137,8 +137,8 @@ def make_request(
         raise invalid_value("minutes", minutes, "> 0")
     if not 0 < precision < 1:
         raise invalid_value("precision", precision, "> 0, < 1")
-    road = make_scenario(file, {**ACC_SETTINGS, **(options or {}), "penetration_rate": ZERO_PENETRATION_RATE})
-    assert isinstance(road, UserNetwork)
+    changes = {**ACC_SETTINGS, **(options or {}), "penetration_rate": ZERO_PENETRATION_RATE}
+    road = cast(UserNetwork, make_scenario(file, changes))
     controllers = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
     for name, driver in controllers.items():
         if driver.is_native:

@@ -12,6 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from optuna import create_study
+from optuna.distributions import CategoricalDistribution, FloatDistribution
+from optuna.samplers import TPESampler
+from optuna.trial import TrialState
 
 from unjam.controller.file import sha256_of_file
 from unjam.errors import (
@@ -33,8 +37,7 @@ from unjam.scenarios.user_network import ROAD_CLASSES, UserNetwork, load_user_ne
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.sumo_files.variants import write_variant
 from unjam.training.assess import ZERO_PENETRATION_RATE
-from unjam.training.search import import_optuna
-from unjam.training.search_space import NumericRange, SearchSpace, parse_search_space, suggest_values
+from unjam.training.search_space import SearchSpace, boundary_values, float_range, parse_search_space
 from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.training.trial_log import TrialLog
 from unjam.worlds.sumo.detectors import DetectorPool
@@ -49,12 +52,12 @@ CALIBRATION_TEST_SEEDS = 10
 FLOW_FACTOR = "flow"
 """factor on the number of vehicles, of all types"""
 FACTOR_RANGES: SearchSpace = {
-    "tau": NumericRange(0.5, 2.0, log=True),
-    "accel": NumericRange(0.5, 2.0, log=True),
-    "decel": NumericRange(0.5, 2.0, log=True),
-    "minGap": NumericRange(0.5, 2.0, log=True),
-    "speedFactor": NumericRange(0.8, 1.25, log=True),
-    FLOW_FACTOR: NumericRange(0.67, 1.5, log=True),
+    "tau": FloatDistribution(0.5, 2.0, log=True),
+    "accel": FloatDistribution(0.5, 2.0, log=True),
+    "decel": FloatDistribution(0.5, 2.0, log=True),
+    "minGap": FloatDistribution(0.5, 2.0, log=True),
+    "speedFactor": FloatDistribution(0.8, 1.25, log=True),
+    FLOW_FACTOR: FloatDistribution(0.67, 1.5, log=True),
 }
 """factors on the attributes of passenger vehicle types, and on flows"""
 SUMO_TYPE_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
@@ -204,9 +207,9 @@ def parse_factor_space(texts: list[str]) -> SearchSpace:
     for name, values in (parse_search_space(texts) if texts else FACTOR_RANGES).items():
         if name not in FACTOR_RANGES:
             raise unknown_name("vary", name, FACTOR_RANGES)
-        if not isinstance(values, NumericRange) or not values.low > 0:
-            raise invalid_value(f"vary {name}", values.boundary_values, "a range of factors > 0, as 0.5..2")
-        space[name] = NumericRange(float(values.low), float(values.high), values.log)
+        if isinstance(values, CategoricalDistribution) or not values.low > 0:
+            raise invalid_value(f"vary {name}", boundary_values(values), "a range of factors > 0, as 0.5..2")
+        space[name] = float_range(values)
     return space
 
 
@@ -277,7 +280,7 @@ def calibrate(
 
     Raise `UnjamError` if SUMO cannot simulate the original network, or if its process was lost repeatedly.
     """
-    optuna, original = import_optuna(), dict.fromkeys(space, 1.0)
+    original = dict.fromkeys(space, 1.0)
     log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})
     measurements = corridor.measurements
 
@@ -303,15 +306,15 @@ def calibrate(
         return CalibrationTrial(factors, *log.verdicts[first, text])
 
     results: list[CalibrationTrial] = []
-    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed, multivariate=True))
-    limits = {name: values.boundary_values for name, values in space.items()}
+    study = create_study(sampler=TPESampler(seed=seed, multivariate=True))
+    limits = {name: boundary_values(values) for name, values in space.items()}
     study.enqueue_trial({name: min(max(1.0, low), high) for name, (low, high) in limits.items()})
     original_trial = score_factors(original, 0, seeds_per_trial)
     for number in range(trials):
-        asked = study.ask()
-        factors = {name: float(f"{value:.4g}") for name, value in suggest_values(asked, space).items()}
+        asked = study.ask(dict(space))
+        factors = {name: float(f"{value:.4g}") for name, value in asked.params.items()}
         results.append(trial := score_factors(factors, 0, seeds_per_trial))
-        study.tell(asked, trial.score, state=None if trial.score is not None else optuna.trial.TrialState.FAIL)
+        study.tell(asked, trial.score, state=TrialState.FAIL if trial.score is None else None)
         text = trial.failure if trial.score is None else f"{trial.score:.4g}"
         on_message(f"{number + 1} of {trials}: {_factor_text(trial.factors)}: {text}")
     ranked = sorted((each for each in results if each.score is not None), key=_ranking_score)[:CALIBRATION_FINALISTS]

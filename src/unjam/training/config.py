@@ -32,7 +32,6 @@ from unjam.parameters import (
     read_toml,
 )
 from unjam.scenarios import default_scenario, make_scenario
-from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.training.seeds import TRAINING_SEED_LIMIT
@@ -129,7 +128,7 @@ class RunConfig(AgentSettings):
         reasons = list(map(unsupported_reason if self.tasks else statistically_unsupported_reason, scenarios))
         model = self.model.kind if self.model.model_ratio > 0 else ""
         has_memory = "expert_memory" in policy.inputs or any(map(is_file_reference, policy.inputs))
-        has_pairs = not model or (model == "road" and all(isinstance(road, Motorway) for road in scenarios))
+        has_pairs = not model or (model == "road" and not any(road.is_closed for road in scenarios))
         has_validated_tasks = len(self.tasks) > 1 and evaluation.validation_interval > 0
         device, patience, exploration = self.model.device, evaluation.patience, policy.exploration
         no_memory = policy.history_features and not has_memory

@@ -54,40 +54,35 @@ EvaluationProgress = Callable[[tuple[str, int], int], None]
 class Evaluation:
     """Several drivers on the same episodes."""
 
-    rows: RowsByDriver
-    plot_episodes: dict[str, Episode] = field(repr=False)
+    rows: RowsByDriver = field(repr=False)
+    """by driver: a row of metrics per episode"""
+    plot_episodes: dict[str, Episode] = field(default_factory=dict, repr=False)
     """by driver: the episode for figures, the same seed for all"""
+
+    def summary(self, driver: str) -> dict[str, Estimate]:
+        """Return the mean and 95 % CI of every metric for a driver."""
+        return summarize(self.rows[driver])
 
     def means(self) -> dict[str, dict[str, float]]:
         """Return the mean of each metric, by driver."""
-        return {
-            label: {name: found.mean for name, found in summarize(rows).items()} for label, rows in self.rows.items()
-        }
+        return {label: {name: each.mean for name, each in self.summary(label).items()} for label in self.rows}
 
 
 @dataclass(frozen=True)
-class DriveResult:
-    """Episodes of one or several drivers on the same traffic."""
+class DriveResult(Evaluation):
+    """Episodes of one or several drivers on the same traffic, and the files with them."""
 
-    scenario: str
-    rows: RowsByDriver = field(repr=False)
-    """by driver: a row of metrics per episode"""
+    scenario: str = ""
     folder: Path | None = None
     """folder of the results"""
     report: Path | None = None
-    plot_episodes: dict[str, Episode] = field(default_factory=dict, repr=False)
-    """by driver: the episode for figures, the same seed for all"""
     notes: list[str] = field(default_factory=list)
     """caveats, as controllers on a road that they were not made for"""
 
     @property
     def mean(self) -> dict[str, float]:
         """Mean of every metric over the episodes of the first driver."""
-        return {name: each.mean for name, each in self.summary(next(iter(self.rows))).items()}
-
-    def summary(self, driver: str) -> dict[str, Estimate]:
-        """Return the mean and 95 % CI of every metric for a driver."""
-        return summarize(self.rows[driver])
+        return next(iter(self.means().values()))
 
     def table(self) -> "pd.DataFrame":
         """Return a row per metric with the mean and both ends of the 95 % CI of each driver.
@@ -238,7 +233,7 @@ def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
             raise error_from_name(row["error"], f"{row['reason']}{seed}")
 
 
-def raise_failures(result: "Evaluation | DriveResult") -> None:
+def raise_failures(result: Evaluation) -> None:
     """Raise the first failure among the episodes of a result, if any."""
     raise_failure([row for rows in result.rows.values() for row in rows])
 
@@ -408,4 +403,4 @@ def drive(
 
             report = write_report_page([folder], folder / "report.html")
     used_folder = folder if has_results else None
-    return DriveResult(scenario, evaluation.rows, used_folder, report, evaluation.plot_episodes, notes)
+    return DriveResult(evaluation.rows, evaluation.plot_episodes, scenario, used_folder, report, notes)

@@ -107,7 +107,6 @@ def _run_alone(backend: str, task: EpisodeTask) -> Episode:
 
 
 def _row_facts(rollouts: ModelRollouts, config: RunConfig, progress_row: dict[str, Any]) -> dict[str, Any]:
-    """Return the errors of the row model on holdout episodes."""
     model, generator = rollouts.world_model, np.random.default_rng(config.seed)
     scenario, transitions = model.scenario, model.data.transitions(config.model.holdout)
     holdout = transitions.select(generator.permutation(np.flatnonzero(transitions.is_holdout))[:MAX_ERROR_ROWS])

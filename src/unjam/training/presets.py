@@ -4,7 +4,7 @@ import operator
 import tomllib
 from functools import cache, reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from unjam.errors import invalid_value, unknown_name
 from unjam.parameters import merge_changes
@@ -65,8 +65,9 @@ def _resolve(values: dict[str, Any]) -> dict[str, Any]:
 def _family_task(name: str, scenario: Scenario) -> dict[str, Any]:
     """Return a road of the family as a task; on loops the reward is relative to the speed limit."""
     task = {"scenario": FAMILY[name].scenario, "scenario_options": FAMILY[name].options, "reward": "", "name": name}
-    if not isinstance(scenario, LoopScenario):
+    if not scenario.is_closed:
         return {**task, "weight": ON_RAMP_TASK_WEIGHT}
-    limits = [scenario.limit_speed(size) for size in scenario.drawn_ranges[scenario.size_parameter]]
+    loop = cast(LoopScenario, scenario)
+    limits = [loop.limit_speed(size) for size in loop.drawn_ranges[loop.size_parameter]]
     speed = round(5.0 * len(limits) / sum(limits), 4)
     return {**task, "reward": f"released:speed={speed},acceleration={BRAKING_COST}"}

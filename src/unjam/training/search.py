@@ -4,31 +4,30 @@ Each trial is a training in its own folder. Its objective is the validation retu
 a training; test seeds are not used.
 """
 
-import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from unjam.errors import InputError, UnjamError, import_optional, invalid_value
-from unjam.files import append_line, atomic_write, read_json_lines, to_json
+from optuna import Study, create_study
+from optuna.samplers import TPESampler
+from optuna.trial import TrialState, create_trial
+
+from unjam.errors import InputError, UnjamError, invalid_value
+from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.parameters import merge_changes, nest_keys
 from unjam.reports.results import read_progress, validation_gains
-from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, MessageCallback, open_executor, training_command
-from unjam.training.run_folder import check_config, make_new_folder, read_config
-from unjam.training.search_space import Categorical, NumericRange, SearchSpace, suggest_values
+from unjam.training.run_folder import check_config
+from unjam.training.search_space import SearchSpace, boundary_values
+from unjam.training.trial_log import TRIALS_FILE, TrialLog
 
-if TYPE_CHECKING:
-    from optuna import Study
-
-SEARCH_CONFIG_FILE, SEARCH_FILE, BEST_CONFIG_FILE = "config.toml", "search.json", "best.toml"
-JOURNAL_FILE = "journal.log"
-"""Optuna's log of the trials"""
+SEARCH_FILE, BEST_CONFIG_FILE = "search.json", "best.toml"
 
 
 def check_search_space(base: RunConfig, space: SearchSpace) -> None:
@@ -36,7 +35,7 @@ def check_search_space(base: RunConfig, space: SearchSpace) -> None:
     if base.evaluation.validation_interval == 0:
         raise invalid_value("evaluation.validation_interval", 0, ">= 1: trials are compared by validations")
     for key, values in space.items():
-        for value in values.boundary_values:
+        for value in boundary_values(values):
             check_config(trial_config(base, {key: value}))
 
 
@@ -75,11 +74,12 @@ def search(
 
     Raises:
         InputError: the folder has another search.
-        MissingPartError: Optuna is not installed.
         UnjamError: all trainings failed.
     """
-    study = _open_study(base, space, folder)
-    proposed = _propose_trials(study, space, trials)
+    log = TrialLog(folder, {"config": asdict(base), "space": repr(space)})
+    atomic_write(folder / CONFIG_FILE, to_toml(base))  # below it, files may only name trusted code
+    study = _restore_study(log, base.seed, space)
+    proposed = _propose_trials(study, log, space, trials)
     with open_executor(executor, workers) as start:
         jobs: dict[Future[int], int] = {}
         while True:
@@ -90,7 +90,9 @@ def search(
             for done in wait(jobs, return_when=FIRST_COMPLETED).done:
                 number = jobs.pop(done)
                 has_failed = done.result() != 0
-                _report_gain(study, number, None if has_failed else _objective(_trial_folder(folder, number), space))
+                objective = None if has_failed else _objective(_trial_folder(folder, number), space)
+                log.append({"trial": number, "objective": objective})
+                study.tell(number, objective, state=TrialState.FAIL if objective is None else None)
                 on_message(_progress_line(study, number, trials))
     ended = study.get_trials()
     ended.sort(key=lambda one: -math.inf if one.value is None else one.value, reverse=True)
@@ -117,7 +119,6 @@ def _trial_folder(folder: Path, number: int) -> Path:
 
 
 def _trial_command(base: RunConfig, folder: Path, number: int, values: dict[str, Any]) -> CommandLine:
-    """Return the command line of a trial."""
     config = trial_config(base, values)
     short_evaluation = replace(config.evaluation, baselines=(), episodes=1)  # test seeds do not count in a search
     config_file, log = (folder / "configs" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
@@ -125,91 +126,33 @@ def _trial_command(base: RunConfig, folder: Path, number: int, values: dict[str,
     return training_command(config, _trial_folder(folder, number), config_file, log)
 
 
-def import_optuna() -> Any:
-    """Return Optuna with only its warnings; raise `MissingPartError` if it is not installed."""
-    optuna = import_optional("optuna")
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return optuna
-
-
-def _open_study(base: RunConfig, space: SearchSpace, folder: Path) -> "Study":
-    optuna = import_optuna()
-    from optuna.storages import JournalStorage
-
-    if not (folder / SEARCH_CONFIG_FILE).is_file():
-        make_new_folder(folder, ", or that of a search")
-    elif read_config(folder, check_trust=False) != base:
-        raise InputError(f"out: {str(folder)!r} has another configuration; allowed: a new folder")
-    atomic_write(folder / SEARCH_CONFIG_FILE, to_toml(base))
-    storage = JournalStorage(Journal(folder / JOURNAL_FILE))  # pyright: ignore[reportArgumentType]
-    study = optuna.create_study(storage=storage, study_name="search", direction="maximize", load_if_exists=True)
+def _restore_study(log: TrialLog, seed: int, space: SearchSpace) -> Study:
+    """Return the study with the trials of earlier calls; some may have been interrupted."""
+    proposals = [row["values"] for row in log.rows if "values" in row]
     # A new sampler with the same seed would repeat earlier proposals.
-    study.sampler = optuna.samplers.TPESampler(seed=base.seed + 1_000_003 * len(study.get_trials()))
-    before = study.user_attrs.get("space")
-    if before is not None and before != repr(space):
-        raise InputError(f"vary: {str(folder)!r} has other ranges; allowed: a new folder")
-    study.set_user_attr("space", repr(space))
+    study = create_study(direction="maximize", sampler=TPESampler(seed=seed + 1_000_003 * len(proposals)))
+    try:
+        objectives = {row["trial"]: row["objective"] for row in log.rows if "trial" in row}
+        for number, values in enumerate(proposals):
+            value = objectives.get(number)
+            ended = TrialState.FAIL if value is None else TrialState.COMPLETE
+            state = ended if number in objectives else TrialState.RUNNING
+            study.add_trial(create_trial(state=state, value=value, params=values, distributions=dict(space)))
+    except (ValueError, TypeError, LookupError, AttributeError):  # a text outside the space may name code
+        raise InputError(f"out: {TRIALS_FILE} has a trial outside the search space; allowed: a new folder") from None
     return study
 
 
-class Journal:
-    """Optuna's log of a study, as `optuna.storages.journal.BaseJournalBackend`; the search's folder must be locked.
-
-    Optuna's own class follows symbolic links, and leaves one as its lock.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Read the file, which may be missing; an incomplete line of a crash is left out."""
-        self._path, self._lines = path, list(map(_json_line, read_json_lines(path)))
-        if path.is_file():
-            atomic_write(path, "".join(f"{line}\n" for line in self._lines))
-
-    def read_logs(self, log_number_from: int) -> Iterable[dict[str, Any]]:
-        """Return the entries of the log from a number on."""
-        return map(json.loads, self._lines[log_number_from:])
-
-    def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Add entries to the log; they are on the disk when this returns."""
-        lines = list(map(_json_line, logs))
-        append_line(self._path, "\n".join(lines))
-        self._lines += lines
-
-
-def _json_line(entry: dict[str, Any]) -> str:
-    return json.dumps(entry, separators=(",", ":"))
-
-
-def _propose_trials(study: "Study", space: SearchSpace, trials: int) -> Iterator[tuple[int, dict[str, Any]]]:
+def _propose_trials(
+    study: Study, log: TrialLog, space: SearchSpace, trials: int
+) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield number and values of interrupted trials, then of new ones, up to a total number."""
-    for stored in study.get_trials():
-        for key, value in stored.params.items():
-            _check_in_space(key, value, space.get(key))
-        if stored.state.name == "WAITING":
-            raise InputError(f"out: {JOURNAL_FILE} has a trial that was not started by a search; allowed: a new folder")
-        if stored.state.is_finished():
-            continue
-        if stored.state.name == "RUNNING" and stored.params.keys() == space.keys():
-            yield stored.number, stored.params
-        else:
-            _report_gain(study, stored.number, None)  # it was interrupted before it had all its values
-    while len(study.get_trials(deepcopy=False)) < trials:
-        trial = study.ask()
-        yield trial.number, suggest_values(trial, space)
-
-
-def _check_in_space(key: str, value: Any, values: NumericRange | Categorical | None) -> None:
-    """Raise `InputError` if a stored value is not in the search space, because a text may name code."""
-    if values is None or (not isinstance(value, int | float) and value not in values.boundary_values):
-        raise InputError(f"out: {key}: {value!r} in {JOURNAL_FILE} is not in the search space; allowed: a new folder")
-
-
-def _report_gain(study: "Study", number: int, gain: float | None) -> None:
-    from optuna.trial import TrialState
-
-    if gain is None or not math.isfinite(gain):
-        study.tell(number, state=TrialState.FAIL)
-    else:
-        study.tell(number, gain)
+    stored = study.get_trials()
+    yield from ((trial.number, trial.params) for trial in stored if not trial.state.is_finished())
+    for number in range(len(stored), trials):
+        values = study.ask(dict(space)).params
+        log.append({"values": values})
+        yield number, values
 
 
 def validation_gain(folder: Path) -> float | None:
@@ -236,7 +179,7 @@ def describe_trial(trial: SearchTrial) -> str:
     return f"trial {trial.number}: validation gain over expert {trial.gain:+.1f}, {last}{untrained}: {values}"
 
 
-def _progress_line(study: "Study", number: int, trials: int) -> str:
+def _progress_line(study: Study, number: int, trials: int) -> str:
     stored = study.get_trials(deepcopy=False)
     trial, ended = stored[number], sum(one.state.is_finished() for one in stored)
     values = ", ".join(

@@ -1,69 +1,31 @@
-"""Search spaces of searches, tunings and calibrations: ranges and choices by name."""
+"""Search spaces of searches, tunings and calibrations: Optuna's distributions by name."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
+from dataclasses import fields
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+import optuna
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import parse_value
 
-if TYPE_CHECKING:
-    from optuna.trial import Trial as OptunaTrial
+optuna.logging.set_verbosity(optuna.logging.WARNING)
 
 RANGE_FACTOR = 4.0
 """default ranges go from the default value divided by this factor to its product with it"""
 ZERO_DEFAULT_HIGH = 1.0
 """upper end of the range of a parameter that is zero by default"""
 
-
-@dataclass(frozen=True)
-class NumericRange:
-    """Numbers between two limits, both included."""
-
-    low: float
-    high: float
-    log: bool = False
-    """whether values are proposed on a logarithmic scale"""
-
-    @property
-    def is_integer(self) -> bool:
-        """Whether the values are integers."""
-        return isinstance(self.low, int) and isinstance(self.high, int)
-
-    @property
-    def boundary_values(self) -> tuple[Any, ...]:
-        """The values to check before a search; if they are valid, so are those between."""
-        return self.low, self.high
-
-    def suggest(self, trial: "OptunaTrial", key: str) -> None:
-        """Let Optuna propose a value."""
-        if self.is_integer:
-            trial.suggest_int(key, int(self.low), int(self.high), log=self.log)
-        else:
-            trial.suggest_float(key, self.low, self.high, log=self.log)
+Distribution = FloatDistribution | IntDistribution | CategoricalDistribution
+SearchSpace = dict[str, Distribution]
 
 
-@dataclass(frozen=True)
-class Categorical:
-    """One of several values."""
-
-    boundary_values: tuple[Any, ...]
-
-    def suggest(self, trial: "OptunaTrial", key: str) -> None:
-        """Let Optuna propose a value."""
-        trial.suggest_categorical(key, self.boundary_values)
-
-
-SearchSpace = dict[str, NumericRange | Categorical]
-
-
-def suggest_values(trial: "OptunaTrial", space: SearchSpace) -> dict[str, Any]:
-    """Let Optuna propose a value for each name, and return them."""
-    for key, values in space.items():
-        values.suggest(trial, key)
-    return {key: trial.params[key] for key in space}
+def boundary_values(values: Distribution) -> Sequence[Any]:
+    """Return the values to check before a search; if they are valid, so are those between."""
+    return values.choices if isinstance(values, CategoricalDistribution) else (values.low, values.high)
 
 
 def parse_search_space(texts: Sequence[str]) -> SearchSpace:
@@ -79,19 +41,25 @@ def parse_search_space(texts: Sequence[str]) -> SearchSpace:
         if ".." in values:
             space[key] = _parse_range(text, values)
         else:
-            space[key] = Categorical(tuple(parse_value(value.strip()) for value in values.split(",")))
+            space[key] = CategoricalDistribution([parse_value(value.strip()) for value in values.split(",")])
     if not space:
         raise InputError("vary: at least one key is needed: --vary trpo.target_kl=0.003..0.1:log")
     return space
 
 
-def _parse_range(text: str, values: str) -> NumericRange:
+def _parse_range(text: str, values: str) -> Distribution:
     values, log = values.removesuffix(":log"), values.endswith(":log")
     low, high, *rest = (parse_value(limit.strip()) for limit in values.split(".."))
     are_numbers = all(isinstance(limit, int | float) and not isinstance(limit, bool) for limit in (low, high))
     if rest or not are_numbers or not low < high or not math.isfinite(high - low) or (log and low <= 0):
         raise invalid_value("vary", text, "low < high, with :log low > 0")
-    return NumericRange(low, high, log)
+    kind = IntDistribution if isinstance(low, int) and isinstance(high, int) else FloatDistribution
+    return kind(low, high, log=log)
+
+
+def float_range(values: Distribution) -> Distribution:
+    """Return a range of integers as one of numbers, and other values unchanged."""
+    return FloatDistribution(values.low, values.high, values.log) if isinstance(values, IntDistribution) else values
 
 
 def default_search_space(expert: str, time_step: float) -> SearchSpace:
@@ -121,24 +89,23 @@ def expert_search_space(texts: Sequence[str], defaults: SearchSpace) -> SearchSp
     A range with integer limits is still one of numbers if that of `defaults` (`default_search_space`) is.
     """
     space = parse_search_space(texts)
-    for name, values in space.items():
-        default = defaults.get(name)
-        if isinstance(values, NumericRange) and isinstance(default, NumericRange) and not default.is_integer:
-            space[name] = NumericRange(float(values.low), float(values.high), values.log)
-    return space
+    is_float = {name: isinstance(defaults.get(name), FloatDistribution) for name in space}
+    return {name: float_range(values) if is_float[name] else values for name, values in space.items()}
 
 
-def _default_range(value: Any, hint: Any) -> NumericRange | Categorical | None:
+def _default_range(value: Any, hint: Any) -> Distribution | None:
     """Return the default range of a parameter; None for types without one, as lists."""
     if isinstance(value, bool):
-        return Categorical((False, True))
+        return CategoricalDistribution((False, True))
     if get_origin(hint) is Literal:
-        return Categorical(get_args(hint))
-    if not isinstance(value, int | float):
+        return CategoricalDistribution(get_args(hint))
+    if isinstance(value, int):
+        if value == 0:
+            return IntDistribution(0, round(RANGE_FACTOR))
+        return IntDistribution(max(1, round(value / RANGE_FACTOR)), round(value * RANGE_FACTOR), log=True)
+    if not isinstance(value, float):
         return None
     if value == 0:
-        return NumericRange(0, round(RANGE_FACTOR)) if isinstance(value, int) else NumericRange(0.0, ZERO_DEFAULT_HIGH)
-    if isinstance(value, int):
-        return NumericRange(max(1, round(value / RANGE_FACTOR)), round(value * RANGE_FACTOR), log=True)
-    limits = sorted((float(value) / RANGE_FACTOR, float(value) * RANGE_FACTOR))
-    return NumericRange(*limits, log=value > 0)
+        return FloatDistribution(0.0, ZERO_DEFAULT_HIGH)
+    low, high = sorted((value / RANGE_FACTOR, value * RANGE_FACTOR))
+    return FloatDistribution(low, high, log=value > 0)

@@ -113,7 +113,6 @@ def min_verdict_episodes(rate_count: int, driver_count: int, with_unchanged_acc:
 
 
 def _episodes_per_test_seed(rate_count: int, driver_count: int, with_unchanged_acc: bool) -> int:
-    """Return the number of episodes of each test seed."""
     return 1 + rate_count * (1 + bool(driver_count) + with_unchanged_acc)
 
 

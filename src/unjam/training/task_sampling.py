@@ -5,7 +5,6 @@ from math import ceil
 from typing import Literal
 
 from unjam.drivers.driver import Driver
-from unjam.scenarios.ring import Ring
 from unjam.worlds.batch.ring.warm_up import MAX_CACHED_CAVS
 from unjam.worlds.episode import Task
 from unjam.worlds.worker_pool import EpisodeTask
@@ -114,7 +113,7 @@ def warm_up_iterations(
     warm-up states, which has room for the `counts` of episodes of each task in so many iterations.
     """
     pairs = zip((task.scenario for task in tasks), counts, strict=True)
-    cavs = sum(count * scenario.cavs for scenario, count in pairs if isinstance(scenario, Ring))
+    cavs = sum(count * len(scenario.possible_cav_ids()) for scenario, count in pairs if scenario.is_closed)
     cached = MAX_CACHED_CAVS // (2 * max(cavs, 1))
     length = min(MAX_WARM_UP_ITERATIONS, cached, ceil(remaining_steps / steps_per_iteration))
     return range(iteration, iteration + max(length, 1))

@@ -371,7 +371,6 @@ class Trainer:
         return [whole, *rows]
 
     def _progress_row(self, log: IterationLog, validation: ValidationReturns, index: int) -> dict[str, Any]:
-        """Return the row of progress of one task."""
         measured = [measure(episode) for episode in self.collector.episodes[index]]
         model = log.model[index] if log.model else {}
         means = {name: float(np.mean([row[name] for row in measured])) for name in ("return", *PROGRESS_METRICS)}

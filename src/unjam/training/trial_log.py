@@ -1,4 +1,4 @@
-"""Log of the trials of a tuning or calibration, with which it resumes after an interruption."""
+"""Log of the trials of a search, tuning or calibration, with which it resumes after an interruption."""
 
 import json
 from contextlib import suppress
@@ -30,7 +30,7 @@ class TuningTrial:
 
 
 class TrialLog:
-    """Verdicts on trials by the first of their seeds, including those of earlier calls."""
+    """Rows about trials, including those of earlier calls, and verdicts by the first of their seeds."""
 
     def __init__(self, folder: Path, request: dict[str, Any]) -> None:
         """Begin in a new folder, or resume in that of the same request; raise `InputError` for other folders."""
@@ -43,7 +43,7 @@ class TrialLog:
                 raise InputError(f"out: {str(folder)!r} was made with other settings; allowed: a new folder")
             starts = stored.get("starts", [])
         else:
-            make_new_folder(folder, ", or that of this tuning")
+            make_new_folder(folder, ", or that of the same request")
         current = manifest()
         self.starts = [*starts, {"commit": current["commit"], "started": current["started"]}]
         """time and commit of each call"""
@@ -51,15 +51,19 @@ class TrialLog:
         self._path = folder / TRIALS_FILE
         self.verdicts: dict[tuple[int, str], TrialVerdict] = {}
         """verdicts by first seed and driver, without damaged rows"""
-        rows = read_json_lines(self._path)
-        for row in rows:
+        self.rows = read_json_lines(self._path)
+        for row in self.rows:
             with suppress(KeyError, TypeError):
                 self.verdicts[row["first_seed"], row["driver"]] = row["score"], row["verdict"]
         if self._path.is_file():  # this removes an incomplete last row
-            atomic_write(self._path, "".join(f"{to_json(row)}\n" for row in rows))
+            atomic_write(self._path, "".join(f"{to_json(row)}\n" for row in self.rows))
 
     def add(self, first_seed: int, driver: str, verdict: TrialVerdict) -> None:
         """Add a verdict; it is on the disk when this returns."""
         self.verdicts[first_seed, driver] = verdict
-        row = {"first_seed": first_seed, "driver": driver, "score": verdict[0], "verdict": verdict[1]}
+        self.append({"first_seed": first_seed, "driver": driver, "score": verdict[0], "verdict": verdict[1]})
+
+    def append(self, row: dict[str, Any]) -> None:
+        """Add a row; it is on the disk when this returns."""
+        self.rows.append(row)
         append_line(self._path, to_json(row))

@@ -12,6 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from optuna import create_study
+from optuna.samplers import TPESampler
+from optuna.trial import TrialState
 
 from unjam.controller.file import SUFFIX, controller_bytes
 from unjam.drivers.driver import label_with_parameters
@@ -23,17 +26,16 @@ from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_fe
 from unjam.measures.gain import MEAN_GAIN, EpisodeRows, normalized_gain, performance_bound
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
-from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
 from unjam.training.fingerprint import file_hashes
 from unjam.training.run_folder import controller_origin
-from unjam.training.search import import_optuna
-from unjam.training.search_space import SearchSpace, suggest_values
+from unjam.training.search_space import SearchSpace
 from unjam.training.seeds import tuning_seeds
 from unjam.training.trial_log import TrialLog, TrialVerdict, TuningTrial
+from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.batch.run import run_batch, run_batches
-from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
+from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 TUNING_FILE = "tuned.json"
@@ -76,6 +78,7 @@ def tune(
     workers: WorkerPool,
     reward: str = "",
     seed: int = 0,
+    backend: str = "sumo",
     on_message: Callable[[str], None] = lambda line: None,
     screen: bool | None = False,
 ) -> TuningResult:
@@ -93,14 +96,14 @@ def tune(
         workers: the result does not depend on their number.
         reward: objective on one road; empty: the scenario's own.
         seed: of the proposals.
+        backend: the simulator: `sumo`, `batch` or `path.py:name`.
         on_message: called with a line for each trial.
         screen: whether trials run in batches on roads that support it (on several roads: exactly), and only the
-            finalists and the default in SUMO; None: if any road supports it.
+            finalists and the default in SUMO; None: if any road supports it; not with another backend.
 
     Raises:
         InputError: too few steps, a wrong parameter, no road that supports batches, or another folder.
         UnjamError: all trials are infeasible.
-        MissingPartError: Optuna is not installed.
     """
     known = driver_from_name(expert, 1.0).recipe()["parameters"]
     for key in space:
@@ -115,22 +118,24 @@ def tune(
     if trial_count < 2:
         raise InputError(f"steps: {steps} is not allowed; allowed: >= {final_steps + 2 * trial_steps} for two settings")
     unsupported = statistically_unsupported_reason if is_single else unsupported_reason
-    reasons = {road: unsupported(scenario) for road, scenario in roads.items()}
+    with open_backend(backend) as simulator:
+        check_support(simulator, *roads.values())
+    other = "" if backend == "sumo" else f"trials run in {backend}"
+    reasons = {road: other or unsupported(scenario) for road, scenario in roads.items()}
     if screen and all(reasons.values()):
         raise InputError(f"screen: {next(iter(reasons.values()))}")
     screened = [road for road, reason in reasons.items() if screen is not False and not reason]
     recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
     request = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
-    files = file_hashes([reward], *roads.values())
+    files = file_hashes([reward, backend], *roads.values())
     request |= {"files": files} if files else {}
-    optuna = import_optuna()
-    log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened)})
+    log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
     trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)
 
     @cache
     def human_rows(first: int, count: int) -> dict[str, EpisodeRows]:
-        return {} if is_single else _run_drivers(roads, ["human"], first, count, reward, sumo_runners)[0]
+        return {} if is_single else _run_drivers(roads, ["human"], first, count, (reward, backend), sumo_runners)[0]
 
     def score_settings(
         settings: list[dict[str, Any]], first: int, count: int, runners: Mapping[str, TuningRunner]
@@ -139,22 +144,20 @@ def tune(
         scores: dict[str, TrialVerdict] = {each: (None, why) for each in drivers if (why := _invalid_reason(each))}
         new = [each for each in drivers if each not in scores and (first, each) not in log.verdicts]
         new = list(dict.fromkeys(new))
-        for driver, rows in zip(new, _run_drivers(roads, new, first, count, reward, runners), strict=True):
+        for driver, rows in zip(new, _run_drivers(roads, new, first, count, (reward, backend), runners), strict=True):
             log.add(first, driver, _score_rows(rows, human_rows(first, count)))
         scores |= {each: log.verdicts[first, each] for each in drivers if each not in scores}
         return [TuningTrial(each, values, *scores[each]) for each, values in zip(drivers, settings, strict=True)]
 
     trials: list[TuningTrial] = []
-    sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True)
-    study = optuna.create_study(direction="maximize", sampler=sampler)
-    has_motorways = any(isinstance(roads[road], Motorway) for road in screened)  # many take as long as few
-    batch_size = SCREENING_BATCH_SIZE if screen or has_motorways else 1
+    study = create_study(direction="maximize", sampler=TPESampler(seed=seed, multivariate=True))
+    shares_batches = any(BATCH_KINDS[type(roads[road])].has_own_drivers for road in screened)
+    batch_size = SCREENING_BATCH_SIZE if screen or shares_batches else 1  # many take as long as few
     for first in range(0, trial_count, batch_size):
-        asked = [study.ask() for _ in range(first, min(first + batch_size, trial_count))]
-        proposed = [suggest_values(each, space) for each in asked]
-        rounded = [{key: _round_digits(value) for key, value in values.items()} for values in proposed]
+        asked = [study.ask(dict(space)) for _ in range(first, min(first + batch_size, trial_count))]
+        rounded = [{key: _round_digits(value) for key, value in each.params.items()} for each in asked]
         for each, trial in zip(asked, score_settings(rounded, 0, episodes, trial_runners), strict=True):
-            study.tell(each, trial.score, state=None if trial.score is not None else optuna.trial.TrialState.FAIL)
+            study.tell(each, trial.score, state=TrialState.FAIL if trial.score is None else None)
             trials.append(trial)
             result = trial.verdict if trial.score is None else f"{trial.score:.4g}"
             on_message(f"{len(trials)} of {trial_count}: {trial.driver}: {result}")
@@ -191,15 +194,21 @@ def _run_drivers(
     drivers: Sequence[str],
     first: int,
     count: int,
-    reward: str,
+    settings: tuple[str, str],
     runners: Mapping[str, TuningRunner],
 ) -> list[dict[str, EpisodeRows]]:
-    """Return the rows of each driver by road, with the runner of the road, on tuning seeds from `first` on."""
+    """Return the rows of each driver by road, with the runner of the road, on tuning seeds from `first` on.
+
+    `settings` are reward and backend.
+    """
     results: list[dict[str, EpisodeRows]] = [{} for _ in drivers]
-    seeds = tuning_seeds(count, first)
+    seeds, (reward, backend) = tuning_seeds(count, first), settings
     for road, scenario in roads.items() if drivers else ():
         tasks = [
-            [EpisodeTask(scenario.stratum(index, count), made, each, reward) for index, each in enumerate(seeds)]
+            [
+                EpisodeTask(scenario.stratum(index, count), made, each, reward, backend=backend)
+                for index, each in enumerate(seeds)
+            ]
             for made in (driver_from_name(driver, scenario.control_step) for driver in drivers)
         ]
         for result, rows in zip(results, runners[road](tasks), strict=True):
@@ -218,7 +227,7 @@ def _run_in_batch(tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
     import torch
 
     all_tasks = [*chain(*tasks)]
-    if isinstance(all_tasks[0].scenario, Motorway):
+    if BATCH_KINDS[type(all_tasks[0].scenario)].has_own_drivers:
         episodes = iter(run_batches(all_tasks, allow_statistical=True))
     else:
         needs_numpy = any(task.driver.requirements().needs_numpy for task in all_tasks)
@@ -228,7 +237,6 @@ def _run_in_batch(tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
 
 
 def _score_rows(rows_by_road: Mapping[str, EpisodeRows], human_rows: Mapping[str, EpisodeRows]) -> TrialVerdict:
-    """Return the score of a trial and its verdict, from its rows by road."""
     if human_rows:
         gains = {
             road: normalized_gain(rows, human_rows[road], [performance_bound(row) for row in human_rows[road]]).mean
@@ -242,7 +250,6 @@ def _score_rows(rows_by_road: Mapping[str, EpisodeRows], human_rows: Mapping[str
 
 
 def _round_digits(value: Any) -> Any:
-    """Return a float with four digits, other values as they are."""
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
