@@ -27,7 +27,7 @@ from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.drive import finish_drive
 from unjam_paper.all_roads import PI_ON_RINGS_LABEL, PI_TUNED_ON_RINGS
-from unjam_paper.results_file import measure_parts, read_part, write_figure
+from unjam_paper.results_file import StudyPart, read_part, write_figure
 from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, mean_text
 
 ADAPTATION_EPISODES = 20
@@ -105,7 +105,7 @@ ROAD_CHANGES: dict[str, tuple[Ring, type[ChangingRings]]] = {
 }
 
 
-def _measure_speeds(name: str, driver: str) -> dict[str, list[Any]]:
+def _measure_speeds(name: str, driver: str, workers: int) -> dict[str, list[Any]]:
     """Return the mean speed of all vehicles in each second and the limit after the change, by episode [m/s]."""
     ring, world = ROAD_CHANGES[name]
     rings = [ring.stratum(number, ADAPTATION_EPISODES) for number in range(ADAPTATION_EPISODES)]
@@ -117,13 +117,15 @@ def _measure_speeds(name: str, driver: str) -> dict[str, list[Any]]:
     return {"limits": limits, "speeds": [values.round(4).tolist() for values in speeds]}
 
 
-def _write_adaptation(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    parts = {
+def _adaptation_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    return {
         f"{number}-{position}": (_measure_speeds, (name, driver))
         for number, name in enumerate(ROAD_CHANGES)
         for position, driver in enumerate(ADAPTATION_DRIVERS.values())
     }
-    measure_parts(folder, parts, workers)
+
+
+def _write_adaptation(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
     write_figure(folder, "adaptation", adaptation_figure(folder), reduce_colors=True)
 
 
@@ -191,8 +193,8 @@ def adaptation_figure(folder: Path) -> Figure:
 
 ADAPTATION = Study(
     title="time until traffic settles after a change of the road",
+    make_parts=_adaptation_parts,
     write=_write_adaptation,
     minutes=10.0,
-    is_resumable=True,
     tables={name: partial(adaptation_table, name) for name in ROAD_CHANGES},
 )

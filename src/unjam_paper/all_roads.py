@@ -8,6 +8,7 @@ for rounding.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import groupby
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from unjam.controller import PACKAGED_PREFIX, make_driver
-from unjam.files import atomic_write, to_json
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
 from unjam.measures.gain import (
     MAX_GAIN,
@@ -29,7 +29,7 @@ from unjam.measures.gain import (
 )
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import estimate_on_shared_seeds, format_difference
+from unjam.measures.statistics import Estimate, estimate_on_shared_seeds, format_difference
 from unjam.physics.arrays import Floats
 from unjam.reports.figures import TEXT_COLOR, new_figure
 from unjam.scenarios.scenario import Scenario
@@ -50,7 +50,7 @@ from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
-from unjam_paper.results_file import StudyPart, controller_digest, measure_parts, read_optional_part, read_parts
+from unjam_paper.results_file import StudyPart, read_parts
 from unjam_paper.study import PlannedRun, Study, StudyFolder
 from unjam_paper.variants import RINGS_EXPERT, SHARED_RINGS_EXPERT, VARIANTS
 
@@ -99,13 +99,15 @@ SINGLE_CONTROLLERS: dict[str, str] = {
     PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS,
 }
 """controllers for all roads: one expert, or one file with several"""
+CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best", "unjam:ring-jammed-best", "unjam:figure-eight-best")
+MOTORWAY_CONTROLLERS = ("unjam:on-ramp-tuned",)
+"""packaged controllers, each with the control step of its type of road"""
 FAMILY_DRIVERS: dict[str, str] = {
     **SINGLE_CONTROLLERS,
     **{"jam-ahead": "jam-ahead", "FollowerStopper": "follower-stopper"},
-    **{f"unjam:{name}": f"unjam:{name}" for name in ("ring-best", "ring-jammed-best", "figure-eight-best")},
-    "unjam:on-ramp-tuned": "unjam:on-ramp-tuned",
+    **{name: name for name in (*CLOSED_ROAD_CONTROLLERS, *MOTORWAY_CONTROLLERS)},
 }
-"""drivers that are evaluated on every road, by label"""
+"""drivers that are evaluated on every road with their control step, by label"""
 TWO_LAWS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned on all roads)"
 """label of the combination of two controllers by the type of road; its results are taken from theirs"""
 RING_GROUP = "rings"
@@ -163,47 +165,56 @@ def family_metrics(index: int, episode: Episode) -> dict[str, Any]:
     return {key: measured[key] for key in FAMILY_METRICS}
 
 
-def _write_all_roads(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    roads = sorted(enumerate(FAMILY.items()), key=lambda each: _is_motorway(each[1][1]))  # quick ones first
-    with WorkerPool(workers) as pool:
-        run_episodes = partial(pool.run_and_map, transform=family_metrics)
-        for number, (name, road) in roads:
-            known = read_optional_part(folder, f"{number:02d}")
-            results = drive_missing(name, road, FAMILY_DRIVERS, FAMILY_TEST_SEEDS, known, run_episodes)
-            atomic_write(folder / f"{number:02d}.json", to_json(results))
+def _all_roads_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    return road_parts(FAMILY, _family_drivers, FAMILY_TEST_SEEDS, in_batches=False)
+
+
+def _family_drivers(road: FamilyRoad) -> dict[str, str]:
+    others = CLOSED_ROAD_CONTROLLERS if _is_motorway(road) else MOTORWAY_CONTROLLERS
+    return {label: driver for label, driver in FAMILY_DRIVERS.items() if label not in others}
+
+
+def road_parts(
+    roads: Mapping[str, FamilyRoad],
+    drivers_on: Callable[[FamilyRoad], Mapping[str, str]],
+    test_seeds: Seeds,
+    in_batches: bool,
+) -> dict[str, StudyPart]:
+    """Return a part for each road, with the drivers that are evaluated on it."""
+    return {
+        f"{number:02d}": (
+            measure_road,
+            (name, road, FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]], drivers_on(road), test_seeds, in_batches),
+        )
+        for number, (name, road) in enumerate(roads.items())
+    }
 
 
 def _is_motorway(road: FamilyRoad) -> bool:
     return GROUP_BY_SCENARIO[road.scenario] == "motorways"
 
 
-def drive_missing(
-    name: str, road: FamilyRoad, drivers: Mapping[str, str], seeds: Seeds, known: dict[str, Any], run: EpisodeRunner
+def measure_road(
+    name: str,
+    road: FamilyRoad,
+    experts: Sequence[str],
+    drivers: Mapping[str, str],
+    test_seeds: Seeds,
+    in_batches: bool,
+    workers: int,
 ) -> dict[str, Any]:
-    """Return the results of a road: what is known, and drivers without results or with a changed packaged file.
+    """Return the metrics of all drivers on a road on the test seeds; its best expert is selected on other seeds.
 
-    The best expert is selected on other seeds than `seeds`. A driver is known by the digest of its packaged file, or by
-    its name with parameters.
+    With `in_batches` the episodes are simulated in batches where these are supported.
     """
-    results = {"road": name, "part": road.part, "best": HUMAN_LABEL, "expert_files": {}, "driver_files": {}, "rows": {}}
-    results, scenario, experts = results | known, road.make_scenario(), FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]]
-    new = [driver for driver in experts if results["expert_files"].get(driver) != controller_digest(driver)]
-    if new:
-        others = experts if results["best"] in new else (results["best"], *new)
-        candidates = {driver: driver for driver in (HUMAN_LABEL, *others)}
-        results["best"] = best_feasible_driver(drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, run))
-        results["expert_files"] |= {driver: controller_digest(driver) for driver in new}
-    evaluated = {HUMAN_LABEL: HUMAN_LABEL, results["best"]: results["best"], **drivers}
-    files = {label: controller_digest(driver) or driver for label, driver in evaluated.items()}
-    missing = {
-        label: driver
-        for label, driver in evaluated.items()
-        if label not in results["rows"] or results["driver_files"].get(label) != files[label]
-    }
-    if missing:
-        results["rows"] |= drive_by_label(scenario, missing, seeds, run)
-        results["driver_files"] |= {label: files[label] for label in missing}
-    return results
+    scenario = road.make_scenario()
+    candidates = {driver: driver for driver in (HUMAN_LABEL, *experts)}
+    with WorkerPool(workers) as pool:
+        run = partial(_run_in_batches, pool) if in_batches else partial(pool.run_and_map, transform=family_metrics)
+        best = best_feasible_driver(drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, run))
+        evaluated = {HUMAN_LABEL: HUMAN_LABEL, best: best, **drivers}
+        rows = drive_by_label(scenario, evaluated, test_seeds, run)
+    return {"road": name, "part": road.part, "best": best, "rows": rows}
 
 
 def best_feasible_driver(rows: Mapping[str, EpisodeRows]) -> str:
@@ -270,9 +281,10 @@ def all_drivers_table(folder: Path) -> pd.DataFrame:
             for values in (road["gains"], road["by_seed"]):
                 values[TWO_LAWS_LABEL] = values[law]
         for label, row in rows.items():
-            differences = (road["by_seed"][first] - road["by_seed"][label] for road in roads.values())
-            row[heading] = _mean_gain(road["by_seed"][label] for road in roads.values())
-            row[f"worst, {heading}"] = _worst_gain(roads, label)
+            driven = {name: road for name, road in roads.items() if label in road["gains"]}
+            differences = (road["by_seed"][first] - road["by_seed"][label] for road in driven.values())
+            row[heading] = _mean_gain(road["by_seed"][label] for road in driven.values())
+            row[f"worst, {heading}"] = _worst_gain(driven, label)
             row[f"{first}, difference to it, {heading}"] = "" if label == first else _mean_gain(differences)
     return pd.DataFrame([*rows.values()])
 
@@ -293,13 +305,15 @@ def _seed_cell(values: Floats) -> str:
 def all_roads_figure(folder: Path) -> Figure:
     """Return a map of the gains, roads by drivers."""
     roads = road_gains(folder)
-    values = np.array([[road["gains"][label].mean for label in FAMILY_DRIVERS] for road in roads.values()])
+    unknown = Estimate(nan, nan, nan, 0)
+    values = np.array([[road["gains"].get(label, unknown).mean for label in FAMILY_DRIVERS] for road in roads.values()])
     figure = new_figure(0.3 * len(roads) + 1.0)
     axes = figure.subplots()
     # The pale half of the color map: numbers stay legible on it.
     image = axes.imshow(values, cmap="RdYlGn", vmin=-2 * MAX_GAIN, vmax=2 * MAX_GAIN, aspect="auto")
-    for (row, column), value in np.ndenumerate(values):
-        axes.text(column, row, f"{value:+.2f}", ha="center", va="center", color=TEXT_COLOR, fontsize=8)
+    for row, column in np.argwhere(np.isfinite(values)):
+        text = f"{values[row, column]:+.2f}"
+        axes.text(column, row, text, ha="center", va="center", color=TEXT_COLOR, fontsize=8)
     axes.set_xticks(range(len(FAMILY_DRIVERS)), list(FAMILY_DRIVERS), rotation=40, ha="right", rotation_mode="anchor")
     marks = {"training": "", "combination": " (new combination)", "axis": " (new)"}
     axes.set_yticks(range(len(roads)), [f"{name}{marks[road['part']]}" for name, road in roads.items()])
@@ -310,9 +324,8 @@ def all_roads_figure(folder: Path) -> Figure:
 
 ALL_ROADS_STUDY = Study(
     title="gain of one controller on every road of the family, training roads and unseen roads",
-    write=_write_all_roads,
+    make_parts=_all_roads_parts,
     minutes=60.0,
-    is_resumable=True,
     tables={
         **{name: partial(all_roads_table, parts) for name, parts in TABLE_PARTS.items()},
         "drivers": all_drivers_table,
@@ -336,19 +349,16 @@ def joint_training_study(
     def make_runs(seeds: int) -> list[PlannedRun]:
         return [PlannedRun(group, name, seed) for name, limit in variants.items() for seed in range(min(seeds, limit))]
 
-    def write(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-        parts: dict[str, StudyPart] = {}
-        for number, (name, road) in enumerate((roads or family_roads(group)).items()):
-            trained = {
-                f"{VARIANTS[run.variant].label} {run.seed}": str(joint_controller(road, run, study_folder))
-                for run in make_runs(seeds)
-            }
-            parts[f"{number:02d}"] = measure_road, (name, road, {**baselines, **trained}, test_seeds)
-        measure_parts(folder, parts, workers)
+    def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+        def drivers_on(road: FamilyRoad) -> dict[str, str]:
+            controllers = ((run, joint_controller(road, run, study_folder)) for run in make_runs(seeds))
+            return {**baselines, **{f"{VARIANTS[run.variant].label} {run.seed}": str(own) for run, own in controllers}}
+
+        return road_parts(roads or family_roads(group), drivers_on, test_seeds, in_batches=True)
 
     labels = [VARIANTS[name].label for name in variants]
     tables = {name: partial(joint_training_table, labels, parts, baselines) for name, parts in TABLE_PARTS.items()}
-    return Study(title, write, make_runs, minutes=25.0, is_resumable=True, tables=tables)
+    return Study(title, make_runs, make_parts, minutes=25.0, tables=tables)
 
 
 def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolder) -> Path:
@@ -361,13 +371,6 @@ def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolde
     configs = run.config.task_configs().items()
     name = next(name for name, config in configs if GROUP_BY_SCENARIO[config.scenario] == group)
     return study_folder.run_folder(run) / name
-
-
-def measure_road(name: str, road: FamilyRoad, drivers: Mapping[str, str], seeds: Seeds) -> dict[str, Any]:
-    """Return the metrics of all drivers on a road on the test seeds; its best expert is selected on other seeds."""
-    with WorkerPool() as workers:
-        results = drive_missing(name, road, drivers, seeds, {}, partial(_run_in_batches, workers))
-    return {key: results[key] for key in ("road", "part", "best", "rows")}
 
 
 def _run_in_batches(workers: WorkerPool, tasks: list[EpisodeTask]) -> EpisodeRows:

@@ -31,8 +31,8 @@ from unjam_paper.open_test_roads import (
     write_network,
     write_road_files,
 )
-from unjam_paper.results_file import read_optional_part, read_part, write_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder
+from unjam_paper.results_file import read_part
+from unjam_paper.study import NO_VALUE_TEXT, Study
 
 EXAMPLES_PART = "roads"
 MAX_EPISODES = 51
@@ -137,24 +137,16 @@ EXAMPLES: dict[str, Example] = {
 }
 
 
-def _write_examples(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    """Assess the roads that have no results with these settings yet, and write the results after each of them."""
-    roads = read_optional_part(folder, EXAMPLES_PART)
-    for name, example in EXAMPLES.items():
-        settings = {"rate": example.rate, "episodes": MAX_EPISODES, "seconds": None, "precision": PRECISION}
-        if roads.get(name, {}).get("settings") != settings:
-            with TemporaryDirectory() as place:
-                roads[name] = {"settings": settings, **_assess_road(example, Path(place), workers)}
-            write_part(folder, EXAMPLES_PART, roads)
-
-
-def _assess_road(example: Example, folder: Path, workers: int) -> dict[str, Any]:
-    (folder / "road").mkdir()
-    request = make_request(str(example.write(folder / "road")), [example.rate], MAX_EPISODES, PRECISION)
-    with WorkerPool(workers) as pool:
-        assessment = assess(request, folder / "assessment", pool, on_message=partial(print, flush=True))
+def assess_example(name: str, rate: float, max_episodes: int, precision: float, workers: int) -> dict[str, Any]:
+    """Return the assessment of an example at a penetration rate."""
+    with TemporaryDirectory() as place, WorkerPool(workers) as pool:
+        road, results = Path(place, "road"), Path(place, "assessment")
+        road.mkdir()
+        request = make_request(str(EXAMPLES[name].write(road)), [rate], max_episodes, precision)
+        assessment = assess(request, results, pool, on_message=partial(print, flush=True))
     document = assessment.document
     return {
+        "settings": {"rate": rate, "episodes": max_episodes, "seconds": None, "precision": precision},
         "headline": document["headline"],
         "sentences": [each.summary for each in (*assessment.controller_results, *assessment.acc_results)],
         "notes": document["notes"],
@@ -207,8 +199,10 @@ def _difference_text(row: Mapping[str, Any], name: str, digits: int) -> str:
 
 ASSESS_EXAMPLES = Study(
     title="assessments of five small roads",
-    write=_write_examples,
+    make_parts=lambda study_folder, seeds: {
+        f"{EXAMPLES_PART}/{name}": (assess_example, (name, example.rate, MAX_EPISODES, PRECISION))
+        for name, example in EXAMPLES.items()
+    },
     minutes=25.0,
-    is_resumable=True,
     tables={"roads": examples_table},
 )

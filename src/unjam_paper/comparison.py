@@ -107,7 +107,7 @@ which a batch steps only in distribution, the last is trained in batches, too"""
 def comparison_study(title: str, variants: Sequence[str], road: str = "ring") -> Study:
     """Return the study that compares variants on a road."""
 
-    def write(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+    def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
         write_comparison_table(comparison_rows(study_folder, road, variants, seeds), folder)
         curves, metric = training_curves(study_folder, road, variants, seeds), return_metric(road, variants[0])
         rows = study_folder.reference_rows(road)
@@ -117,7 +117,7 @@ def comparison_study(title: str, variants: Sequence[str], road: str = "ring") ->
         study_folder.copy_controllers(planned_runs([road], variants, seeds), folder)
 
     tables = {"checkpoints": partial(_checkpoint_table, road)}
-    return Study(title, write, lambda seeds: planned_runs([road], variants, seeds), (road,), tables=tables)
+    return Study(title, lambda seeds: planned_runs([road], variants, seeds), write=write, roads=(road,), tables=tables)
 
 
 def best_expert(reference_rows: dict[str, Table], metric: str = "return") -> str:
@@ -286,7 +286,7 @@ def curve_figure(road: str, curves: dict[str, Any], reference_rows: dict[str, Ta
     return figure
 
 
-def _write_figure_5(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def _write_figure_5(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
     for road in PAPER_ROADS:
         write_figure(folder, road, trajectory_figure(figure_5_episodes(study_folder, road)))
 
@@ -320,8 +320,8 @@ def paper_exact_study(road: str) -> Study:
     variants = (f"trpo-exact{fewer}", f"proposed-exact{fewer}")
     study = comparison_study(f"exact settings of the paper, on {road}", variants, road)
 
-    def write(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-        study.write(study_folder, seeds, folder, workers)
+    def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
+        study.write(study_folder, seeds, folder)
         facts = {
             variant: [
                 {

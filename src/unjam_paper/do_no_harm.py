@@ -4,9 +4,7 @@ Seeds are paired, and added in batches until the confidence intervals allow a ve
 coverage of 95 % holds for a single evaluation; with repeated evaluations it is smaller.
 """
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from itertools import product
 from math import nan
 from pathlib import Path
@@ -18,7 +16,6 @@ import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
 from unjam.controller import make_driver
-from unjam.files import to_json
 from unjam.measures.effect import FLOW_METRIC, HARD_BRAKING_METRIC, TIME_METRIC
 from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL
@@ -38,8 +35,8 @@ from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.open_test_roads import OPEN_TEST_ROADS, OpenTestRoad, write_road_files
-from unjam_paper.results_file import controller_digest, read_part, write_part
-from unjam_paper.study import Study, StudyFolder, Table
+from unjam_paper.results_file import read_part
+from unjam_paper.study import Study, Table
 
 TESTED_CONTROLLER, ACC_BASELINE = "unjam:best", "cruise"
 PENETRATION_RATES = (0.05, 0.1)
@@ -56,7 +53,7 @@ MIN_FLOW_SHARE = 0.2
 """minimum flow in a breakdown as a share of the capacity: a few slow vehicles are no breakdown"""
 SECTION_LENGTH, SECTION_SECONDS = 250.0, 30.0
 """length [m] and time [s] over which mean speeds are taken"""
-RESULTS_FILE = "do-no-harm"
+RESULTS_PART = "do-no-harm"
 HARM_METRICS = (
     *("seed", "status", TIME_METRIC, FLOW_METRIC, "collisions", "feasibility", "required_time_gap", "has_lanes"),
     *("override_share", HARD_BRAKING_METRIC, "min_time_gap", "share_short_time_gap", "cav_min_ttc"),
@@ -128,26 +125,20 @@ def _evaluate_rate(results: Mapping[str, Any], rate: float) -> HarmVerdict:
     return evaluate_harm(rows, acc_rows, is_frequent)
 
 
-def _write_harm(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    """Run the missing episodes; results are kept unless the controller or the road has changed."""
-    results = _read_results(folder) if (folder / f"{RESULTS_FILE}.json").is_file() else {}
-    with TemporaryDirectory() as place, WorkerPool(workers) as pool:
-        for number, (name, road) in enumerate(OPEN_TEST_ROADS.items()):
-            about = {"controller": controller_digest(TESTED_CONTROLLER), "road": json.loads(to_json(asdict(road)))}
-            if results.get(name, {}).get("about") != about:
-                results[name] = {"about": about, "rows": {}}
-            files = Path(place, str(number))
-            files.mkdir()
-            file = write_road_files(road, files)
-            while rates := [rate for rate in PENETRATION_RATES if _needs_seeds(results[name], rate)]:
-                for label, rows in _run_seed_batch(file, road, results[name], rates, pool).items():
-                    results[name]["rows"].setdefault(label, []).extend(rows)
-                write_part(folder, RESULTS_FILE, results)
+def measure_harm(controller: str, road: OpenTestRoad, workers: int) -> dict[str, Any]:
+    """Return the rows of all drivers on a road, with as many seeds as the verdicts need."""
+    results: dict[str, Any] = {"rows": {}}
+    with TemporaryDirectory() as folder, WorkerPool(workers) as pool:
+        file = write_road_files(road, Path(folder))
+        while rates := [rate for rate in PENETRATION_RATES if _needs_seeds(results, rate)]:
+            for label, rows in _run_seed_batch(file, road, results, rates, pool).items():
+                results["rows"].setdefault(label, []).extend(rows)
+    return results
 
 
 def _read_results(study: Path) -> dict[str, Any]:
     """Return the results by road, with NaN for null."""
-    results: dict[str, Any] = read_part(study, RESULTS_FILE)
+    results: dict[str, Any] = read_part(study, RESULTS_PART)
     for row in (row for road in results.values() for rows in road["rows"].values() for row in rows):
         row |= {name: nan for name, value in row.items() if value is None}
     return results
@@ -214,8 +205,9 @@ def _percent_text(share: Estimate) -> str:
 
 DO_NO_HARM = Study(
     title="harm check of unjam:best against the ACC alone on open roads",
-    write=_write_harm,
+    make_parts=lambda study_folder, seeds: {
+        f"{RESULTS_PART}/{name}": (measure_harm, (TESTED_CONTROLLER, road)) for name, road in OPEN_TEST_ROADS.items()
+    },
     minutes=40.0,
-    is_resumable=True,
     tables={"harm": harm_table},
 )

@@ -25,7 +25,6 @@ from unjam.drivers.car_following import FollowerStopper
 from unjam.drivers.driver import Driver
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
-from unjam.files import atomic_write, to_json
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.physics.arrays import Floats
@@ -36,8 +35,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.export import export_controller
 from unjam.training.presets import preset_values
 from unjam.training.road_family import LONG_WARM_UP
-from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.results_file import controller_digest, read_optional_part, read_part, write_part
+from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import (
     NO_VALUE_TEXT,
     DriverComparison,
@@ -45,7 +43,7 @@ from unjam_paper.study import (
     PlannedRun,
     Study,
     StudyFolder,
-    evaluate_on_test_seeds,
+    evaluate_metrics,
     mean_text,
     planned_runs,
 )
@@ -102,12 +100,17 @@ CONTROLLER_ROADS: dict[str, str] = {
     **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned")},
 }
 """packaged controllers for closed roads, and the road of each"""
-LANE_CONTROLLERS = ("unjam:on-ramp-tuned", *(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight"))
+LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)
+RING_CONTROLLERS = tuple(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight")
+RING_STEPS: dict[str, Any] = {"simulation_step": 0.1, "steps_per_control_step": 1}
+"""those of the rings, which their controllers need on any road"""
+LANE_SECONDS = 900.0
+"""duration of an episode on a motorway lane [s]"""
 IMPAIRED_DRIVERS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
 VEHICLE_SPACINGS = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
 """range of the road length per vehicle [m]"""
-WORST_FILE, CONTROLLER_HASHES_FILE = "worst", "controller-hashes"
-"""names of parts: the worst cases of the certificates, and the digests of the controllers by part"""
+WORST_PART = "worst"
+"""part with the worst cases of the certificates"""
 ENVELOPE_METRICS = ("return", "mean_speed", "min_time_gap", "cav_max_braking", "steps", "collisions")
 LANE_CONDITIONS: dict[str, dict[str, Any]] = {
     "a free lane": {"inflow": 1200.0, "off_peak_inflow": 1200.0},
@@ -190,21 +193,18 @@ FEASIBLE_ROADS = {
 }
 
 
-def _write_feasible(
-    roads: Sequence[str], variant: str, study_folder: StudyFolder, seeds: int, folder: Path, workers: int
-) -> None:
-    with WorkerPool(workers) as pool:
-        for name in roads:
-            road = FEASIBLE_ROADS[name]
-            runs = {f"training {run.seed}": run for run in planned_runs([name], [variant], seeds)}
-            for other in set(roads) - {name}:
-                runs[OTHER_ROAD_LABEL] = PlannedRun(other, variant, 0)
-            drivers = road.drivers | {label: study_folder.run_folder(run) for label, run in runs.items()}
-            results = {}
-            for size in road.sizes:
-                scenario, metrics = road.make_scenario(size), FEASIBILITY_STUDY_METRICS
-                results[str(size)] = evaluate_on_test_seeds(scenario, drivers, SEEDS_PER_SIZE, metrics, pool)
-            write_part(folder, name, results)
+def _feasible_parts(roads: Sequence[str], variant: str, study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    parts: dict[str, StudyPart] = {}
+    for name in roads:
+        road, runs = FEASIBLE_ROADS[name], planned_runs([name], [variant], seeds)
+        trained = {f"training {run.seed}": run for run in runs}
+        for other in set(roads) - {name}:
+            trained[OTHER_ROAD_LABEL] = PlannedRun(other, variant, 0)
+        drivers = road.drivers | {label: study_folder.run_folder(run) for label, run in trained.items()}
+        for size in road.sizes:
+            arguments = road.make_scenario(size), drivers, SEEDS_PER_SIZE, FEASIBILITY_STUDY_METRICS
+            parts[f"{name}/{size}"] = evaluate_metrics, arguments
+    return parts
 
 
 def feasible_table(road: str, folder: Path) -> pd.DataFrame:
@@ -239,8 +239,8 @@ def feasible_study(title: str, roads: Sequence[str], minutes: float, variant: st
     """Return the study that compares trainings of a variant with the tuned experts of closed roads."""
     return Study(
         title=title,
-        write=partial(_write_feasible, roads, variant),
         make_runs=lambda seeds: planned_runs(roads, [variant], seeds),
+        make_parts=partial(_feasible_parts, roads, variant),
         minutes=minutes,
         tables={road: partial(feasible_table, road) for road in roads},
     )
@@ -250,20 +250,18 @@ def on_ramp_study(variants: Mapping[str, str]) -> Study:
     """Return the study of variants that are trained on the on-ramp, with their labels in the table."""
     return Study(
         title="residual compared with tuned experts on the on-ramp, 5 % CAVs",
-        write=partial(_write_on_ramp, tuple(variants)),
         make_runs=partial(planned_runs, ["on-ramp"], tuple(variants)),
+        make_parts=partial(_on_ramp_parts, tuple(variants)),
         minutes=35.0,
         tables={"on-ramp": partial(_on_ramp_table, variants)},
     )
 
 
-def _write_on_ramp(variants: Sequence[str], study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def _on_ramp_parts(variants: Sequence[str], study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     drivers: dict[str, DriverSource] = {**ON_RAMP_DRIVERS}
     for variant, seed in product(variants, range(seeds)):
         drivers[f"{variant} {seed}"] = study_folder.controller_folder(PlannedRun("on-ramp", variant, seed))
-    with WorkerPool(workers) as pool:
-        results = evaluate_on_test_seeds(ON_RAMP_ROAD, drivers, ON_RAMP_SEEDS, ON_RAMP_METRICS, pool)
-    write_part(folder, "on-ramp", results)
+    return {"on-ramp": (evaluate_metrics, (ON_RAMP_ROAD, drivers, ON_RAMP_SEEDS, ON_RAMP_METRICS))}
 
 
 def _on_ramp_table(variants: Mapping[str, str], folder: Path) -> pd.DataFrame:
@@ -298,12 +296,12 @@ def envelope_figure_eights() -> Iterator[tuple[str, FigureEight]]:
         yield f"radius {low} to {high} m", FigureEight(radius=(low, high))
 
 
-def envelope_lanes() -> Iterator[tuple[str, Motorway]]:
+def envelope_lanes(**changes: Any) -> Iterator[tuple[str, Motorway]]:
     """Yield motorway lanes by name on which the safety filter is active and the checks of SUMO are not."""
-    for name, changes in LANE_CONDITIONS.items():
-        ramp = Ramp(position=2000.0, inflow=0.0, off_peak_inflow=0.0)
-        lane = Motorway(lanes=1, ramps=(ramp,), horizon=900)
-        yield name, replace(lane, actuation="raw", safety=SafetyFilter(), **changes)
+    lane = Motorway(lanes=1, ramps=(Ramp(position=2000.0, inflow=0.0, off_peak_inflow=0.0),), **changes)
+    lane = replace(lane, horizon=round(LANE_SECONDS / lane.control_step), actuation="raw", safety=SafetyFilter())
+    for name, demand in LANE_CONDITIONS.items():
+        yield f"{name}, control step {lane.control_step:g} s", replace(lane, **demand)
 
 
 def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
@@ -312,37 +310,29 @@ def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
         yield name, replace(Ring(warmup=warmup), **changes)
 
 
-def _write_envelope(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    """Return the parts of the study `envelope`."""
     closed = tuple(CONTROLLER_ROADS)
-    parts: dict[str, tuple[Iterator[tuple[str, Scenario]], tuple[str, ...], int]] = {
-        WORST_FILE: (iter(()), closed, 1),
-        "rings": (envelope_rings(), closed, ENVELOPE_SEEDS),
-        "figure-eights": (envelope_figure_eights(), closed, ENVELOPE_SEEDS),
-        "rings-raw": (envelope_rings(actuation="raw"), closed, RAW_ACTUATION_SEEDS),
-        "lanes-raw": (envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
-        "impaired": (impaired_rings(0), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
-        "impaired-jammed": (impaired_rings(LONG_WARM_UP), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
+    parts: dict[str, StudyPart] = {
+        f"{WORST_PART}/{driver}": (_certify_worst_cases, (driver, road)) for driver, road in CONTROLLER_ROADS.items()
     }
-    digests = read_optional_part(folder, CONTROLLER_HASHES_FILE)
-    with WorkerPool(workers) as pool:
-        for part, (roads, drivers, count) in parts.items():
-            known = digests.setdefault(part, {})
-            missing = [driver for driver in drivers if known.get(driver) != controller_digest(driver)]
-            if not missing:
-                continue
-            results = read_optional_part(folder, part)
-            if part == WORST_FILE:
-                results |= {driver: _certify_worst_cases(driver, CONTROLLER_ROADS[driver]) for driver in missing}
-            for name, road in roads:
-                named = {driver: driver for driver in (HUMAN_LABEL, *missing)}
-                found = evaluate_on_test_seeds(road, named, count, ENVELOPE_METRICS, pool)
-                results[name] = results.get(name, {}) | found
-            atomic_write(folder / f"{part}.json", to_json(results))
-            known |= {driver: controller_digest(driver) for driver in missing}
-            write_part(folder, CONTROLLER_HASHES_FILE, digests)
+    tests: tuple[tuple[str, Iterator[tuple[str, Scenario]], tuple[str, ...], int], ...] = (
+        ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
+        ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
+        ("rings-raw", envelope_rings(actuation="raw"), closed, RAW_ACTUATION_SEEDS),
+        ("lanes-raw", envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
+        ("lanes-raw", envelope_lanes(**RING_STEPS), RING_CONTROLLERS, RAW_ACTUATION_SEEDS),
+        ("impaired", impaired_rings(0), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
+        ("impaired-jammed", impaired_rings(LONG_WARM_UP), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
+    )
+    for part, roads, controllers, count in tests:
+        drivers = {driver: driver for driver in (HUMAN_LABEL, *controllers)}
+        for name, road in roads:
+            parts[f"{part}/{name}"] = evaluate_metrics, (road, drivers, count, ENVELOPE_METRICS)
+    return parts
 
 
-def _certify_worst_cases(controller: str, road: str) -> dict[str, Any]:
+def _certify_worst_cases(controller: str, road: str, workers: int) -> dict[str, Any]:
     """Return the worst cases that the certificate finds for a controller on its road."""
     with TemporaryDirectory() as folder:
         file = Path(folder, f"controller{SUFFIX}")
@@ -363,7 +353,7 @@ def worst_table(folder: Path) -> pd.DataFrame:
             "min time gap [s]": f"{worst['min_time_gap']:.2f}",
             "max braking [m/s²]": f"{worst['max_braking']:.1f}",
         }
-        for controller, worst in read_part(folder, WORST_FILE).items()
+        for controller, worst in read_part(folder, WORST_PART).items()
     )
 
 
@@ -389,18 +379,14 @@ def domain_table(part: str, folder: Path) -> pd.DataFrame:
 
 def contact_table(part: str, folder: Path) -> pd.DataFrame:
     """Return the contacts and the smallest time gap of each controller where SUMO's safety checks are off."""
-    comparison = DriverComparison([*read_part(folder, part).values()])
-    return pd.DataFrame(
-        {
-            "controller": driver,
-            "episodes": comparison.values([driver], "steps").size,
-            "control steps": f"{comparison.values([driver], 'steps').sum():,.0f}",
-            "in contact": int(comparison.values([driver], "collisions").sum()),
-            **_safety_cells(comparison, driver),
-        }
-        for driver in comparison.roads[0]
-        if driver != HUMAN_LABEL
-    )
+    roads = [*read_part(folder, part).values()]
+    rows = []
+    for driver in dict.fromkeys(label for road in roads for label in road if label != HUMAN_LABEL):
+        comparison = DriverComparison([road for road in roads if driver in road])
+        steps, contacts = (comparison.values([driver], name) for name in ("steps", "collisions"))
+        row = {"controller": driver, "episodes": steps.size, "control steps": f"{steps.sum():,.0f}"}
+        rows.append(row | {"in contact": int(contacts.sum()), **_safety_cells(comparison, driver)})
+    return pd.DataFrame(rows)
 
 
 def _safety_cells(comparison: DriverComparison, driver: str) -> dict[str, str]:
@@ -424,11 +410,10 @@ def impaired_table(part: str, folder: Path) -> pd.DataFrame:
 
 ENVELOPE = Study(
     title="feasibility of packaged controllers far from their training roads, with actuation delay and sensor errors",
-    write=_write_envelope,
+    make_parts=envelope_parts,
     minutes=30.0,
-    is_resumable=True,
     tables={
-        WORST_FILE: worst_table,
+        WORST_PART: worst_table,
         **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
         **{part: partial(contact_table, part) for part in ("rings-raw", "lanes-raw")},
         **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},

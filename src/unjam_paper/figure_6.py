@@ -35,8 +35,8 @@ from unjam.following.trajectories import (
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
-from unjam_paper.results_file import measure_parts, write_figure, write_part
-from unjam_paper.study import Study, StudyFolder, Table, study_manifest
+from unjam_paper.results_file import StudyPart, read_part, write_figure, write_part
+from unjam_paper.study import Study, StudyFolder, Table
 
 SplitKind = Literal["trajectories", "rows", "released"]
 """How test rows are separated from training rows. `trajectories`: no row of their trajectory is in training. `rows`:
@@ -122,7 +122,7 @@ def split_rows(driver: str, split: SplitKind) -> DataSplit:
     return DataSplit(rows.select(training), rows.select(validation), rows.select(test), overlap)
 
 
-def measure_fit(fit: FourRegimeFit) -> dict[str, Any]:
+def measure_fit(fit: FourRegimeFit, workers: int = 1) -> dict[str, Any]:
     """Return the errors of a fit on the test rows [m/s2], and its losses.
 
     `error` is the error to the data, noise included; `driver_error` is the error to the mean acceleration of the driver
@@ -189,14 +189,17 @@ def _rms(error: Floats) -> float:
     return float(np.sqrt(np.square(error).mean()))
 
 
-def _write_figure_6(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    """Measure the parts that are missing in `folder/parts`; the losses of fits to all data only are written."""
-    about = study_manifest(folder)
-    rows = measure_parts(folder / "parts", {fit.name: (measure_fit, (fit,)) for fit in four_regime_fits()}, workers)
+def _figure_6_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    return {f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()}
+
+
+def _write_figure_6(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
+    """Write the rows, with the losses of fits to all data only, and the figure."""
+    rows: Table = [*read_part(folder, "figure-6").values()]
     stored = [
         {key: value for key, value in row.items() if row["size"] == 1.0 or not key.endswith("_loss")} for row in rows
     ]
-    write_part(folder, "figure-6", {"manifest": about, "rows": stored})
+    write_part(folder, "figure-6", {"rows": stored})
     write_figure(folder, "figure-6", figure_6(rows))
 
 
@@ -251,6 +254,7 @@ def _set_log_axes(axes: Axes, title: str) -> None:
 
 FIGURE_6 = Study(
     title="networks that learn car following, with and without a car-following model",
+    make_parts=_figure_6_parts,
     write=_write_figure_6,
     minutes=25.0,
 )

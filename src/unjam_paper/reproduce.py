@@ -20,9 +20,9 @@ from unjam.training.run_folder import read_config
 from unjam.training.seeds import make_test_seeds
 from unjam.worlds.episode import can_drive
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.results_file import collect_results, write_part
+from unjam_paper.results_file import collect_results
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
-from unjam_paper.study import STUDY_ROADS, PlannedRun, Study, StudyFolder, study_manifest
+from unjam_paper.study import STUDY_ROADS, PlannedRun, Study, StudyFolder, write_manifest
 from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES
 
 TRAINING_SECONDS: dict[str, dict[str, float]] = {
@@ -74,11 +74,6 @@ def make_plan(names: Sequence[str], seeds: int, study_folder: StudyFolder) -> St
             before = replace(read_config(folder), workers=run.config.workers, steps=run.config.steps)
             if before != run.config:
                 raise InputError(f"out: {str(folder)!r} was trained with other settings; allowed: a new folder")
-    for name in (name for name, study in studies.items() if study.is_resumable):
-        file = study_folder.folder / name / "manifest.json"
-        before = json.loads(file.read_text(encoding="utf-8")).get("seeds", seeds) if file.is_file() else seeds
-        if before != seeds:  # its parts are those of so many trainings
-            raise InputError(f"seeds: {seeds} is not allowed; allowed: {before}, as in {file}, or a new --out")
     missing = [run for run in runs if not study_folder.is_finished(run)]
     roads = dict.fromkeys(road for study in studies.values() for road in study.roads)
     undriven = [road for road in roads if not (study_folder.reference_folder(road) / EVALUATION_FILE).is_file()]
@@ -134,12 +129,9 @@ def run_plan(
     for name in plan.names:
         study, folder = STUDIES[name], studies.folder / name
         on_message(f"writing {name}: {study.title}")
-        make_folder(folder)
-        origin = study_manifest(folder, seeds=plan.seeds) if study.is_resumable else manifest()
-        study.write(studies, plan.seeds, folder, workers)
-        about = {"study": name, "title": study.title, "seeds": plan.seeds, **origin}
-        about["trainings"] = [_training_record(run, studies) for run in study.make_runs(plan.seeds)]
-        write_part(folder, "manifest", about)
+        trainings = [_training_record(run, studies) for run in study.make_runs(plan.seeds)]
+        write_manifest(folder, study=name, title=study.title, seeds=plan.seeds, trainings=trainings)
+        study.run(studies, plan.seeds, folder, workers)
         collect_results(folder)
     return [studies.folder / name for name in plan.names]
 

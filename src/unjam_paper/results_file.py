@@ -1,6 +1,6 @@
 """Measure, write and read the parts of a study, and its results file: one JSON object with its manifest and each part.
 
-A part is measured once, and again if a packaged controller that drives in it has changed.
+A part is measured once, and again if its arguments, or the controllers that they name, have changed.
 
 Tables of rows with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; a number or a text that is the
 same in all rows is stored once, `{NAME: VALUE}`. This takes a third of the space. Figures and controllers are separate
@@ -23,7 +23,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 from matplotlib.figure import Figure
 
 from unjam.child_processes import isolated_start
-from unjam.controller import PACKAGED_PREFIX, packaged_file
+from unjam.controller import controller_hash
 from unjam.files import atomic_write, make_folder, to_json
 from unjam.reports.figures import png_bytes
 
@@ -31,10 +31,8 @@ COLUMNS = "columns"
 """the only key of a table that is stored by columns"""
 CONTROLLERS = "controllers"
 """subfolder with controllers, in the working folder of a study"""
-CONTROLLERS_FILE = "controllers"
-"""name of the part with the digests of the packaged controllers that drove, by part"""
 StudyPart = tuple[Callable[..., Any], tuple[Any, ...]]
-"""a function of a module and its arguments; it returns a JSON value"""
+"""a function of a module and its arguments, without the last: the number of processes; it returns a JSON value"""
 
 
 def write_part(folder: Path, name: str, part: Any) -> None:
@@ -79,11 +77,6 @@ def read_part(path: Path, name: str) -> Any:
     if path.is_dir():
         return json.loads((path / f"{name}.json").read_text(encoding="utf-8"))
     return _by_rows(json.loads(path.read_text(encoding="utf-8"))[name])
-
-
-def read_optional_part(folder: Path, name: str) -> dict[str, Any]:
-    """Return one part of a study from its working folder, or an empty part if there is none yet."""
-    return read_part(folder, name) if (folder / f"{name}.json").is_file() else {}
 
 
 def read_parts(path: Path) -> dict[str, Any]:
@@ -144,49 +137,56 @@ def _by_rows(value: Any) -> Any:
     return [dict(zip(columns, row, strict=True)) for row in zip(*full_columns, strict=True)]
 
 
-def measure_parts(folder: Path, parts: dict[str, StudyPart], workers: int) -> list[Any]:
-    """Return the results of all parts; those without a current `folder/NAME.json` are measured and written.
+def measure_parts(folder: Path, parts: Mapping[str, StudyPart], workers: int) -> dict[str, Any]:
+    """Return the results of all parts; those without a current file `folder/NAME.json` are measured and written.
 
-    A part is not current if a packaged controller in it has another digest than when it was measured.
+    Parts NAME/ENTRY are returned as one part NAME: their rows if they are lists, else an object by entry.
     """
-    digests: dict[str, dict[str, str]] = read_optional_part(folder, CONTROLLERS_FILE)
+    stamps = {name: _stamp(part) for name, part in parts.items()}
+    files = {name: folder / f"{name}.json" for name in parts}
 
-    def is_current(name: str) -> bool:
-        current = _packaged_digests(parts[name][1])
-        return (folder / f"{name}.json").is_file() and digests.get(name, current) == current
+    def read(name: str) -> dict[str, Any]:
+        return json.loads(files[name].read_text(encoding="utf-8")) if files[name].is_file() else {"stamp": ""}
 
-    def save_part(name: str, result: Any) -> None:
-        atomic_write(folder / f"{name}.json", to_json(result))
-        if packaged := _packaged_digests(parts[name][1]):
-            digests[name] = packaged
-            write_part(folder, CONTROLLERS_FILE, digests)
+    def save(name: str, result: Any) -> None:
+        make_folder(files[name].parent)
+        atomic_write(files[name], to_json({"stamp": stamps[name], "result": result}))
 
-    make_folder(folder)
-    missing = {name: part for name, part in parts.items() if not is_current(name)}
-    if workers == 1 or len(missing) < 2:
+    missing = {name: part for name, part in parts.items() if read(name)["stamp"] != stamps[name]}
+    count = max(1, min(workers, len(missing)))
+    if count == 1:
         for name, (function, arguments) in missing.items():
-            save_part(name, function(*arguments))
+            save(name, function(*arguments, workers))
     else:
         # Spawned processes: a forked one would inherit the locks of torch's threads without the threads.
-        context = multiprocessing.get_context("spawn")
+        context, share = multiprocessing.get_context("spawn"), max(1, workers // count)
         absolute = filter(os.path.isabs, sys.path)  # in a notebook it holds the working folder
-        with isolated_start(absolute), ProcessPoolExecutor(workers, mp_context=context) as pool:
-            running = {pool.submit(function, *arguments): name for name, (function, arguments) in missing.items()}
+        with isolated_start(absolute), ProcessPoolExecutor(count, mp_context=context) as pool:
+            running = {pool.submit(function, *given, share): name for name, (function, given) in missing.items()}
             for done in as_completed(running):
-                save_part(running[done], done.result())
-    return [read_part(folder, name) for name in parts]
+                save(running[done], done.result())
+    measured: dict[str, Any] = {}
+    for name in parts:
+        (part, _, entry), result = name.partition("/"), read(name)["result"]
+        if not entry:
+            measured[part] = result
+        elif isinstance(result, list):
+            measured.setdefault(part, []).extend(result)
+        else:
+            measured.setdefault(part, {})[entry] = result
+    return measured
 
 
-def controller_digest(driver: str) -> str:
-    """Return the digest of a packaged controller; an empty text for other drivers, which their name identifies."""
-    name = driver.removeprefix(PACKAGED_PREFIX)
-    return "" if name == driver else sha256(packaged_file(name).read_bytes()).hexdigest()[:12]
+def _stamp(part: StudyPart) -> str:
+    """Return a text that changes with the arguments of a part, and with the controllers that they name."""
+    return sha256(repr(_described(part)).encode()).hexdigest()[:12]
 
 
-def _packaged_digests(arguments: Any) -> dict[str, str]:
-    """Return the digest of each packaged controller that arguments name."""
-    if isinstance(arguments, str):
-        return {arguments: controller_digest(arguments)} if arguments.startswith(PACKAGED_PREFIX) else {}
-    inner = list(arguments.values()) if isinstance(arguments, Mapping) else arguments
-    inner = inner if isinstance(inner, list | tuple) else ()
-    return {name: digest for each in inner for name, digest in _packaged_digests(each).items()}
+def _described(value: Any) -> Any:
+    if isinstance(value, str | Path):
+        return str(value), controller_hash(str(value))
+    if isinstance(value, Mapping):
+        return [(key, _described(entry)) for key, entry in value.items()]
+    if isinstance(value, list | tuple):
+        return list(map(_described, value))
+    return value.__qualname__ if callable(value) else value  # the text of a function has its address

@@ -6,6 +6,7 @@ the experiment of Sugiyama et al. (2008), 22 cars on 230 m, a jam arose without 
 traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from itertools import product
@@ -17,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from unjam.controller import make_driver
+from unjam.drivers.driver import Driver
 from unjam.drivers.wrappers import ImpairedDriver
 from unjam.files import atomic_write, make_folder
 from unjam.manifest import manifest
@@ -28,20 +30,21 @@ from unjam.reports.figures import png_bytes
 from unjam.reports.results import read_results
 from unjam.reports.space_time import trajectory_figure
 from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
-from unjam.training.evaluate import TRAINED_LABEL, Evaluation, evaluate, raise_failure, save_evaluation
+from unjam.training.evaluate import TRAINED_LABEL, Evaluation, raise_failure, save_evaluation
 from unjam.training.road_family import NGSIM_IDM
-from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics, write_comparison_table
-from unjam_paper.results_file import read_part, write_part
+from unjam_paper.results_file import StudyPart, read_part, write_part
 from unjam_paper.study import (
     STUDY_ROADS,
     PlannedRun,
     Study,
     StudyFolder,
     Table,
+    evaluate_drivers,
     interval_text,
     number_text,
     planned_runs,
@@ -106,43 +109,44 @@ EXPERIMENT_RING: dict[str, Any] = {"length": (230, 230)}
 DRIVER_TITLES = {"human": "no CAV", "pi": "PI", TRAINED_LABEL: "PI + residual"}
 
 
-def condition_rows(road: str, worker_count: int, episodes: int = CONDITION_EPISODES) -> Table:
-    """Return a row for each condition and driver: human baseline, tuned expert and trained controller."""
-    rows = []
-    trained, tuned = ROAD_CONTROLLERS[road]
-    names = {HUMAN_LABEL: HUMAN_LABEL, TUNED_EXPERT: tuned, TRAINED_LABEL: trained}
-    with WorkerPool(worker_count) as workers:
-        for condition, changes in ROAD_CONDITIONS[road].items():
-            options = {f"scenario_options.{key}": value for key, value in changes.items() if key != "impairments"}
-            impairments = changes.get("impairments", {})
-            found = _drive_named({**STUDY_ROADS[road], **options}, names, episodes, workers, **impairments)
-            for label, own in found.items():
-                row: dict[str, Any] = {"road": road, "condition": condition, "driver": label}
-                row |= {"feasibility": overall_feasibility(own, found[HUMAN_LABEL])}
-                row |= estimate_metrics(own, ROBUSTNESS_METRICS)
-                gain = paired_difference(own, found[TUNED_EXPERT], "mean_speed")
-                rows.append({**row, "speed_gain_over_expert": asdict(gain)})
+def condition_rows(
+    road: str, condition: str, changes: Mapping[str, Any], controllers: tuple[str, str], episodes: int, workers: int
+) -> Table:
+    """Return a row for each driver under a condition: human baseline, tuned expert and trained controller.
+
+    `controllers` are the trained controller and the tuned expert.
+    """
+    names = dict(zip((HUMAN_LABEL, TUNED_EXPERT, TRAINED_LABEL), (HUMAN_LABEL, *reversed(controllers)), strict=True))
+    options = {f"scenario_options.{key}": value for key, value in changes.items() if key != "impairments"}
+    scenario = load_config(changes={**STUDY_ROADS[road], **options}).make_scenario()
+    drivers = {label: partial(_impaired_driver, name, changes.get("impairments", {})) for label, name in names.items()}
+    found = evaluate_drivers(scenario, drivers, episodes, workers)
+    rows: Table = []
+    for label, own in found.items():
+        row = {"road": road, "condition": condition, "driver": label}
+        row |= {"feasibility": overall_feasibility(own, found[HUMAN_LABEL])}
+        row |= estimate_metrics(own, ROBUSTNESS_METRICS)
+        gain = paired_difference(own, found[TUNED_EXPERT], "mean_speed")
+        rows.append({**row, "speed_gain_over_expert": asdict(gain)})
     return rows
 
 
-def _drive_named(
-    changes: dict[str, Any], names: dict[str, str], episodes: int, workers: WorkerPool, **impairments: float
-) -> dict[str, Table]:
-    """Return the rows of named drivers on a road by label; `impairments` apply to all CAVs."""
-    scenario = load_config(changes=changes).make_scenario()
-    step = scenario.control_step
-    drivers = {label: make_driver(name, step) for label, name in names.items()}
-    if impairments:
-        drivers |= {
-            label: ImpairedDriver(driver, **impairments, time_step=step)
-            for label, driver in drivers.items()
-            if not driver.is_native
-        }
-    return evaluate(scenario, drivers, make_test_seeds(episodes), workers).rows
+def _impaired_driver(name: str, impairments: Mapping[str, float], scenario: Scenario) -> Driver:
+    driver = make_driver(name, scenario.control_step)
+    if driver.is_native or not impairments:
+        return driver
+    return ImpairedDriver(driver, **impairments, time_step=scenario.control_step)
 
 
-def _write_robustness(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    write_part(folder, "robustness", [row for road in ROAD_CONDITIONS for row in condition_rows(road, workers)])
+def _robustness_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    return {
+        f"robustness/{road}, {condition}": (
+            condition_rows,
+            (road, condition, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES),
+        )
+        for road, conditions in ROAD_CONDITIONS.items()
+        for condition, changes in conditions.items()
+    }
 
 
 def _robustness_table(road: str, folder: Path) -> pd.DataFrame:
@@ -160,23 +164,25 @@ def _robustness_table(road: str, folder: Path) -> pd.DataFrame:
     return pd.DataFrame(table.values())
 
 
-def transfer_rows(study_folder: StudyFolder, seeds: int, worker_count: int = 2) -> Table:
-    """Return the metrics of controllers trained with 22 vehicles on roads with other numbers, without training."""
-    names = {"human": "human", "pi": "pi"}
+def transfer_rows(road: str, drivers: Mapping[str, str], workers: int) -> Table:
+    """Return the metrics of drivers on a road with another number of vehicles than in training."""
+    scenario = load_config(changes=TRANSFER_ROADS[road]).make_scenario()
+    found = evaluate_drivers(scenario, drivers, TRANSFER_EPISODES, workers)
+    return [
+        {"road": road, "driver": label, **estimate_metrics(rows, COMPARISON_METRICS)} for label, rows in found.items()
+    ]
+
+
+def _transfer_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    drivers = {"human": "human", "pi": "pi"}
     for variant, seed in product(TRANSFER_VARIANTS, range(seeds)):
-        names[f"{variant} {seed}"] = str(study_folder.run_folder(PlannedRun(TRANSFER_SOURCE, variant, seed)))
-    with WorkerPool(worker_count) as workers:
-        return [
-            {"road": road, "driver": label, **estimate_metrics(rows, COMPARISON_METRICS)}
-            for road, changes in TRANSFER_ROADS.items()
-            for label, rows in _drive_named(changes, names, TRANSFER_EPISODES, workers).items()
-        ]
+        drivers[f"{variant} {seed}"] = str(study_folder.run_folder(PlannedRun(TRANSFER_SOURCE, variant, seed)))
+    return {f"transfer/{road}": (transfer_rows, (road, drivers)) for road in TRANSFER_ROADS}
 
 
-def _write_figure_10(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def _write_figure_10(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
     tables = (comparison_rows(study_folder, road, VOLUME_VARIANTS, seeds) for road in VOLUME_ROADS)
     write_comparison_table([row for rows in tables for row in rows], folder)
-    write_part(folder, "transfer", transfer_rows(study_folder, seeds, workers))
 
 
 def _transfer_table(folder: Path) -> pd.DataFrame:
@@ -225,14 +231,15 @@ def humans_on_ring(folder: Path, populations: dict[str, Path], controller: Path,
 
 ROBUSTNESS = Study(
     title="packaged controllers with roads, human drivers and sensors that differ from training",
-    write=_write_robustness,
+    make_parts=_robustness_parts,
     minutes=20.0,
     tables={road: partial(_robustness_table, road) for road in ROAD_CONDITIONS},
 )
 FIGURE_10 = Study(
     title="5, 11 and 22 vehicles, trained for each, and transfer between them",
-    write=_write_figure_10,
     make_runs=lambda seeds: planned_runs(VOLUME_ROADS, VOLUME_VARIANTS, seeds),
+    make_parts=_transfer_parts,
+    write=_write_figure_10,
     roads=VOLUME_ROADS,
     minutes=3.0,
     tables={"transfer": _transfer_table},

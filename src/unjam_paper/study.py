@@ -27,7 +27,7 @@ from unjam.training.run_folder import read_config
 from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Floats
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.results_file import CONTROLLERS, write_part
+from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, write_part
 from unjam_paper.variants import VARIANTS
 
 STUDY_ROADS: dict[str, dict[str, Any]] = {
@@ -143,58 +143,72 @@ class StudyFolder:
 
 @dataclass(frozen=True)
 class Study:
-    """A study: which trainings it needs, how it measures and writes its parts, and the tables of its page."""
+    """A study: which trainings it needs, what it measures and writes, and the tables of its page."""
 
     title: str
-    write: Callable[[StudyFolder, int, Path, int], None]
-    """measures, and writes parts and figures; arguments: folder of all studies, seeds, folder of this study, workers"""
     make_runs: Callable[[int], list[PlannedRun]] = lambda seeds: []
     """returns the trainings for a number of seeds"""
+    make_parts: Callable[[StudyFolder, int], dict[str, StudyPart]] = lambda study_folder, seeds: {}
+    """returns what is measured, by name of the part, or as PART/ENTRY; arguments: folder of all studies, seeds"""
+    write: Callable[[StudyFolder, int, Path], None] = lambda study_folder, seeds, folder: None
+    """writes figures, and parts that need no measurement; the last argument is the folder of this study"""
     roads: tuple[str, ...] = ()
     """roads on which the reference drivers are evaluated"""
     minutes: float = 0.0
-    """duration of `write` on two cores"""
-    is_resumable: bool = False
-    """whether `write` keeps the results of an earlier call; the manifest then lists the resumptions"""
+    """duration of `run` on two cores"""
     tables: Mapping[str, Callable[[Path], pd.DataFrame]] = field(default_factory=dict)
     """tables of its page by name, made from its results"""
 
+    def run(self, study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+        """Measure the parts that have no current results, and write everything into the study's folder."""
+        for name, part in measure_parts(folder / "parts", self.make_parts(study_folder, seeds), workers).items():
+            write_part(folder, name, part)
+        self.write(study_folder, seeds, folder)
 
-def study_manifest(folder: Path, **metadata: Any) -> dict[str, Any]:
-    """Write and return the manifest of a study: that of its first call, with `metadata`, and all resumptions."""
+
+def write_manifest(folder: Path, **metadata: Any) -> None:
+    """Write the manifest of a study: that of its first call with this `metadata`, and all resumptions."""
     make_folder(folder)
-    about = {**metadata, **manifest()}
-    if (folder / "manifest.json").is_file():
+    about, file = manifest(), folder / "manifest.json"
+    if file.is_file():
         resumption = {name: about[name] for name in ("commit", "started")}
-        about = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        about = json.loads(file.read_text(encoding="utf-8"))
         about["resumptions"] = [*about.get("resumptions", []), resumption]
-    write_part(folder, "manifest", about)
-    return about
+    write_part(folder, "manifest", {**about, **metadata})
 
 
-def evaluate_on_test_seeds(
-    scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: WorkerPool
+def evaluate_drivers(
+    scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, workers: int
+) -> dict[str, Table]:
+    """Return the rows of drivers on the same test seeds, by label."""
+    made = {
+        label: source(scenario) if callable(source) else make_driver(str(source), scenario.control_step)
+        for label, source in drivers.items()
+    }
+    with WorkerPool(workers) as pool:
+        evaluation = evaluate(scenario, made, make_test_seeds(seeds), pool)
+    raise_failures(evaluation)
+    return evaluation.rows
+
+
+def evaluate_metrics(
+    scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: int
 ) -> dict[str, Any]:
     """Return the verdict on each driver and these metrics of its episodes on test seeds.
 
     The human baseline, if it is one of the drivers, is `human`.
     """
-    made = {
-        label: source(scenario) if callable(source) else make_driver(str(source), scenario.control_step)
-        for label, source in drivers.items()
-    }
-    evaluation = evaluate(scenario, made, make_test_seeds(seeds), workers)
-    raise_failures(evaluation)
-    verdicts = feasibility_by_driver(evaluation.rows)
+    rows = evaluate_drivers(scenario, drivers, seeds, workers)
+    verdicts = feasibility_by_driver(rows)
     return {
-        label: {"feasibility": verdicts[label], "episodes": [{name: row[name] for name in metrics} for row in rows]}
-        for label, rows in evaluation.rows.items()
+        label: {"feasibility": verdicts[label], "episodes": [{name: row[name] for name in metrics} for row in own]}
+        for label, own in rows.items()
     }
 
 
 @dataclass(frozen=True)
 class DriverComparison:
-    """What `evaluate_on_test_seeds` returned for the same drivers on one or several roads."""
+    """What `evaluate_metrics` returned for the same drivers on one or several roads."""
 
     roads: Sequence[Mapping[str, Any]]
 

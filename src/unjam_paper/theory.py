@@ -5,7 +5,6 @@ is measured side by side in one run.
 """
 
 import tempfile
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import pairwise, product
@@ -60,26 +59,24 @@ def random_network(inputs: int, authority: float, seed: int) -> Network:
     return Network(tuple(layers), authority)
 
 
-def untrained_rows(roads: Sequence[str] = PAPER_ROADS, policies: int = RANDOM_POLICIES, worker_count: int = 2) -> Table:
+def untrained_rows(road: str, policies: int, workers: int) -> Table:
     """A1: return of the expert plus a random residual and of a random network alone, on the same seeds."""
+    config = PlannedRun(road, "proposed", 0).config
+    scenario, expert, inputs = config.make_scenario(), config.make_expert(), config.policy.inputs
+    limit = scenario.action_limit
+    drivers, bases = {"expert alone": expert}, {"expert + random": expert, "random": Constant()}
+    for number, (kind, base) in product(range(policies), bases.items()):
+        network = random_network(observation_size(inputs, base), limit, number)
+        drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, inputs)
+    with WorkerPool(workers) as pool:
+        evaluation = evaluate(scenario, drivers, make_test_seeds(4), pool)
+    returns = {label: metric_estimate(own, "return").mean for label, own in evaluation.rows.items()}
     rows: Table = []
-    with WorkerPool(worker_count) as workers:
-        for road in roads:
-            config = PlannedRun(road, "proposed", 0).config
-            scenario, expert, inputs = config.make_scenario(), config.make_expert(), config.policy.inputs
-            limit = scenario.action_limit
-            drivers, bases = {"expert alone": expert}, {"expert + random": expert, "random": Constant()}
-            for number, (kind, base) in product(range(policies), bases.items()):
-                network = random_network(observation_size(inputs, base), limit, number)
-                drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, inputs)
-            evaluation = evaluate(scenario, drivers, make_test_seeds(4), workers)
-            returns = {label: metric_estimate(own, "return").mean for label, own in evaluation.rows.items()}
-            for kind in bases:
-                values = [returns[f"{kind} {number}"] for number in range(policies)]
-                row = {"road": road, "policy": kind, "returns": values}
-                rows.append(row | asdict(estimate_over_trainings(values)))
-            rows.append({"road": road, "policy": "expert alone", "mean": returns["expert alone"]})
-    return rows
+    for kind in bases:
+        values = [returns[f"{kind} {number}"] for number in range(policies)]
+        row = {"road": road, "policy": kind, "returns": values}
+        rows.append(row | asdict(estimate_over_trainings(values)))
+    return [*rows, {"road": road, "policy": "expert alone", "mean": returns["expert alone"]}]
 
 
 def convergence_rows(study_folder: StudyFolder, seeds: int) -> Table:
@@ -132,14 +129,14 @@ def model_error_figure(by_variant: dict[str, list[Table]]) -> Figure:
     return figure
 
 
-def _write_theory(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
+def _write_theory(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
     model = model_error_history(study_folder, seeds)
-    results = {"untrained": untrained_rows(worker_count=workers), "convergence": convergence_rows(study_folder, seeds)}
+    results = {"untrained": read_part(folder, "theory"), "convergence": convergence_rows(study_folder, seeds)}
     write_part(folder, "theory", {**results, "model": model})
     write_figure(folder, "model", model_error_figure(model))
 
 
-def training_seconds(steps: int = TIMED_STEPS, rounds: int = TIMING_ROUNDS) -> dict[str, list[dict[str, float]]]:
+def training_seconds(steps: int, rounds: int) -> dict[str, list[dict[str, float]]]:
     """Return the wall time of the parts of training per 1,000 environment steps [s], by variant and round.
 
     The variants are trained in turn, so that other load of the machine affects all of them equally.
@@ -163,16 +160,20 @@ def training_seconds(steps: int = TIMED_STEPS, rounds: int = TIMING_ROUNDS) -> d
     return seconds
 
 
-def _write_time(study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-    rounds = training_seconds()
+def _measure_time(steps: int, rounds: int, workers: int) -> dict[str, Any]:
+    measured = training_seconds(steps, rounds)
     # The median round: other load of the machine may slow down single rounds.
     medians = {
-        variant: sorted(each, key=lambda parts: sum(parts.values()))[len(each) // 2] for variant, each in rounds.items()
+        variant: sorted(each, key=lambda parts: sum(parts.values()))[len(each) // 2]
+        for variant, each in measured.items()
     }
     totals = {variant: sum(parts.values()) for variant, parts in medians.items()}
     relative = {variant: total / totals["trpo"] for variant, total in totals.items()}
-    write_part(folder, "time", {"rounds": rounds, "median": medians, "relative_to_trpo": relative})
-    write_figure(folder, "time", training_time_bars(medians))
+    return {"rounds": measured, "median": medians, "relative_to_trpo": relative}
+
+
+def _write_time(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
+    write_figure(folder, "time", training_time_bars(read_part(folder, "time")["median"]))
 
 
 def training_time_bars(seconds: dict[str, dict[str, float]]) -> Figure:
@@ -197,10 +198,17 @@ def _time_table(folder: Path) -> pd.DataFrame:
 
 THEORY = Study(
     title="measurable quantities of the theorems A1, A2 and A3",
-    write=_write_theory,
     make_runs=partial(planned_runs, [THEORY_ROAD], tuple(dict.fromkeys((*CONVERGENCE_VARIANTS, *MODEL_VARIANTS)))),
+    make_parts=lambda study_folder, seeds: {
+        f"theory/{road}": (untrained_rows, (road, RANDOM_POLICIES)) for road in PAPER_ROADS
+    },
+    write=_write_theory,
     minutes=8.0,
 )
 FIGURE_8 = Study(
-    title="training time, measured side by side", write=_write_time, minutes=12.0, tables={"training time": _time_table}
+    title="training time, measured side by side",
+    make_parts=lambda study_folder, seeds: {"time": (_measure_time, (TIMED_STEPS, TIMING_ROUNDS))},
+    write=_write_time,
+    minutes=12.0,
+    tables={"training time": _time_table},
 )

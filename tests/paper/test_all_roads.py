@@ -2,14 +2,12 @@
 
 from math import nan
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from unjam.measures.gain import MAX_GAIN, MIN_GAIN
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.training.road_family import FAMILY
-from unjam_paper import all_roads
 from unjam_paper.all_roads import (
     FAMILY_DRIVERS,
     SINGLE_CONTROLLERS,
@@ -83,54 +81,3 @@ def test_the_best_driver_is_feasible_in_every_episode() -> None:
 def test_the_figure_has_a_cell_for_each_driver_on_each_road() -> None:
     axes = all_roads_figure(RESULTS).axes[0]
     assert len(axes.texts) == len(road_gains(RESULTS)) * len(FAMILY_DRIVERS)
-
-
-def test_only_missing_drivers_run_and_the_best_can_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A row is current while the digest of its packaged file is the same."""
-    runs: list[list[str]] = []
-    speeds = {HUMAN_LABEL: 3.0, "pi": 4.0, "unjam:ring-tuned": 4.5}
-
-    def drive(scenario: object, drivers: dict[str, str], seeds: object, run: object) -> dict[str, Any]:
-        runs.append([*drivers.values()])
-        return {label: [{**row, "mean_speed_second_half": speeds[name]}] for label, name in drivers.items()}
-
-    found = read_part(RESULTS, "00")
-    row = {**found["rows"]["unjam:best"][0], "travel_time": nan}
-    files = {"unjam:ring-tuned": "one"}
-    monkeypatch.setattr(all_roads, "drive_by_label", drive)
-    monkeypatch.setattr(all_roads, "controller_digest", lambda driver: files.get(driver, ""))
-
-    road: dict[str, Any] = {"best": HUMAN_LABEL, "expert_files": {}, "driver_files": {}, "rows": {}}
-    experts: dict[str, tuple[str, ...]] = {}
-    monkeypatch.setattr(all_roads, "FAMILY_EXPERTS", experts)
-    drivers, name = {"PI": "pi"}, "ring-22-grown"
-
-    def resume(names: tuple[str, ...]) -> None:
-        experts["rings"] = names
-        road.update(all_roads.drive_missing(name, FAMILY[name], drivers, [(1,)], road, lambda tasks: []))
-
-    resume(("pi",))
-    assert (runs, road["best"]) == ([[HUMAN_LABEL, "pi"], [HUMAN_LABEL, "pi", "pi"]], "pi")
-    resume(("pi",))
-    assert len(runs) == 2, "all results are current"
-    resume(("pi", "unjam:ring-tuned"))
-    assert (runs[2:], road["best"]) == (
-        [[HUMAN_LABEL, "pi", "unjam:ring-tuned"], ["unjam:ring-tuned"]],
-        "unjam:ring-tuned",
-    )
-    files["unjam:ring-tuned"] = "another"
-    resume(("pi", "unjam:ring-tuned"))
-    assert runs[4:] == [[HUMAN_LABEL, "pi", "unjam:ring-tuned"], ["unjam:ring-tuned"]], "the best can change"
-    del road["driver_files"][HUMAN_LABEL]  # as in older files
-    resume(("pi", "unjam:ring-tuned"))
-    assert runs[6:] == [[HUMAN_LABEL]]
-    drivers["PI"] = "pi:window=9"
-    speeds["pi:window=9"] = 4.1
-    resume(("pi", "unjam:ring-tuned"))
-    assert runs[7:] == [["pi:window=9"]], "other parameters are another driver"
-
-
-def test_only_packaged_controllers_have_a_digest() -> None:
-    assert all_roads.controller_digest("pi:window=23") == ""
-    names = ("unjam:best", "unjam:ring-tuned")
-    assert len({all_roads.controller_digest(name) for name in names} - {""}) == 2

@@ -41,7 +41,7 @@ def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
     monkeypatch.setattr(assess_examples, "EXAMPLES", short)
     monkeypatch.setattr(assess_examples, "MAX_EPISODES", 15)
     monkeypatch.setattr(open_test_roads, "EPISODE_SECONDS", 60.0)
-    ASSESS_EXAMPLES.write(StudyFolder(tmp_path), 1, out, 2)
+    ASSESS_EXAMPLES.run(StudyFolder(tmp_path), 1, out, 2)
     found: dict[str, Any] = read_part(out, EXAMPLES_PART)["first"]
     human, acc, controller = found["drivers"]
     assert (human["driver"], acc["driver"]) == ("human", "cruise")
@@ -52,7 +52,7 @@ def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
     assert len(found["sentences"]) == 2
     assert list(examples_table(out)["driver"]) == ["human", "cruise", controller["driver"]]
     short["second"] = Example(write, 0.3)
-    ASSESS_EXAMPLES.write(StudyFolder(tmp_path), 1, out, 2)
+    ASSESS_EXAMPLES.run(StudyFolder(tmp_path), 1, out, 2)
     assert len(written) == 2
     assert list(read_part(out, EXAMPLES_PART)) == ["first", "second"]
     assert read_part(out, EXAMPLES_PART)["first"] == found

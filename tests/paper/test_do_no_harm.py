@@ -1,6 +1,5 @@
 """Verdicts, breakdowns and roads of the study `do-no-harm`."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from unjam_paper.do_no_harm import (
     DO_NO_HARM,
     HARM,
     NO_HARM,
-    RESULTS_FILE,
     TESTED_CONTROLLER,
     UNDECIDED,
     evaluate_harm,
@@ -157,13 +155,10 @@ def test_the_study_ends_by_itself_and_can_be_resumed(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(WorkerPool, "run_and_map", stop_in_the_second)
     with pytest.raises(KeyboardInterrupt):
-        DO_NO_HARM.write(StudyFolder(tmp_path), 1, tmp_path, 1)
-    first = json.loads((tmp_path / f"{RESULTS_FILE}.json").read_text())
-    assert list(first) == ["a"]
+        DO_NO_HARM.run(StudyFolder(tmp_path), 1, tmp_path, 1)
     for _ in range(2):  # the second call finds nothing to run
-        DO_NO_HARM.write(StudyFolder(tmp_path), 1, tmp_path, 1)
+        DO_NO_HARM.run(StudyFolder(tmp_path), 1, tmp_path, 1)
     assert batches == [15, 15, 15], "the baseline, and both drivers at two penetration rates, on three seeds"
-    assert json.loads((tmp_path / f"{RESULTS_FILE}.json").read_text())["a"] == first["a"]
     table = DO_NO_HARM.tables["harm"](tmp_path)
     assert table["road"].tolist() == ["a", "a", "b", "b"]
     assert set(table["verdict"]) == {NO_HARM}

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from unjam.controller import PACKAGED_PREFIX, certificate, packaged_names
-from unjam.scenarios import Motorway, Ring
+from unjam.scenarios import Ring
 from unjam_paper import feasible
 from unjam_paper.feasible import ENVELOPE
 from unjam_paper.study import StudyFolder
@@ -24,7 +24,8 @@ def test_rings_have_the_documented_range() -> None:
 
 
 def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None:
-    for roads in (feasible.envelope_rings(actuation="raw"), feasible.envelope_lanes()):
+    lanes = feasible.envelope_lanes(), feasible.envelope_lanes(**feasible.RING_STEPS)
+    for roads in (feasible.envelope_rings(actuation="raw"), *lanes):
         for _, road in roads:
             assert road.actuation == "raw"
             assert road.safety.active
@@ -34,24 +35,24 @@ def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None
 def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = "unjam:ring-gap-tuned"
     monkeypatch.setattr(feasible, "CONTROLLER_ROADS", {one: "ring"})
-    for name in ("IMPAIRED_DRIVERS", "LANE_CONTROLLERS"):
+    for name in ("IMPAIRED_DRIVERS", "RING_CONTROLLERS"):
         monkeypatch.setattr(feasible, name, (one,))
     for name in ("ENVELOPE_SEEDS", "RAW_ACTUATION_SEEDS", "IMPAIRED_SEEDS"):
         monkeypatch.setattr(feasible, name, 1)
     short = Ring(length=(60, 60), vehicles=5, horizon=60)
     for name in ("envelope_rings", "envelope_figure_eights"):
         monkeypatch.setattr(feasible, name, lambda **changes: iter([("a short ring", short)]))
-    lane = Motorway(lanes=1, horizon=600, simulation_step=0.1, steps_per_control_step=1)
-    monkeypatch.setattr(feasible, "envelope_lanes", lambda: iter([("a short lane", lane)]))
+    monkeypatch.setattr(feasible, "LANE_SECONDS", 60.0)
     monkeypatch.setattr(feasible, "impaired_rings", lambda warmup: iter([("late", short)]))
     monkeypatch.setattr(certificate, "ATTACK_GENERATIONS", 1)
     monkeypatch.setattr(certificate, "STRING_SPEED_RATIOS", ())
 
-    ENVELOPE.write(StudyFolder(tmp_path), 1, tmp_path, 1)
+    ENVELOPE.run(StudyFolder(tmp_path), 1, tmp_path, 1)
 
     tables = {name: table(tmp_path) for name, table in ENVELOPE.tables.items()}
-    assert {name: len(table) for name, table in tables.items()} == dict.fromkeys(tables, 1)
+    assert {name: len(table) for name, table in tables.items()} == {**dict.fromkeys(tables, 1), "lanes-raw": 2}
     assert tables["worst"].loc[0, "contacts"] == 0
     assert tables["rings"].loc[0, "feasible on"] == "1 of 1 roads"
     assert tables["rings-raw"].loc[0, ["control steps", "in contact"]].tolist() == ["60", 0]
+    assert tables["lanes-raw"]["control steps"].tolist() == ["180", "1,800"], "on three lanes for 60 s"
     assert tables["impaired"].columns.tolist() == ["impairment", "human", one]

@@ -84,7 +84,7 @@ def test_the_study_writes_results_and_a_figure(small: None, tmp_path: Path, monk
     chosen = [FourRegimeFit("other", name, size, 0) for name in ("knowledge", "vanilla") for size in (0.3, 1.0)]
     long_fits = [FourRegimeFit("other", name, 0.01, 0, is_long=True) for name in ("knowledge", "vanilla")]
     monkeypatch.setattr(figure_6, "four_regime_fits", lambda: [*chosen, *long_fits])
-    figure_6.FIGURE_6.write(StudyFolder(tmp_path), 1, tmp_path, 1)
+    figure_6.FIGURE_6.run(StudyFolder(tmp_path), 1, tmp_path, 1)
     rows = json.loads((tmp_path / "figure-6.json").read_text())["rows"]
     assert len(rows) == 6
     assert ["training_loss" in row for row in rows] == [False, True, False, True, False, False]

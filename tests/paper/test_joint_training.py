@@ -9,6 +9,7 @@ import pytest
 from unjam.drivers.wrappers import MIN_SHARED_PENETRATION_RATE
 from unjam.training.road_family import FAMILY, family_roads
 from unjam_paper.all_roads import (
+    FAMILY_EXPERTS,
     FAMILY_TEST_SEEDS,
     FRESH_TEST_SEEDS,
     RING_BASELINES,
@@ -94,9 +95,9 @@ def test_all_drivers_of_a_ring_have_the_same_seeds(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr("unjam_paper.all_roads.drive_by_label", drive)
     monkeypatch.setattr("unjam_paper.all_roads.best_feasible_driver", lambda rows: "pi")
-    found = measure_road(
-        "ring-22-grown", FAMILY["ring-22-grown"], RING_BASELINES | {"residual 0": "runs/0"}, FAMILY_TEST_SEEDS
-    )
+    drivers = RING_BASELINES | {"residual 0": "runs/0"}
+    name, experts = "ring-22-grown", FAMILY_EXPERTS["rings"]
+    found = measure_road(name, FAMILY[name], experts, drivers, FAMILY_TEST_SEEDS, in_batches=True, workers=1)
     (candidates, tuning), (evaluated, testing) = runs
     assert {"human", "pi", RINGS_EXPERT} <= evaluated
     assert "runs/0" in evaluated - candidates

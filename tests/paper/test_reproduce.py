@@ -1,5 +1,6 @@
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.files import atomic_write
+from unjam.scenarios.scenario import Scenario
 from unjam.training.run_folder import read_config
+from unjam.worlds.episode import check_can_drive
+from unjam.worlds.sumo.backend import SumoBackend
+from unjam_paper.all_roads import measure_road
 from unjam_paper.comparison import comparison_study
 from unjam_paper.reproduce import estimated_seconds, find_studies, make_plan, run_plan
 from unjam_paper.results_file import read_parts
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
-from unjam_paper.study import PlannedRun, StudyFolder
+from unjam_paper.study import DriverSource, PlannedRun, StudyFolder, evaluate_metrics
 from unjam_paper.variants import VARIANTS
 
 Made = tuple[Path, list[str]]
@@ -53,12 +59,25 @@ def test_a_training_of_two_studies_is_planned_once(tmp_path: Path) -> None:
     assert both.seconds(4) < both.seconds(2)
 
 
-def test_a_resumable_study_is_not_continued_with_more_trainings(tmp_path: Path) -> None:
-    (tmp_path / "rings").mkdir()
-    (tmp_path / "rings/manifest.json").write_text('{"seeds": 2}')
-    assert make_plan(["rings"], 2, StudyFolder(tmp_path)).seeds == 2
-    with pytest.raises(InputError, match="seeds: 5 is not allowed; allowed: 2"):
-        make_plan(["rings"], 5, StudyFolder(tmp_path))
+@pytest.mark.parametrize("name", STUDIES)
+def test_drivers_of_every_study_can_drive_its_roads(name: str, tmp_path: Path) -> None:
+    """Controllers of trainings are missing here; all other drivers have the control step of their road."""
+    for function, arguments in STUDIES[name].make_parts(StudyFolder(tmp_path), 1).values():
+        scenario: Scenario
+        sources: Sequence[DriverSource]
+        if function is measure_road:
+            _, road, experts, drivers, _, _ = arguments
+            scenario, sources = road.make_scenario(), [*experts, *drivers.values()]
+        elif function is evaluate_metrics:
+            scenario, sources = arguments[0], [*arguments[1].values()]
+        else:
+            continue
+        assert SumoBackend().supports(scenario) == ""
+        for source in sources:
+            if callable(source):
+                check_can_drive(source(scenario), scenario)
+            elif not str(source).startswith(str(tmp_path)):
+                check_can_drive(make_driver(str(source), scenario.control_step), scenario)
 
 
 def test_the_estimated_time_is_proportional_to_the_steps() -> None:

@@ -31,7 +31,7 @@ def test_training_time_is_measured_for_all_variants_in_turn(
     plain, model = (found[variant][0] for variant in SMALL_VARIANTS)
     assert set(model) - set(plain) == {"fit", "roll_out"}
     assert min(plain["collect"], plain["update"], model["fit"], model["roll_out"]) > 0
-    axes = theory.training_time_bars({variant: found[variant][0] for variant in VARIANTS}).axes[0]
+    axes = theory.training_time_bars({variant: found[variant][0] for variant in SMALL_VARIANTS}).axes[0]
     longest = max(sum(plain.values()), sum(model.values()))
     assert longest < axes.get_xlim()[1] < 1.2 * longest
 
@@ -49,20 +49,21 @@ def test_controllers_are_evaluated_in_other_traffic(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(robustness, "TRANSFER_VARIANTS", ("plain",))
     monkeypatch.setattr(robustness, "TRANSFER_SOURCE", "small")
     monkeypatch.setattr(robustness, "TRANSFER_EPISODES", 2)
-    rows = robustness.transfer_rows(StudyFolder(folder), 2)
+    [(measure, arguments)] = robustness.FIGURE_10.make_parts(StudyFolder(folder), 2).values()
+    rows = measure(*arguments, 2)
     assert [row["driver"] for row in rows] == ["human", "pi", "plain 0", "plain 1"]
     assert all(row["road"] == "six" and np.isfinite(row["mean_speed"]["mean"]) for row in rows)
 
 
-def test_controllers_and_experts_are_evaluated_under_other_conditions(
-    monkeypatch: pytest.MonkeyPatch, reproduced: Made
-) -> None:
+def test_controllers_and_experts_are_evaluated_under_other_conditions(reproduced: Made) -> None:
     folder, _ = reproduced
     run = folder / "runs" / "small" / "plain" / "0"
     conditions = {"as in training": {}, "noise": {"noise": 0.4}, "delay": {"impairments": {"delay": 0.3}}}
-    monkeypatch.setitem(robustness.ROAD_CONDITIONS, "small", conditions)
-    monkeypatch.setitem(robustness.ROAD_CONTROLLERS, "small", (str(run), "pi"))
-    rows = robustness.condition_rows("small", 2, episodes=2)
+    rows = [
+        row
+        for condition, changes in conditions.items()
+        for row in robustness.condition_rows("small", condition, changes, (str(run), "pi"), episodes=2, workers=2)
+    ]
     assert [(row["condition"], row["driver"]) for row in rows] == [
         (condition, driver) for condition in conditions for driver in ("human", "tuned expert", "trained")
     ]
@@ -116,7 +117,7 @@ def rows_of_run(folder: Path, seed: int) -> list[dict[str, Any]]:
 
 @pytest.mark.long
 def test_untrained_policies_are_compared_on_the_same_seeds(small_study: pytest.MonkeyPatch) -> None:
-    rows = theory.untrained_rows(("small",), policies=2)
+    rows = theory.untrained_rows("small", policies=2, workers=2)
     assert [row["policy"] for row in rows] == ["expert + random", "random", "expert alone"]
     assert [len(row["returns"]) for row in rows[:2]] == [2, 2]
     assert rows[0]["mean"] == pytest.approx(np.mean(rows[0]["returns"]))
