@@ -1,9 +1,6 @@
 """Controllers with roads, human drivers and sensors that differ from those of the training.
 
-Three studies: packaged controllers with single changes (`robustness`); other numbers of vehicles (Figure 10); and
-calibrated human drivers on the ring: whether their waves are like real ones, and whether a CAV still dissolves them. In
-the experiment of Sugiyama et al. (2008), 22 cars on 230 m, a jam arose without a bottleneck and travelled against the
-traffic at about 20 km/h, 5.6 m/s; on motorways it is 15 to 20 km/h.
+Two studies: packaged controllers with single changes (`robustness`), and other numbers of vehicles (Figure 10).
 """
 
 from collections.abc import Mapping
@@ -14,30 +11,20 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.wrappers import ImpairedDriver
-from unjam.files import atomic_write, make_folder
-from unjam.manifest import manifest
 from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL
-from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, paired_difference
-from unjam.reports.figures import png_bytes
-from unjam.reports.results import read_results
-from unjam.reports.space_time import trajectory_figure
-from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
-from unjam.training.evaluate import TRAINED_LABEL, Evaluation, raise_failure, save_evaluation
+from unjam.training.evaluate import TRAINED_LABEL
 from unjam.training.road_family import NGSIM_IDM
-from unjam.worlds.record import Episode, Floats
-from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics, write_comparison_table
-from unjam_paper.results_file import StudyPart, read_part, write_part
+from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import (
     STUDY_ROADS,
     PlannedRun,
@@ -57,12 +44,6 @@ ROBUSTNESS_METRICS = (
     *("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_time_gap", "collisions"),
     "insertion_backlog_veh",
 )
-WAVE_CELLS = 512
-"""number of positions along the road at which the speed is sampled"""
-WAVE_LAG = 8.0
-"""time between the two compared speed profiles [s]: a wave moves far less than half a lap in it"""
-MIN_WAVE_STD = 0.5
-"""standard deviation of the speed along the road below which there is no wave [m/s]"""
 COMMON_CONDITIONS: dict[str, dict[str, Any]] = {
     "as in training": {},
     "twice the noise": {"noise": 0.4},
@@ -104,9 +85,6 @@ TRANSFER_ROADS: dict[str, dict[str, Any]] = {
         **{"scenario": "ring", "scenario_options.vehicles": 44, "scenario_options.length": [520, 520]}
     },
 }
-EXPERIMENT_RING: dict[str, Any] = {"length": (230, 230)}
-"""changes to `ring-jammed` for calibrated human drivers: the length of the experiment [m]"""
-DRIVER_TITLES = {"human": "no CAV", "pi": "PI", TRAINED_LABEL: "PI + residual"}
 
 
 def condition_rows(
@@ -197,38 +175,6 @@ def _mean_and_range(values: pd.Series) -> str:
     return interval_text(asdict(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2)
 
 
-def humans_on_ring(folder: Path, populations: dict[str, Path], controller: Path, workers: int = 2) -> None:
-    """Write `ring.json` and `ring.png` into `folder`: human baseline, PI and a trained controller on the ring.
-
-    `populations` are files of `unjam fit-drivers` by label; `controller` is a run folder or a .unjam file.
-    """
-    make_folder(folder)
-    about, rows = manifest(), []
-    roads: dict[str, dict[str, Any]] = {"paper's IDM": {}}  # the human drivers of the training
-    roads |= {label: {"population": str(file.absolute())} for label, file in populations.items()}
-    names = {"human": "human", "pi": "pi", TRAINED_LABEL: str(controller)}
-    episodes_to_plot: dict[str, Episode] = {}
-    largest = 0
-    with WorkerPool(workers) as pool:
-        for humans, changes in roads.items():
-            scenario = make_scenario("ring-jammed", {**EXPERIMENT_RING, **changes})
-            for label, name in names.items():
-                driver = make_driver(name, scenario.control_step)
-                seeds = range(CONDITION_EPISODES)
-                episodes = pool.run([EpisodeTask(scenario, driver, (seed,), record_details=True) for seed in seeds])
-                measured = [measure(episode) for episode in episodes]
-                raise_failure(measured)
-                for episode, row in zip(episodes, measured, strict=True):
-                    rows.append({"humans": humans, "driver": label, **row, "wave_speed": wave_speed(episode)})
-                if label == "human":  # the seed with the largest wave of the human baseline is plotted
-                    largest = int(np.argmax([row["speed_std_fleet_steady"] for row in measured]))
-                episodes_to_plot[f"{humans}: {DRIVER_TITLES[label]}"] = episodes[largest]
-    write_part(folder, "ring", {"manifest": about, "rows": rows})
-    save_evaluation(folder / "episodes", Evaluation({}, episodes_to_plot), {})
-    figure = trajectory_figure(list(read_results(folder / "episodes").plot_episodes.values()))
-    atomic_write(folder / "ring.png", png_bytes(figure, dpi=90))
-
-
 ROBUSTNESS = Study(
     title="packaged controllers with roads, human drivers and sensors that differ from training",
     make_parts=_robustness_parts,
@@ -244,30 +190,3 @@ FIGURE_10 = Study(
     minutes=3.0,
     tables={"transfer": _transfer_table},
 )
-
-
-def wave_speed(episode: Episode) -> float:
-    """Return the speed at which the speed profile moves along a closed road [m/s]; NaN if there is no wave.
-
-    It is negative against the direction of travel, as for real stop-and-go waves: the peak of the circular
-    cross-correlation of profiles `WAVE_LAG` seconds apart, averaged over the second half of the episode.
-    """
-    half = len(episode.speeds) // 2
-    profiles = speed_along_road(episode.speeds[half:], episode.positions[half:], episode.loop_length)
-    if profiles.std(1).mean() < MIN_WAVE_STD:
-        return nan
-    steps = round(WAVE_LAG / episode.control_step)
-    spectrum = np.fft.rfft(profiles - profiles.mean(1, keepdims=True), axis=1)
-    correlation = np.fft.irfft((spectrum[:-steps].conj() * spectrum[steps:]).mean(0), n=WAVE_CELLS)
-    shift = (np.argmax(correlation) + WAVE_CELLS / 2) % WAVE_CELLS - WAVE_CELLS / 2
-    return float(shift * episode.loop_length / WAVE_CELLS / WAVE_LAG)
-
-
-def speed_along_road(speeds: Floats, positions: Floats, loop_length: float) -> Floats:
-    """Return the speed at `WAVE_CELLS` positions of a closed road, shape (steps, WAVE_CELLS) [m/s].
-
-    It is interpolated between vehicles. Speeds and positions have the shape (steps, vehicles).
-    """
-    grid = np.arange(WAVE_CELLS) * (loop_length / WAVE_CELLS)
-    steps = zip(speeds, positions, strict=True)
-    return np.array([np.interp(grid, position % loop_length, speed, period=loop_length) for speed, position in steps])

@@ -1,5 +1,6 @@
 """Synthetic pairs of leader and follower, on which tests calibrate."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +43,16 @@ def idm_driver(
     return follower(idm_function(parameters), name, seconds, 8.0, gap, seed, split)
 
 
-def write_table(path: Path, drivers: int = 3) -> None:
-    """Write a CSV file of trajectories as a user has them, of drivers that differ in their time headway."""
+def write_table(path: Path, drivers: Sequence[Mapping[str, object]] = ({},) * 3) -> None:
+    """Write trajectories as a user has them, as CSV or Parquet; drivers differ in their time headway.
+
+    `drivers` has further columns with one value for each driver.
+    """
     parts = []
-    for number in range(drivers):
+    for number, columns in enumerate(drivers):
         trajectory = idm_driver(IDMParameters(time_headway=0.9 + 0.1 * number), seed=number, seconds=20.0)
         times = STEP * np.arange(len(trajectory.speed))
         numbers = {"t": times, "v_foll": trajectory.speed, "v_lead": trajectory.leader_speed, "gap": trajectory.gap}
-        parts.append(pd.DataFrame({"pair": number, **numbers}))
-    pd.concat(parts).to_csv(path, index=False)
+        parts.append(pd.DataFrame({"pair": number, **numbers, **columns}))
+    table = pd.concat(parts)
+    table.to_parquet(path) if path.suffix == ".parquet" else table.to_csv(path, index=False)

@@ -4,8 +4,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.following.synthetic_trajectories import idm_driver
-from tests.paper.test_field_data import table
+from tests.following.synthetic_trajectories import idm_driver, write_table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings, MultiStepSettings
 from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files, unit_warnings
@@ -74,7 +73,9 @@ CHANGES = {"calibration.generations": 2, "residual": False}
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    return Path(table(tmp_path / "data.parquet", [{"kind": kind} for kind in ("human", "human", "ACC")]))
+    path = tmp_path / "data.parquet"
+    write_table(path, [{"kind": kind} for kind in ("human", "human", "ACC")])
+    return path
 
 
 def test_speeds_in_another_unit_than_gaps_give_a_warning() -> None:
@@ -89,7 +90,7 @@ def test_speeds_in_another_unit_than_gaps_give_a_warning() -> None:
 def test_file_is_fitted_to_a_population(data: Path) -> None:
     fit = fit_drivers_from_files([data], CHANGES)
     assert len(fit.population.drivers) == 3
-    assert fit.notes == ["data.parquet: 3 trajectories with 723 of 723 rows"]
+    assert fit.notes == ["data.parquet: 3 trajectories with 603 of 603 rows"]
     assert fit.population.metadata["data"] == ["data.parquet"]
     assert "one IDM for all" in fit.report_lines()[0]
     assert fit.facts()["drivers"] == 3
@@ -102,7 +103,7 @@ def test_trajectories_with_different_time_steps_are_fitted_at_the_longest(data: 
     pd.concat([rows, slower]).to_parquet(tmp_path / "both.parquet")
     fit = fit_drivers_from_files([tmp_path / "both.parquet"], CHANGES)
     assert fit.notes[:2] == [
-        "both.parquet: 6 trajectories with 1,446 of 1,446 rows",
+        "both.parquet: 6 trajectories with 1,206 of 1,206 rows",
         "trajectories with a shorter time step are interpolated to 0.2 s",
     ]
     assert len(fit.population.drivers) == 6
@@ -122,7 +123,8 @@ def test_filters_select_trajectories(data: Path) -> None:
 
 @pytest.mark.long
 def test_drivers_of_several_files_have_different_names(data: Path, tmp_path: Path) -> None:
-    other = Path(table(tmp_path / "other.parquet", [{}]))
+    other = tmp_path / "other.parquet"
+    write_table(other, [{}])
     names = [one["name"] for one in fit_drivers_from_files([data, other], CHANGES).population.details]
     assert names == ["data-0", "data-1", "data-2", "other-0"]
 

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from tests.faults.processes import SETTINGS, TINY
-from tests.paper.test_field_data import table
+from tests.following.synthetic_trajectories import write_table
 from tests.system.conftest import UNJAM, Run
 from tests.worlds.sumo.user_networks import game, straight
 
@@ -409,7 +409,7 @@ def test_a_closed_pipe_is_no_error(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_calibrated_human_drivers_in_drive_train_and_evaluate(unjam: Run, tmp_path: Path) -> None:
-    table(tmp_path / "data.parquet", [{}, {}])
+    write_table(tmp_path / "data.parquet", [{}, {}])
     found = document(unjam("fit-drivers", "data.parquet", "--set", "calibration.generations=2", "--json"))
     assert (found["drivers"], found["population"]) == (2, "drivers.json")
     humans = ["--humans", "drivers.json"]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.faults.links import KINDS, plant, state_of, with_temporary_names
-from tests.paper.test_field_data import table
+from tests.following.synthetic_trajectories import write_table
 from tests.system.conftest import PLAIN, UNJAM, Run
 from tests.system.test_calibrate import CALIBRATE, DEMAND, ROWS
 from tests.system.test_commands import SMALL, TINY_RUN
@@ -104,7 +104,7 @@ def base(tmp_path_factory: pytest.TempPathFactory, preloaded: Run) -> Path:
     (place / "studies").mkdir()
     straight(place, DEMAND, length=100.0)
     (place / "detectors.csv").write_text("\n".join(ROWS).replace("100", "50"))
-    table(place / "data.parquet", [{}, {}])
+    write_table(place / "data.parquet", [{}, {}])
     (place / "roads.toml").write_text(TWO_ROADS)
     for words in (
         [*TINY_RUN, "--steps", "160", "--out", "run", "--tensorboard"],

@@ -148,10 +148,3 @@ def simulate_followers(model: DriverModel, segments: Segments) -> SimulatedFollo
     speed_mse = (np.square(speed - segments.speed) * is_present).sum(0) / counts
     gap_mse = (np.square(gap - segments.gap) * is_present).sum(0) / counts
     return SimulatedFollowers(speed, gap, speed_mse, gap_mse, np.any((gap <= 0.0) & is_present, axis=0), counts)
-
-
-def one_step_error(model: DriverModel, segments: Segments) -> Floats:
-    """Return the mean squared error of the acceleration from each recorded sample to the next [(m/s2)2], shape (n,)."""
-    predicted = model(*segments.start)(segments.speed[:-1], segments.leader_speed[:-1], segments.gap[:-1])
-    error = predicted - np.diff(segments.speed, axis=0) / segments.time_step
-    return (np.square(error) * segments.is_present[1:]).sum(0) / segments.sample_counts

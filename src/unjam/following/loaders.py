@@ -63,8 +63,6 @@ class ReadOptions:
     """minimum duration of a trajectory [s]; shorter ones are skipped and counted"""
     driver_columns: tuple[str, ...] = ()
     """columns of a plain table that together identify the driver, if it has no column `driver`"""
-    kind_columns: tuple[str, ...] = ()
-    """columns of a plain table that together are the kind of driver, if it has no column `kind`"""
 
 
 @dataclass(frozen=True)
@@ -107,10 +105,9 @@ def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
     """Return the trajectories of a plain table with `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`."""
     frame = frame.rename(columns={other: name for other, name in COLUMN_ALIASES.items() if name not in frame})
     _check_columns(frame, TABLE_COLUMNS, path)
-    for name, columns in (("driver", options.driver_columns), ("kind", options.kind_columns)):
-        if columns and name not in frame:
-            _check_columns(frame, columns, path)
-            frame[name] = _join_columns(frame, columns)
+    if options.driver_columns and "driver" not in frame:
+        _check_columns(frame, options.driver_columns, path)
+        frame["driver"] = _join_columns(frame, options.driver_columns)
     return _split_trajectories(_to_numeric(frame, TABLE_COLUMNS[1:]), path, options)
 
 
