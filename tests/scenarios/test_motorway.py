@@ -77,7 +77,7 @@ def test_human_drivers_differ_within_their_ranges() -> None:
 def test_variants_with_one_lane_and_with_a_steady_peak_have_names() -> None:
     one = make_motorway("on-ramp-1")
     assert {entry.lane for entry in drawn(one).entries} == {0}
-    assert {lane.name for lane in drawn(one).geometry.edge_lanes} >= {"motorway_0", "merging_1", "after_0"}
+    assert {name for name, *_ in drawn(one).geometry.edge_lanes} >= {"motorway_0", "merging_1", "after_0"}
     assert make_motorway("on-ramp-steady").peak == (300.0, 2400.0)
 
 

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unjam.drivers.safety import FollowingState
 from unjam.worlds import audit
-from unjam.worlds.audit import Audit, BrakingLog, FollowingPair, braking_statistics, following_statistics, is_recovering
+from unjam.worlds.audit import Audit, BrakingLog, braking_statistics, following_statistics, is_recovering
 
 
 def test_braking_is_counted_beyond_each_threshold_with_a_tolerance() -> None:
@@ -34,7 +35,7 @@ def test_a_recovering_cav_counts_for_the_time_to_collision_and_not_for_time_gaps
     assert (found.min_time_gap, found.share_short_time_gap, found.min_time_to_collision) == (1.2, 0.0, 5.0)
 
 
-OPENING, CLOSING = FollowingPair(10.0, 10.5, 6.0), FollowingPair(10.0, 9.5, 5.4)
+OPENING, CLOSING = FollowingState(10.0, 10.5, 6.0), FollowingState(10.0, 9.5, 5.4)
 
 
 @pytest.mark.parametrize(
@@ -43,21 +44,21 @@ OPENING, CLOSING = FollowingPair(10.0, 10.5, 6.0), FollowingPair(10.0, 9.5, 5.4)
         pytest.param(False, 0.0, CLOSING, True, id="another vehicle has just cut in"),
         pytest.param(True, 5.0, CLOSING, True, id="the first seconds"),
         pytest.param(True, 9.0, OPENING, True, id="the leader is faster"),
-        pytest.param(True, 9.0, FollowingPair(9.8, 9.8, 5.7), True, id="the time gap increases"),
+        pytest.param(True, 9.0, FollowingState(9.8, 9.8, 5.7), True, id="the time gap increases"),
         pytest.param(True, 9.0, CLOSING, False, id="the time gap decreases"),
-        pytest.param(True, 9.0, FollowingPair(10.0, 10.0, 5.7), False, id="the CAV has settled at a short time gap"),
-        pytest.param(True, 9.0, FollowingPair(10.0, 11.0, 10.0), False, id="one second is no longer short"),
-        pytest.param(True, 9.0, FollowingPair(0.9, 2.0, 0.5), False, id="at walking speed"),
+        pytest.param(True, 9.0, FollowingState(10.0, 10.0, 5.7), False, id="the CAV has settled at a short time gap"),
+        pytest.param(True, 9.0, FollowingState(10.0, 11.0, 10.0), False, id="one second is no longer short"),
+        pytest.param(True, 9.0, FollowingState(0.9, 2.0, 0.5), False, id="at walking speed"),
         pytest.param(False, 9.0, OPENING, False, id="the recovery has ended before"),
         pytest.param(False, 2.0, OPENING, False, id="the gap was not short when the leader changed"),
     ],
 )
 def test_recovery_is_a_short_time_gap_that_opens_since_a_cut_in(
-    so_far: bool, lasts: float, now: FollowingPair, expected: bool
+    so_far: bool, lasts: float, now: FollowingState, expected: bool
 ) -> None:
-    before = FollowingPair(10.0, 10.0, 5.7)
+    before = FollowingState(10.0, 10.0, 5.7)
     assert is_recovering(so_far, lasts, before, now) is expected
-    rows = [FollowingPair(*(np.array([value]) for value in each)) for each in (before, now)]
+    rows = [FollowingState(*(np.array([value]) for value in each)) for each in (before, now)]
     assert is_recovering(np.array([so_far]), np.array([lasts]), *rows).tolist() == [expected]
 
 

@@ -16,7 +16,7 @@ from unjam.files import reject_damaged
 from unjam.parameters import build_dataclass
 from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
 from unjam.worlds.drive import drive_world
-from unjam.worlds.world import CarFollowingRecord, CarFollowingWorld
+from unjam.worlds.world import CarFollowingWorld
 
 ISO_MEAN_SECONDS, LEADER_STOP_SECONDS = 2.0, 20.0
 """averaging time of accelerations in ISO 15622; simulated time after the start of a leader's emergency stop [s]"""
@@ -134,7 +134,7 @@ def make_certificate(controller: Controller) -> dict[str, Any]:
     return asdict(certify_driver(driver, states, humans))
 
 
-FollowingSimulator = Callable[[FollowingState, Floats], CarFollowingRecord]
+FollowingSimulator = Callable[[FollowingState, Floats], FollowingState]
 """simulates a controller behind leaders, from initial states and the leaders' accelerations, shape (steps, rows)"""
 
 
@@ -150,7 +150,7 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
     if reason := driver.requirements(road).unmet_reason(road):
         raise InputError(f"certify: the driver is not allowed on {road.title}: {reason}")
 
-    def simulate(initial_states: FollowingState, leader_accelerations: Floats) -> CarFollowingRecord:
+    def simulate(initial_states: FollowingState, leader_accelerations: Floats) -> FollowingState:
         world = CarFollowingWorld(initial_states, leader_accelerations, driver.limits, driver.time_step, loop)
         return drive_world(world, driver)
 
@@ -205,7 +205,7 @@ def _comfort(speeds: Floats, step: float) -> Comfort:
 
 def _search_attacks(
     simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver, generator: np.random.Generator
-) -> tuple[CarFollowingRecord, Floats, int]:
+) -> tuple[FollowingState, Floats, int]:
     """Search maneuvers of a leader with the smallest gap, by the cross-entropy method.
 
     Return the generation with the smallest gap, its worst maneuver, and the simulated steps of single vehicles.
@@ -215,7 +215,7 @@ def _search_attacks(
     mean, spread = np.zeros(pieces), np.full(pieces, (high - low) / 2.0)
     chosen = generator.integers(len(states.speed), size=ATTACK_POPULATION)
     start = FollowingState(*(values[chosen] for values in states))
-    worst: list[tuple[CarFollowingRecord, Floats]] = []
+    worst: list[tuple[FollowingState, Floats]] = []
     for _ in range(ATTACK_GENERATIONS):
         maneuvers = np.clip(generator.normal(mean, spread, (ATTACK_POPULATION, pieces)), low, high)
         record = simulate(start, np.repeat(maneuvers, repeats, axis=1).T)

@@ -134,7 +134,7 @@ def _speeds_after_step(
 ) -> Floats:
     """Return the speeds after a control step [m/s]; NaN for vehicles that changed lanes or left."""
     empty = [replace(road, entries=())] * road_count
-    traffic = BatchMotorways(empty, scenario.simulation_step, draw_noise, np.asarray)
+    traffic = BatchMotorways(empty, scenario.simulation_step, draw_noise)
     traffic.vehicles = vehicles.map(np.copy)
     for _ in range(scenario.steps_per_control_step):
         traffic.step()

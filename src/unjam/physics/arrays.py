@@ -76,19 +76,6 @@ def square_root(array: Array) -> Array:
     return array.rsqrt().reciprocal()
 
 
-def running_maximum(array: Array) -> Array:
-    """Return the largest of all entries so far, for an array of shape (n,)."""
-    return np.maximum.accumulate(array) if isinstance(array, np.ndarray) else array.cummax(0).values
-
-
-def scatter_minimum(array: Array, rows: Array, values: Array) -> None:
-    """Reduce entries of `array` to at most the values for their rows; a row may occur several times."""
-    if isinstance(array, np.ndarray):
-        np.minimum.at(array, rows, values)
-    else:
-        array.scatter_reduce_(0, rows, values, "amin")
-
-
 def as_column(array: Array) -> Array:
     """Return an array of shape (n,) as (n, 1); a float as a tuple of one."""
     return (array,) if type(array) is float else array[..., None]

@@ -11,8 +11,8 @@ from pydantic.dataclasses import dataclass
 from unjam.parameters import STRICT, NonNegative, NumberOrRange, PositiveInt
 from unjam.physics.arrays import Array
 from unjam.physics.idm import equilibrium_speed
-from unjam.scenarios.ring import EdgeSpan, LoopLayout, LoopScenario
-from unjam.scenarios.road import Connection, Edge, Node, Polyline, RoadNetwork, as_polyline
+from unjam.scenarios.ring import EdgeSpan, LoopScenario
+from unjam.scenarios.road import ClosedRoad, Connection, Edge, Node, Polyline, RoadNetwork, as_polyline
 from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl
 
 CROSSING_RADIUS = 3.1
@@ -87,8 +87,8 @@ class FigureEight(LoopScenario):
             )
         return self
 
-    def layout(self, size: float) -> LoopLayout:
-        """Return the figure eight of a given radius [m]."""
+    def build(self, size: float) -> ClosedRoad:
+        """Return the figure eight of a given radius [m] with its vehicles."""
         spans = _edge_spans(size)
         # As in Flow, vehicles are spread over the edges alone, without the links across the junctions.
         spacing = (_edge_length(size) - self.free_length) / self.vehicles
@@ -104,12 +104,13 @@ class FigureEight(LoopScenario):
             np.column_stack([np.linspace(lower.start, lower.end, ARC_POINTS), lower_arc]),
             [(figure_eight_length(size), 0.0, -size)],
         ]
-        return LoopLayout(
+        return self._closed_road(
+            size,
             spans,
-            figure_eight_length(size),
             positions_on_edges,
-            _network(size, as_polyline(upper_arc), as_polyline(lower_arc), self.top_speed),
-            np.vstack(lines),
+            loop_length=figure_eight_length(size),
+            network=_network(size, as_polyline(upper_arc), as_polyline(lower_arc), self.top_speed),
+            center_line=np.vstack(lines),
             crossings=((bottom.end, top.start), (right.end, left.start)),
         )
 

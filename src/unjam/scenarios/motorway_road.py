@@ -5,11 +5,14 @@ acceleration lanes; the lanes of the main road follow from right to left.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+
 from unjam.drivers.roadside import RoadsideSettings
-from unjam.physics.arrays import Array, namespace
-from unjam.scenarios.road import BuiltRoad, Connection, Edge, EdgeLane, Node, OpenRoad, RoadNetwork, Route, VehicleType
+from unjam.physics.arrays import Array
+from unjam.scenarios.road import BuiltRoad, Connection, Edge, Node, OpenRoad, RoadNetwork, Route, VehicleType
 
 MAIN_ROUTE = "motorway"
 """route, and first edge, of vehicles that enter the main road"""
@@ -87,24 +90,23 @@ class MotorwayGeometry(NamedTuple):
 
     def sections(self, lane: Array, position: Array) -> MotorwaySections:
         """Return the sections of n vehicles with these lanes and positions [m], arrays of shape (n,)."""
-        xp = namespace(position)
         first, *others = self.ramps or (RampGeometry(self.length, self.length, 0.0, self.speed_limit),)
         ramp, start = 0 * lane, 0.0 * position
         merge_start, merge_end, limit = (0.0 * position + each for each in (first[0], first[1], first.speed_limit))
         upstream = first
         for number, each in enumerate(others, 1):
             # A vehicle that stands at the end of an acceleration lane is not yet on the next ramp.
-            begin = xp.where(lane == 0, each.start + self.vehicle_length, upstream.merge_end)
+            begin = np.where(lane == 0, each.start + self.vehicle_length, upstream.merge_end)
             is_next = position >= begin
-            ramp = xp.where(is_next, number, ramp)
-            start = xp.where(is_next, upstream.merge_end, start)
+            ramp = np.where(is_next, number, ramp)
+            start = np.where(is_next, upstream.merge_end, start)
             merge_start, merge_end = (
-                xp.where(is_next, new, old) for new, old in zip(each[:2], (merge_start, merge_end), strict=True)
+                np.where(is_next, new, old) for new, old in zip(each[:2], (merge_start, merge_end), strict=True)
             )
-            limit = xp.where(is_next, each.speed_limit, limit)
+            limit = np.where(is_next, each.speed_limit, limit)
             upstream = each
         is_before, is_past = position < merge_start, position >= merge_end
-        start = xp.where(is_before, start, xp.where(is_past, merge_end, merge_start))
+        start = np.where(is_before, start, np.where(is_past, merge_end, merge_start))
         return MotorwaySections(ramp, merge_start, merge_end, limit, start, is_before, ~is_before & ~is_past)
 
     def distance_to_merge(self, lane: Array, position: Array) -> Array | None:
@@ -117,36 +119,35 @@ class MotorwayGeometry(NamedTuple):
     def speed_limits(self, lane: Array, sections: MotorwaySections) -> Array:
         """Return the speed limit where each of n vehicles is [m/s]."""
         is_on_ramp = (lane == 0) & sections.is_before
-        return namespace(sections.merge_start).where(is_on_ramp, sections.ramp_speed_limit, self.speed_limit)
+        return np.where(is_on_ramp, sections.ramp_speed_limit, self.speed_limit)
 
     @property
     def network(self) -> RoadNetwork:
         """The network; its x axis has its zero at `origin`."""
-        lanes, origin, main = self.lane_count, self.origin, self._main_edges()
-        nodes, edges = [Node("entrance", 0.0 - origin, 0.0)], [_edge(main[0], ("entrance", "joins"), lanes)]
-        connections = list[Connection]()
+        lanes, origin = self.lane_count, self.origin
+        borders = [_numbered(name, number) for number in range(len(self.ramps)) for name in ("joins", "closes")]
+        main = [
+            Edge(name, *ends, end - start, lanes=lanes + index % 2)
+            for index, ((name, start, end), ends) in enumerate(
+                zip(self._main_edges(), pairwise(["entrance", *borders, "exit"]), strict=True)
+            )
+        ]
+        nodes, edges, connections = [Node("entrance", 0.0 - origin, 0.0)], main[:1], list[Connection]()
         for number, (name, ramp) in enumerate(zip(self.route_names[1:], self.ramps, strict=True)):
             before, merging, after = main[2 * number : 2 * number + 3]
-            last = number == len(self.ramps) - 1
-            entrance, joins, closes = (_numbered(each, number) for each in ("ramp_entrance", "joins", "closes"))
+            entrance, joins, closes = _numbered("ramp_entrance", number), merging.from_node, merging.to_node
             nodes += [
                 Node(entrance, ramp.start - origin + 1.0, -RAMP_OFFSET),
                 Node(joins, ramp.merge_start - origin, 0.0),
                 Node(closes, ramp.merge_end - origin, 0.0),
             ]
-            edges += [
-                Edge(name, entrance, joins, ramp.length, speed_limit=ramp.speed_limit),
-                _edge(merging, (joins, closes), lanes + 1),
-                _edge(after, (closes, "exit" if last else _numbered("joins", number + 1)), lanes),
-            ]
+            edges += [Edge(name, entrance, joins, ramp.length, speed_limit=ramp.speed_limit), merging, after]
             connections += [
-                *(Connection(before[0], merging[0], lane, lane + 1) for lane in range(lanes)),
-                Connection(name, merging[0], 0, 0),
-                *(Connection(merging[0], after[0], lane + 1, lane) for lane in range(lanes)),
+                *(Connection(before.name, merging.name, lane, lane + 1) for lane in range(lanes)),
+                Connection(name, merging.name, 0, 0),
+                *(Connection(merging.name, after.name, lane + 1, lane) for lane in range(lanes)),
             ]
         nodes.append(Node("exit", self.length - origin, 0.0))
-        if not self.ramps:
-            edges = [_edge(main[0], ("entrance", "exit"), lanes)]
         return RoadNetwork(
             tuple(nodes), tuple(edges), self.speed_limit, has_internal_links=False, connections=tuple(connections)
         )
@@ -159,21 +160,14 @@ class MotorwayGeometry(NamedTuple):
         return (Route(MAIN_ROUTE, tuple(names)), *(Route(name, (name, *names[2 * i + 1 :])) for i, name in ramps))
 
     @property
-    def edge_lanes(self) -> tuple[EdgeLane, ...]:
-        """All lanes of all edges."""
-        main, result = self._main_edges(), list[EdgeLane]()
-        for number, (name, ramp) in enumerate(zip(self.route_names[1:], self.ramps, strict=True)):
-            merging = main[2 * number + 1][0]
-            result += [
-                EdgeLane(f"{name}_0", 0, ramp.start, ramp.speed_limit, ramp=number),
-                EdgeLane(f"{merging}_0", 0, ramp.merge_start, self.speed_limit, is_merging=True, ramp=number),
-            ]
+    def edge_lanes(self) -> list[tuple[str, int, float]]:
+        """All lanes of all edges: name, number among the lanes of the road, and position of the start [m]."""
+        main, result = self._main_edges(), list[tuple[str, int, float]]()
+        for (merging, start, _), name, ramp in zip(main[1::2], self.route_names[1:], self.ramps, strict=True):
+            result += [(f"{name}_0", 0, ramp.start), (f"{merging}_0", 0, start)]
         for lane in range(self.lane_count):
-            for index, (name, start, _) in enumerate(main):
-                merges = index % 2
-                own = f"{name}_{lane + merges}"
-                result.append(EdgeLane(own, lane + 1, start, self.speed_limit, is_merging=bool(merges)))
-        return tuple(result)
+            result += [(f"{name}_{lane + index % 2}", lane + 1, start) for index, (name, start, _) in enumerate(main)]
+        return result
 
     def _main_edges(self) -> list[tuple[str, float, float]]:
         """Return name, start and end of the edges of the main road; every second one is a merging section."""
@@ -182,11 +176,6 @@ class MotorwayGeometry(NamedTuple):
             names += [_numbered("merging", number), _numbered("after", number)]
         points = [0.0, *(point for ramp in self.ramps for point in ramp[:2]), self.length]
         return list(zip(names, points[:-1], points[1:], strict=True))
-
-
-def _edge(part: tuple[str, float, float], nodes: tuple[str, str], lanes: int) -> Edge:
-    name, start, end = part
-    return Edge(name, *nodes, end - start, lanes=lanes)
 
 
 def _numbered(name: str, number: int) -> str:

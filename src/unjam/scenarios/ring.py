@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,21 +29,6 @@ class EdgeSpan(NamedTuple):
     def end(self) -> float:
         """Its end along the road [m]."""
         return self.start + self.length
-
-
-class LoopLayout(NamedTuple):
-    """One closed road, and the initial positions of its vehicles [m]."""
-
-    edges: Sequence[EdgeSpan]
-    """in driving order"""
-    length: float
-    positions: NDArray[np.float64]
-    """of the vehicles, from the last to the first of the queue"""
-    network: RoadNetwork
-    outline: NDArray[np.float64]
-    """rows (coordinate along the lap, x, y)"""
-    crossings: tuple[tuple[float, float], ...] = ()
-    """sections where the road crosses itself"""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -79,8 +64,8 @@ class LoopScenario(Scenario):
             )
         return self
 
-    def layout(self, size: float) -> LoopLayout:
-        """Return the road of a given size [m]."""
+    def build(self, size: float) -> ClosedRoad:
+        """Return the road of a given size [m] with its vehicles."""
         raise NotImplementedError
 
     def limit_speed(self, size: float) -> float:
@@ -89,22 +74,32 @@ class LoopScenario(Scenario):
 
     def draw(self, generator: np.random.Generator) -> ClosedRoad:
         """Return a road of random size with its vehicles."""
-        size = float(generator.integers(*self._size_range, endpoint=True))
-        layout, ids = self.layout(size), self._vehicle_ids()
-        routes, entries = _entries(layout, ids, self.max_duration * self.top_speed)
+        road = self.build(float(generator.integers(*self._size_range, endpoint=True)))
+        return replace(road, human_parameters=self.draw_humans(road.vehicle_ids, generator))
+
+    def _closed_road(
+        self, size: float, edges: Sequence[EdgeSpan], positions: NDArray[np.float64], **fields: Any
+    ) -> ClosedRoad:
+        """Return a road of edges in driving order with vehicles at these positions, from the last to the first [m].
+
+        `fields` are further ones of the road.
+        """
+        ids, names = self._vehicle_ids(), [edge.name for edge in edges]
+        laps = int(self.max_duration * self.top_speed / sum(edge.length for edge in edges)) + 2  # enough for an episode
+        routes = [Route(f"from_{name}", (*names[first:], *names[:first]), laps) for first, name in enumerate(names)]
+        entries = []
+        for name, position in zip(ids, positions.tolist(), strict=True):
+            edge = max((edge for edge in edges if edge.start <= position), key=lambda edge: edge.start)
+            entries.append(Entry(name, f"from_{edge.name}", min(position - edge.start, edge.length)))
         return ClosedRoad(
-            network=layout.network,
-            routes=routes,
-            entries=entries,
+            routes=tuple(routes),
+            entries=tuple(entries),
             vehicle_ids=ids,
             cav_ids=self.possible_cav_ids(),
-            start_positions=layout.positions,
-            loop_length=layout.length,
-            crossings=layout.crossings,
+            start_positions=positions,
             limit_speed=self.limit_speed(size),
-            center_line=layout.outline,
             drawn_values={self.size_parameter: size},
-            human_parameters=self.draw_humans(ids, generator),
+            **fields,
         )
 
     @property
@@ -176,35 +171,22 @@ class Ring(LoopScenario):
             )
         return self
 
-    def layout(self, size: float) -> LoopLayout:
-        """Return the circle of a given length [m], of equal edges."""
+    def build(self, size: float) -> ClosedRoad:
+        """Return the circle of a given length [m], of equal edges, with its vehicles."""
         edge_length = size / RING_EDGES
         coordinates = np.linspace(0, size, 161)
-        return LoopLayout(
-            edges=[EdgeSpan(f"edge_{index}", index * edge_length, edge_length) for index in range(RING_EDGES)],
-            length=size,
-            positions=np.arange(self.vehicles, dtype=np.float64) * (size / self.vehicles),
+        return self._closed_road(
+            size,
+            [EdgeSpan(f"edge_{index}", index * edge_length, edge_length) for index in range(RING_EDGES)],
+            np.arange(self.vehicles, dtype=np.float64) * (size / self.vehicles),
+            loop_length=size,
             network=_circle_network(size, self.top_speed),
-            outline=np.column_stack([coordinates, _circle_points(2 * np.pi * coordinates / size, size)]),
+            center_line=np.column_stack([coordinates, _circle_points(2 * np.pi * coordinates / size, size)]),
         )
 
     def limit_speed(self, size: float) -> float:
         """Return the IDM's equilibrium speed on a ring of a given length [m/s]."""
         return equilibrium_speed(size / self.vehicles - VEHICLE_LENGTH, self.humans)
-
-
-def _entries(
-    layout: LoopLayout, ids: Sequence[str], min_distance: float
-) -> tuple[tuple[Route, ...], tuple[Entry, ...]]:
-    """Return routes of at least `min_distance` [m] from each edge, and the vehicles that stand there."""
-    names = [edge.name for edge in layout.edges]
-    laps = int(min_distance / sum(edge.length for edge in layout.edges)) + 2
-    routes = [Route(f"from_{name}", (*names[first:], *names[:first]), laps) for first, name in enumerate(names)]
-    entries = []
-    for name, position in zip(ids, layout.positions.tolist(), strict=True):
-        edge = max((edge for edge in layout.edges if edge.start <= position), key=lambda edge: edge.start)
-        entries.append(Entry(name, f"from_{edge.name}", min(position - edge.start, edge.length)))
-    return tuple(routes), tuple(entries)
 
 
 def _circle_points(angles: NDArray[np.float64], length: float) -> NDArray[np.float64]:

@@ -129,7 +129,7 @@ class ClosedRoad(BuiltRoad):
     """front bumper of each vehicle along the route at the start [m]"""
     loop_length: float
     """length of the closed road [m]"""
-    crossings: tuple[tuple[float, float], ...]
+    crossings: tuple[tuple[float, float], ...] = ()
     """sections where the road crosses itself, and SUMO itself drives commanded human drivers [m]"""
     center_line: NDArray[np.float64]
     """the road's center line: rows (coordinate along the route, x, y) [m]"""
@@ -151,22 +151,6 @@ class VehicleType(NamedTuple):
     """to a standing leader"""
     speed_factor: float
     """desired speed divided by the speed limit"""
-
-
-class EdgeLane(NamedTuple):
-    """A lane of an edge, from its start along the main road [m] on; speed limit [m/s].
-
-    The lanes of consecutive edges with the same `lane_index` form one lane of the road.
-    """
-
-    name: str
-    lane_index: int
-    start: float
-    speed_limit: float
-    is_merging: bool = False
-    """whether it is part of a merging section, where no vehicle is commanded"""
-    ramp: int = 0
-    """number of the ramp to which a lane with index 0 belongs"""
 
 
 @dataclass(frozen=True, kw_only=True)

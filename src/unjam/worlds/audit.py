@@ -2,11 +2,12 @@
 
 from collections import defaultdict
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.safety import FollowingState
 from unjam.physics.arrays import Floats
 
 BRAKING_THRESHOLDS = (3.5, 4.5, 9.0)
@@ -117,15 +118,9 @@ class BrakingLog:
             self._block.clear()
 
 
-class FollowingPair(NamedTuple):
-    """Speeds [m/s] and net gap [m] of a CAV and its leader in a simulation step: floats, or arrays of n CAVs."""
-
-    speed: Any
-    leader_speed: Any
-    gap: Any
-
-
-def is_recovering(was_recovering: Any, time_behind_leader: Any, previous: FollowingPair, current: FollowingPair) -> Any:
+def is_recovering(
+    was_recovering: Any, time_behind_leader: Any, previous: FollowingState, current: FollowingState
+) -> Any:
     """Return whether a CAV still recovers from a change of its leader: a short time gap that opens.
 
     Another vehicle that cuts in determines the first time gap, not the CAV. The CAV recovers as long as the

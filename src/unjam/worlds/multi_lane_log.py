@@ -7,25 +7,19 @@ brakes in the seconds after a cut-in, and excludes the time gaps until it has re
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.safety import FollowingState
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds import audit
-from unjam.worlds.audit import CAV_AFTER_CUT_IN, Audit, FollowingPair, is_recovering
+from unjam.worlds.audit import CAV_AFTER_CUT_IN, Audit, is_recovering
 from unjam.worlds.open_road_log import OpenRoadLog
 from unjam.worlds.record import Floats, Trajectory
 
-
-class TrackedLeader(NamedTuple):
-    """The leader of a CAV, empty without a leader within range; own and leader speed [m/s], gap [m]."""
-
-    leader: str
-    speed: float
-    leader_speed: float
-    gap: float
+TrackedLeader = tuple[str, FollowingState]
+"""the leader of a CAV, empty without a leader within range, and the state of the CAV behind it"""
 
 
 class MultiLaneLog(OpenRoadLog):
@@ -42,7 +36,7 @@ class MultiLaneLog(OpenRoadLog):
         self._tracked_leaders = tracked_leaders
         self._leaders: dict[str, tuple[str, int]] = {}
         """leader of each CAV, and the simulation step since which it is the leader"""
-        self._recovery_states: dict[str, tuple[bool, FollowingPair]] = {}
+        self._recovery_states: dict[str, tuple[bool, FollowingState]] = {}
         """whether each CAV recovers from a change of its leader, and the pair in the last step"""
         self._steady_following = array("d")
         """of CAVs long behind the same leader, in each simulation step: speed, leader speed, gap, and recovery"""
@@ -52,14 +46,13 @@ class MultiLaneLog(OpenRoadLog):
         self._step_count += 1
         kinds, rows = self._kinds.copy(), {name: row for row, name in enumerate(self._names)}
         names = [name for name in self._cav_ids if name in rows]
-        for name, (leader, *pair) in zip(names, self._tracked_leaders(names) if names else (), strict=True):
+        for name, (leader, current) in zip(names, self._tracked_leaders(names) if names else (), strict=True):
             known = self._leaders.get(name)
             if known is None or known[0] != leader:
                 known = self._leaders[name] = leader, self._step_count
             time_behind_leader = (self._step_count - known[1]) * self._scenario.simulation_step
             if time_behind_leader < audit.CUT_IN_SECONDS:
                 kinds[rows[name]] = CAV_AFTER_CUT_IN
-            current = FollowingPair(*pair)
             was_recovering, previous = self._recovery_states.get(name, (False, current))
             recovers = bool(leader) and is_recovering(was_recovering, time_behind_leader, previous, current)
             self._recovery_states[name] = recovers, current

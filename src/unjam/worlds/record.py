@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
 from unjam.physics.arrays import Floats
+from unjam.scenarios.road import Road
+from unjam.scenarios.scenario import Scenario
 from unjam.worlds.audit import Audit
 from unjam.worlds.world import DriverLog
 
@@ -260,6 +262,21 @@ def assign_columns(
         columns[trip] = column
         heappush(heap, (int(last_steps[trip]), column))
     return columns
+
+
+def common_fields(
+    scenario: Scenario, road: Road, seed: Sequence[int], has_crashed: bool, stop_reason: str = ""
+) -> dict[str, Any]:
+    """Return the fields that all records of simulated roads have, by name; `stop_reason` is that of an early end."""
+    return {
+        "seed": tuple(seed),
+        "status": "collision" if has_crashed else "teleports" if stop_reason else "completed",
+        "reason": "" if has_crashed else stop_reason,
+        "control_step": scenario.control_step,
+        "warmup": scenario.warmup,
+        "drawn_values": road.drawn_values,
+        "limit_speed": road.limit_speed,
+    }
 
 
 def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:

@@ -14,7 +14,7 @@ from unjam.errors import UnjamError
 from unjam.physics.arrays import Array, Floats
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, common_fields
 from unjam.worlds.world import World
 
 DrawnRoad = tuple[Road, Sequence[np.random.SeedSequence]]
@@ -66,7 +66,7 @@ class RoadWorld(World[Episode], Protocol):
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""
-        raise UnjamError("render: this backend draws no pictures")
+        raise UnjamError("render: this backend draws no pictures; allowed: backend='sumo'")
 
 
 class SimulatedRoad(RoadWorld):
@@ -138,12 +138,4 @@ class SimulatedRoad(RoadWorld):
 
     def record_fields(self) -> dict[str, Any]:
         """Return the common fields of all records."""
-        return {
-            "seed": self.seed,
-            "status": "collision" if self.has_crashed else "teleports" if self.stop_reason else "completed",
-            "reason": "" if self.has_crashed else self.stop_reason,
-            "control_step": self.scenario.control_step,
-            "warmup": self.scenario.warmup,
-            "drawn_values": self.road.drawn_values,
-            "limit_speed": self.road.limit_speed,
-        }
+        return common_fields(self.scenario, self.road, self.seed, self.has_crashed, self.stop_reason)

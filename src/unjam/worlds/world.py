@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,14 +133,6 @@ class RecordedWorld(_OfflineWorld):
         return np.array(self._accelerations)
 
 
-class CarFollowingRecord(NamedTuple):
-    """Speeds [m/s] and gaps [m] of n CAVs and their leaders in T steps; arrays of shape (T + 1, n)."""
-
-    speed: Floats
-    leader_speed: Floats
-    gap: Floats
-
-
 class CarFollowingWorld(_OfflineWorld):
     """n CAVs behind leaders; the follower of each CAV has the CAV's own speed and gap."""
 
@@ -179,6 +171,6 @@ class CarFollowingWorld(_OfflineWorld):
         self._position = self._position + speed * step
         self._states.append(FollowingState(speed, leader, before.gap + (leader - speed) * step))
 
-    def record(self, driver_log: DriverLog) -> CarFollowingRecord:
-        """Return the motion of all pairs."""
-        return CarFollowingRecord(*(np.array(values) for values in zip(*self._states, strict=True)))
+    def record(self, driver_log: DriverLog) -> FollowingState:
+        """Return the states of all pairs in T steps, arrays of shape (T + 1, n)."""
+        return FollowingState(*(np.array(values) for values in zip(*self._states, strict=True)))

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from tests.conftest import random_network
 from unjam.drivers import ResidualDriver
@@ -379,7 +378,7 @@ def test_neighbours_are_those_next_on_each_way_of_the_same_road() -> None:
 
 def test_nobody_enters_before_the_time_or_without_room() -> None:
     road = SHORT.draw(np.random.default_rng(1))
-    traffic = BatchMotorways([road], STEP, lambda shape: np.zeros(shape), np.asarray)
+    traffic = BatchMotorways([road], STEP, np.zeros)
     times = [entry.time for entry in road.entries]
     for _ in range(240):
         known = set(traffic.vehicles.entry.tolist())
@@ -439,25 +438,3 @@ def test_where_episodes_must_be_sumos_it_runs_in_sumo() -> None:
     asked.clear()
     run_batched_if_supported(some, run, allow_statistical=True)
     assert not asked
-
-
-@pytest.mark.long
-def test_tensors_are_stepped_as_arrays_are() -> None:
-    roads = [SHORT.draw(np.random.default_rng(number)) for number in range(2)]
-    generator = np.random.default_rng(0)
-    drawn = [generator.standard_normal((3, 300)) for _ in range(90)]
-
-    def after(numbers: Any) -> MotorwayVehicles:
-        steps = iter(drawn)
-        traffic = BatchMotorways(roads, STEP, lambda shape: numbers(next(steps)[:, : shape[1]]), numbers)
-        for _ in range(90):  # later somebody changes lanes one step sooner: roots are rounded otherwise
-            traffic.step()
-        return traffic.vehicles
-
-    arrays, tensors = after(np.asarray), after(torch.as_tensor)
-    assert len(arrays.road) > 50
-    came = [roads[road].entries[entry].route for road, entry in zip(arrays.road, arrays.entry, strict=True)]
-    assert any(route == "ramp" and way > 0 for route, way in zip(came, arrays.lane, strict=True))
-    np.testing.assert_array_equal(arrays.entry, tensors.entry.numpy())
-    np.testing.assert_array_equal(arrays.lane, tensors.lane.numpy())
-    np.testing.assert_allclose(arrays.position, tensors.position.numpy(), atol=1e-6)

@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.errors import UnjamError
 from unjam.physics.arrays import Floats
@@ -14,13 +13,11 @@ from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import WorldOptions
-from unjam.worlds.batch.motorway.record import NO_END_STEP
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason
 from unjam.worlds.closed_road import loop_scene
-from unjam.worlds.record import Episode
 from unjam.worlds.road_world import RoadScene, RoadWorld
 from unjam.worlds.world import DriverLog
 
@@ -40,30 +37,40 @@ class BatchBackend:
         yield world
 
 
-class SingleRing(RingBatch):
+class _SingleRoad:
+    """What batches of one road have in common."""
+
+    roads: Sequence[Any]
+
+    @property
+    def road(self) -> Any:
+        return self.roads[0]
+
+    @property
+    def has_crashed(self) -> bool:
+        return bool(cast(Any, self).crashed_roads[0])
+
+    @property
+    def has_ended(self) -> bool:
+        return self.has_crashed or cast(Any, super()).has_ended
+
+    def record(self, driver_log: DriverLog) -> Any:
+        return cast(Any, super()).record(driver_log)[0]
+
+
+class SingleRing(_SingleRoad, RingBatch):
     """One closed road of a batch."""
 
     backlog, expects_cavs = 0, False
 
     def __init__(self, scenario: LoopScenario, seed: Sequence[int]) -> None:
         super().__init__([scenario], [seed])
-        self.road = self.roads[0]
         self.cav_ids = self.road.cav_ids
 
     @property
     def speeds(self) -> Floats:
         """Of all vehicles [m/s]."""
         return self._speed[:-1, 0]
-
-    @property
-    def has_crashed(self) -> bool:
-        """Whether there was a collision, which ends the episode."""
-        return bool(self._has_crashed[0])
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether the horizon is reached, or there was a collision."""
-        return self.has_crashed or super().has_ended
 
     def last_applied_acceleration(self) -> Floats:
         """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2]."""
@@ -73,17 +80,12 @@ class SingleRing(RingBatch):
         """Return the current state of the road for pictures."""
         return loop_scene(self.road, self._position[:, 0], self.speeds)
 
-    def record(self, driver_log: DriverLog) -> Episode:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the record since the start."""
-        return super().record(driver_log)[0]
 
-
-class SingleMotorway(MotorwayBatch):
+class SingleMotorway(_SingleRoad, MotorwayBatch):
     """One motorway of a batch."""
 
     def __init__(self, scenario: Motorway, seed: Sequence[int]) -> None:
         super().__init__(scenario, [seed])
-        self.road = self.roads[0]
 
     @property
     def cav_ids(self) -> list[str]:
@@ -96,16 +98,6 @@ class SingleMotorway(MotorwayBatch):
         return self._traffic.vehicles.speed
 
     @property
-    def has_crashed(self) -> bool:
-        """Whether vehicles touched, which ends the episode."""
-        return bool(self._log.end_steps[0] < NO_END_STEP)
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether the horizon is reached, or vehicles touched."""
-        return self.has_crashed or super().has_ended
-
-    @property
     def backlog(self) -> int:
         """The insertion backlog now."""
         return int(self._log.backlogs[-1][0])
@@ -115,30 +107,21 @@ class SingleMotorway(MotorwayBatch):
         """Whether a CAV may still enter."""
         return self.entered_count < len(self.road.cav_ids)
 
-    def advance(self, command: Command | None) -> None:
-        """Simulate one control step with the same command throughout; None: the CAVs stay human."""
-        before = dict(zip(self.cav_ids, self._local_state.speed, strict=True))
-        super().advance(command)
-        after = before | dict(zip(self.cav_ids, self._local_state.speed, strict=True))
-        self._last_applied = (
-            np.array([after[name] - speed for name, speed in before.items()]) / self.scenario.control_step
-        )
-
     def exact_state(self) -> LocalState:
         """Return the exact local state of the CAVs now."""
-        return self._local_state
-
-    def last_applied_acceleration(self) -> Floats:
-        """Return the CAVs' accelerations in the last control step [m/s2]; zero for those that have left."""
-        return self._last_applied
+        return self.local_state()
 
     def scene(self) -> RoadScene:
         """Raise `UnjamError`: a batch has no geometry of motorways."""
         raise UnjamError("render: the batch draws no pictures of motorways; allowed: backend='sumo'")
 
-    def record(self, driver_log: DriverLog) -> Episode:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the record since the start."""
-        return super().record(driver_log)[0]
+    def last_applied_acceleration(self) -> Floats:
+        """Return the CAVs' accelerations in the last control step [m/s2]; zero for those that have left."""
+        before, after = (states.speed for states in self._log.states[-2:])
+        remaining, changes = self.remaining_rows, np.zeros(len(before))
+        rows = np.arange(len(before)) if remaining is None else np.array(remaining, np.intp)
+        changes[rows] = after[: len(rows)] - before[rows]
+        return changes / self.scenario.control_step
 
 
 SINGLE_ROADS: dict[type, Any] = {RingBatch: SingleRing, MotorwayBatch: SingleMotorway}

@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from unjam.errors import EpisodeError, InputError, SumoInputError, UnjamError, as_unjam_error
+from unjam.scenarios import SCENARIO_KINDS
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.scenarios.road import ClosedRoad, MergeRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import Scenario
@@ -46,14 +47,12 @@ class SumoBackend(AbstractContextManager["SumoBackend"]):
         self._given = simulation
         self._transport: Transport | None = transport
         self._opened: Simulation | None = None
-        self._road_classes: dict[type[Scenario], type[Road]] = {}
 
     def supports(self, scenario: Scenario) -> str:
         """Return why SUMO cannot simulate a scenario; empty if it can."""
-        kind = type(scenario)
-        if kind not in self._road_classes:  # drawing the roads of large networks takes time
-            self._road_classes[kind] = type(scenario.draw_from_seed((0,))[0])
-        return _unsupported_reason(self._road_classes[kind])
+        if type(scenario) in SCENARIO_KINDS.values():  # drawing the roads of large networks takes time
+            return ""
+        return _unsupported_reason(type(scenario.draw_from_seed((0,))[0]))
 
     @contextmanager
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[Traffic[Any]]:

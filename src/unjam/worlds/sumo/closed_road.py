@@ -21,12 +21,10 @@ from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import gap_on_loop, next_speed
 from unjam.scenarios.population import apply_population
 from unjam.scenarios.road import ClosedRoad
-from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds import closed_road
-from unjam.worlds.backend import WorldOptions
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.road_world import DrawnRoad, RoadScene
-from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.road_world import RoadScene
 from unjam.worlds.sumo.traffic import NO_SPEED_COMMAND, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
 
@@ -34,18 +32,10 @@ from unjam.worlds.world import DriverLog, ProgressCallback
 class ClosedTraffic(Traffic[ClosedRoad]):
     """The SUMO environment of a closed road."""
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        seed: Sequence[int],
-        simulation: Simulation,
-        options: WorldOptions,
-        drawn: DrawnRoad | None = None,
-    ) -> None:
-        super().__init__(scenario, seed, simulation, options, drawn)
-        road, vehicles = self.road, len(self.road.vehicle_ids)
+    def _prepare(self) -> None:
+        scenario, simulation, road, vehicles = self.scenario, self._simulation, self.road, len(self.road.vehicle_ids)
         self.cav_ids, self.entered_count = road.cav_ids, len(road.cav_ids)
-        self.is_scalar = options.accepts_floats and self.cav_count == 1
+        self.is_scalar = self.options.accepts_floats and self.cav_count == 1
         self._collided_vehicles: set[str] = set()
         self._cav_indices = [road.vehicle_ids.index(name) for name in road.cav_ids]
         self._neighbors = closed_road.loop_neighbors(np.array(self._cav_indices), vehicles)

@@ -1,6 +1,6 @@
 """Induction loops on a user's network: which vehicles pass in human-only traffic, when, and at which speed."""
 
-import queue
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
@@ -41,10 +41,9 @@ class DetectorPool(AbstractContextManager["DetectorPool"]):
 
     def __init__(self, count: int = 1) -> None:
         self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-detectors")
-        self._idle_simulations: queue.SimpleQueue[SandboxedSimulation | None] = queue.SimpleQueue()
+        self._own = threading.local()
+        """`simulation`: that of the thread, None after a failure"""
         self._open_simulations: set[SandboxedSimulation] = set()
-        for _ in range(count):
-            self._idle_simulations.put(None)
 
     def run(
         self, scenario: UserNetwork, seeds: Sequence[tuple[int, ...]], loops: Sequence[InductionLoop]
@@ -62,22 +61,18 @@ class DetectorPool(AbstractContextManager["DetectorPool"]):
     def _run_one(
         self, scenario: UserNetwork, seed: tuple[int, ...], loops: Sequence[InductionLoop]
     ) -> list[DetectorPassage]:
-        simulation = self._idle_simulations.get()
+        simulation = getattr(self._own, "simulation", None)
+        if simulation is None:
+            simulation = self._own.simulation = SandboxedSimulation()
+            self._open_simulations.add(simulation)
         try:
-            if simulation is None:
-                simulation = SandboxedSimulation()
-                self._open_simulations.add(simulation)
             load_with_loops(simulation, scenario, seed, loops)  # pyright: ignore[reportArgumentType]
-            steps = scenario.horizon * scenario.steps_per_control_step
-            return simulation.passages(loops, steps)
-        except EpisodeError:
-            if simulation is not None:  # the process may be lost: the next run starts another one
-                simulation.close()
-                self._open_simulations.discard(simulation)
-            simulation = None
+            return simulation.passages(loops, scenario.horizon * scenario.steps_per_control_step)
+        except EpisodeError:  # the process may be lost: the next run starts another one
+            simulation.close()
+            self._open_simulations.discard(simulation)
+            self._own.simulation = None
             raise
-        finally:
-            self._idle_simulations.put(simulation)
 
     def close(self) -> None:
         """End all processes; may be called twice."""

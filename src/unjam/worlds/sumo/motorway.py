@@ -28,12 +28,8 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
     def _prepare(self) -> None:
         super()._prepare()
         road, types, self._geometry = self.road, self.road.vehicle_types, self.road.geometry
-        edge_lanes = self._geometry.edge_lanes
-        self._lane_of_edge_lane, self._edge_lane_starts, self._edge_lane_speed_limits, _, self._edge_lane_ramps = (
-            np.array(each) for each in zip(*(lane[1:] for lane in edge_lanes), strict=True)
-        )
-        self._edge_lane_names = [lane.name for lane in edge_lanes]
-        self._closing_edge_lanes = {number for number, lane in enumerate(edge_lanes) if lane.is_merging}
+        self._edge_lane_names, *values = zip(*self._geometry.edge_lanes, strict=True)
+        self._lane_of_edge_lane, self._edge_lane_starts = map(np.array, values)
         self._speed_factors = {entry.name: types[entry.vehicle_type].speed_factor for entry in road.entries}
         self._road_sections = RoadSections(1 + self._geometry.lane_count, self._geometry.length)
         self._messages = RoadsideMessages(road.roadside, self.scenario.control_step, self.noise_generator)
@@ -47,16 +43,19 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
             on_lane = simulation.vehicles_on_lane(name)
             names += on_lane
             edge_lanes += [number] * len(on_lane)
-        self._names, self._edge_lanes = names, edge_lanes
+        self._names = names
         self._row_of_name = {name: row for row, name in enumerate(names)}
         self._speed = np.array(simulation.speeds(names), np.float64)
-        self._lane, ramp = self._lane_of_edge_lane[edge_lanes], self._edge_lane_ramps[edge_lanes]
+        self._lane = lane = self._lane_of_edge_lane[edge_lanes]
         self._position = self._edge_lane_starts[edge_lanes] + np.array(simulation.lane_offsets(names), np.float64)
-        self._order = order = np.lexsort((self._position, self._lane))
-        is_same_lane = (self._lane[order[1:]] == self._lane[order[:-1]]) & (ramp[order[1:]] == ramp[order[:-1]])
+        self._sections = self._geometry.sections(lane, self._position)
+        self._order = order = np.lexsort((self._position, lane))
+        before, after = order[:-1], order[1:]
+        is_same_ramp = (lane[before] > 0) | (self._sections.ramp[before] == self._sections.ramp[after])
+        is_same_lane = (lane[before] == lane[after]) & is_same_ramp
         self._leader, self._follower = np.full((2, len(names)), -1)
-        self._leader[order[:-1][is_same_lane]] = order[1:][is_same_lane]
-        self._follower[order[1:][is_same_lane]] = order[:-1][is_same_lane]
+        self._leader[before[is_same_lane]] = after[is_same_lane]
+        self._follower[after[is_same_lane]] = before[is_same_lane]
 
     def _names_and_speeds(self) -> tuple[Sequence[str], Floats]:
         return self._names, self._speed
@@ -65,8 +64,9 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         rows = [self._row_of_name[name] for name in names]
         leaders = self._leader[rows]
         leader_names = [self._names[leader] if leader >= 0 else "" for leader in leaders.tolist()]
-        values = self._speed[rows], self._speed[leaders], self._leader_gaps(rows, leaders)
-        return list(map(TrackedLeader, leader_names, *(each.tolist() for each in values)))
+        gaps = np.where(leaders >= 0, self._leader_gaps(rows, leaders), inf)
+        values = (each.tolist() for each in (self._speed[rows], self._speed[leaders], gaps))
+        return list(zip(leader_names, map(FollowingState, *values), strict=True))
 
     def _leader_gaps(self, rows: Any, leaders: Any) -> Floats:
         return self._position[leaders] - self._geometry.vehicle_length - self._position[rows]
@@ -88,7 +88,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         adjacent_gaps, adjacent_speeds = self._adjacent_vehicles(rows)
         return state._replace(
             route_position=position - geometry.origin,
-            allowed_speed=self._edge_lane_speed_limits[[self._edge_lanes[row] for row in rows]] * factors,
+            allowed_speed=geometry.speed_limits(self._lane, self._sections)[rows] * factors,
             distance_to_merge=geometry.distance_to_merge(self._lane[rows], position),
             lane_speeds=lane_speeds,
             road_speeds=road_speeds,
@@ -113,14 +113,11 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         return np.stack(gaps, -1), np.stack(speeds, -1)
 
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
-        rows = [self._row_of_name[name] for name in names]
-        leaders = self._leader[rows]
-        gaps = np.where(leaders >= 0, self._leader_gaps(rows, leaders), inf).tolist()
-        return list(map(FollowingState, self._speed[rows].tolist(), self._speed[leaders].tolist(), gaps))
+        return [state for _, state in self._tracked_leaders(names)]
 
     def _is_uncapped(self, name: str) -> bool:
         """Whether its lane, or an adjacent one, closes: vehicles make room for each other in this section."""
-        return self._edge_lanes[self._row_of_name[name]] in self._closing_edge_lanes
+        return bool(self._sections.is_merging[self._row_of_name[name]])
 
     def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
         routes = {entry.name: entry.route for entry in self.road.entries}

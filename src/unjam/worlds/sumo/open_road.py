@@ -101,9 +101,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
         """Return SUMO's network file."""
         return network_file(cast(BuiltRoad, self.road).network)
 
-    def _prepare(self) -> None:
-        """Create the attributes of this kind of road, before the warm-up."""
-
     def _is_cav(self, name: str) -> bool:
         """Return whether a vehicle that has just entered is a CAV."""
         return name in self.road.cav_ids
@@ -168,7 +165,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
         """Run the warm-up, then hand the CAVs to the driver, without a history."""
-        self._prepare()
         self._vehicles = ActiveVehicles()
         self._controlled_cavs = set[str]()
         self.cav_ids = []

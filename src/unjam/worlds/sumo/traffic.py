@@ -46,6 +46,10 @@ class Traffic(SimulatedRoad, Generic[RoadT]):
         super().__init__(scenario, seed, drawn)
         self.options, self._simulation = options, simulation
         simulation.load(self.inputs(scenario, self.road), scenario.simulation_step, sumo_seed(self.seed))
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Create the attributes of this kind of road."""
 
     @staticmethod
     def inputs(scenario: Scenario, road: Any) -> SumoInputs:

@@ -146,16 +146,16 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
 
     def _tracked_leaders(self, names: Sequence[str]) -> list[TrackedLeader]:
         speeds = zip(self._simulation.speeds(names), map(self._neighbors, names), strict=True)
-        return [TrackedLeader(leader, speed, leader_speed, gap) for speed, (leader, leader_speed, gap, *_) in speeds]
+        return [(leader, FollowingState(speed, *state[:2])) for speed, (leader, *state) in speeds]
 
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
         if not self.scenario.safety.active:
             return super()._following_states(names)
         states = list[FollowingState]()
-        for name, (leader, *state) in zip(names, self._tracked_leaders(names), strict=True):
+        for name, (leader, state) in zip(names, self._tracked_leaders(names), strict=True):
             if not leader:  # at high speed, the filter needs a longer range than the drivers' sensors have
-                state[1:] = self._simulation.neighbors(name, SAFETY_FILTER_RANGE)[1:3]
-            states.append(FollowingState(*state))
+                state = FollowingState(state.speed, *self._simulation.neighbors(name, SAFETY_FILTER_RANGE)[1:3])
+            states.append(state)
         return states
 
     def _neighbors(self, name: str) -> NeighborStates:

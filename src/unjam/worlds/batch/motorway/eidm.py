@@ -9,7 +9,9 @@ Sources: SUMO's MSCFModel_EIDM (`_v`, `finalizeSpeed`, `slowToStartTerm`); Salle
 from math import exp, sqrt
 from typing import NamedTuple
 
-from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, square_root
+import numpy as np
+
+from unjam.physics.arrays import Array, clamp_max, clamp_min, square_root
 from unjam.physics.idm import IDMArrays, desired_gap
 
 EIDM_SUBSTEPS = 2
@@ -51,8 +53,8 @@ class DriverErrors(NamedTuple):
             exp(-step / time) * value + sqrt(2.0 * step / time) * strength * normal
             for value, (time, strength), normal in zip(self, processes, noise, strict=True)
         )
-        where, is_fast = namespace(speed).where, speed > LOW_SPEED_THRESHOLD
-        return DriverErrors(*(where(is_fast, new, old) for new, old in zip(changed, self, strict=True)))
+        is_fast = speed > LOW_SPEED_THRESHOLD
+        return DriverErrors(*(np.where(is_fast, new, old) for new, old in zip(changed, self, strict=True)))
 
 
 class LeaderMotion(NamedTuple):
@@ -65,34 +67,34 @@ class LeaderMotion(NamedTuple):
         self, uncooled: Array, speed: Array, leader_speed: Array, gap: Array, wanted_gap: Array, parameters: IDMArrays
     ) -> Array:
         """Return accelerations with less braking where a leader with constant acceleration does not require it."""
-        xp, braking = namespace(speed), parameters.comfortable_deceleration
-        leader = xp.minimum(self.acceleration, parameters.max_acceleration)
-        leader = xp.where(gap > 1.5 * wanted_gap, leader * 1.5 * wanted_gap / gap, leader)
-        leader = xp.where(leader_speed >= LEADER_STANDING_SPEED, leader, EIDM_EPSILON)
+        braking = parameters.comfortable_deceleration
+        leader = np.minimum(self.acceleration, parameters.max_acceleration)
+        leader = np.where(gap > 1.5 * wanted_gap, leader * 1.5 * wanted_gap / gap, leader)
+        leader = np.where(leader_speed >= LEADER_STANDING_SPEED, leader, EIDM_EPSILON)
         leader_speed = clamp_min(leader_speed, LEADER_STANDING_SPEED)
         closing_speed = speed - leader_speed
         divisor = leader_speed * leader_speed - 2.0 * gap * leader
         both_stop = leader_speed * closing_speed <= -2.0 * gap * leader
-        stopping = speed * speed * leader / xp.where(both_stop, divisor, 1.0)
-        required = xp.where(both_stop, stopping, leader - clamp_min(closing_speed, 0.0) ** 2 / (2.0 * gap))
-        smooth = required + braking * xp.tanh((uncooled - required) / braking)
+        stopping = speed * speed * leader / np.where(both_stop, divisor, 1.0)
+        required = np.where(both_stop, stopping, leader - clamp_min(closing_speed, 0.0) ** 2 / (2.0 * gap))
+        smooth = required + braking * np.tanh((uncooled - required) / braking)
         cooled = (1.0 - COOLNESS) * uncooled + COOLNESS * smooth
-        return xp.where(self.may_stay_cool & (uncooled < required), cooled, uncooled)
+        return np.where(self.may_stay_cool & (uncooled < required), cooled, uncooled)
 
 
 def eidm_acceleration(speed: Array, gap_ratio: Array, parameters: IDMArrays) -> Array:
     """Return the acceleration of the improved IDM [m/s2]; `gap_ratio` is the desired gap over the actual one."""
-    xp, highest, braking = namespace(speed), parameters.max_acceleration, parameters.comfortable_deceleration
+    highest, braking = parameters.max_acceleration, parameters.comfortable_deceleration
     speed_ratio = speed / parameters.desired_speed
     square = clamp_max(speed_ratio, 1.0) ** 2
     free = highest * (1.0 - square * square)
     near = highest * (1.0 - gap_ratio * gap_ratio)
-    far = free * (1.0 - xp.exp(xp.log(clamp_max(gap_ratio, 1.0)) * (2.0 * highest / clamp_min(free, 1e-6))))
+    far = free * (1.0 - np.exp(np.log(clamp_max(gap_ratio, 1.0)) * (2.0 * highest / clamp_min(free, 1e-6))))
     is_near, is_too_fast = gap_ratio >= 1.0, speed_ratio > 1.0
-    acceleration = xp.where(is_near, near, far)
+    acceleration = np.where(is_near, near, far)
     if bool(is_too_fast.any()):
-        slowing = -braking * (1.0 - xp.exp(-xp.log(clamp_min(speed_ratio, 1.0)) * (4.0 * highest / braking)))
-        acceleration = xp.where(is_too_fast, xp.where(is_near, slowing + near, slowing), acceleration)
+        slowing = -braking * (1.0 - np.exp(-np.log(clamp_min(speed_ratio, 1.0)) * (4.0 * highest / braking)))
+        acceleration = np.where(is_too_fast, np.where(is_near, slowing + near, slowing), acceleration)
     return acceleration
 
 
@@ -114,9 +116,9 @@ def eidm_follow_speed(
     leader_motion: LeaderMotion | None = None,
 ) -> DesiredSpeed:
     """Return the desired speeds after a step at bumper-to-bumper gaps behind leaders."""
-    xp, minimum_gap, remaining = namespace(speed), parameters.minimum_gap, eidm_effective_gap(gap, parameters)
+    minimum_gap, remaining = parameters.minimum_gap, eidm_effective_gap(gap, parameters)
     new, substep = speed, step / EIDM_SUBSTEPS
-    gap_factor = xp.exp(GAP_ERROR_STRENGTH * errors.gap)
+    gap_factor = np.exp(GAP_ERROR_STRENGTH * errors.gap)
     speed_error = LEADER_SPEED_ERROR_STRENGTH * errors.leader_speed
     uncooled = 0.0 * speed
     for _ in range(EIDM_SUBSTEPS):
@@ -124,7 +126,7 @@ def eidm_follow_speed(
         wanted_gap = desired_gap(new, new - seen_speed, parameters) + EIDM_SLACK
         stop_gap = seen_gap * square_root(1.0 + 2.0 * EIDM_SLACK / parameters.max_acceleration)
         stops = (seen_gap < minimum_gap + (10.0 * step + 1.0) * EIDM_SLACK) & (new < LOW_SPEED_THRESHOLD)
-        wanted_gap = xp.where(stops, xp.maximum(wanted_gap, stop_gap), wanted_gap)
+        wanted_gap = np.where(stops, np.maximum(wanted_gap, stop_gap), wanted_gap)
         acceleration = uncooled = eidm_acceleration(new, wanted_gap / seen_gap, parameters)
         if leader_motion is not None:
             acceleration = leader_motion.cooled(acceleration, new, seen_speed, seen_gap, wanted_gap, parameters)
@@ -141,20 +143,20 @@ def eidm_effective_gap(gap: Array, parameters: IDMArrays) -> Array:
 
 def eidm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, errors: DriverErrors, step: float) -> Array:
     """Return the desired speeds after a step of drivers that must stop within a distance."""
-    xp, highest = namespace(speed), parameters.max_acceleration
+    highest = parameters.max_acceleration
     minimum_gap = EIDM_SLACK + 0.2 * clamp_min(highest, 0.25)
     own = parameters._replace(minimum_gap=minimum_gap)
     start = remaining = clamp_min(distance + minimum_gap, EIDM_EPSILON)
     new, substep = speed, step / EIDM_SUBSTEPS
     for number in range(EIDM_SUBSTEPS):
-        seen_gap = remaining * xp.exp(GAP_ERROR_STRENGTH * errors.gap * clamp_max(new / LOW_SPEED_THRESHOLD, 1.0))
+        seen_gap = remaining * np.exp(GAP_ERROR_STRENGTH * errors.gap * clamp_max(new / LOW_SPEED_THRESHOLD, 1.0))
         wanted_gap = desired_gap(new, new, own) + EIDM_SLACK
         stop_gap = seen_gap * square_root(1.0 + EIDM_SLACK / highest)
-        wanted_gap = xp.where(seen_gap < minimum_gap + 2.0 * EIDM_SLACK, xp.maximum(wanted_gap, stop_gap), wanted_gap)
+        wanted_gap = np.where(seen_gap < minimum_gap + 2.0 * EIDM_SLACK, np.maximum(wanted_gap, stop_gap), wanted_gap)
         new = clamp_min(new + eidm_acceleration(new, wanted_gap / seen_gap, parameters) * substep, 0.0)
         remaining = clamp_min(remaining - new * substep, EIDM_EPSILON)
         mean_speed = clamp_min((start - remaining) / step * EIDM_SUBSTEPS / (number + 1.0), 0.0)
-        new = xp.where(new < LOW_SPEED_THRESHOLD * step, mean_speed, new)
+        new = np.where(new < LOW_SPEED_THRESHOLD * step, mean_speed, new)
     return new
 
 
@@ -168,16 +170,16 @@ def eidm_speed_bounds(
     step: float,
 ) -> tuple[Array, Array, Array]:
     """Return minimum, desired and maximum speeds after a step, the desired ones with driving errors."""
-    xp, max_acceleration = namespace(speed), parameters.max_acceleration
+    max_acceleration = parameters.max_acceleration
     emergency = clamp_min(speed - EIDM_EMERGENCY_BRAKING * step, 0.0)
     comfortable = clamp_min(speed - parameters.comfortable_deceleration * step, 0.0)
-    lowest = xp.minimum(comfortable, xp.maximum(safe_speed, emergency))
-    highest = xp.maximum(lowest, xp.minimum(speed + max_acceleration * step, safe_speed))
+    lowest = np.minimum(comfortable, np.maximum(safe_speed, emergency))
+    highest = np.maximum(lowest, np.minimum(speed + max_acceleration * step, safe_speed))
     critical = (desired_gap(speed, speed - leader_speed, parameters) + EIDM_SLACK) / effective_gap - 0.5
     critical = clamp_max(clamp_min(critical, -0.4), 0.0)
-    strength = xp.minimum(max_acceleration, clamp_min(highest - 0.5 * max_acceleration, 0.0))
+    strength = np.minimum(max_acceleration, clamp_min(highest - 0.5 * max_acceleration, 0.0))
     strength = strength * (2.75**2 * critical * critical + 1.0)
-    return lowest, xp.maximum(lowest, highest + step * DRIVING_ERROR_STRENGTH * errors.driving * strength), highest
+    return lowest, np.maximum(lowest, highest + step * DRIVING_ERROR_STRENGTH * errors.driving * strength), highest
 
 
 def finalize_eidm_speed(
@@ -194,24 +196,24 @@ def finalize_eidm_speed(
 
     `acceleration` is that of the previous step; the step ends at `end_time`; speeds are those of `eidm_speed_bounds`.
     """
-    xp, is_rolling = namespace(speed), speed > 2.0 * CLUTCH_ENGAGE_SPEED
+    is_rolling = speed > 2.0 * CLUTCH_ENGAGE_SPEED
     change, previous_change = desired - speed, acceleration * step
     jerk = MAX_JERK * step * step
-    faster = xp.where(MAX_JERK * step + acceleration < 0.0, 2.0 * jerk, jerk)
-    faster = xp.minimum(change, previous_change + faster)
-    slower = xp.minimum(highest - speed, xp.maximum(change, previous_change - jerk))
+    faster = np.where(MAX_JERK * step + acceleration < 0.0, 2.0 * jerk, jerk)
+    faster = np.minimum(change, previous_change + faster)
+    slower = np.minimum(highest - speed, np.maximum(change, previous_change - jerk))
     up = (change > 0.0) & is_rolling & (start_time + START_UP_DURATION + EIDM_EPSILON < end_time)
     down = (change <= 0.0) & is_rolling & (desired < highest - EIDM_EPSILON)
-    change = xp.where(up, faster, xp.where(down, slower, change))
-    change = xp.maximum(change, -speed)
+    change = np.where(up, faster, np.where(down, slower, change))
+    change = np.maximum(change, -speed)
     accelerates = change > 0.0
     may_start = accelerates & (speed < CLUTCH_ENGAGE_SPEED) & (acceleration < clamp_max(max_acceleration / 4.0, 0.2))
     part, total = change / EIDM_SUBSTEPS, 0.0 * change
     for number in range(EIDM_SUBSTEPS):
         time = end_time - step * (EIDM_SUBSTEPS - number - 1.0) / EIDM_SUBSTEPS
         starts = may_start & (start_time + MIN_START_UP_INTERVAL - EIDM_EPSILON < time)
-        start_time = xp.where(starts, time, start_time)
+        start_time = np.where(starts, time, start_time)
         elapsed = time - start_time
-        profile = (xp.tanh((elapsed * 2.0 / START_UP_DURATION - START_UP_SHIFT) * START_UP_SHAPE) + 1.0) / 2.0
-        total = total + part * xp.where(elapsed < START_UP_DURATION + EIDM_EPSILON, profile, 1.0)
-    return speed + xp.where(accelerates, total, change), start_time
+        profile = (np.tanh((elapsed * 2.0 / START_UP_DURATION - START_UP_SHIFT) * START_UP_SHAPE) + 1.0) / 2.0
+        total = total + part * np.where(elapsed < START_UP_DURATION + EIDM_EPSILON, profile, 1.0)
+    return speed + np.where(accelerates, total, change), start_time

@@ -10,7 +10,9 @@ Sources: SUMO's MSLaneChanger (`getRealLeader`, `getRealFollower`, `checkChange`
 
 from typing import NamedTuple
 
-from unjam.physics.arrays import Array, clamp_min, namespace, scatter_minimum
+import numpy as np
+
+from unjam.physics.arrays import Array, clamp_min
 from unjam.scenarios.motorway_road import MotorwayGeometry, MotorwaySections
 from unjam.worlds.batch.motorway.vehicles import (
     ADVICE_FIELDS,
@@ -18,7 +20,6 @@ from unjam.worlds.batch.motorway.vehicles import (
     NO_VEHICLE,
     MotorwayDrivers,
     MotorwayVehicles,
-    copy_array,
     find_neighbors,
     find_road_neighbors,
     neighbors_on_lane,
@@ -84,27 +85,27 @@ class LaneChangeContext(NamedTuple):
 
 def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: float) -> LaneChangeContext:
     """Return what each vehicle looks at, in a simulation with a `step` [s]."""
-    xp, lane, position, speed = namespace(vehicles.speed), vehicles.lane, vehicles.position, vehicles.speed
+    lane, position, speed = vehicles.lane, vehicles.position, vehicles.speed
     sections = geometry.sections(lane, position)
     is_merging = sections.is_merging
-    target_lane = xp.where((lane == 0) & is_merging, 1, NO_VEHICLE)
+    target_lane = np.where((lane == 0) & is_merging, 1, NO_VEHICLE)
     if geometry.lane_count > 1:
-        target_lane = xp.where(lane == 1, 2, xp.where(lane == 2, 1, target_lane))
+        target_lane = np.where(lane == 1, 2, np.where(lane == 2, 1, target_lane))
     neighbors = find_road_neighbors(vehicles, geometry)
     drivers, length = vehicles.drivers, geometry.vehicle_length
-    section_end = xp.where(is_merging, sections.merge_end, geometry.length)
-    section_end = xp.where(sections.is_before, sections.merge_start, section_end)
+    section_end = np.where(is_merging, sections.merge_end, geometry.length)
+    section_end = np.where(sections.is_before, sections.merge_start, section_end)
     sees_past_end = drivers.brake_gap(speed, step) + vehicles.minimum_gap >= section_end - position
 
     def neighbor_ahead(row: Array) -> Neighbor:
         is_visible = sees_past_end | (sections.start[row] == sections.start) | (position[row] - length < section_end)
         is_present = (row >= 0) & is_visible
-        gap = xp.where(is_present, position[row] - length - position - vehicles.minimum_gap, NO_NEIGHBOR_GAP)
+        gap = np.where(is_present, position[row] - length - position - vehicles.minimum_gap, NO_NEIGHBOR_GAP)
         return Neighbor(row, is_present, speed[row], gap)
 
     leader, ahead = (neighbor_ahead(neighbors_on_lane(neighbors.leaders, each)) for each in (lane, target_lane))
     row = neighbors_on_lane(neighbors.followers, target_lane)
-    gap = xp.where(row >= 0, position - length - position[row] - vehicles.minimum_gap[row], NO_NEIGHBOR_GAP)
+    gap = np.where(row >= 0, position - length - position[row] - vehicles.minimum_gap[row], NO_NEIGHBOR_GAP)
     behind, followers = Neighbor(row, row >= 0, speed[row], gap), drivers.select(row)
     by_leader = ahead.is_present & (ahead.gap < clamp_min(drivers.secure_gap(speed, ahead.speed), 0.0))
     by_follower = behind.is_present & (behind.gap < clamp_min(followers.secure_gap(behind.speed, speed), 0.0))
@@ -114,9 +115,9 @@ def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, 
 
 def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: float) -> MotorwayVehicles:
     """Return the vehicles after their lane changes, with advice for the next step."""
-    xp, speed, previous = namespace(vehicles.speed), vehicles.speed, vehicles.look_ahead_speed
+    speed, previous = vehicles.speed, vehicles.look_ahead_speed
     retention = 1.0 - (1.0 - LOOK_AHEAD_RETENTION) * step
-    look_ahead_speed = xp.where(speed > previous, speed, retention * previous + (1.0 - retention) * speed)
+    look_ahead_speed = np.where(speed > previous, speed, retention * previous + (1.0 - retention) * speed)
     advice = dict.fromkeys(ADVICE_FIELDS, speed * 0.0 + NO_ADVICE)
     vehicles = vehicles._replace(**advice, speed_bias=speed * 0.0, look_ahead_speed=look_ahead_speed)
     context = lane_change_context(vehicles, geometry, step)
@@ -126,7 +127,7 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     vehicles, wants_change = _speed_gain_changes(vehicles, context, geometry, ~is_urgent & has_target)
     helps = is_asked & (vehicles.lane > 0) & (context.target_lane > vehicles.lane)
     changes = (is_urgent | wants_change | helps) & is_clear
-    bias = xp.where(helps & ~is_clear, xp.where(context.is_leader_blocking, -1.0, 1.0), vehicles.speed_bias)
+    bias = np.where(helps & ~is_clear, np.where(context.is_leader_blocking, -1.0, 1.0), vehicles.speed_bias)
     vehicles = vehicles._replace(speed_bias=bias)
     changes = changes & ~_has_change_conflict(vehicles, changes, geometry)
     initial = dict.fromkeys(("speed_gain", "keep_right", "look_ahead_speed", "speed_bias"), 0.0)
@@ -135,40 +136,44 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
         name: (0.0 * getattr(vehicles, name) + value, getattr(vehicles, name)) for name, value in initial.items()
     }
     columns["lane"] = context.target_lane, vehicles.lane
-    return vehicles._replace(**{name: xp.where(changes, *values) for name, values in columns.items()})
+    return vehicles._replace(**{name: np.where(changes, *values) for name, values in columns.items()})
 
 
 def mandatory_lane_changes(
     vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry
 ) -> tuple[MotorwayVehicles, Array, Array]:
     """Return the vehicles with advice, whether each must change now, and whether it is asked to make room."""
-    xp, position, step = namespace(vehicles.speed), vehicles.position, context.step
+    position, step = vehicles.position, context.step
     is_on_lane = (vehicles.lane == 0) & (context.target_lane != NO_VEHICLE)
     occupies = (vehicles.lane == 1) & (position >= geometry.origin)  # those ahead of vehicles that merge
-    lengths = xp.where(occupies, vehicles.minimum_gap + geometry.vehicle_length, 0.0 * position)
+    lengths = np.where(occupies, vehicles.minimum_gap + geometry.vehicle_length, 0.0 * position)
     total = lengths.cumsum(0)
-    first = xp.searchsorted(vehicles.road, vehicles.road)
-    occupied = total - xp.where(first > 0, total[first - 1], 0.0 * position)
+    first = np.searchsorted(vehicles.road, vehicles.road)
+    occupied = total - np.where(first > 0, total[first - 1], 0.0 * position)
     needed = vehicles.look_ahead_speed * (MERGE_LOOK_AHEAD_TIME * LEFT_LOOK_AHEAD_FACTOR)
     needed = needed + 2.0 * (vehicles.minimum_gap + geometry.vehicle_length)
     is_urgent = is_on_lane & (context.sections.merge_end - position - occupied < needed)
     is_asked = vehicles.speed < 0.0
-    rows = xp.arange(len(position))[is_urgent]
+    rows = np.arange(len(position))[is_urgent]
     if len(rows) == 0:
         return vehicles, is_urgent, is_asked
-    own, cooperative, bias = map(copy_array, (vehicles.own_advice, vehicles.cooperative_advice, vehicles.speed_bias))
+    own, cooperative, bias = (
+        vehicles.own_advice.copy(),
+        vehicles.cooperative_advice.copy(),
+        vehicles.speed_bias.copy(),
+    )
     merging = _MergingVehicles(vehicles, context, geometry, rows)
     leader, follower = merging.leader, merging.follower
     planned, own_advice, overtakes = merging.plan_with_leader()
     is_blocked = merging.is_leader_blocking & leader.is_present
     bias[leader.row[is_blocked]] = 1.0
     overtakes_leader = is_blocked & overtakes
-    scatter_minimum(cooperative, leader.row[overtakes_leader], 0.0 * merging.speed[overtakes_leader])
+    np.minimum.at(cooperative, leader.row[overtakes_leader], 0.0 * merging.speed[overtakes_leader])
     is_request, speeds, more_advice, asks_for_change = merging.request_from_follower(planned, ~overtakes_leader)
-    own[rows] = xp.minimum(own_advice, more_advice)
-    scatter_minimum(cooperative, follower.row[is_request], (speeds - follower.speed)[is_request] / step)
+    own[rows] = np.minimum(own_advice, more_advice)
+    np.minimum.at(cooperative, follower.row[is_request], (speeds - follower.speed)[is_request] / step)
     is_asked[follower.row[asks_for_change]] = True
-    stuck_rows = rows[merging.is_leader_blocking | merging.is_follower_blocking]
+    stuck_rows = rows[np.logical_or(merging.is_leader_blocking, merging.is_follower_blocking)]
     bias[stuck_rows] = 1.0
     vehicles = vehicles._replace(own_advice=own, cooperative_advice=cooperative, speed_bias=bias)
     return _yield_to_stuck(vehicles, context, geometry, stuck_rows), is_urgent, is_asked
@@ -196,31 +201,31 @@ class _MergingVehicles:
 
     def plan_with_leader(self) -> tuple[Array, Array, Array]:
         """Return planned speeds, advised accelerations [m/s2], and whether each vehicle overtakes its leader."""
-        xp, speed, step, leader = namespace(self.speed), self.speed, self._step, self.leader
-        planned = xp.minimum(speed, self._drivers.stop_speed(speed, self._remaining_distance, step))
+        speed, step, leader = self.speed, self._step, self.leader
+        planned = np.minimum(speed, self._drivers.stop_speed(speed, self._remaining_distance, step))
         leader_speed = leader.speed - step * clamp_min(-self._leader_acceleration, 1.0)
         gap = leader.gap + step * (leader_speed - planned)
         follow = self._drivers.follow_speed(speed, gap + self._minimum_gap, leader_speed, step)
-        follow = xp.maximum(clamp_min(speed - self._braking * step, 0.0), follow)
+        follow = np.maximum(clamp_min(speed - self._braking * step, 0.0), follow)
         way = leader.gap + 2.0 * self._vehicle_length + self._leader_drivers.parameters.minimum_gap
         way = clamp_min(way + self._leader_drivers.secure_gap(leader.speed, speed), 0.0)
         surplus = planned - leader.speed
-        duration = xp.where(surplus > 0.0, way / clamp_min(surplus, 1e-6), self._remaining_time + 1.0)
+        duration = np.where(surplus > 0.0, way / clamp_min(surplus, 1e-6), self._remaining_time + 1.0)
         has_room = self._remaining_distance - self._drivers.brake_gap(speed, step) >= way
         overtakes = (surplus >= 0.0) & (speed < UNCONGESTED_SPEED) & has_room & (duration <= self._remaining_time)
         braking = clamp_min((speed - follow) / self._remaining_time, MIN_FALL_BEHIND_BRAKING)
-        behind = xp.minimum(planned, clamp_min(speed - step * xp.minimum(self._braking, braking), 0.0))
+        behind = np.minimum(planned, clamp_min(speed - step * np.minimum(self._braking, braking), 0.0))
         is_blocked = self.is_leader_blocking & leader.is_present
         falls_behind = is_blocked & ~overtakes & (follow < speed)
-        advice = (xp.where(falls_behind, behind, follow) - speed) / step
-        advice = xp.where(leader.is_present & ~(is_blocked & overtakes), advice, NO_ADVICE)
+        advice = (np.where(falls_behind, behind, follow) - speed) / step
+        advice = np.where(leader.is_present & ~(is_blocked & overtakes), advice, NO_ADVICE)
         is_free = leader.is_present & ~self.is_leader_blocking
-        planned = xp.where(is_free, xp.minimum(follow, planned), planned)
-        return xp.where(falls_behind, behind, planned), advice, overtakes
+        planned = np.where(is_free, np.minimum(follow, planned), planned)
+        return np.where(falls_behind, behind, planned), advice, overtakes
 
     def request_from_follower(self, planned_speed: Array, may_request: Array) -> tuple[Array, Array, Array, Array]:
         """Return whether each follower is asked for a speed, the speed, own advice, and if it is asked to change."""
-        xp, speed, step, follower = namespace(self.speed), self.speed, self._step, self.follower
+        speed, step, follower = self.speed, self._step, self.follower
         may_ask, drivers, seconds = may_request & follower.is_present, self._follower_drivers, self._remaining_time
         braking, minimum_gap = drivers.parameters.comfortable_deceleration, drivers.parameters.minimum_gap
         slower, after_second = clamp_min(follower.speed - step * braking, 0.0), clamp_min(follower.speed - braking, 0.0)
@@ -231,7 +236,7 @@ class _MergingVehicles:
             gap = follower.gap + minimum_gap + step * slack
             return drivers.follow_speed(follower.speed, gap, planned_speed, step)
 
-        behind = follower_speed(planned_speed - xp.maximum(slower, follower_speed(planned_speed)))
+        behind = follower_speed(planned_speed - np.maximum(slower, follower_speed(planned_speed)))
         difference = planned_speed - follower.speed
         missing = drivers.secure_gap(follower.speed, planned_speed) - follower.gap
         opens_alone = (difference >= HELP_SPEED_DIFFERENCE) & (missing < difference * seconds)
@@ -239,19 +244,19 @@ class _MergingVehicles:
         is_in_time = (surplus > 0.0) & (surplus * seconds > needed - room + SUMO_POSITION_TOLERANCE)
         is_faster = follower.speed > speed
         passing = speed + HELP_SPEED_DIFFERENCE
-        passing = xp.where(is_faster, xp.maximum(slower, passing), xp.maximum(follower.speed, passing))
-        requested = xp.where(can_brake, xp.maximum(slower, behind), xp.where(is_in_time, slower, passing))
-        requested = xp.where(opens_alone, planned_speed - HELP_SPEED_DIFFERENCE, requested)
+        passing = np.where(is_faster, np.maximum(slower, passing), np.maximum(follower.speed, passing))
+        requested = np.where(can_brake, np.maximum(slower, behind), np.where(is_in_time, slower, passing))
+        requested = np.where(opens_alone, planned_speed - HELP_SPEED_DIFFERENCE, requested)
         is_passed = ~opens_alone & ~can_brake & ~is_in_time
         is_passed = is_passed & ~(is_faster & ((follower.speed - speed) / braking < seconds))
         way = follower.gap + 2.0 * self._vehicle_length + self._minimum_gap
         way = clamp_min(way + self._drivers.secure_gap(planned_speed, passing), 0.0)
-        own_speed = xp.maximum(passing - way / seconds, speed - step * self._braking)
+        own_speed = np.maximum(passing - way / seconds, speed - step * self._braking)
         is_blocked = may_ask & self.is_follower_blocking
-        own_advice = xp.where(is_blocked & is_passed, (own_speed - speed) / step, NO_ADVICE)
+        own_advice = np.where(is_blocked & is_passed, (own_speed - speed) / step, NO_ADVICE)
         keeps_gap = may_ask & ~self.is_follower_blocking & self.is_leader_blocking
         keeping = follower_speed(planned_speed - follower_speed(planned_speed))
-        return is_blocked | keeps_gap, xp.where(is_blocked, requested, keeping), own_advice, is_blocked
+        return is_blocked | keeps_gap, np.where(is_blocked, requested, keeping), own_advice, is_blocked
 
 
 def _yield_to_stuck(
@@ -260,12 +265,12 @@ def _yield_to_stuck(
     """Return the vehicles with advice to those that crawl next to the ramp's lane: each lets one stuck vehicle in."""
     if len(stuck_rows) == 0:
         return vehicles
-    xp, position, speed = namespace(vehicles.position), vehicles.position, vehicles.speed
+    position, speed = vehicles.position, vehicles.speed
     sections = context.sections
     crawls = (vehicles.lane == 1) & sections.is_merging & (speed < vehicles.braking)
     if not bool(crawls.any()):
         return vehicles
-    index = xp.searchsorted(stuck_rows, xp.arange(len(position))) - 1
+    index = np.searchsorted(stuck_rows, np.arange(len(position))) - 1
     stuck = stuck_rows[clamp_min(index, 0)]
     gap = position[stuck] - geometry.vehicle_length - position - vehicles.minimum_gap
     yields = crawls & (index >= 0) & (vehicles.road[stuck] == vehicles.road) & (gap > SUMO_POSITION_TOLERANCE)
@@ -281,38 +286,38 @@ def _speed_gain_changes(
     vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry, may_change: Array
 ) -> tuple[MotorwayVehicles, Array]:
     """Return the vehicles with their gains, and whether each wants to change for its gain or to keep right."""
-    xp, speed, step = namespace(vehicles.speed), vehicles.speed, context.step
+    speed, step = vehicles.speed, context.step
     ahead, leader, drivers, speed_limit = context.target_leader, context.leader, context.drivers, geometry.speed_limit
     is_left = context.target_lane > vehicles.lane
 
     def allowed_speed(limit: Array, rows: Array) -> Array:
-        return xp.minimum(limit * vehicles.speed_factor[rows], vehicles.speed_cap[rows])
+        return np.minimum(limit * vehicles.speed_factor[rows], vehicles.speed_cap[rows])
 
     every, sections = slice(None), context.sections
     target_speed = allowed_speed(speed_limit, every)
     own_speed = allowed_speed(geometry.speed_limits(vehicles.lane, sections), every)
     remaining = geometry.length - sections.start
-    own_remaining = xp.where(vehicles.lane == 0, sections.merge_end - sections.merge_start, remaining)
+    own_remaining = np.where(vehicles.lane == 0, sections.merge_end - sections.merge_start, remaining)
     gain, keep, is_fast = vehicles.speed_gain, vehicles.keep_right, speed >= UNCONGESTED_SPEED
     # Vehicles do not pass on the right: behind a slower vehicle on the left lane, they slow down or change to the left.
-    difference = xp.maximum(own_speed - allowed_speed(speed_limit, ahead.row), speed - ahead.speed)
+    difference = np.maximum(own_speed - allowed_speed(speed_limit, ahead.row), speed - ahead.speed)
     is_held_back = may_change & is_left & ahead.is_present & is_fast & (difference > 0.0)
     max_speed, must_brake_soon, advice = own_speed, speed < 0.0, vehicles.adjacent_advice
     if bool(is_held_back.any()):
         safe, brakes_soon = _speed_behind_left_leader(vehicles, context, is_held_back, difference[is_held_back])
-        advice, max_speed = copy_array(advice), copy_array(own_speed)
-        advice[is_held_back] = xp.minimum(advice[is_held_back], (safe - speed[is_held_back]) / step)
+        advice, max_speed = advice.copy(), own_speed.copy()
+        advice[is_held_back] = np.minimum(advice[is_held_back], (safe - speed[is_held_back]) / step)
         must_brake_soon[is_held_back] = brakes_soon
-        max_speed[is_held_back] = xp.minimum(own_speed[is_held_back], safe)
+        max_speed[is_held_back] = np.minimum(own_speed[is_held_back], safe)
         relative = step * difference / clamp_min(own_speed, MIN_REFERENCE_SPEED)
-        gain = gain + xp.where(must_brake_soon, relative, 0.0 * gain)
+        gain = gain + np.where(must_brake_soon, relative, 0.0 * gain)
     # Anticipated speeds on both lanes.
     accelerates = ahead.is_present & (vehicles.acceleration[ahead.row] > 0.0)
     accelerates = accelerates | (leader.is_present & (vehicles.acceleration[leader.row] > 0.0))
 
     def anticipated_speed(neighbor: Neighbor, end_distance: Array) -> Array:
-        gap = xp.where(neighbor.is_present, neighbor.gap, end_distance)
-        leader_speed = xp.where(neighbor.is_present, neighbor.speed, 0.0 * speed)
+        gap = np.where(neighbor.is_present, neighbor.gap, end_distance)
+        leader_speed = np.where(neighbor.is_present, neighbor.speed, 0.0 * speed)
         anticipated = drivers.safe_speed(gap, leader_speed, vehicles.braking[neighbor.row], step)
         later = (speed + vehicles.max_acceleration * (1.0 - step))[accelerates]
         gap = (gap + vehicles.minimum_gap)[accelerates]
@@ -320,38 +325,38 @@ def _speed_gain_changes(
         anticipated[accelerates] = own_drivers.follow_speed(later, gap, leader_speed[accelerates], step)
         return anticipated
 
-    there = xp.minimum(target_speed, anticipated_speed(ahead, remaining))
+    there = np.minimum(target_speed, anticipated_speed(ahead, remaining))
     # At steady speeds, the safe speeds are compared, without the restriction against passing on the right.
-    here = xp.minimum(xp.where(accelerates, max_speed, own_speed), anticipated_speed(leader, own_remaining))
+    here = np.minimum(np.where(accelerates, max_speed, own_speed), anticipated_speed(leader, own_remaining))
     relative = (there - here) / clamp_min(there, MIN_REFERENCE_SPEED)
     continues = remaining / clamp_min(speed, 0.1) > MIN_REMAINING_TIME
     # To the right.
     right = may_change & (context.target_lane < vehicles.lane)
     is_slower = here - RIGHT_SPEED_TOLERANCE > there
-    decay = xp.where(right & is_slower & (gain < 0.0), 0.5**step, 1.0)
+    decay = np.where(right & is_slower & (gain < 0.0), 0.5**step, 1.0)
     is_suitable = right & ~is_slower
     is_counted = is_suitable & ((gain < 0.0) | (relative > 0.0))
-    gain = gain * decay - xp.where(is_counted, step * relative, 0.0 * gain)
+    gain = gain * decay - np.where(is_counted, step * relative, 0.0 * gain)
     accepted = KEEP_RIGHT_ACCEPTANCE_TIME * (own_speed / speed_limit) * clamp_min(speed, 1.0)
     distance = clamp_min(remaining - drivers.brake_gap(own_speed, step), 0.0)
-    seconds = xp.minimum(accepted, distance / own_speed)
+    seconds = np.minimum(accepted, distance / own_speed)
     closes_in = ahead.is_present & (ahead.speed < own_speed)
-    secure = clamp_min(xp.minimum(distance, ahead.gap - drivers.secure_gap(own_speed, ahead.speed)), 0.0)
-    closing_seconds = xp.minimum(seconds, secure / clamp_min(own_speed - ahead.speed, 1e-6))
-    seconds, distance = xp.where(closes_in, closing_seconds, seconds), xp.where(closes_in, secure, distance)
+    secure = clamp_min(np.minimum(distance, ahead.gap - drivers.secure_gap(own_speed, ahead.speed)), 0.0)
+    closing_seconds = np.minimum(seconds, secure / clamp_min(own_speed - ahead.speed, 1e-6))
+    seconds, distance = np.where(closes_in, closing_seconds, seconds), np.where(closes_in, secure, distance)
     is_behind = is_suitable & is_fast & leader.is_present & (allowed_speed(speed_limit, leader.row) < own_speed)
     surplus = own_speed - leader.speed
-    surplus = xp.where(surplus * surplus < 1e-12, 1e-6, surplus)
-    seconds = xp.where(is_behind, xp.minimum(seconds, xp.minimum(distance, leader.gap) / surplus), seconds)
+    surplus = np.where(surplus * surplus < 1e-12, 1e-6, surplus)
+    seconds = np.where(is_behind, np.minimum(seconds, np.minimum(distance, leader.gap) / surplus), seconds)
     obligation = step * RIGHT_GAIN_THRESHOLD * seconds / accepted / KEEP_RIGHT_TIME
-    keep = keep - xp.where(is_suitable, obligation, 0.0 * keep)
+    keep = keep - np.where(is_suitable, obligation, 0.0 * keep)
     keeps_right = is_suitable & (keep < -RIGHT_GAIN_THRESHOLD)
     wants_change = keeps_right | (right & (gain < -RIGHT_GAIN_THRESHOLD) & continues)
     # To the left.
     left = may_change & is_left
-    decay = xp.where(here > there, 0.5**step, 0.8**step)
-    gain = xp.where(left & (here >= there) & (gain > 0.0), gain * decay, gain)
-    gain = gain + xp.where(left & (here < there), step * relative, 0.0 * gain)
+    decay = np.where(here > there, 0.5**step, 0.8**step)
+    gain = np.where(left & (here >= there) & (gain > 0.0), gain * decay, gain)
+    gain = gain + np.where(left & (here < there), step * relative, 0.0 * gain)
     gains = (gain > LEFT_GAIN_THRESHOLD) & ((relative > 1e-3) | must_brake_soon) & continues
     merges = (vehicles.lane == 0) & (relative >= 0.0) & (gain > 0.0)
     vehicles = vehicles._replace(speed_gain=gain, keep_right=keep, adjacent_advice=advice)
@@ -362,24 +367,24 @@ def _speed_behind_left_leader(
     vehicles: MotorwayVehicles, context: LaneChangeContext, rows: Array, speed_difference: Array
 ) -> tuple[Array, Array]:
     """Return the speeds of vehicles that do not pass a slower one on the left, and whether each must brake soon."""
-    xp, speed, drivers, step = namespace(rows), vehicles.speed[rows], context.drivers.select(rows), context.step
+    speed, drivers, step = vehicles.speed[rows], context.drivers.select(rows), context.step
     leader_speed, gap = context.target_leader.speed[rows], (context.target_leader.gap + vehicles.minimum_gap)[rows]
     comfortable = clamp_min(speed - vehicles.braking[rows] * step, 0.0)
     safe = drivers.follow_speed(speed, gap, leader_speed, step)
-    limited = xp.maximum(comfortable, leader_speed - HELP_SPEED_DIFFERENCE)
-    safe = xp.where(safe >= comfortable, safe, limited)
-    safe = xp.where(vehicles.speed_gain[rows] < LEFT_GAIN_THRESHOLD, xp.maximum(safe, leader_speed), safe)
+    limited = np.maximum(comfortable, leader_speed - HELP_SPEED_DIFFERENCE)
+    safe = np.where(safe >= comfortable, safe, limited)
+    safe = np.where(vehicles.speed_gain[rows] < LEFT_GAIN_THRESHOLD, np.maximum(safe, leader_speed), safe)
     later = drivers.follow_speed(speed, gap - speed_difference * OVERTAKING_LOOK_AHEAD, leader_speed, step)
     return safe, later < safe
 
 
 def _has_change_conflict(vehicles: MotorwayVehicles, changes_lane: Array, geometry: MotorwayGeometry) -> Array:
     """Return which vehicles would change into a gap of the right lane into which a vehicle merges from the ramp."""
-    xp, position = namespace(vehicles.position), vehicles.position
+    position = vehicles.position
     merges = changes_lane & (vehicles.lane == 0)
     if not bool(merges.any()):
         return merges
-    neighbors = find_neighbors(vehicles._replace(lane=xp.where(merges, 1, vehicles.lane)), 2)
+    neighbors = find_neighbors(vehicles._replace(lane=np.where(merges, 1, vehicles.lane)), 2)
     ahead, behind = (neighbors_on_lane(each, 1 + 0 * vehicles.lane) for each in neighbors)
     min_distance = 2.0 * (geometry.vehicle_length + vehicles.minimum_gap)
     is_tight_ahead = (ahead >= 0) & merges[ahead] & (position[ahead] - position < min_distance)

@@ -9,12 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import FollowingState
 from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds import audit
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, MotorwayVehicles
-from unjam.worlds.record import SHARED_COLUMN_FRAMES, Episode, Trajectory, assign_columns, make_trajectory
+from unjam.worlds.record import (
+    SHARED_COLUMN_FRAMES,
+    Episode,
+    Trajectory,
+    assign_columns,
+    common_fields,
+    make_trajectory,
+)
 from unjam.worlds.world import DriverLog
 
 Integers = NDArray[np.intp]
@@ -45,7 +53,7 @@ class MotorwayLog:
         self._roads, self._scenario = roads, scenario
         self.end_steps = np.full(len(roads), NO_END_STEP)
         """control step after which vehicles touched on each road, or `NO_END_STEP`"""
-        self._placements, self._states = list[_Placements](), list[LocalState]()
+        self._placements, self.states = list[_Placements](), list[LocalState]()
         self.backlogs, self._cav_numbers = list[Integers](), list[Integers]()
         self._arrivals, self._braking = np.zeros(len(roads), np.intp), audit.BrakingLog(1.0)
         shape = len(roads), max(len(road.entries) for road in roads)
@@ -53,8 +61,8 @@ class MotorwayLog:
         self._step_count, self._steady_following = 0, list[Floats]()
         self._is_recovering = np.zeros(shape, bool)
         """whether each CAV recovers from a change of leader"""
-        self._following_pairs = np.zeros((len(audit.FollowingPair._fields), *shape))
-        """each CAV and its leader in the last step, with the fields of `FollowingPair`"""
+        self._following_pairs = np.zeros((len(FollowingState._fields), *shape))
+        """each CAV and its leader in the last step, with the fields of `FollowingState`"""
 
     def record_step(
         self, vehicles: MotorwayVehicles, leader_rows: Integers, arrived: MotorwayVehicles, cav_rows: Integers
@@ -74,15 +82,15 @@ class MotorwayLog:
         kind[cav_rows] = np.where(duration < audit.CUT_IN_SECONDS, audit.CAV_AFTER_CUT_IN, audit.CAV_DRIVER)
         is_steady = (leader >= 0) & (duration > audit.STEADY_FOLLOWING_SECONDS) & is_running[own[0]]
         gap = vehicles.position[leader] - self._roads[0].geometry.vehicle_length - vehicles.position[cav_rows]
-        pair = audit.FollowingPair(vehicles.speed[cav_rows], vehicles.speed[leader], gap)
-        previous = audit.FollowingPair(*self._following_pairs[:, *own])
+        pair = FollowingState(vehicles.speed[cav_rows], vehicles.speed[leader], gap)
+        previous = FollowingState(*self._following_pairs[:, *own])
         recovers = audit.is_recovering(self._is_recovering[own], duration, previous, pair) & (leader >= 0)
         self._is_recovering[own], self._following_pairs[:, *own] = recovers, pair
         columns = own[0], *pair, recovers
         self._steady_following.append(np.stack([each[is_steady].astype(np.float64) for each in columns]))
         counted = is_running[road]
         driver = (road * len(_DRIVER_KINDS) + kind)[counted].astype(np.uint16)
-        self._braking.add(vehicles.acceleration[counted].astype(np.float64), driver)
+        self._braking.add(vehicles.acceleration[counted], driver)
 
     def record_control_step(
         self, vehicles: MotorwayVehicles, gaps: Floats, backlog: Integers, cav_numbers: Integers, states: LocalState
@@ -92,7 +100,7 @@ class MotorwayLog:
         self._placements.append(_Placements(step_index, *vehicles[:5], gaps))
         self.backlogs.append(backlog)
         self._cav_numbers.append(cav_numbers)
-        self._states.append(states)
+        self.states.append(states)
 
     def make_episodes(self, driver_log: DriverLog, seeds: Sequence[Sequence[int]]) -> tuple[Episode, ...]:
         """Return the record of each road."""
@@ -107,8 +115,10 @@ class MotorwayLog:
             rows = order[start:end]
             rows = rows[every.step_index[rows] <= self.end_steps[number]]
             placements = _Placements(*(values[rows] for values in every))  # pyright: ignore[reportCallIssue, reportArgumentType]
-            own_steady, seed = steady[1:, steady[0] == number], tuple(seeds[number])
-            episodes.append(self._make_episode(number, seed, placements, trips[number], backlogs[number], own_steady))
+            own_steady = steady[1:, steady[0] == number]
+            episodes.append(
+                self._make_episode(number, seeds[number], placements, trips[number], backlogs[number], own_steady)
+            )
         return tuple(episodes)
 
     def _trips(self, driver_log: DriverLog) -> list[list[Trajectory]]:
@@ -119,7 +129,7 @@ class MotorwayLog:
         numbers = np.concatenate(self._cav_numbers)
         order = np.argsort(numbers, kind="stable")
         groups = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1) if len(order) else []
-        first, *others = self._states
+        first, *others = self.states
         states = first.map(lambda *values: np.concatenate(values), *others)
         trips: list[list[Trajectory]] = [[] for _ in self._roads]
         for entry_number, rows in enumerate(sorted(groups, key=lambda group: group[0])):
@@ -139,13 +149,13 @@ class MotorwayLog:
     def _make_episode(
         self,
         road_index: int,
-        seed: tuple[int, ...],
+        seed: Sequence[int],
         placements: _Placements,
         trips: list[Trajectory],
         backlog: Floats,
         steady_following: Floats,
     ) -> Episode:
-        road, steps, control_step = self._roads[road_index], placements.step_index, self._scenario.control_step
+        road, steps = self._roads[road_index], placements.step_index
         geometry = road.geometry
         moments = min(len(backlog), int(self.end_steps[road_index]) + 1)
         has_crashed = self.end_steps[road_index] < len(backlog)
@@ -167,11 +177,8 @@ class MotorwayLog:
             return table
 
         return Episode(
-            seed=seed,
-            status="collision" if has_crashed else "completed",
+            **common_fields(self._scenario, road, seed, bool(has_crashed)),
             collisions=2 * int(has_crashed),
-            control_step=control_step,
-            limit_speed=road.limit_speed,
             vehicle_ids=tuple(each.name for each in entries),
             cav_ids=tuple(cav_ids),
             vehicle_columns=tuple(columns.tolist()),
@@ -183,7 +190,7 @@ class MotorwayLog:
             lane_names=geometry.lane_names[::-1],
             arrivals=int(self._arrivals[road_index]),
             backlog=backlog[:moments],
-            planned_duration=self._scenario.horizon * control_step,
+            planned_duration=self._scenario.horizon * self._scenario.control_step,
             demand_peak=road.peak,
             free_flow_time=road.free_flow_time,
             trajectories=tuple(trips),

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from unjam.physics.arrays import Array, clamp_min, namespace
+from unjam.physics.arrays import Array, clamp_min
 from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayRoad
 from unjam.scenarios.road import VehicleType
 from unjam.scenarios.scenario import CruiseControl
@@ -20,12 +20,11 @@ from unjam.worlds.batch.motorway.vehicles import (
     NO_ADVICE,
     LaneNeighbors,
     MotorwayVehicles,
-    copy_array,
     find_road_neighbors,
     neighbors_on_lane,
     sort_vehicles,
 )
-from unjam.worlds.batch.noise import ArrayFactory, DrawNormal
+from unjam.worlds.batch.noise import DrawNormal
 
 LONG_BEFORE_START = -1000.0
 """long before an episode starts [s]"""
@@ -51,8 +50,8 @@ class InsertionQueue:
     Origins are the ramps from upstream to downstream, and then the lanes of the main road from right to left.
     """
 
-    def __init__(self, roads: Sequence[MotorwayRoad], to_array: ArrayFactory) -> None:
-        self._roads, self._to_array, self._geometry = roads, to_array, roads[0].geometry
+    def __init__(self, roads: Sequence[MotorwayRoad]) -> None:
+        self._roads, self._geometry = roads, roads[0].geometry
         ramp_of_route = {name: number - 1 for number, name in enumerate(self._geometry.route_names)}
         self._ramp_count = len(self._geometry.ramps)
         shape = self._ramp_count + self._geometry.lane_count, len(roads)
@@ -83,7 +82,7 @@ class InsertionQueue:
         if not is_due.any():
             return vehicles
         new, last, geometry = list[tuple[float, ...]](), np.full(is_due.shape, -1), self._geometry
-        road, lane, position, speed = (np.asarray(each) for each in vehicles[:1] + vehicles[2:5])
+        road, _, lane, position, speed = vehicles[:5]
         sections = geometry.sections(lane, position)
         is_on_first_edge = sections.is_before & ((lane == 0) | (sections.ramp == 0))
         upstream = np.flatnonzero(is_on_first_edge)
@@ -109,10 +108,8 @@ class InsertionQueue:
             self._next[number, index] += 1
         if not new:
             return vehicles
-        xp = namespace(vehicles.speed)
         entered = make_vehicles(*map(np.array, zip(*new, strict=True)))
-        converted = entered.map(lambda new, old: xp.asarray(self._to_array(new * 1.0), dtype=old.dtype), vehicles)
-        return sort_vehicles(vehicles.map(lambda old, new: xp.concatenate([old, new]), converted))
+        return sort_vehicles(vehicles.map(lambda old, new: np.concatenate([old, new.astype(old.dtype)]), entered))
 
 
 def driver_columns(vehicle_type: VehicleType) -> tuple[float, ...]:
@@ -147,20 +144,17 @@ class BatchMotorways:
         roads: Sequence[MotorwayRoad],
         step: float,
         draw: DrawNormal,
-        to_array: ArrayFactory,
         correction: LearnedCorrection | None = None,
         steps_per_control_step: int = 1,
     ) -> None:
         """Take empty roads; `correction` is that of a control step."""
         self._correction, self._steps_per_control_step = correction, steps_per_control_step
         self.geometry = roads[0].geometry
-        empty = to_array(np.zeros(0))
-        integers = namespace(empty).zeros(0, dtype=namespace(empty).int64)
-        columns = dict.fromkeys(MotorwayVehicles._fields, empty) | {"is_eidm": empty > 0.0}
-        columns |= dict.fromkeys(("road", "entry", "lane"), integers)
+        columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(0)) | {"is_eidm": np.zeros(0, bool)}
+        columns |= dict.fromkeys(("road", "entry", "lane"), np.zeros(0, np.int64))
         self.vehicles, self.time = MotorwayVehicles(**columns), 0.0
         self._cached_neighbors: tuple[Array, LaneNeighbors] | None = None
-        self.insertion_queue = InsertionQueue(roads, to_array)
+        self.insertion_queue = InsertionQueue(roads)
         self._step, self._draw = step, draw
 
     @property
@@ -184,7 +178,7 @@ class BatchMotorways:
 
     def _moved_vehicles(self) -> MotorwayVehicles:
         vehicles, geometry, step = self.vehicles, self.geometry, self._step
-        xp, speed, position = namespace(vehicles.speed), vehicles.speed, vehicles.position
+        speed, position = vehicles.speed, vehicles.position
         if not len(speed):
             return vehicles
         row = neighbors_on_lane(self.neighbors.leaders, vehicles.lane)
@@ -192,39 +186,39 @@ class BatchMotorways:
         is_on_ramp, is_on_lane = (vehicles.lane == 0) & sections.is_before, (vehicles.lane == 0) & ~sections.is_before
         limit, ramp_limit = (each * vehicles.speed_factor for each in (geometry.speed_limit, sections.ramp_speed_limit))
         allowed = geometry.speed_limits(vehicles.lane, sections) * vehicles.speed_factor
-        allowed = xp.minimum(allowed, vehicles.speed_cap)
+        allowed = np.minimum(allowed, vehicles.speed_cap)
         adapted = vehicles.desired_speed + clamp_min(limit - ramp_limit, 0.0) * step / LIMIT_ADAPTATION_TIME
-        eidm_desired = xp.minimum(xp.where(is_on_ramp, ramp_limit, limit), adapted)
-        vehicles = vehicles._replace(desired_speed=xp.where(vehicles.is_eidm, eidm_desired, allowed))
+        eidm_desired = np.minimum(np.where(is_on_ramp, ramp_limit, limit), adapted)
+        vehicles = vehicles._replace(desired_speed=np.where(vehicles.is_eidm, eidm_desired, allowed))
         drivers = vehicles.drivers
-        leader_speed, free_gap = xp.where(has_leader, speed[row], allowed), FREE_DRIVING_GAP + vehicles.minimum_gap
-        gap = xp.where(has_leader, position[row] - geometry.vehicle_length - position, free_gap)
+        leader_speed, free_gap = np.where(has_leader, speed[row], allowed), FREE_DRIVING_GAP + vehicles.minimum_gap
+        gap = np.where(has_leader, position[row] - geometry.vehicle_length - position, free_gap)
         is_started = vehicles.start_time + eidm.START_UP_DURATION + eidm.EIDM_EPSILON < self.time
         may_stay_cool = is_started & (speed > eidm.EIDM_HALTING_SPEED) & has_leader
-        motion = eidm.LeaderMotion(xp.where(has_leader, vehicles.acceleration[row], 0.0 * speed), may_stay_cool)
+        motion = eidm.LeaderMotion(np.where(has_leader, vehicles.acceleration[row], 0.0 * speed), may_stay_cool)
         follow, uncooled = drivers.desired_speed(speed, gap, leader_speed, step, motion)
-        next_allowed = xp.minimum(limit, vehicles.speed_cap)
+        next_allowed = np.minimum(limit, vehicles.speed_cap)
         # EIDMs desire the allowed speed, and drive a little faster or slower; IDMs never drive faster.
-        max_speed = xp.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
-        safe = xp.minimum(xp.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
+        max_speed = np.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
+        safe = np.minimum(np.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
         may_be_free = safe > speed - LEADER_BRAKING_THRESHOLD * step
         free = drivers.select(may_be_free).desired_speed(
             speed[may_be_free], free_gap[may_be_free], next_allowed[may_be_free], step
         )
         # Of the leader and the allowed speed, drivers obey the one that requires more braking without coolness.
-        is_free = copy_array(may_be_free)
+        is_free = may_be_free.copy()
         is_free[may_be_free] = free.uncooled_acceleration < uncooled[may_be_free] + eidm.EIDM_EPSILON
-        safe[may_be_free] = xp.where(is_free[may_be_free], xp.minimum(safe[may_be_free], free.speed), safe[may_be_free])
-        effective_gap = xp.where(is_free, FREE_DRIVING_GAP, eidm.eidm_effective_gap(gap, drivers.parameters))
-        leader_speed = xp.where(is_free, next_allowed, leader_speed)
+        safe[may_be_free] = np.where(is_free[may_be_free], np.minimum(safe[may_be_free], free.speed), safe[may_be_free])
+        effective_gap = np.where(is_free, FREE_DRIVING_GAP, eidm.eidm_effective_gap(gap, drivers.parameters))
+        leader_speed = np.where(is_free, next_allowed, leader_speed)
         if bool(is_on_lane.any()):
             remaining = clamp_min((sections.merge_end - position)[is_on_lane], 0.0)
             stop_speed = drivers.select(is_on_lane).stop_speed(speed[is_on_lane], remaining, step)
             must_stop = stop_speed < safe[is_on_lane]
-            safe[is_on_lane] = xp.minimum(safe[is_on_lane], stop_speed)
+            safe[is_on_lane] = np.minimum(safe[is_on_lane], stop_speed)
             stop_gap = remaining + 0.05 + 0.2 * vehicles.max_acceleration[is_on_lane]
-            effective_gap[is_on_lane] = xp.where(must_stop, stop_gap, effective_gap[is_on_lane])
-            leader_speed[is_on_lane] = xp.where(must_stop, 0.0, leader_speed[is_on_lane])
+            effective_gap[is_on_lane] = np.where(must_stop, stop_gap, effective_gap[is_on_lane])
+            leader_speed[is_on_lane] = np.where(must_stop, 0.0, leader_speed[is_on_lane])
         new, start_time = self._final_speeds(vehicles, safe, effective_gap, leader_speed)
         if self._correction is not None:
             new = self._corrected_speeds(new, row, self._correction)
@@ -250,19 +244,19 @@ class BatchMotorways:
     def _final_speeds(
         self, vehicles: MotorwayVehicles, safe_speed: Array, effective_gap: Array, leader_speed: Array
     ) -> tuple[Array, Array]:
-        step, speed, drivers, xp = self._step, vehicles.speed, vehicles.drivers, namespace(vehicles.speed)
+        step, speed, drivers = self._step, vehicles.speed, vehicles.drivers
         lowest, desired, highest = eidm.eidm_speed_bounds(
             speed, safe_speed, effective_gap, leader_speed, drivers.parameters, drivers.errors, step
         )
-        desired = xp.where(vehicles.is_eidm, desired, highest)
+        desired = np.where(vehicles.is_eidm, desired, highest)
         patched, is_advised = desired, speed < 0.0
         for advice in (vehicles.own_advice, vehicles.cooperative_advice, vehicles.adjacent_advice):
             advised = speed + advice * step
             is_possible = (advised >= lowest) & (advised <= highest)
-            patched = xp.where(is_possible, xp.minimum(advised, patched), patched)
+            patched = np.where(is_possible, np.minimum(advised, patched), patched)
             is_advised = is_advised | is_possible
-        room = xp.where(vehicles.speed_bias > 0.0, highest - desired, desired - lowest)
-        desired = xp.where(is_advised, patched, desired + 0.5 * room * vehicles.speed_bias)
+        room = np.where(vehicles.speed_bias > 0.0, highest - desired, desired - lowest)
+        desired = np.where(is_advised, patched, desired + 0.5 * room * vehicles.speed_bias)
         start_limits = vehicles.start_time, vehicles.max_acceleration, self.time + step, step
         eidm_speed, start_time = eidm.finalize_eidm_speed(speed, vehicles.acceleration, desired, highest, *start_limits)
-        return xp.where(vehicles.is_eidm, eidm_speed, desired), start_time
+        return np.where(vehicles.is_eidm, eidm_speed, desired), start_time

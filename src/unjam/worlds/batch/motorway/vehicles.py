@@ -7,7 +7,9 @@ never changed in place: functions return new ones.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, running_maximum, square_root
+import numpy as np
+
+from unjam.physics.arrays import Array, clamp_max, clamp_min, square_root
 from unjam.physics.idm import IDMArrays, desired_gap, fast_power, idm_acceleration
 from unjam.physics.kinematics import next_speed, stopping_distance
 from unjam.scenarios.motorway_road import MotorwayGeometry
@@ -83,7 +85,7 @@ class MotorwayVehicles(NamedTuple):
 
     def replace_rows(self, rows: Array, **values: Any) -> "MotorwayVehicles":
         """Return the vehicles with new values of some columns in some rows."""
-        columns = {name: copy_array(getattr(self, name)) for name in values}
+        columns = {name: getattr(self, name).copy() for name in values}
         for name, column in columns.items():
             column[rows] = values[name]
         return self._replace(**columns)
@@ -91,7 +93,7 @@ class MotorwayVehicles(NamedTuple):
     @property
     def drivers(self) -> "MotorwayDrivers":
         """The drivers of the vehicles."""
-        speed = namespace(self.speed).minimum(self.desired_speed, self.speed_cap)
+        speed = np.minimum(self.desired_speed, self.speed_cap)
         parameters = IDMArrays(speed, self.time_headway, self.max_acceleration, self.braking, 4.0, self.minimum_gap)
         errors = DriverErrors(self.gap_error, self.leader_error, self.driving_error)
         return MotorwayDrivers(parameters, errors, self.is_eidm)
@@ -121,7 +123,7 @@ class MotorwayDrivers(NamedTuple):
             speed, gap, leader_speed, self.parameters, self.errors, step, leader_motion
         )
         desired = self._eidm_or_idm(values, _idm_follow_speed, speed, gap, leader_speed, step=step)
-        return DesiredSpeed(desired, namespace(desired).where(self.is_eidm, urgency, (desired - speed) / step))
+        return DesiredSpeed(desired, np.where(self.is_eidm, urgency, (desired - speed) / step))
 
     def stop_speed(self, speed: Array, distance: Array, step: float) -> Array:
         """Return the desired speeds after a step of drivers that must stop within a distance."""
@@ -133,19 +135,19 @@ class MotorwayDrivers(NamedTuple):
         p = self.parameters
         gap = desired_gap(speed, speed - leader_speed, p) - p.minimum_gap
         divisor = square_root(p.comfortable_deceleration / p.max_acceleration + 1.0)
-        return gap / namespace(gap).where(self.is_eidm, divisor, 1.0)
+        return gap / np.where(self.is_eidm, divisor, 1.0)
 
     def safe_speed(self, gap: Array, leader_speed: Array, leader_braking: Array, step: float) -> Array:
         """Return the maximum speed from which drivers that brake a headway later stop behind leaders that brake.
 
         Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`), for all drivers; gaps are beyond the minimum gap.
         """
-        xp, braking = namespace(gap), self.parameters.comfortable_deceleration
+        braking = self.parameters.comfortable_deceleration
         change, delay = braking * step, self.parameters.time_headway / step
-        stop_distance = stopping_distance(leader_speed, xp.maximum(braking, leader_braking), step)
+        stop_distance = stopping_distance(leader_speed, np.maximum(braking, leader_braking), step)
         room = (clamp_min(gap, 0.0) + stop_distance) / step
         # n whole steps of braking from v = n b h + r require n b h ((n - 1) / 2 + delay) + (n + delay) r = room.
-        steps = xp.floor(0.5 - delay + square_root(0.25 + delay * (delay - 1.0) + 2.0 * room / change))
+        steps = np.floor(0.5 - delay + square_root(0.25 + delay * (delay - 1.0) + 2.0 * room / change))
         rest = room - change * steps * ((steps - 1.0) / 2.0 + delay)
         return change * steps + rest / (steps + delay)
 
@@ -187,11 +189,6 @@ class LaneNeighbors(NamedTuple):
     followers: Array
 
 
-def copy_array(values: Array) -> Array:
-    """Return a copy."""
-    return namespace(values).asarray(values, copy=True)
-
-
 def vehicle_numbers(vehicles: MotorwayVehicles) -> Array:
     """Return road and entry of each vehicle as one number."""
     return vehicles.road * NUMBERS_PER_ROAD + vehicles.entry
@@ -199,12 +196,12 @@ def vehicle_numbers(vehicles: MotorwayVehicles) -> Array:
 
 def find_rows(numbers: Array, vehicles: MotorwayVehicles) -> Array:
     """Return the rows of the vehicles with these numbers; `NO_VEHICLE` for those that are not on a road."""
-    own, xp = vehicle_numbers(vehicles), namespace(vehicles.road)
+    own = vehicle_numbers(vehicles)
     if not len(own):
         return 0 * numbers + NO_VEHICLE
     order = own.argsort()
-    rows = order[xp.searchsorted(own[order], numbers).clip(0, len(own) - 1)]
-    return xp.where(own[rows] == numbers, rows, NO_VEHICLE)
+    rows = order[np.searchsorted(own[order], numbers).clip(0, len(own) - 1)]
+    return np.where(own[rows] == numbers, rows, NO_VEHICLE)
 
 
 def sort_vehicles(vehicles: MotorwayVehicles) -> MotorwayVehicles:
@@ -215,15 +212,15 @@ def sort_vehicles(vehicles: MotorwayVehicles) -> MotorwayVehicles:
 
 def find_neighbors(vehicles: MotorwayVehicles, lane_count: int) -> LaneNeighbors:
     """Return the neighbors of sorted vehicles."""
-    road, xp = vehicles.road, namespace(vehicles.position)
-    rows = xp.arange(len(road))
+    road = vehicles.road
+    rows = np.arange(len(road))
     leaders, followers = [], []
     for lane in range(lane_count):
         is_on_lane = vehicles.lane == lane
         leaders.append(_previous_row(is_on_lane, rows, road))
-        reverse = xp.flip(_previous_row(xp.flip(is_on_lane, (0,)), rows, xp.flip(road, (0,))), (0,))
-        followers.append(xp.where(reverse >= 0, len(road) - 1 - reverse, NO_VEHICLE))
-    return LaneNeighbors(xp.stack(leaders), xp.stack(followers))
+        reverse = np.flip(_previous_row(np.flip(is_on_lane, (0,)), rows, np.flip(road, (0,))), (0,))
+        followers.append(np.where(reverse >= 0, len(road) - 1 - reverse, NO_VEHICLE))
+    return LaneNeighbors(np.stack(leaders), np.stack(followers))
 
 
 def find_road_neighbors(vehicles: MotorwayVehicles, geometry: MotorwayGeometry) -> LaneNeighbors:
@@ -231,26 +228,25 @@ def find_road_neighbors(vehicles: MotorwayVehicles, geometry: MotorwayGeometry) 
     found = find_neighbors(vehicles, geometry.lane_count + 1)
     if len(geometry.ramps) < 2 or not len(vehicles.lane):
         return found
-    xp, ramp = namespace(vehicles.position), geometry.sections(vehicles.lane, vehicles.position).ramp
+    ramp = geometry.sections(vehicles.lane, vehicles.position).ramp
 
     def without_other_ramps(rows: Array) -> Array:
         is_other = (vehicles.lane == 0) & (ramp[rows[0]] != ramp)
-        return xp.concatenate([xp.where(is_other, NO_VEHICLE, rows[0])[None], rows[1:]])
+        return np.concatenate([np.where(is_other, NO_VEHICLE, rows[0])[None], rows[1:]])
 
     return LaneNeighbors(*map(without_other_ramps, found))
 
 
 def _previous_row(is_on_lane: Array, rows: Array, road: Array) -> Array:
     """Return the last row before each with a vehicle on a lane of the same road."""
-    xp = namespace(rows)
-    last = running_maximum(xp.where(is_on_lane, rows, NO_VEHICLE))
-    previous = xp.concatenate([last[:1] * 0 + NO_VEHICLE, last[:-1]])
-    return xp.where((previous >= 0) & (road[previous] == road), previous, NO_VEHICLE)
+    last = np.maximum.accumulate(np.where(is_on_lane, rows, NO_VEHICLE))
+    previous = np.concatenate([last[:1] * 0 + NO_VEHICLE, last[:-1]])
+    return np.where((previous >= 0) & (road[previous] == road), previous, NO_VEHICLE)
 
 
 def neighbors_on_lane(neighbors: Array, lane: Array) -> Array:
     """Return each vehicle's neighbor on a lane given for each; `NO_VEHICLE` for lanes that do not exist."""
-    xp, lane_count = namespace(neighbors), neighbors.shape[0]
-    rows = xp.arange(neighbors.shape[1])
+    lane_count = neighbors.shape[0]
+    rows = np.arange(neighbors.shape[1])
     found = neighbors[clamp_max(clamp_min(lane, 0), lane_count - 1), rows]
-    return xp.where((lane >= 0) & (lane < lane_count), found, NO_VEHICLE)
+    return np.where((lane >= 0) & (lane < lane_count), found, NO_VEHICLE)

@@ -17,7 +17,7 @@ from unjam.physics.kinematics import next_speed
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds.batch.human_idm import CONTACT_GAP
-from unjam.worlds.batch.motorway.record import MotorwayLog
+from unjam.worlds.batch.motorway.record import NO_END_STEP, MotorwayLog
 from unjam.worlds.batch.motorway.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers
 from unjam.worlds.batch.noise import ArrayFactory
@@ -51,13 +51,12 @@ class MotorwayBatch:
         self,
         scenario: Motorway,
         seeds: Sequence[Sequence[int]],
-        dtype: type = np.float64,
         explore: Sequence[float] | None = None,
         replay: ReplayOptions | None = None,
     ) -> None:
-        """Take empty roads, one for each seed; `dtype` is the precision, `explore` the factor of exploration noise."""
+        """Take empty roads, one for each seed; `explore` is the factor of exploration noise on each."""
         self._exploration_scales = np.ones(len(seeds)) if explore is None else np.array(explore)
-        self.scenario, self._seeds, self._replay, self._dtype = scenario, seeds, replay, dtype
+        self.scenario, self._seeds, self._replay = scenario, seeds, replay
         drawn = [scenario.draw_from_seed(seed) for seed in seeds]
         self.roads = [cast(MotorwayRoad, road) for road, _ in drawn]
         generator_seeds = [others[:2] for _, others in drawn] if replay is None else replay.seeds
@@ -65,8 +64,7 @@ class MotorwayBatch:
             [np.random.default_rng(seed) for seed in each] for each in zip(*generator_seeds, strict=True)
         )
         settings = replay and replay.correction, scenario.steps_per_control_step
-        step, to_array = scenario.simulation_step, lambda values: values.astype(dtype)
-        self._traffic = BatchMotorways(self.roads, step, self._draw_errors, to_array, *settings)
+        self._traffic = BatchMotorways(self.roads, scenario.simulation_step, self._draw_errors, *settings)
         self._is_cav = np.zeros((len(seeds), max(len(road.entries) for road in self.roads)), bool)
         for number, road in enumerate(self.roads):
             self._is_cav[number, : len(road.entries)] = [entry.name in road.cav_ids for entry in road.entries]
@@ -87,13 +85,13 @@ class MotorwayBatch:
     def _draw_errors(self, shape: tuple[int, ...]) -> Floats:
         """Return noise for the errors of all drivers in this step, which each road draws itself."""
         if self._replay is not None and not self._replay.has_driver_errors:
-            return np.zeros(shape, self._dtype)
+            return np.zeros(shape)
         counts = np.bincount(self._traffic.vehicles.road, minlength=len(self.roads)).tolist()
         draws = [
             generator.standard_normal((shape[0], count))
             for generator, count in zip(self._human_generators, counts, strict=True)
         ]
-        return np.concatenate(draws, 1).astype(self._dtype)
+        return np.concatenate(draws, 1)
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
         """Start with empty roads, without a history."""
@@ -119,6 +117,11 @@ class MotorwayBatch:
         """Whether the horizon is reached."""
         return self.control_steps >= (self.scenario.horizon if self._replay is None else self._replay.control_steps)
 
+    @property
+    def crashed_roads(self) -> NDArray[np.bool_]:
+        """Whether vehicles touched on each road, shape (W,)."""
+        return self._log.end_steps < NO_END_STEP
+
     def local_state(self) -> LocalState:
         """Return what the CAVs observe now: arrays of shape (CAVs,)."""
         return self._local_state
@@ -131,7 +134,7 @@ class MotorwayBatch:
             self._set_time_gaps(command)
         for _ in range(scenario.steps_per_control_step):
             if accelerations is not None:
-                self._apply_set_speeds(np.asarray(accelerations, np.float64))
+                self._apply_set_speeds(np.asarray(accelerations))
             arrived = traffic.step()
             vehicles = traffic.vehicles
             leader_rows = neighbors_on_lane(traffic.neighbors.leaders, vehicles.lane)
@@ -156,7 +159,7 @@ class MotorwayBatch:
         rows = find_rows(self._cav_numbers, vehicles)
         is_present = rows >= 0
         rows, accelerations = rows[is_present], accelerations[is_present]
-        speed = vehicles.speed[rows].astype(np.float64)
+        speed = vehicles.speed[rows]
         commanded = next_speed(speed, accelerations, step)
         set_speed = self.scenario.cruise.set_speed(speed, commanded, self.limits.highest, step)
         is_merging = geometry.sections(vehicles.lane[rows], vehicles.position[rows]).is_merging
@@ -217,7 +220,7 @@ class MotorwayBatch:
             adjacent_speeds=np.stack([adjacent_speed for adjacent_speed, _ in left + right], -1),
             penetration_rate=penetration_rate[roads],
         )
-        return state.map(lambda values: values.astype(np.float64)).as_read_only()
+        return state.as_read_only()
 
     def noise(self, episode_noise_size: int = 0) -> Floats:
         """Return standard normal noise for one action, shape (CAVs,), or of the episode, see `World.noise`."""

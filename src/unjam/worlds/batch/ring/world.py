@@ -33,7 +33,7 @@ from unjam.worlds.batch.human_idm import (
     ring_contacts,
 )
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, QuickNoise, SeededNoise, WorldSeeds
-from unjam.worlds.batch.ring.record import RingLog, as_numpy
+from unjam.worlds.batch.ring.record import as_numpy, make_episodes
 from unjam.worlds.batch.ring.warm_up import WarmUpState
 from unjam.worlds.closed_road import MAX_RECALL_SECONDS
 from unjam.worlds.record import Episode
@@ -126,11 +126,11 @@ class RingBatch:
 
     def _reset_log(self) -> None:
         cav_series = "requested_accelerations", "safe_accelerations", "commanded_speeds"
-        series = {"speeds": [self._speed[:-1]], **{name: [] for name in ("noise_free_speeds", *cav_series)}}
-        start, self._series = as_numpy(self._position), series
-        self._log = RingLog(self._scenarios, self.roads, self._seeds, start, self._find_contacts, series)
+        self._series = {"speeds": [self._speed[:-1]], **{name: [] for name in ("noise_free_speeds", *cav_series)}}
+        self._start_positions = as_numpy(self._position)
         zeros = self._loop_lengths * 0.0
-        self._is_running, self._has_crashed, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
+        self._is_running, self.crashed_roads, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
+        """whether each road still counts, whether there was a collision on it, and its control steps, shape (W,)"""
 
     def place_vehicles(self, speeds: Array, positions: Array, memories: Sequence[CrossingMemory | None]) -> None:
         """Move vehicles before the start [m/s, m], (vehicles, W); `memories` are those of figure eights."""
@@ -146,7 +146,7 @@ class RingBatch:
         (CAVs * W, moments), oldest first; None without a warm-up that may be remembered.
         """
         history = self._restore(self.warm_up_states) if self.warm_up_states else self._drive_warm_up()
-        if bool(self._has_crashed.any()):
+        if bool(self.crashed_roads.any()):
             raise EpisodeError("collision in the all-human warm-up of a ring")
         self._is_controlled = is_controlled
         if is_controlled:
@@ -176,7 +176,7 @@ class RingBatch:
             history = history.map(lambda values: values.reshape(*self._shape, -1).swapaxes(0, 1).copy())
         speed, position, gap = (values.T.copy() for values in (self._speed, self._position, self._gap))
         states = []
-        for ring, crashed in enumerate(self._has_crashed.tolist()):
+        for ring, crashed in enumerate(self.crashed_roads.tolist()):
             memory = self._figure_eight and CrossingMemory(*(each[:, ring] for each in self._figure_eight.memory))
             own_history = None if history is None else history.select(ring)
             motion = speed[ring], position[ring], gap[ring]
@@ -186,7 +186,7 @@ class RingBatch:
     def _restore(self, states: Sequence[WarmUpState]) -> LocalState | None:
         *motion, noise, histories, memories = zip(*states, strict=True)
         arrays = (self._to_array(np.stack(each, -1)) for each in motion)
-        self._speed, self._position, self._gap, self._has_crashed = arrays
+        self._speed, self._position, self._gap, self.crashed_roads = arrays
         cast(SeededNoise, self._noise).restore(noise)
         if self._figure_eight:
             self._figure_eight.restore_memory(memories)
@@ -239,7 +239,7 @@ class RingBatch:
         self.safe_accelerations = [self._simulate(requested) for _ in range(self.scenario.steps_per_control_step)]
         self.control_steps += 1
         self._control_step_counts = self._control_step_counts + self._is_running
-        self._is_running = self._is_running * ~self._has_crashed
+        self._is_running = self._is_running * ~self.crashed_roads
 
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
         """Return the speeds of all vehicles after this step if humans drive them, shape (vehicles, W)."""
@@ -267,7 +267,7 @@ class RingBatch:
         self._position = next_position(self._position, moved, step)
         if self._figure_eight or bool((self._gap < CONTACT_GAP).any()):
             contacts = self._find_contacts(self._position, self._gap, self._loop_lengths)
-            self._has_crashed = self._has_crashed | contacts.any(0)
+            self.crashed_roads = self.crashed_roads | contacts.any(0)
         self._speed = xp.concatenate([speeds, speeds[:1]])
         if self._keep_record:
             self._series["noise_free_speeds"].append(moved)
@@ -296,9 +296,12 @@ class RingBatch:
 
     def record(self, driver_log: DriverLog) -> tuple[Episode, ...]:
         """Return the record of each ring since the start, without rewards; none if records are not kept."""
-        steps, crashed = as_numpy(self._control_step_counts), 1.0 - as_numpy(self._is_running)
+        if not self._keep_record:
+            return ()
+        steps, crashed = as_numpy(self._control_step_counts).astype(int), as_numpy(self._is_running) == 0.0
+        rings = zip(self._scenarios, self.roads, self._seeds, steps.tolist(), crashed.tolist(), strict=True)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
-        return self._log.make_episodes(steps, crashed, driver_log, rate) if self._keep_record else ()
+        return make_episodes(rings, self._start_positions, self._series, self._find_contacts, driver_log, rate)
 
 
 class RingReadings:
