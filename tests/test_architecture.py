@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from unjam.drivers.registry import RECIPE_BUILDERS
+from unjam.drivers.registry import DRIVER_CLASSES
 
 PAGE = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
 EXAMPLES = dict(re.findall(r"^### ([^\n]+)\n.*?^```python\n(.*?)^```$", PAGE, flags=re.S | re.M))
@@ -21,12 +21,12 @@ def test_the_page_has_eight_worked_examples_of_eleven_changes() -> None:
 @pytest.mark.parametrize("title", EXAMPLES)
 def test_an_example_of_the_architecture_runs(title: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    before = dict(RECIPE_BUILDERS)  # what an example adds is taken away again
+    before = dict(DRIVER_CLASSES)  # what an example adds is taken away again
     try:
         exec(compile(EXAMPLES[title], title, "exec"), {"__name__": "example"})
     finally:
-        RECIPE_BUILDERS.clear()
-        RECIPE_BUILDERS.update(before)
+        DRIVER_CLASSES.clear()
+        DRIVER_CLASSES.update(before)
 
 
 def test_the_page_lists_all_sub_packages() -> None:

@@ -53,24 +53,24 @@ def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) 
 
     `field` is the origin of the values, for the message.
     """
-    _check_values(values, field)
+    check_values(values, field)
     try:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
         raise InputError(validation_message(error, field, kind)) from None
 
 
-def _check_values(value: Any, name: str) -> None:
+def check_values(value: Any, name: str) -> None:
     """Raise `InputError` if `value` contains a huge integer, or a text with NUL.
 
     TOML has 64 bits for integers; longer ones fit into no array and no float. No name of a file contains NUL.
     """
     if isinstance(value, dict):
         for key, inner in value.items():
-            _check_values(inner, f"{name}.{key}".strip("."))
+            check_values(inner, f"{name}.{key}".strip("."))
     elif isinstance(value, list | tuple):
         for inner in value:
-            _check_values(inner, name)
+            check_values(inner, name)
     elif isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
         raise InputError(
             f"{name}: a number of {value.bit_length()} bits is not allowed; allowed: at most {MAX_INTEGER_BITS}"
@@ -79,7 +79,7 @@ def _check_values(value: Any, name: str) -> None:
         raise invalid_value(name, value, "a text without NUL")
 
 
-def validation_message(error: ValidationError, field: str, kind: Any) -> str:
+def validation_message(error: ValidationError, field: str, kind: Any = None) -> str:
     """Return the first problem of a pydantic error as `field.name: value is not allowed; allowed: ...`."""
     problem = error.errors()[0]
     name = ".".join([field, *(str(part) for part in problem["loc"])]).strip(".")

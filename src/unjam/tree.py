@@ -1,13 +1,15 @@
 """Convert records to JSON and arrays, and back: the format of files and of messages to workers.
 
-A tree is made of dataclasses, named tuples, dicts, tuples and lists; its leaves are arrays and plain values. `pack`
-converts it, and `unpack` restores it by the declared types of its records. Nothing is ever executed, and what does not
-fit the declared types is refused.
+A tree is made of dataclasses, named tuples, dicts, tuples and lists; its leaves are arrays, paths and plain values.
+`pack` converts it, and `unpack` restores it by the declared types of its records. Where the declared type is the base
+of several classes, the name of the class is stored as `kind`. Nothing is ever executed, and what does not fit the
+declared types is refused.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -18,6 +20,10 @@ Arrays = dict[str, np.ndarray]
 """arrays by path in the tree, such as `trajectories.0.states.speed`"""
 ARRAY_KEY = "array"
 """key of the JSON object that represents an array; its value is the path"""
+KIND_KEY = "kind"
+"""key of the name of a class"""
+ClassesByBase = Mapping[type, Mapping[str, type]]
+"""the classes that may stand for a base class, by their names"""
 
 
 def select_prefix(prefix: str, values: Mapping[str, ValueT]) -> dict[str, ValueT]:
@@ -25,26 +31,30 @@ def select_prefix(prefix: str, values: Mapping[str, ValueT]) -> dict[str, ValueT
     return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
 
 
-def pack(tree: Any, path: str = "") -> tuple[Any, Arrays]:
+def pack(tree: Any, path: str = "", classes: ClassesByBase = {}) -> tuple[Any, Arrays]:  # noqa: B006
     """Return a tree as JSON and arrays; `unpack` is the exact inverse."""
     arrays: Arrays = {}
+    kinds = {each: {KIND_KEY: name} for of_base in classes.values() for name, each in of_base.items()}
 
     def pack_value(value: Any, path: str) -> Any:
         if isinstance(value, np.ndarray):
             arrays[path] = value
             return {ARRAY_KEY: path}
-        parts = _named_parts(value)
+        parts = named_parts(value)
         if parts is not None:
-            return {name: pack_value(part, _join_path(path, name)) for name, part in parts.items()}
+            packed = {name: pack_value(part, _join_path(path, name)) for name, part in parts.items()}
+            return kinds.get(type(value), {}) | packed
         if isinstance(value, (tuple, list)):
             return [pack_value(part, _join_path(path, str(index))) for index, part in enumerate(value)]
+        if isinstance(value, Path):
+            return str(value)
         return value.item() if isinstance(value, np.generic) else value
 
     return pack_value(tree, path), arrays
 
 
-def unpack(kind: Any, packed: Any, arrays: Arrays) -> Any:
-    """Return the tree of type `kind` that `pack` converted.
+def unpack(kind: Any, packed: Any, arrays: Arrays, classes: ClassesByBase = {}) -> Any:  # noqa: B006
+    """Return the tree of type `kind` that `pack` converted; a missing part has its default.
 
     Raises:
         ValueError: it has another type: a name, a type or an array is missing, unknown or wrong.
@@ -57,30 +67,38 @@ def unpack(kind: Any, packed: Any, arrays: Arrays) -> Any:
         if not isinstance(packed, dict):
             return packed
         return {name: unpack(Any, part, arrays) for name, part in packed.items()}
+    if kind in classes:
+        _check_type(dict, packed, kind)
+        name, packed = packed.get(KIND_KEY), {key: part for key, part in packed.items() if key != KIND_KEY}
+        if not isinstance(name, str) or name not in classes[kind]:
+            raise ValueError(f"{KIND_KEY}: {name!r:.60} is not allowed; allowed: {', '.join(classes[kind])}")
+        kind = classes[kind][name]
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         if packed is None and NoneType in inner:
             return None
         (kind,) = (member for member in inner if member is not NoneType)
-        return unpack(kind, packed, arrays)
+        return unpack(kind, packed, arrays, classes)
     types = _field_types(kind)
     if types is not None:
         _check_type(dict, packed, kind)
-        unknown, missing = packed.keys() - types.keys(), types.keys() - packed.keys()
+        unknown, missing = packed.keys() - types.keys(), _required_parts(kind) - packed.keys()
         if unknown or missing:
             raise ValueError(f"{kind.__name__}: {min(unknown | missing)!r} is {'unknown' if unknown else 'missing'}")
-        return kind(**{name: unpack(types[name], part, arrays) for name, part in packed.items()})
+        return kind(**{name: unpack(types[name], part, arrays, classes) for name, part in packed.items()})
     if origin is dict:
         _check_type(dict, packed, kind)
-        return {name: unpack(inner[1], part, arrays) for name, part in packed.items()}
+        return {name: unpack(inner[1], part, arrays, classes) for name, part in packed.items()}
     if origin in (tuple, list):
         _check_type(list, packed, kind)
         kinds = (inner[0],) * len(packed) if origin is list or inner[1:] == (...,) else inner
         if len(kinds) != len(packed):
             raise ValueError(f"{len(packed)} values are not allowed; allowed: {len(kinds)}")
-        return origin(unpack(each, part, arrays) for each, part in zip(kinds, packed, strict=True))
+        return origin(unpack(each, part, arrays, classes) for each, part in zip(kinds, packed, strict=True))
     if kind is float and (packed is None or type(packed) is int):
         return float("nan") if packed is None else float(packed)
+    if kind is Path and isinstance(packed, str):
+        return Path(packed)
     if isinstance(kind, type):
         _check_type(kind, packed, kind)
     return packed
@@ -113,7 +131,7 @@ def _join_path(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _named_parts(value: Any) -> dict[str, Any] | None:
+def named_parts(value: Any) -> dict[str, Any] | None:
     """Return the named parts of a dict or record; None: the value is neither."""
     if isinstance(value, dict):
         return value
@@ -133,6 +151,15 @@ def _field_types(kind: Any) -> dict[str, Any] | None:
     if isinstance(kind, type) and hasattr(kind, "_fields"):
         return get_type_hints(kind)
     return None
+
+
+@cache
+def _required_parts(kind: Any) -> frozenset[str]:
+    """Return the parts of a record that have no default."""
+    if not is_dataclass(kind):
+        return frozenset(kind._fields) - kind._field_defaults.keys()
+    defaults = ((field.name, (field.default, field.default_factory)) for field in fields(kind) if field.init)
+    return frozenset(name for name, default in defaults if default == (MISSING, MISSING))
 
 
 def _is_array(kind: Any) -> bool:

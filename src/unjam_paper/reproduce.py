@@ -6,8 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from safetensors.numpy import save
+
 from unjam.controller import make_driver
-from unjam.controller.file import WEIGHTS_PART, sha256_of, unpack_parts
+from unjam.controller.file import load_controller, sha256_of
+from unjam.drivers.network import network_weights
+from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError, unknown_name
 from unjam.files import make_folder
 from unjam.manifest import manifest
@@ -153,5 +157,6 @@ def drive_references(road: str, study_folder: StudyFolder, workers: int) -> None
 def _training_record(run: PlannedRun, study_folder: StudyFolder) -> dict[str, Any]:
     """Return what is needed to repeat a training, and the digest of its network."""
     commit = json.loads((study_folder.run_folder(run) / "manifest.json").read_text(encoding="utf-8"))["commit"]
-    weights = unpack_parts(study_folder.controller_folder(run) / "controller.unjam")[WEIGHTS_PART]
-    return {"run": run.name, "commit": commit, "weights_sha256": sha256_of(weights)}
+    driver = load_controller(study_folder.controller_folder(run))
+    assert isinstance(driver, ResidualDriver)
+    return {"run": run.name, "commit": commit, "weights_sha256": sha256_of(save(network_weights(driver.network)))}

@@ -6,6 +6,7 @@ import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from unjam.controller.manifest import MANIFEST_FORMAT
 from unjam.drivers import IDM, FollowerStopper, PISaturation, ResidualDriver
 from unjam.drivers.check import random_state
 from unjam.drivers.driver import Driver
-from unjam.drivers.network import network_weights
 from unjam.drivers.observation import FeatureName, observation_size
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.user_driver import FileDriver
@@ -116,8 +116,8 @@ def test_the_networks_of_a_nested_residual_are_not_mixed_up(tmp_path: Path) -> N
     assert isinstance(loaded, ResidualDriver)
     assert isinstance(loaded.expert, ResidualDriver)
     for found, given_ in ((loaded.network, driver.network), (loaded.expert.network, inner.network)):
-        for name, array in network_weights(given_).items():
-            np.testing.assert_array_equal(network_weights(found)[name], array)
+        for one, other in zip(chain(*found.layers), chain(*given_.layers), strict=True):
+            np.testing.assert_array_equal(one, other)
         assert (found.authority, found.exploration_std) == (given_.authority, given_.exploration_std)
 
 
@@ -135,7 +135,7 @@ def test_the_manifest_says_what_it_is() -> None:
     assert manifest["format"] == MANIFEST_FORMAT
     assert manifest["scenario"] == {"kind": "ring"}
     assert manifest["iteration"] == 3
-    assert manifest["driver"]["expert"]["name"] == "idm"
+    assert manifest["driver"]["expert"]["kind"] == "idm"
     assert manifest["sha256"] == {WEIGHTS_PART: hashlib.sha256(weights).hexdigest()}
 
 
@@ -193,12 +193,10 @@ def seen_by_own(tmp_path: Path) -> tuple[Path, dict[str, Any], bytes]:
     [
         lambda recipe: recipe.pop("files"),
         lambda recipe: recipe.update(files=[]),
-        lambda recipe: recipe["files"][0].update(kind="named"),
-        lambda recipe: recipe["files"][0].pop("kind"),
         lambda recipe: recipe["files"][0].update(path="/other.py"),
         lambda recipe: recipe["files"][0].update(name="other"),
     ],
-    ids=["no list", "empty list", "another kind", "no kind", "another file", "another name"],
+    ids=["no list", "empty list", "another file", "another name"],
 )
 @pytest.mark.parametrize("own", [False, True], ids=["by itself", "run folder"])
 def test_a_feature_whose_file_is_not_listed_is_never_run(
@@ -260,13 +258,13 @@ def test_parts_that_are_not_those_that_are_named_are_refused(tmp_path: Path, cha
 
 
 def test_weights_of_no_network_are_refused(tmp_path: Path) -> None:
-    arrays = {**driver_recipe(residual(IDM()))[1], "expert.0.weight": np.zeros((2, 2))}
+    arrays = {**driver_recipe(residual(IDM()))[1], "expert.network.layers.0.0": np.zeros((2, 2))}
     words = refusal_message(written(tmp_path, with_weights(save(arrays))))
-    assert "weights 'expert.0.weight' belong to no network" in words
+    assert "weights 'expert.network.layers.0.0' belong to no network" in words
 
 
 def test_a_memory_that_would_fill_the_machine_is_refused(tmp_path: Path) -> None:
-    pi = {"kind": "named", "name": "pi", "parameters": {"window": 1e12}}
+    pi = {"kind": "pi", "window": 1e12}
     content = with_manifest(lambda manifest: manifest["driver"].update(expert=pi))
     with pytest.raises(InputError, match=r"window: 1000000000000\.0 is not allowed"):
         load_controller(written(tmp_path, content))
@@ -410,11 +408,10 @@ def test_statements_that_contradict_the_scenario_are_refused(tmp_path: Path, key
     [
         {"kind": "magic"},
         {"kind": None},
-        {"kind": "named", "name": "magic", "parameters": {}},
-        {"kind": "named", "name": ["pi"], "parameters": {}},
-        {"kind": "named", "name": "pi", "parameters": {"window": -1}},
-        {"kind": "named", "name": "pi", "parameters": {"charm": 1}},
-        {"kind": "named", "name": "pi", "parameters": 3},
+        {"kind": ["pi"]},
+        {"kind": "pi", "window": -1},
+        {"kind": "pi", "window": 10**400},
+        {"kind": "pi", "charm": 1},
         {"expert": None},
         {"expert": "pi"},
         {"expert": []},
@@ -427,15 +424,26 @@ def test_statements_that_contradict_the_scenario_are_refused(tmp_path: Path, key
         {"action_limit": -1.0},
         {"action_limit": float("nan")},
         {"action_limit": "much"},
-        {"authority": float("inf")},
-        {"authority": "all"},
-        {"exploration_std": float("nan")},
-        {"exploration_std": None},
+        {"network": {"authority": float("inf")}},
+        {"network": {"authority": "all"}},
+        {"network": {"authority": 10**400}},
+        {"network": {"exploration_std": float("nan")}},
+        {"network": {"exploration_std": None}},
+        {"network": {"episode_noise": 1}},
+        {"network": {"layers": []}},
+        {"network": {"layers": [[1.0, 2.0]]}},
+        {"network": {"layers": [[{"array": "none"}, {"array": "none"}]]}},
     ],
     ids=str,
 )
 def test_a_recipe_that_makes_no_sense_is_refused(tmp_path: Path, change: dict[str, Any]) -> None:
-    path = written(tmp_path, with_manifest(lambda manifest: manifest["driver"].update(change)))
+    network, others = change.get("network", {}), {key: value for key, value in change.items() if key != "network"}
+
+    def change_recipe(manifest: dict[str, Any]) -> None:
+        manifest["driver"].update(others)
+        manifest["driver"]["network"].update(network)
+
+    path = written(tmp_path, with_manifest(change_recipe))
     with pytest.raises(InputError) as caught:
         load_controller(path)
     assert "\n" not in str(caught.value)
@@ -456,13 +464,13 @@ def test_a_recipe_of_endless_depth_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"1.weight": np.zeros((3, 16))},
-        {"1.bias": np.zeros(3)},
-        {"0.weight": np.zeros(16)},
-        {"2.weight": np.zeros((16, 3)), "2.bias": np.zeros(3)},
-        {"1.bias": np.full(16, np.nan)},
-        {"1.bias": np.full(16, np.inf)},
-        {"0.weight": np.zeros((3, 16))},
+        {"network.layers.1.0": np.zeros((3, 16))},
+        {"network.layers.1.1": np.zeros(3)},
+        {"network.layers.0.0": np.zeros(16)},
+        {"network.layers.2.0": np.zeros((16, 3)), "network.layers.2.1": np.zeros(3)},
+        {"network.layers.1.1": np.full(16, np.nan)},
+        {"network.layers.1.1": np.full(16, np.inf)},
+        {"network.layers.0.0": np.zeros((3, 16))},
     ],
     ids=["inputs", "bias", "dimensions", "outputs", "nan", "infinite", "not what it observes"],
 )
@@ -475,8 +483,8 @@ def test_weights_of_a_wrong_shape_or_not_finite_are_refused(tmp_path: Path, chan
 
 def test_weights_that_are_missing_are_refused(tmp_path: Path) -> None:
     arrays = driver_recipe(residual(IDM()))[1]
-    del arrays["1.bias"]
-    with pytest.raises(InputError, match="network layer 1"):
+    del arrays["network.layers.1.1"]
+    with pytest.raises(InputError, match=r"array .network\.layers\.1\.1. is missing"):
         load_controller(written(tmp_path, with_weights(save(arrays))))
 
 

@@ -76,7 +76,7 @@ def test_each_part_of_a_controller_is_checked_absent_or_stated(tmp_path: Path) -
 
 def test_what_a_recipe_leaves_out_is_said_to_be_a_default(tmp_path: Path) -> None:
     def leave_out(manifest: dict[str, Any]) -> None:
-        del manifest["driver"]["expert"]["parameters"]["time_constant"]
+        del manifest["driver"]["expert"]["time_constant"]
 
     for content, words in (
         (content_of(), "of which nothing was ignored"),
@@ -106,8 +106,8 @@ def test_a_feature_of_a_folder_is_code_too(tmp_path: Path, monkeypatch: pytest.M
     code, ran = tmp_path / "eyes.py", tmp_path / "ran"
     code.write_text("def seen(state):\n    return state.speed\n")
     network = random_network(inputs=1)
-    held = ResidualDriver(PISaturation(), network, 1.0, (f"{code}:seen",))
     code.write_text(f"open({str(ran)!r}, 'w').close()\n" + code.read_text())
+    held = ResidualDriver(PISaturation(), network, 1.0, (f"{code}:seen",))
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
     ran.unlink(missing_ok=True)
     monkeypatch.setenv("UNJAM_STATE", str(tmp_path / "of another user"))

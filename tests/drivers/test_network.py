@@ -1,12 +1,14 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from tests.conftest import random_network
-from unjam.drivers.network import Network, network_from_weights, network_weights
+from unjam.drivers.network import Network
 from unjam.errors import InputError
+from unjam.tree import pack, unpack
 
 
 def test_agrees_with_the_layers_written_out() -> None:
@@ -97,7 +99,7 @@ def test_exploring_rows_at_once_equal_single_rows_and_plain_numbers() -> None:
 
 @pytest.mark.parametrize("network", [random_network(5), random_network(5, outputs=2)])
 def test_arrays_make_the_same_network_again(network: Network) -> None:
-    again = network_from_weights(network_weights(network), network.authority, network.exploration_std)
+    again = unpack(Network, *pack(network))
     observation, noise = np.ones((2, 5)), np.ones(2)
     np.testing.assert_array_equal(again(observation), network(observation))
     np.testing.assert_array_equal(again.explore(observation, noise), network.explore(observation, noise))
@@ -106,18 +108,31 @@ def test_arrays_make_the_same_network_again(network: Network) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"0.bias": np.zeros(3)}, "weight and bias do not fit"),
-        ({"1.weight": np.zeros((3, 16))}, "3 inputs are not allowed; allowed: 16"),
-        ({"1.bias": np.full(16, np.nan)}, "not finite"),
-        ({"2.weight": np.zeros((16, 3)), "2.bias": np.zeros(3)}, "one output, or two"),
-        ({"0.weight": np.zeros(5)}, "do not fit"),
+        ({(0, 1): np.zeros(3)}, "weight and bias do not fit"),
+        ({(1, 0): np.zeros((3, 16))}, "3 inputs are not allowed; allowed: 16"),
+        ({(1, 1): np.full(16, np.nan)}, "not finite"),
+        ({(2, 0): np.zeros((16, 3)), (2, 1): np.zeros(3)}, "one output, or two"),
+        ({(0, 0): np.zeros(5)}, "do not fit"),
+        ({(0, 0): np.zeros((5, 16), int)}, "weights are int64, float64; allowed: floats"),
     ],
 )
-def test_refuses_weights_that_do_not_fit(change: dict[str, np.ndarray], words: str) -> None:
+def test_refuses_weights_that_do_not_fit(change: dict[tuple[int, int], np.ndarray], words: str) -> None:
+    layers = [list(layer) for layer in random_network(5).layers]
+    for (layer, part), array in change.items():
+        layers[layer][part] = array
     with pytest.raises(InputError, match=words):
-        network_from_weights({**network_weights(random_network(5)), **change}, 1.0, 0.1)
+        Network(tuple((weight, bias) for weight, bias in layers), 1.0, 0.1)
 
 
-def test_refuses_no_weights() -> None:
-    with pytest.raises(InputError, match="one output"):
-        network_from_weights({}, 1.0, 0.1)
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"layers": ()}, "one output"),
+        ({"authority": 0.0}, "authority: 0.0 is not allowed; allowed: > 0"),
+        ({"exploration_std": -1.0}, "exploration_std: -1.0 is not allowed; allowed: >= 0"),
+        ({"exploration_std": np.nan}, "exploration_std: nan"),
+    ],
+)
+def test_refuses_settings_out_of_range(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        replace(random_network(5), **settings)

@@ -62,4 +62,4 @@ def test_a_class_of_ones_own_must_come_from_a_file() -> None:
 )
 def test_a_recipe_of_what_no_driver_is_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError):
-        driver_from_recipe({"driver": PISaturation().recipe(), **wrong}, {})
+        driver_from_recipe({"driver": driver_recipe(PISaturation())[0], **wrong}, {})

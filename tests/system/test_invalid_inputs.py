@@ -15,6 +15,7 @@ from tests.controller.test_verify import HELD
 from tests.system.conftest import UNJAM, Run
 from unjam.controller import controller_bytes
 from unjam.controller.file import WEIGHTS_PART
+from unjam.drivers.registry import driver_recipe
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=60"]
 
@@ -246,7 +247,7 @@ def test_invalid_input_is_refused_in_one_line_with_exit_code_2(name: str, unjam:
 
 
 def with_weights_of(kind: type) -> bytes:
-    parts = {WEIGHTS_PART: save({name: array.astype(kind) for name, array in HELD.weights().items()})}
+    parts = {WEIGHTS_PART: save({name: array.astype(kind) for name, array in driver_recipe(HELD)[1].items()})}
     return controller_bytes(HELD, {}, parts)
 
 

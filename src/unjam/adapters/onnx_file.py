@@ -9,6 +9,8 @@ import stat
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Driver
 from unjam.drivers.onnx_policy import OnnxDriver
@@ -53,7 +55,7 @@ def onnx_driver(
     inner = _expert(table.pop("expert", ""), time_step) if expert is None else as_driver(expert, time_step)
     if description is None:
         description = build_dataclass(PolicyDescription, table, f"driver {path.name}")
-    return OnnxDriver(path.name, description, inner, time_step, graph=content)
+    return OnnxDriver(path.name, description, inner, time_step, graph=np.frombuffer(content, np.uint8))
 
 
 def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:

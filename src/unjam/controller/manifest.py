@@ -17,7 +17,7 @@ from unjam.files import parse_json
 from unjam.parameters import STRICT, build_dataclass
 from unjam.tree import leaves
 
-MANIFEST_FORMAT = 4
+MANIFEST_FORMAT = 5
 """version of the schema, the only one that is read"""
 JsonObject = dict[str, Any]
 _StrictPositive = Annotated[StrictFloat, Field(gt=0)]
@@ -111,7 +111,7 @@ def driver_interface(driver: Driver, action_limit: float | None = None) -> JsonO
     """Return the interface of a controller beyond the recipe of its driver, as JSON.
 
     `observation`: inputs in each control step, in order, in SI units; `networks`: inputs of each network, in order, by
-    the prefix of its weights: each number is divided by its scale; `memory`: its entries for each CAV, with their
+    the prefix of its memory: each number is divided by its scale; `memory`: its entries for each CAV, with their
     initial values, null for NaN; `action`: the acceleration with its bounds; `action_repeat`: control steps for which
     a residual is repeated. `action_limit` is that of its road [m/s2], for drivers without their own limits.
     """

@@ -136,7 +136,7 @@ def _describe_code(controller: Controller) -> PartCheck:
 
 def _describe_weights(controller: Controller) -> PartCheck:
     """Describe the weights; their shapes and values were checked while the driver was built."""
-    part, arrays = controller.parts[archive.WEIGHTS_PART], controller.driver.weights()
+    part, arrays = controller.parts[archive.WEIGHTS_PART], driver_recipe(controller.driver)[1]
     if not arrays:
         return PartCheck("weights", "absent", f"the driver has no network; SHA-256 {sha256_of(part)}")
     detail = f"{len(arrays)} arrays, finite, of the required shapes, none superfluous; SHA-256 {sha256_of(part)}"

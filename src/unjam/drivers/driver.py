@@ -2,7 +2,6 @@
 
 from array import array
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, fields, is_dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -12,13 +11,13 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.local_state import LocalState, ScaledInput
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface, merge_requirements
 from unjam.physics.arrays import Array
-from unjam.tree import Arrays, map_leaves
+from unjam.tree import map_leaves, named_parts
 
 Memory = dict[str, Any]
 """State of a driver between control steps: arrays by name, whose first axis is the row of the CAV. A driver that
 contains another driver keeps the memory of that driver within its own."""
 Recipe = dict[str, Any]
-"""Specification of a driver as JSON; the weights of its networks are stored separately as arrays."""
+"""Specification of a driver as JSON, with its class as `kind`; the weights of its networks are separate arrays."""
 NoiseSampler = Callable[[], Array]
 """returns standard normal noise for one evaluation of a network, one number for each row"""
 
@@ -138,20 +137,9 @@ class Driver:
         """Return its name and the parameters that differ from the defaults."""
         if not self.name:
             return type(self).__name__
-        default = {field.name: field.default for field in fields(self)}  # pyright: ignore[reportArgumentType]
-        parameters = asdict(self).items()  # pyright: ignore[reportArgumentType]
-        changed = {key: value for key, value in parameters if value != default[key] and key != "time_step"}
+        parameters = (named_parts(self) or {}).items()
+        changed = {key: value for key, value in parameters if value != getattr(type(self), key) and key != "time_step"}
         return label_with_parameters(self.name, changed)
-
-    def recipe(self) -> Recipe:
-        """Return its specification, without `weights`; without an own name, other processes cannot build it."""
-        name = vars(type(self)).get("name", "")  # not the name of a base class
-        return {"kind": "named", "name": name, "parameters": asdict(self) if name and is_dataclass(self) else {}}
-
-    def weights(self) -> Arrays:
-        """Return the weights of its networks, with prefixes for those of inner drivers."""
-        inner = self.inner_drivers.items()
-        return {f"{name}.{key}": array for name, driver in inner for key, array in driver.weights().items()}
 
 
 class FormulaDriver(Driver):

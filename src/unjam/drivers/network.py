@@ -1,12 +1,13 @@
 """The small policy network, as it drives in workers and in exported controllers: on NumPy alone."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from unjam.errors import InputError
+from unjam.errors import InputError, invalid_value
 from unjam.physics.arrays import Array, Floats, namespace
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -39,6 +40,11 @@ class Network:
     _residual_weights: Floats = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "layers", _checked_layers(self.layers))
+        if not 0.0 < self.authority < math.inf:
+            raise invalid_value("network: authority", self.authority, "> 0")
+        if not 0.0 <= self.exploration_std < math.inf:
+            raise invalid_value("network: exploration_std", self.exploration_std, ">= 0")
         *hidden, last = _fold_biases(self.layers)
         object.__setattr__(self, "squashes_noise", self.layers[-1][1].shape == (2,))
         object.__setattr__(self, "_hidden_weights", tuple(hidden))
@@ -135,28 +141,25 @@ def _as_tensors_like(tensor: Any, layer: tuple[Floats, Floats]) -> Any:
 
 
 def network_weights(network: Network) -> dict[str, Floats]:
-    """Return the weights of a network under the names that `network_from_weights` reads."""
+    """Return the weights of a network as arrays by name: `0.weight`, `0.bias`, ..."""
     weights = {f"{index}.weight": weight for index, (weight, _) in enumerate(network.layers)}
     return weights | {f"{index}.bias": bias for index, (_, bias) in enumerate(network.layers)}
 
 
-def network_from_weights(
-    weights: dict[str, Floats], authority: float, exploration_std: float, episode_noise: bool = False
-) -> Network:
-    """Return the network with the weights of `network_weights`; raise `InputError` if they do not fit together."""
-    layers: list[tuple[Floats, Floats]] = []
-    for index in range(sum(name.endswith(".weight") for name in weights)):
-        weight, bias = weights.get(f"{index}.weight"), weights.get(f"{index}.bias")
-        if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[1:]:
+def _checked_layers(layers: Sequence[tuple[Floats, Floats]]) -> tuple[tuple[Floats, Floats], ...]:
+    """Return layers in double precision; raise `InputError` if they do not fit together, or are not finite."""
+    outputs = None
+    for index, (weight, bias) in enumerate(layers):
+        if weight.ndim != 2 or bias.shape != weight.shape[1:]:
             raise InputError(f"network layer {index}: weight and bias do not fit together")
-        if layers and layers[-1][0].shape[1] != weight.shape[0]:
-            allowed = f"{layers[-1][0].shape[1]}, the outputs of the previous layer"
+        if outputs not in (None, weight.shape[0]):
+            allowed = f"{outputs}, the outputs of the previous layer"
             raise InputError(f"network layer {index}: {weight.shape[0]} inputs are not allowed; allowed: {allowed}")
         if not (np.issubdtype(weight.dtype, np.floating) and np.issubdtype(bias.dtype, np.floating)):
             raise InputError(f"network layer {index}: weights are {weight.dtype}, {bias.dtype}; allowed: floats")
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"network layer {index}: a weight is not finite")
-        layers.append((np.asarray(weight, np.float64), np.asarray(bias, np.float64)))
-    if not layers or layers[-1][0].shape[1] not in (1, 2):
+        outputs = weight.shape[1]
+    if outputs not in (1, 2):
         raise InputError("network: the last layer must have one output, or two with the log std of its noise")
-    return Network(tuple(layers), authority, exploration_std, episode_noise)
+    return tuple((np.asarray(weight, np.float64), np.asarray(bias, np.float64)) for weight, bias in layers)

@@ -5,7 +5,7 @@ A user's own feature is a function of a `LocalState` that returns an array of sh
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
 from operator import attrgetter
@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import AfterValidator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from unjam.drivers.driver import Driver, Memory, Recipe
+from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import (
     ADJACENT_POSITIONS,
     COMMON_FIELDS,
@@ -343,18 +343,23 @@ def observation_size(names: Sequence[NetworkInput], expert: Driver) -> int:
     return compute_observation(names, FeatureInputs(state, acceleration, expert, memory)).shape[1]
 
 
-def check_user_files(names: Sequence[str], files: Sequence[Recipe]) -> None:
-    """Reload the user's own features if their code was not that in `files`; raise `InputError` if it still is not."""
-    if any(file not in files for file in user_files(names)):
+def checked_user_files(names: Sequence[str], expected: Sequence[FileReference]) -> tuple[FileReference, ...]:
+    """Return the files of the user's own features, loaded again if their code was not that in `expected`.
+
+    Raise `InputError` if it still is not.
+    """
+    hashes, own = {file: file.sha256 for file in expected}, [each for each in names if each not in FEATURES]
+
+    def read_files() -> list[FileReference]:
+        return [replace(FileReference.parse(name), sha256=_user_code(name).sha256) for name in own]
+
+    def has_changed(file: FileReference) -> bool:
+        return hashes.get(file, file.sha256) != file.sha256
+
+    if any(map(has_changed, read_files())):
         _user_code.cache_clear()
         _file_feature.cache_clear()
-    for file in user_files(names):
-        if file not in files:
-            allowed = "allowed: as it was when the driver was made"
-            raise InputError(f"driver recipe: the code {file['path']!r} of a feature has changed; {allowed}")
-
-
-def user_files(names: Sequence[str]) -> list[Recipe]:
-    """Return file, name and hash of the user's own features."""
-    own = [name for name in names if name not in FEATURES]
-    return [FileReference.parse(name).file_recipe(_user_code(name).sha256) for name in own]
+    for file in filter(has_changed, read_files()):
+        allowed = "allowed: as it was when the driver was made"
+        raise InputError(f"driver recipe: the code {str(file.path)!r} of a feature has changed; {allowed}")
+    return tuple(read_files())

@@ -1,25 +1,22 @@
 """An ONNX graph of a third party as a driver: data, which workers and controller files carry."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.driver import Driver, Memory, Recipe
-from unjam.drivers.observation import Feature, PolicyInput, observation_size
+from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.observation import PolicyInput, observation_size
 from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyMemory
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session
-from unjam.tree import Arrays
 
 OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)
 """allowed versions of the operators and of the format"""
 TYPES: dict[int, type[np.floating[Any]]] = {1: np.float32, 11: np.float64}
 """allowed types of inputs and outputs, by their numbers in ONNX"""
-GRAPH_WEIGHTS = "graph"
-"""name of the graph among the weights of a driver: its bytes"""
 MAX_MEMORY_NUMBERS = 100_000
 """maximum count of numbers in the recurrent state of one CAV"""
 PROBE_ROWS, MAX_PROBE_DIFFERENCE = 3, 1e-4
@@ -91,12 +88,17 @@ class OnnxDriver(PolicyDriver):
     """
 
     policy: Any = field(init=False)  # an `OnnxPolicy`
-    graph: bytes = field(kw_only=True, repr=False)
+    graph: NDArray[np.uint8] = field(kw_only=True, repr=False)
+    """bytes of the graph"""
 
     def __post_init__(self) -> None:
         try:
             super().__post_init__()
-            object.__setattr__(self, "policy", _read_policy(self.graph, self.description, self.expert))
+            if self.graph.dtype != np.uint8 or self.graph.ndim != 1:
+                raise InputError("graph: it is not bytes")
+            policy = _read_policy(self.graph.tobytes(), self.description, self.expert)
+            object.__setattr__(self, "policy", policy)
+            object.__setattr__(self, "graph", np.frombuffer(policy.graph, np.uint8))
             _probe(self)
         except InputError as error:
             prefix = f"driver {self.label}: "
@@ -105,17 +107,6 @@ class OnnxDriver(PolicyDriver):
     def policy_memory(self, n: int) -> Memory:
         """Return the initial recurrent state of the graph for `n` CAVs."""
         return self.policy.initial_memory(n)
-
-    def recipe(self) -> Recipe:
-        """Return its specification, without the graph; other processes cannot build one that reads Python functions."""
-        if any(isinstance(each, Feature) for each in self.inputs):
-            return super().recipe()
-        fields = {"label": self.label, "description": asdict(self.description), "time_step": self.time_step}  # pyright: ignore[reportArgumentType]
-        return {"kind": "onnx", **fields, "expert": self.expert.recipe()}
-
-    def weights(self) -> Arrays:
-        """Return the graph as bytes and, with their prefix, the weights of its expert."""
-        return {**super().weights(), GRAPH_WEIGHTS: np.frombuffer(self.policy.graph, np.uint8)}
 
 
 def _read_policy(content: bytes, description: PolicyDescription, expert: Driver) -> OnnxPolicy:

@@ -75,7 +75,7 @@ class PolicyMemory:
 
     input: str
     output: str
-    initial: Annotated[float | list[Any] | None, BeforeValidator(_without_nan)] = 0.0
+    initial: Annotated[Any, BeforeValidator(_without_nan)] = 0.0
     """initial value of all numbers, or of each number of one CAV; None: NaN"""
 
 
@@ -104,7 +104,6 @@ class PolicyDriver(ExpertWrapper):
     """A policy that others have trained, alone or added to an expert; other processes cannot build it."""
 
     own_requirements: ClassVar[Requirements] = Driver.own_requirements
-    recipe = Driver.recipe  # that of a driver without a name
 
     policy: Callable[[Any, Memory], tuple[Any, Memory]]
     """returns numbers, shape (n,) or (n, 1), and its new memory, for observations, shape (n, inputs)"""

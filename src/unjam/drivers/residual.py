@@ -1,20 +1,31 @@
 """An expert plus a learned residual: the full policy of the paper, Eq. 8."""
 
-from dataclasses import dataclass
+from dataclasses import field
 from functools import cached_property, partial
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import Field, InstanceOf
+from pydantic.dataclasses import dataclass
 
 from unjam.drivers.command import Command, Limits
-from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, Recipe
+from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState, ScaledInput
-from unjam.drivers.network import Network, network_weights
-from unjam.drivers.observation import FeatureInputs, compute_observation, feature, observation_inputs, user_files
+from unjam.drivers.network import Network
+from unjam.drivers.observation import (
+    FeatureInputs,
+    FeatureName,
+    checked_user_files,
+    compute_observation,
+    feature,
+    observation_inputs,
+)
 from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
-from unjam.drivers.wrappers import DriverWrapper, select_rows
+from unjam.drivers.user_driver import FileReference
+from unjam.drivers.wrappers import COMPOSITE_CONFIG, DriverWrapper, select_rows
+from unjam.parameters import Positive, PositiveInt
 from unjam.physics.arrays import Array, namespace
-from unjam.tree import Arrays, map_leaves
+from unjam.tree import map_leaves
 
 EXPERT_KEY, RESIDUAL_KEY, RESIDUAL_AGE_KEY = "expert", "residual", "age"
 """names in the memory: memory of the expert; the repeated residual, and its control steps so far"""
@@ -76,7 +87,7 @@ class ExpertWrapper(DriverWrapper):
         return decision.command.acceleration, decision.memory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class ResidualDriver(ExpertWrapper):
     """Adds the output of a network to an expert, within the action limit: Eq. 8 of the paper.
 
@@ -84,13 +95,18 @@ class ResidualDriver(ExpertWrapper):
     """
 
     expert: Driver
-    network: Network
-    action_limit: float
+    network: InstanceOf[Network]
+    action_limit: Positive
     """largest acceleration in either direction [m/s2]"""
-    inputs: tuple[str, ...] = ("local",)
+    inputs: Annotated[tuple[FeatureName, ...], Field(min_length=1)] = ("local",)
     """features that the network reads"""
-    action_repeat: int = 1
+    action_repeat: PositiveInt = 1
     """control steps for which one residual is repeated; the expert decides in each of them"""
+    files: tuple[FileReference, ...] = field(default=(), repr=False, compare=False)
+    """the user's files of features; if given, the files must have these hashes"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "files", checked_user_files(self.inputs, self.files))
 
     @cached_property
     def limits(self) -> Limits:
@@ -117,22 +133,3 @@ class ResidualDriver(ExpertWrapper):
     def describe(self) -> str:
         """Return the description of the expert, and that there is a residual."""
         return f"{self.expert.describe()} + residual"
-
-    def recipe(self) -> Recipe:
-        """Return its specification, without the weights of the network."""
-        files = user_files(self.inputs)
-        return {
-            "kind": "residual",
-            "expert": self.expert.recipe(),
-            "action_limit": self.action_limit,
-            "inputs": list(self.inputs),
-            "action_repeat": self.action_repeat,
-            "authority": self.network.authority,
-            "exploration_std": self.network.exploration_std,
-            **({"episode_noise": True} if self.network.episode_noise else {}),
-            **({"files": files} if files else {}),
-        }
-
-    def weights(self) -> Arrays:
-        """Return the weights of its network and, with their prefix, those of its expert."""
-        return {**super().weights(), **network_weights(self.network)}

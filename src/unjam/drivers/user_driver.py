@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from unjam.drivers.command import answer_as_array
-from unjam.drivers.driver import Driver, Memory, Recipe, label_with_parameters
+from unjam.drivers.driver import Driver, Memory, label_with_parameters
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import Requirements, RoadInterface
 from unjam.errors import InputError
@@ -107,6 +107,8 @@ class FileReference:
     path: Path
     """resolved"""
     name: str
+    sha256: str = field(default="", kw_only=True, repr=False, compare=False)
+    """hash of the code; if given, the file must have it"""
 
     @classmethod
     def parse(cls, text: str) -> "FileReference":
@@ -118,10 +120,6 @@ class FileReference:
 
     def __str__(self) -> str:
         return f"{self.path.name}:{self.name}"
-
-    def file_recipe(self, sha256: str) -> Recipe:
-        """Return path and hash of the code."""
-        return {"kind": "file", "path": str(self.path), "name": self.name, "sha256": sha256}
 
     def read_code(self) -> UserCode:
         """Return the current code of the file.
@@ -224,8 +222,6 @@ class FileDriver(FileReference, UserDriver):
 
     parameters: dict[str, Any] = field(default_factory=dict)
     time_step: float = 0.1
-    sha256: str = field(default="", repr=False, compare=False)
-    """hash of the file; if given, the file must have it"""
     implementation: Any = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -251,10 +247,6 @@ class FileDriver(FileReference, UserDriver):
     def describe(self) -> str:
         """Return the names of file and driver, and the given parameters."""
         return label_with_parameters(str(self), self.parameters)
-
-    def recipe(self) -> Recipe:
-        """Return path and hash of the loaded code, and the parameters."""
-        return {**self.file_recipe(self.sha256), "parameters": self.parameters, "time_step": self.time_step}
 
 
 @dataclass(frozen=True)

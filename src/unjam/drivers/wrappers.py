@@ -1,7 +1,7 @@
 """Drivers that contain other drivers: mixtures and switches, impaired sensing, the safety filter, history features."""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import cached_property, partial
 from math import exp
 from typing import ClassVar
@@ -11,7 +11,7 @@ from pydantic import ConfigDict, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.command import Limits
-from unjam.drivers.driver import Driver, Memory, Recipe
+from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface
 from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION
@@ -21,7 +21,7 @@ from unjam.drivers.speed_history import MAX_WINDOW_STEPS
 from unjam.errors import InputError
 from unjam.parameters import STRICT, NonNegative, Positive
 from unjam.physics.arrays import Array, clamp_min, clip, join_columns, namespace, square_root, stack_columns
-from unjam.tree import map_leaves
+from unjam.tree import map_leaves, named_parts
 
 COMPOSITE_CONFIG: ConfigDict = {**STRICT, "arbitrary_types_allowed": True}
 """configuration of parameter dataclasses with drivers among their fields"""
@@ -57,25 +57,13 @@ def select_rows(condition: Array, if_true: Array, if_false: Array) -> Array:
 class CompositeDriver(Driver):
     """A driver that contains other drivers in fields of a dataclass; the field `driver` has the memory name `inner`."""
 
-    kind: ClassVar[str] = ""
-    """kind of its recipe"""
     own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
     @cached_property
     def inner_drivers(self) -> dict[str, Driver]:
         """The drivers in its fields, in order."""
-        drivers = ((field.name, getattr(self, field.name)) for field in fields(self))  # pyright: ignore[reportArgumentType]
-        return {INNER_KEY if name == "driver" else name: each for name, each in drivers if isinstance(each, Driver)}
-
-    def recipe(self) -> Recipe:
-        """Return the recipes of its inner drivers, and its settings."""
-        inner = {name: driver.recipe() for name, driver in self.inner_drivers.items()}
-        recipe = {"kind": self.kind, **({"driver": inner[INNER_KEY]} if INNER_KEY in inner else {"drivers": inner})}
-        for field in fields(self):  # pyright: ignore[reportArgumentType]
-            value = getattr(self, field.name)
-            if value is not None and not isinstance(value, Driver):
-                recipe[field.name] = asdict(value) if is_dataclass(value) else value  # pyright: ignore[reportArgumentType]
-        return recipe
+        parts = (named_parts(self) or {}).items()
+        return {INNER_KEY if name == "driver" else name: each for name, each in parts if isinstance(each, Driver)}
 
 
 class DriverWrapper(CompositeDriver):
@@ -144,16 +132,11 @@ class MixedDriver(CompositeDriver):
         """Return all of them, joined by +."""
         return "+".join(driver.describe() for driver in self.drivers)
 
-    def recipe(self) -> Recipe:
-        """Return the recipes of all of them."""
-        return {"kind": "mixed", "drivers": [driver.recipe() for driver in self.drivers]}
-
 
 @checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class ImpairedDriver(DriverWrapper):
     """Drives as another driver does with noisy gaps and delayed commands."""
 
-    kind: ClassVar[str] = "impaired"
     own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
 
     driver: Driver
@@ -209,8 +192,6 @@ class FilteredDriver(DriverWrapper):
     actuator delay. On a road with the same filter and one simulation step per control step, nothing changes.
     """
 
-    kind: ClassVar[str] = "filtered"
-
     driver: Driver
     action_limit: Positive
     """largest acceleration in either direction that the driver may command [m/s2]"""
@@ -240,8 +221,6 @@ class HistoryDriver(DriverWrapper):
 
     Until an averaging time has passed, its mean is that of all control steps so far.
     """
-
-    kind: ClassVar[str] = "history"
 
     driver: Driver
     time_step: Positive
@@ -320,7 +299,6 @@ class QueueFallback(CompositeDriver):
     time_step: Positive
     """control step [s]"""
 
-    kind: ClassVar[str] = "queue-fallback"
     own_requirements: ClassVar[Requirements] = Requirements(needs_loop=True, needs_numpy=True)
 
     def initial_memory(self, n: int) -> Memory:
@@ -363,7 +341,6 @@ class RoadTypeSwitch(CompositeDriver):
     All CAVs of an episode are on one road. The memories for other road types keep their initial values.
     """
 
-    kind: ClassVar[str] = "road-type-switch"
     own_requirements: ClassVar[Requirements] = Requirements(
         used_fields=frozenset({"distance_to_crossing", "penetration_rate"}), needs_numpy=True
     )
@@ -416,7 +393,3 @@ class RoadTypeSwitch(CompositeDriver):
             return "loop"
         rate = rate if isinstance(rate, float) else float(rate[0])
         return "shared_loop" if rate >= MIN_SHARED_PENETRATION_RATE else "loop"
-
-
-COMPOSITE_CLASSES = ImpairedDriver, FilteredDriver, HistoryDriver, RoadTypeSwitch, QueueFallback
-"""composite drivers with a recipe that contains their fields"""

@@ -18,7 +18,7 @@ import numpy as np
 from safetensors.numpy import load, save
 
 from unjam import __version__
-from unjam.drivers.network import Network, network_from_weights, network_weights
+from unjam.drivers.network import Network, network_weights
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.files import INVALID_DATA_ERRORS, PACKAGED_PREFIX, atomic_write, to_json
 from unjam.parameters import build_dataclass
@@ -183,7 +183,9 @@ def _read_residual(path: Path, entry: dict[str, Any] | None) -> Network | None:
     weights = weights_file.read_bytes()
     if hashlib.sha256(weights).hexdigest() != entry["sha256"]:
         raise InputError(f"population {path.name}: damaged: {weights_file.name} does not have the hash it names")
-    network = network_from_weights(load(weights), float(entry["authority"]), 0.0)
+    arrays = load(weights)
+    layers = ((arrays[f"{index}.weight"], arrays[f"{index}.bias"]) for index in range(len(arrays) // 2))
+    network = Network(tuple(layers), float(entry["authority"]))
     if network.input_size != len(RESIDUAL_INPUTS):
         raise InputError(f"population {path.name}: {network.input_size} inputs are not allowed; allowed: 3")
     return network

@@ -3,6 +3,7 @@
 Python files run as `unjam.user_code` says, only when the user names them. TOML files have settings alone.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,6 +12,7 @@ from unjam.drivers.user_driver import FileReference, object_label, object_refere
 from unjam.errors import InputError, invalid_value
 from unjam.parameters import build_dataclass, read_toml
 from unjam.scenarios.scenario import Scenario
+from unjam.tree import pack
 from unjam.user_code import USER_MODULE_PREFIX
 
 CODE_ENTRY = "code"
@@ -40,7 +42,7 @@ def _load_object(reference: FileReference, sha256: str = "") -> Scenario | type[
     if not issubclass(kind, Scenario):
         raise InputError(f"{reference}: is neither a class nor an instance of unjam.scenarios.Scenario")
     if kind.__module__.startswith(USER_MODULE_PREFIX):
-        _class_recipes[kind] = reference.file_recipe(code.sha256)
+        _class_recipes[kind], _ = pack(replace(reference, sha256=code.sha256))
     return found
 
 

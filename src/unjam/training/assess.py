@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
+from unjam.drivers.registry import driver_recipe
 from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
@@ -280,7 +281,7 @@ def _assessment_document(
         "baseline": {name: asdict(metric_estimate(baseline_rows, name)) for name in BASELINE_METRICS},
         "road": {**scenario_recipe(request.network), "file": request.file},
         "human_drivers": request.network.human_description,
-        "drivers": {name: driver.recipe().get("parameters", {}) for name, driver in request.drivers.items()},
+        "drivers": {name: driver_recipe(driver)[0] for name, driver in request.drivers.items()},
         "penetration_rates": request.penetration_rates,
         "precision": request.precision,
         "budget": {"episodes": request.episodes, "minutes": request.minutes},

@@ -33,6 +33,7 @@ from unjam.training.run_folder import controller_origin
 from unjam.training.search_space import SearchSpace
 from unjam.training.seeds import tuning_seeds
 from unjam.training.trial_log import TrialLog, TrialVerdict, TuningTrial
+from unjam.tree import named_parts
 from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.batch.run import run_batch, run_batches
 from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason, unsupported_reason
@@ -105,7 +106,7 @@ def tune(
         InputError: too few steps, a wrong parameter, no road that supports batches, or another folder.
         UnjamError: all trials are infeasible.
     """
-    known = driver_from_name(expert, 1.0).recipe()["parameters"]
+    known = named_parts(driver_from_name(expert, 1.0)) or {}
     for key in space:
         if key not in known:
             raise unknown_name("vary", key, known)
