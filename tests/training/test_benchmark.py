@@ -10,14 +10,12 @@ from unjam.errors import MissingPartError
 from unjam.training import benchmark
 from unjam.training.benchmark import benchmark_batches, benchmark_episodes, make_benchmark_driver
 
-RATES = ("sumo_steps_per_s", "episode_steps_per_s", "traci_steps_per_s", "every_step_steps_per_s")
-
 
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measures less, and so less exactly."""
     monkeypatch.setattr(benchmark, "TRACI_STEPS", 50)
-    monkeypatch.setattr(benchmark, "ROLLOUT_SIZES", {"long": (500, 20), "short": (50, 10)})
+    monkeypatch.setattr(benchmark, "ROLLOUT_SIZES", ((500, 20), (50, 10)))
     monkeypatch.setattr(benchmark, "RING_SIZES", {22: 200, 66: 100})
     monkeypatch.setattr(benchmark, "BATCH_VEHICLES", 2200)
     monkeypatch.setattr(benchmark, "STEPS_PER_ROUND", 20)
@@ -34,12 +32,12 @@ def cores() -> Iterator[None]:
     os.sched_setaffinity(0, before)
 
 
-@pytest.mark.parametrize("hold", [1, 10])
-def test_benchmark_driver_is_valid(hold: int) -> None:
-    driver = make_benchmark_driver(hold)
+@pytest.mark.parametrize(("time_step", "duration", "repeat"), [(0.1, 0.0, 1), (0.1, 1.0, 10), (1.0, 1.0, 1)])
+def test_benchmark_driver_is_valid(time_step: float, duration: float, repeat: int) -> None:
+    driver = make_benchmark_driver(time_step, duration)
     check_driver(driver)
-    assert driver.expert == PISaturation()
-    assert driver.action_repeat == hold
+    assert driver.expert == PISaturation(time_step=time_step)
+    assert driver.action_repeat == repeat
     assert [weight.shape for weight, _ in driver.network.layers] == [(5, 64), (64, 64), (64, 1)]
 
 
@@ -49,28 +47,17 @@ def test_benchmark_has_rates_and_ratios_and_restores_cores() -> None:
     messages: list[str] = []
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
     found = benchmark_episodes(1, messages.append)
-    assert found["rounds"] == 1
-    assert min(found[name] for name in RATES) > 0
-    assert found["relative_to_sumo"] == pytest.approx(found["episode_steps_per_s"] / found["sumo_steps_per_s"])
-    assert found["relative_to_sumo_every_step"] == pytest.approx(
-        found["every_step_steps_per_s"] / found["sumo_steps_per_s"]
-    )
-    assert found["relative_to_traci"] > 2.0
-    for rollouts in found["model"].values():
-        assert rollouts["relative_to_environment"] == pytest.approx(
-            rollouts["steps_per_s"] / found["episode_steps_per_s"]
-        )
-    assert found["model"]["long"]["relative_to_environment"] > 2.0
-    batch = found["batch"]
-    assert batch["rings"] == 100
-    assert batch["relative_to_sumo"] == pytest.approx(batch["steps_per_s"] / found["sumo_steps_per_s"])
-    assert [entry["vehicles"] for entry in batch["scaling"]] == [22, 66]
-    for road in found["scenarios"].values():
-        assert road["relative_to_sumo"] == pytest.approx(road["episode_steps_per_s"] / road["sumo_steps_per_s"])
-    costs = [entry["us_per_vehicle_step"] for entry in found["scaling"]]
-    assert [entry["vehicles"] for entry in found["scaling"]] == [22, 66]
-    assert found["cost_growth"] == max(costs) / costs[0]
-    assert messages == ["round 1 of 1", "larger roads"]
+    parts = {part["name"]: part for part in found["parts"]}
+    assert len(parts) == len(found["parts"])
+    assert min(part["steps_per_s"] for part in parts.values()) > 0
+    for part in parts.values():
+        if part["reference"]:
+            assert part["ratio"] == pytest.approx(part["steps_per_s"] / parts[part["reference"]]["steps_per_s"])
+    assert parts["driving loop over TraCI"]["ratio"] < 0.5
+    assert parts["learned model: 500 rollouts of 20 control steps"]["ratio"] > 2.0
+    assert parts["batch of 100 rings of 22 vehicles"]["vehicles"] == 22
+    assert {"figure-eight: run_episode", "merge: run_episode", "driving loop, ring of 66 vehicles"} <= parts.keys()
+    assert (found["rounds"], messages) == (1, ["round 1 of 1"])
     assert cores is None or os.sched_getaffinity(0) == cores
 
 

@@ -178,52 +178,20 @@ def bench_command(
     - unjam bench
     - unjam bench --device cuda
     """
-    if device:
-        _bench_batches(device, json)
-        return
-    from unjam.training.benchmark import benchmark_episodes
+    from unjam.training.benchmark import benchmark_batches, benchmark_episodes
 
-    rates = benchmark_episodes(rounds, err_console.print)
+    rates = benchmark_batches(device, err_console.print) if device else benchmark_episodes(rounds, err_console.print)
     if json:
         print_json(rates)
         return
-    episode, to_sumo = "run_episode, residual with observations", "{:.2f} of SUMO"
-    batch, every_step = rates["batch"], to_sumo.format(rates["relative_to_sumo_every_step"])
-    slower, many = f"{rates['relative_to_traci']:.1f} times slower", f"{batch['relative_to_sumo']:.0f} of SUMO"
-    rows = [
-        ("SUMO alone", rates["sumo_steps_per_s"], "1"),
-        (f"{episode} once a second", rates["episode_steps_per_s"], to_sumo.format(rates["relative_to_sumo"])),
-        (f"{episode} in every step", rates["every_step_steps_per_s"], every_step),
-        (f"{episode} once a second, over TraCI", rates["traci_steps_per_s"], slower),
-        (f"a batch of {batch['rings']:,} rings, observations once a second", batch["steps_per_s"], many),
-    ]
-    for rollouts in rates["model"].values():
-        label = f"learned model, {rollouts['rows']:,} rollouts of {rollouts['control_steps']} control steps"
-        rows.append((label, rollouts["steps_per_s"], f"{rollouts['relative_to_environment']:.0f} times run_episode"))
-    for name, road in rates["scenarios"].items():
-        rows.append((f"{name}: SUMO alone", road["sumo_steps_per_s"], "1"))
-        rows.append((f"{name}: run_episode", road["episode_steps_per_s"], to_sumo.format(road["relative_to_sumo"])))
-    table = new_table(("ring, 22 vehicles, one core",), ("steps/s", "ratio"))
-    for label, speed, ratio in rows:
-        table.add_row(label, f"{speed:,.0f}", ratio)
-    console.print(table)
-    filtered = f"safety filter: an episode runs at {rates['relative_to_unfiltered']:.2f} of the speed without it"
-    console.print(f"{filtered}; its audit takes {100 * rates['audit_share']:.1f} % of the time")
-    for entry in rates["scaling"]:
-        console.print(f"{entry['vehicles']:>5} vehicles: {entry['us_per_vehicle_step']:.2f} us per vehicle-step")
-    for entry in batch["scaling"]:
-        cost = f"{1e3 * entry['us_per_vehicle_step']:.1f} ns per vehicle-step in a batch"
-        console.print(f"{entry['vehicles']:>5} vehicles: {cost}")
-
-
-def _bench_batches(device: Literal["cpu", "cuda"], json: bool) -> None:
-    from unjam.training.benchmark import benchmark_batches
-
-    rates = benchmark_batches(device, err_console.print)
-    if json:
-        print_json(rates)
-        return
-    for name, entries in rates["batches"].items():
+    if not device:
+        table = new_table(("part, one core",), ("steps/s", "us per vehicle-step", "ratio"))
+        for part in rates["parts"]:
+            cost = f"{1e6 / part['steps_per_s'] / part['vehicles']:.3g}" if part["vehicles"] else ""
+            ratio = f"{part['ratio']:,.2f} of {part['reference']}" if part["reference"] else ""
+            table.add_row(part["name"], f"{part['steps_per_s']:,.0f}", cost, ratio)
+        console.print(table)
+    for name, entries in rates.get("batches", {}).items():
         heading = f"rings of {rates['vehicles']} vehicles on {rates['device']}, {name}"
         table = new_table((heading,), ("steps/s", "vehicle-steps/s"))
         for entry in entries:

@@ -8,11 +8,11 @@ import itertools
 import os
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,12 +47,12 @@ from unjam.worlds.sumo.simulation import Simulation
 TRACI_STEPS = 200
 RING_SIZES = {22: 3000, 220: 800, 2200: 200}
 """vehicles on the ring, one in 22 a CAV, and control steps"""
-ROLLOUT_SIZES = {"long": (2000, 50), "short": (1200, 10)}
+ROLLOUT_SIZES = ((2000, 50), (1200, 10))
 """rows and control steps of model rollouts: with an accurate model, and as in a training iteration on the ring"""
 BATCH_VEHICLES = 90_112
 """vehicles of a batch: 4,096 rings of 22"""
-OTHER_SCENARIOS = ("figure-eight", "merge")
-"""scenarios besides the ring for the comparison with plain SUMO"""
+BENCHMARK_SCENARIOS = ("ring", "figure-eight", "merge")
+"""scenarios that are compared with plain SUMO"""
 STEPS_PER_ROUND = 100
 METERS_PER_VEHICLE = 245 / 22
 VEHICLES_PER_RING = 22
@@ -61,114 +61,94 @@ BATCH_SIZES = {"cpu": (64, 256, 1024, 4096, 16_384), "cuda": (64, 256, 1024, 409
 """numbers of rings, by device"""
 BENCHMARK_MODEL = ModelSettings(hidden=(32, 32))
 """the networks of human drivers"""
+SUMO_PART, EPISODE_PART = "SUMO alone", "run_episode"
+"""what other parts are related to, after the name of a scenario"""
+
+
+class Part(NamedTuple):
+    """What a round measures."""
+
+    name: str
+    reference: str = ""
+    """name of the part to which its speed is related; empty: none"""
+    vehicles: int = 0
+    """on a road, if the cost of a vehicle-step is of interest"""
 
 
 def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: None) -> dict[str, Any]:
-    """Return steps per second, their ratios, and the cost of a vehicle-step by size of the road; on one core.
+    """Return control steps per second, and their ratios, for each `Part`; on one core, medians over the rounds.
 
-    `relative_to_sumo`: `run_episode` (with loading and recording) relative to plain SUMO, with the default residual
-    driver of training, which has an action repeat of one second. `relative_to_sumo_every_step`: the same without action
-    repeat. `relative_to_traci`: the driving loop with libsumo relative to TraCI. `batch`: rings in a batch, in single
-    precision with fast noise, relative to plain SUMO, and the cost of a vehicle-step by size of the rings. `model`:
-    model rollouts with the default ensemble, relative to `run_episode`. `relative_to_unfiltered`: `run_episode`
-    relative to the same without safety filter. `audit_share`: share of the audit in the time of an episode.
-    `scenarios`: `relative_to_sumo` for other scenarios. `cost_growth`: largest cost of a vehicle-step relative to that
-    of the smallest road.
+    Episodes have the default residual driver of training, which has an action repeat of one second, and are loaded,
+    filtered, audited and recorded. Batches of rings are in single precision, with fast noise; model rollouts use the
+    default ensemble.
     """
-    if not hasattr(os, "sched_setaffinity"):
-        return _run_rounds(rounds, on_message)
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(cores)})
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
+    if cores is not None:
+        os.sched_setaffinity(0, {min(cores)})
     try:
-        return _run_rounds(rounds, on_message)
+        torch.set_num_threads(1)
+        driver = make_benchmark_driver(SCENARIOS["ring"].control_step)
+        batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
+        with Simulation() as simulation:  # writes network files and fills caches
+            for name in reversed(BENCHMARK_SCENARIOS):
+                episode = _run_episode(SCENARIOS[name], 0, simulation)
+        rates: defaultdict[Part, list[float]] = defaultdict(list)
+        for number in range(1, rounds + 1):
+            on_message(f"round {number} of {rounds}")
+            for part, rate in _measure_round(number, driver, episode, batches):
+                rates[part].append(rate)
     finally:
-        os.sched_setaffinity(0, cores)
+        if cores is not None:
+            os.sched_setaffinity(0, cores)
+    by_name = {part.name: values for part, values in rates.items()}
+    parts = []
+    for part, values in rates.items():
+        ratios = [a / b for a, b in zip(values, by_name.get(part.reference, ()), strict=False)]
+        ratio = median(ratios) if ratios else None
+        parts.append({**part._asdict(), "steps_per_s": median(values), "ratio": ratio})
+    return {"rounds": rounds, "parts": parts}
 
 
-def _run_rounds(rounds: int, on_message: MessageCallback) -> dict[str, Any]:
+def _measure_round(
+    number: int, driver: ResidualDriver, episode: Episode, batches: Mapping[int, Iterator[object]]
+) -> Iterator[tuple[Part, float]]:
     ring = SCENARIOS["ring"]
-    driver = make_benchmark_driver(PolicySettings().action_repeat(ring.control_step))
-    every_step_driver = make_benchmark_driver(1)
+    sumo, own = f"ring: {SUMO_PART}", f"ring: {EPISODE_PART}"
     unfiltered = replace(ring, safety=replace(ring.safety, active=False))
-    rates: defaultdict[str, list[float]] = defaultdict(list)  # steps per second of each round, by measured part
-    torch.set_num_threads(1)
-    batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
-    with Simulation() as simulation:  # writes network files and fills caches
-        for name in OTHER_SCENARIOS:
-            run_episode(SCENARIOS[name], driver, (0,), explore=True, backend=SumoBackend(simulation))
-        episode = run_episode(ring, driver, (0,), explore=True, backend=SumoBackend(simulation))
-    for number in range(1, rounds + 1):
-        on_message(f"round {number} of {rounds}")
+    with Simulation() as simulation:
+        for name in BENCHMARK_SCENARIOS:
+            scenario, sumo_part = SCENARIOS[name], f"{name}: {SUMO_PART}"
+            make_traffic(scenario, (number,), simulation)
+            step_sumo = partial(_step_sumo, simulation, scenario.horizon * scenario.steps_per_control_step)
+            yield Part(sumo_part), steps_per_second(step_sumo, scenario.horizon)
+            yield Part(f"{name}: {EPISODE_PART}", sumo_part), _episode_rate(scenario, number, simulation)
+        yield Part(f"{own}, network in every step", sumo), _episode_rate(ring, number, simulation, 0.0)
+        yield Part(f"{own} without safety filter", own), _episode_rate(unfiltered, number, simulation)
+        yield Part("ring: audit of an episode", own), steps_per_second(partial(_repeat_audit, episode), ring.horizon)
+        for rows, steps in ROLLOUT_SIZES:
+            name = f"learned model: {rows:,} rollouts of {steps} control steps"
+            yield Part(name, own), _rollout_rate(episode, ring, driver, rows, steps)
+        for vehicles, batch in batches.items():
+            rings = BATCH_VEHICLES // vehicles
+            name = f"batch of {rings:,} rings of {vehicles:,} vehicles"
+            yield Part(name, sumo, vehicles), ring_steps_per_second(batch, rings)
+    for vehicles, horizon in RING_SIZES.items():  # of the same density
         with Simulation() as simulation:
-            for name in ("ring", *OTHER_SCENARIOS):
-                scenario = SCENARIOS[name]
-                make_traffic(scenario, (number,), simulation)
-                steps = scenario.horizon * scenario.steps_per_control_step
-                step_sumo = partial(_step_sumo, simulation, steps)
-                rates[f"sumo {name}"].append(steps_per_second(step_sumo, scenario.horizon))
-                rates[f"episode {name}"].append(_episode_rate(scenario, driver, number, simulation))
-            rates["every_step"].append(_episode_rate(ring, every_step_driver, number, simulation))
-            rates["unfiltered"].append(_episode_rate(unfiltered, driver, number, simulation))
-            rates["audit"].append(steps_per_second(partial(_repeat_audit, episode), ring.horizon))
-            for name, (rows, steps) in ROLLOUT_SIZES.items():
-                rates[f"model {name}"].append(_rollout_rate(episode, ring, driver, rows, steps))
-            for vehicles, batch in batches.items():
-                rates[f"batch {vehicles}"].append(ring_steps_per_second(batch, BATCH_VEHICLES // vehicles))
-            rates["loop"].append(_loop_rate(ring, driver, simulation))
-        with Simulation("traci") as simulation:
-            rates["traci"].append(_loop_rate(replace(ring, horizon=TRACI_STEPS), driver, simulation))
-    on_message("larger roads")
-    for _ in range(max(1, rounds // 2)):
-        for vehicles, horizon in RING_SIZES.items():  # of the same density
-            with Simulation() as simulation:
-                loop_rate = _loop_rate(make_benchmark_ring(vehicles, horizon), driver, simulation)
-            rates[f"loop {vehicles}"].append(loop_rate)
-    medians = {part: median(each) for part, each in rates.items()}
-
-    def ratio(numerator: str, denominator: str) -> float:
-        return median(a / b for a, b in zip(rates[numerator], rates[denominator], strict=True))
-
-    def scenario_result(name: str) -> dict[str, float]:
-        sumo, own = f"sumo {name}", f"episode {name}"
-        speeds = {"sumo_steps_per_s": medians[sumo], "episode_steps_per_s": medians[own]}
-        return {**speeds, "relative_to_sumo": ratio(own, sumo)}
-
-    def scaling_result(part: str) -> dict[str, Any]:
-        costs = {vehicles: 1e6 / medians[f"{part} {vehicles}"] / vehicles for vehicles in RING_SIZES}
-        scaling = [{"vehicles": vehicles, "us_per_vehicle_step": cost} for vehicles, cost in costs.items()]
-        return {"scaling": scaling, "cost_growth": max(costs.values()) / costs[min(costs)]}
-
+            rate = _loop_rate(make_benchmark_ring(vehicles, horizon), driver, simulation)
+            yield Part(f"driving loop, ring of {vehicles:,} vehicles", vehicles=vehicles), rate
     smallest = min(RING_SIZES)
-    return {
-        **scenario_result("ring"),
-        "traci_steps_per_s": medians["traci"],
-        "every_step_steps_per_s": medians["every_step"],
-        "relative_to_sumo_every_step": ratio("every_step", "sumo ring"),
-        "relative_to_unfiltered": ratio("episode ring", "unfiltered"),
-        "audit_share": ratio("episode ring", "audit"),
-        "relative_to_traci": ratio("loop", "traci"),
-        "batch": {
-            "rings": BATCH_VEHICLES // smallest,
-            "steps_per_s": medians[f"batch {smallest}"],
-            "relative_to_sumo": ratio(f"batch {smallest}", "sumo ring"),
-            **scaling_result("batch"),
-        },
-        "model": {
-            name: {
-                **{"rows": rows, "control_steps": steps, "steps_per_s": medians[f"model {name}"]},
-                "relative_to_environment": ratio(f"model {name}", "episode ring"),
-            }
-            for name, (rows, steps) in ROLLOUT_SIZES.items()
-        },
-        "scenarios": {name: scenario_result(name) for name in OTHER_SCENARIOS},
-        **scaling_result("loop"),
-        "rounds": rounds,
-    }
+    with Simulation("traci") as simulation:
+        rate = _loop_rate(make_benchmark_ring(smallest, TRACI_STEPS), driver, simulation)
+        yield Part("driving loop over TraCI", f"driving loop, ring of {smallest} vehicles"), rate
 
 
-def _episode_rate(scenario: Scenario, driver: ResidualDriver, seed: int, simulation: Simulation) -> float:
-    run = partial(run_episode, scenario, driver, (seed,), explore=True, backend=SumoBackend(simulation))
-    return steps_per_second(run, scenario.horizon)
+def _run_episode(scenario: Scenario, seed: int, simulation: Simulation, action_duration: float = 1.0) -> Episode:
+    driver = make_benchmark_driver(scenario.control_step, action_duration)
+    return run_episode(scenario, driver, (seed,), explore=True, backend=SumoBackend(simulation))
+
+
+def _episode_rate(scenario: Scenario, seed: int, simulation: Simulation, action_duration: float = 1.0) -> float:
+    return steps_per_second(partial(_run_episode, scenario, seed, simulation, action_duration), scenario.horizon)
 
 
 def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulation) -> float:
@@ -205,14 +185,15 @@ def _step_sumo(simulation: Simulation, steps: int) -> None:
         step()
 
 
-def make_benchmark_driver(action_repeat: int) -> ResidualDriver:
-    """Return PI with a residual network of the paper's size that is evaluated every `action_repeat` control steps."""
+def make_benchmark_driver(time_step: float, action_duration: float = 1.0) -> ResidualDriver:
+    """Return PI with a residual network of the paper's size that is evaluated every `action_duration` seconds."""
     generator = np.random.default_rng(0)
     layers = tuple(
         (generator.normal(size=(inputs, outputs)) / 100, np.zeros(outputs))
         for inputs, outputs in itertools.pairwise([5, 64, 64, 1])
     )
-    return ResidualDriver(PISaturation(), Network(layers, 1.0, 0.1), 1.0, action_repeat=action_repeat)
+    repeat = PolicySettings(action_duration=action_duration).action_repeat(time_step)
+    return ResidualDriver(PISaturation(time_step=time_step), Network(layers, 1.0, 0.1), 1.0, action_repeat=repeat)
 
 
 def make_benchmark_ring(vehicles: int, horizon: int) -> Ring:
@@ -266,7 +247,7 @@ def benchmark_batches(device: Device, on_message: MessageCallback = lambda line:
     check_device(device)
     torch.set_num_threads(1)
     ring = make_benchmark_ring(VEHICLES_PER_RING, 1)
-    driver = make_benchmark_driver(PolicySettings().action_repeat(ring.control_step))
+    driver = make_benchmark_driver(ring.control_step)
     model = RoadModel(BENCHMARK_MODEL, (0,)).to(device)
     model.output_mask.fill_(1.0)
     human_models = {
