@@ -35,7 +35,6 @@ from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figur
 from unjam.reports.results import PlotEpisode, read_results, validation_gains
 from unjam.reports.space_time import trajectory_figure
 from unjam.training.config import load_config
-from unjam.training.early_stopping import has_converged
 from unjam.worlds.record import Floats
 from unjam_paper.results_file import read_part, write_figure, write_part
 from unjam_paper.study import (
@@ -341,10 +340,10 @@ def paper_exact_study(road: str) -> Study:
 
 def paper_convergence(progress: Table) -> dict[str, float] | None:
     """Return the steps after which the rule of the paper ends a training, and the return then; None: never."""
-    config = load_config(preset="paper-exact")
-    window = config.evaluation.convergence_window
+    rule = load_config(preset="paper-exact").evaluation
+    window = rule.convergence_window
     for count in range(window, len(progress) + 1, window):
-        if has_converged(config, progress[:count]):
+        if rule.has_converged(progress[:count]):
             mean = np.mean([row["return_mean"] for row in progress[count - window : count]])
             return {"steps": progress[count - 1]["environment_steps"], "return": float(mean)}
     return None

@@ -9,7 +9,6 @@ import pytest
 from tests.training.test_run import STEPS, controller_manifest, learn_with, outcome, small_config
 from unjam.errors import MissingPartError
 from unjam.reports.results import read_progress, validation_gains
-from unjam.training.early_stopping import has_converged, is_out_of_patience
 from unjam.training.tensorboard import TENSORBOARD_FOLDER, tensorboard_writer
 from unjam.training.train import Trainer
 from unjam.worlds.worker_pool import WorkerPool
@@ -33,7 +32,7 @@ def test_patience_counts_validations_since_the_best(validations: list[float | No
         {"iteration": number, "return_validation": value, "return_expert": 11.0}
         for number, value in enumerate(validations, 1)
     ]
-    assert is_out_of_patience(small_config(evaluation__patience=patience), rows) is over
+    assert small_config(evaluation__patience=patience).evaluation.is_out_of_patience(rows) is over
 
 
 @pytest.mark.parametrize(
@@ -49,7 +48,7 @@ def test_patience_counts_validations_since_the_best(validations: list[float | No
 )
 def test_convergence_compares_two_windows(returns: list[float], span: int, over: bool) -> None:
     rows = [{"return_mean": value} for value in returns]
-    assert has_converged(small_config(evaluation__convergence_window=span), rows) is over
+    assert small_config(evaluation__convergence_window=span).evaluation.has_converged(rows) is over
 
 
 def test_converged_policy_is_the_controller(tmp_path: Path) -> None:
@@ -145,4 +144,5 @@ def test_unscheduled_validation_does_not_count_for_patience() -> None:
     rows = [{"iteration": number, "return_expert": 10.0} for number in range(1, 5)]
     for row, found in zip(rows, (None, 12.0, 11.0, 11.5), strict=True):
         row["return_validation"] = found  # pyright: ignore[reportArgumentType]
-    assert not is_out_of_patience(small_config(evaluation__validation_interval=2, evaluation__patience=2), rows)
+    config = small_config(evaluation__validation_interval=2, evaluation__patience=2)
+    assert not config.evaluation.is_out_of_patience(rows)

@@ -137,14 +137,12 @@ def _without_none(values: dict[str, Any]) -> dict[str, Any]:
 class TrainingOptions(NamedTuple):
     """Values of the options that configure a training."""
 
-    preset: str
-    """name of the preset, or empty"""
     config: Path | None
     """TOML file with the configuration"""
-    options: dict[str, Any]
-    """configuration values of the options that were given, by key"""
-    settings: dict[str, Any]
-    """configuration values of `--set`, by key"""
+    preset: str
+    """name of the preset, or empty"""
+    changes: dict[str, Any]
+    """configuration values of other options and of `--set`, by key"""
 
 
 def training_options(
@@ -167,7 +165,7 @@ def training_options(
     """Return the values of the options that configure a training."""
     options = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
     options = _without_none({**options, "reward": reward or None})
-    return TrainingOptions(preset, config, options, parse_settings(settings))
+    return TrainingOptions(config, preset, merge_settings(options, parse_settings(settings)))
 
 
 MAX_NUMBER_DIGITS = 10

@@ -11,8 +11,6 @@ from unjam.cli import options as opt
 from unjam.cli import output
 from unjam.cli.output import console, err_console, print_json
 from unjam.errors import InputError
-from unjam.files import make_folder
-from unjam.processes import lock_folder
 
 if TYPE_CHECKING:
     from unjam.training.config import RunConfig
@@ -54,21 +52,20 @@ def train_command(
     - unjam train --resume runs/ring-001 --steps 2000000
     """
     from unjam.training.config import load_config
-    from unjam.training.early_stopping import should_stop_early
     from unjam.training.run_folder import check_config, read_config
 
-    settings = dict(options.settings)
+    config_file, preset, settings = options
     if "out" in settings:
         out = Path(str(settings.pop("out")))
     scenario_options = {f"scenario_options.{key}": value for key, value in changes.items()}
-    changes = {"workers": workers, **opt.merge_settings({**options.options, **scenario_options}, settings)}
+    changes = {"workers": workers, **opt.merge_settings(scenario_options, settings)}
     if resume is not None:
-        if out is not None or options.preset or options.config is not None:
+        if out is not None or preset or config_file is not None:
             raise InputError("resume: --out, --preset and --config are not allowed together with it")
         config = load_config(resume / "config.toml", changes={"steps": read_config(resume).steps, **changes})
         folder = resume
     else:
-        config = load_config(options.config, options.preset, changes)
+        config = load_config(config_file, preset, changes)
         folder = opt.new_folder(out, config.scenario)
     check_config(config)
     # These import torch, which takes seconds: errors in the arguments are reported before.
@@ -103,7 +100,7 @@ def train_command(
         output.print_notes(results.metadata["notes"])
         err_console.print(f"controller: {road.controller}")
         steps = max(config.steps, results.progress[-1]["environment_steps"])
-        is_finished = should_stop_early(config, read_progress(result.folder))
+        is_finished = config.evaluation.should_stop_early(read_progress(result.folder))
         output.suggest_after_training(road.folder, road.gain, steps, result.folder, is_finished)
     err_console.print(f"report: {result.report}")
 
@@ -189,16 +186,17 @@ def search_command(
     - unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/search
     """
     from unjam.training.config import load_config
+    from unjam.training.run_folder import lock_new_folder
     from unjam.training.search import BEST_CONFIG_FILE, check_search_space, describe_trial, search
     from unjam.training.search_space import parse_search_space
+    from unjam.training.trial_log import REQUEST_FILE
 
-    base = replace(load_config(options.config, options.preset, options.options | options.settings), workers=1)
+    base = replace(load_config(*options), workers=1)
     space = parse_search_space(vary or [])
     check_search_space(base, space)
     folder = opt.new_folder(out, f"search-{Path(base.scenario).stem}")
-    make_folder(folder)
     on_message = (lambda line: None) if json else err_console.print
-    with lock_folder(folder):
+    with lock_new_folder(folder, resumable_file=REQUEST_FILE):
         found = search(base, space, trials, folder, workers, executor, on_message)
     best = folder / BEST_CONFIG_FILE
     if json:

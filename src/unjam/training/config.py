@@ -63,6 +63,29 @@ class EvaluationSettings:
     baselines: tuple[str, ...] = ("human", "pi", "follower-stopper")
     """drivers that are evaluated in addition to the expert and the trained controller"""
 
+    def should_stop_early(self, progress: Sequence[dict[str, Any]]) -> bool:
+        """Return whether a training with these rows of progress ends before its steps are done."""
+        return self.is_out_of_patience(progress) or self.has_converged(progress)
+
+    def has_converged(self, progress: Sequence[dict[str, Any]]) -> bool:
+        """Return whether the last `convergence_window` iterations were not better than those before."""
+        window = self.convergence_window
+        if not window or len(progress) % window or len(progress) < 2 * window:
+            return False
+        returns = [row["return_mean"] for row in progress[-2 * window :]]
+        return sum(returns[window:]) <= sum(returns[:window])
+
+    def is_out_of_patience(self, progress: Sequence[dict[str, Any]]) -> bool:
+        """Return whether `patience` validations in a row had no new best return."""
+        interval = self.validation_interval
+        scheduled = [row for row in progress if interval and row["iteration"] % interval == 0]  # not that at the end
+        returns = [value for row in scheduled if (value := row.get("return_validation")) is not None]
+        if not self.patience or not returns:
+            return False
+        best = max(range(len(returns)), key=returns.__getitem__)
+        since = len(returns) - 1 - best if returns[best] > progress[0]["return_expert"] else len(returns)
+        return since >= self.patience
+
 
 @dataclass(frozen=True, config=STRICT)
 class TaskConfig:

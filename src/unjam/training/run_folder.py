@@ -36,7 +36,6 @@ from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
-from unjam.training.early_stopping import should_stop_early
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
 from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.episode import can_drive, check_can_drive, check_policy_inputs
@@ -173,7 +172,7 @@ def resume_run_folder(folder: Path, config: RunConfig) -> None:
     before, progress = read_config(folder), read_progress(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change")
-    if config.steps > before.steps and should_stop_early(before, progress):
+    if config.steps > before.steps and before.evaluation.should_stop_early(progress):
         reason = f"evaluation.patience or evaluation.convergence_window ended it; allowed: {before.steps}, or a new run"
         raise InputError(f"steps: {config.steps} is not allowed: {reason}")
     done = max((row.get("environment_steps", 0) for row in progress), default=0)

@@ -14,7 +14,6 @@ from unjam.parameters import flatten_keys
 from unjam.processes import check_not_locked, is_locked
 from unjam.reports.results import EVALUATION_FILE, damaged_results_error, read_evaluation, read_progress
 from unjam.training.config import CONFIG_FILE, RunConfig
-from unjam.training.early_stopping import should_stop_early
 from unjam.training.run_folder import MANIFEST_FILE, read_config
 
 RunState = Literal["running", "finished", "stopped", "damaged"]
@@ -84,7 +83,7 @@ def read_run(folder: Path, name: str = "") -> Run:
     except INVALID_DATA_ERRORS as error:
         raise damaged_results_error(folder, error) from None
     is_evaluated = all((folder / task / EVALUATION_FILE).is_file() for task in gains)
-    is_trained = steps >= config.steps or should_stop_early(config, progress)
+    is_trained = steps >= config.steps or config.evaluation.should_stop_early(progress)
     state: RunState = "finished" if is_evaluated and is_trained else "stopped"
     return Run(name or str(folder), folder, config, "running" if is_locked(folder) else state, steps, gains)
 

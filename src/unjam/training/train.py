@@ -53,7 +53,6 @@ from unjam.training.run_folder import (
     restore_newest_checkpoint,
     resume_run_folder,
     save_checkpoint,
-    should_stop_early,
 )
 from unjam.training.seeds import VALIDATION_SEED
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
@@ -222,7 +221,8 @@ class Trainer:
         self._fingerprint = fingerprint(config)
         if checkpoint := restore_newest_checkpoint(folder, {folder, *self.folders}, self._fingerprint):
             state, tensors = checkpoint
-            is_finished = state["environment_steps"] >= config.steps or should_stop_early(config, read_progress(folder))
+            is_stopped = config.evaluation.should_stop_early(read_progress(folder))
+            is_finished = is_stopped or state["environment_steps"] >= config.steps
             self._controllers.restore(tensors, is_finished)
             self.collector.iteration = state["iteration"]
             self.collector.environment_steps = state["environment_steps"]
@@ -244,7 +244,7 @@ class Trainer:
             self._sampler.best_returns = self._expert_returns
             self._save_controllers(self.network(), is_best=True)
             self._best_validation = self._sampler.weighted_mean(self._expert_returns)
-        if not should_stop_early(self.config, read_progress(self.folder)):
+        if not self.config.evaluation.should_stop_early(read_progress(self.folder)):
             with reporting_user_errors(self.config.agent):
                 run_iterations(
                     self.algorithm, self.collector, self.config.steps, self.config.seed, self.finish_iteration
@@ -297,7 +297,7 @@ class Trainer:
         seconds = {"collect": self.collector.seconds, **log.seconds, "validation": time.perf_counter() - started}
         log = replace(log, seconds=seconds)
         whole, *tasks = self._progress_rows(log, validation)
-        early = should_stop_early(self.config, [*read_progress(self.folder), whole])
+        early = self.config.evaluation.should_stop_early([*read_progress(self.folder), whole])
         if early and validation is None:
             started, validation = time.perf_counter(), self.validate(has_ended=True)
             seconds["validation"] += time.perf_counter() - started

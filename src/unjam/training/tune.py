@@ -173,7 +173,21 @@ def tune(
     unused_steps = (TUNING_FINALISTS - len(best_values)) * 2 * trial_steps
     sumo_steps = trial_runs * trial_steps + final_steps - unused_steps - batch_steps
     result = TuningResult(best, default, trials, sumo_steps, batch_steps, folder / f"{expert}{SUFFIX}")
-    _write_result(roads, expert, result, folder, reward, seed, log.starts)
+    recipe = next(iter(recipes.values())) if is_single else recipes
+    scenario = next(iter(roads.values()))
+    tuning = {
+        "reward": reward or (scenario.reward if is_single else MEAN_GAIN),
+        "seed": seed,
+        "environment_steps": sumo_steps,
+        "batch_steps": batch_steps,
+        "best": asdict(best),
+        "default": asdict(default),
+    }
+    driver = driver_from_name(best.driver, scenario.control_step)
+    atomic_write(result.file, controller_bytes(driver, {**controller_origin(scenario, driver), "tuning": tuning}))
+    facts = {"scenario": recipe, "expert": expert, **tuning, "manifest": {**manifest(), "starts": log.starts}}
+    document = {**facts, "trials": [asdict(trial) for trial in trials]}
+    atomic_write(folder / TUNING_FILE, to_json(document, indent=1))
     return result
 
 
@@ -252,35 +266,3 @@ def _score_rows(rows_by_road: Mapping[str, EpisodeRows], human_rows: Mapping[str
 
 def _round_digits(value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
-
-
-def _write_result(
-    roads: Mapping[str, Scenario],
-    expert: str,
-    result: TuningResult,
-    folder: Path,
-    reward: str,
-    seed: int,
-    starts: list[dict[str, Any]],
-) -> None:
-    recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
-    scenario = next(iter(roads.values()))
-    tuning = {
-        "reward": reward or (scenario.reward if len(roads) == 1 else MEAN_GAIN),
-        "seed": seed,
-        "environment_steps": result.environment_steps,
-        "batch_steps": result.batch_steps,
-        "best": asdict(result.best),
-        "default": asdict(result.default),
-    }
-    driver = driver_from_name(result.best.driver, scenario.control_step)
-    content = controller_bytes(driver, {**controller_origin(scenario, driver), "tuning": tuning})
-    atomic_write(result.file, content)
-    document = {
-        "scenario": recipes if len(roads) > 1 else scenario_recipe(scenario),
-        "expert": expert,
-        **tuning,
-        "manifest": {**manifest(), "starts": starts},
-        "trials": [asdict(trial) for trial in result.trials],
-    }
-    atomic_write(folder / TUNING_FILE, to_json(document, indent=1))
