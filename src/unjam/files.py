@@ -95,18 +95,6 @@ def write_new_file(path: Path, content: bytes, mode: int) -> None:
         raise InputError(f"file: {str(path)!r} exists; allowed: a new one") from None
 
 
-def write_folder(folder: Path, files: dict[str, bytes | str]) -> None:
-    """Write a complete folder of files or none, by renaming; an existing file or folder with its name is removed."""
-    remove(folder)
-    make_folder(folder.parent)
-    with _replacement(folder) as (parent, temporary):
-        parent.make_subfolder(temporary)
-        with parent.enter(temporary) as inner:
-            for name, content in files.items():
-                _write_and_sync(inner.create(name), content)
-            inner.sync()
-
-
 def is_leftover(path: Path) -> bool:
     """Return whether a file is an unfinished one, which a killed process has left."""
     return path.name.startswith(".") and path.name.endswith(".part")

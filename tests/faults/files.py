@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from safetensors.torch import save
 
 from tests.controller.test_signature import FOR_ANY_MESSAGE, WEAK, forge, signature_part
 from tests.controller.test_verify import HELD, content_of, mutated
@@ -35,7 +36,7 @@ from unjam.errors import DiskError, InputError
 from unjam.reports.html import write_report_page
 from unjam.training.config import load_config, to_toml
 from unjam.training.evaluate import drive
-from unjam.training.run_folder import CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE, load_checkpoint, save_checkpoint
+from unjam.training.run_folder import load_checkpoint, save_checkpoint
 from unjam.training.runs import list_runs
 
 MUTATIONS = ("change", "cut", "insert", "double", "swap")
@@ -87,18 +88,18 @@ def checkpoints(count: int, folder: Path, generator: np.random.Generator) -> Out
         place = folder / str(number)
         save_small_checkpoint(place, 1)
         save_small_checkpoint(place, 2)
-        part = place / "000002" / str(generator.choice([CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE]))
+        other, path = sorted(place.iterdir())
         kind = generator.choice(["bytes", "bytes", "bytes", "empty", "missing", "another's", "old schema"])
         if kind == "bytes":
-            part.write_bytes(any_mutation(part.read_bytes(), generator))
+            path.write_bytes(any_mutation(path.read_bytes(), generator))
         elif kind == "empty":
-            part.write_bytes(b"")
+            path.write_bytes(b"")
         elif kind == "missing":
-            part.unlink()
+            path.unlink()
         elif kind == "another's":
-            part.write_bytes((place / "000001" / part.name).read_bytes())
+            path.write_bytes(other.read_bytes())
         else:
-            (place / "000002" / CHECKPOINT_STATE_FILE).write_text('{"iteration": 2, "format": 0}')
+            path.write_bytes(save({}, {"state": '{"iteration": 2, "format": 0}'}))
         newest = loaded_iteration(place)
         outcome.happened["the generation before was used" if newest == 1 else "nothing was lost"] += 1
     return outcome

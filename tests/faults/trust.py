@@ -41,7 +41,7 @@ from unjam.processes import lock_folder
 from unjam.scenarios import Ring, make_scenario
 from unjam.training import run_folder
 from unjam.training.fingerprint import fingerprint
-from unjam.training.run_folder import CHECKPOINT_STATE_FILE, create_run_folder, restore_newest_checkpoint
+from unjam.training.run_folder import create_run_folder, restore_newest_checkpoint
 from unjam.trust import check_trusted_values, expecting_code, remember_trusted
 from unjam.user_code import read_code
 from unjam.worlds.episode import run_episode
@@ -160,8 +160,10 @@ def _anothers_checkpoint(at: _Run, generator: np.random.Generator) -> Any:
 
 def _edited_checkpoint(at: _Run, generator: np.random.Generator) -> Any:
     with_checkpoint(at.folder, small_config())
-    state = next((at.folder / "checkpoint").rglob(CHECKPOINT_STATE_FILE))
-    state.write_text(state.read_text().replace('"seed": 0', '"seed": 7'))
+    (checkpoint,) = (at.folder / "checkpoint").iterdir()
+    content = checkpoint.read_bytes()
+    assert b'seed\\": 0' in content
+    checkpoint.write_bytes(content.replace(b'seed\\": 0', b'seed\\": 7'))
     return small_config(seed=7)
 
 

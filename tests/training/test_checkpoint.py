@@ -1,7 +1,5 @@
 import errno
-import json
 import os
-import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -11,10 +9,12 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from safetensors.torch import save
 
+from unjam.controller.file import sha256_of
 from unjam.errors import DiskError, InputError
 from unjam.training import run_folder
-from unjam.training.run_folder import CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE, load_checkpoint, save_checkpoint
+from unjam.training.run_folder import load_checkpoint, save_checkpoint
 
 Content = tuple[dict[str, Any], dict[str, torch.Tensor]]
 
@@ -34,6 +34,12 @@ def content_of(iteration: int) -> Content:
 def save_all(folder: Path, *iterations: int) -> None:
     for iteration in iterations:
         save_checkpoint(folder, *content_of(iteration))
+
+
+def file_of(folder: Path, iteration: int) -> Path:
+    """The file of the checkpoint of an iteration."""
+    (path,) = folder.glob(f"{iteration:06d}-*.safetensors")
+    return path
 
 
 def is_content(found: Content | None, iteration: int) -> bool:
@@ -66,16 +72,16 @@ def test_missing_checkpoint_is_none(tmp_path: Path) -> None:
 
 def test_newest_two_checkpoints_are_kept(tmp_path: Path) -> None:
     save_all(tmp_path, 1, 2, 9, 10, 11)
-    assert sorted(place.name for place in tmp_path.iterdir()) == ["000010", "000011"]
+    assert sorted(path.name[:7] for path in tmp_path.iterdir()) == ["000010-", "000011-"]
     assert is_content(load_checkpoint(tmp_path), 11)
 
 
 def test_other_files_are_not_changed(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    (tmp_path / "old").mkdir()
+    (tmp_path / "000000-old").mkdir()
     save_all(tmp_path, 1, 2, 3)
     assert (tmp_path / "notes.txt").read_text() == "mine"
-    assert (tmp_path / "old").is_dir()
+    assert (tmp_path / "000000-old").is_dir()
     assert is_content(load_checkpoint(tmp_path), 3)
 
 
@@ -83,7 +89,7 @@ def test_checkpoint_of_another_format_is_refused(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(run_folder, "CHECKPOINT_FORMAT", 1)
     save_all(tmp_path, 1)
     monkeypatch.undo()
-    with pytest.raises(InputError, match=r"000001 has format 1, of another version of unjam; allowed: \d+$"):
+    with pytest.raises(InputError, match=r"000001-.* has format 1, of another version of unjam; allowed: \d+$"):
         load_checkpoint(tmp_path)
 
 
@@ -98,45 +104,39 @@ def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def edit_state(place: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    path = place / CHECKPOINT_STATE_FILE
-    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+def rewrite(path: Path, content: bytes) -> None:
+    """Replace a checkpoint by another content with the hash that belongs to it."""
+    path.unlink()
+    path.with_name(f"{path.name[:7]}{sha256_of(content)}.safetensors").write_bytes(content)
 
 
 DAMAGE: dict[str, Callable[[Path], object]] = {
-    "no state": lambda place: (place / CHECKPOINT_STATE_FILE).unlink(),
-    "no tensors": lambda place: (place / CHECKPOINT_TENSORS_FILE).unlink(),
-    "nothing": lambda place: (shutil.rmtree(place), place.mkdir()),
-    "half a state": lambda place: halve(place / CHECKPOINT_STATE_FILE),
-    "half the tensors": lambda place: halve(place / CHECKPOINT_TENSORS_FILE),
-    "empty state": lambda place: (place / CHECKPOINT_STATE_FILE).write_bytes(b""),
-    "empty tensors": lambda place: (place / CHECKPOINT_TENSORS_FILE).write_bytes(b""),
-    "more than the tensors": lambda place: (place / CHECKPOINT_TENSORS_FILE).open("ab").write(b"\0"),
-    "state of zeros": lambda place: (place / CHECKPOINT_STATE_FILE).write_bytes(bytes(300)),
-    "state that is a list": lambda place: (place / CHECKPOINT_STATE_FILE).write_text("[]"),
-    "state that is a number": lambda place: (place / CHECKPOINT_STATE_FILE).write_text("3"),
-    "state that is null": lambda place: (place / CHECKPOINT_STATE_FILE).write_text("null"),
-    "state without its hash": lambda place: edit_state(place, lambda s: {k: s[k] for k in s if k != "sha256"}),
-    "state with another number": lambda place: edit_state(place, lambda s: {**s, "environment_steps": 601}),
-    "hash that is none": lambda place: edit_state(place, lambda s: {**s, "sha256": None}),
-    "tensors of another iteration": lambda place: swap(
-        place / CHECKPOINT_TENSORS_FILE, place.parent / "000001" / CHECKPOINT_TENSORS_FILE
-    ),
+    "nothing": lambda path: path.write_bytes(b""),
+    "half": halve,
+    "zeros": lambda path: path.write_bytes(bytes(300)),
+    "one byte more": lambda path: path.open("ab").write(b"\0"),
+    "another number": lambda path: path.write_bytes(path.read_bytes().replace(b"00, ", b"01, ")),
+    "another hash": lambda path: path.rename(path.with_name(f"{path.name[:7]}{'0' * 64}.safetensors")),
+    "a list as state": lambda path: rewrite(path, save({}, {"state": "[1]"})),
+    "null as state": lambda path: rewrite(path, save({}, {"state": "null"})),
+    "no state": lambda path: rewrite(path, save({})),
+    "no tensors": lambda path: rewrite(path, path.read_bytes()[:-1]),
+    "of another iteration": lambda path: swap(path, file_of(path.parent, 1)),
 }
 
 
 @pytest.mark.parametrize("name", [name for name in DAMAGE if "another iteration" not in name])
 def test_previous_checkpoint_replaces_a_damaged_one(tmp_path: Path, name: str) -> None:
     save_all(tmp_path, 1, 2)
-    DAMAGE[name](tmp_path / "000002")
+    DAMAGE[name](file_of(tmp_path, 2))
     assert is_content(load_checkpoint(tmp_path), 1)
 
 
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damaged_checkpoints_are_reported(tmp_path: Path, name: str) -> None:
     save_all(tmp_path, 1, 2)
-    for place in ("000002",) if "another iteration" in name else ("000002", "000001"):
-        DAMAGE[name](tmp_path / place)
+    for iteration in (2,) if "another iteration" in name else (2, 1):
+        DAMAGE[name](file_of(tmp_path, iteration))
     with pytest.raises(InputError, match=r"checkpoint: all 2 under .* are damaged") as caught:
         load_checkpoint(tmp_path)
     assert "\n" not in str(caught.value)
@@ -144,45 +144,39 @@ def test_damaged_checkpoints_are_reported(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.long
 @settings(max_examples=60)
-@given(
-    part=st.sampled_from([CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE]),
-    place=st.floats(0, 1, exclude_max=True),
-    bits=st.integers(1, 255),
-)
-@example(part=CHECKPOINT_STATE_FILE, place=0.0, bits=0x20)
-@example(part=CHECKPOINT_TENSORS_FILE, place=0.0, bits=1)
-@example(part=CHECKPOINT_TENSORS_FILE, place=0.999, bits=128)
-def test_changed_byte_never_changes_the_loaded_content(part: str, place: float, bits: int) -> None:
+@given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
+@example(place=0.0, bits=1)
+@example(place=0.999, bits=128)
+def test_changed_byte_never_changes_the_loaded_content(place: float, bits: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         save_all(folder, 1, 2)
-        path = folder / "000002" / part
+        path = file_of(folder, 2)
         content = bytearray(path.read_bytes())
         content[int(place * len(content))] ^= bits
         path.write_bytes(content)
-        found = load_checkpoint(folder)
-    # A blank between two entries of the state says nothing, so a state with another one is still whole.
-    harmless = part == CHECKPOINT_STATE_FILE and is_content(found, 2)
-    assert harmless or is_content(found, 1)
+        assert is_content(load_checkpoint(folder), 1)
 
 
 @settings(max_examples=60)
-@given(part=st.sampled_from([CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE]), share=st.floats(0, 1, exclude_max=True))
-def test_truncated_file_is_detected(part: str, share: float) -> None:
+@given(share=st.floats(0, 1, exclude_max=True))
+def test_truncated_file_is_detected(share: float) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         save_all(folder, 1, 2)
-        path = folder / "000002" / part
+        path = file_of(folder, 2)
         content = path.read_bytes()
         path.write_bytes(content[: int(share * len(content))])
         assert is_content(load_checkpoint(folder), 1)
 
 
-def test_damaged_checkpoint_is_overwritten(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", [name for name in DAMAGE if "another iteration" not in name])
+def test_damaged_checkpoint_is_replaced(tmp_path: Path, name: str) -> None:
     save_all(tmp_path, 1, 2)
-    halve(tmp_path / "000002" / CHECKPOINT_TENSORS_FILE)
+    DAMAGE[name](file_of(tmp_path, 2))
     save_all(tmp_path, 2)
     assert is_content(load_checkpoint(tmp_path), 2)
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_full_disk_keeps_earlier_checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

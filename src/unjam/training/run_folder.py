@@ -1,10 +1,11 @@
 """The folder of a run: its creation, resumption and checkpoints.
 
-torch is only imported to read or write a checkpoint, so that errors are reported quickly. A checkpoint is written at
-the end of each iteration, as a whole, with a hash; the newest two are kept.
+torch is only imported to read or write a checkpoint, so that errors are reported quickly. A checkpoint is a file that
+is written at the end of each iteration, and named by iteration and hash; the newest two are kept.
 """
 
 import json
+import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -19,16 +20,7 @@ from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
-from unjam.files import (
-    INVALID_DATA_ERRORS,
-    atomic_write,
-    is_leftover,
-    make_folder,
-    remove,
-    remove_if_empty,
-    to_json,
-    write_folder,
-)
+from unjam.files import INVALID_DATA_ERRORS, atomic_write, is_leftover, make_folder, remove, remove_if_empty, to_json
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, read_toml
 from unjam.processes import LOCK_FILE, lock_folder
@@ -44,11 +36,12 @@ from unjam.worlds.reward import make_reward
 if TYPE_CHECKING:
     from unjam.learners.algorithm import Tensors
 
-CHECKPOINT_FORMAT = 6
+CHECKPOINT_FORMAT = 7
 """format of run folders and their checkpoints; other formats are refused"""
 MAX_CHECKPOINTS = 2
 MANIFEST_FILE, PROGRESS_FILE = "manifest.json", "progress.jsonl"
-CHECKPOINT_STATE_FILE, CHECKPOINT_TENSORS_FILE = "state.json", "tensors.safetensors"
+CHECKPOINT_NAME = re.compile(r"\d{6,}-[0-9a-f]{64}\.safetensors")
+"""file name of a checkpoint: iteration and hash of the content"""
 ROW_MODEL_FIELDS = {"distance_to_crossing", "penetration_rate"}
 """optional inputs that the row model continues"""
 
@@ -215,15 +208,15 @@ def controller_origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> None:
-    """Write the checkpoint of an iteration under `folder`, and remove all but the newest two.
-
-    `state["iteration"]` is its name. It is written as a whole or not at all; the state has the hash of both parts.
-    """
+    """Write the checkpoint of `state["iteration"]` into a folder, and remove all but the newest two."""
     from safetensors.torch import save
 
-    state, data = {**state, "format": CHECKPOINT_FORMAT}, save(tensors)
-    text = json.dumps({**state, "sha256": _checkpoint_hash(state, data)}, indent=1)
-    write_folder(folder / f"{state['iteration']:06d}", {CHECKPOINT_TENSORS_FILE: data, CHECKPOINT_STATE_FILE: text})
+    data = save(tensors, {"state": json.dumps({**state, "format": CHECKPOINT_FORMAT})})
+    name = f"{state['iteration']:06d}-{sha256_of(data)}.safetensors"
+    make_folder(folder)
+    atomic_write(folder / name, data)
+    for damaged in [path for path in _checkpoint_files(folder) if path.name[:7] == name[:7] and path.name != name]:
+        remove(damaged)
     _remove_old_checkpoints(folder)
 
 
@@ -253,32 +246,29 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
     """Return the newest valid checkpoint, or None; raise `InputError` if all are damaged or of another format."""
     from safetensors.torch import load
 
-    for place, state, data in _valid_checkpoints(folder):
+    for path, state, data in _valid_checkpoints(folder):
         try:
             found, tensors = state.pop("format", 1), load(data)
         except INVALID_DATA_ERRORS:
             continue
         if found != CHECKPOINT_FORMAT:
             raise InputError(
-                f"checkpoint: {place} has format {found!r}, of another version of unjam; allowed: {CHECKPOINT_FORMAT}"
+                f"checkpoint: {path} has format {found!r}, of another version of unjam; allowed: {CHECKPOINT_FORMAT}"
             )
         return state, tensors
-    if places := _checkpoint_folders(folder):
-        raise InputError(f"checkpoint: all {len(places)} under {folder} are damaged")
+    if paths := _checkpoint_files(folder):
+        raise InputError(f"checkpoint: all {len(paths)} under {folder} are damaged")
     return None
 
 
 def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], bytes]]:
-    """Yield folder, state and tensors of the checkpoints with a correct hash, the newest first."""
-    for place in reversed(_checkpoint_folders(folder)):
-        try:
-            state = json.loads((place / CHECKPOINT_STATE_FILE).read_text())
-            data = (place / CHECKPOINT_TENSORS_FILE).read_bytes()
-            is_valid = state.pop("sha256") == _checkpoint_hash(state, data)
-        except INVALID_DATA_ERRORS:
-            continue
-        if is_valid:
-            yield place, state, data
+    """Yield file, state and content of the checkpoints with a correct hash, the newest first."""
+    for path in reversed(_checkpoint_files(folder)):
+        with suppress(*INVALID_DATA_ERRORS):
+            data = path.read_bytes()
+            header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+            if f"-{sha256_of(data)}." in path.name:
+                yield path, dict(json.loads(header["__metadata__"]["state"])), data
 
 
 def check_run_files(folder: Path, config: RunConfig) -> None:
@@ -290,14 +280,10 @@ def check_run_files(folder: Path, config: RunConfig) -> None:
 
 def _remove_old_checkpoints(folder: Path) -> None:
     """Remove all but the newest two checkpoints, and incomplete ones."""
-    for old in [*_checkpoint_folders(folder)[:-MAX_CHECKPOINTS], *filter(is_leftover, folder.glob(".*"))]:
+    for old in [*_checkpoint_files(folder)[:-MAX_CHECKPOINTS], *filter(is_leftover, folder.glob(".*"))]:
         with suppress(DiskError):
             remove(old)
 
 
-def _checkpoint_hash(state: dict[str, Any], data: bytes) -> str:
-    return sha256_of(json.dumps(state, sort_keys=True).encode() + data)
-
-
-def _checkpoint_folders(folder: Path) -> list[Path]:
-    return sorted(place for place in folder.glob("*") if place.is_dir() and place.name.isdigit())
+def _checkpoint_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("*") if path.is_file() and CHECKPOINT_NAME.fullmatch(path.name))
