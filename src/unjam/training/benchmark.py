@@ -90,8 +90,7 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
         driver = make_benchmark_driver(SCENARIOS["ring"].control_step)
         batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
         with Simulation() as simulation:  # writes network files and fills caches
-            for name in reversed(BENCHMARK_SCENARIOS):
-                episode = _run_episode(SCENARIOS[name], 0, simulation)
+            episode, *_ = [_run_episode(SCENARIOS[name], 0, simulation) for name in BENCHMARK_SCENARIOS]
         rates: defaultdict[Part, list[float]] = defaultdict(list)
         for number in range(1, rounds + 1):
             on_message(f"round {number} of {rounds}")
