@@ -47,8 +47,8 @@ def test_a_graph_with_three_inputs_drives_as_described(name: str, tmp_path: Path
     assert driver.describe() == name
     assert [str(each) for each in driver.network_inputs or ()] == [
         "speed / 1 m/s",
-        "leader_speed / 1 m/s",
-        "leader_gap / 1 m",
+        "leader speed / 1 m/s",
+        "leader gap / 1 m",
     ]
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.adapters.onnx_policies import follower, write
 from tests.pictures import empty_pictures
 from tests.training.test_run import STEPS, learn_with, small_config
 from unjam.controller import controller_bytes, load_controller
@@ -155,6 +156,20 @@ def test_user_expert_and_reward_are_used(pool: WorkerPool, tmp_path: Path, my_dr
     (trajectory,) = run_episode(config.make_scenario(), driver, seed, config.reward).trajectories
     assert set(trajectory.reward_terms) == {"speed", "push"}
     assert found.rows[TRAINED_LABEL][0]["return"] == trajectory.reward.sum()
+
+
+@pytest.mark.long
+def test_an_onnx_expert_is_trained_with_and_stored_as_data(pool: WorkerPool, tmp_path: Path) -> None:
+    graph = write(tmp_path, follower())
+    folder, config = train_small_run(pool, tmp_path / "run", expert=str(graph), model__model_ratio=0.0)
+    found = evaluate_run(folder, with_evaluation(config), pool)
+    assert list(found.rows) == ["human", "policy.onnx", TRAINED_LABEL]
+    graph.unlink()
+    driver = load_controller(folder)
+    assert driver.describe() == "policy.onnx + residual"
+    seed = make_test_seeds(1)[0]
+    episode = run_episode(config.make_scenario(), driver, seed, config.reward)
+    assert found.rows[TRAINED_LABEL][0]["return"] == episode.trajectories[0].reward.sum()
 
 
 def test_failed_baseline_is_reported_and_the_rest_is_saved(

@@ -11,17 +11,19 @@ from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
 from unjam.adapters import onnx_driver
 from unjam.adapters.stable_baselines3_export import stable_baselines3_bytes
-from unjam.controller import load_controller, packaged_file
+from unjam.controller import certificate, load_controller, packaged_file
 from unjam.controller.file import (
     GRAPH_PART,
     MANIFEST_PART,
     MAX_SAMPLE_STEPS,
     SAMPLE_PART,
     WEIGHTS_PART,
+    read_controller,
     read_sample,
     replay_states,
     unpack_parts,
 )
+from unjam.controller.verify import verify_controller_file
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.wrappers import FilteredDriver
@@ -213,3 +215,25 @@ def test_exported_controller_file_keeps_its_origin(tmp_path: Path) -> None:
         assert again[name] == shipped[name]
     states, _ = read_sample(unpack_parts(tmp_path / "again.unjam")[SAMPLE_PART])
     assert len(states.speed) == MAX_SAMPLE_STEPS
+
+
+@pytest.mark.long
+def test_a_controller_of_a_users_road_is_certified_and_its_code_needs_trust(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, mark = tmp_path / "roads.py", tmp_path / "ran"
+    code.write_text(
+        "from pathlib import Path\nfrom unjam.scenarios import Ring\n"
+        f"class Own(Ring):\n    title = 'own ring'\nPath({str(mark)!r}).touch()\n"
+    )
+    file = export_controller("idm", tmp_path / "own.unjam", scenario=f"{code}:Own").file
+    monkeypatch.setattr(certificate, "ATTACK_POPULATION", 24)
+    monkeypatch.setattr(certificate, "ATTACK_GENERATIONS", 3)
+    monkeypatch.setattr(certificate, "OSCILLATION_FREQUENCIES", certificate.OSCILLATION_FREQUENCIES[::4])
+    mark.unlink()
+    assert certificate.make_certificate(read_controller(file))["worst_cases"]["contacts"] == 0
+    assert {each.part: each.detail for each in verify_controller_file(file)}["road"].startswith("made for the own ring")
+    monkeypatch.setenv("UNJAM_STATE", str(tmp_path / "of another user"))
+    with pytest.raises(InputError, match=r"controller own\.unjam names Python code .*: it runs only with --trust-code"):
+        export_controller(file, tmp_path / "again.unjam")
+    assert not mark.exists()

@@ -52,7 +52,7 @@ def onnx_driver(
         content, table = _read(path, MAX_MODEL_BYTES), {}
     else:
         content, table = _read_described(path)
-    inner = _expert(table.pop("expert", ""), time_step) if expert is None else as_driver(expert, time_step)
+    inner = _expert(table.pop("expert", Constant.name), time_step) if expert is None else as_driver(expert, time_step)
     if description is None:
         description = build_dataclass(PolicyDescription, table, f"driver {path.name}")
     return OnnxDriver(path.name, description, inner, time_step, graph=np.frombuffer(content, np.uint8))
@@ -103,8 +103,6 @@ def _parse_description(content: bytes, name: str) -> dict[str, Any]:
 
 def _expert(name: Any, time_step: float) -> Driver:
     """Return the expert of a description: a driver with a name, which is no file."""
-    if name == "":
-        return Constant()
     if not isinstance(name, str) or split_parameters(name)[0] not in DRIVERS:
         raise unknown_name("expert", name, DRIVERS)
     return driver_from_name(name, time_step)

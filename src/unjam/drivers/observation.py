@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
-from operator import attrgetter
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -119,74 +118,6 @@ def _adjacent_lane_features(state: LocalState) -> Array:
     return namespace(speeds).concatenate((speeds, state.adjacent_gaps / GAP_SCALE), -1)
 
 
-def _field_feature(
-    field: str,
-    description: ScaledInput,
-    value: Callable[[LocalState], Array] | None = None,
-    requirements: Requirements = NO_REQUIREMENTS,
-) -> Feature:
-    """Return the feature of a field of `LocalState`, or of a `value` that depends on it, divided by its scale."""
-    compute, scale = value or attrgetter(field), description.scale
-    requirements = requirements._replace(required_fields=frozenset({field}).difference(COMMON_FIELDS))
-    return Feature(lambda inputs: as_column(compute(inputs.state) / scale), (description,), requirements)
-
-
-FEATURES: dict[str, Feature] = {
-    "local": Feature(
-        lambda inputs: local_observation(inputs.state),
-        (
-            ScaledInput("own speed", SPEED_SCALE, "m/s"),
-            ScaledInput("leader speed - own speed", RELATIVE_SPEED_SCALE, "m/s"),
-            ScaledInput("leader gap", GAP_SCALE, "m"),
-            ScaledInput("follower speed - own speed", RELATIVE_SPEED_SCALE, "m/s"),
-            ScaledInput("follower gap", GAP_SCALE, "m"),
-        ),
-    ),
-    "expert_acceleration": Feature(
-        lambda inputs: as_column(inputs.expert_acceleration), (ScaledInput("expert acceleration", 1.0, "m/s2"),)
-    ),
-    "expert_memory": Feature(lambda inputs: inputs.expert.memory_features(inputs.memory), None),
-    "loop_length": _field_feature(
-        "loop_length", ScaledInput("loop length", 250.0, "m"), requirements=Requirements(needs_loop=True)
-    ),
-    "lap_position": Feature(
-        lambda inputs: lap_position(inputs.state),
-        (ScaledInput("cosine of lap position", 1.0, ""), ScaledInput("sine of lap position", 1.0, "")),
-        Requirements(needs_loop=True),
-    ),
-    "route_position": _field_feature(
-        "route_position", ScaledInput("route position", 100.0, "m"), requirements=Requirements(needs_coordinate=True)
-    ),
-    "allowed_speed": _field_feature(
-        "allowed_speed",
-        ScaledInput("allowed speed - own speed", SPEED_SCALE, "m/s"),
-        lambda state: state.allowed_speed - state.speed,
-    ),
-    "distance_to_merge": _field_feature(
-        "distance_to_merge",
-        ScaledInput("distance to merge", MERGE_DISTANCE_SCALE, "m"),
-        lambda state: clip(state.distance_to_merge, -MERGE_DISTANCE_SCALE, 2.0 * MERGE_DISTANCE_SCALE),
-    ),
-    "merge_proximity": Feature(
-        lambda inputs: merge_proximity(inputs.state),
-        tuple(ScaledInput(f"proximity to {each:g} m before the merge", 1.0, "") for each in PROXIMITY_DISTANCES),
-        Requirements(frozenset({"distance_to_merge"}), needs_arrays=True),
-    ),
-    "lane_speeds": _section_speed_feature("lane_speeds", "in own lane"),
-    "road_speeds": _section_speed_feature("road_speeds", "on all lanes"),
-    "penetration_rate": _field_feature("penetration_rate", ScaledInput("penetration rate", 1.0, "")),
-    "adjacent_lanes": Feature(
-        lambda inputs: _adjacent_lane_features(inputs.state),
-        (
-            *(ScaledInput(f"speed {each} - own speed", RELATIVE_SPEED_SCALE, "m/s") for each in ADJACENT_POSITIONS),
-            *(ScaledInput(f"gap {each}", GAP_SCALE, "m") for each in ADJACENT_POSITIONS),
-        ),
-        Requirements(frozenset({"adjacent_gaps", "adjacent_speeds"}), needs_arrays=True),
-    ),
-}
-"""all features of networks; `local` has the five numbers of the paper"""
-
-
 RELATIVE_SPEEDS = {"leader_relative_speed": "leader_speed", "follower_relative_speed": "follower_speed"}
 """quantities that are the difference of a field of `LocalState` and the own speed"""
 UNIT_FACTORS = {"m/s": {"m/s": 1.0, "km/h": 3.6}}
@@ -242,20 +173,74 @@ class PolicyInput:
         """The feature with these numbers."""
         name, unit = self._field, self.unit or STATE_UNITS[self._field]
         factor, is_relative = unit_factor(self.unit, STATE_UNITS[name]), self.quantity in RELATIVE_SPEEDS
+        is_converted = factor != 1.0 or self.offset
 
         def compute(inputs: FeatureInputs) -> Array:
             value = getattr(inputs.state, name)
-            value = ((value - inputs.state.speed if is_relative else value) * factor - self.offset) / self.scale
+            value = value - inputs.state.speed if is_relative else value
+            value = (value * factor - self.offset if is_converted else value) / self.scale
             return value if name in FIELD_SIZES else as_column(value)
 
-        known = FEATURES[name].requirements if name in FEATURES else NO_REQUIREMENTS
-        requirements = known._replace(needs_arrays=name in FIELD_SIZES)
-        label = f"{self.quantity} - {self.offset:g} {unit}" if self.offset else self.quantity
-        return Feature(
-            compute,
-            (ScaledInput(label, self.scale, unit),) * FIELD_SIZES.get(name, 1),
-            requirements._replace(required_fields=frozenset({name}).difference(COMMON_FIELDS)),
+        requirements = Requirements(
+            required_fields=frozenset({name}).difference(COMMON_FIELDS),
+            needs_loop=name == "loop_length",
+            needs_coordinate=name == "route_position",
+            needs_arrays=name in FIELD_SIZES,
         )
+        label = self.quantity.replace("_", " ") + (f" - {self.offset:g} {unit}" if self.offset else "")
+        return Feature(compute, (ScaledInput(label, self.scale, unit),) * FIELD_SIZES.get(name, 1), requirements)
+
+
+FEATURES: dict[str, Feature] = {
+    "local": Feature(
+        lambda inputs: local_observation(inputs.state),
+        (
+            ScaledInput("own speed", SPEED_SCALE, "m/s"),
+            ScaledInput("leader speed - own speed", RELATIVE_SPEED_SCALE, "m/s"),
+            ScaledInput("leader gap", GAP_SCALE, "m"),
+            ScaledInput("follower speed - own speed", RELATIVE_SPEED_SCALE, "m/s"),
+            ScaledInput("follower gap", GAP_SCALE, "m"),
+        ),
+    ),
+    "expert_acceleration": Feature(
+        lambda inputs: as_column(inputs.expert_acceleration), (ScaledInput("expert acceleration", 1.0, "m/s2"),)
+    ),
+    "expert_memory": Feature(lambda inputs: inputs.expert.memory_features(inputs.memory), None),
+    "loop_length": PolicyInput("loop_length", scale=250.0).feature,
+    "lap_position": Feature(
+        lambda inputs: lap_position(inputs.state),
+        (ScaledInput("cosine of lap position", 1.0, ""), ScaledInput("sine of lap position", 1.0, "")),
+        Requirements(needs_loop=True),
+    ),
+    "route_position": PolicyInput("route_position", scale=100.0).feature,
+    "allowed_speed": Feature(
+        lambda inputs: as_column((inputs.state.allowed_speed - inputs.state.speed) / SPEED_SCALE),
+        (ScaledInput("allowed speed - own speed", SPEED_SCALE, "m/s"),),
+        Requirements(frozenset({"allowed_speed"})),
+    ),
+    "distance_to_merge": Feature(
+        lambda inputs: as_column(clip(inputs.state.distance_to_merge / MERGE_DISTANCE_SCALE, -1.0, 2.0)),
+        (ScaledInput("distance to merge", MERGE_DISTANCE_SCALE, "m"),),
+        Requirements(frozenset({"distance_to_merge"})),
+    ),
+    "merge_proximity": Feature(
+        lambda inputs: merge_proximity(inputs.state),
+        tuple(ScaledInput(f"proximity to {each:g} m before the merge", 1.0, "") for each in PROXIMITY_DISTANCES),
+        Requirements(frozenset({"distance_to_merge"}), needs_arrays=True),
+    ),
+    "lane_speeds": _section_speed_feature("lane_speeds", "in own lane"),
+    "road_speeds": _section_speed_feature("road_speeds", "on all lanes"),
+    "penetration_rate": PolicyInput("penetration_rate").feature,
+    "adjacent_lanes": Feature(
+        lambda inputs: _adjacent_lane_features(inputs.state),
+        (
+            *(ScaledInput(f"speed {each} - own speed", RELATIVE_SPEED_SCALE, "m/s") for each in ADJACENT_POSITIONS),
+            *(ScaledInput(f"gap {each}", GAP_SCALE, "m") for each in ADJACENT_POSITIONS),
+        ),
+        Requirements(frozenset({"adjacent_gaps", "adjacent_speeds"}), needs_arrays=True),
+    ),
+}
+"""all features of networks; `local` has the five numbers of the paper"""
 
 
 def _check_feature_name(name: str) -> str:

@@ -62,21 +62,14 @@ class PolicyOutput:
         return (value - state.speed) / time_step if self.quantity == "desired_speed" else value
 
 
-def _without_nan(value: Any) -> Any:
-    """Return a value of JSON, which has no NaN."""
-    if isinstance(value, list):
-        return [_without_nan(each) for each in value]
-    return None if value != value else value
-
-
 @dataclass(frozen=True, config=STRICT)
 class PolicyMemory:
     """Recurrent state of an ONNX graph: an input and an output whose first axis is the row of the CAV."""
 
     input: str
     output: str
-    initial: Annotated[Any, BeforeValidator(_without_nan)] = 0.0
-    """initial value of all numbers, or of each number of one CAV; None: NaN"""
+    initial: Any = 0.0
+    """initial value of all numbers, or of each number of one CAV; None is NaN, as in JSON"""
 
 
 def _as_input(value: Any) -> NetworkInput:

@@ -24,6 +24,7 @@ from unjam.drivers.wrappers import (
     RoadTypeSwitch,
 )
 from unjam.errors import InputError, invalid_value, spelling_hint
+from unjam.files import to_json
 from unjam.parameters import build_dataclass, check_values, split_parameters, validation_message
 from unjam.tree import Arrays, pack, unpack
 
@@ -151,4 +152,5 @@ def _is_same_driver(driver: Driver, other: Driver) -> bool:
     if not (is_serializable(driver) and is_serializable(other)):
         return driver is other
     (recipe, arrays), (other_recipe, other_arrays) = driver_recipe(driver), driver_recipe(other)
-    return recipe == other_recipe and all(np.array_equal(array, other_arrays[name]) for name, array in arrays.items())
+    is_equal = to_json(recipe) == to_json(other_recipe)  # in JSON, NaN is equal to itself
+    return is_equal and all(np.array_equal(array, other_arrays[name]) for name, array in arrays.items())

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from math import exp
+from math import exp, nan
 from typing import ClassVar
 
 import numpy as np
@@ -111,21 +111,23 @@ class MixedDriver(CompositeDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration by the driver of each CAV, and the new memory."""
-        after, chosen = dict(memory), None
-        for number, (key, driver) in enumerate(self.inner_drivers.items()):
-            acceleration, after[key] = driver.act(state, memory[key])
-            is_chosen = memory[DRIVER_INDEX_KEY] == number
-            chosen = acceleration if chosen is None else namespace(acceleration).where(is_chosen, acceleration, chosen)
-        return chosen, after
+        answers = {key: driver.act(state, memory[key]) for key, driver in self.inner_drivers.items()}
+        after = {key: new_memory for key, (_, new_memory) in answers.items()}
+        return self._select(memory, (acceleration for acceleration, _ in answers.values())), {**memory, **after}
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gap by the driver of each CAV."""
+        return self._select(
+            memory, (driver.time_gaps(state, memory[key]) for key, driver in self.inner_drivers.items())
+        )
+
+    def _select(self, memory: Memory, answers: Iterable[Array | None]) -> Array | None:
+        """Return the answer by the driver of each CAV, NaN for those without; None if there is no answer."""
         chosen = None
-        for number, (key, driver) in enumerate(self.inner_drivers.items()):
-            time_gaps = driver.time_gaps(state, memory[key])
-            if time_gaps is not None:
-                others = np.nan if chosen is None else chosen
-                chosen = np.where(memory[DRIVER_INDEX_KEY] == number, time_gaps, others)
+        for number, answer in enumerate(answers):
+            if answer is not None:
+                others = answer * nan if chosen is None else chosen
+                chosen = namespace(answer).where(memory[DRIVER_INDEX_KEY] == number, answer, others)
         return chosen
 
     def describe(self) -> str:

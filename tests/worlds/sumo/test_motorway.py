@@ -1,11 +1,14 @@
 """Traffic on a motorway compared with SUMO, and commands to CAVs."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import libsumo
 import numpy as np
 import pytest
 
+from tests.adapters.onnx_policies import linear, write
+from unjam.adapters import onnx_driver
 from unjam.drivers import Human
 from unjam.drivers.car_following import AdaptiveACC
 from unjam.drivers.command import Command
@@ -272,3 +275,14 @@ def test_a_cav_with_a_cap_still_brakes_as_hard_as_its_own_acc(sumo: SumoBackend)
     assert road.cruise.deceleration is not None
     assert episode.audit.cav_braking.max_braking > road.cruise.deceleration + 0.1
     assert episode.audit.cav_braking.exceedances[1] == 0
+
+
+def test_an_onnx_policy_sets_the_speed_of_cars_with_an_acc(tmp_path: Path) -> None:
+    description = 'inputs = ["penetration_rate"]\noutput = { quantity = "set_speed", unit = "km/h", offset = 54.0 }'
+    driver = onnx_driver(write(tmp_path, linear(1, [0.0]), description))
+    light = replace(BUSY, inflow=600, ramps=(), penetration_rate=0.5, horizon=120)
+    episode = run_episode(light, driver, (3,))
+    late = [each.states.speed[40:] for each in episode.trajectories if len(each.states.speed) > 60]
+    assert len(late) > 3
+    assert all(abs(speeds.max() - 15.0) < 0.5 for speeds in late)
+    assert measure(episode)["contacts"] == 0
