@@ -27,6 +27,7 @@ from unjam.drivers.observation import (
 )
 from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
 from unjam.drivers.user_driver import DriverLike
+from unjam.drivers.wrappers import INNER_KEY
 from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.processes import has_display
@@ -46,6 +47,7 @@ class ExternalDriver(Driver):
     def __init__(self, expert: Driver, features: tuple[NetworkInput, ...], limits: Limits) -> None:
         """Let `expert` drive within `limits`; `features` are the external observation."""
         self.expert, self.features, self._limits = expert, features, limits
+        self.inner_drivers = {INNER_KEY: expert}
         self.actions: Any = np.zeros(0)
         """additions to the accelerations [m/s2], shape (CAVs,)"""
 
@@ -55,19 +57,11 @@ class ExternalDriver(Driver):
             self.expert.requirements(road), *(feature(each).requirements for each in self.features)
         )
 
-    def initial_memory(self, n: int) -> Memory:
-        """Return that of the expert."""
-        return self.expert.initial_memory(n)
-
-    def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return the memory of the expert after the warm-up."""
-        return self.expert.recall(memory, history)
-
     def observation(self, state: LocalState, memory: Memory) -> Any:
         """Return the external observation, shape (CAVs, numbers), and store the expert's acceleration."""
-        acceleration, self._next_memory = self.expert.act(state, memory)
-        self._expert_acceleration = self._limits.clip(acceleration)
-        inputs = FeatureInputs(state, self._expert_acceleration, self.expert, self._next_memory)
+        acceleration, after = self.expert.act(state, memory[INNER_KEY])
+        self._expert_acceleration, self._next_memory = self._limits.clip(acceleration), {INNER_KEY: after}
+        inputs = FeatureInputs(state, self._expert_acceleration, self.expert, after)
         return compute_observation(self.features, inputs)
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
@@ -75,7 +69,7 @@ class ExternalDriver(Driver):
         if not len(state.speed):
             return Decision(Command(np.zeros(0)), np.zeros(0), np.zeros(0), None, memory)
         acceleration = self._limits.clip(self._expert_acceleration + self.actions)
-        command = Command(acceleration, self.expert.time_gaps(state, memory))
+        command = Command(acceleration, self.expert.time_gaps(state, memory[INNER_KEY]))
         return Decision(command, self._expert_acceleration, self.actions, None, self._next_memory)
 
 

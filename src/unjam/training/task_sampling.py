@@ -5,7 +5,7 @@ from math import ceil
 from typing import Literal
 
 from unjam.drivers.driver import Driver
-from unjam.worlds.batch.ring.warm_up import MAX_CACHED_CAVS
+from unjam.worlds.batch.run import MAX_CACHED_CAVS
 from unjam.worlds.episode import Task
 from unjam.worlds.worker_pool import EpisodeTask
 

@@ -4,13 +4,16 @@ An hour of an on-ramp has 2,000 vehicles, a corridor 10,000, each on the road fo
 one column per vehicle would be 99 % empty: in large tables, vehicles of different times share a column.
 """
 
+from array import array
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import FollowingState
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds import audit
 from unjam.worlds.record import SHARED_COLUMN_FRAMES, Floats, Trajectory, assign_columns, make_trajectory
@@ -21,6 +24,9 @@ MAX_SNAPSHOT_VEHICLES = 600_000
 """total number of vehicles in all snapshots: beyond it, only every second moment is kept, then every fourth, ..."""
 MAX_UNSHARED_CELLS = 2_000_000
 """cells of a table with one column per vehicle; in larger tables columns are shared"""
+
+TrackedLeader = tuple[str, FollowingState]
+"""the leader of a CAV, empty without a leader within range, and the state of the CAV behind it"""
 
 
 class TrafficLog:
@@ -205,3 +211,56 @@ class OpenRoadLog:
         following = audit.following_statistics(speed, leader, gap, step, is_overridden, np.zeros_like(added))
         human, cav = map(self._braking.statistics, (audit.HUMAN_DRIVER, audit.CAV_DRIVER))
         return audit.Audit(human, cav, following, self._scenario.safety.time_gap)
+
+
+class MultiLaneLog(OpenRoadLog):
+    """The log of an episode on a road with lanes, where other vehicles cut in.
+
+    A vehicle that cuts in leaves a smaller gap than the CAV would choose. The audit counts separately how the CAV
+    brakes in the seconds after a cut-in, and excludes the time gaps until it has recovered.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        names: Sequence[str],
+        speeds: Floats,
+        tracked_leaders: Callable[[Sequence[str]], list[TrackedLeader]],
+    ) -> None:
+        super().__init__(scenario, names, speeds)
+        self._tracked_leaders = tracked_leaders
+        self._following: dict[str, tuple[str, int, bool, FollowingState]] = {}
+        """of each CAV: its leader and since which step, whether it recovers from the change, and the last state"""
+        self._steady_following = array("d")
+        """of CAVs long behind the same leader, in each simulation step: speed, leader speed, gap, and recovery"""
+        self._step_count = 0
+
+    def _driver_kinds(self) -> NDArray[np.uint8]:
+        self._step_count += 1
+        kinds, rows = self._kinds.copy(), {name: row for row, name in enumerate(self._names)}
+        names = [name for name in self._cav_ids if name in rows]
+        for name, (leader, current) in zip(names, self._tracked_leaders(names) if names else (), strict=True):
+            last_leader, since, was_recovering, previous = self._following.get(name, (None, 0, False, current))
+            since = since if leader == last_leader else self._step_count
+            time_behind_leader = (self._step_count - since) * self._scenario.simulation_step
+            if time_behind_leader < audit.CUT_IN_SECONDS:
+                kinds[rows[name]] = audit.CAV_AFTER_CUT_IN
+            recovers = bool(leader) and audit.is_recovering(was_recovering, time_behind_leader, previous, current)
+            self._following[name] = leader, since, recovers, current
+            if leader and time_behind_leader > audit.STEADY_FOLLOWING_SECONDS:
+                self._steady_following.extend((*current, recovers))
+        return kinds
+
+    def make_audit(self, trajectories: Sequence[Trajectory]) -> audit.Audit:
+        """Return the audit of every simulation step; overrides and jerk of every control step."""
+        speed, leader_speed, gap, recovers = np.array(self._steady_following, np.float64).reshape(-1, 4).T[:, None]
+        step, common = self._scenario.simulation_step, super().make_audit(trajectories)
+        steady = audit.following_statistics(speed, leader_speed, gap, step, in_recovery=recovers)
+        commands = {name: getattr(common.following, name) for name in ("max_jerk", "override_share", "yield_share")}
+        return replace(
+            common,
+            following=replace(steady, **commands),
+            required_time_gap=audit.SHORT_TIME_GAP,
+            has_lanes=True,
+            cut_in_braking=self._braking.statistics(audit.CAV_AFTER_CUT_IN),
+        )

@@ -28,9 +28,8 @@ from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
 from unjam.training.benchmark import make_benchmark_driver
 from unjam.worlds.batch.noise import ArrayFactory, NoiseState
-from unjam.worlds.batch.ring.warm_up import WarmUpCache, WarmUpState
-from unjam.worlds.batch.ring.world import RingBatch
-from unjam.worlds.batch.run import WARM_UP_CACHE, run_batch, run_batches, start_batch_drive
+from unjam.worlds.batch.ring.world import RingBatch, WarmUpState
+from unjam.worlds.batch.run import WARM_UP_CACHE, run_batch, run_batches, start_batch_drive, warm_up_states
 from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.drive import finish_drive
 from unjam.worlds.episode import run_episode
@@ -158,20 +157,22 @@ def test_a_ring_that_was_warmed_up_with_others_goes_on_to_the_same_bits(name: st
 
 def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[str]] = []
+    kept: Any = {}
 
     def warm_up(rings: Sequence[str]) -> dict[str, WarmUpState]:
         asked.append(list(rings))
         still, noise = np.zeros(3), NoiseState({}, np.zeros((0, 2)))
         return {ring: WarmUpState(still, still[1:], still[1:], False, noise, None) for ring in rings}
 
-    monkeypatch.setattr("unjam.worlds.batch.ring.warm_up.MAX_CACHED_CAVS", 4)
-    kept = WarmUpCache[str]()
-    first, second, same = kept.get_states(["a", "b", "a"], ["b", "c"], warm_up)
+    for name, value in {"MAX_CACHED_CAVS": 4, "WARM_UP_CACHE": kept, "_warm_up": warm_up}.items():
+        monkeypatch.setattr(f"unjam.worlds.batch.run.{name}", value)
+    states: Any = warm_up_states
+    first, second, same = states(["a", "b", "a"], ["b", "c"])
     assert first is same is kept["a"]
     assert second is kept["b"]
-    assert kept.get_states(["c"], ["d"], warm_up) == [kept["c"]]
+    assert states(["c"], ["d"]) == [kept["c"]]
     assert asked == [["a", "b", "c"]], "where nothing is missing nothing is warmed up ahead"
-    assert kept.get_states(["a", "e", "f"], [], warm_up) == [first, kept["e"], kept["f"]]
+    assert states(["a", "e", "f"], []) == [first, kept["e"], kept["f"]]
     assert asked[1:] == [["e", "f"]]
     assert list(kept) == ["b", "c", "e", "f"]
 

@@ -11,7 +11,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
 from unjam.scenarios.motorway import ON_RAMP
 from unjam.scenarios.user_network import ACC_SETTINGS
-from unjam.worlds import multi_lane_log
+from unjam.worlds import audit
 from unjam.worlds.audit import FollowingStatistics
 from unjam.worlds.batch.motorway.record import MotorwayLog
 from unjam.worlds.batch.motorway.traffic import make_vehicles
@@ -35,7 +35,7 @@ def test_an_acc_that_restores_its_gap_after_cut_ins_is_feasible(
     assert 1.0 <= recovered.min_time_gap < 1.3
     assert recovered.share_short_time_gap == 0.0
     assert measure(episode)["feasibility"] == FEASIBLE
-    monkeypatch.setattr(multi_lane_log, "is_recovering", lambda *arguments: False)
+    monkeypatch.setattr(audit, "is_recovering", lambda *arguments: False)
     without_exclusion = run_episode(scenario, driver, (1,), backend=sumo).audit.following
     assert without_exclusion.min_time_gap < 0.8
     assert without_exclusion.share_short_time_gap > 0.001

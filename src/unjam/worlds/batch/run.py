@@ -19,8 +19,7 @@ from unjam.tree import map_leaves
 from unjam.worlds.batch import support
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.noise import ArrayFactory
-from unjam.worlds.batch.ring.warm_up import WarmUpCache, WarmUpState
-from unjam.worlds.batch.ring.world import RingBatch
+from unjam.worlds.batch.ring.world import RingBatch, WarmUpState
 from unjam.worlds.drive import DriveLoop, finish_drive
 from unjam.worlds.episode import add_reward_terms, check_can_drive, check_has_cavs
 from unjam.worlds.record import Episode
@@ -29,7 +28,10 @@ from unjam.worlds.worker_pool import EpisodeTask
 
 _WarmUpKey = tuple[LoopScenario, tuple[int, ...], frozenset[str]]
 """a scenario, the seed of an episode, and the fields that the driver measures"""
-WARM_UP_CACHE = WarmUpCache[_WarmUpKey]()
+WARM_UP_CACHE: dict[_WarmUpKey, WarmUpState] = {}
+"""states of rings after their all-human warm-up, which the driver of the CAVs does not influence: the newest ones"""
+MAX_CACHED_CAVS = 2048
+"""CAVs on cached rings: some 60 kB each, mostly the history of the CAV's last minute"""
 
 
 def start_batch_drive(
@@ -92,7 +94,7 @@ def _run_at_once(
     world = kind.world.from_tasks(tasks, to_array)
     if first.scenario.warmup > 0:
         keys, upcoming_keys = (list(map(_warm_up_key, each)) for each in (tasks, upcoming))
-        cast(RingBatch, world).warm_up_states = WARM_UP_CACHE.get_states(keys, upcoming_keys, _warm_up)
+        cast(RingBatch, world).warm_up_states = warm_up_states(keys, upcoming_keys)
     driver = _combined_driver(tasks, world.values_of_cavs)
     explore = float(any(task.explore for task in tasks)) if kind.has_own_drivers else first.explore
     episodes = finish_drive(start_batch_drive(world, driver, to_array, explore))
@@ -136,6 +138,22 @@ def _combined_driver(tasks: Sequence[EpisodeTask], to_cavs: Callable[[Array], Ar
 
 def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
     return cast(LoopScenario, task.scenario), task.seed, task.driver.requirements().measured_fields
+
+
+def warm_up_states(keys: Sequence[_WarmUpKey], upcoming: Sequence[_WarmUpKey]) -> list[WarmUpState]:
+    """Return the state of each key after its warm-up; missing ones are simulated together with those of `upcoming`."""
+    cache = WARM_UP_CACHE
+    if all(key in cache for key in keys):
+        return [cache[key] for key in keys]
+    known = {**cache, **_warm_up([key for key in dict.fromkeys([*keys, *upcoming]) if key not in cache])}
+    counts = [1 if state.history is None else len(state.history.speed) for state in known.values()]
+    remaining_cavs = sum(counts)
+    cache.clear()
+    for (key, state), count in zip(known.items(), counts, strict=True):
+        if remaining_cavs <= MAX_CACHED_CAVS:
+            cache[key] = state
+        remaining_cavs -= count
+    return [known[key] for key in keys]
 
 
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:

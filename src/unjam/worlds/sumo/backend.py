@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
-from unjam.errors import EpisodeError, InputError, SumoInputError, UnjamError, as_unjam_error
+from unjam.errors import EpisodeError, SumoInputError, UnjamError, as_unjam_error
 from unjam.scenarios import SCENARIO_KINDS
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.scenarios.road import ClosedRoad, MergeRoad, Road, UserNetworkRoad
@@ -28,13 +28,6 @@ TRAFFIC_CLASSES: dict[type[Road], type[Traffic[Any]]] = {
 }
 
 
-def _unsupported_reason(road_class: type[Road]) -> str:
-    """Return why SUMO cannot simulate roads of a class; empty if it can."""
-    allowed = ", ".join(each.__name__ for each in TRAFFIC_CLASSES)
-    reason = f"{road_class.__name__} is not allowed as the road of SUMO; allowed: {allowed}"
-    return "" if road_class in TRAFFIC_CLASSES else reason
-
-
 class SumoBackend(AbstractContextManager["SumoBackend"]):
     """SUMO: a given simulation, or one that the first episode opens and the others reuse.
 
@@ -52,7 +45,12 @@ class SumoBackend(AbstractContextManager["SumoBackend"]):
         """Return why SUMO cannot simulate a scenario; empty if it can."""
         if type(scenario) in SCENARIO_KINDS.values():  # drawing the roads of large networks takes time
             return ""
-        return _unsupported_reason(type(scenario.draw_from_seed((0,))[0]))
+        road_class, allowed = (
+            type(scenario.draw_from_seed((0,))[0]),
+            ", ".join(each.__name__ for each in TRAFFIC_CLASSES),
+        )
+        reason = f"{road_class.__name__} is not allowed as the road of SUMO; allowed: {allowed}"
+        return "" if road_class in TRAFFIC_CLASSES else reason
 
     @contextmanager
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[Traffic[Any]]:
@@ -104,8 +102,6 @@ def make_traffic(
 ) -> Traffic[Any]:
     """Put the vehicles of a seed on the road; nothing moves yet."""
     drawn = scenario.draw_from_seed(seed)
-    if reason := _unsupported_reason(type(drawn[0])):
-        raise InputError(f"scenario: {reason}")
     return TRAFFIC_CLASSES[type(drawn[0])](scenario, seed, simulation, options, drawn)
 
 

@@ -55,36 +55,24 @@ def single_lane_inputs(scenario: Scenario, road: BuiltRoad) -> SumoInputs:
 
 
 def motorway_inputs(scenario: Scenario, road: MotorwayRoad) -> SumoInputs:
-    """Return SUMO's inputs for a motorway that is built for the episode."""
-    return _built_road_inputs(road, _motorway_types_xml(scenario, road))
+    """Return SUMO's inputs for a motorway that is built for the episode.
+
+    Each vehicle type has a type of the CAV that may replace it, with the same desired speed.
+    """
+    lines = []
+    for name, kind in road.vehicle_types.items():
+        common = {"length": road.geometry.vehicle_length, "emissionClass": scenario.emission_class}
+        common |= {"speedFactor": kind.speed_factor, "speedDev": 0.0, "emergencyDecel": 9.0}
+        model = {"carFollowModel": kind.model, "tau": kind.time_headway, "minGap": kind.minimum_gap}
+        model |= {"accel": kind.acceleration, "decel": kind.deceleration}
+        lines.append(xml_element("vType", id=name, **common, **model))
+        cav = {"id": CAV_TYPE_TEMPLATE.format(name), **common, **_cav_attributes(scenario)}
+        lines.append(xml_element("vType", **cav))
+    return _built_road_inputs(road, lines)
 
 
 def _built_road_inputs(road: BuiltRoad, types: list[str], humans: Collection[str] = ()) -> SumoInputs:
     """Return SUMO's inputs for a road with the XML of its vehicle types; `humans` has types of single vehicles."""
-    # Vehicles are neither teleported out of a jam nor removed from the insertion backlog.
-    patience = ("--time-to-teleport", "-1", "--max-depart-delay", "-1")
-    network = {"--net-file": (network_file(road.network),)}
-    return SumoInputs((*patience, *COLLISION_OPTIONS), network, _traffic_xml(road, types, humans), "--route-files")
-
-
-def user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs:
-    """Return SUMO's inputs for a user's network: never its configuration file itself."""
-    files = road.files
-    # Vehicles of the insertion backlog must not vanish: their waiting time counts.
-    options = ["--max-depart-delay=-1", *(f"--{name}={value}" for name, value in files.options.items())]
-    # Validation would download the schemas that the files name.
-    options += [f"--xml-validation{suffix}=never" for suffix in ("", ".net", ".routes")]
-    existing = {
-        "--net-file": (files.network,),
-        "--additional-files": files.additional_files,
-        "--route-files": files.route_files,
-        "--weight-files": files.weight_files,
-    }
-    types = _user_network_types_xml(scenario, road)
-    return SumoInputs(tuple(options), existing, types, "--additional-files", files.copy_sources, records_trips=True)
-
-
-def _traffic_xml(road: BuiltRoad, types: list[str], humans: Collection[str]) -> str:
     lines = [*types]
     for route in road.routes:
         laps = route.laps if route.laps > 1 else None
@@ -103,21 +91,27 @@ def _traffic_xml(road: BuiltRoad, types: list[str], humans: Collection[str]) -> 
             "departLane": entry.lane,
         }
         lines.append(xml_element("vehicle", **attributes))
-    return "\n".join(["<routes>", *lines, "</routes>"])
+    xml = "\n".join(["<routes>", *lines, "</routes>"])
+    # Vehicles are neither teleported out of a jam nor removed from the insertion backlog.
+    options = ("--time-to-teleport", "-1", "--max-depart-delay", "-1", *COLLISION_OPTIONS)
+    return SumoInputs(options, {"--net-file": (network_file(road.network),)}, xml, "--route-files")
 
 
-def _motorway_types_xml(scenario: Scenario, road: MotorwayRoad) -> list[str]:
-    """Return the XML of each vehicle type, and of the CAV that may replace it, with the same desired speed."""
-    lines = []
-    for name, kind in road.vehicle_types.items():
-        common = {"length": road.geometry.vehicle_length, "emissionClass": scenario.emission_class}
-        common |= {"speedFactor": kind.speed_factor, "speedDev": 0.0, "emergencyDecel": 9.0}
-        model = {"carFollowModel": kind.model, "tau": kind.time_headway, "minGap": kind.minimum_gap}
-        model |= {"accel": kind.acceleration, "decel": kind.deceleration}
-        lines.append(xml_element("vType", id=name, **common, **model))
-        cav = {"id": CAV_TYPE_TEMPLATE.format(name), **common, **_cav_attributes(scenario)}
-        lines.append(xml_element("vType", **cav))
-    return lines
+def user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs:
+    """Return SUMO's inputs for a user's network: never its configuration file itself."""
+    files = road.files
+    # Vehicles of the insertion backlog must not vanish: their waiting time counts.
+    options = ["--max-depart-delay=-1", *(f"--{name}={value}" for name, value in files.options.items())]
+    # Validation would download the schemas that the files name.
+    options += [f"--xml-validation{suffix}=never" for suffix in ("", ".net", ".routes")]
+    existing = {
+        "--net-file": (files.network,),
+        "--additional-files": files.additional_files,
+        "--route-files": files.route_files,
+        "--weight-files": files.weight_files,
+    }
+    types = _user_network_types_xml(scenario, road)
+    return SumoInputs(tuple(options), existing, types, "--additional-files", files.copy_sources, records_trips=True)
 
 
 def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:

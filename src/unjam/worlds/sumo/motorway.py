@@ -12,11 +12,10 @@ from unjam.drivers.roadside import RoadSections, RoadsideMessages
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
-from unjam.worlds.multi_lane_log import TrackedLeader
+from unjam.worlds.open_road_log import TrackedLeader
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.inputs import motorway_inputs
-from unjam.worlds.sumo.multi_lane import MultiLaneTraffic
-from unjam.worlds.sumo.open_road import neighbor_state
+from unjam.worlds.sumo.open_road import MultiLaneTraffic, neighbor_state
 
 
 class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):

@@ -8,7 +8,7 @@ the first CAV of every ring, then of the second one, and so on.
 from collections.abc import Collection, Sequence
 from functools import reduce
 from itertools import product
-from typing import Self, cast
+from typing import NamedTuple, Self, cast
 
 import numpy as np
 
@@ -32,13 +32,30 @@ from unjam.worlds.batch.human_idm import (
     human_ring_speed,
     ring_contacts,
 )
-from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, QuickNoise, SeededNoise, WorldSeeds
+from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, NoiseState, QuickNoise, SeededNoise, WorldSeeds
 from unjam.worlds.batch.ring.record import as_numpy, make_episodes
-from unjam.worlds.batch.ring.warm_up import WarmUpState
 from unjam.worlds.closed_road import MAX_RECALL_SECONDS
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam.worlds.world import DriverLog, ProgressCallback
+
+
+class WarmUpState(NamedTuple):
+    """State of one ring at the moment when its CAVs are handed over."""
+
+    speed: Floats
+    """speeds [m/s], shape (vehicles + 1,), with the first one again at the end"""
+    position: Floats
+    """positions [m], shape (vehicles,)"""
+    gap: Floats
+    """gaps to the vehicle ahead [m], shape (vehicles,)"""
+    has_crashed: bool
+    """whether human drivers collided"""
+    noise: NoiseState
+    history: LocalState | None
+    """what the CAVs observed in the last minute, shape (CAVs, moments); None if it is not remembered"""
+    crossing_memory: CrossingMemory | None = None
+    """memory of the crossing of a figure eight; None on rings"""
 
 
 class RingBatch:
