@@ -27,8 +27,8 @@ from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.drive import finish_drive
 from unjam_paper.all_roads import PI_ON_RINGS_LABEL, PI_TUNED_ON_RINGS
-from unjam_paper.results_file import StudyPart, read_part, write_figure
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, mean_text
+from unjam_paper.results_file import read_part, write_figure
+from unjam_paper.study import NO_VALUE_TEXT, Study, mean_text
 
 ADAPTATION_EPISODES = 20
 STEPS_PER_SECOND = 10
@@ -117,18 +117,6 @@ def _measure_speeds(name: str, driver: str, workers: int) -> dict[str, list[Any]
     return {"limits": limits, "speeds": [values.round(4).tolist() for values in speeds]}
 
 
-def _adaptation_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    return {
-        f"{number}-{position}": (_measure_speeds, (name, driver))
-        for number, name in enumerate(ROAD_CHANGES)
-        for position, driver in enumerate(ADAPTATION_DRIVERS.values())
-    }
-
-
-def _write_adaptation(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
-    write_figure(folder, "adaptation", adaptation_figure(folder), reduce_colors=True)
-
-
 def read_speeds(folder: Path, name: str, label: str) -> dict[str, Floats]:
     """Return the speeds of a driver at a change: `speeds` (episodes, seconds) and `limits` (episodes,) [m/s]."""
     number, position = list(ROAD_CHANGES).index(name), list(ADAPTATION_DRIVERS).index(label)
@@ -193,8 +181,14 @@ def adaptation_figure(folder: Path) -> Figure:
 
 ADAPTATION = Study(
     title="time until traffic settles after a change of the road",
-    make_parts=_adaptation_parts,
-    write=_write_adaptation,
+    make_parts=lambda study_folder, seeds: {
+        f"{number}-{position}": (_measure_speeds, (name, driver))
+        for number, name in enumerate(ROAD_CHANGES)
+        for position, driver in enumerate(ADAPTATION_DRIVERS.values())
+    },
+    write=lambda study_folder, seeds, folder: write_figure(
+        folder, "adaptation", adaptation_figure(folder), reduce_colors=True
+    ),
     minutes=10.0,
     tables={name: partial(adaptation_table, name) for name in ROAD_CHANGES},
 )

@@ -8,7 +8,6 @@ for rounding.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import groupby
-from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +28,10 @@ from unjam.measures.gain import (
 )
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import Estimate, estimate_on_shared_seeds, format_difference
+from unjam.measures.statistics import estimate_on_shared_seeds, format_difference
 from unjam.physics.arrays import Floats
 from unjam.reports.figures import TEXT_COLOR, new_figure
+from unjam.reports.results import replace_null
 from unjam.scenarios.scenario import Scenario
 from unjam.training.road_family import (
     ACTUATOR_LATENCY,
@@ -107,7 +107,7 @@ FAMILY_DRIVERS: dict[str, str] = {
     **{"jam-ahead": "jam-ahead", "FollowerStopper": "follower-stopper"},
     **{name: name for name in (*CLOSED_ROAD_CONTROLLERS, *MOTORWAY_CONTROLLERS)},
 }
-"""drivers that are evaluated on every road with their control step, by label"""
+"""drivers that are evaluated on every road, by label"""
 TWO_LAWS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned on all roads)"
 """label of the combination of two controllers by the type of road; its results are taken from theirs"""
 RING_GROUP = "rings"
@@ -165,13 +165,10 @@ def family_metrics(index: int, episode: Episode) -> dict[str, Any]:
     return {key: measured[key] for key in FAMILY_METRICS}
 
 
-def _all_roads_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    return road_parts(FAMILY, _family_drivers, FAMILY_TEST_SEEDS, in_batches=False)
-
-
 def _family_drivers(road: FamilyRoad) -> dict[str, str]:
+    """Return the drivers by label; a controller that cannot drive on a road neither gains nor loses there."""
     others = CLOSED_ROAD_CONTROLLERS if _is_motorway(road) else MOTORWAY_CONTROLLERS
-    return {label: driver for label, driver in FAMILY_DRIVERS.items() if label not in others}
+    return FAMILY_DRIVERS | dict.fromkeys(others, HUMAN_LABEL)
 
 
 def road_parts(
@@ -236,10 +233,7 @@ def road_gains(folder: Path, parts: Sequence[str] = ("training", *UNSEEN_PARTS))
     for number, results in read_parts(folder).items():
         if not number.isdecimal() or results["part"] not in parts:
             continue
-        rows: dict[str, EpisodeRows] = {
-            label: [{key: np.nan if value is None else value for key, value in row.items()} for row in own]
-            for label, own in results["rows"].items()
-        }
+        rows: dict[str, EpisodeRows] = {label: list(map(replace_null, own)) for label, own in results["rows"].items()}
         best = [performance(row) for row in rows[results["best"]]]
         baseline = rows.pop(HUMAN_LABEL)
         roads[results["road"]] = {
@@ -281,10 +275,9 @@ def all_drivers_table(folder: Path) -> pd.DataFrame:
             for values in (road["gains"], road["by_seed"]):
                 values[TWO_LAWS_LABEL] = values[law]
         for label, row in rows.items():
-            driven = {name: road for name, road in roads.items() if label in road["gains"]}
-            differences = (road["by_seed"][first] - road["by_seed"][label] for road in driven.values())
-            row[heading] = _mean_gain(road["by_seed"][label] for road in driven.values())
-            row[f"worst, {heading}"] = _worst_gain(driven, label)
+            differences = (road["by_seed"][first] - road["by_seed"][label] for road in roads.values())
+            row[heading] = _mean_gain(road["by_seed"][label] for road in roads.values())
+            row[f"worst, {heading}"] = _worst_gain(roads, label)
             row[f"{first}, difference to it, {heading}"] = "" if label == first else _mean_gain(differences)
     return pd.DataFrame([*rows.values()])
 
@@ -305,15 +298,13 @@ def _seed_cell(values: Floats) -> str:
 def all_roads_figure(folder: Path) -> Figure:
     """Return a map of the gains, roads by drivers."""
     roads = road_gains(folder)
-    unknown = Estimate(nan, nan, nan, 0)
-    values = np.array([[road["gains"].get(label, unknown).mean for label in FAMILY_DRIVERS] for road in roads.values()])
+    values = np.array([[road["gains"][label].mean for label in FAMILY_DRIVERS] for road in roads.values()])
     figure = new_figure(0.3 * len(roads) + 1.0)
     axes = figure.subplots()
     # The pale half of the color map: numbers stay legible on it.
     image = axes.imshow(values, cmap="RdYlGn", vmin=-2 * MAX_GAIN, vmax=2 * MAX_GAIN, aspect="auto")
-    for row, column in np.argwhere(np.isfinite(values)):
-        text = f"{values[row, column]:+.2f}"
-        axes.text(column, row, text, ha="center", va="center", color=TEXT_COLOR, fontsize=8)
+    for (row, column), value in np.ndenumerate(values):
+        axes.text(column, row, f"{value:+.2f}", ha="center", va="center", color=TEXT_COLOR, fontsize=8)
     axes.set_xticks(range(len(FAMILY_DRIVERS)), list(FAMILY_DRIVERS), rotation=40, ha="right", rotation_mode="anchor")
     marks = {"training": "", "combination": " (new combination)", "axis": " (new)"}
     axes.set_yticks(range(len(roads)), [f"{name}{marks[road['part']]}" for name, road in roads.items()])
@@ -324,7 +315,7 @@ def all_roads_figure(folder: Path) -> Figure:
 
 ALL_ROADS_STUDY = Study(
     title="gain of one controller on every road of the family, training roads and unseen roads",
-    make_parts=_all_roads_parts,
+    make_parts=lambda study_folder, seeds: road_parts(FAMILY, _family_drivers, FAMILY_TEST_SEEDS, in_batches=False),
     minutes=60.0,
     tables={
         **{name: partial(all_roads_table, parts) for name, parts in TABLE_PARTS.items()},

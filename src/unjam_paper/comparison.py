@@ -18,7 +18,6 @@ import pandas as pd
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from unjam.files import atomic_write
 from unjam.measures.feasibility import feasibility_by_driver, overall_feasibility
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.metrics import METRICS
@@ -41,7 +40,6 @@ from unjam_paper.study import (
     FINAL_SHARE,
     NO_VALUE_TEXT,
     PAPER_ROADS,
-    STUDY_ROADS,
     PlannedRun,
     Study,
     StudyFolder,
@@ -107,7 +105,7 @@ def comparison_study(title: str, variants: Sequence[str], road: str = "ring") ->
     """Return the study that compares variants on a road."""
 
     def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
-        write_comparison_table(comparison_rows(study_folder, road, variants, seeds), folder)
+        write_part(folder, "table", comparison_rows(study_folder, road, variants, seeds))
         curves, metric = training_curves(study_folder, road, variants, seeds), return_metric(road, variants[0])
         rows = study_folder.reference_rows(road)
         references = {"human baseline": rows["human"], "best expert": rows[best_expert(rows, metric)]}
@@ -144,7 +142,7 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
             key: _mean_and_std([row[name] for row in found if np.isfinite(row[name])])
             for key, (name, _) in PAPER_COLUMNS.items()
         }
-        rows.append({**row, "paper_convention": convention, "steady_speed_by_value": _speed_by_value(road, found)})
+        rows.append({**row, "paper_convention": convention})
     trained = study_folder.trained_runs(road, variants, seeds)
     return [*rows, *(_variant_row(road, variant, runs, references) for variant, runs in trained.items())]
 
@@ -168,7 +166,6 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
     return {
         **row,
         "paper_convention": convention,
-        "steady_speed_by_value": _speed_by_value(road, [one for run in runs for one in run.rows]),
         "gain_reference": {"expert": best, "metric": metric},
         "gain_over_best_expert": asdict(estimate_crossed(differences)),
         "probability_of_improvement": asdict(probability_of_improvement(differences)),
@@ -176,17 +173,6 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
         "feasibility": [overall_feasibility(run.rows, reference_rows["human"]) for run in runs],
         "seconds": float(np.mean([run.seconds for run in runs])),
         "gains": differences.mean(1).tolist(),
-    }
-
-
-def _speed_by_value(road: str, rows: Table) -> dict[str, dict[str, float]]:
-    """Return the steady mean speed by each value that episodes draw: the length or the radius."""
-    return {
-        name: {
-            f"{value:g}": _finite_mean([row for row in rows if row[name] == value], "mean_speed_steady")
-            for value in sorted({row[name] for row in rows})
-        }
-        for name in load_config(changes=STUDY_ROADS[road]).make_scenario().drawn_ranges
     }
 
 
@@ -201,20 +187,6 @@ def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
 
 def _finite_mean(rows: Table, name: str) -> float:
     return estimate([row[name] for row in rows]).mean
-
-
-def write_comparison_table(rows: Table, folder: Path) -> None:
-    """Write a table as JSON with all entries and as CSV with the main numbers."""
-    write_part(folder, "table", rows)
-    names = (*COMPARISON_METRICS, "gain_over_best_expert", "probability_of_improvement")
-    table = []
-    for row in rows:
-        cells = {name: row[name] for name in ("road", "name", "trainings")}
-        for key in PAPER_COLUMNS:
-            cells[f"{key}, paper"] = (row.get("paper") or {}).get(key)
-            cells[f"{key}, paper convention"] = round(row["paper_convention"][key]["mean"], 2)
-        table.append(cells | {name: round(row[name]["mean"], 3) for name in names if name in row})
-    atomic_write(folder / "table.csv", pd.DataFrame(table).to_csv(index=False))
 
 
 def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:

@@ -6,7 +6,6 @@ coverage of 95 % holds for a single evaluation; with repeated evaluations it is 
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from math import nan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -28,6 +27,7 @@ from unjam.measures.statistics import (
     metric_estimate,
     pair_rows,
 )
+from unjam.reports.results import replace_null
 from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.training.evaluate import raise_failure
@@ -139,9 +139,10 @@ def measure_harm(controller: str, road: OpenTestRoad, workers: int) -> dict[str,
 def _read_results(study: Path) -> dict[str, Any]:
     """Return the results by road, with NaN for null."""
     results: dict[str, Any] = read_part(study, RESULTS_PART)
-    for row in (row for road in results.values() for rows in road["rows"].values() for row in rows):
-        row |= {name: nan for name, value in row.items() if value is None}
-    return results
+    return {
+        name: {"rows": {label: list(map(replace_null, rows)) for label, rows in road["rows"].items()}}
+        for name, road in results.items()
+    }
 
 
 def _needs_seeds(results: Mapping[str, Any], rate: float) -> bool:

@@ -35,7 +35,7 @@ from unjam.following.trajectories import (
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
-from unjam_paper.results_file import StudyPart, read_part, write_figure, write_part
+from unjam_paper.results_file import read_part, write_figure, write_part
 from unjam_paper.study import Study, StudyFolder, Table
 
 SplitKind = Literal["trajectories", "rows", "released"]
@@ -189,10 +189,6 @@ def _rms(error: Floats) -> float:
     return float(np.sqrt(np.square(error).mean()))
 
 
-def _figure_6_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    return {f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()}
-
-
 def _write_figure_6(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
     """Write the rows, with the losses of fits to all data only, and the figure."""
     rows: Table = [*read_part(folder, "figure-6").values()]
@@ -254,7 +250,9 @@ def _set_log_axes(axes: Axes, title: str) -> None:
 
 FIGURE_6 = Study(
     title="networks that learn car following, with and without a car-following model",
-    make_parts=_figure_6_parts,
+    make_parts=lambda study_folder, seeds: {
+        f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()
+    },
     write=_write_figure_6,
     minutes=25.0,
 )

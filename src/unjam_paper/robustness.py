@@ -23,8 +23,8 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
 from unjam.training.evaluate import TRAINED_LABEL
 from unjam.training.road_family import NGSIM_IDM
-from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics, write_comparison_table
-from unjam_paper.results_file import StudyPart, read_part
+from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics
+from unjam_paper.results_file import StudyPart, read_part, write_part
 from unjam_paper.study import (
     STUDY_ROADS,
     PlannedRun,
@@ -160,7 +160,7 @@ def _transfer_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPar
 
 def _write_figure_10(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
     tables = (comparison_rows(study_folder, road, VOLUME_VARIANTS, seeds) for road in VOLUME_ROADS)
-    write_comparison_table([row for rows in tables for row in rows], folder)
+    write_part(folder, "table", [row for rows in tables for row in rows])
 
 
 def _transfer_table(folder: Path) -> pd.DataFrame:

@@ -164,6 +164,8 @@ class Study:
         for name, part in measure_parts(folder / "parts", self.make_parts(study_folder, seeds), workers).items():
             write_part(folder, name, part)
         self.write(study_folder, seeds, folder)
+        for name, table in self.tables.items():
+            atomic_write(folder / f"{name}.csv", table(folder).to_csv(index=False))
 
 
 def write_manifest(folder: Path, **metadata: Any) -> None:

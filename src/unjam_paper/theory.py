@@ -136,14 +136,15 @@ def _write_theory(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
     write_figure(folder, "model", model_error_figure(model))
 
 
-def training_seconds(steps: int, rounds: int) -> dict[str, list[dict[str, float]]]:
+def measure_training_time(steps: int, rounds: int, workers: int) -> dict[str, Any]:
     """Return the wall time of the parts of training per 1,000 environment steps [s], by variant and round.
 
-    The variants are trained in turn, so that other load of the machine affects all of them equally.
+    The variants are trained in turn, so that other load of the machine affects all of them equally; as it may slow down
+    single rounds, figures show the `median` round.
     """
     torch.set_num_threads(1)
-    seconds: dict[str, list[dict[str, float]]] = {variant: [] for variant in TIMED_VARIANTS}
-    with WorkerPool(1) as workers, tempfile.TemporaryDirectory() as place:
+    measured: dict[str, list[dict[str, float]]] = {variant: [] for variant in TIMED_VARIANTS}
+    with WorkerPool(1) as pool, tempfile.TemporaryDirectory() as place:
         for number, variant in product(range(rounds), TIMED_VARIANTS):
             config = PlannedRun(THEORY_ROAD, variant, number).config
             # SAC begins earlier, otherwise mostly its start would be measured.
@@ -152,23 +153,17 @@ def training_seconds(steps: int, rounds: int) -> dict[str, list[dict[str, float]
             config = replace(config, steps=steps, sac=sac, evaluation=evaluation)
             folder = Path(place) / f"{variant}-{number}"
             create_run_folder(folder, config)
-            Trainer(folder, config, workers).train()
+            Trainer(folder, config, pool).train()
             rows = read_progress(folder)
             thousands, parts = rows[-1]["environment_steps"] / 1000.0, seconds_by_part(rows)
             parts.pop("validation", None)  # switched off, because it is the same for all variants
-            seconds[variant].append({part: each / thousands for part, each in parts.items()})
-    return seconds
-
-
-def _measure_time(steps: int, rounds: int, workers: int) -> dict[str, Any]:
-    measured = training_seconds(steps, rounds)
-    # The median round: other load of the machine may slow down single rounds.
+            measured[variant].append({part: each / thousands for part, each in parts.items()})
     medians = {
         variant: sorted(each, key=lambda parts: sum(parts.values()))[len(each) // 2]
         for variant, each in measured.items()
     }
     totals = {variant: sum(parts.values()) for variant, parts in medians.items()}
-    relative = {variant: total / totals["trpo"] for variant, total in totals.items()}
+    relative = {variant: total / totals[TIMED_VARIANTS[0]] for variant, total in totals.items()}
     return {"rounds": measured, "median": medians, "relative_to_trpo": relative}
 
 
@@ -207,7 +202,7 @@ THEORY = Study(
 )
 FIGURE_8 = Study(
     title="training time, measured side by side",
-    make_parts=lambda study_folder, seeds: {"time": (_measure_time, (TIMED_STEPS, TIMING_ROUNDS))},
+    make_parts=lambda study_folder, seeds: {"time": (measure_training_time, (TIMED_STEPS, TIMING_ROUNDS))},
     write=_write_time,
     minutes=12.0,
     tables={"training time": _time_table},

@@ -92,8 +92,10 @@ def test_a_study_writes_trainings_results_figure_and_manifest(reproduced: Made) 
         for seed in (0, 1):
             assert (folder / "runs" / "small" / variant / str(seed) / "report.html").is_file()
     assert {path.name for path in (folder / "small").iterdir()} == {
-        *("table.json", "table.csv", "curves.json", "curves.png", "manifest.json", "controllers")
+        *("table.json", "curves.json", "curves.png", "checkpoints.csv", "manifest.json", "controllers")
     }
+    table = pd.read_csv(folder / "small/checkpoints.csv")
+    assert set(table.iloc[:, 0]) == {"plain", "with a model"}
     one_file = read_parts(folder / "small.json")
     assert one_file == read_parts(folder / "small")
     assert list(one_file) == ["manifest", "curves", "table"]
@@ -140,9 +142,6 @@ def test_the_table_has_the_means_of_the_trainings(reproduced: Made) -> None:
         json.loads((folder / "runs/small/plain" / seed / "progress.jsonl").read_text().splitlines()[-1])
         for seed in ("0", "1")
     ]
-    lengths = table["plain"]["steady_speed_by_value"]["length"]
-    assert list(lengths) == sorted(lengths, key=float)
-    assert min(lengths.values()) <= table["plain"]["mean_speed_steady"]["mean"] <= max(lengths.values())
     assert table[best]["gain_over_best_expert"]["mean"] == 0.0
     assert table["human"]["gain_over_best_expert"]["count"] > 0
     assert math.isnan(gain_entry(table["plain"], "low"))  # two trainings have only a range
@@ -150,7 +149,6 @@ def test_the_table_has_the_means_of_the_trainings(reproduced: Made) -> None:
     convention = table["plain"]["paper_convention"]
     assert convention["speed"]["mean"] == pytest.approx(np.mean([row["cav_mean_speed"] for row in progress]))
     assert math.isclose(convention["reward"]["mean"], np.mean([row["return_mean"] for row in progress]))
-    assert set(pd.read_csv(folder / "small" / "table.csv")["name"]) == set(table)
 
 
 def gain_entry(row: dict[str, Any], part: str) -> float:

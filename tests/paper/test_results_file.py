@@ -36,7 +36,7 @@ def test_a_part_is_read_from_the_working_folder_or_from_the_file(tmp_path: Path)
     (folder / "controllers").mkdir(parents=True)
     for name, part in PARTS.items():
         (folder / f"{name}.json").write_text(to_json(part))
-    for name in ("curves.png", "study.png", "table.csv", "controllers/pi-0.unjam"):
+    for name in ("curves.png", "study.png", "controllers/pi-0.unjam"):
         (folder / name).write_bytes(name.encode())
     path = collect_results(folder)
     assert {each.name for each in tmp_path.iterdir()} == {

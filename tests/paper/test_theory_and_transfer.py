@@ -26,8 +26,10 @@ def test_training_time_is_measured_for_all_variants_in_turn(
 ) -> None:
     monkeypatch.setattr(theory, "THEORY_ROAD", "small")
     monkeypatch.setattr(theory, "TIMED_VARIANTS", SMALL_VARIANTS)
-    found = theory.training_seconds(steps=320, rounds=2)
+    results = theory.measure_training_time(320, 2, workers=1)
+    found = results["rounds"]
     assert [len(found[variant]) for variant in SMALL_VARIANTS] == [2, 2]
+    assert results["relative_to_trpo"]["plain"] == 1.0
     plain, model = (found[variant][0] for variant in SMALL_VARIANTS)
     assert set(model) - set(plain) == {"fit", "roll_out"}
     assert min(plain["collect"], plain["update"], model["fit"], model["roll_out"]) > 0

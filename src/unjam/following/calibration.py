@@ -105,8 +105,6 @@ class CalibratedIDM:
     """The result of a calibration."""
 
     parameters: IDMParameters
-    initial_headway_weight: float
-    """weight of the initial time headway, see `individual_idm`"""
     gap_error: float
     """root mean squared error of the simulated gap [m]"""
     speed_error: float
@@ -117,10 +115,6 @@ class CalibratedIDM:
     """duration of the data [s]"""
     parameters_at_bounds: tuple[str, ...]
     """parameters at a bound of their range: the data do not determine them"""
-
-    def model(self, limits: AccelerationBounds) -> DriverModel:
-        """Return the driver model with these parameters, with its acceleration within `limits` [m/s2]."""
-        return individual_idm(self.parameters, self.initial_headway_weight, limits)
 
 
 def calibrate_idm(
@@ -161,7 +155,7 @@ def calibrate_idm(
     collisions, seconds = int(simulated.has_collided.sum()), sum(each.seconds for each in trajectories)
     names = CALIBRATED_PARAMETERS
     at_bounds = [name for name in names if is_at_bound(getattr(parameters, name), getattr(settings, name))]
-    return CalibratedIDM(parameters, weight, gap_error, speed_error, collisions, seconds, tuple(at_bounds))
+    return CalibratedIDM(parameters, gap_error, speed_error, collisions, seconds, tuple(at_bounds))
 
 
 def gap_objective(
@@ -257,7 +251,7 @@ def _calibrate_one_parameter(
     ):
         parameters, at_bounds = replace(typical, **{name: value}), (name,) if is_at_bound(value, bounds) else ()
         seconds = sum(each.seconds for each in trajectories)
-        calibrated.append(CalibratedIDM(parameters, 0.0, gap_error, speed_error, crashes, seconds, at_bounds))
+        calibrated.append(CalibratedIDM(parameters, gap_error, speed_error, crashes, seconds, at_bounds))
     return calibrated
 
 

@@ -259,13 +259,13 @@ def _fit_residual(
     parts = [select_splits(split, name) for name in ("train", "validation")]
     drivers = [[calibrated[each.driver].parameters for each in part] for part in parts]
     training, validation = map(CalibratedTrajectories, parts, drivers)
-    fit = fit_multi_step(training, validation, settings.calibration.limits, settings.multi_step, settings.seed)
-    is_better = min(fit.validation_errors) < fit.validation_errors[0]
-    facts = {"residual_gap_errors": fit.validation_errors, "residual_is_better": is_better}
-    return fit.network.to_numpy_network() if is_better else None, facts
+    network, errors = fit_multi_step(
+        training, validation, settings.calibration.limits, settings.multi_step, settings.seed
+    )
+    is_better = min(errors) < errors[0]
+    facts = {"residual_gap_errors": errors, "residual_is_better": is_better}
+    return network.to_numpy_network() if is_better else None, facts
 
 
 def _calibration_details(calibrated: CalibratedIDM) -> dict[str, Any]:
-    details = asdict(calibrated)
-    del details["parameters"], details["initial_headway_weight"]
-    return details
+    return {name: value for name, value in asdict(calibrated).items() if name != "parameters"}

@@ -8,7 +8,8 @@ through all steps.
 import itertools
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,8 +27,9 @@ from unjam.following.leader_replay import (
     DriverModel,
     ResidualFunction,
     add_residual,
+    as_driver_model,
     follow_leader,
-    individual_idm,
+    idm_function,
     simulate_followers,
 )
 from unjam.following.trajectories import (
@@ -122,13 +124,12 @@ def batched_network(network: Network) -> ResidualFunction:
     return lambda inputs: network(inputs.reshape(-1, len(RESIDUAL_INPUTS))).reshape(inputs.shape[:-1])
 
 
-@dataclass(frozen=True)
-class LossHistory:
+class LossHistory(NamedTuple):
     """Mean squared errors of the acceleration in each epoch of a fit [(m/s2)2]."""
 
-    training: list[float] = field(default_factory=list)
+    training: list[float]
     """error on the training samples, averaged over the gradient steps of the epoch"""
-    validation: list[float] = field(default_factory=list)
+    validation: list[float]
     """error on the validation samples at the end of the epoch"""
 
 
@@ -157,7 +158,7 @@ def fit_one_step(
     (inputs, targets), (validation_inputs, validation_targets) = to_tensors(samples), to_tensors(validation)
     optimizer = Adam(network.parameters(), lr=settings.learning_rate, fused=True)
     generator = torch.Generator().manual_seed(seed)
-    losses, best, waited, best_state = LossHistory(), float("inf"), 0, deepcopy(network.state_dict())
+    losses, best, waited, best_state = LossHistory([], []), float("inf"), 0, deepcopy(network.state_dict())
     while len(losses.training) < settings.epochs and waited < settings.patience:
         total = torch.zeros(())
         for batch in torch.randperm(len(targets), generator=generator).split(settings.batch_size):
@@ -186,8 +187,6 @@ class CalibratedTrajectories:
     trajectories: Sequence[FollowingTrajectory]
     drivers: Sequence[IDMParameters]
     """IDM parameters of the driver of each trajectory"""
-    initial_headway_weight: float = 0.0
-    """weight of the initial time headway, see `individual_idm`"""
 
     def model(
         self, trajectory_index: NDArray[np.int64], limits: AccelerationBounds, as_tensors: bool = False
@@ -196,16 +195,7 @@ class CalibratedTrajectories:
         parameters = stack_idm_parameters([self.drivers[number] for number in trajectory_index])
         if as_tensors:
             parameters = IDMArrays(*map(_to_tensor, parameters))
-        return individual_idm(parameters, self.initial_headway_weight, limits)
-
-
-@dataclass(frozen=True)
-class MultiStepFit:
-    """The result of `fit_multi_step`."""
-
-    network: FollowingNetwork
-    validation_errors: list[float]
-    """RMS gap error at each validation, averaged over the validation trajectories [m]; the first is that of the base"""
+        return as_driver_model(idm_function(parameters, limits))
 
 
 def fit_multi_step(
@@ -214,8 +204,11 @@ def fit_multi_step(
     limits: AccelerationBounds,
     settings: MultiStepSettings,
     seed: int,
-) -> MultiStepFit:
-    """Fit a residual for calibrated drivers that reduces the difference between simulated and recorded gaps.
+) -> tuple[FollowingNetwork, list[float]]:
+    """Return a residual for calibrated drivers that reduces the difference between simulated and recorded gaps.
+
+    With it come the RMS gap errors at each validation, averaged over the validation trajectories [m]; the first is that
+    of the base.
 
     The initial residual is zero. The network has the weights with the smallest error on uncut `validation`
     trajectories, possibly the initial ones. `limits` are those of the acceleration [m/s2]; `seed` determines the
@@ -257,7 +250,7 @@ def fit_multi_step(
             if errors[-1] <= min(errors):
                 best_state = deepcopy(network.state_dict())
     network.load_state_dict(best_state)
-    return MultiStepFit(network, errors)
+    return network, errors
 
 
 def _gap_loss(

@@ -63,6 +63,12 @@ CAR_FOLLOWING_MODELS = (
     *("Daniel1", "PWagner2009", "BKerner", "Wiedemann", "W99", "ACC", "CACC", "CC", "Rail"),
 )
 """car-following models that older files define in a nested element"""
+READ_ELEMENTS = (
+    *(*DEMAND_ELEMENTS, "lane", "param", "person", "personFlow", "personTrip", "calibrator"),
+    *("vType", "/vType", "vTypeDistribution", "/vTypeDistribution"),
+    *(f"carFollowing-{name}" for name in CAR_FOLLOWING_MODELS),
+)
+"""elements with content that `_Demand` needs, and the ends of some"""
 TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")
 """texts that SUMO accepts as true"""
 
@@ -220,21 +226,42 @@ class _Demand:
 
     def handlers(self) -> XmlHandlers:
         """Return the functions to call with the attributes of an element, by its name."""
-        return {
-            **{tag: partial(self._on_vehicle, depart) for tag, depart in DEMAND_ELEMENTS.items()},
-            **dict.fromkeys(("person", "personFlow"), self._on_person),
-            "personTrip": self._on_person_trip,
-            "calibrator": self._on_calibrator,
-            "lane": self._on_lane,
-            "vType": self._on_type,
-            "/vType": self._on_type_end,
-            "vTypeDistribution": self._on_distribution,
-            "/vTypeDistribution": self._on_distribution_end,
-            **{f"carFollowing-{name}": self._on_model for name in CAR_FOLLOWING_MODELS},
-            "param": self._on_parameter,
-        }
+        return {tag: partial(self._read, tag) for tag in READ_ELEMENTS}
 
-    def _on_vehicle(self, depart_attribute: str, attributes: XmlAttributes) -> None:
+    def _read(self, tag: str, attributes: XmlAttributes) -> None:
+        match tag:
+            case "vehicle" | "trip" | "flow":
+                self._add_vehicles(attributes, DEMAND_ELEMENTS[tag])
+            case "lane":
+                self.has_bicycle_lanes |= attributes.get("allow") == "bicycle"
+            case "param":
+                if self._current_type:
+                    self.type_parameters[self._current_type][attributes.get("key", "")] = attributes.get("value", "")
+            case "person" | "personFlow":
+                self.first_departure = None  # persons may use their own car
+            case "personTrip":
+                modes = attributes.get("modes", "").replace(",", " ").split()
+                default_types = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
+                self.used_names |= set(attributes.get("vTypes", "").split()) or default_types
+            case "calibrator":
+                self.calibrates = True
+            case "vType":
+                name = attributes.get("refId") or attributes.get("id", "")
+                self._current_distribution.add(name)
+                if "refId" not in attributes:
+                    self._current_type, self.types[name], self.type_parameters[name] = name, dict(attributes), {}
+            case "/vType":
+                self._current_type = ""
+            case "vTypeDistribution":
+                self._current_distribution = set(attributes.get("vTypes", "").split())
+                self._distributions[attributes.get("id", "")] = self._current_distribution
+            case "/vTypeDistribution":
+                self._current_distribution = set()
+            case _:  # an older file, with the car-following attributes of a type in an element of their own
+                if self._current_type:
+                    self.types[self._current_type] |= attributes
+
+    def _add_vehicles(self, attributes: XmlAttributes, depart_attribute: str) -> None:
         if "speed" in attributes and "vehsPerHour" not in attributes:
             return  # a calibrator that only changes speeds
         self.used_names.add(attributes.get("type", DEFAULT_VEHICLE_TYPE))
@@ -242,44 +269,6 @@ class _Demand:
             self.last_end = max(self.last_end, last)
         if self.first_departure is not None:
             self._add_departure(attributes.get(depart_attribute, ""))
-
-    def _on_person(self, attributes: XmlAttributes) -> None:
-        self.first_departure = None  # persons may use their own car
-
-    def _on_person_trip(self, attributes: XmlAttributes) -> None:
-        modes = attributes.get("modes", "").replace(",", " ").split()
-        default_types = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
-        self.used_names |= set(attributes.get("vTypes", "").split()) or default_types
-
-    def _on_lane(self, attributes: XmlAttributes) -> None:
-        self.has_bicycle_lanes |= attributes.get("allow") == "bicycle"
-
-    def _on_calibrator(self, attributes: XmlAttributes) -> None:
-        self.calibrates = True
-
-    def _on_type(self, attributes: XmlAttributes) -> None:
-        name = attributes.get("refId") or attributes.get("id", "")
-        self._current_distribution.add(name)
-        if "refId" not in attributes:
-            self._current_type, self.types[name], self.type_parameters[name] = name, dict(attributes), {}
-
-    def _on_model(self, attributes: XmlAttributes) -> None:
-        if self._current_type:  # an older file, with the car-following attributes in an element of their own
-            self.types[self._current_type] |= attributes
-
-    def _on_parameter(self, attributes: XmlAttributes) -> None:
-        if self._current_type:
-            self.type_parameters[self._current_type][attributes.get("key", "")] = attributes.get("value", "")
-
-    def _on_type_end(self, attributes: XmlAttributes) -> None:
-        self._current_type = ""
-
-    def _on_distribution(self, attributes: XmlAttributes) -> None:
-        self._current_distribution = set(attributes.get("vTypes", "").split())
-        self._distributions[attributes.get("id", "")] = self._current_distribution
-
-    def _on_distribution_end(self, attributes: XmlAttributes) -> None:
-        self._current_distribution = set()
 
     def _add_departure(self, text: str) -> None:
         try:
