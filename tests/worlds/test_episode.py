@@ -15,6 +15,7 @@ from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.user_driver import FileDriver
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring, make_scenario
+from unjam.scenarios.road import ClosedRoad
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
@@ -394,3 +395,15 @@ def test_a_seed_may_be_any_non_negative_integer(sumo: SumoBackend) -> None:
     assert all(np.array_equal(first.speeds, other.speeds) for other in others)
     with pytest.raises(InputError, match="seed: -1 is not allowed; allowed: >= 0"):
         run_episode(SHORT_RING, PISaturation(), -1, backend=sumo)
+
+
+def test_an_episode_in_sumo_draws_its_road_once(monkeypatch: pytest.MonkeyPatch, sumo: SumoBackend) -> None:
+    drawn, draw = list[ClosedRoad](), Ring.draw
+
+    def noted(self: Ring, generator: np.random.Generator) -> ClosedRoad:
+        drawn.append(draw(self, generator))
+        return drawn[-1]
+
+    monkeypatch.setattr(Ring, "draw", noted)
+    run_episode(replace(SHORT_RING, horizon=2), IDM(), (1,), backend=sumo)
+    assert len(drawn) == 1

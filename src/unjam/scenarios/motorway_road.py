@@ -90,24 +90,16 @@ class MotorwayGeometry(NamedTuple):
 
     def sections(self, lane: Array, position: Array) -> MotorwaySections:
         """Return the sections of n vehicles with these lanes and positions [m], arrays of shape (n,)."""
-        first, *others = self.ramps or (RampGeometry(self.length, self.length, 0.0, self.speed_limit),)
-        ramp, start = 0 * lane, 0.0 * position
-        merge_start, merge_end, limit = (0.0 * position + each for each in (first[0], first[1], first.speed_limit))
-        upstream = first
-        for number, each in enumerate(others, 1):
-            # A vehicle that stands at the end of an acceleration lane is not yet on the next ramp.
-            begin = np.where(lane == 0, each.start + self.vehicle_length, upstream.merge_end)
-            is_next = position >= begin
-            ramp = np.where(is_next, number, ramp)
-            start = np.where(is_next, upstream.merge_end, start)
-            merge_start, merge_end = (
-                np.where(is_next, new, old) for new, old in zip(each[:2], (merge_start, merge_end), strict=True)
-            )
-            limit = np.where(is_next, each.speed_limit, limit)
-            upstream = each
+        ramps = self.ramps or (RampGeometry(self.length, self.length, 0.0, self.speed_limit),)
+        merge_starts, merge_ends, lengths, limits = np.array(ramps).T
+        # A vehicle that stands at the end of an acceleration lane is not yet on the next ramp.
+        begins = merge_starts[1:] - lengths[1:] + self.vehicle_length
+        ramp = (position[:, None] >= np.where(lane[:, None] == 0, begins, merge_ends[:-1])).sum(1)
+        merge_start, merge_end = merge_starts[ramp], merge_ends[ramp]
         is_before, is_past = position < merge_start, position >= merge_end
-        start = np.where(is_before, start, np.where(is_past, merge_end, merge_start))
-        return MotorwaySections(ramp, merge_start, merge_end, limit, start, is_before, ~is_before & ~is_past)
+        section_before = np.where(ramp > 0, merge_ends[ramp - 1], 0.0)
+        start = np.where(is_before, section_before, np.where(is_past, merge_end, merge_start))
+        return MotorwaySections(ramp, merge_start, merge_end, limits[ramp], start, is_before, ~is_before & ~is_past)
 
     def distance_to_merge(self, lane: Array, position: Array) -> Array | None:
         """Return the distance of n vehicles to the merging section of their next ramp [m]; None without ramps.

@@ -132,11 +132,7 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     changes = changes & ~_has_change_conflict(vehicles, changes, geometry)
     initial = dict.fromkeys(("speed_gain", "keep_right", "look_ahead_speed", "speed_bias"), 0.0)
     initial |= dict.fromkeys(ADVICE_FIELDS, NO_ADVICE)
-    columns = {
-        name: (0.0 * getattr(vehicles, name) + value, getattr(vehicles, name)) for name, value in initial.items()
-    }
-    columns["lane"] = context.target_lane, vehicles.lane
-    return vehicles._replace(**{name: np.where(changes, *values) for name, values in columns.items()})
+    return vehicles.replace_rows(changes, lane=context.target_lane[changes], **initial)
 
 
 def mandatory_lane_changes(

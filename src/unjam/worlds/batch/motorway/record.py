@@ -162,8 +162,7 @@ class MotorwayLog:
         numbers, first_rows, inverse = np.unique(placements.entry, return_index=True, return_inverse=True)
         order = np.argsort(first_rows, kind="stable")
         vehicle = np.argsort(order)[inverse]  # by first appearance
-        first, last = np.full(len(order), moments), np.zeros(len(order), np.intp)
-        np.minimum.at(first, vehicle, steps)
+        first, last = steps[first_rows[order]], np.zeros(len(order), np.intp)
         np.maximum.at(last, vehicle, steps)
         cav_ids = dict.fromkeys(each.vehicle for each in trips)
         entries = [road.entries[number] for number in numbers[order].tolist()]

@@ -212,35 +212,26 @@ def sort_vehicles(vehicles: MotorwayVehicles) -> MotorwayVehicles:
 
 def find_neighbors(vehicles: MotorwayVehicles, lane_count: int) -> LaneNeighbors:
     """Return the neighbors of sorted vehicles."""
-    road = vehicles.road
-    rows = np.arange(len(road))
-    leaders, followers = [], []
-    for lane in range(lane_count):
-        is_on_lane = vehicles.lane == lane
-        leaders.append(_previous_row(is_on_lane, rows, road))
-        reverse = np.flip(_previous_row(np.flip(is_on_lane, (0,)), rows, np.flip(road, (0,))), (0,))
-        followers.append(np.where(reverse >= 0, len(road) - 1 - reverse, NO_VEHICLE))
-    return LaneNeighbors(np.stack(leaders), np.stack(followers))
+    road, is_on_lane = vehicles.road, vehicles.lane == np.arange(lane_count)[:, None]
+    reverse = _previous_rows(is_on_lane[:, ::-1], road[::-1])[:, ::-1]
+    followers = np.where(reverse >= 0, len(road) - 1 - reverse, NO_VEHICLE)
+    return LaneNeighbors(_previous_rows(is_on_lane, road), followers)
 
 
 def find_road_neighbors(vehicles: MotorwayVehicles, geometry: MotorwayGeometry) -> LaneNeighbors:
     """Return the neighbors of sorted vehicles on all lanes; on lane 0, vehicles of different ramps are none."""
     found = find_neighbors(vehicles, geometry.lane_count + 1)
-    if len(geometry.ramps) < 2 or not len(vehicles.lane):
-        return found
-    ramp = geometry.sections(vehicles.lane, vehicles.position).ramp
-
-    def without_other_ramps(rows: Array) -> Array:
-        is_other = (vehicles.lane == 0) & (ramp[rows[0]] != ramp)
-        return np.concatenate([np.where(is_other, NO_VEHICLE, rows[0])[None], rows[1:]])
-
-    return LaneNeighbors(*map(without_other_ramps, found))
+    if len(geometry.ramps) > 1:
+        ramp = geometry.sections(vehicles.lane, vehicles.position).ramp
+        for rows in found:
+            rows[0, (vehicles.lane == 0) & (ramp[rows[0]] != ramp)] = NO_VEHICLE
+    return found
 
 
-def _previous_row(is_on_lane: Array, rows: Array, road: Array) -> Array:
-    """Return the last row before each with a vehicle on a lane of the same road."""
-    last = np.maximum.accumulate(np.where(is_on_lane, rows, NO_VEHICLE))
-    previous = np.concatenate([last[:1] * 0 + NO_VEHICLE, last[:-1]])
+def _previous_rows(is_on_lane: Array, road: Array) -> Array:
+    """Return for each lane the last row before each row with a vehicle on this lane of the same road."""
+    last = np.maximum.accumulate(np.where(is_on_lane, np.arange(len(road)), NO_VEHICLE), 1)
+    previous = np.concatenate([0 * last[:, :1] + NO_VEHICLE, last[:, :-1]], 1)
     return np.where((previous >= 0) & (road[previous] == road), previous, NO_VEHICLE)
 
 
