@@ -15,7 +15,6 @@ from unjam.cli.train import _TrainingProgress
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate
 from unjam.parameters import parse_assignments
-from unjam.training import evaluate
 from unjam.training.config import RunConfig
 
 USUAL: dict[str, Any] = {"status": "completed", "reason": "", **dict.fromkeys(METRICS, 1.0)}
@@ -124,7 +123,7 @@ def test_the_evaluation_after_a_training_shows_its_progress(
 ) -> None:
     monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "err_console", output.err_console)
     monkeypatch.setattr(output, "PROGRESS_LINE_SECONDS", -1.0)
-    monkeypatch.setattr(evaluate, "evaluation_steps", lambda config, folder: 3000)
+    monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "evaluation_steps", lambda config, folder: 3000)
     with _TrainingProgress(RunConfig(), Path("run")) as progress:
         for episode, steps in ((("pi", 0), 500), (("pi", 1), 500), (("pi", 0), 1500)):
             progress.show_evaluation(episode, steps)

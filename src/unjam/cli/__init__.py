@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from importlib import import_module
 from itertools import pairwise
 from types import FrameType
 from typing import Annotated, Any
@@ -13,28 +14,68 @@ from typer.core import TyperGroup
 
 from unjam import __version__
 from unjam.child_processes import isolate_children
-from unjam.cli import calibration, catalog, controllers, diagnostics, drive, runs, train
 from unjam.cli.options import with_trust_option
-from unjam.errors import DISK_ERRNOS, InputError, UnjamError, disk_error, invalid_value, missing_package_error
+from unjam.errors import (
+    DISK_ERRNOS,
+    InputError,
+    UnjamError,
+    disk_error,
+    invalid_value,
+    missing_package_error,
+    unknown_name,
+)
 from unjam.plugins import load_plugins, plugin_names
 from unjam.processes import exit_with_parent, mark_as_command_line
 
 INTERRUPTED_EXIT_CODE = 130
+COMMANDS = {
+    "scenarios": "unjam.cli.catalog",
+    "drivers": "unjam.cli.catalog",
+    "drive": "unjam.cli.drive",
+    "assess": "unjam.cli.drive",
+    "calibrate": "unjam.cli.calibration",
+    "train": "unjam.cli.train",
+    "evaluate": "unjam.cli.runs",
+    "model": "unjam.cli.runs",
+    "fit-drivers": "unjam.cli.calibration",
+    "report": "unjam.cli.runs",
+    "tune": "unjam.cli.calibration",
+    "search": "unjam.cli.train",
+    "export": "unjam.cli.controllers",
+    "certify": "unjam.cli.controllers",
+    "keys": "unjam.cli.controllers",
+    "sign": "unjam.cli.controllers",
+    "verify": "unjam.cli.controllers",
+    "watch": "unjam.cli.drive",
+    "bench": "unjam.cli.diagnostics",
+    "doctor": "unjam.cli.diagnostics",
+    "runs": "unjam.cli.runs",
+}
+"""module of each command, which defines NAME_command"""
+CODE_RUNNING_COMMANDS = {
+    *("drive", "assess", "train", "evaluate", "model", "search", "export", "certify", "verify", "watch")
+}
+"""commands with the option --trust-code: they read folders, which can name Python code"""
 
 
 class _CommandGroup(TyperGroup):
-    """The commands of unjam, and those of plugins, which are loaded on demand."""
+    """The commands of unjam, and those of plugins; each is imported on demand."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*super().list_commands(ctx), *plugin_names("unjam.commands")]
+        return [*COMMANDS, *plugin_names("unjam.commands")]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        command = super().get_command(ctx, cmd_name)
-        if command is None and (plugins := load_plugins("unjam.commands", cmd_name)):
-            single = typer.Typer(rich_markup_mode="markdown")
-            single.command(cmd_name)(plugins[cmd_name])
-            command = typer.main.get_command(single)
-        return command
+        if cmd_name in COMMANDS:
+            command = getattr(import_module(COMMANDS[cmd_name]), f"{cmd_name.replace('-', '_')}_command")
+        elif plugins := load_plugins("unjam.commands", cmd_name):
+            command = plugins[cmd_name]
+        else:
+            raise unknown_name("command", cmd_name, self.list_commands(ctx))
+        if isinstance(command, typer.Typer):
+            return typer.main.get_command(command)
+        single = typer.Typer(rich_markup_mode="markdown", add_completion=False)
+        single.command(cmd_name)(with_trust_option(command) if cmd_name in CODE_RUNNING_COMMANDS else command)
+        return typer.main.get_command(single)
 
 
 app = typer.Typer(
@@ -63,37 +104,6 @@ def _root(
     pass
 
 
-COMMANDS = {
-    "scenarios": catalog.scenarios_command,
-    "drivers": catalog.drivers_command,
-    "drive": drive.drive_command,
-    "assess": drive.assess_command,
-    "calibrate": calibration.calibrate_command,
-    "train": train.train_command,
-    "evaluate": runs.evaluate_command,
-    "model": runs.model_command,
-    "fit-drivers": calibration.fit_drivers_command,
-    "report": runs.report_command,
-    "tune": calibration.tune_command,
-    "search": train.search_command,
-    "export": controllers.export_command,
-    "certify": controllers.certify_command,
-    "keys": controllers.keys_command,
-    "sign": controllers.sign_command,
-    "verify": controllers.verify_command,
-    "watch": drive.watch_command,
-    "bench": diagnostics.bench_command,
-    "doctor": diagnostics.doctor_command,
-}
-CODE_RUNNING_COMMANDS = {
-    *("drive", "assess", "train", "evaluate", "model", "search", "export", "certify", "verify", "watch")
-}
-"""commands with the option --trust-code: they read folders, which can name Python code"""
-for _name, _command in COMMANDS.items():
-    app.command(_name)(with_trust_option(_command) if _name in CODE_RUNNING_COMMANDS else _command)
-app.add_typer(runs.runs_app)
-
-
 class _Terminated(BaseException):
     """The process received SIGTERM, or SIGHUP because its terminal was closed."""
 
@@ -104,6 +114,9 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
 
 def main() -> None:
     """Run the command line; print every error that a user can correct as one line, and exit with its code."""
+    for stream, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, stream) is None:  # a closed stream must not become the next file that is opened
+            setattr(sys, stream, open(os.devnull, mode))  # noqa: SIM115
     mark_as_command_line()
     for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and nohup ignores it
         signum = getattr(signal, name, None)

@@ -17,6 +17,14 @@ from unjam.cli.output import (
     setting_options,
 )
 from unjam.errors import InputError
+from unjam.scenarios import make_scenario
+from unjam.scenarios.population import write_population
+from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
+from unjam.training.run_folder import lock_new_folder
+from unjam.training.trial_log import REQUEST_FILE
+from unjam.worlds.reward import make_reward
+from unjam.worlds.sumo.detectors import DetectorPool
+from unjam.worlds.worker_pool import WorkerPool
 
 CALIBRATION_COLUMNS = {
     "geh": ("mean GEH", "", 2),
@@ -69,14 +77,8 @@ def tune_command(
     - unjam tune figure-eight --expert pacer --vary gathering_speed=1..3 --steps 300000
     - unjam tune rings --expert pi         (also shared-rings, figure-eights, motorways, or all-roads)
     """
-    from unjam.scenarios import make_scenario
-    from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
-    from unjam.training.run_folder import lock_new_folder
     from unjam.training.search_space import default_search_space, expert_search_space
-    from unjam.training.trial_log import REQUEST_FILE
     from unjam.training.tune import tune
-    from unjam.worlds.reward import make_reward
-    from unjam.worlds.worker_pool import WorkerPool
 
     changes = opt.merge_settings(changes, opt.parse_settings(settings))
     if scenario in ROAD_GROUPS:
@@ -140,9 +142,6 @@ def calibrate_command(
     - unjam assess runs/calibrate-my-001/calibrated.sumocfg
     """
     from unjam.training.calibrate import calibrate, calibration_document, load_corridor, parse_factor_space
-    from unjam.training.run_folder import lock_new_folder
-    from unjam.training.trial_log import REQUEST_FILE
-    from unjam.worlds.sumo.detectors import DetectorPool
 
     space = parse_factor_space(vary or [])
     corridor = load_corridor(scenario, detectors, begin, end)
@@ -209,7 +208,6 @@ def fit_drivers_command(
     - unjam drive ring-jammed -d human -d pi --humans drivers.json
     """
     from unjam.following.fit_drivers import fit_drivers_from_files
-    from unjam.scenarios.population import write_population
 
     changes: dict[str, Any] = {"residual": residual, "seed": seed, **opt.parse_settings(settings)}
     columns = tuple(name for name in driver.split(",") if name)

@@ -13,7 +13,16 @@ from typer import Argument, Option
 
 from unjam.cli.options import JsonOption
 from unjam.cli.output import console, new_table, print_json
+from unjam.controller import PACKAGED_PREFIX, packaged_file, packaged_names
+from unjam.controller.file import read_controller
+from unjam.drivers.observation import FEATURES
+from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError
+from unjam.files import atomic_write, check_parent_folder
+from unjam.measures.gain import MEAN_GAIN
+from unjam.scenarios import SCENARIOS, example_scenario, scenario_recipe
+from unjam.worlds.backend import WorldOptions
+from unjam.worlds.sumo.backend import SumoBackend
 
 PICTURE_SECONDS = 60.0
 """simulated time after which an open road is drawn [s]; at the start it is almost empty"""
@@ -32,8 +41,6 @@ def scenarios_command(
     - unjam scenarios ring
     - unjam scenarios figure-eight --picture eight.png
     """
-    from unjam.scenarios import SCENARIOS, example_scenario, scenario_recipe
-
     if picture is not None and (name is None or picture.suffix.lower() != ".png"):
         raise InputError("picture: it needs the name of a scenario, and a file that ends in .png")
     if name is None:
@@ -65,10 +72,7 @@ def scenarios_command(
 
 def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
     """Write a picture of the road of seed 0: a closed road at the start, an open road after `PICTURE_SECONDS`."""
-    from unjam.files import atomic_write, check_parent_folder
     from unjam.reports.video import draw_road
-    from unjam.worlds.backend import WorldOptions
-    from unjam.worlds.sumo.backend import SumoBackend
 
     check_parent_folder(path)
     with SumoBackend() as sumo, sumo.open(scenario, (0,), WorldOptions()) as world:
@@ -84,7 +88,6 @@ def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
 
 
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
-    from unjam.drivers.observation import FEATURES
 
     seconds = scenario.warmup * scenario.simulation_step
     end = "in training, a collision of a CAV" if scenario.reads_user_files else "a collision"
@@ -105,9 +108,6 @@ def drivers_command(json: JsonOption = False) -> None:
 
     - unjam drivers
     """
-    from unjam.controller import PACKAGED_PREFIX, packaged_names
-    from unjam.drivers.registry import DRIVERS
-
     entries: dict[str, dict[str, Any]] = {
         name: {"description": (kind.__doc__ or "").strip().splitlines()[0], "parameters": parameter_entries(kind())}
         for name, kind in DRIVERS.items()
@@ -128,10 +128,6 @@ def drivers_command(json: JsonOption = False) -> None:
 
 def _packaged_summary(name: str) -> str:
     """Return a description of a packaged controller and its measured performance, from its manifest."""
-    from unjam.controller import packaged_file
-    from unjam.controller.file import read_controller
-    from unjam.measures.gain import MEAN_GAIN
-
     manifest = read_controller(packaged_file(name)).manifest
     if tuning := manifest.get("tuning"):
         best, default = (f"{tuning[key]['score']:.4g}" for key in ("best", "default"))

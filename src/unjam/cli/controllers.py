@@ -7,12 +7,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
+from rich.markup import escape
 from typer import Argument, Option
 
 from unjam.cli.options import JsonOption, check_page_path
 from unjam.cli.output import console, err_console, print_json
+from unjam.controller.file import add_certificate, add_signature, check_unsigned, controller_file, read_controller
+from unjam.controller.verify import check_parts, require_complete
+from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import invalid_value
+from unjam.files import check_parent_folder
 from unjam.processes import continue_in_limited_child
+from unjam.training.export import export_controller
 
 
 def export_command(
@@ -40,8 +46,6 @@ def export_command(
     - unjam export runs/ring-001 --out ring.unjam --onnx --sb3
     - unjam export pi:window=30 --scenario merge --out pi.unjam
     """
-    from unjam.training.export import export_controller
-
     if onnx:  # messages of the exporter are of no use to users
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
@@ -76,9 +80,6 @@ def certify_command(
     - unjam certify ring.unjam
     """
     from unjam.controller.certificate import make_certificate
-    from unjam.controller.file import add_certificate, check_unsigned, controller_file, read_controller
-    from unjam.drivers.wrappers import FilteredDriver
-    from unjam.files import check_parent_folder
 
     if out is not None:
         check_page_path(out)
@@ -120,11 +121,7 @@ def verify_command(
     - unjam verify ring.unjam --signer maker.pub     (signed with this key, or exit code 2)
     - unjam verify runs/mine --trust-code            (its expert is a Python file that you trust)
     """
-    from rich.markup import escape
-
     continue_in_limited_child(f"controller: {str(file)!r}")
-    from unjam.controller.file import read_controller
-    from unjam.controller.verify import check_parts, require_complete
 
     controller = read_controller(file)
     checks = check_parts(controller, signer)
@@ -178,7 +175,6 @@ def sign_command(
     - unjam sign ring.unjam --key maker.key
     - unjam verify ring.unjam --signer maker.pub
     """
-    from unjam.controller.file import add_signature, read_controller
     from unjam.controller.signature import fingerprint_of, read_private_key
 
     if os.path.isdir(file):

@@ -15,9 +15,13 @@ from typer import Option
 
 from unjam.cli.options import JsonOption
 from unjam.cli.output import console, err_console, new_table, print_json
+from unjam.drivers.pi_saturation import PISaturation
 from unjam.errors import EXTRAS, MissingPartError, UnjamError
 from unjam.files import make_folder
 from unjam.processes import has_display, kernel_protections
+from unjam.scenarios.ring import Ring
+from unjam.worlds.sumo.networks import cache_folder, sumo_program
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 REFERENCE_SUMO_VERSION = "1.28.0"
 """version of SUMO with which all results of the documentation were measured"""
@@ -67,8 +71,6 @@ class HealthCheck:
 
 def check_health() -> list[HealthCheck]:
     """Run all checks and return their results; the last one, an episode in a worker process, is the slowest."""
-    from unjam.worlds.sumo.networks import sumo_program
-
     python, sumo = platform.python_version(), f"pip install eclipse-sumo=={REFERENCE_SUMO_VERSION}"
     display = has_display()
     no_display = "for unjam watch without a display: --video FILE, or xvfb-run unjam watch ..."
@@ -130,7 +132,6 @@ def _try_check(name: str, run: Callable[[], str], remedy: str) -> HealthCheck:
 
 
 def _cache_check() -> HealthCheck:
-    from unjam.worlds.sumo.networks import cache_folder
 
     folder = cache_folder()
     try:
@@ -150,9 +151,6 @@ def _sandbox_check() -> HealthCheck:
 
 
 def _run_test_episode() -> str:
-    from unjam.drivers.pi_saturation import PISaturation
-    from unjam.scenarios.ring import Ring
-    from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
     with WorkerPool(1) as pool:
         episode = pool.run([EpisodeTask(Ring(length=(230, 230), horizon=100), PISaturation(), (0,))])[0]

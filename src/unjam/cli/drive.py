@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
@@ -16,13 +16,26 @@ from unjam.cli.output import (
     print_notes,
     suggest_after_drive,
 )
+from unjam.controller import DEFAULT_DRIVER, make_driver
+from unjam.controller.domain import controller_notes
+from unjam.drivers.driver import Driver
 from unjam.errors import InputError, MissingPartError, invalid_value
+from unjam.files import check_parent_folder
+from unjam.measures.effect import effects_by_driver
+from unjam.measures.metrics import measure
+from unjam.measures.notes import episode_notes
 from unjam.processes import has_display
-
-if TYPE_CHECKING:
-    from unjam.drivers.driver import Driver
-    from unjam.scenarios.scenario import Scenario
-    from unjam.worlds.record import Episode
+from unjam.scenarios import make_scenario, scenario_recipe
+from unjam.scenarios.scenario import Scenario
+from unjam.scenarios.user_network import ACC_SETTINGS
+from unjam.training.evaluate import drive, raise_failure, raise_failures
+from unjam.training.run_folder import lock_new_folder
+from unjam.worlds.backend import check_support, open_backend
+from unjam.worlds.episode import run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.sumo.backend import SumoBackend
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 
 @opt.with_options(changes=opt.scenario_changes)
@@ -66,12 +79,6 @@ def drive_command(
     - unjam drive ring-jammed -d human -d pi --humans drivers.json
     - unjam drive ring -d pi -d runs/ring-001 --test-seeds --episodes 20
     """
-    from unjam.controller import DEFAULT_DRIVER
-    from unjam.measures.effect import effects_by_driver
-    from unjam.scenarios import make_scenario
-    from unjam.scenarios.user_network import ACC_SETTINGS
-    from unjam.training.evaluate import drive, raise_failures
-
     changes = opt.merge_settings(changes, opt.parse_settings(settings))
     if out is not None and not report:
         raise InputError("out: it is not allowed with --no-report, which writes nothing")
@@ -124,16 +131,7 @@ def watch_command(
     - unjam watch ring --driver pi
     - unjam watch ring-jammed --driver runs/ring-001 --video wave.mp4
     """
-    from unjam.controller import make_driver
-    from unjam.controller.domain import controller_notes
-    from unjam.files import check_parent_folder
-    from unjam.measures.metrics import measure
-    from unjam.measures.notes import episode_notes
     from unjam.reports.video import check_video_format, write_video
-    from unjam.scenarios import make_scenario, scenario_recipe
-    from unjam.training.evaluate import raise_failure
-    from unjam.worlds.backend import check_support, open_backend
-    from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
     if len(drivers) > 1:
         raise invalid_value("driver", ", ".join(drivers), "one")
@@ -165,16 +163,12 @@ def watch_command(
         console.print(str(video))
 
 
-def watch_in_window(scenario: "Scenario", driver: "Driver", seed: Sequence[int], pace: float) -> "Episode":
+def watch_in_window(scenario: Scenario, driver: Driver, seed: Sequence[int], pace: float) -> Episode:
     """Run an episode in SUMO's window, `pace` times as fast as real time, and return it.
 
     Raises:
         MissingPartError: there is no display.
     """
-    from unjam.worlds.episode import run_episode
-    from unjam.worlds.sumo.backend import SumoBackend
-    from unjam.worlds.sumo.simulation import Simulation
-
     if not has_display():
         raise MissingPartError("watch: no display; write a video: --video FILE, or use xvfb-run unjam watch ...")
     delay = 1000.0 / pace  # [ms] per second of simulation, for any number of steps
@@ -224,8 +218,6 @@ def assess_command(
     - unjam assess my.sumocfg -d runs/my-001 --penetration-rates 0.1 --begin 28800 --end 32400 --json
     """
     from unjam.training.assess import DEFAULT_CONTROLLERS, assess, make_request
-    from unjam.training.run_folder import lock_new_folder
-    from unjam.worlds.worker_pool import WorkerPool
 
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
     request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)

@@ -1,7 +1,6 @@
 """Output of the command line: tables, one JSON document, progress on standard error, and suggested next commands."""
 
 import json
-import os
 import shlex
 import sys
 import time
@@ -9,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from rich.console import Console
 from rich.measure import Measurement
@@ -18,12 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 from unjam.cli.options import DEFAULT_WORKERS
+from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, MissingPartError
 from unjam.files import to_json
-
-if TYPE_CHECKING:
-    from unjam.measures.metric_table import TableCell
-    from unjam.measures.statistics import Estimate
+from unjam.measures.metric_table import TableCell, choose_baseline, metric_table, table_headings
+from unjam.measures.statistics import Estimate
 
 PROGRESS_LINE_SECONDS = 5.0
 """time between two plain lines of progress without a terminal"""
@@ -33,10 +31,6 @@ NARROW_COLUMN_WIDTHS = 18, 7
 """widths of the columns of metrics and units in a narrow terminal [characters]"""
 TEXT_COLUMN_WIDTH = 22
 """width of headings and verdicts [characters]: that of most numbers with their intervals"""
-
-for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-    if getattr(sys, name) is None:  # a closed stream must not become the next file that is opened
-        setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
 
 console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else PIPED_TABLE_WIDTH)
 err_console = Console(
@@ -66,8 +60,6 @@ def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
     If the terminal is too narrow for all drivers, there are several tables; if it is too narrow for one,
     intervals are below means.
     """
-    from unjam.measures.metric_table import choose_baseline, metric_table, table_headings
-
     baseline = choose_baseline(rows_by_driver)
     headings, rows = table_headings(rows_by_driver, baseline), metric_table(rows_by_driver, baseline)
     columns = {label: [number] for number, label in enumerate(rows_by_driver)}
@@ -154,8 +146,6 @@ def print_next_command(reason: str, *arguments: object) -> None:
 
 def suggest_after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any], reward: str) -> None:
     """Suggest the next command on the same road: compare with human drivers, train on an expert, or watch."""
-    from unjam.drivers.registry import DRIVERS
-
     controllers = [driver for driver in drivers if driver != "human"]
     if "human" not in drivers:
         print_next_command("compare with human drivers", *_arguments_without_out(), "-d", "human")

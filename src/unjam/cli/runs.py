@@ -20,8 +20,15 @@ from unjam.cli.output import (
     print_next_command,
     print_notes,
 )
+from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, resume_hint
+from unjam.measures.statistics import format_difference
 from unjam.processes import check_not_locked, continue_in_limited_child, lock_folder
+from unjam.reports.results import read_progress, read_results
+from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
+from unjam.training.run_folder import check_run_files, lock_new_folder, read_config
+from unjam.training.runs import config_differences, find_run, list_runs, read_run, remove_run
+from unjam.worlds.worker_pool import WorkerPool
 
 
 def evaluate_command(
@@ -43,12 +50,6 @@ def evaluate_command(
     - unjam evaluate runs/ring-001 --episodes 50 --json
     - unjam evaluate runs/ring-001 --humans drivers.json --out runs/other-drivers
     """
-    from unjam.drivers.registry import DRIVERS
-    from unjam.reports.results import read_results
-    from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
-    from unjam.training.run_folder import check_run_files, lock_new_folder, read_config
-    from unjam.worlds.worker_pool import WorkerPool
-
     if humans is not None and out is None:
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
     config = read_config(run)
@@ -102,9 +103,7 @@ def model_command(
     continue_in_limited_child(f"model: {run}", run, Path(get_cachedir()))
     from unjam.reports import model
     from unjam.reports.html import write_report_page
-    from unjam.reports.results import read_progress
     from unjam.training.model_facts import update_model_facts
-    from unjam.training.run_folder import read_config
 
     config = read_config(run)
     with lock_folder(run):
@@ -168,10 +167,10 @@ RunsFolderOption = Annotated[Path, Option("--folder", help="Folder that contains
 RunNamesArgument = Annotated[list[str], Argument(help="Names of runs, as listed, or their folders.", metavar="NAME...")]
 DEFAULT_RUNS_FOLDER = Path("runs")
 
-runs_app = typer.Typer(name="runs", rich_markup_mode="markdown")
+runs_command = typer.Typer(name="runs", rich_markup_mode="markdown", add_completion=False)
 
 
-@runs_app.callback(invoke_without_command=True)
+@runs_command.callback(invoke_without_command=True)
 def list_runs_command(
     context: typer.Context,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
@@ -193,7 +192,6 @@ def list_runs_command(
             allowed = f"after it, as in unjam runs {context.invoked_subcommand} --folder studies"
             raise InputError(f"runs: options are not allowed before the command; allowed: {allowed}")
         return
-    from unjam.training.runs import list_runs
 
     runs = list_runs(folder, scenario) if folder != DEFAULT_RUNS_FOLDER or folder.is_dir() else []
     if json:
@@ -214,12 +212,11 @@ def list_runs_command(
 
 
 def _gain_text(gain: Any) -> str:
-    from unjam.measures.statistics import format_difference
 
     return format_difference(gain) if gain else "–"
 
 
-@runs_app.command("compare")
+@runs_command.command("compare")
 def compare_command(
     names: RunNamesArgument, folder: RunsFolderOption = DEFAULT_RUNS_FOLDER, json: JsonOption = False
 ) -> None:
@@ -229,8 +226,6 @@ def compare_command(
 
     - unjam runs compare ring-001 ring-002
     """
-    from unjam.training.runs import config_differences
-
     if len(names) < 2:
         raise InputError("compare: one run is not allowed; allowed: two or more")
     runs = _find_runs(names, folder)
@@ -252,7 +247,7 @@ def compare_command(
     print_next_command("compare them on one page", "report", *(run.folder for run in runs), "--out", "compared.html")
 
 
-@runs_app.command("progress")
+@runs_command.command("progress")
 def progress_command(
     name: Annotated[str, Argument(help="Name of a run, as listed, or its folder.")],
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
@@ -266,8 +261,6 @@ def progress_command(
     """
     import pandas as pd
 
-    from unjam.reports.results import read_progress
-
     rows = read_progress(_find_runs([name], folder)[0].folder)
     if json:
         print_json(rows)
@@ -275,7 +268,7 @@ def progress_command(
         pd.json_normalize(rows).to_csv(sys.stdout, index=False)
 
 
-@runs_app.command("remove")
+@runs_command.command("remove")
 def remove_command(
     names: RunNamesArgument,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
@@ -290,8 +283,6 @@ def remove_command(
 
     - unjam runs remove ring-001 ring-002 --yes
     """
-    from unjam.training.runs import remove_run
-
     runs = _find_runs(names, folder)
     for run in runs:
         if run.state == "running":
@@ -308,7 +299,6 @@ def remove_command(
 
 
 def _find_runs(names: Sequence[str], folder: Path) -> list[Any]:
-    from unjam.training.runs import find_run, read_run
 
     runs = (read_run(find_run(name, folder), name) for name in names)
     return list({run.folder.resolve(): run for run in runs}.values())

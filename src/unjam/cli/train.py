@@ -11,9 +11,14 @@ from unjam.cli import options as opt
 from unjam.cli import output
 from unjam.cli.output import console, err_console, print_json
 from unjam.errors import InputError
+from unjam.measures.notes import episode_notes
+from unjam.reports.results import read_progress, read_results
+from unjam.training.config import RunConfig, load_config, planned_steps
+from unjam.training.evaluate import Evaluation, evaluation_steps
+from unjam.training.run_folder import check_config, lock_new_folder, read_config
+from unjam.training.trial_log import REQUEST_FILE
 
 if TYPE_CHECKING:
-    from unjam.training.config import RunConfig
     from unjam.training.train import TrainResult
 
 PROGRESS_LINE_INTERVAL = 5
@@ -51,9 +56,6 @@ def train_command(
     - unjam train ring --humans drivers.json --set model.base=population
     - unjam train --resume runs/ring-001 --steps 2000000
     """
-    from unjam.training.config import load_config
-    from unjam.training.run_folder import check_config, read_config
-
     config_file, preset, settings = options
     if "out" in settings:
         out = Path(str(settings.pop("out")))
@@ -69,9 +71,7 @@ def train_command(
         folder = opt.new_folder(out, config.scenario)
     check_config(config)
     # These import torch, which takes seconds: errors in the arguments are reported before.
-    from unjam.reports.results import read_progress, read_results
     from unjam.reports.summary import main_finding
-    from unjam.training.config import planned_steps
     from unjam.training.tensorboard import tensorboard_writer
     from unjam.training.train import train
 
@@ -107,9 +107,6 @@ def train_command(
 
 def _result_facts(road: "TrainResult", run: "TrainResult") -> dict[str, Any]:
     """Return the result of a run on one road for JSON; for a run on a single road, both arguments are the same."""
-    from unjam.measures.notes import episode_notes
-    from unjam.training.evaluate import Evaluation
-
     return {
         **{"folder": str(road.folder), "controller": str(road.controller), "report": str(run.report)},
         "gain": asdict(road.gain) if road.gain else None,
@@ -140,7 +137,6 @@ class _TrainingProgress(output.ProgressReporter):
 
     def show_evaluation(self, episode: tuple[str, int], steps: int) -> None:
         """Show the progress of the evaluation after the training."""
-        from unjam.training.evaluate import evaluation_steps
 
         if not self._done:
             roads = self._config.task_configs().items()
@@ -185,11 +181,8 @@ def search_command(
     - unjam search merge --agent ppo --vary expert=acc,bcm,lacc --trials 30 --workers 8 --out runs/search
     - unjam search ring --vary policy.exploration_std=0.05..0.5 --executor ray --workers 64 --out /shared/search
     """
-    from unjam.training.config import load_config
-    from unjam.training.run_folder import lock_new_folder
     from unjam.training.search import BEST_CONFIG_FILE, check_search_space, describe_trial, search
     from unjam.training.search_space import parse_search_space
-    from unjam.training.trial_log import REQUEST_FILE
 
     base = replace(load_config(*options), workers=1)
     space = parse_search_space(vary or [])
