@@ -131,7 +131,6 @@ def _code_files(text: str) -> Iterable[Path]:
 
 
 def _trust_key(code: Path, sha256: str) -> str:
-    """Return the hash of the path and content of code."""
     return hashlib.sha256(os.fsencode(code) + b"\0" + sha256.encode()).hexdigest()
 
 

@@ -1,5 +1,6 @@
 """Each type of road gets its own driver from one file."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ from unjam.drivers import Constant, PISaturation
 from unjam.drivers.check import check_driver
 from unjam.drivers.local_state import COMMON_FIELDS, LocalState, state_of_ones
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
-from unjam.drivers.wrappers import ROAD_TYPES, RoadTypeSwitch
+from unjam.drivers.wrappers import RoadTypeSwitch
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 
+ROAD_TYPES = tuple(each.name for each in fields(RoadTypeSwitch))
 EACH = RoadTypeSwitch(*(Constant(acceleration=0.1 * number) for number in range(len(ROAD_TYPES))))
 
 

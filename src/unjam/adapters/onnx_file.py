@@ -59,7 +59,6 @@ def onnx_driver(
 
 
 def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:
-    """Return a graph and the table of its description."""
     description_file = path.with_suffix(DESCRIPTION_SUFFIX)
     if os.path.lexists(description_file):
         table = _parse_description(_read(description_file, MAX_DESCRIPTION_BYTES), description_file.name)

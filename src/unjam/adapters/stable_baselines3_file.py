@@ -133,7 +133,6 @@ def _read_weights(content: bytes) -> dict[str, Floats]:
 
 
 def _read_box(space: dict[str, Any]) -> Box:
-    """Return a `Box` with one axis."""
     if not space[":type:"].endswith(".Box'>"):
         raise ValueError(f"{space[':type:']} is not a Box")
     low, high = (np.array(space[name].strip("[]").split(), np.float64) for name in ("low", "high"))

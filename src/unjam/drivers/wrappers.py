@@ -27,23 +27,16 @@ COMPOSITE_CONFIG: ConfigDict = {**STRICT, "arbitrary_types_allowed": True}
 """configuration of parameter dataclasses with drivers among their fields"""
 DRIVER_INDEX_KEY = "driver_index"
 """name in the memory of a mixture: the driver of a CAV"""
-INNER_KEY, STEP_KEY, PENDING_KEY = "inner", "step", "pending"
-"""names in the memory of a wrapper: memory of the inner driver; control steps so far; delayed accelerations"""
+INNER_KEY = "inner"
+"""name in the memory of a wrapper: that of the inner driver"""
 AVERAGING_TIMES = (10.0, 40.0, 160.0)
 """time constants of the means [s]: within a wave, of a wave, of several waves"""
 SPEED_STD_SCALE, MEAN_GAP_SCALE = 2.0, 20.0
 """divisors of the standard deviation of speed [m/s] and of the mean gap [m] in network inputs"""
-HISTORY_STEPS_KEY = "steps"
-"""name in the memory: observed control steps"""
 MEAN_KEYS = ("mean_speed", "mean_square", "mean_gap")
 """names of the means in the memory, before their averaging time"""
 MAX_GATHERING_TIME = 30.0
 """time in which all vehicles gather if their queue fits on the road [s]"""
-PRIMARY_KEY, FALLBACK_KEY = "primary", "fallback"
-"""names of both drivers in the memory, as of their fields"""
-ELAPSED_KEY, GATHERED_KEY, GAVE_UP_KEY = "elapsed", "has_gathered", "gave_up"
-"""names in the memory: elapsed time [s]; whether all had gathered; whether the fallback drives"""
-ROAD_TYPES = ("motorway", "crossing_loop", "loop", "open_road", "shared_loop")
 MIN_SHARED_PENETRATION_RATE = 0.06
 """penetration rate from which a closed road counts as shared by several CAVs; one CAV among 16 vehicles counts, too,
 because the rate does not give their number"""
@@ -159,13 +152,13 @@ class ImpairedDriver(DriverWrapper):
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the inner driver, no elapsed step, and zero accelerations until the delay has passed."""
         delay_steps = round(self.delay / self.time_step)
-        return {**super().initial_memory(n), STEP_KEY: np.zeros(n), PENDING_KEY: np.zeros((n, delay_steps))}
+        return {**super().initial_memory(n), "step": np.zeros(n), "pending": np.zeros((n, delay_steps))}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the inner driver from `delay` ago, and store the current one."""
-        acceleration, after = self.driver.act(self._add_gap_noise(state, memory[STEP_KEY]), memory[INNER_KEY])
-        pending = np.concatenate([memory[PENDING_KEY], np.asarray(acceleration)[:, None]], axis=1)
-        return pending[:, 0], {INNER_KEY: after, STEP_KEY: memory[STEP_KEY] + 1.0, PENDING_KEY: pending[:, 1:]}
+        acceleration, after = self.driver.act(self._add_gap_noise(state, memory["step"]), memory[INNER_KEY])
+        pending = np.concatenate([memory["pending"], np.asarray(acceleration)[:, None]], axis=1)
+        return pending[:, 0], {INNER_KEY: after, "step": memory["step"] + 1.0, "pending": pending[:, 1:]}
 
     def _add_gap_noise(self, state: LocalState, step: Array) -> LocalState:
         if self.gap_noise == 0.0 or not len(step):
@@ -245,7 +238,7 @@ class HistoryDriver(DriverWrapper):
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the inner driver, and means over no steps."""
         means = {f"{name}_{time:g}": np.zeros(n) for time in AVERAGING_TIMES for name in MEAN_KEYS}
-        return {**super().initial_memory(n), HISTORY_STEPS_KEY: np.zeros(n), **means}
+        return {**super().initial_memory(n), "steps": np.zeros(n), **means}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return `memory` as if both had observed `history`."""
@@ -261,8 +254,8 @@ class HistoryDriver(DriverWrapper):
 
     def _update_means(self, memory: Memory, speed: Array, gap: Array) -> Memory:
         xp, after = namespace(speed), dict(memory)
-        after[HISTORY_STEPS_KEY] = memory[HISTORY_STEPS_KEY] + 1.0
-        early_weight = 1.0 / after[HISTORY_STEPS_KEY]
+        after["steps"] = memory["steps"] + 1.0
+        early_weight = 1.0 / after["steps"]
         for time in AVERAGING_TIMES:
             late_weight = 1.0 - exp(-self.time_step / time)
             weight = xp.where(early_weight > late_weight, early_weight, early_weight * 0.0 + late_weight)
@@ -304,32 +297,32 @@ class QueueFallback(CompositeDriver):
     own_requirements: ClassVar[Requirements] = Requirements(needs_loop=True, needs_numpy=True)
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the memories of both, without elapsed time, queue and switch."""
-        own = {key: np.zeros(n) for key in (ELAPSED_KEY, GATHERED_KEY, GAVE_UP_KEY)}
+        """Return the memories of both, without elapsed time [s], queue and switch."""
+        own = {key: np.zeros(n) for key in ("elapsed", "has_gathered", "gave_up")}
         return {**super().initial_memory(n), **own}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration by the active driver, and the new memory; that of the fallback starts with it."""
         after = self._update_memory(state, memory)
-        gave_up = after[GAVE_UP_KEY]
+        gave_up = after["gave_up"]
         if type(gave_up) is float:
-            key, driver = (FALLBACK_KEY, self.fallback) if gave_up else (PRIMARY_KEY, self.primary)
+            key, driver = ("fallback", self.fallback) if gave_up else ("primary", self.primary)
             acceleration, after[key] = driver.act(state, memory[key])
             return acceleration, after
-        acceleration, after[PRIMARY_KEY] = self.primary.act(state, memory[PRIMARY_KEY])
-        fallback_acceleration, fallback_memory = self.fallback.act(state, memory[FALLBACK_KEY])
+        acceleration, after["primary"] = self.primary.act(state, memory["primary"])
+        fallback_acceleration, fallback_memory = self.fallback.act(state, memory["fallback"])
         select = partial(select_rows, gave_up > 0.0)
-        after[FALLBACK_KEY] = map_leaves(select, fallback_memory, memory[FALLBACK_KEY])
+        after["fallback"] = map_leaves(select, fallback_memory, memory["fallback"])
         return select(fallback_acceleration, acceleration), after
 
     def _update_memory(self, state: LocalState, memory: Memory) -> Memory:
-        free, elapsed = state.leader_gap / state.loop_length, memory[ELAPSED_KEY] + self.time_step
-        xp, one = namespace(free), memory[GATHERED_KEY] * 0.0 + 1.0
-        gathered = xp.where(free >= GATHERED_LAP_FRACTION, one, memory[GATHERED_KEY])
+        free, elapsed = state.leader_gap / state.loop_length, memory["elapsed"] + self.time_step
+        xp, one = namespace(free), memory["has_gathered"] * 0.0 + 1.0
+        gathered = xp.where(free >= GATHERED_LAP_FRACTION, one, memory["has_gathered"])
         is_broken = (gathered > 0.0) & (free < BROKEN_LAP_FRACTION)
         failed = is_broken | ((gathered == 0.0) & (elapsed > MAX_GATHERING_TIME))
-        gave_up = xp.where(failed, one, memory[GAVE_UP_KEY])
-        return {**memory, ELAPSED_KEY: elapsed, GATHERED_KEY: gathered, GAVE_UP_KEY: gave_up}
+        gave_up = xp.where(failed, one, memory["gave_up"])
+        return {**memory, "elapsed": elapsed, "has_gathered": gathered, "gave_up": gave_up}
 
     def describe(self) -> str:
         """Return both."""

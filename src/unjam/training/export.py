@@ -176,14 +176,12 @@ def _residual_model(driver: Driver, metadata: dict[str, Any]) -> bytes:
 
 
 def _is_signed(file: Path) -> bool:
-    """Return whether a file is a signed controller."""
     with suppress(InputError):
         return file.is_file() and read_controller(file).signed_by is not None
     return False
 
 
 def _read_run_origin(run: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
-    """Return the road, controller and origin of a run."""
     if scenario:
         raise invalid_value("scenario", scenario, "none for a run, which has its own")
     folder = Path(run)
