@@ -76,7 +76,7 @@ def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
 
     Raise `InputError` if no other process could build such a driver.
     """
-    if any(type(each) not in DRIVER_CLASSES.values() for each in _all_drivers(driver)):
+    if not is_serializable(driver):
         raise invalid_value("driver", driver.describe(), f"{driver_names()} (put your class in a file: path.py:name)")
     return pack(driver, classes={Driver: DRIVER_CLASSES})
 
@@ -90,10 +90,7 @@ def _all_drivers(driver: Driver) -> Iterator[Driver]:
 
 def is_serializable(driver: Driver) -> bool:
     """Return whether another process can build a driver; drivers defined in a notebook drive in their own process."""
-    try:
-        return bool(driver_recipe(driver))
-    except InputError:
-        return False
+    return all(type(each) in DRIVER_CLASSES.values() for each in _all_drivers(driver))
 
 
 def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
