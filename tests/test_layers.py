@@ -215,7 +215,7 @@ UNSAFE_BUT = {
     "worlds/sumo/simulation.py: self._traffic_file.write_text(inputs.traffic_xml)": PRIVATE,
     "worlds/sumo/networks.py: (folder / name).write_text(content)": PRIVATE,
     "unjam_paper/open_test_roads.py: (folder / 'road.rou.xml').write_text(routes)": PRIVATE,
-    "unjam_paper/open_test_roads.py: path.write_text(element_document('configuration', lines))": PRIVATE,
+    "unjam_paper/open_test_roads.py: path.write_text(f'<configuration>{lines}</configuration>')": PRIVATE,
     "unjam_paper/assess_examples.py: road.mkdir()": PRIVATE,
     "unjam_paper/assess_examples.py: (folder / 'road.rou.xml').write_text('\\n'.join(lines))": PRIVATE,
     "unjam_paper/assess_examples.py: shutil.copy(network_file(road.network), folder / 'road.net.xml')": PRIVATE,

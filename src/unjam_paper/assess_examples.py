@@ -15,6 +15,7 @@ import pandas as pd
 from unjam.measures.recommendation import ControllerResult
 from unjam.measures.statistics import Estimate, format_difference
 from unjam.scenarios.motorway import ON_RAMP
+from unjam.scenarios.road import Connection
 from unjam.training.assess import Assessment, assess, make_request
 from unjam.worlds.sumo.backend import sumo_inputs
 from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE
@@ -24,9 +25,6 @@ from unjam_paper.open_test_roads import (
     EPISODE_SECONDS,
     OpenTestRoad,
     RoadSection,
-    connection_element,
-    edge_element,
-    node_element,
     write_configuration,
     write_network,
     write_road_files,
@@ -66,9 +64,9 @@ def write_grid(folder: Path) -> Path:
     every = [(x, y) for x in (0, *inside, SIGNALS + 1) for y in (0, *inside, SIGNALS + 1)]
     arms = [(x, y) for x, y in every if (x in ends) != (y in ends)]
     kinds = {**dict.fromkeys(signals, "traffic_light"), **dict.fromkeys(arms, "priority")}
-    nodes = [node_element(f"n{x}{y}", BLOCK_LENGTH * x, BLOCK_LENGTH * y, kind) for (x, y), kind in kinds.items()]
+    nodes = [(f"n{x}{y}", BLOCK_LENGTH * x, BLOCK_LENGTH * y, kind) for (x, y), kind in kinds.items()]
     edges = [
-        edge_element(f"{x}{y}to{to_x}{to_y}", f"n{x}{y}", f"n{to_x}{to_y}", 2, 13.89)
+        (f"{x}{y}to{to_x}{to_y}", f"n{x}{y}", f"n{to_x}{to_y}", 2, 13.89)
         for x, y in kinds
         for to_x, to_y in kinds
         if abs(x - to_x) + abs(y - to_y) == 1 and ((x, y) in signals or (to_x, to_y) in signals)
@@ -91,15 +89,13 @@ def _route(nodes: Sequence[tuple[int, int]]) -> str:
 def write_ramp(folder: Path) -> Path:
     """Write a motorway of two lanes with an on-ramp and SUMO's default vehicles."""
     positions = {"a": (0.0, 0.0), "b": (1500.0, 0.0), "c": (1800.0, 0.0), "d": (2500.0, 0.0), "r": (1100.0, -80.0)}
-    nodes = [node_element(name, x, y) for name, (x, y) in positions.items()]
-    edges = [
-        *(edge_element("before", "a", "b", 2, 33.33), edge_element("merging", "b", "c", 3, 33.33)),
-        *(edge_element("after", "c", "d", 2, 33.33), edge_element("ramp", "r", "b", 1, 22.22)),
-    ]
+    nodes = [(name, x, y, "priority") for name, (x, y) in positions.items()]
+    edges = [("before", "a", "b", 2, 33.33), ("merging", "b", "c", 3, 33.33)]
+    edges += [("after", "c", "d", 2, 33.33), ("ramp", "r", "b", 1, 22.22)]
     lanes = [("before", "merging", 0, 1), ("before", "merging", 1, 2), ("ramp", "merging", 0, 0)]
     lanes += [("merging", "after", 1, 0), ("merging", "after", 2, 1)]
     traffic = _default_traffic({"before merging after": MOTORWAY_FLOW, "ramp merging after": RAMP_FLOW})
-    return write_network(folder, nodes, edges, [connection_element(*each) for each in lanes], traffic)
+    return write_network(folder, nodes, edges, [Connection(*each) for each in lanes], traffic)
 
 
 def _default_traffic(routes: Mapping[str, float]) -> list[str]:

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from unjam.physics.idm import IDMParameters, equilibrium_gap
-from unjam.worlds.sumo.networks import run_netconvert, xml_element
+from unjam.scenarios.road import Connection
+from unjam.worlds.sumo.networks import run_netconvert, xml_document, xml_element
 
 EPISODE_SECONDS, ROAD_SIMULATION_STEP = 900.0, 0.5
 """length of an episode, and simulation step [s]"""
@@ -22,6 +23,10 @@ CROSSING_SHARE = 0.05
 """demand on each road that crosses at a signal, as a share of the demand on the main road"""
 SIDE_ROAD = (1, 20.0)
 """lanes and speed limit [m/s] of ramps and of crossing roads"""
+RoadNode = tuple[str, float, float, str]
+"""name, position (x, y) [m] and SUMO's type"""
+RoadEdge = tuple[str, str, str, int, float]
+"""name, both nodes, lanes, and speed limit [m/s]"""
 
 
 class RoadSection(NamedTuple):
@@ -144,33 +149,34 @@ def write_road_files(road: OpenTestRoad, folder: Path) -> Path:
     """Write the files of a road into a folder, and return its configuration."""
     main = [f"main{number}" for number in range(len(road.sections))]
     routes = {"main": (main, 1.0 - sum(section.ramp_flow for section in road.sections))}
-    nodes, edges, links = list[str](), list[str](), list[str]()
+    nodes, edges, links = list[RoadNode](), list[RoadEdge](), list[Connection]()
     x = y = heading = 0.0
     for number, section in enumerate(road.sections):
         before = road.sections[number - 1] if number else None
         has_signal = before is not None and before.has_signal
-        nodes.append(node_element(f"n{number}", x, y, "traffic_light" if has_signal else "priority"))
-        edges.append(edge_element(main[number], f"n{number}", f"n{number + 1}", section.lanes, section.speed))
+        nodes.append((f"n{number}", round(x, 2), round(y, 2), "traffic_light" if has_signal else "priority"))
+        edges.append((main[number], f"n{number}", f"n{number + 1}", section.lanes, section.speed))
         if before:
             more = section.lanes - before.lanes
             pairs = [(lane, lane + more) for lane in range(before.lanes) if lane + more >= 0]
-            links += [connection_element(main[number - 1], main[number], lane, other) for lane, other in pairs]
+            links += [Connection(main[number - 1], main[number], *lanes) for lanes in pairs]
         if has_signal:
-            nodes += [node_element(f"south{number}", x, y - 300.0), node_element(f"north{number}", x, y + 300.0)]
+            nodes.append((f"south{number}", round(x, 2), round(y - 300.0, 2), "priority"))
+            nodes.append((f"north{number}", round(x, 2), round(y + 300.0, 2), "priority"))
             crossing = [f"in{number}", f"out{number}"]
-            edges.append(edge_element(crossing[0], f"south{number}", f"n{number}", *SIDE_ROAD))
-            edges.append(edge_element(crossing[1], f"n{number}", f"north{number}", *SIDE_ROAD))
-            links.append(connection_element(crossing[0], crossing[1], 0, 0))
+            edges.append((crossing[0], f"south{number}", f"n{number}", *SIDE_ROAD))
+            edges.append((crossing[1], f"n{number}", f"north{number}", *SIDE_ROAD))
+            links.append(Connection(crossing[0], crossing[1], 0, 0))
             routes[f"crossing{number}"] = (crossing, CROSSING_SHARE)
         if section.ramp_flow:
             ramp = f"ramp{number}"
-            nodes.append(node_element(ramp, x - 400.0, y - 80.0))
-            edges.append(edge_element(ramp, ramp, f"n{number}", *SIDE_ROAD))
-            links.append(connection_element(ramp, main[number], 0, 0))
+            nodes.append((ramp, round(x - 400.0, 2), round(y - 80.0, 2), "priority"))
+            edges.append((ramp, ramp, f"n{number}", *SIDE_ROAD))
+            links.append(Connection(ramp, main[number], 0, 0))
             routes[ramp] = ([ramp, *main[number:]], section.ramp_flow)
         heading += math.radians(section.turn)
         x, y = x + section.length * math.cos(heading), y + section.length * math.sin(heading)
-    nodes.append(node_element(f"n{len(main)}", x, y))
+    nodes.append((f"n{len(main)}", round(x, 2), round(y, 2), "priority"))
     route_elements = [xml_element("route", id=name, edges=" ".join(route)) for name, (route, _) in routes.items()]
     shares = {name: share for name, (_, share) in routes.items()}
     traffic = [*_vehicle_types(road), *route_elements, *_flows(road, shares)]
@@ -203,43 +209,29 @@ def _vehicle_types(road: OpenTestRoad) -> Iterator[str]:
     yield xml_element("vType", id="truck", length=TRUCK_LENGTH, **shared, **slow)
 
 
-def element_document(root: str, elements: Sequence[str]) -> str:
-    """Return an XML document with these elements below its root."""
-    return f"<{root}>{''.join(elements)}</{root}>"
-
-
-def node_element(name: str, x: float, y: float, kind: str = "priority") -> str:
-    """Return a node at a position [m]."""
-    return xml_element("node", id=name, x=round(x, 2), y=round(y, 2), type=kind)
-
-
-def edge_element(name: str, start: str, end: str, lanes: int, speed: float) -> str:
-    """Return an edge between two nodes with a speed limit [m/s]."""
-    return xml_element("edge", id=name, **{"from": start, "to": end}, numLanes=lanes, speed=speed, priority=3)
-
-
-def connection_element(start: str, end: str, lane: int, next_lane: int) -> str:
-    """Return a connection between lanes of two edges."""
-    return xml_element("connection", **{"from": start, "to": end}, fromLane=lane, toLane=next_lane)
-
-
 def write_network(
     folder: Path,
-    nodes: Sequence[str],
-    edges: Sequence[str],
-    connections: Sequence[str],
+    nodes: Sequence[RoadNode],
+    edges: Sequence[RoadEdge],
+    connections: Sequence[Connection],
     traffic: Sequence[str],
     *options: str,
 ) -> Path:
     """Write a network and its traffic with options of netconvert, and return the SUMO configuration."""
-    parts = {"node": ("nod", nodes), "edge": ("edg", edges), "connection": ("con", connections)}
+    parts = (
+        ("node", "nod", ("id", "x", "y", "type"), nodes),
+        ("edge", "edg", ("id", "from", "to", "numLanes", "speed", "priority"), [(*edge, 3) for edge in edges]),
+        ("connection", "con", ("from", "to", "fromLane", "toLane"), connections),
+    )
     inputs = {
-        (f"--{name}-files", f"road.{suffix}.xml"): element_document(f"{name}s", elements)
-        for name, (suffix, elements) in parts.items()
-        if elements
+        (f"--{tag}-files", f"road.{suffix}.xml"): xml_document(
+            f"{tag}s", tag, [dict(zip(names, row, strict=True)) for row in rows]
+        )
+        for tag, suffix, names, rows in parts
+        if rows
     }
     run_netconvert(inputs, ["--no-turnarounds=true", *options], folder)
-    routes = element_document("routes", traffic)
+    routes = f"<routes>{''.join(traffic)}</routes>"
     (folder / "road.rou.xml").write_text(routes)
     return write_configuration(folder, {})
 
@@ -249,6 +241,6 @@ def write_configuration(folder: Path, options: Mapping[str, str]) -> Path:
     files = {"net-file": "road.net.xml", "route-files": "road.rou.xml"}
     values = {**files, "end": EPISODE_SECONDS, "step-length": ROAD_SIMULATION_STEP, **options}
     path = folder / "road.sumocfg"
-    lines = [xml_element(name, value=value) for name, value in values.items()]
-    path.write_text(element_document("configuration", lines))
+    lines = "".join(xml_element(name, value=value) for name, value in values.items())
+    path.write_text(f"<configuration>{lines}</configuration>")
     return path

@@ -145,18 +145,18 @@ def measure_parts(folder: Path, parts: Mapping[str, StudyPart], workers: int) ->
     stamps = {name: _stamp(part) for name, part in parts.items()}
     files = {name: folder / f"{name}.json" for name in parts}
 
-    def read(name: str) -> dict[str, Any]:
+    def stored_part(name: str) -> dict[str, Any]:
         return json.loads(files[name].read_text(encoding="utf-8")) if files[name].is_file() else {"stamp": ""}
 
-    def save(name: str, result: Any) -> None:
+    def save_part(name: str, result: Any) -> None:
         make_folder(files[name].parent)
         atomic_write(files[name], to_json({"stamp": stamps[name], "result": result}))
 
-    missing = {name: part for name, part in parts.items() if read(name)["stamp"] != stamps[name]}
+    missing = {name: part for name, part in parts.items() if stored_part(name)["stamp"] != stamps[name]}
     count = max(1, min(workers, len(missing)))
     if count == 1:
         for name, (function, arguments) in missing.items():
-            save(name, function(*arguments, workers))
+            save_part(name, function(*arguments, workers))
     else:
         # Spawned processes: a forked one would inherit the locks of torch's threads without the threads.
         context, share = multiprocessing.get_context("spawn"), max(1, workers // count)
@@ -164,10 +164,10 @@ def measure_parts(folder: Path, parts: Mapping[str, StudyPart], workers: int) ->
         with isolated_start(absolute), ProcessPoolExecutor(count, mp_context=context) as pool:
             running = {pool.submit(function, *given, share): name for name, (function, given) in missing.items()}
             for done in as_completed(running):
-                save(running[done], done.result())
+                save_part(running[done], done.result())
     measured: dict[str, Any] = {}
     for name in parts:
-        (part, _, entry), result = name.partition("/"), read(name)["result"]
+        (part, _, entry), result = name.partition("/"), stored_part(name)["result"]
         if not entry:
             measured[part] = result
         elif isinstance(result, list):
@@ -179,14 +179,14 @@ def measure_parts(folder: Path, parts: Mapping[str, StudyPart], workers: int) ->
 
 def _stamp(part: StudyPart) -> str:
     """Return a text that changes with the arguments of a part, and with the controllers that they name."""
-    return sha256(repr(_described(part)).encode()).hexdigest()[:12]
+    return sha256(repr(_describe(part)).encode()).hexdigest()[:12]
 
 
-def _described(value: Any) -> Any:
+def _describe(value: Any) -> Any:
     if isinstance(value, str | Path):
         return str(value), controller_hash(str(value))
     if isinstance(value, Mapping):
-        return [(key, _described(entry)) for key, entry in value.items()]
+        return [(key, _describe(entry)) for key, entry in value.items()]
     if isinstance(value, list | tuple):
-        return list(map(_described, value))
+        return list(map(_describe, value))
     return value.__qualname__ if callable(value) else value  # the text of a function has its address

@@ -1,5 +1,6 @@
 import json
 import math
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -62,7 +63,9 @@ def test_a_training_of_two_studies_is_planned_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", STUDIES)
 def test_drivers_of_every_study_can_drive_its_roads(name: str, tmp_path: Path) -> None:
     """Controllers of trainings are missing here; all other drivers have the control step of their road."""
-    for function, arguments in STUDIES[name].make_parts(StudyFolder(tmp_path), 1).values():
+    parts = STUDIES[name].make_parts(StudyFolder(tmp_path), 1)
+    pickle.dumps(parts)  # other processes measure them
+    for function, arguments in parts.values():
         scenario: Scenario
         sources: Sequence[DriverSource]
         if function is measure_road:

@@ -226,9 +226,9 @@ class _Demand:
 
     def handlers(self) -> XmlHandlers:
         """Return the functions to call with the attributes of an element, by its name."""
-        return {tag: partial(self._read, tag) for tag in READ_ELEMENTS}
+        return {tag: partial(self._on_element, tag) for tag in READ_ELEMENTS}
 
-    def _read(self, tag: str, attributes: XmlAttributes) -> None:
+    def _on_element(self, tag: str, attributes: XmlAttributes) -> None:
         match tag:
             case "vehicle" | "trip" | "flow":
                 self._add_vehicles(attributes, DEMAND_ELEMENTS[tag])
