@@ -190,39 +190,33 @@ def evaluate_on_roads(
 
     With `with_plots` one episode of each is kept for figures, which needs much memory.
     """
-    pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
     settings: dict[str, Any] = {"reward": reward, "backend": backend}
     settings |= {"record_details": True, "stop_at_contact": False}
-    tasks = [EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs]
-    remote = [number for number, task in enumerate(tasks) if task.is_serializable]
-    local = [number for number, task in enumerate(tasks) if not task.is_serializable]
+    pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
+    tasks = {(label, index): EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs}
+    remote = [pair for pair in pairs if tasks[pair].is_serializable]
+    local = [pair for pair in pairs if not tasks[pair].is_serializable]
 
-    def on_progress(number: int, steps: int) -> None:
+    def on_progress(pair: tuple[str, int], steps: int) -> None:
         if progress is not None:
-            progress(pairs[number], steps)
+            progress(pair, steps)
 
-    def measure_task(number: int, episode: Episode) -> tuple[dict[str, Any], Episode | None]:
-        is_plotted = with_plots and pairs[number][1] == 0 and episode.has_run
-        return measure(episode), episode if is_plotted else None
+    def measure_task(pair: tuple[str, int], episode: Episode) -> tuple[dict[str, Any], Episode | None]:
+        return measure(episode), episode if with_plots and pair[1] == 0 and episode.has_run else None
 
     measured = workers.run_and_map(
-        [tasks[number] for number in remote],
+        [tasks[pair] for pair in remote],
         lambda index, episode: measure_task(remote[index], episode),
         lambda index, steps: on_progress(remote[index], steps),
     )
     results = dict(zip(remote, measured, strict=True))
     with open_backend(backend) if local else nullcontext(backend) as opened:
-        for number in local:
-            task = replace(tasks[number], backend=opened)
-            results[number] = measure_task(number, run_episode(**vars(task), on_progress=partial(on_progress, number)))
-    rows: RowsByDriver = {label: [] for label in drivers}
-    plot_episodes: dict[str, Episode] = {}
-    for number, (label, _) in enumerate(pairs):
-        row, episode = results[number]
-        rows[label].append(row)
-        if episode is not None:
-            plot_episodes[label] = episode
-    return Evaluation(rows, plot_episodes)
+        for pair in local:
+            task = replace(tasks[pair], backend=opened)
+            results[pair] = measure_task(pair, run_episode(**vars(task), on_progress=partial(on_progress, pair)))
+    rows = {label: [results[label, index][0] for index in range(len(seeds))] for label in drivers}
+    first_episodes = {label: results[label, 0][1] for label in drivers if seeds}
+    return Evaluation(rows, {label: each for label, each in first_episodes.items() if each is not None})
 
 
 def raise_failure(rows: Sequence[dict[str, Any]]) -> None:

@@ -25,7 +25,6 @@ from unjam.models.world_model import WorldModel
 from unjam.reports.results import MODEL_FILE, read_model_facts, read_progress
 from unjam.training.config import RunConfig
 from unjam.training.run_folder import load_checkpoint
-from unjam.worlds.batch.run import run_batch
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask
@@ -93,16 +92,12 @@ def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     rollouts.restore(state["algorithm"][rollouts.name], tensors_with_prefix(f"algorithm/{rollouts.name}/", tensors))
     facts = {"iteration": state["iteration"], "base": settings.base, "members": settings.members}
     if settings.kind == "road":
-        run = _run_in_batch if config.backend == "batch" else partial(_run_alone, config.backend)
+        run = partial(_run_episode, config.backend)
         return _round_values(facts | cast(WholeRoadModel[Any], rollouts.world_model).waves(run))
     return _round_values(facts | _row_facts(rollouts, config, progress[-1]))
 
 
-def _run_in_batch(task: EpisodeTask) -> Episode:
-    return run_batch([task], allow_statistical=True)[0]
-
-
-def _run_alone(backend: str, task: EpisodeTask) -> Episode:
+def _run_episode(backend: str, task: EpisodeTask) -> Episode:
     return run_episode(task.scenario, task.driver, task.seed, backend=backend)
 
 
