@@ -23,26 +23,22 @@ from plain_safety import highest
 class Driver:
     """An expert, or a driver plus what a network has learned: its residual is repeated for some control steps."""
 
-    def __init__(self, recipe: dict[str, Any], weights: dict[str, np.ndarray], prefix: str = "") -> None:
+    def __init__(self, recipe: dict[str, Any], weights: dict[str, np.ndarray]) -> None:
         self.r, self.memory, self.age, self.held = recipe, SimpleNamespace(), 0, 0.0
-        if recipe["kind"] == "named":
-            self.p = SimpleNamespace(**recipe["parameters"])
-            if recipe["name"] not in EXPERTS:
-                raise ValueError(f"{recipe['name']} is not read here; read it with unjam")
-            return
         if recipe["kind"] in ("filtered", "history"):
-            self.inner = Driver(recipe["driver"], weights, f"{prefix}inner.")
-            return
-        if recipe["kind"] != "residual":
+            self.inner = Driver(recipe["driver"], weights)
+        elif recipe["kind"] == "residual":
+            self.expert = Driver(recipe["expert"], weights)
+            self.layers = [[weights[part["array"]] for part in layer] for layer in recipe["network"]["layers"]]
+        elif recipe["kind"] in EXPERTS:
+            self.p = SimpleNamespace(**recipe)
+        else:
             raise ValueError(f"a driver of the kind {recipe['kind']} is not read here; read it with unjam")
-        self.expert = Driver(recipe["expert"], weights, f"{prefix}expert.")
-        count = sum(f"{prefix}{index}.weight" in weights for index in range(len(weights)))
-        self.layers = [[weights[f"{prefix}{i}.{part}"] for part in ("weight", "bias")] for i in range(count)]
 
     def act(self, s: State) -> float:
         """Return the wanted acceleration [m/s2]."""
-        if self.r["kind"] == "named":
-            return EXPERTS[self.r["name"]](self.p, s, self.memory)
+        if self.r["kind"] in EXPERTS:
+            return EXPERTS[self.r["kind"]](self.p, s, self.memory)
         if self.r["kind"] == "filtered":
             wanted = clip(self.inner.act(s), -self.r["action_limit"], self.r["action_limit"])
             self.memory = self.inner.memory
@@ -55,7 +51,7 @@ class Driver:
         expert = clip(self.expert.act(s), -limit, limit)
         self.memory = self.expert.memory
         if self.age % self.r["action_repeat"] == 0:
-            self.held = self.r["authority"] * math.tanh(self.network(s, expert))
+            self.held = self.r["network"]["authority"] * math.tanh(self.network(s, expert))
         self.age += 1
         return clip(expert + self.held, -limit, limit)
 

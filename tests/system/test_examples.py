@@ -120,7 +120,7 @@ def test_without_a_map_the_plain_reader_holds_back_for_reported_congestion_alone
 
 def test_the_plain_reader_says_what_it_cannot_read(tmp_path: Path) -> None:
     asks = run_comparison(write_controller(driver_from_name("gap-maker", 0.1), tmp_path / "asks.unjam", perceived()))
-    assert asks.stderr.endswith("ValueError: gap-maker is not read here; read it with unjam\n")
+    assert asks.stderr.endswith("ValueError: a driver of the kind gap-maker is not read here; read it with unjam\n")
     ran = run_comparison(
         write_controller(MixedDriver((PISaturation(), PISaturation())), tmp_path / "it.unjam", perceived())
     )
