@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from functools import wraps
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
@@ -134,15 +134,8 @@ def _without_none(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-class TrainingOptions(NamedTuple):
-    """Values of the options that configure a training."""
-
-    config: Path | None
-    """TOML file with the configuration"""
-    preset: str
-    """name of the preset, or empty"""
-    changes: dict[str, Any]
-    """configuration values of other options and of `--set`, by key"""
+TrainingOptions = tuple[Path | None, str, dict[str, Any]]
+"""arguments of `load_config`: TOML file, name of the preset, and values of other options and of `--set`, by key"""
 
 
 def training_options(
@@ -165,7 +158,7 @@ def training_options(
     """Return the values of the options that configure a training."""
     options = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
     options = _without_none({**options, "reward": reward or None})
-    return TrainingOptions(config, preset, merge_settings(options, parse_settings(settings)))
+    return config, preset, merge_settings(options, parse_settings(settings))
 
 
 MAX_NUMBER_DIGITS = 10
