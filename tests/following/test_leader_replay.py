@@ -13,7 +13,7 @@ from unjam.following.leader_replay import (
     individual_idm,
     simulate_followers,
 )
-from unjam.following.trajectories import make_segments
+from unjam.following.trajectories import Floats, make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.scenarios.population import residual_inputs
 
@@ -34,12 +34,15 @@ def test_another_driver_has_an_error() -> None:
 
 
 def test_vehicle_that_never_brakes_touches_its_leader_and_stays_behind_it() -> None:
-    simulated = simulate_followers(
-        as_driver_model(lambda speed, leader_speed, gap: speed * 0.0 + 1.0), make_segments([idm_driver(QUICK)])
-    )
-    assert simulated.has_collided[0]
-    assert simulated.gap.min() == 0.0
-    assert simulated.speed.max() < 20.0
+    segments = make_segments([idm_driver(QUICK)])
+
+    def accelerate(speed: Floats, leader_speed: Floats, gap: Floats) -> Floats:
+        return speed * 0.0 + 1.0
+
+    assert simulate_followers(as_driver_model(accelerate), segments).has_collided[0]
+    states = list(follow_leader(accelerate, segments.start, segments.leader, segments.time_step))
+    assert min(gap[0] for _, gap in states) == 0.0
+    assert max(speed[0] for speed, _ in states) < 20.0
 
 
 @given(weight=st.floats(0, 1), gap=st.floats(3.0, 60.0), speed=st.floats(0.0, 20.0))

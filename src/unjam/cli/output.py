@@ -20,7 +20,7 @@ from unjam.cli.options import DEFAULT_WORKERS
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, MissingPartError
 from unjam.files import to_json
-from unjam.measures.metric_table import TableCell, choose_baseline, metric_table, table_headings
+from unjam.measures.metric_table import TableCell, choose_baseline, metric_table
 from unjam.measures.statistics import Estimate
 
 PROGRESS_LINE_SECONDS = 5.0
@@ -61,7 +61,7 @@ def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
     intervals are below means.
     """
     baseline = choose_baseline(rows_by_driver)
-    headings, rows = table_headings(rows_by_driver, baseline), metric_table(rows_by_driver, baseline)
+    headings, rows = metric_table(rows_by_driver, baseline)
     columns = {label: [number] for number, label in enumerate(rows_by_driver)}
     compared = [label for label in columns if label != baseline]
     for label, number in zip(compared, range(len(columns), len(headings)), strict=False):

@@ -150,7 +150,7 @@ def calibrate_idm(
     parameters = IDMParameters(**dict(zip(CALIBRATED_PARAMETERS, values, strict=True)))
     individual = replace_parameters(parameters, time_headway=parameters.time_headway * factors)
     simulated = simulate_followers(individual_idm(individual, weight, settings.limits), segments)
-    shares = simulated.sample_counts / simulated.sample_counts.sum()
+    shares = segments.sample_counts / segments.sample_counts.sum()
     gap_error, speed_error = (float(np.sqrt((mse * shares).sum())) for mse in (simulated.gap_mse, simulated.speed_mse))
     collisions, seconds = int(simulated.has_collided.sum()), sum(each.seconds for each in trajectories)
     names = CALIBRATED_PARAMETERS
@@ -176,7 +176,7 @@ def gap_objective(
 
 
 def gap_mean_squares(segments: Segments, model: DriverModel, candidate_count: int = 1) -> Floats:
-    """Return `SimulatedFollowers.gap_mse` for several candidates at once [m2], shape (candidates, n)."""
+    """Return `SimulationErrors.gap_mse` for several candidates at once [m2], shape (candidates, n)."""
     total = np.zeros((candidate_count, len(segments.sample_counts)))
     speed, gap = (np.broadcast_to(values, total.shape) for values in segments.start)
     states = follow_leader(model(speed, gap), (speed, gap), segments.leader, segments.time_step)

@@ -5,8 +5,7 @@ one step ahead of recorded states are not sufficient: a model with smaller ones 
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,29 +121,22 @@ def follow_leader(
         yield speed, gap
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedFollowers:
-    """Followers that a driver model drives behind recorded leaders, and their errors: n segments of T samples."""
+class SimulationErrors(NamedTuple):
+    """Errors of followers that a driver model drives behind recorded leaders, in n segments."""
 
-    speed: Floats
-    """simulated speed [m/s], shape (T, n)"""
-    gap: Floats
-    """simulated gap [m], shape (T, n)"""
     speed_mse: Floats
     """mean squared difference to the recorded speed in each segment [m2/s2], shape (n,)"""
     gap_mse: Floats
     """mean squared difference to the recorded gap in each segment [m2], shape (n,)"""
     has_collided: NDArray[np.bool_]
     """whether the gap became zero in a segment, shape (n,)"""
-    sample_counts: NDArray[np.int64]
-    """number of simulated samples of each segment, without the given first one, shape (n,)"""
 
 
-def simulate_followers(model: DriverModel, segments: Segments) -> SimulatedFollowers:
+def simulate_followers(model: DriverModel, segments: Segments) -> SimulationErrors:
     """Simulate a driver model behind the leader of each segment, starting from the first recorded sample."""
     start, is_present, counts = segments.start, segments.is_present, segments.sample_counts
     states = follow_leader(model(*start), start, segments.leader, segments.time_step)
     speed, gap = map(np.stack, zip(start, *states, strict=True))
     speed_mse = (np.square(speed - segments.speed) * is_present).sum(0) / counts
     gap_mse = (np.square(gap - segments.gap) * is_present).sum(0) / counts
-    return SimulatedFollowers(speed, gap, speed_mse, gap_mse, np.any((gap <= 0.0) & is_present, axis=0), counts)
+    return SimulationErrors(speed_mse, gap_mse, np.any((gap <= 0.0) & is_present, axis=0))

@@ -59,17 +59,13 @@ def choose_baseline(rows_by_driver: RowsByDriver) -> str:
     return max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default="")
 
 
-def table_headings(rows_by_driver: RowsByDriver, baseline: str) -> list[str]:
-    """Return the headings of the columns: drivers, then differences to the baseline."""
-    return [*rows_by_driver, *(f"{label} − {baseline}" for label in _compared_rows(rows_by_driver, baseline))]
-
-
-def metric_table(rows_by_driver: RowsByDriver, baseline: str) -> list[TableRow]:
-    """Return the verdicts, the probabilities of improvement over the baseline, and all metrics.
+def metric_table(rows_by_driver: RowsByDriver, baseline: str) -> tuple[list[str], list[TableRow]]:
+    """Return the headings; and verdicts, probabilities of improvement over the baseline, and all metrics.
 
     A row has a cell per driver, then the paired differences to the baseline; none without a baseline.
     """
-    compared = _compared_rows(rows_by_driver, baseline)
+    compared = {label: rows for label, rows in rows_by_driver.items() if baseline and label != baseline}
+    headings = [*rows_by_driver, *(f"{label} − {baseline}" for label in compared)]
     pairs = {label: len(pair_rows(rows, rows_by_driver[baseline])) for label, rows in compared.items()}
     verdicts = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]
     description = "The first violated limit; see docs/safety.md."
@@ -92,11 +88,7 @@ def metric_table(rows_by_driver: RowsByDriver, baseline: str) -> list[TableRow]:
             for label, rows in compared.items()
         ]
         table.append(TableRow(metric.label, metric.unit, " ".join((metric.function.__doc__ or "").split()), cells))
-    return table
-
-
-def _compared_rows(rows_by_driver: RowsByDriver, baseline: str) -> RowsByDriver:
-    return {label: rows for label, rows in rows_by_driver.items() if baseline and label != baseline}
+    return headings, table
 
 
 def estimate_cell(estimate: Estimate, digits: int, expected_count: int | None = None, sign: str = "") -> TableCell:

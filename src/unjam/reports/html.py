@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from unjam import __version__
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder
-from unjam.measures.metric_table import metric_table, table_headings
+from unjam.measures.metric_table import metric_table
 from unjam.measures.statistics import metric_estimate
 from unjam.reports import figures, space_time, summary
 from unjam.reports.model import error_figure, example_figure, model_section, rollout_figure, wave_figure
@@ -87,6 +87,7 @@ def render_report(results: Sequence[Results]) -> str:
     sources = list(zip(summary.folder_names(results), results, strict=True))
     counts = [len(column.rows) for column in columns]
     rows, baseline = {column.name: column.rows for column in columns}, summary.common_baseline(results)
+    headings, table = metric_table(rows, baseline)
     roads = (", ".join(f"{key} {value:g} m" for key, value in episode.drawn_values.items()) for episode in panels)
     return render_template(
         "report.html",
@@ -104,9 +105,9 @@ def render_report(results: Sequence[Results]) -> str:
         model=model_section(single) if single else None,
         columns=columns,
         episodes=list(dict.fromkeys((min(counts), max(counts)))),
-        headings=table_headings(rows, baseline),
+        headings=headings,
         baseline=baseline,
-        table=metric_table(rows, baseline),
+        table=table,
         sources=[(name, result, original_command(result)) for name, result in sources],
         script=_page_file("replay.js"),
         replay_data=Markup(json.dumps(replay_data(panels)).replace("<", "\\u003c")),

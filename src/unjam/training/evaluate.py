@@ -23,7 +23,7 @@ from unjam.files import atomic_write, make_folder, to_json
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
 from unjam.measures.feasibility import feasibility_by_driver
-from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_table, table_headings
+from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_table
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
@@ -110,13 +110,9 @@ class DriveResult(Evaluation):
         from unjam.reports.figures import data_uri
         from unjam.reports.space_time import space_time_figure
 
-        baseline = choose_baseline(self.rows)
-        cells = [
-            [f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)]
-            for row in metric_table(self.rows, baseline)
-        ]
-        headings = ["", *table_headings(self.rows, baseline)]
-        table = pd.DataFrame(cells, columns=headings).to_html(index=False, border=0)
+        headings, rows = metric_table(self.rows, choose_baseline(self.rows))
+        cells = [[f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)] for row in rows]
+        table = pd.DataFrame(cells, columns=["", *headings]).to_html(index=False, border=0)
         if not self.plot_episodes:
             return table
         episodes = [to_plot_episode(label, each) for label, each in self.plot_episodes.items()]
