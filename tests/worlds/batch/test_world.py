@@ -190,7 +190,7 @@ def test_it_stays_so_for_five_minutes(sumo: SumoBackend) -> None:
 def test_a_network_sees_explores_and_is_recorded_as_in_sumo(
     hold: int, wrong: dict[str, Any], sumo: SumoBackend
 ) -> None:
-    ring, driver = Ring(cavs=2, warmup=120, horizon=100, **wrong), make_benchmark_driver(hold)
+    ring, driver = Ring(cavs=2, warmup=120, horizon=100, **wrong), make_benchmark_driver(0.1, 0.1 * hold)
     for found, seed in zip(run_batch(tasks(ring, driver, (1, 2), True)), (1, 2), strict=True):
         actual = run_episode(ring, driver, seed, explore=True, backend=sumo)
         assert_alike(found, actual)
@@ -256,7 +256,7 @@ def doubles(values: Floats) -> Tensor:
 
 @pytest.mark.parametrize("wrong", [{}, WRONG], ids=["exact sensors", "wrong sensors"])
 def test_tensors_do_what_arrays_do(wrong: dict[str, Any]) -> None:
-    asked = tasks(Ring(horizon=200, cavs=2, warmup=100, **wrong), make_benchmark_driver(10), range(3))
+    asked = tasks(Ring(horizon=200, cavs=2, warmup=100, **wrong), make_benchmark_driver(0.1), range(3))
     for one, other in zip(run_batch(asked), run_batch(asked, doubles), strict=True):
         assert_alike(one, other)
 
@@ -267,7 +267,7 @@ def singles(device: str) -> ArrayFactory:
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=NEEDS_A_CARD)])
 def test_single_precision_is_near(device: str) -> None:
-    asked = tasks(Ring(horizon=300), make_benchmark_driver(10), range(3))
+    asked = tasks(Ring(horizon=300), make_benchmark_driver(0.1), range(3))
     for one, other in zip(run_batch(asked), run_batch(asked, singles(device)), strict=True):
         assert np.abs(one.speeds - other.speeds).max() < 1e-3
         assert other.reward.sum() == pytest.approx(one.reward.sum(), rel=1e-4)
