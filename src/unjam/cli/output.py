@@ -196,5 +196,5 @@ def suggest_resume(folder: Path, workers: int) -> Iterator[None]:
     except BaseException as error:
         if not isinstance(error, InputError | MissingPartError) and (folder / "config.toml").is_file():
             options = [] if workers == DEFAULT_WORKERS else ["--workers", workers]
-            print_next_command("continue with", "train", "--resume", folder, *options)
+            print_next_command("resume with", "train", "--resume", folder, *options)
         raise
