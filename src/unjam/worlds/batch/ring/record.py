@@ -19,7 +19,7 @@ FindContacts = Callable[[Array, Array, Array], Array]
 """returns the vehicles that touch another one, for positions, gaps and the length of the road [m]"""
 
 
-def make_episodes(
+def make_ring_episodes(
     rings: Iterable[tuple[LoopScenario, ClosedRoad, Sequence[int], int, bool]],
     start_positions: Floats,
     series: dict[str, list[Array]],

@@ -33,7 +33,7 @@ from unjam.worlds.batch.human_idm import (
     ring_contacts,
 )
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, NoiseState, QuickNoise, SeededNoise, WorldSeeds
-from unjam.worlds.batch.ring.record import as_numpy, make_episodes
+from unjam.worlds.batch.ring.record import as_numpy, make_ring_episodes
 from unjam.worlds.closed_road import MAX_RECALL_SECONDS
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask
@@ -318,7 +318,7 @@ class RingBatch:
         steps, crashed = as_numpy(self._control_step_counts).astype(int), as_numpy(self._is_running) == 0.0
         rings = zip(self._scenarios, self.roads, self._seeds, steps.tolist(), crashed.tolist(), strict=True)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
-        return make_episodes(rings, self._start_positions, self._series, self._find_contacts, driver_log, rate)
+        return make_ring_episodes(rings, self._start_positions, self._series, self._find_contacts, driver_log, rate)
 
 
 class RingReadings:
