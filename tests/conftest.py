@@ -29,7 +29,7 @@ else:
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No timed tests, and the same each time. `make test-all` takes the thorough one.
-settings.register_profile("unjam", deadline=None, derandomize=True, max_examples=20)
+settings.register_profile("unjam", deadline=None, derandomize=True, max_examples=10)
 settings.register_profile("thorough", deadline=None, derandomize=True, max_examples=200)
 settings.load_profile("unjam")
 

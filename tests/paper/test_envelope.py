@@ -31,7 +31,7 @@ def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None
             assert road.safety.active
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = "unjam:ring-gap-tuned"
     monkeypatch.setattr(feasible, "CONTROLLER_ROADS", {one: "ring"})

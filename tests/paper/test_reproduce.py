@@ -113,6 +113,7 @@ def test_a_study_writes_trainings_results_figure_and_manifest(reproduced: Made) 
     assert len({entry["weights_sha256"] for entry in manifest["trainings"]}) == 4
 
 
+@pytest.mark.slow
 def test_finished_trainings_are_not_repeated(reproduced: Made) -> None:
     folder, _ = reproduced
     before = {path: path.stat().st_mtime_ns for path in (folder / "runs").rglob("controller.unjam")}

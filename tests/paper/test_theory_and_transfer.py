@@ -57,6 +57,7 @@ def test_controllers_are_evaluated_in_other_traffic(monkeypatch: pytest.MonkeyPa
     assert all(row["road"] == "six" and np.isfinite(row["mean_speed"]["mean"]) for row in rows)
 
 
+@pytest.mark.slow
 def test_controllers_and_experts_are_evaluated_under_other_conditions(reproduced: Made) -> None:
     folder, _ = reproduced
     run = folder / "runs" / "small" / "plain" / "0"

@@ -77,6 +77,7 @@ def test_train_on_several_roads_prints_a_table_for_each(unjam: Run, tmp_path: Pa
     assert {"ring", "short", "report.html"} <= {path.name for path in (tmp_path / "run").iterdir()}
 
 
+@pytest.mark.slow
 def test_drive_prints_one_json_document(unjam: Run) -> None:
     command = ("drive", "ring", "--driver", "pi", "--episodes", 2, "--seed", 7, *SMALL, "--json")
     found = document(unjam(*command, pictures=False))
@@ -136,7 +137,7 @@ def test_drive_on_the_merge_has_flow_and_backlog(unjam: Run, tmp_path: Path) -> 
     assert "Speed, waves and backlog over time" in (tmp_path / found["drivers"][0]["report"]).read_text()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_drive_without_a_driver_compares_human_drivers_and_the_default_controller(unjam: Run, tmp_path: Path) -> None:
     common = [game(tmp_path, "ramp").name, "--penetration-rate", "0.3", "-n", 1, "--no-report"]
     common += ["--set", "horizon=60"]
@@ -148,7 +149,7 @@ def test_drive_without_a_driver_compares_human_drivers_and_the_default_controlle
     assert "note: unjam:best limits the ACC of a " in " ".join(without.stderr.split())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
     file = game(tmp_path, "ramp").name
     common = ["-n", 1, "--set", "horizon=150", "--json"]
@@ -163,7 +164,7 @@ def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
 ASSESS = ["assess", "straight.sumocfg", "--penetration-rates", "0,0.5", "-d", "acc", "--set", "horizon=120"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_assess_prints_text_and_json_and_writes_a_page(unjam: Run, tmp_path: Path) -> None:
     straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>', length=100.0)
     ran = unjam(*ASSESS, "-n", 36, "--out", "answer")
@@ -253,7 +254,7 @@ def test_doctor_finds_all_parts(unjam: Run) -> None:
     assert {"netconvert", "an episode in a worker"} <= {check["name"] for check in found["checks"]}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_train_resume_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     trained = document(unjam(*TINY_RUN, "--steps", 320, "--out", "run", "--json", pictures=False))
     run = tmp_path / "run"

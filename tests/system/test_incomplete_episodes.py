@@ -25,7 +25,7 @@ def document(run: Run, *words: object) -> dict[str, Any]:
     return json.loads(ran.stdout)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ignored_demand_is_in_terminal_json_and_report(unjam: Run, tmp_path: Path) -> None:
     straight(tmp_path, UNSORTED, end=90.0, step=0.5)
     drive = ("drive", "straight.sumocfg", "--penetration-rate", 0.5, "-d", "human", "-n", 2)
@@ -107,7 +107,7 @@ def test_assess_refuses_a_baseline_that_a_limit_of_teleports_ends(unjam: Run, tm
     assert not (tmp_path / "answer").exists()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_contact_of_cavs_is_recorded_without_ending_the_episode(unjam: Run, tmp_path: Path) -> None:
     two_way(tmp_path)
     drive = ("drive", "my.sumocfg", "--penetration-rate", 0.9, "-d", "acc", "-n", 2, "--no-report")

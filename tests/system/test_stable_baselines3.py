@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 from stable_baselines3 import PPO
 
 from tests.adapters.test_stable_baselines3 import Space
@@ -18,6 +19,7 @@ def save_model(folder: Path, inputs: int = 5) -> str:
     return "ppo.zip"
 
 
+@pytest.mark.slow
 def test_a_file_drives_beside_drivers_with_names(unjam: Run, tmp_path: Path) -> None:
     done = unjam("drive", "ring", *SMALL, "-d", save_model(tmp_path), "-d", "pi", "--episodes", "1", "--json")
     assert done.returncode == 0, done.stderr

@@ -64,7 +64,7 @@ def test_commands_of_the_core_run_without_extras(run_without: RunWithout, tmp_pa
     assert ran.returncode == 0, ran.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("package", "command"),
     [

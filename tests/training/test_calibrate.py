@@ -119,7 +119,7 @@ def test_written_network_has_the_reported_agreement(corridor: Corridor, done: tu
     assert episode.status == "completed"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_interrupted_calibration_resumes(
     corridor: Corridor, done: tuple[Path, CalibrationResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

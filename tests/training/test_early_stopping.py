@@ -124,7 +124,7 @@ def test_missing_tensorboard_is_reported_before_training(monkeypatch: pytest.Mon
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_early_stop_persists_when_resumed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     returns = iter([5.0, 6.0, 5.5, 5.8, 9.0, 9.5])
     monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])

@@ -100,7 +100,7 @@ def test_exported_driver_has_step_and_bounds_of_the_scenario(tmp_path: Path) -> 
     assert load_controller(again.file) == load_controller(done.file)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_graph_is_in_the_controller_and_in_its_own_file(run: Path, tmp_path: Path) -> None:
     done = export_controller(run, tmp_path / "ring.unjam", onnx=True)
     assert done.graph == tmp_path / "ring.onnx"

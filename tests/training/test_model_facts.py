@@ -163,7 +163,7 @@ RAMP: dict[str, Any] = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["batch", "sumo"])
 def test_on_ramp_model_has_waves_by_lane(world: str, tmp_path: Path) -> None:
     changes = {"model__model_ratio": 1.0, "model__kind": "road", "model__members": 2, **RAMP}

@@ -122,7 +122,7 @@ def test_unsupported_roads_are_not_screened(tmp_path: Path) -> None:
         tune({"merge": Merge()}, "pi", SPACE, 10**9, tmp_path, workers, screen=True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_on_ramps_are_screened_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("unjam.training.tune.TUNING_EPISODES", 2)
     monkeypatch.setattr("unjam.training.tune.TUNING_FINALISTS", 1)
@@ -142,7 +142,7 @@ def test_trials_of_another_backend_are_not_screened(tmp_path: Path) -> None:
         tune({"ring": SMALL}, "pi", SPACE, 10**9, tmp_path, workers, backend="batch", screen=True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_trials_run_in_the_backend(tmp_path: Path) -> None:
     with WorkerPool(1) as workers:
         found, driven = (

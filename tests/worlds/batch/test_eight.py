@@ -60,7 +60,7 @@ def test_it_begins_as_sumos_of_the_same_seed(name: str, sumo: SumoBackend) -> No
         assert states.distance_to_crossing[:until] == pytest.approx(expected.distance_to_crossing[:until], abs=1e-2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("expert", ["human", "pi"])
 def test_from_each_of_sumos_moments_a_step_is_sumos(expert: str, simulation: Simulation) -> None:
     eight = replace(SHORT, horizon=900)

@@ -286,6 +286,7 @@ def test_a_road_is_the_same_alone_and_among_others(driven: dict[str, list[Episod
     assert alone.audit == among.audit
 
 
+@pytest.mark.slow
 def test_nobody_touches_anybody_or_is_lost(driven: dict[str, list[Episode]]) -> None:
     for episode in driven["human"] + driven["jam-ahead"]:
         assert episode.status == "completed"

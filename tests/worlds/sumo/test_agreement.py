@@ -82,7 +82,7 @@ def human_rings(request: pytest.FixtureRequest, workers: WorkerPool) -> tuple[in
     return request.param, run(workers, ring_warm(request.param), Human(), range(20))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_human_rings_follow_the_papers_equations(human_rings: tuple[int, list[Episode]]) -> None:
     length, episodes = human_rings
     found, spread = measured(episodes)

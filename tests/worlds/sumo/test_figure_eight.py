@@ -33,7 +33,7 @@ AS_FLOW = FigureEight(actuation="flow", enforce_human_limits=False, safety=Safet
 DRIVERS = {"human": Human(), "pi": PISaturation(time_constant=0.0)}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_agrees_with_flow_within_six_percent_without_collision() -> None:
     tasks = [
         EpisodeTask(replace(AS_FLOW, radius=(radius, radius)), DRIVERS[driver], (seed,))

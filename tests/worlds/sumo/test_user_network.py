@@ -100,7 +100,7 @@ def test_penetration_rate_and_cav_types_select_the_cavs(tmp_path: Path) -> None:
         assert driven == {name for name in there if "truck" in kinds.get(name, "")} != set()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_calibrated_drivers_drive_the_cars_and_the_same_vehicles_are_cavs(tmp_path: Path) -> None:
     file, population = game(tmp_path, "ramp"), tmp_path / "drivers.json"
     near, far = IDMParameters(time_headway=0.8), IDMParameters(time_headway=3.0, minimum_gap=6.0)
@@ -254,6 +254,7 @@ def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, sumo:
     assert not any(trajectory.terminated for trajectory in episode.trajectories)
 
 
+@pytest.mark.slow
 def test_the_flow_does_not_depend_on_the_last_arrival(tmp_path: Path, sumo: SumoBackend) -> None:
     vehicles = '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>'
     scenario = make_scenario(str(straight(tmp_path, vehicles, 800.0, 120.0)), {"penetration_rate": 1.0})
@@ -270,6 +271,7 @@ def test_vehicles_with_a_long_insertion_delay_are_not_dropped(tmp_path: Path, su
     assert len(episode.vehicle_ids) + episode.backlog[-1] == 150
 
 
+@pytest.mark.slow
 def test_flows_without_an_end_last_until_the_given_end(tmp_path: Path, sumo: SumoBackend) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" period="5"/>', end=30.0)
     asked = [{}, {"end": 100.0}, {"end": 100.0, "begin": 0.0}, {"horizon": 1000}]
