@@ -2,7 +2,7 @@
 
 from collections import deque
 from math import exp, prod
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +10,23 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.local_state import ROAD_SECTION_LENGTH, SECTIONS_AHEAD
-from unjam.parameters import STRICT, NonNegative
+from unjam.parameters import STRICT, NonNegative, Positive
 from unjam.physics.arrays import Floats
+
+SpeedSource = Literal["vehicles", "cavs", "detectors", "none"]
 
 
 @dataclass(frozen=True, config=STRICT)
 class RoadsideSettings:
-    """Differences between a message and the current measurement."""
+    """What a message contains, and how it differs from the current measurement."""
 
+    source: SpeedSource = "vehicles"
+    """whose speeds are known: those of all vehicles now; of CAVs, which share theirs, in the last `averaging_time`; of
+    vehicles that pass detectors in each lane, as means of the last `averaging_time` but one; or none"""
+    averaging_time: Positive = 60.0
+    """time over which the speeds of CAVs, or those at detectors, are averaged [s]"""
+    detector_spacing: Positive = 500.0
+    """distance between two detectors; the first one is half of it downstream of the entrance [m]"""
     latency: NonNegative = 0.0
     """time from measurement to arrival [s]"""
     smoothing_time: NonNegative = 0.0
@@ -85,6 +94,20 @@ class CongestionMonitor:
         return self._is_congested
 
 
+class MeasuredVehicles(NamedTuple):
+    """The vehicles on main roads and their ramps now; arrays of shape (vehicles,)."""
+
+    lanes: NDArray[np.intp]
+    """lane index; 0 is that of the ramps"""
+    positions: Floats
+    """along the road [m]"""
+    speeds: Floats
+    """[m/s]"""
+    are_cavs: NDArray[np.bool_]
+    roads: Any = 0
+    """index of the road"""
+
+
 class RoadSections:
     """The sections of main roads and their ramps, by lane."""
 
@@ -92,23 +115,18 @@ class RoadSections:
         """Divide equal roads of a length [m] into sections; lane 0 is that of the ramp."""
         self._shape = road_count, lane_count, int(np.ceil(length / ROAD_SECTION_LENGTH))
 
-    def mean_speeds(
-        self, lanes: NDArray[np.intp], positions: Floats, speeds: Floats, allowed_speed: float, roads: Any = 0
-    ) -> Floats:
-        """Return mean speeds by road, lane and section [m/s]; the last lane stands for all lanes of the main road.
+    def totals(self, vehicles: MeasuredVehicles) -> Floats:
+        """Return the number of vehicles and the sum of their speeds [m/s] by road, lane and section.
 
-        Empty sections and those beyond the end have `allowed_speed`. The arrays have the shape (vehicles,): lane
-        index, position along the road [m], speed, and index of the road.
+        The shape is (2, roads, lanes + 1, sections); the last lane stands for all lanes of the main road.
         """
         _, lane_count, sections = self._shape
-        section = (positions // ROAD_SECTION_LENGTH).astype(np.intp).clip(0, sections - 1)
-        cell = (roads * lane_count + lanes) * sections + section
-        count, total = (np.bincount(cell, weight, prod(self._shape)) for weight in (None, speeds))
+        section = (vehicles.positions // ROAD_SECTION_LENGTH).astype(np.intp).clip(0, sections - 1)
+        cell = (vehicles.roads * lane_count + vehicles.lanes) * sections + section
+        counts = [np.bincount(cell, weight, prod(self._shape)) for weight in (None, vehicles.speeds)]
+        totals = np.array(counts, np.float64).reshape(2, *self._shape)
         # The main road has the lanes from 1 on.
-        count, total = (each.reshape(self._shape).astype(np.float64) for each in (count, total))
-        count, total = (np.hstack([each, each[:, 1:].sum(1, keepdims=True)]) for each in (count, total))
-        mean = np.where(count > 0, total / count.clip(1), allowed_speed)
-        return np.pad(mean, ((0, 0), (0, 0), (0, SECTIONS_AHEAD)), constant_values=allowed_speed)
+        return np.concatenate([totals, totals[:, :, 1:].sum(2, keepdims=True)], 2)
 
     def speeds_ahead(
         self, mean_speeds: Floats, lanes: NDArray[np.intp], positions: Floats, roads: Any = 0
@@ -118,3 +136,57 @@ class RoadSections:
         columns = first[:, None] + np.arange(SECTIONS_AHEAD)
         road = np.broadcast_to(roads, lanes.shape)[:, None]
         return mean_speeds[road, lanes[:, None], columns], mean_speeds[road, -1, columns]
+
+
+def _means(totals: Floats, missing: Floats | float) -> Floats:
+    """Return mean speeds of cells with vehicles, and `missing` for the others [m/s]."""
+    count, total = totals
+    return np.where(count > 0, total / count.clip(1), missing)
+
+
+class SpeedMeasurement:
+    """The mean speeds of sections as their source knows them."""
+
+    def __init__(self, settings: RoadsideSettings, sections: RoadSections, allowed_speed: float, step: float) -> None:
+        """Start without measurements; `step` is the time between two of them [s]."""
+        self._settings, self._sections, self._allowed_speed, self._step = settings, sections, allowed_speed, step
+        self._window_steps = max(1, round(settings.averaging_time / step))
+        self._window: deque[Floats] = deque(maxlen=self._window_steps)
+        self._published: Floats | None = None
+        self._next: Floats | None = None
+
+    def update(self, vehicles: MeasuredVehicles) -> Floats:
+        """Return mean speeds by road, lane and section [m/s]; the last lane stands for all lanes of the main road.
+
+        Sections of which nothing is known, and those beyond the end, have the allowed speed.
+        """
+        if self._settings.source == "vehicles":
+            means = _means(self._sections.totals(vehicles), self._allowed_speed)
+        elif self._settings.source == "cavs":
+            self._window.append(self._sections.totals(_select(vehicles, vehicles.are_cavs)))
+            totals = np.sum(self._window, 0)
+            means = _means(totals, _means(totals[:, :, -1:], self._allowed_speed))
+        else:
+            means = self._detector_means(vehicles)
+        return np.pad(means, ((0, 0), (0, 0), (0, SECTIONS_AHEAD)), constant_values=self._allowed_speed)
+
+    def _detector_means(self, vehicles: MeasuredVehicles) -> Floats:
+        """Return what the nearest detector of each section has published: the means of the last interval but one."""
+        spacing = self._settings.detector_spacing
+        nearest = (vehicles.positions // spacing + 0.5) * spacing
+        has_passed = (vehicles.positions >= nearest) & (vehicles.positions - vehicles.speeds * self._step < nearest)
+        passing = _select(vehicles, has_passed)._replace(positions=nearest[has_passed])
+        self._window.append(self._sections.totals(passing))
+        if self._published is None:
+            self._published = self._next = np.full(self._window[0].shape[1:], self._allowed_speed)
+        if len(self._window) == self._window_steps:
+            self._published, self._next = self._next, _means(np.sum(self._window, 0), self._next)
+            self._window.clear()
+        centers = (np.arange(self._published.shape[-1]) + 0.5) * ROAD_SECTION_LENGTH
+        detectors = (centers // spacing + 0.5) * spacing // ROAD_SECTION_LENGTH
+        return self._published[:, :, detectors.astype(np.intp).clip(0, len(centers) - 1)]
+
+
+def _select(vehicles: MeasuredVehicles, mask: NDArray[np.bool_]) -> MeasuredVehicles:
+    roads = np.broadcast_to(vehicles.roads, mask.shape)
+    return MeasuredVehicles(*(values[mask] for values in vehicles[:4]), roads[mask])

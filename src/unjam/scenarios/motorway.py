@@ -1,6 +1,6 @@
 """Motorways with any number of lanes and on-ramps, a peak of demand, and different human drivers that overtake."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import field, replace
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -12,6 +12,14 @@ from unjam.drivers.roadside import RoadsideSettings
 from unjam.drivers.safety import SafetyFilter
 from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt
 from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayGeometry, MotorwayRoad, RampGeometry
+from unjam.scenarios.motorway_vehicles import (
+    TRUCK_TYPE_COUNT,
+    Interval,
+    LaneChanging,
+    OrdinaryACC,
+    Trucks,
+    draw_uniform,
+)
 from unjam.scenarios.road import Entry, VehicleType
 from unjam.scenarios.scenario import Actuation, Scenario
 
@@ -22,10 +30,11 @@ SPEED_FACTOR_RANGE = 0.8, 1.2
 """range of desired speed / speed limit among human drivers"""
 MIN_END_LENGTH = 50.0
 """minimum length of the road downstream of the last merging section [m]"""
+DEMAND_STEP = 60.0
+"""duration of each step of a rising or falling demand [s]"""
 HUMAN_TYPE_COUNT = 200
 """number of different human drivers"""
 Arrival = tuple[float, str, int, float | Literal["last"]]
-Interval = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
 Section = Annotated[float, Field(ge=50)]
 """length of a part of the road [m]"""
 
@@ -84,10 +93,12 @@ class Motorway(Scenario):
     """demand at the entrance before and after the peak [veh/h]"""
     peak: Interval = (300.0, 1500.0)
     """its begin and end [s]"""
+    peak_rise: NonNegative = 0.0
+    """time in which demand rises before the peak, and falls after it, in steps of a minute [s]"""
     min_entry_headway: NonNegative = 1.1
     """smallest time between two vehicles that want to enter a lane of the motorway [s]"""
     penetration_rate: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """share of CAVs among all vehicles; the CAVs of a smaller share are part of those of a larger one"""
+    """share of CAVs among all cars; the CAVs of a smaller share are part of those of a larger one"""
     cavs: PositiveInt | None = None
     """exact number of CAVs instead of a share, among the vehicles of the first half"""
     car_following: Literal["EIDM", "IDM"] = "EIDM"
@@ -103,7 +114,12 @@ class Motorway(Scenario):
     speed_factor_std: NonNegative = 0.1
     """standard deviation of desired speed / speed limit, with mean 1; at most 0.2 from the mean"""
     vehicle_length: Positive = 4.8
-    """[m]"""
+    """of cars [m]"""
+    lane_changing: LaneChanging = field(default_factory=LaneChanging)
+    """how human drivers change lanes"""
+    trucks: Trucks = field(default_factory=Trucks)
+    ordinary_acc: OrdinaryACC = field(default_factory=OrdinaryACC)
+    """cars with an ACC that are not CAVs"""
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
     """latency and smoothing of the speeds ahead that CAVs receive"""
     simulation_step: Positive = 0.5
@@ -124,6 +140,10 @@ class Motorway(Scenario):
             low, high = getattr(self, name)
             if not 0 <= low <= high or (high == 0 and name != "peak"):
                 raise ValueError(f"{name}: ({low:g}, {high:g}) is not allowed; allowed: 0 < low <= high")
+        if self.peak_rise > self.peak[0]:
+            raise ValueError(
+                f"peak_rise: {self.peak_rise:g} is not allowed; allowed: <= {self.peak[0]:g}, before the peak"
+            )
         capacity = 3600.0 * self.lanes / max(self.min_entry_headway, 1e-9)
         sources = (
             ("", self, capacity, ", by min_entry_headway"),
@@ -133,6 +153,8 @@ class Motorway(Scenario):
             for name in ("inflow", "off_peak_inflow"):
                 if (flow := getattr(source, name)) >= most:
                     raise ValueError(f"{prefix}{name}: {flow:g} is not allowed; allowed: < {most:.0f}{reason}")
+        if (shares := self.trucks.share + self.ordinary_acc.share) > 1:
+            raise ValueError(f"trucks.share + ordinary_acc.share: {shares:g} is not allowed; allowed: <= 1")
         self._check_ramps()
         self.check_native_humans("on a motorway")
         return self
@@ -155,12 +177,12 @@ class Motorway(Scenario):
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
         """Return the road with its demand; random are the human drivers, their entry times and the choice of CAVs."""
-        types = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
+        types, select_type = self._draw_types(generator)
         entries, draws = list[Entry](), dict[str, float]()
         for number, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
-            name, vehicle_type = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
+            name, human = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
             draws[name] = generator.random()
-            entries.append(Entry(name, route, 0.0, speed, time, lane, vehicle_type))
+            entries.append(Entry(name, route, 0.0, speed, time, lane, select_type(human)))
         geometry = self.geometry
         return MotorwayRoad(
             geometry=geometry,
@@ -169,7 +191,7 @@ class Motorway(Scenario):
             entries=tuple(entries),
             limit_speed=self.speed_limit,
             vehicle_types=types,
-            cav_ids=self._select_cavs(draws),
+            cav_ids=self._select_cavs({each.name: draws[each.name] for each in entries if _is_car(types, each)}),
             peak=self.peak,
             free_flow_time=self.free_flow_time,
             roadside=self.roadside,
@@ -198,10 +220,10 @@ class Motorway(Scenario):
 
     @property
     def provided_fields(self) -> tuple[str, ...]:
-        """Optional fields of a `LocalState`; without ramps, there is no distance to a merge."""
+        """Optional fields of a `LocalState`: a distance to a merge with ramps, speeds ahead if any are known."""
         to_merge = ("distance_to_merge",) if self.ramps else ()
-        neighbors = "adjacent_gaps", "adjacent_speeds", "penetration_rate"
-        return ("allowed_speed", *to_merge, "lane_speeds", "road_speeds", *neighbors)
+        ahead = () if self.roadside.source == "none" else ("lane_speeds", "road_speeds")
+        return ("allowed_speed", *to_merge, *ahead, "adjacent_gaps", "adjacent_speeds", "penetration_rate")
 
     def _select_cavs(self, draws: dict[str, float]) -> frozenset[str]:
         """Return the CAVs: the vehicles with the lowest draws."""
@@ -210,17 +232,37 @@ class Motorway(Scenario):
         early = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
         return frozenset(early[: self.cavs])
 
-    def _draw_human_type(self, generator: np.random.Generator) -> VehicleType:
-        def draw_uniform(interval: tuple[float, float]) -> float:
-            return round(float(generator.uniform(*interval)), 4)
+    def _draw_types(self, generator: np.random.Generator) -> tuple[dict[str, VehicleType], Callable[[str], str]]:
+        """Return all vehicle types, and a function that replaces a human driver's type by that of a truck or an ACC.
 
+        What other settings draw, on a generator of their own, does not change the cars with human drivers.
+        """
+        (others,) = generator.spawn(1)
+        humans = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
+        lane_changing, trucks, acc = self.lane_changing, self.trucks, self.ordinary_acc
+        types = {name: one._replace(parameters=lane_changing.draw(others)) for name, one in humans.items()}
+        truck_types = [f"truck_type_{number}" for number in range(TRUCK_TYPE_COUNT if trucks.share else 0)]
+        if acc.share:
+            types |= {_with_acc(name): acc.replace_driver(types[name]) for name in humans}
+        types |= {name: trucks.draw(others, self.car_following, lane_changing) for name in truck_types}
+
+        def select_type(human: str) -> str:
+            draw = others.random()
+            if draw < trucks.share:
+                return truck_types[others.integers(TRUCK_TYPE_COUNT)]
+            return _with_acc(human) if draw < trucks.share + acc.share else human
+
+        return types, select_type
+
+    def _draw_human_type(self, generator: np.random.Generator) -> VehicleType:
         human = VehicleType(
             model=self.car_following,
-            time_headway=draw_uniform(self.time_headways),
-            acceleration=draw_uniform(self.accelerations),
-            deceleration=draw_uniform(self.decelerations),
-            minimum_gap=draw_uniform(self.minimum_gaps),
+            time_headway=draw_uniform(generator, self.time_headways),
+            acceleration=draw_uniform(generator, self.accelerations),
+            deceleration=draw_uniform(generator, self.decelerations),
+            minimum_gap=draw_uniform(generator, self.minimum_gaps),
             speed_factor=round(float(np.clip(generator.normal(1.0, self.speed_factor_std), *SPEED_FACTOR_RANGE)), 4),
+            length=self.vehicle_length,
         )
         if self.driver_population is None:
             return human
@@ -249,7 +291,7 @@ class Motorway(Scenario):
     ) -> Iterator[float]:
         """Yield times with shifted exponential headways, period by period [s]; flows in veh/h."""
         begin = 0.0
-        for end, flow in ((self.peak[0], off_peak), (self.peak[1], peak), (self.max_duration, off_peak)):
+        for end, flow in self._demand_periods(off_peak, peak):
             time = begin
             while flow:
                 time += min_headway + float(generator.exponential(3600.0 / flow - min_headway))
@@ -257,6 +299,17 @@ class Motorway(Scenario):
                     break
                 yield round(time, 2)
             begin = max(begin, end)
+
+    def _demand_periods(self, off_peak: float, peak: float) -> Iterator[tuple[float, float]]:
+        """Yield the end of each period [s] and its flow [veh/h]."""
+        steps = int(self.peak_rise // DEMAND_STEP)
+        flows = [off_peak + (peak - off_peak) * (number + 0.5) / steps for number in range(steps)]
+        begin, end = self.peak[0] - steps * DEMAND_STEP, self.peak[1]
+        yield begin, off_peak
+        yield from ((begin + (number + 1) * DEMAND_STEP, flow) for number, flow in enumerate(flows))
+        yield end, peak
+        yield from ((end + (number + 1) * DEMAND_STEP, flow) for number, flow in enumerate(flows[::-1]))
+        yield self.max_duration, off_peak
 
     @property
     def top_speed(self) -> float:
@@ -286,6 +339,15 @@ class Motorway(Scenario):
         vehicles = f"{peak}, else {off_peak} ({100 * self.penetration_rate:g} % CAV)"
         road = f"motorway of {self.length / 1000:g} km, {lanes}, {ramps}"
         return road, vehicles, f"{self.speed_limit:.2f} m/s", "the speed limit of the motorway"
+
+
+def _with_acc(human_type: str) -> str:
+    """Return the name of the vehicle type of a human driver's car with an ordinary ACC."""
+    return f"acc_{human_type}"
+
+
+def _is_car(types: Mapping[str, VehicleType], entry: Entry) -> bool:
+    return types[entry.vehicle_type].vehicle_class is None
 
 
 ON_RAMP = Motorway(ramps=(Ramp(position=2000.0),))

@@ -140,7 +140,7 @@ class ClosedRoad(BuiltRoad):
 
 
 class VehicleType(NamedTuple):
-    """A human driver on a motorway, with the parameters of one of SUMO's car-following models, in SI units."""
+    """A vehicle and its driver on a motorway, with parameters of one of SUMO's car-following models, in SI units."""
 
     model: str
     time_headway: float
@@ -151,6 +151,15 @@ class VehicleType(NamedTuple):
     """to a standing leader"""
     speed_factor: float
     """desired speed divided by the speed limit"""
+    length: float
+    max_speed: float | None = None
+    """None: none below the desired speed"""
+    vehicle_class: str | None = None
+    """one of SUMO's vehicle classes; None: passenger cars"""
+    emission_class: str | None = None
+    """None: that of the scenario"""
+    parameters: tuple[tuple[str, float], ...] = ()
+    """parameters of lane changing by SUMO's names; SUMO's defaults for others"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -63,6 +63,8 @@ class CruiseControl:
     """eagerness to keep right; None: that of the vehicle, mostly 1; 0: none"""
     speed_gain: NonNegative | None = None
     """eagerness to change lanes for a higher speed, likewise"""
+    cooperation: Annotated[float, Field(ge=0, le=1)] | None = None
+    """willingness to change lanes and to slow down for vehicles that must change lanes, likewise"""
 
     def set_speed(
         self,

@@ -8,6 +8,7 @@ from typing import Any
 from unjam.errors import InputError
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.motorway import Motorway
+from unjam.scenarios.motorway_vehicles import LaneChanging
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.human_idm import MIN_LOOK_AHEAD
@@ -83,7 +84,11 @@ def _motorway_reason(scenario: Motorway) -> str:
         ("safety.active", not scenario.safety.active, "False: CAVs have their own ACC"),
         ("cruise.keep_right", scenario.cruise.keep_right is None, "None: CAVs change lanes as human drivers do"),
         ("cruise.speed_gain", scenario.cruise.speed_gain is None, "None: CAVs change lanes as human drivers do"),
+        ("cruise.cooperation", scenario.cruise.cooperation is None, "None: CAVs change lanes as human drivers do"),
         ("simulation_step", scenario.simulation_step == MOTORWAY_STEP, f"{MOTORWAY_STEP:g} s"),
+        ("lane_changing", scenario.lane_changing == LaneChanging(), "SUMO's defaults"),
+        ("trucks.share", scenario.trucks.share == 0, "0"),
+        ("ordinary_acc.share", scenario.ordinary_acc.share == 0, "0"),
         ("lanes", scenario.lanes <= MAX_BATCH_LANES, "1, 2"),
         ("sensors.is_exact", scenario.sensors.is_exact, "True"),
         ("actuator.is_instant", scenario.actuator.is_instant, "True"),

@@ -61,8 +61,9 @@ def motorway_inputs(scenario: Scenario, road: MotorwayRoad) -> SumoInputs:
     """
     lines = []
     for name, kind in road.vehicle_types.items():
-        common = {"length": road.geometry.vehicle_length, "emissionClass": scenario.emission_class}
+        common = {"length": kind.length, "emissionClass": kind.emission_class or scenario.emission_class}
         common |= {"speedFactor": kind.speed_factor, "speedDev": 0.0, "emergencyDecel": 9.0}
+        common |= {"maxSpeed": kind.max_speed, "vClass": kind.vehicle_class, **dict(kind.parameters)}
         model = {"carFollowModel": kind.model, "tau": kind.time_headway, "minGap": kind.minimum_gap}
         model |= {"accel": kind.acceleration, "decel": kind.deceleration}
         lines.append(xml_element("vType", id=name, **common, **model))
@@ -236,5 +237,7 @@ def lane_change_parameters(scenario: Scenario) -> dict[str, str]:
     """
     if scenario.actuation != "cruise":
         return {}
-    values = {"lcKeepRight": scenario.cruise.keep_right, "lcSpeedGain": scenario.cruise.speed_gain}
+    cruise = scenario.cruise
+    values = {"lcKeepRight": cruise.keep_right, "lcSpeedGain": cruise.speed_gain}
+    values |= dict.fromkeys(("lcCooperative", "lcCooperativeSpeed"), cruise.cooperation)
     return {f"laneChangeModel.{name}": str(value) for name, value in values.items() if value is not None}

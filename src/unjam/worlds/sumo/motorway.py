@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
-from unjam.drivers.roadside import RoadSections, RoadsideMessages
+from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
@@ -29,9 +29,12 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         road, types, self._geometry = self.road, self.road.vehicle_types, self.road.geometry
         self._edge_lane_names, *values = zip(*self._geometry.edge_lanes, strict=True)
         self._lane_of_edge_lane, self._edge_lane_starts = map(np.array, values)
+        self._lengths = {entry.name: types[entry.vehicle_type].length for entry in road.entries}
         self._speed_factors = {entry.name: types[entry.vehicle_type].speed_factor for entry in road.entries}
         self._road_sections = RoadSections(1 + self._geometry.lane_count, self._geometry.length)
-        self._messages = RoadsideMessages(road.roadside, self.scenario.control_step, self.noise_generator)
+        step, limit = self.scenario.control_step, self._geometry.speed_limit
+        self._measurement = SpeedMeasurement(road.roadside, self._road_sections, limit, step)
+        self._messages = RoadsideMessages(road.roadside, step, self.noise_generator)
         self._entered_is_cav: list[bool] = []
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
@@ -43,6 +46,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
             names += on_lane
             edge_lanes += [number] * len(on_lane)
         self._names = names
+        self._length = np.array([self._lengths[name] for name in names])
         self._row_of_name = {name: row for row, name in enumerate(names)}
         self._speed = np.array(simulation.speeds(names), np.float64)
         self._lane = lane = self._lane_of_edge_lane[edge_lanes]
@@ -68,7 +72,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         return list(zip(leader_names, map(FollowingState, *values), strict=True))
 
     def _leader_gaps(self, rows: Any, leaders: Any) -> Floats:
-        return self._position[leaders] - self._geometry.vehicle_length - self._position[rows]
+        return self._position[leaders] - self._length[leaders] - self._position[rows]
 
     def _snapshot(self, names: Sequence[str]) -> dict[str, Any]:
         leaders = self._leader
@@ -78,12 +82,17 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
         geometry, sections = self._geometry, self._road_sections
-        self._messages.send(sections.mean_speeds(self._lane, self._position, self._speed, geometry.speed_limit))
+        are_cavs = np.array([name in self.road.cav_ids for name in self._names], bool)
+        self._messages.send(
+            self._measurement.update(MeasuredVehicles(self._lane, self._position, self._speed, are_cavs))
+        )
         rows = np.array([self._row_of_name[name] for name in names], np.intp)
         leaders, followers, position = self._leader[rows], self._follower[rows], self._position[rows]
         state = neighbor_state(rows, leaders, followers, self._position, self._speed, self._leader_gaps)
         factors = np.array([self._speed_factors[name] for name in names])
         lane_speeds, road_speeds = sections.speeds_ahead(self._messages.latest, self._lane[rows], position)
+        if self.road.roadside.source == "none":
+            lane_speeds = road_speeds = None
         adjacent_gaps, adjacent_speeds = self._adjacent_vehicles(rows)
         return state._replace(
             route_position=position - geometry.origin,
@@ -105,7 +114,8 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
             first_ahead = np.searchsorted(along, lane * lane_offset + self._position[rows])
             for index, sign in ((first_ahead, 1.0), (first_ahead - 1, -1.0)):
                 other = order[index.clip(0, len(order) - 1)]
-                gap = sign * (self._position[other] - self._position[rows]) - self._geometry.vehicle_length
+                length = self._length[other if sign > 0.0 else rows]
+                gap = sign * (self._position[other] - self._position[rows]) - length
                 is_near = (index >= 0) & (index < len(order)) & (self._lane[other] == lane) & (gap < MAX_OBSERVED_GAP)
                 gaps.append(np.where(is_near, gap, MAX_OBSERVED_GAP))
                 speeds.append(np.where(is_near, self._speed[other], self._speed[rows]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, batch_commanded_accelerations, commanded_time_gaps
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
-from unjam.drivers.roadside import RoadSections, RoadsideMessages
+from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.physics.arrays import Array, Floats
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.motorway import Motorway
@@ -70,7 +70,9 @@ class MotorwayBatch:
             self._is_cav[number, : len(road.entries)] = [entry.name in road.cav_ids for entry in road.entries]
         first = self.roads[0]
         self._road_sections = RoadSections(first.geometry.lane_count + 1, first.geometry.length, len(seeds))
-        self._messages = RoadsideMessages(first.roadside, scenario.control_step, self._human_generators[0])
+        control_step, limit = scenario.control_step, first.geometry.speed_limit
+        self._measurement = SpeedMeasurement(first.roadside, self._road_sections, limit, control_step)
+        self._messages = RoadsideMessages(first.roadside, control_step, self._human_generators[0])
         self.limits, self.control_steps = scenario.acceleration_limits, 0
         self.entered_count, self.cav_count = 0, 0
         self._cav_numbers: NDArray[np.intp] = np.zeros(0, np.intp)
@@ -179,8 +181,9 @@ class MotorwayBatch:
         if self._is_controlled and len(new):
             vehicles = traffic.vehicles = enable_acc(vehicles, new, self.scenario.cruise)
         self._cav_entry_counts += np.bincount(vehicles.road[new], minlength=len(self.roads))
-        motion = vehicles.lane, vehicles.position, vehicles.speed
-        self._messages.send(self._road_sections.mean_speeds(*motion, traffic.geometry.speed_limit, vehicles.road))
+        is_cav = self._is_cav[vehicles.road, vehicles.entry]
+        measured = MeasuredVehicles(vehicles.lane, vehicles.position, vehicles.speed, is_cav, vehicles.road)
+        self._messages.send(self._measurement.update(measured))
         self._local_state = self._exact_state()
         row = neighbors_on_lane(traffic.neighbors.leaders, vehicles.lane)
         gaps = vehicles.position[row] - traffic.geometry.vehicle_length - vehicles.position
@@ -205,6 +208,8 @@ class MotorwayBatch:
         own, left, right = ([neighbor_state(each, offset, sign) for each, sign in sides] for offset in (0, 1, -1))
         limit = geometry.speed_limits(lane, geometry.sections(lane, position))
         lane_speeds, road_speeds = self._road_sections.speeds_ahead(self._messages.latest, lane, position, roads)
+        if self.roads[0].roadside.source == "none":
+            lane_speeds = road_speeds = None
         penetration_rate = self._cav_entry_counts / traffic.insertion_queue.entry_counts.clip(1)
         state = LocalState(
             speed,
