@@ -1,10 +1,19 @@
 """A roadside message contains the measured speeds, with the configured latency and smoothing."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from unjam.drivers.local_state import SECTIONS_AHEAD
-from unjam.drivers.roadside import CongestionMonitor, RoadSections, RoadsideMessages, RoadsideSettings
+from unjam.drivers.roadside import (
+    CongestionMonitor,
+    MeasuredVehicles,
+    RoadSections,
+    RoadsideMessages,
+    RoadsideSettings,
+    SpeedMeasurement,
+)
 from unjam.physics.idm import IDMParameters, equilibrium_gap
 
 ALLOWED = 30.0
@@ -14,14 +23,22 @@ RAMP, RIGHT, LEFT = 0, 1, 2
 ROAD = RoadSections(3, 1000.0)
 
 
-def messages(**how: float) -> RoadsideMessages:
-    return RoadsideMessages(RoadsideSettings(**how), 1.0, np.random.default_rng(0))
+def messages(**settings: Any) -> RoadsideMessages:
+    return RoadsideMessages(RoadsideSettings(**settings), 1.0, np.random.default_rng(0))
+
+
+def vehicles_of(*vehicles: tuple[int, float, float], are_cavs: bool = False) -> MeasuredVehicles:
+    lanes, positions, speeds = zip(*vehicles, strict=True) if vehicles else ((), (), ())
+    arrays = np.array(lanes, np.intp), np.array(positions, float), np.array(speeds, float)
+    return MeasuredVehicles(*arrays, np.full(len(lanes), are_cavs))
+
+
+def measurement(**settings: Any) -> SpeedMeasurement:
+    return SpeedMeasurement(RoadsideSettings(**settings), ROAD, ALLOWED, 1.0)
 
 
 def measure(roadside: RoadsideMessages, *vehicles: tuple[int, float, float]) -> None:
-    ways, places, speeds = zip(*vehicles, strict=True) if vehicles else ((), (), ())
-    arrays = np.array(ways, np.intp), np.array(places, float), np.array(speeds, float)
-    roadside.send(ROAD.mean_speeds(*arrays, ALLOWED))
+    roadside.send(measurement().update(vehicles_of(*vehicles)))
 
 
 def ahead(roadside: RoadsideMessages, way: int, place: float) -> tuple[np.ndarray, np.ndarray]:
@@ -69,6 +86,36 @@ def test_a_lost_message_leaves_the_one_before() -> None:
     assert came[0]
     assert came.mean() == pytest.approx(0.5, abs=0.08)
     assert (np.diff(heard) >= 0).all()
+
+
+def test_cavs_share_their_speeds_of_the_last_minute_and_no_other_vehicle_is_known() -> None:
+    measured = measurement(source="cavs")
+    means = measured.update(vehicles_of((RIGHT, 150.0, 8.0)))
+    assert (means == ALLOWED).all()
+    means = measured.update(vehicles_of((RIGHT, 150.0, 10.0), are_cavs=True))
+    assert means[0, RIGHT, 1] == 10.0
+    assert means[0, LEFT, 1] == 10.0  # of a lane without a CAV, all lanes are the best estimate
+    assert means[0, LEFT, 2] == ALLOWED
+    means = measured.update(vehicles_of((LEFT, 150.0, 20.0), are_cavs=True))
+    assert (means[0, RIGHT, 1], means[0, LEFT, 1], means[0, -1, 1]) == (10.0, 20.0, 15.0)
+    for _ in range(60):
+        means = measured.update(vehicles_of())
+    assert (means == ALLOWED).all()
+
+
+def test_detectors_publish_means_of_passing_vehicles_a_minute_late() -> None:
+    measured, published = measurement(source="detectors"), []
+    for second in range(240):
+        # One vehicle passes the detector at 750 m every ten seconds, first at 20 m/s, then at 10 m/s; another stands.
+        speed = 20.0 if second < 60 else 10.0
+        moving = [(RIGHT, 750.0 + 0.5 * speed, speed)] if second % 10 == 0 else []
+        published.append(measured.update(vehicles_of(*moving, (RIGHT, 550.0, 0.0)))[0, RIGHT])
+    assert published[118][7] == ALLOWED
+    assert published[119][7] == 20.0
+    assert published[178][7] == 20.0
+    assert published[179][5:10].tolist() == [10.0] * 5  # every section next to the detector
+    assert published[239][0] == ALLOWED
+    assert measured.update(vehicles_of())[0, LEFT, 7] == ALLOWED
 
 
 HUMANS = IDMParameters(desired_speed=40.0, time_headway=1.5)

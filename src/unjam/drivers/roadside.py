@@ -107,6 +107,11 @@ class MeasuredVehicles(NamedTuple):
     roads: Any = 0
     """index of the road"""
 
+    def select(self, mask: NDArray[np.bool_]) -> "MeasuredVehicles":
+        """Return some of the vehicles."""
+        roads = np.broadcast_to(self.roads, mask.shape)[mask]
+        return MeasuredVehicles(self.lanes[mask], self.positions[mask], self.speeds[mask], self.are_cavs[mask], roads)
+
 
 class RoadSections:
     """The sections of main roads and their ramps, by lane."""
@@ -114,6 +119,12 @@ class RoadSections:
     def __init__(self, lane_count: int, length: float, road_count: int = 1) -> None:
         """Divide equal roads of a length [m] into sections; lane 0 is that of the ramp."""
         self._shape = road_count, lane_count, int(np.ceil(length / ROAD_SECTION_LENGTH))
+
+    @property
+    def means_shape(self) -> tuple[int, int, int]:
+        """Shape of mean speeds: roads, lanes and all lanes of the main road, sections."""
+        roads, lanes, sections = self._shape
+        return roads, lanes + 1, sections
 
     def totals(self, vehicles: MeasuredVehicles) -> Floats:
         """Return the number of vehicles and the sum of their speeds [m/s] by road, lane and section.
@@ -138,22 +149,15 @@ class RoadSections:
         return mean_speeds[road, lanes[:, None], columns], mean_speeds[road, -1, columns]
 
 
-def _means(totals: Floats, missing: Floats | float) -> Floats:
-    """Return mean speeds of cells with vehicles, and `missing` for the others [m/s]."""
-    count, total = totals
-    return np.where(count > 0, total / count.clip(1), missing)
-
-
 class SpeedMeasurement:
     """The mean speeds of sections as their source knows them."""
 
     def __init__(self, settings: RoadsideSettings, sections: RoadSections, allowed_speed: float, step: float) -> None:
         """Start without measurements; `step` is the time between two of them [s]."""
         self._settings, self._sections, self._allowed_speed, self._step = settings, sections, allowed_speed, step
-        self._window_steps = max(1, round(settings.averaging_time / step))
-        self._window: deque[Floats] = deque(maxlen=self._window_steps)
-        self._published: Floats | None = None
-        self._next: Floats | None = None
+        self._window: deque[Floats] = deque(maxlen=max(1, round(settings.averaging_time / step)))
+        self._published = self._next = np.full(sections.means_shape, allowed_speed)
+        """means of the detectors' last interval but one, and of the last one"""
 
     def update(self, vehicles: MeasuredVehicles) -> Floats:
         """Return mean speeds by road, lane and section [m/s]; the last lane stands for all lanes of the main road.
@@ -163,7 +167,7 @@ class SpeedMeasurement:
         if self._settings.source == "vehicles":
             means = _means(self._sections.totals(vehicles), self._allowed_speed)
         elif self._settings.source == "cavs":
-            self._window.append(self._sections.totals(_select(vehicles, vehicles.are_cavs)))
+            self._window.append(self._sections.totals(vehicles.select(vehicles.are_cavs)))
             totals = np.sum(self._window, 0)
             means = _means(totals, _means(totals[:, :, -1:], self._allowed_speed))
         else:
@@ -171,15 +175,13 @@ class SpeedMeasurement:
         return np.pad(means, ((0, 0), (0, 0), (0, SECTIONS_AHEAD)), constant_values=self._allowed_speed)
 
     def _detector_means(self, vehicles: MeasuredVehicles) -> Floats:
-        """Return what the nearest detector of each section has published: the means of the last interval but one."""
+        """Return what the nearest detector of each section has published."""
         spacing = self._settings.detector_spacing
         nearest = (vehicles.positions // spacing + 0.5) * spacing
         has_passed = (vehicles.positions >= nearest) & (vehicles.positions - vehicles.speeds * self._step < nearest)
-        passing = _select(vehicles, has_passed)._replace(positions=nearest[has_passed])
+        passing = vehicles._replace(positions=nearest).select(has_passed)
         self._window.append(self._sections.totals(passing))
-        if self._published is None:
-            self._published = self._next = np.full(self._window[0].shape[1:], self._allowed_speed)
-        if len(self._window) == self._window_steps:
+        if len(self._window) == self._window.maxlen:
             self._published, self._next = self._next, _means(np.sum(self._window, 0), self._next)
             self._window.clear()
         centers = (np.arange(self._published.shape[-1]) + 0.5) * ROAD_SECTION_LENGTH
@@ -187,6 +189,7 @@ class SpeedMeasurement:
         return self._published[:, :, detectors.astype(np.intp).clip(0, len(centers) - 1)]
 
 
-def _select(vehicles: MeasuredVehicles, mask: NDArray[np.bool_]) -> MeasuredVehicles:
-    roads = np.broadcast_to(vehicles.roads, mask.shape)
-    return MeasuredVehicles(*(values[mask] for values in vehicles[:4]), roads[mask])
+def _means(totals: Floats, missing: Floats | float) -> Floats:
+    """Return mean speeds of cells with vehicles, and `missing` for the others [m/s]."""
+    count, total = totals
+    return np.where(count > 0, total / count.clip(1), missing)

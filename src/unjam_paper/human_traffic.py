@@ -1,0 +1,207 @@
+"""Human traffic on a motorway that matches facts: a search over how humans drive, and the comparison with the facts.
+
+Each candidate is a set of settings of the scenario. It drives on a road with one on-ramp, with a demand that rises
+until traffic breaks down and a jam has formed, and is compared with empirical targets. The candidate with the smallest
+deviation then drives on test seeds, with two simulation steps.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from unjam.drivers import Human
+from unjam.measures.metric_table import estimate_cell
+from unjam.measures.metrics import measure
+from unjam.measures.statistics import estimate
+from unjam.measures.traffic_facts import TrafficFacts, measure_traffic
+from unjam.scenarios import Motorway, make_scenario
+from unjam.training.evaluate import raise_failure
+from unjam.training.seeds import make_test_seeds, tuning_seeds
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam_paper.results_file import read_part
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, StudyPart, Table
+
+CANDIDATES, CANDIDATE_SEEDS, CANDIDATE_BATCH = 60, 3, 6
+"""number of candidates, episodes of each, and candidates that are measured and stored together"""
+FINAL_SEEDS = 20
+"""episodes with the best candidate and each simulation step"""
+TRUCK_SHARE = 0.1
+
+CAPACITY_ROAD: dict[str, Any] = {
+    "length": 4000.0,
+    "ramps": [{"position": 3000.0, "inflow": 700.0, "off_peak_inflow": 250.0}],
+    "inflow": 4500.0,
+    "off_peak_inflow": 1800.0,
+    "peak": (1800.0, 2700.0),
+    "peak_rise": 1800.0,
+    "horizon": 2700,
+}
+"""a road whose demand rises for half an hour, from far below capacity to far above it"""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A fact that simulated traffic should match: a value and an accepted range, from recordings of real motorways."""
+
+    measure: Callable[[TrafficFacts], float]
+    name: str
+    value: float
+    accepted: tuple[float, float]
+    digits: int
+    source: str
+
+    def deviation(self, value: float) -> float:
+        """Return the distance to the value, in half widths of the accepted range."""
+        low, high = self.accepted
+        return abs(value - self.value) / ((high - low) / 2.0)
+
+
+TARGETS: dict[str, Target] = {
+    "highest_flow": Target(
+        lambda facts: facts.highest_flow,
+        "highest flow in 5 min before a breakdown [veh/h per lane]",
+        *(1950.0, (1800.0, 2200.0), 0),
+        "10 % trucks: 2,205 (ROA2017, table 4.3); mean capacity of 38 bottlenecks 1,800 to 2,100 (Geistefeldt and "
+        "Shojaat 2019)",
+    ),
+    "discharge": Target(
+        lambda facts: facts.discharge,
+        "discharge of the queue [veh/h per lane]",
+        *(1780.0, (1650.0, 1950.0), 0),
+        "2,016 passenger cars on average, 5 % below capacity (Zhang and Levinson 2004)",
+    ),
+    "capacity_drop": Target(
+        lambda facts: 100.0 * facts.capacity_drop,
+        "capacity drop [%]",
+        *(8.0, (4.0, 13.0), 1),
+        "2 to 11 % at 27 sites (Zhang and Levinson 2004); up to 10 % (Cassidy and Bertini 1999)",
+    ),
+    "wave_speed": Target(
+        lambda facts: -3.6 * facts.wave_speed,
+        "speed of waves, upstream [km/h]",
+        *(17.0, (14.0, 20.0), 1),
+        "14 to 20 (Zielke, Bertini and Treiber 2008)",
+    ),
+    "free_time_gap": Target(
+        lambda facts: facts.free_time_gap,
+        "median net time gap in dense free traffic [s]",
+        *(1.3, (1.0, 1.6), 2),
+        "1.3 to 1.8 on average (Nishinari, Treiber and Helbing 2003)",
+    ),
+    "congested_time_gap": Target(
+        lambda facts: facts.congested_time_gap,
+        "median net time gap in congestion [s]",
+        *(1.65, (1.4, 2.0), 2),
+        "1.65 at 6 to 9 m/s, 1.94 at 3 to 6 m/s (NGSIM I-80)",
+    ),
+    "lane_changes_per_km": Target(
+        lambda facts: facts.lane_changes_per_km,
+        "lane changes per vehicle and km in dense free traffic",
+        *(0.4, (0.2, 0.6), 2),
+        "0.5, most just below the critical density (Knoop et al. 2012); at least 0.12 in light traffic (highD, 2018)",
+    ),
+    "merge_ratio": Target(
+        lambda facts: facts.merge_ratio,
+        "ramp : right lane in congestion",
+        *(0.9, (0.5, 1.3), 2),
+        "nearly fixed, independent of the discharge (Cassidy and Ahn 2005); about 1 : 1",
+    ),
+    "hardest_braking": Target(
+        lambda facts: facts.hardest_braking,
+        "99.9 % quantile of decelerations near the merge [m/s²]",
+        *(3.0, (2.4, 4.0), 2),
+        "2.6 (NGSIM I-80)",
+    ),
+}
+
+
+def make_candidate(number: int) -> dict[str, Any]:
+    """Return the settings of a candidate, drawn from wide ranges; the first one is SUMO's lane changing of today."""
+    generator = np.random.default_rng((20_261_128, number))
+
+    def draw(low: float, high: float) -> float:
+        return round(float(generator.uniform(low, high)), 2)
+
+    headway, acceleration, assertiveness = draw(0.95, 1.35), draw(0.8, 1.3), draw(1.0, 2.2)
+    settings = {
+        "time_headways": (round(headway - 0.4, 2), round(headway + 0.4, 2)),
+        "accelerations": (round(acceleration - 0.25, 2), round(acceleration + 0.25, 2)),
+        "lane_changing": {
+            "assertiveness": (round(max(assertiveness - 0.4, 0.8), 2), round(assertiveness + 0.4, 2)),
+            "speed_gain": (1.0, draw(1.5, 6.0)),
+            "keep_right": (draw(0.0, 0.8), 1.0),
+            "speed_cooperation": (draw(0.2, 0.9), 1.0),
+            "uncooperative_share": draw(0.0, 0.5),
+        },
+    }
+    if number == 0:
+        settings = {"time_headways": (1.0, 1.8), "accelerations": (1.0, 1.5), "lane_changing": {}}
+    return {**settings, "trucks": {"share": TRUCK_SHARE}}
+
+
+def capacity_road(settings: Mapping[str, Any]) -> Motorway:
+    """Return the road with rising demand, with these settings of its human traffic."""
+    scenario = make_scenario("on-ramp", {**CAPACITY_ROAD, "penetration_rate": 0.0, **settings})
+    assert isinstance(scenario, Motorway)
+    return scenario
+
+
+def measure_candidates(first: int, workers: int) -> list[dict[str, Any]]:
+    """Return the settings of a batch of candidates, with the facts of each of their episodes."""
+    candidates = [make_candidate(number) for number in range(first, min(first + CANDIDATE_BATCH, CANDIDATES))]
+    facts = _measure_facts([capacity_road(each) for each in candidates], tuning_seeds(CANDIDATE_SEEDS), workers)
+    return [{"settings": each, "facts": rows} for each, rows in zip(candidates, facts, strict=True)]
+
+
+def _measure_facts(scenarios: Sequence[Motorway], seeds: Sequence[tuple[int, ...]], workers: int) -> list[Table]:
+    """Return the facts of all episodes of each scenario, with the delay of the episode."""
+    tasks = [EpisodeTask(scenario, Human(), seed) for scenario in scenarios for seed in seeds]
+
+    def facts_row(number: int, episode: Episode) -> dict[str, Any]:
+        row = measure(episode)
+        raise_failure([row])
+        facts = measure_traffic(episode, scenarios[number // len(seeds)])
+        return {**asdict(facts), "capacity_drop": facts.capacity_drop, "delay": row["delay"]}
+
+    with WorkerPool(workers) as pool:
+        rows = pool.run_and_map(tasks, facts_row)
+    return [rows[index : index + len(seeds)] for index in range(0, len(rows), len(seeds))]
+
+
+def mean_facts(rows: Table) -> dict[str, float]:
+    """Return the mean of each fact in its unit of `TARGETS`, over the episodes that show it; NaN if none does."""
+    means = {}
+    for name, target in TARGETS.items():
+        facts = [TrafficFacts(**{key: _number(row[key]) for key in TrafficFacts.__dataclass_fields__}) for row in rows]
+        values = [value for each in facts if isfinite(value := target.measure(each))]
+        means[name] = float(np.mean(values)) if values else float("nan")
+    return means
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def total_deviation(rows: Table) -> float:
+    """Return the root mean square deviation from the targets; infinite without a breakdown in every episode."""
+    deviations = [TARGETS[name].deviation(value) for name, value in mean_facts(rows).items()]
+    return float(np.sqrt(np.mean(np.square(deviations)))) if np.isfinite(deviations).all() else float("inf")
+
+
+def measure_best(study_folder: StudyFolder, workers: int) -> dict[str, Any]:
+    """Return the facts of the best candidate on test seeds with two simulation steps."""
+    candidates = [each for batch in _read_candidates(study_folder.folder / HUMAN_TRAFFIC_NAME / "parts") for each in batch]
+    best = min(candidates, key=lambda each: total_deviation(each["facts"]))
+    steps = {"0.5 s": (0.5, 2), "0.25 s": (0.25, 4)}
+    roads = [
+        capacity_road({**best["settings"], "simulation_step": step, "steps_per_control_step": count})
+        for step, count in steps.values()
+    ]
+    facts = _measure_facts(roads, make_test_seeds(FINAL_SEEDS), workers)
+    return {"settings": best["settings"], "facts": dict(zip(steps, facts, strict=True))}
