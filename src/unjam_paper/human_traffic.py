@@ -6,8 +6,8 @@ deviation then drives on test seeds, with two simulation steps.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from math import isfinite
+from dataclasses import asdict, dataclass, fields
+from math import inf, isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,19 @@ from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, StudyPart, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table
 
-CANDIDATES, CANDIDATE_SEEDS, CANDIDATE_BATCH = 60, 3, 6
-"""number of candidates, episodes of each, and candidates that are measured and stored together"""
+CANDIDATES, CANDIDATE_SEEDS = 60, 3
+"""number of candidates, and of episodes of each"""
 FINAL_SEEDS = 20
-"""episodes with the best candidate and each simulation step"""
+"""number of episodes with the best candidate and each simulation step"""
+SIMULATION_STEPS = (0.5, 0.25)
+"""[s]"""
 TRUCK_SHARE = 0.1
+CANDIDATES_PART, BEST_PART = "candidates", "best"
 
+HUMAN_TRAFFIC: dict[str, Any] = {}
+"""the candidate with the smallest deviation"""
 CAPACITY_ROAD: dict[str, Any] = {
     "length": 4000.0,
     "ramps": [{"position": 3000.0, "inflow": 700.0, "off_peak_inflow": 250.0}],
@@ -152,56 +157,93 @@ def capacity_road(settings: Mapping[str, Any]) -> Motorway:
     return scenario
 
 
-def measure_candidates(first: int, workers: int) -> list[dict[str, Any]]:
-    """Return the settings of a batch of candidates, with the facts of each of their episodes."""
-    candidates = [make_candidate(number) for number in range(first, min(first + CANDIDATE_BATCH, CANDIDATES))]
-    facts = _measure_facts([capacity_road(each) for each in candidates], tuning_seeds(CANDIDATE_SEEDS), workers)
-    return [{"settings": each, "facts": rows} for each, rows in zip(candidates, facts, strict=True)]
+def measure_candidate(number: int, workers: int) -> list[dict[str, Any]]:
+    """Return the settings of a candidate with the facts of its episodes, as a list of one row."""
+    settings = make_candidate(number)
+    return [{"settings": settings, "episodes": measure_facts(settings, {}, tuning_seeds(CANDIDATE_SEEDS), workers)}]
 
 
-def _measure_facts(scenarios: Sequence[Motorway], seeds: Sequence[tuple[int, ...]], workers: int) -> list[Table]:
-    """Return the facts of all episodes of each scenario, with the delay of the episode."""
-    tasks = [EpisodeTask(scenario, Human(), seed) for scenario in scenarios for seed in seeds]
+def measure_step(settings: Mapping[str, Any], step: float, workers: int) -> Table:
+    """Return the facts of human traffic on test seeds with a simulation step [s], and a control step of 1 s."""
+    changes = {"simulation_step": step, "steps_per_control_step": round(1.0 / step)}
+    return measure_facts(settings, changes, make_test_seeds(FINAL_SEEDS), workers)
+
+
+def measure_facts(
+    settings: Mapping[str, Any], changes: Mapping[str, Any], seeds: Sequence[tuple[int, ...]], workers: int
+) -> Table:
+    """Return the facts of human traffic with these settings on the road with rising demand, one row for each seed."""
+    scenario = capacity_road({**settings, **changes})
 
     def facts_row(number: int, episode: Episode) -> dict[str, Any]:
         row = measure(episode)
         raise_failure([row])
-        facts = measure_traffic(episode, scenarios[number // len(seeds)])
-        return {**asdict(facts), "capacity_drop": facts.capacity_drop, "delay": row["delay"]}
+        return {**asdict(measure_traffic(episode, scenario)), "delay": row["delay"], "status": row["status"]}
 
     with WorkerPool(workers) as pool:
-        rows = pool.run_and_map(tasks, facts_row)
-    return [rows[index : index + len(seeds)] for index in range(0, len(rows), len(seeds))]
+        return pool.run_and_map([EpisodeTask(scenario, Human(), seed) for seed in seeds], facts_row)
 
 
 def mean_facts(rows: Table) -> dict[str, float]:
-    """Return the mean of each fact in its unit of `TARGETS`, over the episodes that show it; NaN if none does."""
-    means = {}
-    for name, target in TARGETS.items():
-        facts = [TrafficFacts(**{key: _number(row[key]) for key in TrafficFacts.__dataclass_fields__}) for row in rows]
-        values = [value for each in facts if isfinite(value := target.measure(each))]
-        means[name] = float(np.mean(values)) if values else float("nan")
-    return means
+    """Return the mean of each fact of `TARGETS`, over the episodes that show it; NaN if none does."""
+    values = {name: _values(rows, name) for name in TARGETS}
+    return {name: float(np.mean(each)) if each else nan for name, each in values.items()}
 
 
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
+def _values(rows: Table, target: str) -> list[float]:
+    """Return the values of a fact in its unit, without those of episodes that do not show it."""
+    names = [each.name for each in fields(TrafficFacts)]
+    facts = (TrafficFacts(**{name: nan if row[name] is None else row[name] for name in names}) for row in rows)
+    return [value for each in facts if isfinite(value := TARGETS[target].measure(each))]
 
 
 def total_deviation(rows: Table) -> float:
-    """Return the root mean square deviation from the targets; infinite without a breakdown in every episode."""
+    """Return the root mean square deviation from the targets; infinite if a fact was never observed."""
     deviations = [TARGETS[name].deviation(value) for name, value in mean_facts(rows).items()]
-    return float(np.sqrt(np.mean(np.square(deviations)))) if np.isfinite(deviations).all() else float("inf")
+    return float(np.sqrt(np.mean(np.square(deviations)))) if np.isfinite(deviations).all() else inf
 
 
-def measure_best(study_folder: StudyFolder, workers: int) -> dict[str, Any]:
-    """Return the facts of the best candidate on test seeds with two simulation steps."""
-    candidates = [each for batch in _read_candidates(study_folder.folder / HUMAN_TRAFFIC_NAME / "parts") for each in batch]
-    best = min(candidates, key=lambda each: total_deviation(each["facts"]))
-    steps = {"0.5 s": (0.5, 2), "0.25 s": (0.25, 4)}
-    roads = [
-        capacity_road({**best["settings"], "simulation_step": step, "steps_per_control_step": count})
-        for step, count in steps.values()
-    ]
-    facts = _measure_facts(roads, make_test_seeds(FINAL_SEEDS), workers)
-    return {"settings": best["settings"], "facts": dict(zip(steps, facts, strict=True))}
+def facts_table(folder: Path) -> pd.DataFrame:
+    """Return each fact of the chosen human traffic beside its target and the source of the target."""
+    steps = {step: read_part(folder, BEST_PART)[f"{step:g} s"] for step in SIMULATION_STEPS}
+    table: Table = []
+    for name, target in TARGETS.items():
+        row: dict[str, Any] = {"fact": target.name, "target": "{:g} to {:g}".format(*target.accepted)}
+        for step, rows in steps.items():
+            row[f"step of {step:g} s"] = str(estimate_cell(estimate(_values(rows, name)), target.digits))
+        table.append({**row, "source": target.source})
+    return pd.DataFrame(table)
+
+
+def candidates_table(folder: Path) -> pd.DataFrame:
+    """Return the settings of all candidates and their facts, the smallest deviation first."""
+    candidates = sorted(read_part(folder, CANDIDATES_PART), key=lambda each: total_deviation(each["episodes"]))
+    return pd.DataFrame([_candidate_row(each) for each in candidates])
+
+
+def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
+    settings, deviation = candidate["settings"], total_deviation(candidate["episodes"])
+    facts = {
+        TARGETS[name].name: f"{value:.{TARGETS[name].digits}f}" if isfinite(value) else NO_VALUE_TEXT
+        for name, value in mean_facts(candidate["episodes"]).items()
+    }
+    changing = settings["lane_changing"]
+    return {
+        "deviation": f"{deviation:.2f}" if isfinite(deviation) else NO_VALUE_TEXT,
+        "time headways [s]": "{:g} to {:g}".format(*settings["time_headways"]),
+        "accelerations [m/s²]": "{:g} to {:g}".format(*settings["accelerations"]),
+        **{name.replace("_", " "): str(changing.get(name, NO_VALUE_TEXT)) for name in CHANGING_COLUMNS},
+        **facts,
+    }
+
+
+CHANGING_COLUMNS = ("assertiveness", "speed_cooperation", "uncooperative_share")
+HUMAN_TRAFFIC_STUDY = Study(
+    title="human traffic on a motorway compared with empirical facts",
+    make_parts=lambda study_folder, seeds: {
+        **{f"{CANDIDATES_PART}/{number}": (measure_candidate, (number,)) for number in range(CANDIDATES)},
+        **{f"{BEST_PART}/{step:g} s": (measure_step, (HUMAN_TRAFFIC, step)) for step in SIMULATION_STEPS},
+    },
+    minutes=45.0,
+    tables={"facts": facts_table, "candidates": candidates_table},
+)

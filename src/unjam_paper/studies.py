@@ -16,6 +16,7 @@ from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study
 from unjam_paper.do_no_harm import DO_NO_HARM
 from unjam_paper.feasible import ENVELOPE, feasible_study, on_ramp_study
 from unjam_paper.figure_6 import FIGURE_6
+from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY
 from unjam_paper.robustness import FIGURE_10, ROBUSTNESS
 from unjam_paper.study import PAPER_ROADS, Study
 from unjam_paper.theory import FIGURE_8, THEORY
@@ -54,6 +55,7 @@ STUDIES: dict[str, Study] = {
     ),
     **PAPER_EXACT_STUDIES,
     "robustness": ROBUSTNESS,
+    "human-traffic": HUMAN_TRAFFIC_STUDY,
     "feasible-ring": feasible_study(
         "feasible residual compared with the tuned expert, on the ring and the jammed ring",
         *(("ring", "ring-jammed"), 20.0),
