@@ -36,8 +36,6 @@ SIMULATION_STEPS = (0.5, 0.25)
 TRUCK_SHARE = 0.1
 CANDIDATES_PART, BEST_PART = "candidates", "best"
 
-HUMAN_TRAFFIC: dict[str, Any] = {}
-"""the candidate with the smallest deviation"""
 CAPACITY_ROAD: dict[str, Any] = {
     "length": 4000.0,
     "ramps": [{"position": 3000.0, "inflow": 700.0, "off_peak_inflow": 250.0}],
@@ -150,6 +148,10 @@ def make_candidate(number: int) -> dict[str, Any]:
     return {**settings, "trucks": {"share": TRUCK_SHARE}}
 
 
+POPULATIONS = tuple(make_candidate(number) for number in (17, 56, 49))
+"""the three candidates with the smallest deviations, the best one first"""
+
+
 def capacity_road(settings: Mapping[str, Any]) -> Motorway:
     """Return the road with rising demand, with these settings of its human traffic."""
     scenario = make_scenario("on-ramp", {**CAPACITY_ROAD, "penetration_rate": 0.0, **settings})
@@ -173,12 +175,20 @@ def measure_facts(
     settings: Mapping[str, Any], changes: Mapping[str, Any], seeds: Sequence[tuple[int, ...]], workers: int
 ) -> Table:
     """Return the facts of human traffic with these settings on the road with rising demand, one row for each seed."""
-    scenario = capacity_road({**settings, **changes})
+    return measure_scenario(capacity_road({**settings, **changes}), seeds, workers)
+
+
+def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], workers: int) -> Table:
+    """Return the facts at the last ramp of a motorway with human drivers only, one row for each seed."""
 
     def facts_row(number: int, episode: Episode) -> dict[str, Any]:
         row = measure(episode)
         raise_failure([row])
-        return {**asdict(measure_traffic(episode, scenario)), "delay": row["delay"], "status": row["status"]}
+        return {
+            **asdict(measure_traffic(episode, scenario, ramp_number=-1)),
+            "delay": row["delay"],
+            "status": row["status"],
+        }
 
     with WorkerPool(workers) as pool:
         return pool.run_and_map([EpisodeTask(scenario, Human(), seed) for seed in seeds], facts_row)
@@ -237,13 +247,44 @@ def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def effects_table(folder: Path) -> pd.DataFrame:
+    """Return the change of each fact with each setting, by linear regression over the candidates but the first.
+
+    A change is that of one standard deviation of the setting among the candidates.
+    """
+    candidates = read_part(folder, CANDIDATES_PART)[1:]
+    columns = {name: np.array([setting(each["settings"]) for each in candidates]) for name, setting in FACTORS.items()}
+    standardized = np.array([(values - values.mean()) / values.std() for values in columns.values()])
+    facts = [mean_facts(each["episodes"]) for each in candidates]
+    table: Table = []
+    for name, target in TARGETS.items():
+        values = np.array([each[name] for each in facts])
+        is_known = np.isfinite(values)
+        design = np.vstack([np.ones(is_known.sum()), standardized[:, is_known]]).T
+        coefficients = np.linalg.lstsq(design, values[is_known], rcond=None)[0]
+        explained = 1.0 - np.var(values[is_known] - design @ coefficients) / np.var(values[is_known])
+        changes = {name: f"{value:+.{target.digits}f}" for name, value in zip(FACTORS, coefficients[1:], strict=True)}
+        table.append({"fact": target.name, **changes, "explained": f"{100 * explained:.0f} %"})
+    return pd.DataFrame(table)
+
+
+FACTORS: dict[str, Callable[[Mapping[str, Any]], float]] = {
+    "time headway": lambda settings: settings["time_headways"][0],
+    "acceleration": lambda settings: settings["accelerations"][0],
+    "assertiveness": lambda settings: settings["lane_changing"]["assertiveness"][1],
+    "speed gain": lambda settings: settings["lane_changing"]["speed_gain"][1],
+    "keep right": lambda settings: settings["lane_changing"]["keep_right"][0],
+    "speed cooperation": lambda settings: settings["lane_changing"]["speed_cooperation"][0],
+    "uncooperative share": lambda settings: settings["lane_changing"]["uncooperative_share"],
+}
+"""what differs among the candidates"""
 CHANGING_COLUMNS = ("assertiveness", "speed_cooperation", "uncooperative_share")
 HUMAN_TRAFFIC_STUDY = Study(
     title="human traffic on a motorway compared with empirical facts",
     make_parts=lambda study_folder, seeds: {
         **{f"{CANDIDATES_PART}/{number}": (measure_candidate, (number,)) for number in range(CANDIDATES)},
-        **{f"{BEST_PART}/{step:g} s": (measure_step, (HUMAN_TRAFFIC, step)) for step in SIMULATION_STEPS},
+        **{f"{BEST_PART}/{step:g} s": (measure_step, (POPULATIONS[0], step)) for step in SIMULATION_STEPS},
     },
     minutes=45.0,
-    tables={"facts": facts_table, "candidates": candidates_table},
+    tables={"facts": facts_table, "candidates": candidates_table, "effects": effects_table},
 )

@@ -13,7 +13,7 @@ from unjam.drivers.observation import FEATURES, observation_size
 from unjam.drivers.onnx_policy import OnnxDriver
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import ResidualDriver
-from unjam.drivers.road_experts import Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
+from unjam.drivers.road_experts import AdvisorySpeed, Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.user_driver import FileDriver, FileReference, is_file_reference
 from unjam.drivers.wrappers import (
     FilteredDriver,
@@ -30,7 +30,7 @@ from unjam.tree import Arrays, pack, unpack
 
 _DRIVER_CLASSES = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
-    *(Pacer, JamAbsorber, Cruise, JamAhead, GapMaker, AdaptiveACC, Constant),
+    *(Pacer, JamAbsorber, Cruise, AdvisorySpeed, JamAhead, GapMaker, AdaptiveACC, Constant),
 )
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _DRIVER_CLASSES}
 DRIVER_CLASSES: dict[str, type[Driver]] = {

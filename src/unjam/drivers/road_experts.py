@@ -227,6 +227,37 @@ class Cruise(FormulaDriver):
 
 
 @dataclass(frozen=True, config=STRICT)
+class AdvisorySpeed(FormulaDriver):
+    """Drives no faster than a fixed speed on a section upstream of a ramp; elsewhere its own ACC drives.
+
+    It needs neither messages nor feedback: the cheapest alternative to every driver that does.
+    """
+
+    name: ClassVar[str] = "advisory-speed"
+    own_requirements: ClassVar[Requirements] = Requirements(
+        required_fields=frozenset({"distance_to_merge"}), used_fields=frozenset({"distance_to_merge"})
+    )
+
+    advised_speed: Positive = 19.4
+    """[m/s]"""
+    first_distance: NonNegative = 1500.0
+    """distance upstream of the merging section at which the section begins [m]"""
+    last_distance: NonNegative = 0.0
+    """distance upstream of the merging section at which it ends [m]"""
+    max_deceleration: Positive = 1.5
+    """maximum braking towards the speed [m/s2]"""
+    time_constant: Positive = 3.0
+    """time constant of the approach to the speed [s]"""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration towards the speed on the section, elsewhere one above that of any ACC."""
+        distance, free = state.distance_to_merge, state.speed * 0.0 + UNBOUNDED_ACCELERATION
+        towards = clamp_min((self.advised_speed - state.speed) / self.time_constant, -self.max_deceleration)
+        is_advised = (distance < self.first_distance) & (distance > self.last_distance)
+        return namespace(free).where(is_advised, towards, free), memory
+
+
+@dataclass(frozen=True, config=STRICT)
 class JamAhead(FormulaDriver):
     """Caps the speed upstream of a ramp or a jam near the mean speed of its own lane a few hundred meters ahead.
 

@@ -1,7 +1,7 @@
 """Macroscopic facts of motorway traffic: breakdown, capacity and its drop, waves, time gaps, lane changes.
 
 They are measured as detectors and aerial recordings of real motorways are evaluated, so that simulated traffic can be
-compared with them. All positions are relative to the first merging section.
+compared with them. All positions are relative to where the last `MERGING_LENGTH` of the merging section begin.
 """
 
 from dataclasses import dataclass
@@ -14,6 +14,8 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.worlds.record import Episode
 
+MERGING_LENGTH = 300.0
+"""length of a merging section that counts as the bottleneck: of a longer one the downstream end [m]"""
 INTERVAL = 60.0
 """time over which detectors count [s]"""
 BREAKDOWN_MINUTES = 5
@@ -80,11 +82,13 @@ class TrafficFacts:
         return 1.0 - self.discharge / self.flow_before
 
 
-def measure_traffic(episode: Episode, scenario: Motorway) -> TrafficFacts:
-    """Return the facts of an episode of a motorway, around its first merging section."""
-    ramp, lanes = scenario.ramps[0], scenario.lanes
+def measure_traffic(episode: Episode, scenario: Motorway, ramp_number: int = 0) -> TrafficFacts:
+    """Return the facts of an episode of a motorway, around one of its merging sections."""
+    ramp, lanes = scenario.ramps[ramp_number], scenario.lanes
     stride, step = episode.snapshot_stride, episode.control_step * episode.snapshot_stride
-    positions, lane_indices = episode.positions, episode.lane_indices
+    merging_length = min(ramp.merging_length, MERGING_LENGTH)
+    merge_end = ramp.position + ramp.merging_length - scenario.geometry.origin
+    positions, lane_indices = episode.positions - (merge_end - merging_length), episode.lane_indices
     speeds = episode.speeds[::stride][: len(positions)]
     per_interval = round(INTERVAL / step)
 
@@ -101,7 +105,7 @@ def measure_traffic(episode: Episode, scenario: Motorway) -> TrafficFacts:
         mean = np.where(counts > 0, passing_speeds.sum((1, 2)) / counts.clip(1), np.nan)
         return counts * 3600.0 / INTERVAL, mean
 
-    flow = detect(ramp.merging_length + DOWNSTREAM_DISTANCE)[0] / lanes
+    flow = detect(merging_length + DOWNSTREAM_DISTANCE)[0] / lanes
     upstream_speed = detect(UPSTREAM_DETECTOR)[1]
     slow = np.nan_to_num(upstream_speed, nan=np.inf) < BREAKDOWN_SPEED_RATIO * scenario.speed_limit
     begin, end = _first_run(slow)
@@ -132,7 +136,7 @@ def measure_traffic(episode: Episode, scenario: Motorway) -> TrafficFacts:
         changes = in_range & (lane_indices[free] != lane_indices[1:][free])
         driven = np.where(in_range, after - before, 0.0).sum()
         facts["lane_changes_per_km"] = float(1000.0 * changes.sum() / driven) if driven else nan
-        near = (positions[:-1] > NEAR_MERGE) & (positions[:-1] < ramp.merging_length)
+        near = (positions[:-1] > NEAR_MERGE) & (positions[:-1] < merging_length)
         braking = (speeds[:-1] - speeds[1:])[near & np.isfinite(speeds[1:])] / step
     if len(braking) > MIN_SAMPLES:
         facts["hardest_braking"] = float(np.quantile(braking, BRAKING_QUANTILE))

@@ -21,6 +21,7 @@ from unjam.scenarios.motorway_vehicles import (
     draw_uniform,
 )
 from unjam.scenarios.road import Entry, VehicleType
+from unjam.scenarios.road_control import RampMeter, SpeedLimitControl
 from unjam.scenarios.scenario import Actuation, Scenario
 
 MAX_LANES = 5
@@ -120,6 +121,10 @@ class Motorway(Scenario):
     trucks: Trucks = field(default_factory=Trucks)
     ordinary_acc: OrdinaryACC = field(default_factory=OrdinaryACC)
     """cars with an ACC that are not CAVs"""
+    speed_limit_control: SpeedLimitControl = field(default_factory=SpeedLimitControl)
+    """variable speed limits for all vehicles upstream of each ramp"""
+    ramp_meter: RampMeter = field(default_factory=RampMeter)
+    """meters at all ramps"""
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
     """latency and smoothing of the speeds ahead that CAVs receive"""
     simulation_step: Positive = 0.5

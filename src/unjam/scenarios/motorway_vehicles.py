@@ -61,6 +61,14 @@ class LaneChanging:
     uncooperative_share: Share = 0.0
     """share of drivers who neither change lanes nor slow down for others"""
 
+    @model_validator(mode="after")
+    def _check_intervals(self) -> "LaneChanging":
+        for name in LC2013_NAMES:
+            low, high = getattr(self, name) or (0.0, 0.0)
+            if low > high:
+                raise ValueError(f"{name}: ({low:g}, {high:g}) is not allowed; allowed: low <= high")
+        return self
+
     def draw(self, generator: np.random.Generator) -> tuple[tuple[str, float], ...]:
         """Return the parameters of one driver that differ from SUMO's defaults, by SUMO's names."""
         values = {
@@ -71,11 +79,6 @@ class LaneChanging:
         if self.uncooperative_share and generator.random() < self.uncooperative_share:
             values |= {LC2013_NAMES["cooperation"]: 0.0, LC2013_NAMES["speed_cooperation"]: 0.0}
         return tuple(values.items())
-
-    @property
-    def is_default(self) -> bool:
-        """Whether all drivers change lanes with SUMO's default parameters."""
-        return self == LaneChanging()
 
 
 @dataclass(frozen=True, config=STRICT)

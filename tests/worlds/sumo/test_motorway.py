@@ -12,10 +12,13 @@ from unjam.adapters import onnx_driver
 from unjam.drivers import Human
 from unjam.drivers.car_following import AdaptiveACC
 from unjam.drivers.command import Command
-from unjam.drivers.local_state import MAX_OBSERVED_GAP
-from unjam.drivers.road_experts import Cruise, JamAhead
+from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
+from unjam.drivers.road_experts import AdvisorySpeed, Cruise, JamAhead
+from unjam.drivers.roadside import RoadsideSettings
 from unjam.measures.metrics import measure
 from unjam.scenarios.motorway import ON_RAMP, Motorway
+from unjam.scenarios.motorway_vehicles import LaneChanging, Trucks
+from unjam.scenarios.road_control import RampMeter, SpeedLimitControl
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
@@ -286,3 +289,86 @@ def test_an_onnx_policy_sets_the_speed_of_cars_with_an_acc(tmp_path: Path) -> No
     assert len(late) > 3
     assert all(abs(speeds.max() - 15.0) < 0.5 for speeds in late)
     assert measure(episode)["contacts"] == 0
+
+
+def test_gaps_reach_to_the_rear_of_trucks(simulation: Simulation) -> None:
+    traffic, compared = motorway(simulation, replace(BUSY, trucks=Trucks(share=0.4))), 0
+    for _ in range(120):
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+        seen = traffic.local_state()
+        for row, name in enumerate(traffic.cav_ids):
+            leader, gap = libsumo.vehicle.getLeader(name, 90.0) or ("", 0.0)
+            if leader and libsumo.vehicle.getLength(leader) > 10.0 and libsumo.vehicle.getRoadID(name) == "motorway":
+                assert seen.leader_gap[row] == pytest.approx(gap + libsumo.vehicle.getMinGap(name), abs=1e-6)
+                compared += 1
+    assert compared > 100
+
+
+def test_cavs_cooperate_as_configured_and_people_as_they_are(simulation: Simulation) -> None:
+    changing = LaneChanging(cooperation=(0.2, 0.4))
+    scenario = replace(BUSY, lane_changing=changing, cruise=replace(BUSY.cruise, cooperation=0.9))
+    traffic, key = motorway(simulation, scenario), "laneChangeModel.lcCooperative"
+    for _ in range(60):
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+    values = {name: float(libsumo.vehicle.getParameter(name, key)) for name in libsumo.vehicle.getIDList()}
+    assert {values[name] for name in traffic.cav_ids} == {0.9}
+    assert all(0.2 <= value <= 0.4 for name, value in values.items() if name not in traffic.cav_ids)
+
+
+def test_without_a_source_of_speeds_no_message_arrives(simulation: Simulation) -> None:
+    scenario = replace(BUSY, roadside=RoadsideSettings(source="none"))
+    traffic = motorway(simulation, scenario)
+    traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+    assert traffic.local_state().lane_speeds is None
+    assert "lane_speeds" not in scenario.provided_fields
+
+
+CONTROLLED = replace(ON_RAMP, peak=(0.0, 600.0), penetration_rate=0.0, horizon=400)
+
+
+def test_a_ramp_meter_lets_vehicles_pass_at_its_rate(simulation: Simulation) -> None:
+    meter = RampMeter(active=True, target_density=1.0, rates=(240.0, 1200.0), gain=1000.0)
+    ramp = replace(ON_RAMP.ramps[0], length=1000.0, inflow=600.0)
+    traffic = motorway(simulation, replace(CONTROLLED, ramp_meter=meter, ramps=(ramp,)))
+    entered, merged = set[str](), set[str]()
+    for second in range(400):
+        traffic.advance(None)
+        entered.update(libsumo.edge.getLastStepVehicleIDs("ramp"))
+        if second > 100:
+            merged.update(name for name in libsumo.edge.getLastStepVehicleIDs("merging") if name in entered)
+    assert len(merged) == pytest.approx(240.0 * 300.0 / 3600.0, abs=4)
+    assert not libsumo.simulation.getCollidingVehiclesIDList()
+
+
+def test_a_ramp_meter_does_not_let_its_queue_reach_the_entrance(sumo: SumoBackend) -> None:
+    meter = RampMeter(active=True, target_density=1.0, gain=1000.0)
+    episode = run_episode(replace(CONTROLLED, ramp_meter=meter), Human(), (3,), backend=sumo)
+    assert episode.status == "completed"
+    assert episode.backlog.max() <= 3
+
+
+def test_a_speed_limit_holds_upstream_while_the_density_is_high(simulation: Simulation) -> None:
+    control = SpeedLimitControl(active=True, target_density=1.0, gain=1.0, length=800.0, acceleration_length=500.0)
+    traffic = motorway(simulation, replace(CONTROLLED, speed_limit_control=control))
+    for _ in range(300):
+        traffic.advance(None)
+    speeds = {"limited": list[float](), "downstream": list[float]()}
+    for _ in range(60):
+        traffic.advance(None)
+        for name in libsumo.edge.getLastStepVehicleIDs("motorway"):
+            position, speed = libsumo.vehicle.getLanePosition(name), libsumo.vehicle.getSpeed(name)
+            if 1100.0 < position < 1450.0:
+                speeds["limited"].append(speed)
+            elif position > 1900.0:
+                speeds["downstream"].append(speed)
+    assert np.mean(speeds["limited"]) == pytest.approx(control.min_limit, abs=1.0)
+    assert np.mean(speeds["downstream"]) > control.min_limit + 3.0
+
+
+def test_an_advised_speed_holds_on_its_section_only() -> None:
+    driver = AdvisorySpeed(advised_speed=20.0, first_distance=1000.0, last_distance=200.0)
+    ones = np.ones(4)
+    state = LocalState(25.0 * ones, 25.0 * ones, 50.0 * ones, *(25.0 * ones, 50.0 * ones), ones, np.nan * ones)
+    state = state._replace(distance_to_merge=np.array([1500.0, 900.0, 100.0, -50.0]))
+    accelerations, _ = driver.act(state, {})
+    assert accelerations.tolist() == [100.0, -1.5, 100.0, 100.0]

@@ -87,6 +87,8 @@ def _motorway_reason(scenario: Motorway) -> str:
         ("cruise.cooperation", scenario.cruise.cooperation is None, "None: CAVs change lanes as human drivers do"),
         ("simulation_step", scenario.simulation_step == MOTORWAY_STEP, f"{MOTORWAY_STEP:g} s"),
         ("lane_changing", scenario.lane_changing == LaneChanging(), "SUMO's defaults"),
+        ("speed_limit_control.active", not scenario.speed_limit_control.active, "False"),
+        ("ramp_meter.active", not scenario.ramp_meter.active, "False"),
         ("trucks.share", scenario.trucks.share == 0, "0"),
         ("ordinary_acc.share", scenario.ordinary_acc.share == 0, "0"),
         ("lanes", scenario.lanes <= MAX_BATCH_LANES, "1, 2"),

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from math import inf
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.drivers.safety import FollowingState
+from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 from unjam.worlds.open_road_log import TrackedLeader
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.inputs import motorway_inputs
 from unjam.worlds.sumo.open_road import MultiLaneTraffic, neighbor_state
+from unjam.worlds.sumo.road_control import RampControl
 
 
 class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
@@ -36,6 +38,12 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         self._measurement = SpeedMeasurement(road.roadside, self._road_sections, limit, step)
         self._messages = RoadsideMessages(road.roadside, step, self.noise_generator)
         self._entered_is_cav: list[bool] = []
+        scenario, ramps = (
+            cast(Motorway, self.scenario),
+            zip(self._geometry.ramps, self._geometry.route_names[1:], strict=True),
+        )
+        is_controlled = scenario.speed_limit_control.active or scenario.ramp_meter.active
+        self._ramp_controls = [RampControl(self._simulation, scenario, *ramp) for ramp in ramps if is_controlled]
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
         """Find leaders and followers from the vehicles on SUMO's lanes, which form lanes of the whole road."""
@@ -59,6 +67,11 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         self._leader, self._follower = np.full((2, len(names)), -1)
         self._leader[before[is_same_lane]] = after[is_same_lane]
         self._follower[after[is_same_lane]] = before[is_same_lane]
+
+    def _command_humans(self) -> None:
+        """Let the road operator control speed limits and meters."""
+        for control in self._ramp_controls:
+            control.act(self._names, self._lane, self._position)
 
     def _names_and_speeds(self) -> tuple[Sequence[str], Floats]:
         return self._names, self._speed

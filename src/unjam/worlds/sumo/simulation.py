@@ -318,6 +318,17 @@ class Simulation(AbstractContextManager["Simulation"]):
         for set_limit in (types.setDecel, types.setEmergencyDecel, types.setApparentDecel):
             set_limit(kind, max_braking)
 
+    def stop_at(self, name: str, edge: str, position: float) -> None:
+        """Let a vehicle stop on the first lane of an edge [m], until `end_stop`."""
+        self._sumo.vehicle.setStop(name, edge, pos=position, laneIndex=0)
+
+    def end_stop(self, name: str, edge: str, position: float) -> None:
+        """Let a vehicle drive on, whether it stands at its stop or has not yet reached it."""
+        if self._sumo.vehicle.isStopped(name):
+            self._sumo.vehicle.resume(name)
+        else:
+            self._sumo.vehicle.setStop(name, edge, pos=position, laneIndex=0, duration=0.0)
+
     def take_control(
         self,
         ids: Iterable[str],

@@ -1,0 +1,70 @@
+"""What a road operator does at on-ramps: variable speed limits upstream, and ramp meters; both control a density.
+
+They act on all vehicles, not only on CAVs, and know the exact density of the merging section.
+"""
+
+from pydantic.dataclasses import dataclass
+
+from unjam.parameters import STRICT, NonNegative, Positive
+
+LIMIT_STEP = 10.0 / 3.6
+"""speed limits are multiples of 10 km/h [m/s]"""
+MEASURED_DOWNSTREAM = 200.0
+"""the density is that from the begin of the merging section to this far downstream of its end [m]"""
+
+
+@dataclass(frozen=True, config=STRICT)
+class SpeedLimitControl:
+    """A variable speed limit for all vehicles upstream of a merging section, which all of them obey.
+
+    Integral control of the density, mainstream traffic flow control as in Carlson, Papamichail and Papageorgiou 2011,
+    IEEE Trans. Intell. Transp. Syst. 12:1261-1276. Vehicles accelerate again before they reach the merging section.
+    """
+
+    active: bool = False
+    target_density: Positive = 24.0
+    """[veh/km per lane]"""
+    gain: NonNegative = 0.02
+    """change of limit / unlimited speed in each interval, per veh/km of deviation"""
+    min_limit: Positive = 11.12
+    """[m/s]"""
+    interval: Positive = 30.0
+    """[s]"""
+    length: Positive = 1500.0
+    """length of the road with the limit [m]"""
+    acceleration_length: NonNegative = 500.0
+    """length between its end and the merging section [m]"""
+
+    def next_share(self, share: float, density: float, speed_limit: float) -> float:
+        """Return the next share of the unlimited speed, given the last one and the density [veh/km per lane]."""
+        return min(1.0, max(self.min_limit / speed_limit, share + self.gain * (self.target_density - density)))
+
+    def limit(self, share: float, speed_limit: float) -> float:
+        """Return the limit that signs show [m/s]."""
+        return min(speed_limit, max(self.min_limit, round(share * speed_limit / LIMIT_STEP) * LIMIT_STEP))
+
+
+@dataclass(frozen=True, config=STRICT)
+class RampMeter:
+    """A ramp meter, which lets vehicles pass one by one: ALINEA, on density.
+
+    It is off at its highest rate, and if the queue would reach the entrance of the ramp. Papageorgiou, Hadj-Salem and
+    Blosseville 1991, Transp. Res. Rec. 1320:58-64.
+    """
+
+    active: bool = False
+    target_density: Positive = 24.0
+    """[veh/km per lane]"""
+    gain: NonNegative = 20.0
+    """change of the rate in each interval, per veh/km of deviation [veh/h]"""
+    rates: tuple[Positive, Positive] = (240.0, 1200.0)
+    """lowest and highest rate [veh/h]"""
+    interval: Positive = 30.0
+    """[s]"""
+    distance_to_merge: Positive = 100.0
+    """distance from the stop line to the merging section [m]"""
+
+    def next_rate(self, rate: float, density: float) -> float:
+        """Return the next rate, given the last one [veh/h] and the density [veh/km per lane]."""
+        lowest, highest = self.rates
+        return min(highest, max(lowest, rate + self.gain * (self.target_density - density)))

@@ -1,0 +1,130 @@
+"""An ensemble of motorways: populations, ways to change lanes, trucks, roads and demands, half of them for tuning.
+
+The settings are a balanced random design, drawn before anything is tuned on them. The demand of a setting is relative
+to the flow that this very traffic reaches before it breaks down.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from unjam.scenarios import Motorway, make_scenario
+from unjam.training.seeds import tuning_seeds
+from unjam_paper.human_traffic import POPULATIONS, measure_scenario
+from unjam_paper.study import Table
+
+SETTINGS_PER_HALF = 12
+DESIGN_SEED = 20261128
+CAPACITY_SEEDS = 5
+"""number of episodes in which the capacity of a setting is measured"""
+RAMP_SHARE = 0.15
+"""share of the ramps in the demand"""
+OFF_PEAK_SHARE = 0.6
+"""demand before and after the peak, as a share of capacity"""
+ROADS: dict[str, dict[str, Any]] = {
+    "two lanes": {"ramps": [{"position": 3000.0}]},
+    "three lanes": {"lanes": 3, "ramps": [{"position": 3000.0}]},
+    "two ramps": {"length": 5500.0, "ramps": [{"position": 3000.0}, {"position": 4500.0}]},
+    "lane drop": {"ramps": [{"position": 1500.0, "merging_length": 1500.0, "speed_limit": 27.78, "entry_speed": 22.0}]},
+}
+CAPACITY_GUESS, MAX_DEMAND = 1900.0, 1.3
+"""flow of a lane, and demand relative to it, up to which the demand rises to measure capacity [veh/h]"""
+RISING_DEMAND = {"peak": (1800.0, 2400.0), "peak_rise": 1800.0, "horizon": 2400, "penetration_rate": 0.0}
+LEVELS: dict[str, Sequence[Any]] = {
+    "road": (*("two lanes",) * 5, *("three lanes",) * 3, *("two ramps",) * 2, *("lane drop",) * 2),
+    "population": (0, 1, 2) * 4,
+    "uncooperative_share": (*(0.0,) * 6, *(0.3,) * 3, *(0.6,) * 3),
+    "acceleration": (*(0.0,) * 7, *(0.3,) * 3, *(-0.15,) * 2),
+    "trucks": (*(0.08,) * 5, *(0.12,) * 5, *(0.15,) * 2),
+    "ordinary_acc": (*(0.0,) * 7, *(0.1,) * 3, *(0.3,) * 2),
+    "merging_length": (*(300.0,) * 6, *(200.0,) * 3, *(400.0,) * 3),
+    "demand": (*(0.9,) * 2, *(1.02,) * 3, *(1.05,) * 3, *(1.08,) * 2, *(1.15,) * 2),
+}
+"""the levels of each factor in the settings of one half"""
+
+
+@dataclass(frozen=True)
+class EnsembleSetting:
+    """One motorway of the ensemble."""
+
+    number: int
+    road: str
+    population: int
+    uncooperative_share: float
+    acceleration: float
+    """change of all drivers' accelerations [m/s2]"""
+    trucks: float
+    """share of trucks"""
+    ordinary_acc: float
+    """share of cars with an ordinary ACC"""
+    merging_length: float
+    """of acceleration lanes; a lane drop has its own [m]"""
+    demand: float
+    """demand in the peak, relative to the flow before a breakdown"""
+
+    @property
+    def is_test(self) -> bool:
+        """Whether nothing is tuned on it."""
+        return self.number >= SETTINGS_PER_HALF
+
+    @cached_property
+    def traffic(self) -> dict[str, Any]:
+        """Road and human traffic as settings of a scenario, without a demand."""
+        population, road = POPULATIONS[self.population], ROADS[self.road]
+        accelerations = tuple(round(each + self.acceleration, 2) for each in population["accelerations"])
+        ramps = [{"merging_length": self.merging_length, **ramp} for ramp in road["ramps"]]
+        changes = {
+            "accelerations": accelerations,
+            "lane_changing": {**population["lane_changing"], "uncooperative_share": self.uncooperative_share},
+            "trucks": {"share": self.trucks},
+            "ordinary_acc": {"share": self.ordinary_acc},
+        }
+        return {"length": 4000.0, "lanes": 2, **population, **changes, **road, "ramps": ramps}
+
+    def scenario(self, capacity: float, demand: float, **changes: Any) -> Motorway:
+        """Return the scenario with a demand in the peak relative to `capacity`, that of the carriageway [veh/h]."""
+        ramps, lanes = self.traffic["ramps"], self.traffic["lanes"]
+        # The closing lane carries what each other lane does.
+        share = 1.0 / (lanes + 1) if self.road == "lane drop" else RAMP_SHARE / len(ramps)
+
+        def flows(share: float) -> dict[str, float]:
+            return {
+                "inflow": round(demand * share * capacity),
+                "off_peak_inflow": round(OFF_PEAK_SHARE * share * capacity),
+            }
+
+        settings = {
+            **self.traffic,
+            **flows(1.0 - share * len(ramps)),
+            "ramps": [{**ramp, **flows(share)} for ramp in ramps],
+        }
+        made = make_scenario("on-ramp", {**settings, **changes})
+        assert isinstance(made, Motorway)
+        return made
+
+
+def _draw_settings() -> list[EnsembleSetting]:
+    """Return the balanced random design: in each half, each factor has its levels in an order of its own."""
+    generator, settings = np.random.default_rng(DESIGN_SEED), list[EnsembleSetting]()
+    for half in range(2):
+        columns = {name: generator.permutation(np.array(levels, object)) for name, levels in LEVELS.items()}
+        settings += [
+            EnsembleSetting(half * SETTINGS_PER_HALF + row, **{name: values[row] for name, values in columns.items()})
+            for row in range(SETTINGS_PER_HALF)
+        ]
+    return settings
+
+
+SETTINGS = _draw_settings()
+"""the tuning half, then the test half"""
+
+
+def measure_capacity(number: int, workers: int) -> Table:
+    """Return the facts of a setting with a demand that rises until traffic breaks down, one row for each seed."""
+    setting = SETTINGS[number]
+    capacity = CAPACITY_GUESS * setting.traffic["lanes"]
+    scenario = setting.scenario(capacity, MAX_DEMAND, **RISING_DEMAND)
+    return measure_scenario(scenario, tuning_seeds(CAPACITY_SEEDS), workers)
