@@ -114,7 +114,7 @@ class InsertionQueue:
 
 def driver_columns(vehicle_type: VehicleType) -> tuple[float, ...]:
     """Return the parameters of a driver in the order of `MotorwayVehicles`, from `time_headway` to `is_eidm`."""
-    model, *parameters = vehicle_type
+    model, *parameters = vehicle_type[: VehicleType._fields.index("length")]
     return *parameters, model == "EIDM"
 
 
