@@ -29,7 +29,7 @@ ROADS = {
     "on-ramp": ("on-ramp", {"horizon": 150, "peak": [0, 150], "penetration_rate": 0.3}),
     "user-network": ("", {"horizon": 250, "cav_types": ["van"]}),
 }
-ON_MOTORWAYS = ("cruise", "jam-ahead", "gap-maker", "adaptive-acc")
+ON_MOTORWAYS = ("cruise", "advisory-speed", "jam-ahead", "gap-maker", "adaptive-acc")
 VANS = "".join(
     f'<vehicle id="{number}" type="{"car" if number % 3 else "van"}" route="along" '
     f'depart="{2 * number}" departSpeed="8"/>'
