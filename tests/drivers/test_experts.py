@@ -38,6 +38,7 @@ EXPERTS = [
     "jam-ahead:all_lanes=true,last_section=9",
     "gap-maker:merge_time_gap=1.5,downstream_distance=300",
     "adaptive-acc",
+    "advisory-speed:advised_speed=20",
     "adaptive-acc:time_headway=1.2,jam_front_speed_change=0.5",
     "constant:acceleration=0.2",
 ]

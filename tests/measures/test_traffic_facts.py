@@ -12,7 +12,7 @@ from unjam.scenarios.motorway import ON_RAMP
 from unjam.worlds.record import Episode
 
 FREE, SLOW, LENGTH = 25.0, 8.0, 4.8
-HEADWAYS = 2.0, 2.4
+HEADWAYS = 2.0, 3.0
 """before and after the breakdown, in each lane [s]"""
 BREAKDOWN, DURATION = 1200, 2400
 

@@ -298,8 +298,10 @@ def test_gaps_reach_to_the_rear_of_trucks(simulation: Simulation) -> None:
         seen = traffic.local_state()
         for row, name in enumerate(traffic.cav_ids):
             leader, gap = libsumo.vehicle.getLeader(name, 90.0) or ("", 0.0)
-            if leader and libsumo.vehicle.getLength(leader) > 10.0 and libsumo.vehicle.getRoadID(name) == "motorway":
-                assert seen.leader_gap[row] == pytest.approx(gap + libsumo.vehicle.getMinGap(name), abs=1e-6)
+            true_gap = gap + libsumo.vehicle.getMinGap(name)
+            is_behind_truck = leader and libsumo.vehicle.getLength(leader) > 10.0 and true_gap < 90.0
+            if is_behind_truck and libsumo.vehicle.getRoadID(name) == "motorway":
+                assert seen.leader_gap[row] == pytest.approx(true_gap, abs=1e-6)
                 compared += 1
     assert compared > 100
 
@@ -334,9 +336,9 @@ def test_a_ramp_meter_lets_vehicles_pass_at_its_rate(simulation: Simulation) -> 
     for second in range(400):
         traffic.advance(None)
         entered.update(libsumo.edge.getLastStepVehicleIDs("ramp"))
-        if second > 100:
+        if second >= 150:  # vehicles that entered before the first interval have passed
             merged.update(name for name in libsumo.edge.getLastStepVehicleIDs("merging") if name in entered)
-    assert len(merged) == pytest.approx(240.0 * 300.0 / 3600.0, abs=4)
+    assert len(merged) == pytest.approx(240.0 * 250.0 / 3600.0, abs=2)
     assert not libsumo.simulation.getCollidingVehiclesIDList()
 
 
