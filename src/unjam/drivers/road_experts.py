@@ -252,6 +252,8 @@ class AdvisorySpeed(FormulaDriver):
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the speed on the section, elsewhere one above that of any ACC."""
         distance, free = state.distance_to_merge, state.speed * 0.0 + UNBOUNDED_ACCELERATION
+        if distance is None:
+            return free, memory
         towards = clamp_min((self.advised_speed - state.speed) / self.time_constant, -self.max_deceleration)
         is_advised = (distance < self.first_distance) & (distance > self.last_distance)
         return namespace(free).where(is_advised, towards, free), memory
