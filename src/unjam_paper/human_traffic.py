@@ -196,11 +196,11 @@ def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], worke
 
 def mean_facts(rows: Table) -> dict[str, float]:
     """Return the mean of each fact of `TARGETS`, over the episodes that show it; NaN if none does."""
-    values = {name: _values(rows, name) for name in TARGETS}
+    values = {name: fact_values(rows, name) for name in TARGETS}
     return {name: float(np.mean(each)) if each else nan for name, each in values.items()}
 
 
-def _values(rows: Table, target: str) -> list[float]:
+def fact_values(rows: Table, target: str) -> list[float]:
     """Return the values of a fact in its unit, without those of episodes that do not show it."""
     names = [each.name for each in fields(TrafficFacts)]
     facts = (TrafficFacts(**{name: nan if row[name] is None else row[name] for name in names}) for row in rows)
@@ -220,7 +220,7 @@ def facts_table(folder: Path) -> pd.DataFrame:
     for name, target in TARGETS.items():
         row: dict[str, Any] = {"fact": target.name, "target": "{:g} to {:g}".format(*target.accepted)}
         for step, rows in steps.items():
-            row[f"step of {step:g} s"] = str(estimate_cell(estimate(_values(rows, name)), target.digits))
+            row[f"step of {step:g} s"] = str(estimate_cell(estimate(fact_values(rows, name)), target.digits))
         table.append({**row, "source": target.source})
     return pd.DataFrame(table)
 

@@ -5,16 +5,21 @@ to the flow that this very traffic reaches before it breaks down.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from unjam.measures.metric_table import estimate_cell
+from unjam.measures.statistics import estimate
 from unjam.scenarios import Motorway, make_scenario
 from unjam.training.seeds import tuning_seeds
-from unjam_paper.human_traffic import POPULATIONS, measure_scenario
-from unjam_paper.study import Table
+from unjam_paper.human_traffic import POPULATIONS, TARGETS, fact_values, measure_scenario
+from unjam_paper.results_file import read_part
+from unjam_paper.study import Study, Table
 
 SETTINGS_PER_HALF = 12
 DESIGN_SEED = 20261128
@@ -123,8 +128,36 @@ SETTINGS = _draw_settings()
 
 
 def measure_capacity(number: int, workers: int) -> Table:
-    """Return the facts of a setting with a demand that rises until traffic breaks down, one row for each seed."""
+    """Return the facts of a setting with a demand that rises until traffic breaks down, one row for each seed.
+
+    The flow before the breakdown is what the demand of the setting is relative to.
+    """
     setting = SETTINGS[number]
     capacity = CAPACITY_GUESS * setting.traffic["lanes"]
     scenario = setting.scenario(capacity, MAX_DEMAND, **RISING_DEMAND)
     return measure_scenario(scenario, tuning_seeds(CAPACITY_SEEDS), workers)
+
+
+def settings_table(folder: Path) -> pd.DataFrame:
+    """Return all settings with the flow before a breakdown, its drop and the speed of waves."""
+    capacities, table = read_part(folder, CAPACITY_PART), list[dict[str, Any]]()
+    for setting in SETTINGS:
+        rows = capacities[str(setting.number)]
+        facts = {
+            TARGETS[name].name: str(estimate_cell(estimate(fact_values(rows, name)), TARGETS[name].digits))
+            for name in ("highest_flow", "discharge", "capacity_drop", "wave_speed")
+        }
+        factors = {each.name.replace("_", " "): getattr(setting, each.name) for each in fields(setting)[1:]}
+        table.append({"half": "test" if setting.is_test else "tuning", **factors, **facts})
+    return pd.DataFrame(table)
+
+
+CAPACITY_PART = "capacity"
+MOTORWAY_ENSEMBLE = Study(
+    title="ensemble of motorways: the flow of each setting before it breaks down",
+    make_parts=lambda study_folder, seeds: {
+        f"{CAPACITY_PART}/{each.number}": (measure_capacity, (each.number,)) for each in SETTINGS
+    },
+    minutes=30.0,
+    tables={"settings": settings_table},
+)

@@ -114,8 +114,9 @@ class InsertionQueue:
 
 def driver_columns(vehicle_type: VehicleType) -> tuple[float, ...]:
     """Return the parameters of a driver in the order of `MotorwayVehicles`, from `time_headway` to `is_eidm`."""
-    model, *parameters = vehicle_type[: VehicleType._fields.index("length")]
-    return *parameters, model == "EIDM"
+    kind = vehicle_type
+    following = kind.time_headway, kind.acceleration, kind.deceleration, kind.minimum_gap
+    return *following, kind.speed_factor, kind.model == "EIDM"
 
 
 def make_vehicles(*columns: np.ndarray) -> MotorwayVehicles:

@@ -1,0 +1,72 @@
+"""Studies of motorways: candidates of human traffic, their deviation from facts, and the ensemble of settings."""
+
+from collections import Counter
+from dataclasses import fields
+from math import inf
+from pathlib import Path
+
+import pytest
+
+from unjam.measures.traffic_facts import TrafficFacts
+from unjam_paper.human_traffic import (
+    CANDIDATES_PART,
+    POPULATIONS,
+    TARGETS,
+    capacity_road,
+    make_candidate,
+    total_deviation,
+)
+from unjam_paper.motorway_ensemble import LEVELS, SETTINGS, SETTINGS_PER_HALF
+from unjam_paper.results_file import read_part
+
+RESULTS = Path(__file__).parents[2] / "results"
+AT_TARGET = {
+    **{each.name: 1.0 for each in fields(TrafficFacts)},
+    "highest_flow": 1950.0,
+    "flow_before": 1900.0,
+    "discharge": 1748.0,
+    "wave_speed": -17.0 / 3.6,
+    "free_time_gap": 1.3,
+    "congested_time_gap": 1.65,
+    "lane_changes_per_km": 0.4,
+    "merge_ratio": 0.9,
+    "hardest_braking": 3.0,
+}
+
+
+def test_traffic_at_its_targets_has_no_deviation_and_one_without_a_breakdown_an_infinite_one() -> None:
+    row = {**AT_TARGET, "discharge": 1780.0, "flow_before": 1780.0 / 0.92}
+    assert total_deviation([row, row]) == pytest.approx(0.0, abs=1e-9)
+    assert total_deviation([{**row, "wave_speed": -20.0 / 3.6}]) == pytest.approx((1.0 / len(TARGETS)) ** 0.5)
+    assert total_deviation([{**row, "discharge": None}]) == inf
+
+
+def test_each_candidate_is_a_scenario_with_trucks() -> None:
+    for number in range(20):
+        scenario = capacity_road(make_candidate(number))
+        assert scenario.trucks.share == 0.1
+        assert scenario.peak_rise == scenario.peak[0]
+
+
+def test_the_populations_are_the_candidates_with_the_smallest_deviations() -> None:
+    candidates = read_part(RESULTS / "human-traffic.json", CANDIDATES_PART)
+    best = sorted(candidates, key=lambda each: total_deviation(each["episodes"]))[: len(POPULATIONS)]
+    for candidate, population in zip(best, POPULATIONS, strict=True):
+        assert [*candidate["settings"]["time_headways"]] == [*population["time_headways"]]
+
+
+def test_both_halves_of_the_ensemble_have_all_levels() -> None:
+    assert len(SETTINGS) == 2 * SETTINGS_PER_HALF
+    for is_test in (False, True):
+        half = [each for each in SETTINGS if each.is_test is is_test]
+        for name, levels in LEVELS.items():
+            assert Counter(getattr(each, name) for each in half) == Counter(levels)
+
+
+@pytest.mark.parametrize("number", range(2 * SETTINGS_PER_HALF))
+def test_the_demand_of_a_setting_is_relative_to_its_capacity(number: int) -> None:
+    setting = SETTINGS[number]
+    scenario = setting.scenario(4000.0, setting.demand)
+    total = scenario.inflow + sum(ramp.inflow for ramp in scenario.ramps)
+    assert total == pytest.approx(4000.0 * setting.demand, abs=3.0)
+    assert scenario.trucks.share == setting.trucks
