@@ -165,10 +165,10 @@ def measure_candidate(number: int, workers: int) -> list[dict[str, Any]]:
     return [{"settings": settings, "episodes": measure_facts(settings, {}, tuning_seeds(CANDIDATE_SEEDS), workers)}]
 
 
-def measure_step(settings: Mapping[str, Any], step: float, workers: int) -> Table:
+def measure_step(settings: Mapping[str, Any], step: float, workers: int) -> dict[str, Table]:
     """Return the facts of human traffic on test seeds with a simulation step [s], and a control step of 1 s."""
     changes = {"simulation_step": step, "steps_per_control_step": round(1.0 / step)}
-    return measure_facts(settings, changes, make_test_seeds(FINAL_SEEDS), workers)
+    return {"episodes": measure_facts(settings, changes, make_test_seeds(FINAL_SEEDS), workers)}
 
 
 def measure_facts(
@@ -215,7 +215,7 @@ def total_deviation(rows: Table) -> float:
 
 def facts_table(folder: Path) -> pd.DataFrame:
     """Return each fact of the chosen human traffic beside its target and the source of the target."""
-    steps = {step: read_part(folder, BEST_PART)[f"{step:g} s"] for step in SIMULATION_STEPS}
+    steps = {step: read_part(folder, BEST_PART)[f"{step:g} s"]["episodes"] for step in SIMULATION_STEPS}
     table: Table = []
     for name, target in TARGETS.items():
         row: dict[str, Any] = {"fact": target.name, "target": "{:g} to {:g}".format(*target.accepted)}

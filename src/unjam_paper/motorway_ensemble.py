@@ -127,7 +127,7 @@ SETTINGS = _draw_settings()
 """the tuning half, then the test half"""
 
 
-def measure_capacity(number: int, workers: int) -> Table:
+def measure_capacity(number: int, workers: int) -> dict[str, Table]:
     """Return the facts of a setting with a demand that rises until traffic breaks down, one row for each seed.
 
     The flow before the breakdown is what the demand of the setting is relative to.
@@ -135,14 +135,14 @@ def measure_capacity(number: int, workers: int) -> Table:
     setting = SETTINGS[number]
     capacity = CAPACITY_GUESS * setting.traffic["lanes"]
     scenario = setting.scenario(capacity, MAX_DEMAND, **RISING_DEMAND)
-    return measure_scenario(scenario, tuning_seeds(CAPACITY_SEEDS), workers)
+    return {"episodes": measure_scenario(scenario, tuning_seeds(CAPACITY_SEEDS), workers)}
 
 
 def settings_table(folder: Path) -> pd.DataFrame:
     """Return all settings with the flow before a breakdown, its drop and the speed of waves."""
     capacities, table = read_part(folder, CAPACITY_PART), list[dict[str, Any]]()
     for setting in SETTINGS:
-        rows = capacities[str(setting.number)]
+        rows = capacities[str(setting.number)]["episodes"]
         facts = {
             TARGETS[name].name: str(estimate_cell(estimate(fact_values(rows, name)), TARGETS[name].digits))
             for name in ("highest_flow", "discharge", "capacity_drop", "wave_speed")
