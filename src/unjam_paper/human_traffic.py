@@ -222,6 +222,12 @@ def facts_table(folder: Path) -> pd.DataFrame:
         for step, rows in steps.items():
             row[f"step of {step:g} s"] = str(estimate_cell(estimate(fact_values(rows, name)), target.digits))
         table.append({**row, "source": target.source})
+    delays = {f"step of {step:g} s": estimate([each["delay"] for each in rows]) for step, rows in steps.items()}
+    cells = {step: str(estimate_cell(each, 0)) for step, each in delays.items()}
+    same = "within 10 % of each other"
+    table.append(
+        {"fact": "mean delay, with that at the entrance [s]", "target": same, **cells, "source": NO_VALUE_TEXT}
+    )
     return pd.DataFrame(table)
 
 
