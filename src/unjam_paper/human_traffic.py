@@ -225,9 +225,7 @@ def facts_table(folder: Path) -> pd.DataFrame:
     delays = {f"step of {step:g} s": estimate([each["delay"] for each in rows]) for step, rows in steps.items()}
     cells = {step: str(estimate_cell(each, 0)) for step, each in delays.items()}
     same = "within 10 % of each other"
-    table.append(
-        {"fact": "mean delay, with that at the entrance [s]", "target": same, **cells, "source": NO_VALUE_TEXT}
-    )
+    table.append({"fact": "mean delay with that at the entrance [s]", "target": same, **cells, "source": NO_VALUE_TEXT})
     return pd.DataFrame(table)
 
 
