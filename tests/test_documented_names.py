@@ -13,6 +13,8 @@ FOLDERS = ("src", "tests", "docs", "results", "examples")
 FILE = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]*\w)/?`")
 NAME = re.compile(r"`(?!unjam\.cdx\.json)(unjam(?:_paper)?(?:\.\w+)+)(?:\(\))?`")
 
+MODULE = re.compile(r"`(?:[\w-]+/)*(\w+\.py)`")
+"""a Python file, of which a table of the README may name the last part alone"""
 IMPORT = re.compile(r"from (unjam(?:_paper)?[\w.]*) import ([\w, ]+)")
 
 
@@ -31,6 +33,13 @@ def test_files_and_names_of_a_page_exist(page: Path) -> None:
     missing = [path for path in FILE.findall(text) if not (ROOT / path).exists()]
     missing += [name for name in NAME.findall(text) if not is_importable(name)]
     assert missing == []
+
+
+def test_python_files_that_the_readme_names_exist() -> None:
+    named = set(MODULE.findall((ROOT / "README.md").read_text(encoding="utf-8")))
+    existing = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    assert len(named) > 20
+    assert named - existing == set()
 
 
 @pytest.mark.parametrize("file", CODE, ids=lambda file: file.name)
