@@ -51,8 +51,9 @@ check: $(VENV)/.installed-dev
 bless: $(VENV)/.installed-dev
 	$(BIN)/python tests/golden/bless.py "$(WHY)"
 
+# PAGES="-D nb_execution_mode=off" leaves out the code of the pages
 docs: $(VENV)/.installed-dev
-	$(BIN)/python -m sphinx -q -E -W -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -q -E -W -b html $(PAGES) docs docs/_build/html
 	@echo docs/_build/html/index.html
 
 # Thousands of injected faults, half an hour: results/soak.json

@@ -304,3 +304,8 @@ def test_traffic_that_sumo_makes_otherwise_is_noted(tmp_path: Path) -> None:
         "road.sumocfg: has bicycle lanes, where SUMO repeats an episode only in a new process: travel times of equal "
         "seeds differ by about 0.1 %",
     ]
+
+
+def test_sources_of_speeds_that_only_motorways_have_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"roadside.source: 'cavs' is not allowed here; allowed: 'vehicles'"):
+        own(tmp_path, penetration_rate=0.5, **{"roadside.source": "cavs"})

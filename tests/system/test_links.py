@@ -71,6 +71,8 @@ CASES = {
     "runs remove": Case(["runs", "remove", "run", "--folder", ".", "--yes"], "run"),
 }
 SLOW = (
+    "resume",
+    "train",
     "search",
     "tune",
     "calibrate",

@@ -92,6 +92,8 @@ class UserNetwork(Scenario):
         except InputError as error:
             raise ValueError(str(error)) from None
         used = ", ".join(sorted(files.used_types))
+        if self.roadside.source != "vehicles":
+            raise ValueError(f"roadside.source: {self.roadside.source!r} is not allowed here; allowed: 'vehicles'")
         for name in self.cav_classes:
             if name not in ROAD_CLASSES:
                 raise ValueError(f"cav_classes: {name!r} is not allowed; allowed: {', '.join(ROAD_CLASSES)}")

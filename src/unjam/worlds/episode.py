@@ -118,8 +118,9 @@ def check_has_cavs(episode: Episode, driver: Driver) -> None:
 
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:
-    """Return whether a driver can drive a scenario: some need a loop."""
-    return scenario.is_closed or not driver.requirements(scenario.interface).needs_loop
+    """Return whether a driver can drive a scenario, if its time step is right: some need a loop, or a ramp."""
+    road = scenario.interface
+    return not driver.requirements(road)._replace(time_steps=frozenset()).unmet_reason(road)
 
 
 def add_reward_terms(episode: Episode, reward: Reward) -> Episode:

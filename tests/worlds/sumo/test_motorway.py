@@ -9,18 +9,19 @@ import pytest
 
 from tests.adapters.onnx_policies import linear, write
 from unjam.adapters import onnx_driver
-from unjam.drivers import Human
+from unjam.drivers import Human, PISaturation
 from unjam.drivers.car_following import AdaptiveACC
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.road_experts import AdvisorySpeed, Cruise, JamAhead
 from unjam.drivers.roadside import RoadsideSettings
 from unjam.measures.metrics import measure
+from unjam.scenarios import Ring
 from unjam.scenarios.motorway import ON_RAMP, Motorway
 from unjam.scenarios.motorway_vehicles import LaneChanging, Trucks
 from unjam.scenarios.road_control import RampMeter, SpeedLimitControl
 from unjam.worlds.batch.motorway.world import MotorwayBatch
-from unjam.worlds.episode import run_episode
+from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.motorway import MotorwayTraffic
@@ -375,3 +376,9 @@ def test_an_advised_speed_holds_on_its_section_only() -> None:
     state = state._replace(distance_to_merge=np.array([1500.0, 900.0, 100.0, -50.0]))
     accelerations, _ = driver.act(state, {})
     assert accelerations.tolist() == [100.0, -1.5, 100.0, 100.0]
+
+
+def test_advisory_speed_drives_where_ramps_are_and_no_default_comparison_stops_at_it() -> None:
+    assert can_drive(AdvisorySpeed(), ON_RAMP)
+    assert not can_drive(AdvisorySpeed(), Ring())
+    assert can_drive(PISaturation(time_step=0.5), Ring())  # a wrong time step is refused later, in words
