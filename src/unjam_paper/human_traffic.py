@@ -241,12 +241,15 @@ def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
         TARGETS[name].name: f"{value:.{TARGETS[name].digits}f}" if isfinite(value) else NO_VALUE_TEXT
         for name, value in mean_facts(candidate["episodes"]).items()
     }
-    changing = settings["lane_changing"]
+    changing = {
+        name: "{:g} to {:g}".format(*value) if isinstance(value, Sequence) else f"{value:g}"
+        for name, value in settings["lane_changing"].items()
+    }
     return {
         "deviation": f"{deviation:.2f}" if isfinite(deviation) else NO_VALUE_TEXT,
         "time headways [s]": "{:g} to {:g}".format(*settings["time_headways"]),
         "accelerations [m/s²]": "{:g} to {:g}".format(*settings["accelerations"]),
-        **{name.replace("_", " "): str(changing.get(name, NO_VALUE_TEXT)) for name in CHANGING_COLUMNS},
+        **{name.replace("_", " "): changing.get(name, NO_VALUE_TEXT) for name in CHANGING_COLUMNS},
         **facts,
     }
 
