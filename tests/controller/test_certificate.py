@@ -142,7 +142,7 @@ def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_pa
         verify_controller_file(file)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_certificate_of_another_controller_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
     file = written(tmp_path, filter_driver(FollowerStopper()))
     other = make_certificate(read_controller(file))

@@ -60,7 +60,7 @@ def agree(driver: Driver, stay: Trajectory) -> None:
     np.testing.assert_allclose(run_graph(part, driver, states), stay.applied_acceleration, rtol=0, atol=PARITY)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_policy_driver_and_graph_agree_on_a_whole_episode_of_the_ring(simulation: Simulation) -> None:
     expert = PISaturation()
     policy = make_policy(ResidualPolicy, inputs=observation_size(PARTS, expert))

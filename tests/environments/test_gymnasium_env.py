@@ -126,7 +126,7 @@ def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
     environment.close()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_on_an_own_network_the_first_that_the_share_picks_is_driven(tmp_path: Path) -> None:
     flow = '<flow id="car" type="car" route="along" begin="0" end="60" period="2"/>'
     road: Any = {"penetration_rate": 0.5, "horizon": 300}

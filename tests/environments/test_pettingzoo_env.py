@@ -60,7 +60,7 @@ def test_passes_the_seed_test_of_pettingzoo() -> None:
     parallel_seed_test(lambda: unjam.parallel_env("ring", **SHORT), num_cycles=10)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_on_an_own_network_cavs_are_called_in_order_of_entry(tmp_path: Path) -> None:
     flow = '<flow id="cav_1" type="car" route="along" begin="0" end="60" period="2"/>'
     file = str(straight(tmp_path, flow, length=300.0))

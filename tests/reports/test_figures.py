@@ -402,7 +402,7 @@ def test_cavs_of_the_merge_are_marked(tmp_path: Path) -> None:
     assert len(marks_of(ramp)) == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_trajectory_figure_of_a_user_network_shows_the_route(tmp_path: Path) -> None:
     episode = plot_episode_of(user_episode(tmp_path), "pi")
     (panel,) = panels_of(trajectory_figure([episode]))

@@ -102,7 +102,7 @@ def test_packaged_scenario_is_refused() -> None:
         make_request("ring", [0.1], 400, 0.02)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rows_of_selection_and_test_are_stored_separately(
     example_request: AssessmentRequest, answer: Assessment
 ) -> None:
@@ -141,7 +141,7 @@ def test_document_equals_the_file_and_has_all_results(answer: Assessment) -> Non
     (answer.page.parent / "assessment.json").write_text(json.dumps(written))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_result_does_not_depend_on_the_number_of_workers(
     example_request: AssessmentRequest, answer: Assessment, tmp_path: Path
 ) -> None:

@@ -112,7 +112,7 @@ def test_graph_is_in_the_controller_and_in_its_own_file(run: Path, tmp_path: Pat
     assert described == plain
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_graph_describes_itself_and_drives_as_the_controller(run: Path, tmp_path: Path) -> None:
     done = export_controller(run, tmp_path / "ring.unjam", onnx=True)
     assert done.graph is not None

@@ -164,7 +164,7 @@ def test_other_seed_gives_another_run(uninterrupted_run: Path, tmp_path: Path, l
     assert progress(tmp_path / "other")[0]["return_mean"] != progress(uninterrupted_run)[0]["return_mean"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_number_of_workers_does_not_change_the_result(uninterrupted_run: Path, tmp_path: Path) -> None:
     with WorkerPool(2) as two:
         learn_with(two, tmp_path / "two", small_config(steps=4 * STEPS, workers=2))
@@ -242,7 +242,7 @@ def test_final_validation_does_not_change_learning(tmp_path: Path, learn: Learn)
     assert controller == other
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_run_without_a_checkpoint_starts_again(uninterrupted_run: Path, tmp_path: Path, learn: Learn) -> None:
     folder, config = tmp_path / "run", small_config(steps=4 * STEPS)
     with pytest.raises(Stop):
@@ -261,7 +261,7 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 KILLED, *OTHERS = DAMAGE
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [KILLED, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_leftovers_of_a_crash_do_not_change_the_result(
     uninterrupted_run: Path, tmp_path: Path, name: str, learn: Learn

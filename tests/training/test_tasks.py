@@ -171,7 +171,7 @@ def test_each_task_is_evaluated_in_its_own_folder(tmp_path: Path) -> None:
     assert "comparison of 2 results" in page
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("agent", "exploration"), [("trpo", "per_step"), ("trpo", "antithetic"), ("ppo", "antithetic")]
 )

@@ -191,7 +191,7 @@ def test_progress_is_reported_for_each_task() -> None:
     assert any(task == 0 and 0 < steps < 15_000 for task, steps in reported)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "how",
     [signal.SIGKILL, *(pytest.param(other, marks=pytest.mark.slow) for other in (signal.SIGSEGV, signal.SIGSTOP))],

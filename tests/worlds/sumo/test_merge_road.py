@@ -231,7 +231,7 @@ def test_from_an_empty_road_human_traffic_flows_freely(human: list[Episode]) -> 
     assert min(episode.arrivals for episode in free) > max(episode.arrivals for episode in human)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_driver_collides() -> None:
     for driver in (Constant(1.0), Constant(-0.1)):
         episodes_of(driver, range(2), horizon=200, penetration_rate=0.3)

@@ -270,7 +270,7 @@ def test_branches_and_demand_peak_are_recorded(capped: Episode) -> None:
     assert all((np.diff(stay.states.distance_to_merge) <= 1e-9).all() for stay in stays)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_cav_with_a_cap_still_brakes_as_hard_as_its_own_acc(sumo: SumoBackend) -> None:
     """SUMO limits vehicles with a commanded speed to comfortable braking: they would run into the tail of a jam."""
     road = replace(ON_RAMP, penetration_rate=0.3, horizon=800)

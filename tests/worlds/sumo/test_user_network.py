@@ -81,7 +81,7 @@ def steps_on_road(episode: Any, name: str) -> int:
     return int((~np.isnan(episode.speeds[:, column])).sum())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_penetration_rate_and_cav_types_select_the_cavs(tmp_path: Path) -> None:
     file = game(tmp_path, "ramp")
     episode = run_episode(scenario_of(file, penetration_rate=0.3, horizon=600), Human(), (0,))
@@ -367,7 +367,7 @@ def test_a_vehicle_that_sumo_refuses_later_is_reported_in_one_line(tmp_path: Pat
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_error_of_sumo_during_the_episode_is_reported_in_one_line(tmp_path: Path) -> None:
     flow = '<flow id="f" type="car" from="road" to="road" begin="0" end="690" period="9"/>'
     late = flow + '<trip id="w" type="car" from="road" to="road" depart="690"/>'  # so far SUMO reads ahead
