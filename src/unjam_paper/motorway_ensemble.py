@@ -23,6 +23,7 @@ from unjam_paper.study import Study, Table
 
 SETTINGS_PER_HALF = 12
 DESIGN_SEED = 20261128
+"""seed of the random design"""
 CAPACITY_SEEDS = 5
 """number of episodes in which the capacity of a setting is measured"""
 RAMP_SHARE = 0.15

@@ -59,7 +59,7 @@ class LaneChanging:
     overtaking_right: tuple[Share, Share] | None = None
     """probability of overtaking on the right; default 0"""
     uncooperative_share: Share = 0.0
-    """share of drivers who neither change lanes nor slow down for others"""
+    """share of drivers that neither change lanes nor slow down for others"""
 
     @model_validator(mode="after")
     def _check_intervals(self) -> "LaneChanging":
@@ -107,7 +107,7 @@ class Trucks:
         return self
 
     def draw(self, generator: np.random.Generator, model: str, lane_changing: LaneChanging) -> VehicleType:
-        """Return a truck with its driver, who changes lanes as those of cars, but not for a higher speed."""
+        """Return a truck; its driver changes lanes as drivers of cars do, but not for a higher speed."""
         parameters = dict(lane_changing.draw(generator)) | {LC2013_NAMES["speed_gain"]: 0.0}
         return VehicleType(
             model=model,

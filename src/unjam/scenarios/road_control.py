@@ -19,6 +19,8 @@ class SpeedLimitControl:
 
     Integral control of the density, mainstream traffic flow control as in Carlson, Papamichail and Papageorgiou 2011,
     IEEE Trans. Intell. Transp. Syst. 12:1261-1276. Vehicles accelerate again before they reach the merging section.
+    It is an alternative to controllers: only for human drivers and `cruise`, since the set-speed caps of other drivers
+    and the limit would replace each other. The sections with limits of two ramps must not overlap.
     """
 
     active: bool = False
