@@ -19,8 +19,7 @@ class SpeedLimitControl:
 
     Integral control of the density, mainstream traffic flow control as in Carlson, Papamichail and Papageorgiou 2011,
     IEEE Trans. Intell. Transp. Syst. 12:1261-1276. Vehicles accelerate again before they reach the merging section.
-    It is an alternative to controllers: only for human drivers and `cruise`, since the set-speed caps of other drivers
-    and the limit would replace each other. The sections with limits of two ramps must not overlap.
+    Where the limits of two ramps or the cap of a CAV hold at once, the lowest one does.
     """
 
     active: bool = False
@@ -50,8 +49,8 @@ class SpeedLimitControl:
 class RampMeter:
     """A ramp meter, which lets vehicles pass one by one: ALINEA, on density.
 
-    It is off at its highest rate, and if the queue would reach the entrance of the ramp. Papageorgiou, Hadj-Salem and
-    Blosseville 1991, Transp. Res. Rec. 1320:58-64.
+    At its highest rate it is off. While the queue comes close to the entrance of the ramp it has this rate.
+    Papageorgiou, Hadj-Salem and Blosseville 1991, Transp. Res. Rec. 1320:58-64.
     """
 
     active: bool = False

@@ -351,6 +351,52 @@ def test_a_ramp_meter_does_not_let_its_queue_reach_the_entrance(sumo: SumoBacken
     assert episode.backlog.max() <= 3
 
 
+def test_vehicles_do_not_brake_hard_for_a_speed_limit(sumo: SumoBackend) -> None:
+    control = SpeedLimitControl(active=True, target_density=1.0, gain=1.0, length=800.0, acceleration_length=500.0)
+    braking = [
+        measure(run_episode(replace(CONTROLLED, inflow=600.0, speed_limit_control=each), Human(), (3,), backend=sumo))
+        for each in (control, replace(control, active=False))
+    ]
+    assert braking[0]["mean_speed"] < braking[1]["mean_speed"] - 1.0
+    assert braking[0]["human_max_braking"] < braking[1]["human_max_braking"] + 0.5
+
+
+def test_the_lowest_of_a_speed_limit_and_the_cap_of_a_cav_holds(simulation: Simulation) -> None:
+    control = SpeedLimitControl(active=True, target_density=1.0, gain=1.0, min_limit=15.0)
+    traffic = motorway(simulation, replace(BUSY, speed_limit_control=control))
+    for _ in range(120):
+        traffic.advance(Command(np.full(traffic.cav_count, -1.0)))
+    for _ in range(3):
+        slow = libsumo.vehicle.getSpeed(traffic.cav_ids[-1])
+        traffic.advance(Command(np.full(traffic.cav_count, -1.0)))
+        assert libsumo.vehicle.getSpeed(traffic.cav_ids[-1]) <= max(0.2, slow - 0.9)
+    for _ in range(60):
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+    limited = [
+        name
+        for name in libsumo.edge.getLastStepVehicleIDs("motorway")
+        if 600.0 < libsumo.vehicle.getLanePosition(name) < 1400.0
+    ]
+    assert set(limited) & set(traffic.cav_ids)
+    assert max(map(libsumo.vehicle.getSpeed, limited)) < 15.5
+
+
+def test_a_collision_among_human_drivers_is_counted_and_ends_nothing(
+    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    traffic = motorway(simulation)
+    for _ in range(60):
+        traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+    humans = [name for name in libsumo.vehicle.getIDList() if name not in traffic.cav_ids][:2]
+    monkeypatch.setattr(simulation, "colliding_vehicles", lambda: humans)
+    traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+    assert not traffic.has_crashed
+    assert len(traffic._vehicles.collided) == 2
+    monkeypatch.setattr(simulation, "colliding_vehicles", lambda: [humans[0], traffic.cav_ids[0]])
+    traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
+    assert traffic.has_crashed
+
+
 def test_a_speed_limit_holds_upstream_while_the_density_is_high(simulation: Simulation) -> None:
     control = SpeedLimitControl(active=True, target_density=1.0, gain=1.0, length=800.0, acceleration_length=500.0)
     traffic = motorway(simulation, replace(CONTROLLED, speed_limit_control=control))

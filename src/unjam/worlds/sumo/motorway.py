@@ -17,7 +17,7 @@ from unjam.worlds.open_road_log import TrackedLeader
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.inputs import motorway_inputs
 from unjam.worlds.sumo.open_road import MultiLaneTraffic, neighbor_state
-from unjam.worlds.sumo.road_control import RampControl
+from unjam.worlds.sumo.road_control import ControlledVehicles, RampControl
 
 
 class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
@@ -43,7 +43,9 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
             zip(self._geometry.ramps, self._geometry.route_names[1:], strict=True),
         )
         is_controlled = scenario.speed_limit_control.active or scenario.ramp_meter.active
-        self._ramp_controls = [RampControl(self._simulation, scenario, *ramp) for ramp in ramps if is_controlled]
+        self._ramp_controls = [
+            RampControl(self._simulation, self._speed_caps, scenario, *ramp) for ramp in ramps if is_controlled
+        ]
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
         """Find leaders and followers from the vehicles on SUMO's lanes, which form lanes of the whole road."""
@@ -71,7 +73,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
     def _command_humans(self) -> None:
         """Let the road operator control speed limits and meters."""
         for control in self._ramp_controls:
-            control.act(self._names, self._lane, self._position)
+            control.act(ControlledVehicles(self._names, self._lane, self._position, self._speed, self._length))
 
     def _names_and_speeds(self) -> tuple[Sequence[str], Floats]:
         return self._names, self._speed
@@ -136,6 +138,14 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
 
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
         return [state for _, state in self._tracked_leaders(names)]
+
+    def _collisions(self) -> tuple[Sequence[str], bool]:
+        """Return the vehicles that collided in the last step; the episode ends if a controlled CAV is one of them.
+
+        Collisions among human drivers are those of their model: they are counted, and traffic goes on.
+        """
+        colliding, _ = super()._collisions()
+        return colliding, self.is_controlled and not self.road.cav_ids.isdisjoint(colliding)
 
     def _is_uncapped(self, name: str) -> bool:
         """Whether its lane, or an adjacent one, closes: vehicles make room for each other in this section."""

@@ -19,6 +19,7 @@ from unjam.worlds.road_world import RoadScene
 from unjam.worlds.sumo.inputs import lane_change_parameters
 from unjam.worlds.sumo.networks import network_file, network_geometry
 from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.speed_caps import SpeedCaps
 from unjam.worlds.sumo.traffic import OpenRoadT, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
 
@@ -303,8 +304,7 @@ class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
     """Common part of the roads with lanes, on which the CAV's own ACC may carry out commands."""
 
     def _prepare(self) -> None:
-        self._uncapped_max_speeds: dict[str, float] = {}
-        """maximum speed without the cap, of CAVs that have a set-speed cap [m/s]"""
+        self._speed_caps = SpeedCaps(self._simulation)
         self._time_gaps: dict[str, float] = {}
         """current time gap of CAVs with a time gap command to their ACC [s]"""
 
@@ -348,8 +348,4 @@ class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
         step, limits = self.scenario.simulation_step, self._acc_limits(names)
         caps = cruise.set_speed(current, targets, self.limits.highest, step, limits)
         for name, cap in zip(names, caps.tolist(), strict=True):
-            if cap < inf and not self._is_uncapped(name):
-                max_speed = self._uncapped_max_speeds.setdefault(name, simulation.max_speed(name))
-                simulation.set_max_speed(name, min(cap, max_speed))
-            elif name in self._uncapped_max_speeds:
-                simulation.set_max_speed(name, self._uncapped_max_speeds.pop(name))
+            self._speed_caps.set(name, "set speed", inf if self._is_uncapped(name) else cap)

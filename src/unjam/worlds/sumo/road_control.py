@@ -1,6 +1,7 @@
 """Variable speed limits and ramp meters of a motorway in SUMO."""
 
-from collections.abc import Sequence
+from math import inf
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,81 +11,99 @@ from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import RampGeometry
 from unjam.scenarios.road_control import MEASURED_DOWNSTREAM
 from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.sumo.speed_caps import SpeedCaps
 
-QUEUE_SPACING = 8.0
-"""length of the ramp that a queuing vehicle needs [m]"""
-BRAKING_DISTANCE = 80.0
+QUEUE_GAP = 3.0
+"""length of the ramp that a queuing vehicle needs in front of it [m]"""
+BRAKING_DISTANCE = 150.0
 """length of the ramp that stays free for vehicles that enter it at speed [m]"""
+LIMIT_DECELERATION = 1.0
+"""braking of vehicles towards a lower speed limit [m/s2]"""
+
+
+class ControlledVehicles(NamedTuple):
+    """The vehicles on the road; arrays have shape (vehicles,)."""
+
+    names: list[str]
+    lanes: NDArray[np.intp]
+    """lane index; 0 is that of the ramps"""
+    positions: Floats
+    """of front bumpers along the road [m]"""
+    speeds: Floats
+    """[m/s]"""
+    lengths: Floats
+    """[m]"""
 
 
 class RampControl:
     """The speed limit and the meter at one ramp."""
 
-    def __init__(self, simulation: Simulation, scenario: Motorway, ramp: RampGeometry, ramp_edge: str) -> None:
+    def __init__(
+        self, simulation: Simulation, speed_caps: SpeedCaps, scenario: Motorway, ramp: RampGeometry, ramp_edge: str
+    ) -> None:
         """Start with an unlimited speed and no metering."""
-        self._simulation, self._ramp, self._edge = simulation, ramp, ramp_edge
+        self._simulation, self._speed_caps, self._ramp, self._edge = simulation, speed_caps, ramp, ramp_edge
         self._limits, self._meter = scenario.speed_limit_control, scenario.ramp_meter
         self._lanes, self._speed_limit, self._step = scenario.lanes, scenario.speed_limit, scenario.simulation_step
         self._share, self._rate, self._limit = 1.0, self._meter.rates[1], scenario.speed_limit
-        self._max_speeds: dict[str, float] = {}
-        """maximum speeds of the vehicles that have a limit, without it [m/s]"""
         self._held: list[str] = []
         """vehicles that must stop at the meter, from the first one on"""
         self._known = set[str]()
         """vehicles of the ramp"""
         self._time, self._wait = 0.0, 0.0
 
-    def act(self, names: Sequence[str], lanes: NDArray[np.intp], positions: Floats) -> None:
-        """Measure and control in this simulation step; the arrays have lane and position [m] of each vehicle."""
+    def act(self, vehicles: ControlledVehicles) -> None:
+        """Measure and control in this simulation step."""
         self._time += self._step
         end = self._ramp.merge_end + MEASURED_DOWNSTREAM
-        is_measured = (lanes > 0) & (positions >= self._ramp.merge_start) & (positions < end)
+        positions = vehicles.positions
+        is_measured = (vehicles.lanes > 0) & (positions >= self._ramp.merge_start) & (positions < end)
         density = 1000.0 * float(is_measured.sum()) / (end - self._ramp.merge_start) / self._lanes
         if self._limits.active:
             if self._is_due(self._limits.interval):
                 self._share = self._limits.next_share(self._share, density, self._speed_limit)
                 self._limit = self._limits.limit(self._share, self._speed_limit)
-            self._limit_speeds(names, lanes, positions)
+            self._limit_speeds(vehicles)
         if self._meter.active:
             if self._is_due(self._meter.interval):
                 self._rate = self._meter.next_rate(self._rate, density)
-            self._meter_ramp(names, lanes, positions)
+            self._meter_ramp(vehicles)
 
     def _is_due(self, interval: float) -> bool:
         return self._time % interval < self._step - 1e-9
 
-    def _limit_speeds(self, names: Sequence[str], lanes: NDArray[np.intp], positions: Floats) -> None:
+    def _limit_speeds(self, vehicles: ControlledVehicles) -> None:
         """Limit the speeds of vehicles where the limit holds, and free those that have left."""
+        names, positions = vehicles.names, vehicles.positions
         limit_end = self._ramp.merge_start - self._limits.acceleration_length
-        is_limited = (lanes > 0) & (positions < limit_end) & (positions >= limit_end - self._limits.length)
+        is_limited = (vehicles.lanes > 0) & (positions < limit_end) & (positions >= limit_end - self._limits.length)
         is_limited &= self._limit < self._speed_limit
-        limited = {names[row] for row in np.flatnonzero(is_limited).tolist()}
+        # Drivers do not brake hard for a sign.
+        caps = np.maximum(self._limit, vehicles.speeds - LIMIT_DECELERATION * self._step)
+        limited = {names[row]: float(caps[row]) for row in np.flatnonzero(is_limited).tolist()}
         present = set(names)
-        for name in [name for name in self._max_speeds if name not in limited]:
-            max_speed = self._max_speeds.pop(name)
-            if name in present:
-                self._simulation.set_max_speed(name, max_speed)
-        for name in sorted(limited):
-            if name not in self._max_speeds:
-                self._max_speeds[name] = self._simulation.max_speed(name)
-            self._simulation.set_max_speed(name, min(self._limit, self._max_speeds[name]))
+        for name in self._speed_caps.capped(self):
+            if name not in present:
+                self._speed_caps.forget(name)
+            elif name not in limited:
+                self._speed_caps.set(name, self, inf)
+        for name, cap in limited.items():
+            self._speed_caps.set(name, self, cap)
 
-    def _meter_ramp(self, names: Sequence[str], lanes: NDArray[np.intp], positions: Floats) -> None:
-        """Let vehicles stop at the meter, and release one after the other."""
-        line = self._ramp.merge_start - self._meter.distance_to_merge
-        upstream = (lanes == 0) & (positions < line) & (positions >= self._ramp.start)
-        queue = [names[row] for row in np.flatnonzero(upstream).tolist()]
-        room = (line - self._ramp.start - BRAKING_DISTANCE) / QUEUE_SPACING
-        is_off = self._rate >= self._meter.rates[1] or len(queue) >= room
-        for name in queue:
-            if name not in self._known:
+    def _meter_ramp(self, vehicles: ControlledVehicles) -> None:
+        """Let vehicles stop at the meter, and release one after the other; faster if the queue is long."""
+        line, highest = self._ramp.merge_start - self._meter.distance_to_merge, self._meter.rates[1]
+        is_upstream = (vehicles.lanes == 0) & (vehicles.positions < line) & (vehicles.positions >= self._ramp.start)
+        queue_length = float((vehicles.lengths[is_upstream] + QUEUE_GAP).sum())
+        rate = highest if queue_length > line - self._ramp.start - BRAKING_DISTANCE else self._rate
+        is_off = self._rate >= highest and not self._held
+        for row in np.flatnonzero(is_upstream).tolist():
+            if (name := vehicles.names[row]) not in self._known:
                 self._known.add(name)
                 if not is_off:
                     self._simulation.stop_at(name, self._edge, line - self._ramp.start)
                     self._held.append(name)
         self._wait = max(0.0, self._wait - self._step)
-        released = len(self._held) if is_off else int(self._wait <= 0.0 and bool(self._held))
-        for name in self._held[:released]:
-            self._simulation.end_stop(name, self._edge, line - self._ramp.start)
-            self._wait = 3600.0 / self._rate
-        del self._held[:released]
+        if self._held and self._wait <= 0.0:
+            self._simulation.end_stop(self._held.pop(0), self._edge, line - self._ramp.start)
+            self._wait = 3600.0 / rate

@@ -197,19 +197,19 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
     def _allowed_speeds(self, names: Sequence[str]) -> Floats:
         """Return the speeds that the road allows to vehicles, whatever caps they have [m/s]; NaN off the road."""
         allowed = np.array(self._simulation.allowed_speeds(names), np.float64)
-        rows = [row for row, name in enumerate(names) if name in self._uncapped_max_speeds]
+        rows = [row for row, name in enumerate(names) if name in self._speed_caps.own_max_speeds]
         if rows:
             allowed[rows] = self._speeds_without_caps([names[row] for row in rows])
         return allowed
 
     def _speeds_without_caps(self, names: Sequence[str]) -> Floats:
         """Return the speeds that the road would allow to capped vehicles without their caps [m/s]."""
-        max_speeds = [self._uncapped_max_speeds[name] for name in names]
+        max_speeds = [self._speed_caps.own_max_speeds[name] for name in names]
         return np.fmin(max_speeds, self._simulation.uncapped_speeds(names))
 
     def _simulate(self, cav_speeds: dict[str, float]) -> None:
         super()._simulate(cav_speeds)
-        capped = [name for name in self._uncapped_max_speeds if name in self._vehicles.is_cav]
+        capped = [name for name in self._speed_caps.own_max_speeds if name in self._vehicles.is_cav]
         if not capped:
             return
         simulation, step = self._simulation, self.scenario.simulation_step
