@@ -13,10 +13,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from unjam.drivers import Human
+from unjam.measures.effect import TIME_METRIC
 from unjam.measures.metric_table import estimate_cell
+from unjam.measures.metrics import measure
 from unjam.measures.statistics import estimate
 from unjam.scenarios import Motorway, make_scenario
 from unjam.training.seeds import tuning_seeds
+from unjam.worlds.episode import run_episode
 from unjam_paper.human_traffic import POPULATIONS, TARGETS, fact_values, measure_scenario
 from unjam_paper.results_file import read_part
 from unjam_paper.study import Study, Table
@@ -34,10 +38,20 @@ ROADS: dict[str, dict[str, Any]] = {
     "two lanes": {"ramps": [{"position": 3000.0}]},
     "three lanes": {"lanes": 3, "ramps": [{"position": 3000.0}]},
     "two ramps": {"length": 5500.0, "ramps": [{"position": 3000.0}, {"position": 4500.0}]},
-    "lane drop": {"ramps": [{"position": 1500.0, "merging_length": 1500.0, "speed_limit": 27.78, "entry_speed": 22.0}]},
+    "lane drop": {
+        "ramps": [
+            {
+                **{"position": 2500.0, "merging_length": 500.0, "length": 2000.0},
+                **{"speed_limit": 27.78, "entry_speed": 22.0},
+            }
+        ]
+    },
 }
+"""a lane that closes is a long ramp at the speed of the motorway: vehicles leave it in its last 500 m"""
 CAPACITY_GUESS, MAX_DEMAND = 1900.0, 1.3
 """flow of a lane, and demand relative to it, up to which the demand rises to measure capacity [veh/h]"""
+FREE_DEMAND = 0.2
+"""demand relative to `CAPACITY_GUESS` at which vehicles hardly hinder each other"""
 RISING_DEMAND = {"peak": (1800.0, 2400.0), "peak_rise": 1800.0, "horizon": 2400, "penetration_rate": 0.0}
 LEVELS: dict[str, Sequence[Any]] = {
     "road": (*("two lanes",) * 5, *("three lanes",) * 3, *("two ramps",) * 2, *("lane drop",) * 2),
@@ -75,6 +89,16 @@ class EnsembleSetting:
     def is_test(self) -> bool:
         """Whether nothing is tuned on it."""
         return self.number >= SETTINGS_PER_HALF
+
+    @property
+    def capacity(self) -> float:
+        """The highest flow before a breakdown, of all lanes, as the study measured it [veh/h]."""
+        return CAPACITIES[self.number] * self.traffic["lanes"]
+
+    @property
+    def free_flow_time(self) -> float:
+        """The mean travel time at little demand, as the study measured it [s]."""
+        return FREE_FLOW_TIMES[self.number]
 
     @cached_property
     def traffic(self) -> dict[str, Any]:
@@ -124,6 +148,10 @@ def _draw_settings() -> list[EnsembleSetting]:
     return settings
 
 
+CAPACITIES: tuple[float, ...] = ()
+"""flow before a breakdown of each setting: means of the part `capacity` [veh/h per lane]"""
+FREE_FLOW_TIMES: tuple[float, ...] = ()
+"""travel time of each setting at little demand: the part `free-flow` [s]"""
 SETTINGS = _draw_settings()
 """the tuning half, then the test half"""
 
@@ -137,6 +165,14 @@ def measure_capacity(number: int, workers: int) -> dict[str, Table]:
     capacity = CAPACITY_GUESS * setting.traffic["lanes"]
     scenario = setting.scenario(capacity, MAX_DEMAND, **RISING_DEMAND)
     return {"episodes": measure_scenario(scenario, tuning_seeds(CAPACITY_SEEDS), workers)}
+
+
+def measure_free_flow(number: int, workers: int) -> dict[str, float]:
+    """Return the mean travel time of a setting with human drivers at little demand [s]."""
+    setting = SETTINGS[number]
+    capacity = CAPACITY_GUESS * setting.traffic["lanes"]
+    scenario = setting.scenario(capacity, FREE_DEMAND, peak=(0.0, 2400.0), penetration_rate=0.0)
+    return {"travel_time": measure(run_episode(scenario, Human(), tuning_seeds(1)[0]))[TIME_METRIC]}
 
 
 def settings_table(folder: Path) -> pd.DataFrame:
@@ -153,11 +189,13 @@ def settings_table(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-CAPACITY_PART = "capacity"
+CAPACITY_PART, FREE_FLOW_PART = "capacity", "free-flow"
 MOTORWAY_ENSEMBLE = Study(
     title="ensemble of motorways: the flow of each setting before it breaks down",
     make_parts=lambda study_folder, seeds: {
-        f"{CAPACITY_PART}/{each.number}": (measure_capacity, (each.number,)) for each in SETTINGS
+        f"{part}/{each.number}": (function, (each.number,))
+        for part, function in ((CAPACITY_PART, measure_capacity), (FREE_FLOW_PART, measure_free_flow))
+        for each in SETTINGS
     },
     minutes=30.0,
     tables={"settings": settings_table},

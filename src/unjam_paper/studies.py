@@ -17,6 +17,7 @@ from unjam_paper.do_no_harm import DO_NO_HARM
 from unjam_paper.feasible import ENVELOPE, feasible_study, on_ramp_study
 from unjam_paper.figure_6 import FIGURE_6
 from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY
+from unjam_paper.motorway_benchmark import MOTORWAY_BENCHMARK
 from unjam_paper.motorway_ensemble import MOTORWAY_ENSEMBLE
 from unjam_paper.robustness import FIGURE_10, ROBUSTNESS
 from unjam_paper.study import PAPER_ROADS, Study
@@ -58,6 +59,7 @@ STUDIES: dict[str, Study] = {
     "robustness": ROBUSTNESS,
     "human-traffic": HUMAN_TRAFFIC_STUDY,
     "motorway-ensemble": MOTORWAY_ENSEMBLE,
+    "motorway-benchmark": MOTORWAY_BENCHMARK,
     "feasible-ring": feasible_study(
         "feasible residual compared with the tuned expert, on the ring and the jammed ring",
         *(("ring", "ring-jammed"), 20.0),

@@ -149,7 +149,8 @@ class Study:
     make_runs: Callable[[int], list[PlannedRun]] = lambda seeds: []
     """returns the trainings for a number of seeds"""
     make_parts: Callable[[StudyFolder, int], dict[str, StudyPart]] = lambda study_folder, seeds: {}
-    """returns what is measured, by name of the part, or as PART/ENTRY; arguments: folder of all studies, seeds"""
+    """returns what can be measured with the results so far, by name of the part, or as PART/ENTRY; arguments: folder of
+    all studies, seeds"""
     write: Callable[[StudyFolder, int, Path], None] = lambda study_folder, seeds, folder: None
     """writes figures, and parts that need no measurement; the last argument is the folder of this study"""
     roads: tuple[str, ...] = ()
@@ -160,9 +161,15 @@ class Study:
     """tables of its page by name, made from its results"""
 
     def run(self, study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-        """Measure the parts that have no current results, and write everything into the study's folder."""
-        for name, part in measure_parts(folder / "parts", self.make_parts(study_folder, seeds), workers).items():
-            write_part(folder, name, part)
+        """Measure the parts that have no current results, and write everything into the study's folder.
+
+        Parts may follow from the results of others: `make_parts` is asked again until it names no more.
+        """
+        parts: dict[str, StudyPart] = {}
+        while (planned := self.make_parts(study_folder, seeds)) != parts:
+            parts = planned
+            for name, part in measure_parts(folder / "parts", parts, workers).items():
+                write_part(folder, name, part)
         self.write(study_folder, seeds, folder)
         for name, table in self.tables.items():
             atomic_write(folder / f"{name}.csv", table(folder).to_csv(index=False))

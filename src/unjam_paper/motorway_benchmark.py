@@ -1,0 +1,202 @@
+"""The motorway benchmark: methods tuned on one half of the ensemble, and compared on the other.
+
+Each candidate of a method first drives a few episodes, on settings that are assigned at random. The best of them then
+drive on all settings with a breakdown, and the best of these is the tuned one.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from unjam.controller import make_driver
+from unjam.measures.effect import FLOW_METRIC, TIME_METRIC
+from unjam.measures.feasibility import HARD_BRAKING_METRIC
+from unjam.measures.metric_table import HUMAN_LABEL
+from unjam.measures.metrics import measure
+from unjam.measures.traffic_facts import measure_traffic
+from unjam.scenarios import Motorway
+from unjam.training.evaluate import raise_failure
+from unjam.training.seeds import make_test_seeds, tuning_seeds
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
+from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES, METHODS, Candidate
+from unjam_paper.results_file import StudyPart, read_part
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
+
+STUDY_NAME = "motorway-benchmark"
+HUMAN_PART, TUNING_PART, FINAL_PART = "human", "tuning", "finals"
+HUMAN_SEEDS = 5
+"""number of episodes of human traffic on each setting of the tuning half"""
+FIRST_EPISODES = 4
+"""number of episodes of each candidate in the first round, on as many settings"""
+FINALISTS = 4
+"""number of candidates of each method in the second round"""
+PENETRATION_RATES = (0.05, 0.1)
+EPISODE_METRICS = (
+    *("seed", "status", TIME_METRIC, FLOW_METRIC, "collisions", "vehicles", "feasibility", "required_time_gap"),
+    *("has_lanes", "override_share", HARD_BRAKING_METRIC, "human_braking_beyond_3_5", "min_time_gap"),
+    *("share_short_time_gap", "cav_min_ttc", "cav_max_braking", "cut_in_max_braking"),
+)
+BREAKDOWN_SHARE = 0.5
+"""share of the episodes of human traffic with a breakdown from which on a setting counts as one with a breakdown"""
+Job = tuple[EnsembleSetting, Candidate, float, tuple[int, ...]]
+"""setting, candidate, penetration rate and seeds of an episode"""
+HUMAN = Candidate(HUMAN_LABEL, {})
+
+
+def make_job_scenario(setting: EnsembleSetting, candidate: Candidate, rate: float) -> Motorway:
+    """Return the scenario of an episode; nobody meters a lane that closes."""
+    no_meter = {"ramp_meter.active": False} if setting.road == "lane drop" else {}
+    changes = {"penetration_rate": rate, "roadside.source": "cavs", **candidate.settings, **no_meter}
+    return setting.scenario(setting.capacity, setting.demand, **changes)
+
+
+def run_jobs(jobs: Sequence[Job], workers: int) -> Table:
+    """Return the metrics of episodes on settings of the ensemble, one row for each."""
+    scenarios = [make_job_scenario(setting, candidate, rate) for setting, candidate, rate, _ in jobs]
+    tasks = [
+        EpisodeTask(scenario, make_driver(candidate.driver, scenario.control_step), seed)
+        for scenario, (_, candidate, _, seed) in zip(scenarios, jobs, strict=True)
+    ]
+
+    def episode_row(number: int, episode: Episode) -> dict[str, Any]:
+        row = measure(episode)
+        raise_failure([row])
+        setting, _, rate, _ = jobs[number]
+        demand = episode.backlog[-1] + len(episode.vehicle_ids)
+        return {
+            **{"setting": setting.number, "penetration_rate": rate},
+            **{name: row[name] for name in EPISODE_METRICS},
+            "waiting_at_entrances": float(episode.backlog[1:].sum()) * episode.control_step / demand,
+            "breakdown_time": measure_traffic(episode, scenarios[number], ramp_number=-1).breakdown_time,
+        }
+
+    with WorkerPool(workers) as pool:
+        return pool.run_and_map(tasks, episode_row)
+
+
+def measure_human(number: int, workers: int) -> Table:
+    """Return the episodes of human traffic on a setting of the tuning half."""
+    return run_jobs([(SETTINGS[number], HUMAN, 0.0, seed) for seed in tuning_seeds(HUMAN_SEEDS)], workers)
+
+
+def measure_candidate(method: str, number: int, settings: Sequence[int], workers: int) -> list[dict[str, Any]]:
+    """Return the first episodes of a candidate, on some of these settings, as a list of one row.
+
+    Candidates of different methods with the same number drive on the same settings, with the same seeds.
+    """
+    generator, seeds = np.random.default_rng([CANDIDATE_SEED, number]), tuning_seeds(HUMAN_SEEDS)
+    numbers = generator.permutation(np.array(settings))[:FIRST_EPISODES].tolist()
+    jobs = [
+        (SETTINGS[each], METHODS[method].candidate(number), PENETRATION_RATES[index % 2], seeds[(number + index) % 5])
+        for index, each in enumerate(numbers)
+    ]
+    return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
+
+
+def measure_finalist(method: str, number: int, settings: Sequence[int], workers: int) -> list[dict[str, Any]]:
+    """Return the episodes of a candidate on these settings with both penetration rates, as a list of one row."""
+    seeds = tuning_seeds(len(PENETRATION_RATES))
+    jobs = [
+        (SETTINGS[each], METHODS[method].candidate(number), rate, seed)
+        for each in settings
+        for rate, seed in zip(PENETRATION_RATES, seeds, strict=True)
+    ]
+    return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
+
+
+def measure_test(number: int, candidate: Candidate, rate: float, count: int, workers: int) -> dict[str, Table]:
+    """Return the episodes of a tuned method on a setting of the test half."""
+    jobs = [(SETTINGS[number], candidate, rate, seed) for seed in make_test_seeds(count)]
+    return {"episodes": run_jobs(jobs, workers)}
+
+
+def settings_with_breakdown(episodes: Table) -> list[int]:
+    """Return the numbers of the settings that break down in at least half of these episodes of human traffic."""
+    by_setting: dict[int, list[bool]] = {}
+    for row in episodes:
+        by_setting.setdefault(row["setting"], []).append(is_known(row["breakdown_time"]))
+    return sorted(number for number, each in by_setting.items() if np.mean(each) >= BREAKDOWN_SHARE)
+
+
+def is_known(value: float | None) -> bool:
+    """Return whether a value of a results file is a number."""
+    return value is not None and np.isfinite(value)
+
+
+def delay_change(episodes: Table, human: Table) -> float:
+    """Return the sum of the changes of travel time relative to human traffic, over the sum of its delays."""
+    times = {(row["setting"], str(row["seed"])): row[TIME_METRIC] for row in human}
+    changes, delays = list[float](), list[float]()
+    for row in episodes:
+        time = times[row["setting"], str(row["seed"])]
+        changes.append(row[TIME_METRIC] - time)
+        delays.append(time - SETTINGS[row["setting"]].free_flow_time)
+    return sum(changes) / sum(delays)
+
+
+def rank_candidates(rows: Table, human: Table, method: str) -> list[int]:
+    """Return the numbers of the candidates of a method, that with the largest reduction of delays first."""
+    changes = {row["candidate"]: delay_change(row["episodes"], human) for row in rows if row["method"] == method}
+    return sorted(changes, key=lambda number: changes[number])
+
+
+def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    """Return what can be measured with the results so far: first human traffic, then candidates, then finalists."""
+    folder = study_folder.folder / STUDY_NAME
+    parts: dict[str, StudyPart] = {
+        f"{HUMAN_PART}/{number}": (measure_human, (number,)) for number in range(SETTINGS_PER_HALF)
+    }
+    if not (folder / f"{HUMAN_PART}.json").is_file():
+        return parts
+    human = read_part(folder, HUMAN_PART)
+    settings = settings_with_breakdown(human)
+    parts |= {
+        f"{TUNING_PART}/{method} {number}": (measure_candidate, (method, number, settings))
+        for number in range(CANDIDATES)
+        for method in METHODS
+    }
+    if not (folder / f"{TUNING_PART}.json").is_file():
+        return parts
+    first_rows = read_part(folder, TUNING_PART)
+    return parts | {
+        f"{FINAL_PART}/{method} {number}": (measure_finalist, (method, number, settings))
+        for method in METHODS
+        for number in rank_candidates(first_rows, human, method)[:FINALISTS]
+    }
+
+
+def candidates_table(folder: Path) -> pd.DataFrame:
+    """Return the candidates of all methods and the change of delays in both rounds."""
+    human = read_part(folder, HUMAN_PART)
+    finals = {(row["method"], row["candidate"]): row for row in read_part(folder, FINAL_PART)}
+    table: Table = []
+    for row in read_part(folder, TUNING_PART):
+        candidate = METHODS[row["method"]].candidate(row["candidate"])
+        settings = ", ".join(f"{name} = {value}" for name, value in candidate.settings.items())
+        final = finals.get((row["method"], row["candidate"]))
+        table.append(
+            {
+                "method": row["method"],
+                "parameters": candidate.driver.partition(":")[2] + ("; " if settings else "") + settings,
+                "first round": _percent(delay_change(row["episodes"], human)),
+                "second round": _percent(delay_change(final["episodes"], human)) if final else NO_VALUE_TEXT,
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:+.0f} %"
+
+
+MOTORWAY_BENCHMARK = Study(
+    title="methods against delays on motorways, tuned on one half of an ensemble and compared on the other",
+    make_parts=make_parts,
+    minutes=100.0,
+    tables={"candidates": candidates_table},
+)
