@@ -1,7 +1,7 @@
 """The motorway benchmark: methods tuned on one half of the ensemble, and compared on the other.
 
-Each candidate of a method first drives a few episodes, on settings that are assigned at random. The best of them then
-drive on all settings with a breakdown, and the best of these is the tuned one.
+Each candidate of a method first drives a few episodes, on settings with a breakdown that are assigned at random. The
+best of them then drive on all settings of this half, and the best of these in both rounds is the tuned one.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,12 @@ from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
 
 STUDY_NAME = "motorway-benchmark"
-HUMAN_PART, TUNING_PART, FINAL_PART = "human", "tuning", "finals"
+HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
+ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
+CONTROLLER_METHOD = "jam-ahead"
+TEST_SETTINGS = range(SETTINGS_PER_HALF, len(SETTINGS))
+TEST_SEEDS, HARM_SEEDS = 20, 10
+"""number of episodes of each driver on a setting of the test half with and without a breakdown"""
 HUMAN_SEEDS = 5
 """number of episodes of human traffic on each setting of the tuning half"""
 FIRST_EPISODES = 4
@@ -98,21 +103,20 @@ def measure_candidate(method: str, number: int, settings: Sequence[int], workers
     return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
 
 
-def measure_finalist(method: str, number: int, settings: Sequence[int], workers: int) -> list[dict[str, Any]]:
-    """Return the episodes of a candidate on these settings with both penetration rates, as a list of one row."""
-    seeds = tuning_seeds(len(PENETRATION_RATES))
+def measure_finalist(method: str, number: int, workers: int) -> list[dict[str, Any]]:
+    """Return one episode of a candidate on each setting of the tuning half, as a list of one row."""
+    candidate, (seed, *_) = METHODS[method].candidate(number), tuning_seeds(1)
     jobs = [
-        (SETTINGS[each], METHODS[method].candidate(number), rate, seed)
-        for each in settings
-        for rate, seed in zip(PENETRATION_RATES, seeds, strict=True)
+        (setting, candidate, PENETRATION_RATES[(setting.number + number) % 2], seed)
+        for setting in SETTINGS[:SETTINGS_PER_HALF]
     ]
     return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
 
 
-def measure_test(number: int, candidate: Candidate, rate: float, count: int, workers: int) -> dict[str, Table]:
-    """Return the episodes of a tuned method on a setting of the test half."""
+def measure_test(label: str, candidate: Candidate, rate: float, number: int, count: int, workers: int) -> Table:
+    """Return episodes on a setting of the test half."""
     jobs = [(SETTINGS[number], candidate, rate, seed) for seed in make_test_seeds(count)]
-    return {"episodes": run_jobs(jobs, workers)}
+    return [{"driver": label, **row} for row in run_jobs(jobs, workers)]
 
 
 def settings_with_breakdown(episodes: Table) -> list[int]:
@@ -163,11 +167,45 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     if not (folder / f"{TUNING_PART}.json").is_file():
         return parts
     first_rows = read_part(folder, TUNING_PART)
-    return parts | {
-        f"{FINAL_PART}/{method} {number}": (measure_finalist, (method, number, settings))
+    parts |= {
+        f"{FINAL_PART}/{method} {number}": (measure_finalist, (method, number))
         for method in METHODS
         for number in rank_candidates(first_rows, human, method)[:FINALISTS]
     }
+    parts |= {
+        f"{TEST_HUMAN_PART}/{number}": (measure_test, (HUMAN_LABEL, HUMAN, 0.0, number, TEST_SEEDS))
+        for number in TEST_SETTINGS
+    }
+    if not all((folder / f"{part}.json").is_file() for part in (FINAL_PART, TEST_HUMAN_PART)):
+        return parts
+    tuned = tuned_drivers(first_rows, read_part(folder, FINAL_PART), human)
+    hard = settings_with_breakdown(read_part(folder, TEST_HUMAN_PART))
+    return parts | {
+        f"{TEST_PART}/{label} {100 * rate:g} % {number}": (
+            measure_test,
+            (label, candidate, rate, number, TEST_SEEDS if number in hard else HARM_SEEDS),
+        )
+        for number in TEST_SETTINGS
+        for rate in PENETRATION_RATES
+        for label, candidate in tuned.items()
+        if number in hard or label != OPPONENT
+    }
+
+
+def tuned_drivers(first_rows: Table, finals: Table, human: Table) -> dict[str, Candidate]:
+    """Return what is compared on the test half: the ACC alone, the tuned controller, and the best tuned opponent."""
+    first_episodes = {(row["method"], row["candidate"]): row["episodes"] for row in first_rows}
+
+    def change(row: dict[str, Any]) -> float:
+        return delay_change([*first_episodes[row["method"], row["candidate"]], *row["episodes"]], human)
+
+    own = min((row for row in finals if row["method"] == CONTROLLER_METHOD), key=change)
+    other = min((row for row in finals if row["method"] != CONTROLLER_METHOD), key=change)
+    best = {
+        label: METHODS[row["method"]].candidate(row["candidate"])
+        for label, row in ((CONTROLLER, own), (OPPONENT, other))
+    }
+    return {ACC_ALONE: METHODS["ACC"].candidate(0), **best}
 
 
 def candidates_table(folder: Path) -> pd.DataFrame:

@@ -114,6 +114,17 @@ class EnsembleSetting:
         }
         return {"length": 4000.0, "lanes": 2, **population, **changes, **road, "ramps": ramps}
 
+    @property
+    def unavoidable_delay(self) -> float:
+        """Mean delay of a vehicle if the bottleneck always discharged at its capacity: a queue without length [s]."""
+        scenario = self.scenario(self.capacity, self.demand)
+        seconds = np.arange(scenario.horizon * scenario.control_step)
+        is_peak = (seconds >= scenario.peak[0]) & (seconds < scenario.peak[1])
+        arrivals = self.capacity / 3600.0 * np.where(is_peak, self.demand, OFF_PEAK_SHARE)
+        excess = np.cumsum(arrivals - self.capacity / 3600.0)
+        queue = excess - np.minimum(np.minimum.accumulate(excess), 0.0)
+        return float(queue.sum() / arrivals.sum())
+
     def scenario(self, capacity: float, demand: float, **changes: Any) -> Motorway:
         """Return the scenario with a demand in the peak relative to `capacity`, that of the carriageway [veh/h]."""
         ramps, lanes = self.traffic["ramps"], self.traffic["lanes"]
@@ -148,9 +159,59 @@ def _draw_settings() -> list[EnsembleSetting]:
     return settings
 
 
-CAPACITIES: tuple[float, ...] = ()
+CAPACITIES: tuple[float, ...] = (
+    1878,
+    1847,
+    1547,
+    1680,
+    1856,
+    1766,
+    1706,
+    1578,
+    1758,
+    1694,
+    1621,
+    1579,
+    1738,
+    1638,
+    1674,
+    1693,
+    1733,
+    1760,
+    1716,
+    1758,
+    1814,
+    1543,
+    1507,
+    1895,
+)
 """flow before a breakdown of each setting: means of the part `capacity` [veh/h per lane]"""
-FREE_FLOW_TIMES: tuple[float, ...] = ()
+FREE_FLOW_TIMES: tuple[float, ...] = (
+    132.7,
+    141.0,
+    134.3,
+    134.5,
+    185.2,
+    136.5,
+    141.7,
+    134.3,
+    136.8,
+    135.8,
+    184.4,
+    135.2,
+    137.2,
+    136.8,
+    137.3,
+    142.6,
+    143.3,
+    186.5,
+    132.5,
+    180.3,
+    132.0,
+    133.7,
+    132.8,
+    133.7,
+)
 """travel time of each setting at little demand: the part `free-flow` [s]"""
 SETTINGS = _draw_settings()
 """the tuning half, then the test half"""

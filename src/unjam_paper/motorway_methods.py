@@ -53,14 +53,19 @@ class Method:
 def _draw(generator: np.random.Generator, values: Range) -> Any:
     """Return a value of a range with three digits, or one of a list."""
     if isinstance(values, tuple):
-        return float(f"{generator.uniform(*values):.3g}")
+        low, high = values
+        return float(f"{generator.uniform(low, high):.3g}")
     return values[int(generator.integers(len(values)))]
 
 
 LANE_CHANGING: dict[str, Range] = {"cruise.cooperation": [1.0, 1.0, None], "cruise.speed_gain": [0.0, None]}
 """how CAVs change lanes; two in three candidates cooperate"""
 METHODS = {
-    "ACC": Method("the ACC alone", "cruise", setting_ranges={"cruise.time_gap": (1.1, 2.2), **LANE_CHANGING}),
+    "ACC": Method(
+        "the ACC alone",
+        "cruise",
+        setting_ranges={"cruise.time_gap": (1.1, 2.2), "cruise.acceleration": (1.0, 2.5), **LANE_CHANGING},
+    ),
     "jam-ahead": Method(
         "CAVs near the mean speed ahead",
         "jam-ahead",
@@ -71,6 +76,7 @@ METHODS = {
             "margin_by_penetration": [0.0, 20.0],
             "min_speed": (5.0, 18.0),
             "all_lanes": ["false", "true"],
+            "free_speed_ratio": (0.5, 1.0),
         },
         {"cruise.time_gap": (1.1, 1.4), **LANE_CHANGING},
     ),

@@ -129,3 +129,9 @@ def test_a_network_may_see_who_drives_beside() -> None:
     near = state(20.0, 20.0)._replace(adjacent_gaps=gaps, adjacent_speeds=speeds)
     seen = driver.observation(near, driver.initial_memory(1))
     np.testing.assert_allclose(seen, [[1.0, 0.0, -1.0, 0.0, 0.5, 5.0, -0.1, 2.0]])
+
+
+def test_it_does_not_slow_down_for_traffic_that_counts_as_free() -> None:
+    driver = replace(AT_ONCE, free_speed_ratio=0.7)
+    assert answer(driver, 25.0, 0.7 * 27.0 - 0.1, 500.0, 27.0) == -1.5
+    assert answer(driver, 25.0, 0.7 * 27.0 + 0.1, 500.0, 27.0) == UNBOUNDED_ACCELERATION

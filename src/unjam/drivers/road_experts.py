@@ -297,6 +297,8 @@ class JamAhead(FormulaDriver):
     """time constant of the approach to the cap [s]"""
     jam_speed_ratio: Positive = 0.75
     """share of the allowed speed below which the mean ahead counts as a jam, on roads without a map of ramps"""
+    free_speed_ratio: Positive | None = None
+    """with a map of ramps: share of the allowed speed at which traffic ahead is free, so that no cap is needed"""
 
     @model_validator(mode="after")
     def _check_section_order(self) -> "JamAhead":
@@ -318,7 +320,10 @@ class JamAhead(FormulaDriver):
         cap = xp.minimum(cap, state.allowed_speed)
         towards = clamp_min((cap - state.speed) / self.time_constant, -self.max_deceleration)
         if state.distance_to_merge is not None:
-            return xp.where(state.distance_to_merge > 0.0, towards, free), memory
+            is_capped = state.distance_to_merge > 0.0
+            if self.free_speed_ratio is not None:
+                is_capped = is_capped & (ahead < self.free_speed_ratio * state.allowed_speed)
+            return xp.where(is_capped, towards, free), memory
         if state.congestion is None:
             return free, memory
         congested = (state.congestion[..., sections] >= MIN_REPORTED_CONGESTION).any(-1)
