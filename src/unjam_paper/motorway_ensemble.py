@@ -237,7 +237,7 @@ def measure_free_flow(number: int, workers: int) -> dict[str, float]:
 
 
 def settings_table(folder: Path) -> pd.DataFrame:
-    """Return all settings with the flow before a breakdown, its drop and the speed of waves."""
+    """Return all settings with their flow before a breakdown, its drop, the speed of waves, and delays."""
     capacities, table = read_part(folder, CAPACITY_PART), list[dict[str, Any]]()
     for setting in SETTINGS:
         rows = capacities[str(setting.number)]["episodes"]
@@ -246,7 +246,9 @@ def settings_table(folder: Path) -> pd.DataFrame:
             for name in ("highest_flow", "discharge", "capacity_drop", "wave_speed")
         }
         factors = {each.name.replace("_", " "): getattr(setting, each.name) for each in fields(setting)[1:]}
-        table.append({"half": "test" if setting.is_test else "tuning", **factors, **facts})
+        times = {"free travel time [s]": setting.free_flow_time, "unavoidable delay [s]": setting.unavoidable_delay}
+        texts = {name: f"{value:.0f}" for name, value in times.items()}
+        table.append({"half": "test" if setting.is_test else "tuning", **factors, **facts, **texts})
     return pd.DataFrame(table)
 
 
