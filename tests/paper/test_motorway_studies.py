@@ -1,7 +1,7 @@
 """Studies of motorways: candidates of human traffic, their deviation from facts, and the ensemble of settings."""
 
 from collections import Counter
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import inf
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from unjam_paper.human_traffic import (
     make_candidate,
     total_deviation,
 )
-from unjam_paper.motorway_ensemble import LEVELS, SETTINGS, SETTINGS_PER_HALF
+from unjam_paper.motorway_ensemble import CAPACITY_PART, FREE_FLOW_PART, LEVELS, SETTINGS, SETTINGS_PER_HALF
 from unjam_paper.results_file import read_part
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -61,6 +61,25 @@ def test_both_halves_of_the_ensemble_have_all_levels() -> None:
         half = [each for each in SETTINGS if each.is_test is is_test]
         for name, levels in LEVELS.items():
             assert Counter(getattr(each, name) for each in half) == Counter(levels)
+
+
+def test_capacities_and_free_travel_times_are_those_of_the_results() -> None:
+    capacities = read_part(RESULTS / "motorway-ensemble.json", CAPACITY_PART)
+    times = read_part(RESULTS / "motorway-ensemble.json", FREE_FLOW_PART)
+    for setting in SETTINGS:
+        flows = [row["highest_flow"] for row in capacities[str(setting.number)]["episodes"]]
+        assert setting.capacity / setting.traffic["lanes"] == pytest.approx(sum(flows) / len(flows), abs=0.5)
+        assert setting.free_flow_time == pytest.approx(times[str(setting.number)]["travel_time"], abs=0.05)
+
+
+def test_no_delay_is_unavoidable_below_capacity_and_more_the_higher_the_demand() -> None:
+    delays = [replace(SETTINGS[0], demand=demand).unavoidable_delay for demand in (0.9, 1.0, 1.05, 1.15)]
+    assert delays[:2] == pytest.approx([0.0, 0.0])
+    # A queue of 5 % of the flow of 1,200 s grows to 60 s of flow, and dissolves with 40 % of it in 150 s.
+    flow_seconds = 0.5 * 60.0 * (1200.0 + 150.0)
+    vehicles_in_seconds_of_flow = 1.05 * 1200.0 + 0.6 * 1200.0
+    assert delays[2] == pytest.approx(flow_seconds / vehicles_in_seconds_of_flow, rel=0.01)
+    assert delays[3] > 3.0 * delays[2]
 
 
 @pytest.mark.parametrize("number", range(2 * SETTINGS_PER_HALF))
