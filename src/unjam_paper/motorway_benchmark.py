@@ -5,11 +5,9 @@ best of them then drive on all settings of this half, and the best of these in b
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.measures.effect import FLOW_METRIC, TIME_METRIC
@@ -24,12 +22,27 @@ from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
 from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES, METHODS, Candidate
+from unjam_paper.motorway_tables import (
+    ACC_ALONE,
+    CONTROLLER,
+    FINAL_PART,
+    HUMAN_PART,
+    OPPONENT,
+    PENETRATION_RATES,
+    TEST_HUMAN_PART,
+    TEST_PART,
+    TUNING_PART,
+    candidates_table,
+    comparison_table,
+    delay_change,
+    no_harm_table,
+    settings_with_breakdown,
+    summary_table,
+)
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
+from unjam_paper.study import Study, StudyFolder, Table
 
 STUDY_NAME = "motorway-benchmark"
-HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
-ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
 CONTROLLER_METHOD = "jam-ahead"
 TEST_SETTINGS = range(SETTINGS_PER_HALF, len(SETTINGS))
 TEST_SEEDS, HARM_SEEDS = 20, 10
@@ -40,14 +53,11 @@ FIRST_EPISODES = 4
 """number of episodes of each candidate in the first round, on as many settings"""
 FINALISTS = 4
 """number of candidates of each method in the second round"""
-PENETRATION_RATES = (0.05, 0.1)
 EPISODE_METRICS = (
     *("seed", "status", TIME_METRIC, FLOW_METRIC, "collisions", "vehicles", "feasibility", "required_time_gap"),
     *("has_lanes", "override_share", HARD_BRAKING_METRIC, "human_braking_beyond_3_5", "min_time_gap"),
     *("share_short_time_gap", "cav_min_ttc", "cav_max_braking", "cut_in_max_braking"),
 )
-BREAKDOWN_SHARE = 0.5
-"""share of the episodes of human traffic with a breakdown from which on a setting counts as one with a breakdown"""
 Job = tuple[EnsembleSetting, Candidate, float, tuple[int, ...]]
 """setting, candidate, penetration rate and seeds of an episode"""
 HUMAN = Candidate(HUMAN_LABEL, {})
@@ -119,30 +129,6 @@ def measure_test(label: str, candidate: Candidate, rate: float, number: int, cou
     return [{"driver": label, **row} for row in run_jobs(jobs, workers)]
 
 
-def settings_with_breakdown(episodes: Table) -> list[int]:
-    """Return the numbers of the settings that break down in at least half of these episodes of human traffic."""
-    by_setting: dict[int, list[bool]] = {}
-    for row in episodes:
-        by_setting.setdefault(row["setting"], []).append(is_known(row["breakdown_time"]))
-    return sorted(number for number, each in by_setting.items() if np.mean(each) >= BREAKDOWN_SHARE)
-
-
-def is_known(value: float | None) -> bool:
-    """Return whether a value of a results file is a number."""
-    return value is not None and np.isfinite(value)
-
-
-def delay_change(episodes: Table, human: Table) -> float:
-    """Return the sum of the changes of travel time relative to human traffic, over the sum of its delays."""
-    times = {(row["setting"], str(row["seed"])): row[TIME_METRIC] for row in human}
-    changes, delays = list[float](), list[float]()
-    for row in episodes:
-        time = times[row["setting"], str(row["seed"])]
-        changes.append(row[TIME_METRIC] - time)
-        delays.append(time - SETTINGS[row["setting"]].free_flow_time)
-    return sum(changes) / sum(delays)
-
-
 def rank_candidates(rows: Table, human: Table, method: str) -> list[int]:
     """Return the numbers of the candidates of a method, that with the largest reduction of delays first."""
     changes = {row["candidate"]: delay_change(row["episodes"], human) for row in rows if row["method"] == method}
@@ -208,33 +194,14 @@ def tuned_drivers(first_rows: Table, finals: Table, human: Table) -> dict[str, C
     return {ACC_ALONE: METHODS["ACC"].candidate(0), **best}
 
 
-def candidates_table(folder: Path) -> pd.DataFrame:
-    """Return the candidates of all methods and the change of delays in both rounds."""
-    human = read_part(folder, HUMAN_PART)
-    finals = {(row["method"], row["candidate"]): row for row in read_part(folder, FINAL_PART)}
-    table: Table = []
-    for row in read_part(folder, TUNING_PART):
-        candidate = METHODS[row["method"]].candidate(row["candidate"])
-        settings = ", ".join(f"{name} = {value}" for name, value in candidate.settings.items())
-        final = finals.get((row["method"], row["candidate"]))
-        table.append(
-            {
-                "method": row["method"],
-                "parameters": candidate.driver.partition(":")[2] + ("; " if settings else "") + settings,
-                "first round": _percent(delay_change(row["episodes"], human)),
-                "second round": _percent(delay_change(final["episodes"], human)) if final else NO_VALUE_TEXT,
-            }
-        )
-    return pd.DataFrame(table)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:+.0f} %"
-
-
 MOTORWAY_BENCHMARK = Study(
     title="methods against delays on motorways, tuned on one half of an ensemble and compared on the other",
     make_parts=make_parts,
     minutes=100.0,
-    tables={"candidates": candidates_table},
+    tables={
+        "candidates": candidates_table,
+        "comparison": comparison_table,
+        "summary": summary_table,
+        "no-harm": no_harm_table,
+    },
 )

@@ -9,21 +9,31 @@ import pytest
 from unjam.controller import make_driver
 from unjam.worlds.episode import can_drive
 from unjam_paper.motorway_benchmark import (
-    FINAL_PART,
     FINALISTS,
     HUMAN,
-    HUMAN_PART,
     HUMAN_SEEDS,
     STUDY_NAME,
-    TUNING_PART,
-    delay_change,
     make_job_scenario,
     make_parts,
     rank_candidates,
-    settings_with_breakdown,
 )
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF
 from unjam_paper.motorway_methods import CANDIDATES, METHODS
+from unjam_paper.motorway_tables import (
+    ACC_ALONE,
+    CONTROLLER,
+    FINAL_PART,
+    HUMAN_PART,
+    OPPONENT,
+    TEST_HUMAN_PART,
+    TEST_PART,
+    TUNING_PART,
+    comparison_table,
+    delay_change,
+    no_harm_table,
+    settings_with_breakdown,
+    summary_table,
+)
 from unjam_paper.results_file import write_part
 from unjam_paper.study import StudyFolder
 
@@ -101,3 +111,42 @@ def test_human_traffic_does_not_depend_on_methods() -> None:
     scenario = make_job_scenario(SETTINGS[0], HUMAN, 0.0)
     assert not scenario.speed_limit_control.active
     assert not scenario.ramp_meter.active
+
+
+def compared_rows(driver: str, number: int, delay: float, rate: float = 0.05) -> list[dict[str, Any]]:
+    common = {"driver": driver, "setting": number, "penetration_rate": rate, "status": "completed", "collisions": 0}
+    limits = {"min_time_gap": 1.2, "cav_min_ttc": 9.0, "cav_max_braking": 1.0, "override_share": 0.0, "has_lanes": True}
+    braking = {"human_braking_beyond_4_5": 10.0, "share_short_time_gap": 0.0, "cut_in_max_braking": 0.0}
+    values = {"outflow_veh_per_h": 3000.0, "waiting_at_entrances": 0.0, "required_time_gap": 1.0}
+    return [
+        {
+            **{**common, **limits, **braking, **values},
+            **{"seed": seed, "travel_time": SETTINGS[number].free_flow_time + delay + seed},
+        }
+        for seed in range(3)
+    ]
+
+
+def test_tables_compare_the_controller_with_all_others_on_the_same_seeds(tmp_path: Path) -> None:
+    drivers = {ACC_ALONE: 90.0, CONTROLLER: 70.0, OPPONENT: 80.0}
+    write_part(
+        tmp_path, TEST_HUMAN_PART, [*compared_rows("human", 12, 10.0, 0.0), *compared_rows("human", 13, 99.0, 0.0)]
+    )
+    rows = [
+        row for rate in (0.05, 0.1) for name, delay in drivers.items() for row in compared_rows(name, 13, delay, rate)
+    ]
+    rows += [
+        row for rate in (0.05, 0.1) for name in (ACC_ALONE, CONTROLLER) for row in compared_rows(name, 12, 9.0, rate)
+    ]
+    write_part(tmp_path, TEST_PART, rows)
+    comparison = comparison_table(tmp_path)
+    assert comparison["setting"].tolist() == [13, 13]
+    assert comparison["delay, against human"].str.split().str[0].tolist() == ["-29", "-29"]
+    assert comparison["delay, against ACC alone"].str.split().str[0].tolist() == ["-20", "-20"]
+    assert comparison["feasible"].tolist() == ["yes"] * 2
+    assert summary_table(tmp_path)["delay, against best opponent"].tolist() == ["-10 %", "-10 %"]
+    assert no_harm_table(tmp_path)["travel time"].tolist() == ["+0.0 [+0.0, +0.0] %"] * 2
+
+
+def test_tables_are_empty_before_the_test_half_has_been_driven(tmp_path: Path) -> None:
+    assert comparison_table(tmp_path).empty

@@ -1,0 +1,170 @@
+"""Tables of the motorway benchmark: candidates, and comparisons on the test half of the ensemble."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from unjam.measures.effect import FLOW_METRIC, TIME_METRIC
+from unjam.measures.feasibility import HARD_BRAKING_METRIC, overall_feasibility
+from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.statistics import Estimate, estimate, linearized_ratio, pair_rows
+from unjam.reports.results import replace_null
+from unjam_paper.motorway_ensemble import SETTINGS
+from unjam_paper.motorway_methods import METHODS
+from unjam_paper.results_file import read_part
+from unjam_paper.study import NO_VALUE_TEXT, Table
+
+HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
+ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
+"""what is compared on the test half, besides human traffic"""
+COMPARED = HUMAN_LABEL, ACC_ALONE, OPPONENT
+"""what the controller is compared with"""
+PENETRATION_RATES = (0.05, 0.1)
+BREAKDOWN_SHARE = 0.5
+"""share of the episodes of human traffic with a breakdown from which on a setting counts as one with a breakdown"""
+
+
+def settings_with_breakdown(episodes: Table) -> list[int]:
+    """Return the numbers of the settings that break down in at least half of these episodes of human traffic."""
+    by_setting: dict[int, list[bool]] = {}
+    for row in episodes:
+        by_setting.setdefault(row["setting"], []).append(is_known(row["breakdown_time"]))
+    return sorted(number for number, each in by_setting.items() if np.mean(each) >= BREAKDOWN_SHARE)
+
+
+def is_known(value: float | None) -> bool:
+    """Return whether a value of a results file is a number."""
+    return value is not None and np.isfinite(value)
+
+
+def delay_change(episodes: Table, human: Table) -> float:
+    """Return the sum of the changes of travel time relative to human traffic, over the sum of its delays."""
+    times = {(row["setting"], str(row["seed"])): row[TIME_METRIC] for row in human}
+    changes, delays = list[float](), list[float]()
+    for row in episodes:
+        time = times[row["setting"], str(row["seed"])]
+        changes.append(row[TIME_METRIC] - time)
+        delays.append(time - SETTINGS[row["setting"]].free_flow_time)
+    return sum(changes) / sum(delays)
+
+
+def candidates_table(folder: Path) -> pd.DataFrame:
+    """Return the candidates of all methods and the change of delays in both rounds."""
+    human = read_part(folder, HUMAN_PART)
+    finals = {(row["method"], row["candidate"]): row for row in read_part(folder, FINAL_PART)}
+    table: Table = []
+    for row in read_part(folder, TUNING_PART):
+        candidate = METHODS[row["method"]].candidate(row["candidate"])
+        settings = ", ".join(f"{name} = {value}" for name, value in candidate.settings.items())
+        final = finals.get((row["method"], row["candidate"]))
+        table.append(
+            {
+                "method": row["method"],
+                "parameters": "; ".join(filter(None, (candidate.driver.partition(":")[2], settings))),
+                "first round": f"{100 * delay_change(row['episodes'], human):+.0f} %",
+                "second round": f"{100 * delay_change(final['episodes'], human):+.0f} %" if final else NO_VALUE_TEXT,
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def comparison_table(folder: Path) -> pd.DataFrame:
+    """Return the comparison of the controller with others, for each setting with a breakdown and penetration rate.
+
+    Changes of delay are relative to the delay of human traffic.
+    """
+    table: Table = []
+    for number, rate, rows in _test_rows(folder):
+        if OPPONENT not in rows:
+            continue
+        setting, human, own = SETTINGS[number], rows[HUMAN_LABEL], rows[CONTROLLER]
+        delay = estimate([row[TIME_METRIC] - setting.free_flow_time for row in human])
+        table.append(
+            {
+                "setting": number,
+                "road": setting.road,
+                "demand": setting.demand,
+                "CAVs": f"{100 * rate:g} %",
+                "delay of human traffic [s]": str(estimate_cell(delay, 0)),
+                "of which unavoidable [s]": f"{setting.unavoidable_delay:.0f}",
+                "waiting at entrances [s]": f"{np.mean([row['waiting_at_entrances'] for row in human]):.0f}",
+                **{f"delay, against {label}": _percent(_delay_change(rows, label, number)) for label in COMPARED},
+                "flow": _percent(_relative_change(rows, FLOW_METRIC)),
+                "hard braking of human drivers": _percent(_relative_change(rows, HARD_BRAKING_METRIC)),
+                "feasible": overall_feasibility(own, human),
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def summary_table(folder: Path) -> pd.DataFrame:
+    """Return the mean changes over all settings with a breakdown; the intervals are over settings and their seeds."""
+    comparisons = [each for each in _test_rows(folder) if OPPONENT in each[2]]
+    table: Table = []
+    for rate in PENETRATION_RATES:
+        own = [(number, rows) for number, each, rows in comparisons if each == rate]
+        changes = {label: [_delay_change(rows, label, number).mean for number, rows in own] for label in COMPARED}
+        table.append(
+            {
+                "CAVs": f"{100 * rate:g} %",
+                "settings": len(own),
+                **{f"delay, against {label}": _percent(estimate(values)) for label, values in changes.items()},
+                "least reduction against human": f"{100 * max(changes[HUMAN_LABEL], default=np.nan):+.0f} %",
+                "flow": _percent(estimate([_relative_change(rows, FLOW_METRIC).mean for _, rows in own])),
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def no_harm_table(folder: Path) -> pd.DataFrame:
+    """Return travel time and flow relative to the ACC alone, on the settings without a breakdown."""
+    table: Table = []
+    for number, rate, rows in _test_rows(folder):
+        if OPPONENT not in rows:
+            row = {"setting": number, "road": SETTINGS[number].road, "demand": SETTINGS[number].demand}
+            time, flow = (_relative_change(rows, name, ACC_ALONE) for name in (TIME_METRIC, FLOW_METRIC))
+            row |= {"CAVs": f"{100 * rate:g} %", "travel time": _percent(time, 1), "flow": _percent(flow, 1)}
+            table.append(row)
+    return pd.DataFrame(table)
+
+
+def _test_rows(folder: Path) -> Iterator[tuple[int, float, dict[str, Table]]]:
+    """Yield each setting and penetration rate of the test half with the rows of its drivers."""
+    if not (folder / f"{TEST_PART}.json").is_file() and folder.is_dir():
+        return
+    rows = list(map(replace_null, [*read_part(folder, TEST_HUMAN_PART), *read_part(folder, TEST_PART)]))
+    for number in sorted({row["setting"] for row in rows}):
+        for rate in PENETRATION_RATES:
+            found: dict[str, Table] = {}
+            for row in rows:
+                if row["setting"] == number and row["penetration_rate"] in (0.0, rate):
+                    found.setdefault(row["driver"], []).append(row)
+            yield number, rate, found
+
+
+def _delay_change(rows: dict[str, Table], other: str, number: int) -> Estimate:
+    """Return the difference of delay to another driver, relative to the delay of human traffic."""
+    free, by_seed = SETTINGS[number].free_flow_time, {str(row["seed"]): row for row in rows[HUMAN_LABEL]}
+    values = np.array(
+        [
+            (own[TIME_METRIC] - each[TIME_METRIC], by_seed[str(own["seed"])][TIME_METRIC] - free)
+            for own, each in pair_rows(rows[CONTROLLER], rows[other])
+        ]
+    )
+    return estimate(linearized_ratio(values[:, 0], values[:, 1]).tolist())
+
+
+def _relative_change(rows: dict[str, Table], metric: str, other: str = HUMAN_LABEL) -> Estimate:
+    """Return the difference of a metric to another driver, relative to that driver's."""
+    pairs = pair_rows(rows[CONTROLLER], rows[other])
+    values = np.array([(own[metric], each[metric]) for own, each in pairs], np.float64)
+    if not values[:, 1].any():  # no vehicle brakes hard
+        return Estimate(np.nan, np.nan, np.nan, 0)
+    return estimate(linearized_ratio(values[:, 0] - values[:, 1], values[:, 1]).tolist())
+
+
+def _percent(share: Estimate, digits: int = 0) -> str:
+    percent = Estimate(100 * share.mean, 100 * share.low, 100 * share.high, share.count)
+    return f"{estimate_cell(percent, digits, sign='+')} %"
