@@ -220,7 +220,8 @@ SETTINGS = _draw_settings()
 def measure_capacity(number: int, workers: int) -> dict[str, Table]:
     """Return the facts of a setting with a demand that rises until traffic breaks down, one row for each seed.
 
-    The flow before the breakdown is what the demand of the setting is relative to.
+    The highest flow before the breakdown, or at any time if there is none, is what the demand of the setting is
+    relative to.
     """
     setting = SETTINGS[number]
     capacity = CAPACITY_GUESS * setting.traffic["lanes"]

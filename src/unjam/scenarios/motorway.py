@@ -18,6 +18,7 @@ from unjam.scenarios.motorway_vehicles import (
     LaneChanging,
     OrdinaryACC,
     Trucks,
+    check_intervals,
     draw_uniform,
 )
 from unjam.scenarios.road import Entry, VehicleType
@@ -141,10 +142,10 @@ class Motorway(Scenario):
 
     @model_validator(mode="after")
     def _check_settings(self) -> Self:
-        for name in ("time_headways", "accelerations", "decelerations", "minimum_gaps", "peak"):
-            low, high = getattr(self, name)
-            if not 0 <= low <= high or (high == 0 and name != "peak"):
-                raise ValueError(f"{name}: ({low:g}, {high:g}) is not allowed; allowed: 0 < low <= high")
+        check_intervals(self, "time_headways", "accelerations", "decelerations", "minimum_gaps")
+        begin, end = self.peak
+        if not 0 <= begin <= end:
+            raise ValueError(f"peak: ({begin:g}, {end:g}) is not allowed; allowed: 0 <= begin <= end")
         if self.peak_rise > self.peak[0]:
             raise ValueError(
                 f"peak_rise: {self.peak_rise:g} is not allowed; allowed: <= {self.peak[0]:g}, before the peak"
