@@ -38,14 +38,7 @@ ROADS: dict[str, dict[str, Any]] = {
     "two lanes": {"ramps": [{"position": 3000.0}]},
     "three lanes": {"lanes": 3, "ramps": [{"position": 3000.0}]},
     "two ramps": {"length": 5500.0, "ramps": [{"position": 3000.0}, {"position": 4500.0}]},
-    "lane drop": {
-        "ramps": [
-            {
-                **{"position": 2500.0, "merging_length": 500.0, "length": 2000.0},
-                **{"speed_limit": 27.78, "entry_speed": 22.0},
-            }
-        ]
-    },
+    "lane drop": {"ramps": [{**{"position": 2500.0, "merging_length": 500.0, "length": 2000.0}, "speed_limit": 27.78}]},
 }
 """a lane that closes is a long ramp at the speed of the motorway: vehicles leave it in its last 500 m"""
 CAPACITY_GUESS, MAX_DEMAND = 1900.0, 1.3
@@ -105,7 +98,9 @@ class EnsembleSetting:
         """Road and human traffic as settings of a scenario, without a demand."""
         population, road = POPULATIONS[self.population], ROADS[self.road]
         accelerations = tuple(round(each + self.acceleration, 2) for each in population["accelerations"])
-        ramps = [{"merging_length": self.merging_length, **ramp} for ramp in road["ramps"]]
+        # A queue may reach the entrance of a ramp.
+        common = {"merging_length": self.merging_length, "entry_speed": "last"}
+        ramps = [{**common, **ramp} for ramp in road["ramps"]]
         changes = {
             "accelerations": accelerations,
             "lane_changing": {**population["lane_changing"], "uncooperative_share": self.uncooperative_share},

@@ -53,8 +53,8 @@ class Ramp:
     """length of the ramp upstream of the acceleration lane [m]"""
     speed_limit: Positive = 22.22
     """speed limit of the ramp upstream of the acceleration lane [m/s]"""
-    entry_speed: Positive = 15.0
-    """speed of vehicles that enter the ramp [m/s]"""
+    entry_speed: Positive | Literal["last"] = 15.0
+    """speed of vehicles that enter the ramp [m/s]; `last`: that of the last vehicle on it, as at the entrance"""
     inflow: NonNegative = 500.0
     """demand in the peak [veh/h]"""
     off_peak_inflow: NonNegative = 250.0
@@ -176,7 +176,7 @@ class Motorway(Scenario):
             if geometry.merge_end > self.length - MIN_END_LENGTH:
                 allowed = f"<= {self.length - MIN_END_LENGTH - ramp.merging_length:g}, upstream of the end of the road"
                 raise ValueError(f"{name}.position: {position} is not allowed; allowed: {allowed}")
-            if ramp.entry_speed > (most := SPEED_FACTOR_RANGE[0] * ramp.speed_limit):
+            if ramp.entry_speed != "last" and ramp.entry_speed > (most := SPEED_FACTOR_RANGE[0] * ramp.speed_limit):
                 allowed = f"<= {most:g}, the speed of the slowest drivers"
                 raise ValueError(f"{name}.entry_speed: {ramp.entry_speed:g} is not allowed; allowed: {allowed}")
             upstream_end, upstream_part = geometry.merge_end, f"the merging section of {name}"

@@ -21,10 +21,7 @@ CALIBRATED_TYPE_TEMPLATE = "{}_of_driver_{}"
 """vehicle type of a car of the type `{}` with the calibrated driver of this number"""
 CAR_FOLLOWING_ATTRIBUTES = {"carFollowModel", "tau", "minGap", "sigma", "delta", "stepping"}
 """attributes of a vehicle type that belong to its car-following model: a CAV keeps all others"""
-COLLISION_OPTIONS = (
-    *("--collision.action", "warn", "--collision.mingap-factor", "0"),
-    *("--collision.check-junctions", "true"),
-)
+COLLISION_OPTIONS = ("--collision.mingap-factor", "0", "--collision.check-junctions", "true")
 """options of built-in roads, where a collision is physical contact and each is reported; users' networks have their own
 settings"""
 
@@ -69,10 +66,13 @@ def motorway_inputs(scenario: Scenario, road: MotorwayRoad) -> SumoInputs:
         lines.append(xml_element("vType", id=name, **common, **model))
         cav = {"id": CAV_TYPE_TEMPLATE.format(name), **common, **_cav_attributes(scenario)}
         lines.append(xml_element("vType", **cav))
-    return _built_road_inputs(road, lines)
+    # Vehicles that overlap would block each other; after a collision of a CAV the episode ends.
+    return _built_road_inputs(road, lines, collision_action="remove")
 
 
-def _built_road_inputs(road: BuiltRoad, types: list[str], humans: Collection[str] = ()) -> SumoInputs:
+def _built_road_inputs(
+    road: BuiltRoad, types: list[str], humans: Collection[str] = (), collision_action: str = "warn"
+) -> SumoInputs:
     """Return SUMO's inputs for a road with the XML of its vehicle types; `humans` has types of single vehicles."""
     lines = [*types]
     for route in road.routes:
@@ -95,6 +95,7 @@ def _built_road_inputs(road: BuiltRoad, types: list[str], humans: Collection[str
     xml = "\n".join(["<routes>", *lines, "</routes>"])
     # Vehicles are neither teleported out of a jam nor removed from the insertion backlog.
     options = ("--time-to-teleport", "-1", "--max-depart-delay", "-1", *COLLISION_OPTIONS)
+    options += ("--collision.action", collision_action)
     return SumoInputs(options, {"--net-file": (network_file(road.network),)}, xml, "--route-files")
 
 

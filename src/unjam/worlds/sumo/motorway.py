@@ -142,7 +142,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
     def _collisions(self) -> tuple[Sequence[str], bool]:
         """Return the vehicles that collided in the last step; the episode ends if a controlled CAV is one of them.
 
-        Collisions among human drivers are those of their model: they are counted, and traffic goes on.
+        Collisions among human drivers are those of their model: they are counted, and SUMO removes the vehicles.
         """
         colliding, _ = super()._collisions()
         return colliding, self.is_controlled and not self.road.cav_ids.isdisjoint(colliding)
