@@ -2,26 +2,34 @@
 
 import sys
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 import unjam
 from tests.test_architecture import EXAMPLES
 from unjam.controller.file import sha256_of_file
 from unjam.drivers import IDM, Constant, Human, PISaturation
+from unjam.drivers.road_experts import Cruise
 from unjam.drivers.user_driver import FileReference
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError, UnjamError
 from unjam.scenarios import Merge, Ring
 from unjam.scenarios.motorway import ON_RAMP
+from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
 from unjam.training.fingerprint import fingerprint
+from unjam.worlds.backend import DEFAULT_OPTIONS, Backend
+from unjam.worlds.batch.backend import BatchBackend
+from unjam.worlds.batch.run import run_batch
 from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 RING = Ring(horizon=60, length=(230, 230))
@@ -94,6 +102,34 @@ def test_a_scenario_that_a_backend_does_not_support_is_refused_with_its_reason(o
     ):
         with pytest.raises(InputError, match=r"scenario: (merge|figure-eight) is not a ring"):
             attempt()
+
+
+@dataclass(frozen=True)
+class Track(ClosedRoad):
+    """A kind of road that no backend of unjam knows."""
+
+
+@dataclass(frozen=True)
+class TrackScenario(Ring):
+    def draw(self, generator: np.random.Generator) -> ClosedRoad:
+        return Track(**vars(super().draw(generator)))
+
+
+@pytest.mark.parametrize(
+    ("backend", "scenario", "message"),
+    [
+        (SumoBackend(), TrackScenario(), "scenario: Track is not allowed as the road of SUMO; allowed: ClosedRoad"),
+        (BatchBackend(), Merge(), "scenario: .*merge"),
+    ],
+)
+def test_an_opened_backend_refuses_what_it_cannot_simulate(backend: Backend, scenario: Scenario, message: str) -> None:
+    with pytest.raises(InputError, match=message), backend.open(scenario, (0,), DEFAULT_OPTIONS):
+        pass
+
+
+def test_batches_of_motorways_refuse_other_arrays_than_those_of_numpy() -> None:
+    with pytest.raises(InputError, match=r"to_array: .*allowed: numpy\.asarray"):
+        run_batch([EpisodeTask(ON_RAMP, Cruise(), (0,))], torch.as_tensor, allow_statistical=True)
 
 
 def test_the_code_of_a_backend_belongs_to_the_fingerprint_of_a_training(own: str) -> None:

@@ -12,7 +12,7 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.backend import WorldOptions
+from unjam.worlds.backend import WorldOptions, check_support
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.ring.world import RingBatch
@@ -31,7 +31,8 @@ class BatchBackend:
 
     @contextmanager
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[RoadWorld]:
-        """Yield the road of an episode."""
+        """Yield the road of an episode; raise `InputError` if a batch cannot simulate it."""
+        check_support(self, scenario)
         world = SINGLE_ROADS[BATCH_KINDS[type(scenario)].world](scenario, seed)
         world.measured_fields = options.measured_fields
         yield world

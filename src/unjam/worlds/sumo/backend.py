@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
-from unjam.errors import EpisodeError, SumoInputError, UnjamError, as_unjam_error
+from unjam.errors import EpisodeError, InputError, SumoInputError, UnjamError, as_unjam_error
 from unjam.scenarios import SCENARIO_KINDS
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.scenarios.road import ClosedRoad, MergeRoad, Road, UserNetworkRoad
@@ -45,12 +45,7 @@ class SumoBackend(AbstractContextManager["SumoBackend"]):
         """Return why SUMO cannot simulate a scenario; empty if it can."""
         if type(scenario) in SCENARIO_KINDS.values():  # drawing the roads of large networks takes time
             return ""
-        road_class, allowed = (
-            type(scenario.draw_from_seed((0,))[0]),
-            ", ".join(each.__name__ for each in TRAFFIC_CLASSES),
-        )
-        reason = f"{road_class.__name__} is not allowed as the road of SUMO; allowed: {allowed}"
-        return "" if road_class in TRAFFIC_CLASSES else reason
+        return _unsupported_reason(scenario.draw_from_seed((0,))[0])
 
     @contextmanager
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[Traffic[Any]]:
@@ -102,9 +97,21 @@ def make_traffic(
 ) -> Traffic[Any]:
     """Put the vehicles of a seed on the road; nothing moves yet."""
     drawn = scenario.draw_from_seed(seed)
-    return TRAFFIC_CLASSES[type(drawn[0])](scenario, seed, simulation, options, drawn)
+    return _traffic_class(drawn[0])(scenario, seed, simulation, options, drawn)
 
 
 def sumo_inputs(scenario: Scenario, road: Road) -> SumoInputs:
     """Return the network and traffic of a scenario and its road, as SUMO reads them."""
-    return TRAFFIC_CLASSES[type(road)].inputs(scenario, road)
+    return _traffic_class(road).inputs(scenario, road)
+
+
+def _unsupported_reason(road: Road) -> str:
+    allowed = ", ".join(each.__name__ for each in TRAFFIC_CLASSES)
+    reason = f"{type(road).__name__} is not allowed as the road of SUMO; allowed: {allowed}"
+    return "" if type(road) in TRAFFIC_CLASSES else reason
+
+
+def _traffic_class(road: Road) -> type[Traffic[Any]]:
+    if reason := _unsupported_reason(road):
+        raise InputError(f"scenario: {reason}")
+    return TRAFFIC_CLASSES[type(road)]

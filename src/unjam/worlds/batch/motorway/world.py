@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from unjam.drivers.command import Command, batch_commanded_accelerations, commanded_time_gaps
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
+from unjam.errors import InputError
 from unjam.physics.arrays import Array, Floats
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.motorway import Motorway
@@ -102,7 +103,9 @@ class MotorwayBatch:
 
     @classmethod
     def from_tasks(cls, tasks: Sequence[EpisodeTask], to_array: ArrayFactory) -> Self:
-        """Return the motorways of tasks."""
+        """Return the motorways of tasks; raise `InputError` for arrays other than NumPy's."""
+        if to_array is not np.asarray:
+            raise InputError("to_array: batches of motorways are NumPy's; allowed: numpy.asarray")
         scenario, explore = cast(Motorway, tasks[0].scenario), [task.explore for task in tasks]
         return cls(scenario, [task.seed for task in tasks], explore=explore)
 
