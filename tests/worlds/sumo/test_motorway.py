@@ -20,6 +20,7 @@ from unjam.scenarios import Ring
 from unjam.scenarios.motorway import ON_RAMP, Motorway
 from unjam.scenarios.motorway_vehicles import LaneChanging, Trucks
 from unjam.scenarios.road_control import RampMeter, SpeedLimitControl
+from unjam.worlds.backend import WorldOptions
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
@@ -31,7 +32,7 @@ BUSY = replace(ON_RAMP, peak=(0.0, 240.0), penetration_rate=0.2, horizon=240)
 
 
 def motorway(simulation: Simulation, scenario: Motorway = BUSY) -> MotorwayTraffic:
-    traffic = make_traffic(scenario, (3,), simulation)
+    traffic = make_traffic(scenario, (3,), simulation, WorldOptions(LocalState._fields))
     assert isinstance(traffic, MotorwayTraffic)
     traffic.start(is_controlled=True)
     return traffic

@@ -96,29 +96,32 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         return {"positions": positions, "gaps": gaps, "lane_indices": self._geometry.lane_count - self._lane}
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
-        geometry, sections = self._geometry, self._road_sections
-        are_cavs = np.array([name in self.road.cav_ids for name in self._names], bool)
-        self._messages.send(
-            self._measurement.update(MeasuredVehicles(self._lane, self._position, self._speed, are_cavs))
-        )
+        geometry, fields = self._geometry, self.options.measured_fields
         rows = np.array([self._row_of_name[name] for name in names], np.intp)
         leaders, followers, position = self._leader[rows], self._follower[rows], self._position[rows]
         state = neighbor_state(rows, leaders, followers, self._position, self._speed, self._leader_gaps)
+        if "lane_speeds" in fields or "road_speeds" in fields:
+            lane_speeds, road_speeds = self._receive_speeds_ahead(rows)
+            state = state._replace(lane_speeds=lane_speeds, road_speeds=road_speeds)
+        if "adjacent_gaps" in fields or "adjacent_speeds" in fields:
+            adjacent_gaps, adjacent_speeds = self._adjacent_vehicles(rows)
+            state = state._replace(adjacent_gaps=adjacent_gaps, adjacent_speeds=adjacent_speeds)
         factors = np.array([self._speed_factors[name] for name in names])
-        lane_speeds, road_speeds = sections.speeds_ahead(self._messages.latest, self._lane[rows], position)
-        if self.road.roadside.source == "none":
-            lane_speeds = road_speeds = None
-        adjacent_gaps, adjacent_speeds = self._adjacent_vehicles(rows)
         return state._replace(
             route_position=position - geometry.origin,
             allowed_speed=geometry.speed_limits(self._lane, self._sections)[rows] * factors,
             distance_to_merge=geometry.distance_to_merge(self._lane[rows], position),
-            lane_speeds=lane_speeds,
-            road_speeds=road_speeds,
-            adjacent_gaps=adjacent_gaps,
-            adjacent_speeds=adjacent_speeds,
             penetration_rate=np.full(len(rows), sum(self._entered_is_cav) / max(len(self._entered_is_cav), 1)),
         )
+
+    def _receive_speeds_ahead(self, rows: NDArray[np.intp]) -> tuple[Floats | None, Floats | None]:
+        """Send the current measurement, and return the speeds ahead of the last message, on own lanes and all lanes."""
+        is_cav = np.array([name in self.road.cav_ids for name in self._names], bool)
+        vehicles = MeasuredVehicles(self._lane, self._position, self._speed, is_cav)
+        self._messages.send(self._measurement.update(vehicles))
+        if self.road.roadside.source == "none":
+            return None, None
+        return self._road_sections.speeds_ahead(self._messages.latest, self._lane[rows], self._position[rows])
 
     def _adjacent_vehicles(self, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return gaps and speeds of the neighbors on adjacent lanes, as in `LocalState`."""
