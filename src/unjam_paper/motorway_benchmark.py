@@ -5,6 +5,7 @@ best of them then drive on all settings of this half, and the best of these in b
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ from unjam_paper.motorway_tables import (
     HUMAN_PART,
     OPPONENT,
     PENETRATION_RATES,
+    SENSING_PART,
+    SENSITIVITY_PART,
     TEST_HUMAN_PART,
     TEST_PART,
     TUNING_PART,
@@ -36,6 +39,8 @@ from unjam_paper.motorway_tables import (
     comparison_table,
     delay_change,
     no_harm_table,
+    sensing_table,
+    sensitivity_table,
     settings_with_breakdown,
     summary_table,
 )
@@ -58,6 +63,31 @@ EPISODE_METRICS = (
     *("has_lanes", "override_share", HARD_BRAKING_METRIC, "human_braking_beyond_3_5", "min_time_gap"),
     *("share_short_time_gap", "cav_min_ttc", "cav_max_braking", "cut_in_max_braking"),
 )
+OTHER_SOURCES = ("vehicles", "detectors", "none")
+"""sources of the speeds ahead, besides the CAVs of the main comparison"""
+SENSING_SEEDS, CHANGE_SEEDS = 8, 10
+CHANGED_SETTING = 18
+"""the setting of which one assumption at a time is changed"""
+CHANGES: dict[str, tuple[float, dict[str, Any]]] = {
+    "nothing": (1.0, {}),
+    **{
+        f"cooperation of human drivers {value:g}": (
+            1.0,
+            {f"lane_changing.{name}": (value, value) for name in ("cooperation", "speed_cooperation")},
+        )
+        for value in (1.0, 0.8, 0.5, 0.0)
+    },
+    **{f"demand x {factor:g}": (factor, {}) for factor in (0.9, 0.95, 1.05)},
+    "human drivers accelerate with 1.5 to 2.5 m/s2": (1.0, {"accelerations": (1.5, 2.5)}),
+    "no trucks": (1.0, {"trucks.share": 0.0}),
+    "15 % trucks": (1.0, {"trucks.share": 0.15}),
+    "30 % ordinary ACC": (1.0, {"ordinary_acc.share": 0.3}),
+    **{
+        f"simulation step {step:g} s": (1.0, {"simulation_step": step, "steps_per_control_step": round(1.0 / step)})
+        for step in (0.25, 1.0)
+    },
+}
+"""factor of the demand and changed settings of each changed assumption"""
 Job = tuple[EnsembleSetting, Candidate, float, tuple[int, ...]]
 """setting, candidate, penetration rate and seeds of an episode"""
 HUMAN = Candidate(HUMAN_LABEL, {})
@@ -129,6 +159,20 @@ def measure_test(label: str, candidate: Candidate, rate: float, number: int, cou
     return [{"driver": label, **row} for row in run_jobs(jobs, workers)]
 
 
+def measure_change(name: str, controller: Candidate, workers: int) -> dict[str, Table]:
+    """Return the episodes of human traffic and of the controller on one setting with one changed assumption."""
+    demand_factor, changes = CHANGES[name]
+    setting, seeds = SETTINGS[CHANGED_SETTING], make_test_seeds(CHANGE_SEEDS)
+    setting = replace(setting, demand=demand_factor * setting.demand)
+    drivers = {HUMAN_LABEL: (HUMAN, 0.0), CONTROLLER: (controller, PENETRATION_RATES[0])}
+    return {
+        label: run_jobs(
+            [(setting, replace(each, settings={**each.settings, **changes}), rate, seed) for seed in seeds], workers
+        )
+        for label, (each, rate) in drivers.items()
+    }
+
+
 def rank_candidates(rows: Table, human: Table, method: str) -> list[int]:
     """Return the numbers of the candidates of a method, that with the largest reduction of delays first."""
     changes = {row["candidate"]: delay_change(row["episodes"], human) for row in rows if row["method"] == method}
@@ -166,6 +210,14 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
         return parts
     tuned = tuned_drivers(first_rows, read_part(folder, FINAL_PART), human)
     hard = settings_with_breakdown(read_part(folder, TEST_HUMAN_PART))
+    own = tuned[CONTROLLER]
+    sensing = {source: replace(own, settings={**own.settings, "roadside.source": source}) for source in OTHER_SOURCES}
+    parts |= {
+        f"{SENSING_PART}/{source} {number}": (measure_test, (source, each, PENETRATION_RATES[0], number, SENSING_SEEDS))
+        for source, each in sensing.items()
+        for number in hard
+    }
+    parts |= {f"{SENSITIVITY_PART}/{name}": (measure_change, (name, own)) for name in CHANGES}
     return parts | {
         f"{TEST_PART}/{label} {100 * rate:g} % {number}": (
             measure_test,
@@ -203,5 +255,7 @@ MOTORWAY_BENCHMARK = Study(
         "comparison": comparison_table,
         "summary": summary_table,
         "no-harm": no_harm_table,
+        "sensing": sensing_table,
+        "sensitivity": sensitivity_table,
     },
 )

@@ -13,10 +13,11 @@ from unjam.measures.statistics import Estimate, estimate, linearized_ratio, pair
 from unjam.reports.results import replace_null
 from unjam_paper.motorway_ensemble import SETTINGS
 from unjam_paper.motorway_methods import METHODS
-from unjam_paper.results_file import read_part
+from unjam_paper.results_file import read_part, read_parts
 from unjam_paper.study import NO_VALUE_TEXT, Table
 
 HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
+SENSING_PART, SENSITIVITY_PART = "sensing", "sensitivity"
 ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
 """what is compared on the test half, besides human traffic"""
 COMPARED = HUMAN_LABEL, ACC_ALONE, OPPONENT
@@ -103,7 +104,7 @@ def summary_table(folder: Path) -> pd.DataFrame:
     """Return the mean changes over all settings with a breakdown; the intervals are over settings and their seeds."""
     comparisons = [each for each in _test_rows(folder) if OPPONENT in each[2]]
     table: Table = []
-    for rate in PENETRATION_RATES:
+    for rate in PENETRATION_RATES if comparisons else ():
         own = [(number, rows) for number, each, rows in comparisons if each == rate]
         changes = {label: [_delay_change(rows, label, number).mean for number, rows in own] for label in COMPARED}
         table.append(
@@ -130,9 +131,50 @@ def no_harm_table(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
+def sensing_table(folder: Path) -> pd.DataFrame:
+    """Return the change of delay against human traffic by the source of the speeds ahead, over the same settings."""
+    if not _is_measured(folder, SENSING_PART):
+        return pd.DataFrame()
+    human = list(map(replace_null, read_part(folder, TEST_HUMAN_PART)))
+    rows = [row for row in read_part(folder, TEST_PART) if row["driver"] == CONTROLLER]
+    sensing = read_part(folder, SENSING_PART)
+    driven = {(row["setting"], str(row["seed"]), row["penetration_rate"]) for row in sensing}
+    same = [row for row in rows if (row["setting"], str(row["seed"]), row["penetration_rate"]) in driven]
+    table: Table = []
+    for source in ("cavs", *dict.fromkeys(row["driver"] for row in sensing)):
+        own = same if source == "cavs" else [row for row in sensing if row["driver"] == source]
+        by_setting = [
+            delay_change([row for row in own if row["setting"] == number], human)
+            for number in sorted({row["setting"] for row in own})
+        ]
+        table.append(
+            {"source": source, "settings": len(by_setting), "delay, against human": _percent(estimate(by_setting))}
+        )
+    return pd.DataFrame(table)
+
+
+def sensitivity_table(folder: Path) -> pd.DataFrame:
+    """Return the change of travel time with the controller, with one changed assumption in each row."""
+    if not _is_measured(folder, SENSITIVITY_PART):
+        return pd.DataFrame()
+    table: Table = []
+    for name, rows in read_part(folder, SENSITIVITY_PART).items():
+        pairs = pair_rows(rows[CONTROLLER], rows[HUMAN_LABEL])
+        gains = estimate([own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs])
+        human = estimate([each[TIME_METRIC] for _, each in pairs])
+        texts = (str(estimate_cell(human, 0)), str(estimate_cell(gains, 1, sign="+")))
+        table.append({"changed": name, "human traffic [s]": texts[0], "change [s]": texts[1]})
+    return pd.DataFrame(table)
+
+
+def _is_measured(folder: Path, part: str) -> bool:
+    """Return whether a part is in a working folder or a results file."""
+    return part in read_parts(folder)
+
+
 def _test_rows(folder: Path) -> Iterator[tuple[int, float, dict[str, Table]]]:
     """Yield each setting and penetration rate of the test half with the rows of its drivers."""
-    if not (folder / f"{TEST_PART}.json").is_file() and folder.is_dir():
+    if not _is_measured(folder, TEST_PART):
         return
     rows = list(map(replace_null, [*read_part(folder, TEST_HUMAN_PART), *read_part(folder, TEST_PART)]))
     for number in sorted({row["setting"] for row in rows}):

@@ -9,6 +9,8 @@ import pytest
 from unjam.controller import make_driver
 from unjam.worlds.episode import can_drive
 from unjam_paper.motorway_benchmark import (
+    CHANGED_SETTING,
+    CHANGES,
     FINALISTS,
     HUMAN,
     HUMAN_SEEDS,
@@ -25,12 +27,16 @@ from unjam_paper.motorway_tables import (
     FINAL_PART,
     HUMAN_PART,
     OPPONENT,
+    SENSING_PART,
+    SENSITIVITY_PART,
     TEST_HUMAN_PART,
     TEST_PART,
     TUNING_PART,
     comparison_table,
     delay_change,
     no_harm_table,
+    sensing_table,
+    sensitivity_table,
     settings_with_breakdown,
     summary_table,
 )
@@ -148,5 +154,27 @@ def test_tables_compare_the_controller_with_all_others_on_the_same_seeds(tmp_pat
     assert no_harm_table(tmp_path)["travel time"].tolist() == ["0.0 [0.0, 0.0] %"] * 2
 
 
+def test_sensing_is_compared_on_the_same_settings_and_seeds(tmp_path: Path) -> None:
+    write_part(tmp_path, TEST_HUMAN_PART, compared_rows("human", 13, 99.0, 0.0))
+    write_part(tmp_path, TEST_PART, [*compared_rows(CONTROLLER, 13, 49.0), *compared_rows(CONTROLLER, 13, 9.0, 0.1)])
+    write_part(tmp_path, SENSING_PART, compared_rows("none", 13, 99.0)[:2])
+    table = sensing_table(tmp_path)
+    assert table["source"].tolist() == ["cavs", "none"]
+    assert table["delay, against human"].tolist() == ["-50 %", "0 %"]
+
+
+def test_each_changed_assumption_is_a_scenario_and_has_its_row(tmp_path: Path) -> None:
+    for factor, changes in CHANGES.values():
+        setting = replace(SETTINGS[CHANGED_SETTING], demand=factor * SETTINGS[CHANGED_SETTING].demand)
+        changed = make_job_scenario(setting, replace(HUMAN, settings=changes), 0.0)
+        assert changed.inflow == pytest.approx(factor * make_job_scenario(SETTINGS[18], HUMAN, 0.0).inflow, rel=1e-3)
+        assert changed.control_step == 1.0
+    rows = {name: {label: compared_rows(label, 13, 9.0) for label in ("human", CONTROLLER)} for name in CHANGES}
+    write_part(tmp_path, SENSITIVITY_PART, rows)
+    assert sensitivity_table(tmp_path)["changed"].tolist() == [*CHANGES]
+
+
 def test_tables_are_empty_before_the_test_half_has_been_driven(tmp_path: Path) -> None:
-    assert comparison_table(tmp_path).empty
+    write_part(tmp_path, HUMAN_PART, human_rows())
+    for make_table in (comparison_table, summary_table, no_harm_table, sensing_table, sensitivity_table):
+        assert make_table(tmp_path).empty
