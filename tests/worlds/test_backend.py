@@ -93,6 +93,46 @@ def test_what_is_no_backend_is_refused_in_one_line(backend: Any, message: str) -
         run_episode(RING, IDM(), 0, backend=backend)
 
 
+BAD_BACKENDS = """
+from contextlib import nullcontext
+
+class NeedsArguments:
+    def __init__(self, address): pass
+    def supports(self, scenario): return ""
+    def open(self, scenario, seed, options): return nullcontext()
+
+class AnswersYes:
+    def supports(self, scenario): return True
+    def open(self, scenario, seed, options): return nullcontext()
+
+class AnswersNothing(AnswersYes):
+    def supports(self, scenario): pass
+
+class ReturnsTheWorld(AnswersYes):
+    def supports(self, scenario): return ""
+    def open(self, scenario, seed, options): return []
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("NeedsArguments", "backend: TypeError when making .*NeedsArguments: .*'address'"),
+        ("AnswersYes", r"backend: supports\(\) returns True; allowed: a reason"),
+        ("AnswersNothing", r"backend: supports\(\) returns None; allowed: a reason"),
+        ("ReturnsTheWorld", r"backend: open\(\) returns list; allowed: a context manager"),
+    ],
+)
+def test_a_faulty_backend_is_refused_in_one_line(name: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text(BAD_BACKENDS)
+    for attempt in (
+        lambda backend: run_episode(RING, IDM(), 0, backend=backend),
+        lambda backend: RoadEnv("ring", backend=backend).reset(seed=0),
+    ):
+        with pytest.raises(InputError, match=message):
+            attempt(f"{tmp_path / 'bad.py'}:{name}")
+
+
 def test_a_scenario_that_a_backend_does_not_support_is_refused_with_its_reason(own: str) -> None:
     for attempt in (
         lambda: run_episode(Merge(), Human(), 0, backend=own),

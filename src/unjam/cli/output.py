@@ -145,12 +145,12 @@ def print_next_command(reason: str, *arguments: object) -> None:
 
 
 def suggest_after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any], reward: str) -> None:
-    """Suggest the next command on the same road: compare with human drivers, train on an expert, or watch."""
+    """Suggest the next command on the same road: compare with others, train on an expert, or watch."""
     controllers = [driver for driver in drivers if driver != "human"]
     if "human" not in drivers:
         print_next_command("compare with human drivers", *_arguments_without_out(), "-d", "human")
     elif not controllers:
-        print_next_command("compare with an expert", *_arguments_without_out(), "-d", "pi")
+        print_next_command("compare with a controller", *_arguments_without_out(), "-d", "unjam:best")
     elif all(driver.partition(":")[0] in DRIVERS for driver in controllers):
         command = "train", scenario, "--expert", controllers[-1], "--preset", "demo"
         print_next_command("train on an expert", *command, *setting_options(changes, "scenario_options.", reward))

@@ -32,7 +32,7 @@ from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
-from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend
+from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
 from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap, validate_reward_terms
@@ -143,7 +143,7 @@ class RoadStepper:
         if self._opened is None:
             self._opened = self._backend_context.enter_context(open_backend(self._backend))
         fields = self._driver.requirements(self.scenario.interface).measured_fields
-        opening = self._opened.open(self.scenario, numbers, WorldOptions(fields))
+        opening = open_world(self._opened, self.scenario, numbers, WorldOptions(fields))
         self._world = world = self._world_context.enter_context(opening)
         self._drive_loop = DriveLoop(world, self._driver)
         self._control_steps = iter(self._drive_loop)

@@ -65,7 +65,11 @@ def open_backend(backend: BackendLike) -> Iterator[Backend]:
 def _make_backend(name: str) -> Backend:
     if is_file_reference(name):
         found = FileReference.parse(name).load_object()
-        return check_backend(found() if isinstance(found, type) else found, name)
+        try:
+            made = found() if isinstance(found, type) else found
+        except Exception as error:  # any error of the user's code is the user's to fix
+            raise InputError(f"backend: {type(error).__name__} when making {name}: {error}") from error
+        return check_backend(made, name)
     if check_backend_name(name) == "batch":
         from unjam.worlds.batch.backend import BatchBackend
 
@@ -90,8 +94,22 @@ def check_backend(backend: Backend, label: str) -> Backend:
     return backend
 
 
+def open_world(
+    backend: Backend, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions
+) -> AbstractContextManager[RoadWorld]:
+    """Return the context of the world of an episode; raise `InputError` if a backend returns anything else."""
+    context = backend.open(scenario, seed, options)
+    if not isinstance(context, AbstractContextManager):
+        allowed = "a context manager, as of contextlib.contextmanager"
+        raise InputError(f"backend: open() returns {type(context).__name__}; allowed: {allowed}")
+    return context
+
+
 def check_support(backend: Backend, *scenarios: Scenario) -> None:
     """Raise `InputError` with the reason if a backend cannot simulate one of the scenarios."""
     for scenario in scenarios:
-        if reason := backend.supports(scenario):
+        reason = backend.supports(scenario)
+        if not isinstance(reason, str):
+            raise InputError(f"backend: supports() returns {reason!r}; allowed: a reason why not as text, else ''")
+        if reason:
             raise InputError(f"scenario: {reason}")

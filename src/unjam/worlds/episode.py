@@ -13,7 +13,7 @@ from unjam.drivers.requirements import Requirements
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.backend import BackendLike, WorldOptions, check_support, open_backend
+from unjam.worlds.backend import BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import drive_world
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import Reward, RewardLike, episode_reward_terms, make_reward
@@ -81,7 +81,7 @@ def run_episode(
     options = WorldOptions(needs.measured_fields, record_details, not needs.needs_arrays, stop_at_contact)
     with open_backend(backend) as simulator:
         check_support(simulator, scenario)
-        with simulator.open(scenario, seed, options) as world:
+        with open_world(simulator, scenario, seed, options) as world:
             episode = drive_world(world, driver, explore, on_progress=on_progress)
     check_has_cavs(episode, driver)
     return add_reward_terms(episode, reward_function)
