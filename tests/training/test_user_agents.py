@@ -84,6 +84,7 @@ def test_further_collections_of_an_iteration_have_the_same_seeds_and_count(
 AGENT = """
 from unjam.drivers.network import Network
 from unjam.learners.algorithm import IterationLog
+from unjam.learners.learner import Learner
 import numpy as np
 class Idle:
     def __init__(self, spec): self.spec = spec
@@ -105,6 +106,24 @@ class Forgetful(Idle):
         collect(self.network())
         return IterationLog({"one": 1})
     def state(self): return {"spec": self.spec}, {}
+class Wordy(Idle):
+    def iterate(self, collect):
+        collect(self.network())
+        return IterationLog({"loss": "small"})
+class Stub(Learner):
+    def __init__(self, spec): self.spec = spec
+    def network(self): return None
+class Stray:
+    def __init__(self, spec): pass
+    def network(self): return None
+    def learn(self, update): pass
+    def state(self): return {}, {}
+    def restore(self, values, tensors): pass
+class Stateless(Stub):
+    def network(self): return Idle(self.spec).network()
+    def learn(self, update): pass
+    def state(self): return None
+    def restore(self, values, tensors): pass
 class Half:
     def __init__(self, spec): pass
     def network(self): return None
@@ -117,9 +136,11 @@ def function(spec): return None
     [
         ("Idle", "algorithm: iteration 1 runs no episodes; allowed: at least one collect()"),
         ("Silent", "algorithm: iterate() returns NoneType; allowed: an IterationLog"),
-        ("Failing", "agent: mine.py:Failing: IndexError: list index out of range (line 15)"),
+        ("Failing", "agent: mine.py:Failing: IndexError: list index out of range (line 16)"),
         ("Blind", "mine.py:Blind has 1 inputs; allowed: 8, those of policy.inputs"),
         ("Torch", "mine.py:Torch returns str; allowed: an unjam.drivers.network.Network"),
+        ("Wordy", "algorithm: loss of the log is 'small'; allowed: a number"),
+        ("Stateless", "state() of Stateless cannot be stored: cannot unpack non-iterable NoneType object"),
         ("Forgetful", "mine.py:Forgetful cannot be stored: Object of type AgentSpec is not JSON serializable"),
     ],
 )
@@ -137,6 +158,8 @@ def test_invalid_agent_gets_one_line(name: str, words: str, tmp_path: Path) -> N
     ("name", "words"),
     [
         ("Half", "agent: mine.py:Half has no state(), restore(), learn(); allowed: a class with network()"),
+        ("Stub", "agent: mine.py:Stub has no state(), restore(), learn(); allowed: a class with network()"),
+        ("Stray", "mine.py:Stray has no exploring_network() and others; allowed: a class that inherits from"),
         ("function", "agent: mine.py:function is not a class"),
         ("Nothing", "mine.py: has no 'Nothing'"),
     ],

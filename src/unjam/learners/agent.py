@@ -100,13 +100,21 @@ def is_algorithm(agent: Any) -> bool:
 
 def check_agent(name: str) -> None:
     """Raise `InputError` if `path.py:Class` is not a class of learners or algorithms; the file runs for it."""
+    from unjam.learners.algorithm import Algorithm  # these modules import this one
+    from unjam.learners.learner import Learner
+
     found = _user_class(name)
-    required = ("network", "state", "restore", "iterate" if is_algorithm(found) else "learn")
-    if missing := [f"{each}()" for each in required if not callable(getattr(found, each, None))]:
+    protocol: Any = Algorithm if is_algorithm(found) else Learner
+    required = ("network", "state", "restore", "iterate" if protocol is Algorithm else "learn")
+    # What a class inherits from the protocol does nothing.
+    if missing := [f"{each}()" for each in required if getattr(found, each, None) in (None, getattr(protocol, each))]:
         allowed = (
             "allowed: a class with network(), state(), restore() and iterate(), an algorithm, or learn(), a learner"
         )
         raise InputError(f"agent: {FileReference.parse(name)} has no {', '.join(missing)}; {allowed}")
+    if protocol is Learner and Learner not in found.__mro__:
+        allowed = "allowed: a class that inherits from unjam.learners.learner.Learner"
+        raise InputError(f"agent: {FileReference.parse(name)} has no exploring_network() and others; {allowed}")
 
 
 def check_network(name: str, network: Any, spec: AgentSpec) -> Network:

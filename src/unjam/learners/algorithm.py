@@ -113,8 +113,18 @@ def run_iterations(
             raise UnjamError(
                 f"algorithm: iteration {collect.iteration} runs no episodes; allowed: at least one collect()"
             )
+        _check_numbers({**log.values, **log.seconds})
         if on_iteration(log):
             return
+
+
+def _check_numbers(values: Mapping[str, Any]) -> None:
+    """Raise `UnjamError` if one of the values of a log is not a number."""
+    for name, value in values.items():
+        try:
+            float(value)
+        except (TypeError, ValueError):
+            raise UnjamError(f"algorithm: {name} of the log is {value!r}; allowed: a number") from None
 
 
 def seed_iteration(run_seed: int, iteration: int, part: int | None = None) -> None:

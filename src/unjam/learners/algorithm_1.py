@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from unjam.drivers.network import Network
-from unjam.learners.agent import AgentSpec, is_algorithm, make_agent
+from unjam.learners.agent import AgentSpec, check_state, is_algorithm, make_agent
 from unjam.learners.algorithm import Algorithm, Collector, IterationLog, Tensors, seed_iteration, tensors_with_prefix
 from unjam.learners.experience import Experience, environment_experience, join_experience
 from unjam.learners.learner import Learner, Update, policy_distance
@@ -110,7 +110,7 @@ class Algorithm1:
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all values and tensors that are needed to resume after an iteration."""
-        values, tensors = self.learner.state()
+        values, tensors = check_state(type(self.learner).__name__, self.learner.state())
         for each in self.model_rollouts:
             values[each.name], model_tensors = each.state()
             tensors |= {f"{each.name}/{name}": tensor for name, tensor in model_tensors.items()}
