@@ -22,14 +22,14 @@ from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
-from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES, METHODS, Candidate
+from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES_PER_METHOD, METHODS, Candidate
 from unjam_paper.motorway_tables import (
     ACC_ALONE,
+    BENCHMARK_RATES,
     CONTROLLER,
     FINAL_PART,
     HUMAN_PART,
     OPPONENT,
-    PENETRATION_RATES,
     SENSING_PART,
     SENSITIVITY_PART,
     TEST_HUMAN_PART,
@@ -137,7 +137,7 @@ def measure_candidate(method: str, number: int, settings: Sequence[int], workers
     generator, seeds = np.random.default_rng([CANDIDATE_SEED, number]), tuning_seeds(HUMAN_SEEDS)
     numbers = generator.permutation(np.array(settings))[:FIRST_EPISODES].tolist()
     jobs = [
-        (SETTINGS[each], METHODS[method].candidate(number), PENETRATION_RATES[index % 2], seeds[(number + index) % 5])
+        (SETTINGS[each], METHODS[method].candidate(number), BENCHMARK_RATES[index % 2], seeds[(number + index) % 5])
         for index, each in enumerate(numbers)
     ]
     return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
@@ -147,7 +147,7 @@ def measure_finalist(method: str, number: int, workers: int) -> list[dict[str, A
     """Return one episode of a candidate on each setting of the tuning half, as a list of one row."""
     candidate, (seed, *_) = METHODS[method].candidate(number), tuning_seeds(1)
     jobs = [
-        (setting, candidate, PENETRATION_RATES[(setting.number + number) % 2], seed)
+        (setting, candidate, BENCHMARK_RATES[(setting.number + number) % 2], seed)
         for setting in SETTINGS[:SETTINGS_PER_HALF]
     ]
     return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
@@ -164,7 +164,7 @@ def measure_change(name: str, controller: Candidate, workers: int) -> dict[str, 
     demand_factor, changes = CHANGES[name]
     setting, seeds = SETTINGS[CHANGED_SETTING], make_test_seeds(CHANGE_SEEDS)
     setting = replace(setting, demand=demand_factor * setting.demand)
-    drivers = {HUMAN_LABEL: (HUMAN, 0.0), CONTROLLER: (controller, PENETRATION_RATES[0])}
+    drivers = {HUMAN_LABEL: (HUMAN, 0.0), CONTROLLER: (controller, BENCHMARK_RATES[0])}
     return {
         label: run_jobs(
             [(setting, replace(each, settings={**each.settings, **changes}), rate, seed) for seed in seeds], workers
@@ -191,7 +191,7 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     settings = settings_with_breakdown(human)
     parts |= {
         f"{TUNING_PART}/{method} {number}": (measure_candidate, (method, number, settings))
-        for number in range(CANDIDATES)
+        for number in range(CANDIDATES_PER_METHOD)
         for method in METHODS
     }
     if not (folder / f"{TUNING_PART}.json").is_file():
@@ -213,7 +213,7 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     own = tuned[CONTROLLER]
     sensing = {source: replace(own, settings={**own.settings, "roadside.source": source}) for source in OTHER_SOURCES}
     parts |= {
-        f"{SENSING_PART}/{source} {number}": (measure_test, (source, each, PENETRATION_RATES[0], number, SENSING_SEEDS))
+        f"{SENSING_PART}/{source} {number}": (measure_test, (source, each, BENCHMARK_RATES[0], number, SENSING_SEEDS))
         for source, each in sensing.items()
         for number in hard
     }
@@ -224,7 +224,7 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
             (label, candidate, rate, number, TEST_SEEDS if number in hard else HARM_SEEDS),
         )
         for number in TEST_SETTINGS
-        for rate in PENETRATION_RATES
+        for rate in BENCHMARK_RATES
         for label, candidate in tuned.items()
         if number in hard or label != OPPONENT
     }

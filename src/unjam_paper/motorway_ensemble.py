@@ -91,7 +91,7 @@ class EnsembleSetting:
     @property
     def free_flow_time(self) -> float:
         """The mean travel time at little demand, as the study measured it [s]."""
-        return FREE_FLOW_TIMES[self.number]
+        return SETTING_FREE_FLOW_TIMES[self.number]
 
     @cached_property
     def traffic(self) -> dict[str, Any]:
@@ -181,7 +181,7 @@ CAPACITIES: tuple[float, ...] = (
     1877,
 )
 """flow before a breakdown of each setting: means of the part `capacity` [veh/h per lane]"""
-FREE_FLOW_TIMES: tuple[float, ...] = (
+SETTING_FREE_FLOW_TIMES: tuple[float, ...] = (
     132.2,
     140.7,
     133.9,

@@ -1,6 +1,6 @@
 """Ways to reduce delays at bottlenecks of motorways, with the candidates among which each of them is tuned.
 
-All have the same budget: `CANDIDATES` sets of parameters, drawn at random before anything is evaluated.
+All have the same budget: `CANDIDATES_PER_METHOD` sets of parameters, drawn at random before anything is evaluated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-CANDIDATES = 30
+CANDIDATES_PER_METHOD = 30
 """number of candidates of each method"""
 CANDIDATE_SEED = 20261129
 Range = tuple[float, float] | Sequence[Any]

@@ -22,7 +22,7 @@ ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
 """what is compared on the test half, besides human traffic"""
 COMPARED = HUMAN_LABEL, ACC_ALONE, OPPONENT
 """what the controller is compared with"""
-PENETRATION_RATES = (0.05, 0.1)
+BENCHMARK_RATES = (0.05, 0.1)
 BREAKDOWN_SHARE = 0.5
 """share of the episodes of human traffic with a breakdown from which on a setting counts as one with a breakdown"""
 
@@ -104,7 +104,7 @@ def summary_table(folder: Path) -> pd.DataFrame:
     """Return the mean changes over all settings with a breakdown; the intervals are over settings and their seeds."""
     comparisons = [each for each in _test_rows(folder) if OPPONENT in each[2]]
     table: Table = []
-    for rate in PENETRATION_RATES if comparisons else ():
+    for rate in BENCHMARK_RATES if comparisons else ():
         own = [(number, rows) for number, each, rows in comparisons if each == rate]
         changes = {label: [_delay_change(rows, label, number).mean for number, rows in own] for label in COMPARED}
         table.append(
@@ -178,7 +178,7 @@ def _test_rows(folder: Path) -> Iterator[tuple[int, float, dict[str, Table]]]:
         return
     rows = list(map(replace_null, [*read_part(folder, TEST_HUMAN_PART), *read_part(folder, TEST_PART)]))
     for number in sorted({row["setting"] for row in rows}):
-        for rate in PENETRATION_RATES:
+        for rate in BENCHMARK_RATES:
             found: dict[str, Table] = {}
             for row in rows:
                 if row["setting"] == number and row["penetration_rate"] in (0.0, rate):

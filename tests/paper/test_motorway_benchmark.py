@@ -20,7 +20,7 @@ from unjam_paper.motorway_benchmark import (
     rank_candidates,
 )
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF
-from unjam_paper.motorway_methods import CANDIDATES, METHODS
+from unjam_paper.motorway_methods import CANDIDATES_PER_METHOD, METHODS
 from unjam_paper.motorway_tables import (
     ACC_ALONE,
     CONTROLLER,
@@ -64,9 +64,9 @@ def candidate_rows(gain: float) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_all_candidates_drive_on_motorways_of_the_ensemble(name: str) -> None:
-    candidates = [METHODS[name].candidate(number) for number in range(CANDIDATES)]
-    assert len({repr(each) for each in candidates}) == CANDIDATES
-    assert [METHODS[name].candidate(number) for number in range(CANDIDATES)] == candidates
+    candidates = [METHODS[name].candidate(number) for number in range(CANDIDATES_PER_METHOD)]
+    assert len({repr(each) for each in candidates}) == CANDIDATES_PER_METHOD
+    assert [METHODS[name].candidate(number) for number in range(CANDIDATES_PER_METHOD)] == candidates
     for number, candidate in enumerate(candidates):
         scenario = make_job_scenario(SETTINGS[number % len(SETTINGS)], candidate, 0.05)
         assert can_drive(make_driver(candidate.driver, scenario.control_step), scenario)
@@ -100,17 +100,17 @@ def test_parts_follow_from_the_results_of_earlier_parts(tmp_path: Path) -> None:
     study.mkdir()
     write_part(study, HUMAN_PART, human_rows())
     parts = make_parts(folder, 1)
-    assert sum(name.startswith(TUNING_PART) for name in parts) == CANDIDATES * len(METHODS)
+    assert sum(name.startswith(TUNING_PART) for name in parts) == CANDIDATES_PER_METHOD * len(METHODS)
     assert all(arguments[-1] == [0, 2, 4, 6, 8, 10] for _, arguments in parts.values() if len(arguments) > 1)
     rows = [
         {"method": method, "candidate": number, "episodes": candidate_rows(float(number))}
         for method in METHODS
-        for number in range(CANDIDATES)
+        for number in range(CANDIDATES_PER_METHOD)
     ]
     write_part(study, TUNING_PART, rows)
     finalists = [name for name in make_parts(folder, 1) if name.startswith(FINAL_PART)]
     assert len(finalists) == FINALISTS * len(METHODS)
-    assert all(int(name.rpartition(" ")[2]) >= CANDIDATES - FINALISTS for name in finalists)
+    assert all(int(name.rpartition(" ")[2]) >= CANDIDATES_PER_METHOD - FINALISTS for name in finalists)
 
 
 def test_human_traffic_does_not_depend_on_methods() -> None:
