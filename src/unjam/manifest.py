@@ -29,6 +29,11 @@ def manifest() -> dict[str, Any]:
     }
 
 
+def without_folders(command: list[str]) -> list[str]:
+    """Return a command for publication: paths of the machine become names of files."""
+    return [Path(word).name if "/" in word else word for word in command]
+
+
 def package_versions() -> dict[str, str | None]:
     """Return the installed versions of the packages that results depend on; None: not installed."""
     return {name: _package_version(name) for name in RECORDED_PACKAGES}

@@ -19,14 +19,7 @@ from unjam.measures.effect import FLOW_METRIC, HARD_BRAKING_METRIC, TIME_METRIC
 from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import (
-    Estimate,
-    estimate,
-    format_difference,
-    linearized_ratio,
-    metric_estimate,
-    pair_rows,
-)
+from unjam.measures.statistics import Estimate, format_difference, metric_estimate, relative_difference
 from unjam.reports.results import replace_null
 from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
@@ -73,7 +66,7 @@ class HarmVerdict(NamedTuple):
 
 def evaluate_harm(rows: Sequence[dict[str, Any]], acc_rows: Sequence[dict[str, Any]], breakdown: bool) -> HarmVerdict:
     """Return the paired differences to the ACC alone and the verdict."""
-    time, flow = (_relative_difference(rows, acc_rows, name) for name in (TIME_METRIC, FLOW_METRIC))
+    time, flow = (relative_difference(rows, acc_rows, name) for name in (TIME_METRIC, FLOW_METRIC))
     limit = MAX_TIME_INCREASE[breakdown]
     verdict = UNDECIDED
     if time.high < limit and flow.low > MIN_FLOW_CHANGE:
@@ -81,12 +74,6 @@ def evaluate_harm(rows: Sequence[dict[str, Any]], acc_rows: Sequence[dict[str, A
     elif time.low > limit or flow.high < MIN_FLOW_CHANGE:
         verdict = HARM
     return HarmVerdict(time, flow, verdict)
-
-
-def _relative_difference(rows: Sequence[dict[str, Any]], acc_rows: Sequence[dict[str, Any]], name: str) -> Estimate:
-    values = np.array([(row[name], acc[name]) for row, acc in pair_rows(rows, acc_rows)]).reshape(-1, 2)
-    ratios = linearized_ratio(values[:, 0] - values[:, 1], values[:, 1]) if len(values) else values[:, 0]
-    return estimate(ratios.tolist())
 
 
 def has_breakdown(episode: Episode, road: OpenTestRoad) -> bool:

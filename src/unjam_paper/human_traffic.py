@@ -159,7 +159,7 @@ def capacity_road(settings: Mapping[str, Any]) -> Motorway:
     return scenario
 
 
-def measure_population(number: int, workers: int) -> list[dict[str, Any]]:
+def measure_traffic_candidate(number: int, workers: int) -> list[dict[str, Any]]:
     """Return the settings of a candidate with the facts of its episodes, as a list of one row."""
     settings = make_candidate(number)
     return [{"settings": settings, "episodes": measure_facts(settings, {}, tuning_seeds(CANDIDATE_SEEDS), workers)}]
@@ -229,7 +229,7 @@ def facts_table(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def populations_table(folder: Path) -> pd.DataFrame:
+def traffic_candidates_table(folder: Path) -> pd.DataFrame:
     """Return the settings of all candidates and their facts, the smallest deviation first."""
     candidates = sorted(read_part(folder, CANDIDATES_PART), key=lambda each: total_deviation(each["episodes"]))
     return pd.DataFrame([_candidate_row(each) for each in candidates])
@@ -289,9 +289,9 @@ CHANGING_COLUMNS = ("assertiveness", "speed_cooperation", "uncooperative_share")
 HUMAN_TRAFFIC_STUDY = Study(
     title="human traffic on a motorway compared with empirical facts",
     make_parts=lambda study_folder, seeds: {
-        **{f"{CANDIDATES_PART}/{number}": (measure_population, (number,)) for number in range(CANDIDATES)},
+        **{f"{CANDIDATES_PART}/{number}": (measure_traffic_candidate, (number,)) for number in range(CANDIDATES)},
         **{f"{BEST_PART}/{step:g} s": (measure_step, (POPULATIONS[0], step)) for step in SIMULATION_STEPS},
     },
     minutes=45.0,
-    tables={"facts": facts_table, "candidates": populations_table, "effects": effects_table},
+    tables={"facts": facts_table, "candidates": traffic_candidates_table, "effects": effects_table},
 )

@@ -6,13 +6,12 @@ best of them then drive on all settings of this half, and the best of these in b
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from unjam.controller import make_driver
-from unjam.measures.effect import FLOW_METRIC, TIME_METRIC
-from unjam.measures.feasibility import HARD_BRAKING_METRIC
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
 from unjam.measures.traffic_facts import measure_traffic
@@ -21,6 +20,7 @@ from unjam.training.evaluate import raise_failure
 from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam_paper.do_no_harm import HARM_METRICS
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
 from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES_PER_METHOD, METHODS, Candidate
 from unjam_paper.motorway_tables import (
@@ -58,11 +58,7 @@ FIRST_EPISODES = 4
 """number of episodes of each candidate in the first round, on as many settings"""
 FINALISTS = 4
 """number of candidates of each method in the second round"""
-EPISODE_METRICS = (
-    *("seed", "status", TIME_METRIC, FLOW_METRIC, "collisions", "vehicles", "feasibility", "required_time_gap"),
-    *("has_lanes", "override_share", HARD_BRAKING_METRIC, "human_braking_beyond_3_5", "min_time_gap"),
-    *("share_short_time_gap", "cav_min_ttc", "cav_max_braking", "cut_in_max_braking"),
-)
+EPISODE_METRICS = (*HARM_METRICS, "vehicles", "human_braking_beyond_3_5")
 OTHER_SOURCES = ("vehicles", "detectors", "none")
 """sources of the speeds ahead, besides the CAVs of the main comparison"""
 SENSING_SEEDS, CHANGE_SEEDS = 8, 10
@@ -94,7 +90,7 @@ HUMAN = Candidate(HUMAN_LABEL, {})
 
 
 def make_job_scenario(setting: EnsembleSetting, candidate: Candidate, rate: float) -> Motorway:
-    """Return the scenario of an episode; nobody meters a lane that closes."""
+    """Return the scenario of an episode; a lane that closes has no meter."""
     no_meter = {"ramp_meter.active": False} if setting.road == "lane drop" else {}
     changes = {"penetration_rate": rate, "roadside.source": "cavs", **candidate.settings, **no_meter}
     return setting.scenario(setting.capacity, setting.demand, **changes)
@@ -137,8 +133,8 @@ def measure_candidate(method: str, number: int, settings: Sequence[int], workers
     generator, seeds = np.random.default_rng([CANDIDATE_SEED, number]), tuning_seeds(HUMAN_SEEDS)
     numbers = generator.permutation(np.array(settings))[:FIRST_EPISODES].tolist()
     jobs = [
-        (SETTINGS[each], METHODS[method].candidate(number), BENCHMARK_RATES[index % 2], seeds[(number + index) % 5])
-        for index, each in enumerate(numbers)
+        (SETTINGS[each], METHODS[method].candidate(number), rate, seeds[(number + index) % HUMAN_SEEDS])
+        for index, (each, rate) in enumerate(zip(numbers, cycle(BENCHMARK_RATES), strict=False))
     ]
     return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
 

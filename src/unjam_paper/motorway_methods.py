@@ -30,6 +30,7 @@ class Method:
     """A way to reduce delays, and the ranges of its parameters."""
 
     description: str
+    """what it does; its candidates are drawn from this text: another text is another tuning"""
     driver: str
     driver_ranges: Mapping[str, Range] = field(default_factory=dict)
     """ranges of parameters of the driver"""

@@ -1,7 +1,9 @@
 """Tables of the motorway benchmark: candidates, and comparisons on the test half of the ensemble."""
 
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -9,11 +11,11 @@ import pandas as pd
 from unjam.measures.effect import FLOW_METRIC, TIME_METRIC
 from unjam.measures.feasibility import HARD_BRAKING_METRIC, overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
-from unjam.measures.statistics import Estimate, estimate, linearized_ratio, pair_rows
+from unjam.measures.statistics import Estimate, estimate, linearized_ratio, pair_rows, relative_difference
 from unjam.reports.results import replace_null
 from unjam_paper.motorway_ensemble import SETTINGS
 from unjam_paper.motorway_methods import METHODS
-from unjam_paper.results_file import read_part, read_parts
+from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, Table
 
 HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
@@ -23,6 +25,7 @@ ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
 COMPARED = HUMAN_LABEL, ACC_ALONE, OPPONENT
 """what the controller is compared with"""
 BENCHMARK_RATES = (0.05, 0.1)
+"""penetration rates with which methods are tuned and compared"""
 BREAKDOWN_SHARE = 0.5
 """share of the episodes of human traffic with a breakdown from which on a setting counts as one with a breakdown"""
 
@@ -31,13 +34,8 @@ def settings_with_breakdown(episodes: Table) -> list[int]:
     """Return the numbers of the settings that break down in at least half of these episodes of human traffic."""
     by_setting: dict[int, list[bool]] = {}
     for row in episodes:
-        by_setting.setdefault(row["setting"], []).append(is_known(row["breakdown_time"]))
+        by_setting.setdefault(row["setting"], []).append(row["breakdown_time"] is not None)
     return sorted(number for number, each in by_setting.items() if np.mean(each) >= BREAKDOWN_SHARE)
-
-
-def is_known(value: float | None) -> bool:
-    """Return whether a value of a results file is a number."""
-    return value is not None and np.isfinite(value)
 
 
 def delay_change(episodes: Table, human: Table) -> float:
@@ -92,8 +90,8 @@ def comparison_table(folder: Path) -> pd.DataFrame:
                 "of which unavoidable [s]": f"{setting.unavoidable_delay:.0f}",
                 "waiting at entrances [s]": f"{np.mean([row['waiting_at_entrances'] for row in human]):.0f}",
                 **{f"delay, against {label}": _percent(_delay_change(rows, label, number)) for label in COMPARED},
-                "flow": _percent(_relative_change(rows, FLOW_METRIC)),
-                "hard braking of human drivers": _percent(_relative_change(rows, HARD_BRAKING_METRIC)),
+                "flow": _percent(relative_difference(own, human, FLOW_METRIC)),
+                "hard braking of human drivers": _percent(relative_difference(own, human, HARD_BRAKING_METRIC)),
                 "feasible": overall_feasibility(own, human),
             }
         )
@@ -107,13 +105,14 @@ def summary_table(folder: Path) -> pd.DataFrame:
     for rate in BENCHMARK_RATES if comparisons else ():
         own = [(number, rows) for number, each, rows in comparisons if each == rate]
         changes = {label: [_delay_change(rows, label, number).mean for number, rows in own] for label in COMPARED}
+        flows = [relative_difference(rows[CONTROLLER], rows[HUMAN_LABEL], FLOW_METRIC).mean for _, rows in own]
         table.append(
             {
                 "CAVs": f"{100 * rate:g} %",
                 "settings": len(own),
                 **{f"delay, against {label}": _percent(estimate(values)) for label, values in changes.items()},
                 "least reduction against human": f"{100 * max(changes[HUMAN_LABEL], default=np.nan):+.0f} %",
-                "flow": _percent(estimate([_relative_change(rows, FLOW_METRIC).mean for _, rows in own])),
+                "flow": _percent(estimate(flows)),
             }
         )
     return pd.DataFrame(table)
@@ -125,7 +124,9 @@ def no_harm_table(folder: Path) -> pd.DataFrame:
     for number, rate, rows in _test_rows(folder):
         if OPPONENT not in rows:
             row = {"setting": number, "road": SETTINGS[number].road, "demand": SETTINGS[number].demand}
-            time, flow = (_relative_change(rows, name, ACC_ALONE) for name in (TIME_METRIC, FLOW_METRIC))
+            time, flow = (
+                relative_difference(rows[CONTROLLER], rows[ACC_ALONE], name) for name in (TIME_METRIC, FLOW_METRIC)
+            )
             row |= {"CAVs": f"{100 * rate:g} %", "travel time": _percent(time, 1), "flow": _percent(flow, 1)}
             table.append(row)
     return pd.DataFrame(table)
@@ -133,11 +134,10 @@ def no_harm_table(folder: Path) -> pd.DataFrame:
 
 def sensing_table(folder: Path) -> pd.DataFrame:
     """Return the change of delay against human traffic by the source of the speeds ahead, over the same settings."""
-    if not _is_measured(folder, SENSING_PART):
+    if not (sensing := _read_measured(folder, SENSING_PART)):
         return pd.DataFrame()
     human = list(map(replace_null, read_part(folder, TEST_HUMAN_PART)))
     rows = [row for row in read_part(folder, TEST_PART) if row["driver"] == CONTROLLER]
-    sensing = read_part(folder, SENSING_PART)
     driven = {(row["setting"], str(row["seed"]), row["penetration_rate"]) for row in sensing}
     same = [row for row in rows if (row["setting"], str(row["seed"]), row["penetration_rate"]) in driven]
     table: Table = []
@@ -155,10 +155,8 @@ def sensing_table(folder: Path) -> pd.DataFrame:
 
 def sensitivity_table(folder: Path) -> pd.DataFrame:
     """Return the change of travel time with the controller, with one changed assumption in each row."""
-    if not _is_measured(folder, SENSITIVITY_PART):
-        return pd.DataFrame()
     table: Table = []
-    for name, rows in read_part(folder, SENSITIVITY_PART).items():
+    for name, rows in _read_measured(folder, SENSITIVITY_PART).items():
         pairs = pair_rows(rows[CONTROLLER], rows[HUMAN_LABEL])
         gains = estimate([own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs])
         human = estimate([each[TIME_METRIC] for _, each in pairs])
@@ -167,23 +165,25 @@ def sensitivity_table(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def _is_measured(folder: Path, part: str) -> bool:
-    """Return whether a part is in a working folder or a results file."""
-    return part in read_parts(folder)
+def _read_measured(folder: Path, part: str) -> Any:
+    """Return a part of a working folder or a results file; an empty object if it is not measured yet."""
+    try:
+        return read_part(folder, part)
+    except (KeyError, FileNotFoundError):
+        return {}
 
 
 def _test_rows(folder: Path) -> Iterator[tuple[int, float, dict[str, Table]]]:
     """Yield each setting and penetration rate of the test half with the rows of its drivers."""
-    if not _is_measured(folder, TEST_PART):
+    if not (compared := _read_measured(folder, TEST_PART)):
         return
-    rows = list(map(replace_null, [*read_part(folder, TEST_HUMAN_PART), *read_part(folder, TEST_PART)]))
-    for number in sorted({row["setting"] for row in rows}):
-        for rate in BENCHMARK_RATES:
-            found: dict[str, Table] = {}
-            for row in rows:
-                if row["setting"] == number and row["penetration_rate"] in (0.0, rate):
-                    found.setdefault(row["driver"], []).append(row)
-            yield number, rate, found
+    rows = list(map(replace_null, [*read_part(folder, TEST_HUMAN_PART), *compared]))
+    for number, rate in product(sorted({row["setting"] for row in rows}), BENCHMARK_RATES):
+        found: dict[str, Table] = {}
+        for row in rows:
+            if row["setting"] == number and row["penetration_rate"] in (0.0, rate):
+                found.setdefault(row["driver"], []).append(row)
+        yield number, rate, found
 
 
 def _delay_change(rows: dict[str, Table], other: str, number: int) -> Estimate:
@@ -196,15 +196,6 @@ def _delay_change(rows: dict[str, Table], other: str, number: int) -> Estimate:
         ]
     )
     return estimate(linearized_ratio(values[:, 0], values[:, 1]).tolist())
-
-
-def _relative_change(rows: dict[str, Table], metric: str, other: str = HUMAN_LABEL) -> Estimate:
-    """Return the difference of a metric to another driver, relative to that driver's."""
-    pairs = pair_rows(rows[CONTROLLER], rows[other])
-    values = np.array([(own[metric], each[metric]) for own, each in pairs], np.float64)
-    if not values[:, 1].any():  # no vehicle brakes hard
-        return Estimate(np.nan, np.nan, np.nan, 0)
-    return estimate(linearized_ratio(values[:, 0] - values[:, 1], values[:, 1]).tolist())
 
 
 def _percent(share: Estimate, digits: int = 0) -> str:

@@ -15,7 +15,7 @@ import pandas as pd
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.files import atomic_write, make_folder
-from unjam.manifest import manifest
+from unjam.manifest import manifest, without_folders
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
@@ -179,6 +179,7 @@ def write_manifest(folder: Path, **metadata: Any) -> None:
     """Write the manifest of a study: that of its first call with this `metadata`, and all resumptions."""
     make_folder(folder)
     about, file = manifest(), folder / "manifest.json"
+    about["command"] = without_folders(about["command"])
     if file.is_file():
         resumption = {name: about[name] for name in ("commit", "started")}
         about = json.loads(file.read_text(encoding="utf-8"))

@@ -23,6 +23,7 @@ from unjam.measures.statistics import (
     paired_difference,
     paired_differences,
     probability_of_improvement,
+    relative_difference,
     summarize,
 )
 from unjam_paper.results_file import read_part
@@ -353,3 +354,13 @@ def test_episodes_that_ended_early_are_not_averaged_with_complete_ones(status: s
     assert counts["return"] == counts["return_eq16"] == (2 if status == "collision" else 1)
     assert paired_difference(rows, others, "travel_time").count == 1
     assert paired_differences([rows], others, "mean_speed").shape == (1, 1)
+
+
+def test_a_relative_difference_is_that_of_the_means_and_unknown_relative_to_zero() -> None:
+    ours = [{"seed": seed, "flow": 110.0 + seed} for seed in range(4)]
+    others = [{"seed": seed, "flow": 100.0 + seed} for seed in range(1, 5)]
+    found = relative_difference(ours, others, "flow")
+    assert found.count == 3
+    assert found.mean == pytest.approx(10.0 / 102.0)
+    assert relative_difference(ours, [{**row, "flow": 0.0} for row in others], "flow").count == 0
+    assert relative_difference([], others, "flow").count == 0

@@ -1,4 +1,5 @@
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -102,6 +103,13 @@ def test_a_study_keeps_its_first_manifest_and_lists_resumptions(tmp_path: Path) 
     found = json.loads((tmp_path / "manifest.json").read_text())
     assert (found["started"], found["seeds"]) == ("long ago", 3)
     assert [one["commit"] for one in found["resumptions"]] == [first["commit"]] * 2
+
+
+def test_a_published_manifest_names_no_folder_of_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["unjam", "reproduce", "rings", "--out", str(tmp_path / "mine")])
+    write_manifest(tmp_path, seeds=2)
+    command = json.loads((tmp_path / "manifest.json").read_text())["command"]
+    assert command == ["unjam", "reproduce", "rings", "--out", "mine"]
 
 
 def test_a_failed_episode_raises_instead_of_being_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

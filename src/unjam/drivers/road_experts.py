@@ -298,7 +298,7 @@ class JamAhead(FormulaDriver):
     jam_speed_ratio: Positive = 0.75
     """share of the allowed speed below which the mean ahead counts as a jam, on roads without a map of ramps"""
     free_speed_ratio: Positive | None = None
-    """with a map of ramps: share of the allowed speed at which traffic ahead is free, so that no cap is needed"""
+    """with a map of ramps: share of the allowed speed from which on no cap is needed; None: there always is one"""
 
     @model_validator(mode="after")
     def _check_section_order(self) -> "JamAhead":

@@ -23,7 +23,7 @@ from unjam.following.calibration import (
 )
 from unjam.following.loaders import ReadOptions, read_trajectories
 from unjam.following.trajectories import FollowingTrajectory, select_splits, split_by_driver
-from unjam.manifest import manifest
+from unjam.manifest import manifest, without_folders
 from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclass, nest_keys
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population
@@ -153,7 +153,7 @@ def fit_drivers_from_files(
     population = fit_drivers(trajectories, settings, on_progress)
     origin = manifest()
     # Populations are published: they do not name folders of this machine.
-    origin["command"] = [Path(word).name if "/" in word else word for word in origin["command"]]
+    origin["command"] = without_folders(origin["command"])
     metadata = {"data": [file.name for file in files], "filters": filters or {}, "manifest": origin}
     return FittedDrivers(replace(population, metadata={**population.metadata, **metadata}), notes)
 

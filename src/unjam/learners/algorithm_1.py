@@ -113,8 +113,8 @@ class Algorithm1:
         values, tensors = check_state(type(self.learner).__name__, self.learner.state())
         for each in self.model_rollouts:
             values[each.name], model_tensors = each.state()
-            tensors |= {f"{each.name}/{name}": tensor for name, tensor in model_tensors.items()}
-        return values, {name: tensor.detach().clone() for name, tensor in tensors.items()}
+            tensors |= {f"{each.name}/{name}": tensor.detach().clone() for name, tensor in model_tensors.items()}
+        return values, tensors
 
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
         """Resume, with the same configuration, from what `state` returned."""

@@ -19,7 +19,7 @@ class SpeedLimitControl:
 
     Integral control of the density, mainstream traffic flow control as in Carlson, Papamichail and Papageorgiou 2011,
     IEEE Trans. Intell. Transp. Syst. 12:1261-1276. Vehicles accelerate again before they reach the merging section.
-    Where the limits of two ramps or the cap of a CAV hold at once, the lowest one does.
+    If several limits or the cap of a CAV apply to a vehicle, the lowest of them holds.
     """
 
     active: bool = False
@@ -49,7 +49,7 @@ class SpeedLimitControl:
 class RampMeter:
     """A ramp meter, which lets vehicles pass one by one: ALINEA, on density.
 
-    At its highest rate it is off. While the queue comes close to the entrance of the ramp it has this rate.
+    It is off at its highest rate, which it also has while the queue is close to the entrance of the ramp.
     Papageorgiou, Hadj-Salem and Blosseville 1991, Transp. Res. Rec. 1320:58-64.
     """
 

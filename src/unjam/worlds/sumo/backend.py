@@ -45,7 +45,8 @@ class SumoBackend(AbstractContextManager["SumoBackend"]):
         """Return why SUMO cannot simulate a scenario; empty if it can."""
         if type(scenario) in SCENARIO_KINDS.values():  # drawing the roads of large networks takes time
             return ""
-        return _unsupported_reason(scenario.draw_from_seed((0,))[0])
+        road, _ = scenario.draw_from_seed((0,))
+        return "" if type(road) in TRAFFIC_CLASSES else _unsupported_reason(road)
 
     @contextmanager
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[Traffic[Any]]:
@@ -107,11 +108,10 @@ def sumo_inputs(scenario: Scenario, road: Road) -> SumoInputs:
 
 def _unsupported_reason(road: Road) -> str:
     allowed = ", ".join(each.__name__ for each in TRAFFIC_CLASSES)
-    reason = f"{type(road).__name__} is not allowed as the road of SUMO; allowed: {allowed}"
-    return "" if type(road) in TRAFFIC_CLASSES else reason
+    return f"{type(road).__name__} is not allowed as the road of SUMO; allowed: {allowed}"
 
 
 def _traffic_class(road: Road) -> type[Traffic[Any]]:
-    if reason := _unsupported_reason(road):
-        raise InputError(f"scenario: {reason}")
+    if type(road) not in TRAFFIC_CLASSES:
+        raise InputError(f"scenario: {_unsupported_reason(road)}")
     return TRAFFIC_CLASSES[type(road)]

@@ -1,6 +1,6 @@
 """Upper limits of vehicles' speeds in SUMO, from several sources at once: set-speed caps of CAVs, and speed limits."""
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable
 from math import inf
 
 from unjam.worlds.sumo.simulation import Simulation
@@ -17,8 +17,8 @@ class SpeedCaps:
         self.own_max_speeds: dict[str, float] = {}
         """maximum speeds of the vehicles that have a cap, without it [m/s]"""
 
-    def capped(self, source: Hashable) -> Iterable[str]:
-        """Return the vehicles that have a cap from a source, among them some that have left the road."""
+    def capped(self, source: Hashable) -> list[str]:
+        """Return the vehicles that have a cap from a source; some of them may have left the road."""
         return [name for name, caps in self._caps.items() if source in caps]
 
     def set(self, name: str, source: Hashable, cap: float) -> None:
