@@ -67,9 +67,12 @@ CHANGED_SETTING = 18
 CHANGES: dict[str, tuple[float, dict[str, Any]]] = {
     "nothing": (1.0, {}),
     **{
-        f"cooperation of human drivers {value:g}": (
+        f"cooperation of all human drivers {value:g}": (
             1.0,
-            {f"lane_changing.{name}": (value, value) for name in ("cooperation", "speed_cooperation")},
+            {
+                **{f"lane_changing.{name}": (value, value) for name in ("cooperation", "speed_cooperation")},
+                "lane_changing.uncooperative_share": 0.0,
+            },
         )
         for value in (1.0, 0.8, 0.5, 0.0)
     },
@@ -207,23 +210,23 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     tuned = tuned_drivers(first_rows, read_part(folder, FINAL_PART), human)
     hard = settings_with_breakdown(read_part(folder, TEST_HUMAN_PART))
     own = tuned[CONTROLLER]
+    parts |= {
+        f"{TEST_PART}/{label} {100 * rate:g} % {number}": (
+            measure_test,
+            (label, candidate, rate, number, TEST_SEEDS if number in hard else HARM_SEEDS),
+        )
+        for rate in BENCHMARK_RATES
+        for number in TEST_SETTINGS
+        for label, candidate in tuned.items()
+        if number in hard or label != OPPONENT
+    }
     sensing = {source: replace(own, settings={**own.settings, "roadside.source": source}) for source in OTHER_SOURCES}
     parts |= {
         f"{SENSING_PART}/{source} {number}": (measure_test, (source, each, BENCHMARK_RATES[0], number, SENSING_SEEDS))
         for source, each in sensing.items()
         for number in hard
     }
-    parts |= {f"{SENSITIVITY_PART}/{name}": (measure_change, (name, own)) for name in CHANGES}
-    return parts | {
-        f"{TEST_PART}/{label} {100 * rate:g} % {number}": (
-            measure_test,
-            (label, candidate, rate, number, TEST_SEEDS if number in hard else HARM_SEEDS),
-        )
-        for number in TEST_SETTINGS
-        for rate in BENCHMARK_RATES
-        for label, candidate in tuned.items()
-        if number in hard or label != OPPONENT
-    }
+    return parts | {f"{SENSITIVITY_PART}/{name}": (measure_change, (name, own)) for name in CHANGES}
 
 
 def tuned_drivers(first_rows: Table, finals: Table, human: Table) -> dict[str, Candidate]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-CANDIDATES_PER_METHOD = 30
+CANDIDATES_PER_METHOD = 18
 """number of candidates of each method"""
 CANDIDATE_SEED = 20261129
 Range = tuple[float, float] | Sequence[Any]
