@@ -39,6 +39,7 @@ from unjam_paper.results_file import read_part, write_figure, write_part
 from unjam_paper.study import (
     FINAL_SHARE,
     NO_VALUE_TEXT,
+    ORIGINAL_ROADS,
     PAPER_ROADS,
     PlannedRun,
     Study,
@@ -148,7 +149,7 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
 
 
 def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows: dict[str, Table]) -> dict[str, Any]:
-    reported = PAPER_RESULTS.get((road, VARIANTS[variant].paper_variant or variant))
+    reported = PAPER_RESULTS.get((ORIGINAL_ROADS.get(road, road), VARIANTS[variant].paper_variant or variant))
     metric = return_metric(road, variant)
     best = best_expert(reference_rows, metric)
     row: dict[str, Any] = {"road": road, "name": VARIANTS[variant].label, "variant": variant, "is_learned": True}
@@ -287,8 +288,8 @@ def paper_exact_study(road: str) -> Study:
 
     All steps are made; the iteration at which the convergence rule of the paper ends the training is computed.
     """
-    fewer = "-million" if road == "merge" else ""
-    variants = (f"trpo-exact{fewer}", f"proposed-exact{fewer}")
+    suffix = {"merge": "-million", "ring": "-filtered", "figure-eight": "-filtered"}.get(road, "")
+    variants = (f"trpo-exact{suffix}", f"proposed-exact{suffix}")
     study = comparison_study(f"exact settings of the paper, on {road}", variants, road)
 
     def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:

@@ -26,7 +26,7 @@ from unjam.worlds.episode import can_drive
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import collect_results
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
-from unjam_paper.study import STUDY_ROADS, PlannedRun, Study, StudyFolder, write_manifest
+from unjam_paper.study import ORIGINAL_ROADS, STUDY_ROADS, PlannedRun, Study, StudyFolder, write_manifest
 from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES
 
 TRAINING_SECONDS: dict[str, dict[str, float]] = {
@@ -144,7 +144,7 @@ def drive_references(road: str, study_folder: StudyFolder, workers: int) -> None
     """Evaluate the reference drivers of a road on the test seeds of the trainings."""
     config = load_config(changes=STUDY_ROADS[road])
     scenario = config.make_scenario()
-    names = {**REFERENCE_DRIVERS, **TUNED_REFERENCES.get(road, {})}
+    names = {**REFERENCE_DRIVERS, **TUNED_REFERENCES.get(ORIGINAL_ROADS.get(road, road), {})}
     drivers = {label: make_driver(name, scenario.control_step) for label, name in names.items()}
     drivers = {label: driver for label, driver in drivers.items() if can_drive(driver, scenario)}
     with WorkerPool(workers) as pool:

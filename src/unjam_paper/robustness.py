@@ -27,6 +27,7 @@ from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate
 from unjam_paper.results_file import StudyPart, read_part, write_part
 from unjam_paper.study import (
     STUDY_ROADS,
+    UNFILTERED_ROADS,
     PlannedRun,
     Study,
     StudyFolder,
@@ -158,8 +159,8 @@ def _transfer_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPar
     return {f"transfer/{road}": (transfer_rows, (road, drivers)) for road in TRANSFER_ROADS}
 
 
-def _write_figure_10(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
-    tables = (comparison_rows(study_folder, road, VOLUME_VARIANTS, seeds) for road in VOLUME_ROADS)
+def _write_figure_10(roads: tuple[str, ...], study_folder: StudyFolder, seeds: int, folder: Path) -> None:
+    tables = (comparison_rows(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads)
     write_part(folder, "table", [row for rows in tables for row in rows])
 
 
@@ -181,11 +182,18 @@ ROBUSTNESS = Study(
     minutes=20.0,
     tables={road: partial(_robustness_table, road) for road in ROAD_CONDITIONS},
 )
+UNFILTERED_VOLUME_ROADS = tuple(UNFILTERED_ROADS[road] for road in VOLUME_ROADS)
+FIGURE_10_UNFILTERED = Study(
+    title="5, 11 and 22 vehicles, trained for each, without the safety filter",
+    make_runs=lambda seeds: planned_runs(UNFILTERED_VOLUME_ROADS, VOLUME_VARIANTS, seeds),
+    write=partial(_write_figure_10, UNFILTERED_VOLUME_ROADS),
+    roads=UNFILTERED_VOLUME_ROADS,
+)
 FIGURE_10 = Study(
     title="5, 11 and 22 vehicles, trained for each, and transfer between them",
     make_runs=lambda seeds: planned_runs(VOLUME_ROADS, VOLUME_VARIANTS, seeds),
     make_parts=_transfer_parts,
-    write=_write_figure_10,
+    write=partial(_write_figure_10, VOLUME_ROADS),
     roads=VOLUME_ROADS,
     minutes=3.0,
     tables={"transfer": _transfer_table},

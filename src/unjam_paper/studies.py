@@ -19,32 +19,48 @@ from unjam_paper.figure_6 import FIGURE_6
 from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY
 from unjam_paper.motorway_benchmark import MOTORWAY_BENCHMARK
 from unjam_paper.motorway_ensemble import MOTORWAY_ENSEMBLE
-from unjam_paper.robustness import FIGURE_10, ROBUSTNESS
-from unjam_paper.study import PAPER_ROADS, Study
+from unjam_paper.robustness import FIGURE_10, FIGURE_10_UNFILTERED, ROBUSTNESS
+from unjam_paper.study import PAPER_ROADS, UNFILTERED_ROADS, UNSCALED_NOISE_ROAD, Study
 from unjam_paper.theory import FIGURE_8, THEORY
 
-TABLE_1_STUDIES: dict[str, Study] = {
-    f"table-1-{road}": comparison_study(
-        f"TRPO, PPO, SAC, the proposed method and ours on {road}",
-        ("trpo", "ppo", "sac", "proposed", "without-model", "ours"),
-        road,
-    )
-    for road in PAPER_ROADS
+TABLE_1_VARIANTS = ("trpo", "ppo", "sac", "proposed", "without-model", "ours")
+TABLE_2_VARIANTS = ("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed", "ours-without-model", "ours")
+FIGURE_9_VARIANTS = ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed", "without-model")
+TABLE_1_TITLE = "TRPO, PPO, SAC, the proposed method and ours on"
+TABLE_2_TITLE = "contribution of each part of the method, on the ring"
+FIGURE_9_TITLE = "PPO and SAC within the framework, on the ring"
+TABLE_1_STUDIES = {
+    f"table-1-{road}": comparison_study(f"{TABLE_1_TITLE} {road}", TABLE_1_VARIANTS, road) for road in PAPER_ROADS
 }
-PAPER_EXACT_STUDIES = {f"to-the-letter-{road}": paper_exact_study(road) for road in PAPER_ROADS}
+RING, FIGURE_EIGHT = UNFILTERED_ROADS["ring"], UNFILTERED_ROADS["figure-eight"]
+UNFILTERED_STUDIES = {
+    **{
+        f"table-1-{road}": comparison_study(f"{TABLE_1_TITLE} {road}", TABLE_1_VARIANTS, road)
+        for road in (RING, FIGURE_EIGHT)
+    },
+    **{
+        f"proposed-{road}": comparison_study(f"TRPO and the proposed method on {road}", ("trpo", "proposed"), road)
+        for road in (RING, FIGURE_EIGHT)
+    },
+    "table-2-unfiltered": comparison_study(f"{TABLE_2_TITLE}, without the safety filter", TABLE_2_VARIANTS, RING),
+    "table-2-unscaled-noise": comparison_study(
+        f"{TABLE_2_TITLE}, without the safety filter, noise not scaled", TABLE_2_VARIANTS, UNSCALED_NOISE_ROAD
+    ),
+    "figure-9-unfiltered": comparison_study(f"{FIGURE_9_TITLE}, without the safety filter", FIGURE_9_VARIANTS, RING),
+    "figure-10-unfiltered": FIGURE_10_UNFILTERED,
+}
+"""the tables and figures of the paper without the safety filter, which it does not have; merges never have it"""
+PAPER_EXACT_STUDIES = {
+    **{f"to-the-letter-{road}": paper_exact_study(UNFILTERED_ROADS.get(road, road)) for road in PAPER_ROADS},
+    **{f"to-the-letter-{road}-filtered": paper_exact_study(road) for road in ("ring", "figure-eight")},
+}
 STUDIES: dict[str, Study] = {
     **TABLE_1_STUDIES,
     "figure-5": FIGURE_5,
-    "table-2": comparison_study(
-        "contribution of each part of the method, on the ring",
-        ("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed", "ours-without-model", "ours"),
-    ),
+    "table-2": comparison_study(TABLE_2_TITLE, TABLE_2_VARIANTS),
     "figure-6": FIGURE_6,
     "figure-8": FIGURE_8,
-    "figure-9": comparison_study(
-        "PPO and SAC within the framework, on the ring",
-        ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed", "without-model"),
-    ),
+    "figure-9": comparison_study(FIGURE_9_TITLE, FIGURE_9_VARIANTS),
     "figure-10": FIGURE_10,
     "theory": THEORY,
     "road-model": road_model_study("ring", "best"),
@@ -56,6 +72,7 @@ STUDIES: dict[str, Study] = {
         ("trpo-eq16", "trpo-as-printed", "proposed-eq16", "proposed-as-printed"),
     ),
     **PAPER_EXACT_STUDIES,
+    **UNFILTERED_STUDIES,
     "robustness": ROBUSTNESS,
     "human-traffic": HUMAN_TRAFFIC_STUDY,
     "motorway-ensemble": MOTORWAY_ENSEMBLE,
@@ -100,6 +117,7 @@ STUDY_GROUPS: dict[str, tuple[str, ...]] = {
     "figure-4": tuple(TABLE_1_STUDIES),
     "figure-7": ("table-2",),
     "to-the-letter": tuple(PAPER_EXACT_STUDIES),
+    "unfiltered": tuple(UNFILTERED_STUDIES),
     "all": tuple(STUDIES),
 }
 """names for one study or several; a figure is drawn with the table of the same trainings"""

@@ -37,6 +37,17 @@ STUDY_ROADS: dict[str, dict[str, Any]] = {
     "ring-11": {"scenario": "ring", "scenario_options.vehicles": 11},
     "ring-5": {"scenario": "ring", "scenario_options.vehicles": 5},
 }
+UNFILTERED_ROADS = {road: f"{road}-unfiltered" for road in ("ring", "figure-eight", "ring-11", "ring-5")}
+"""roads as in the paper, without the safety filter, by the road with it; the merge never has one"""
+UNSCALED_NOISE_ROAD = "ring-unfiltered-unscaled-noise"
+"""... and with the noise of Table B1 in each step, not times the square root of the step as in Flow"""
+STUDY_ROADS |= {
+    unfiltered: {**STUDY_ROADS[road], "scenario_options.safety.active": False}
+    for road, unfiltered in UNFILTERED_ROADS.items()
+}
+STUDY_ROADS[UNSCALED_NOISE_ROAD] = {**STUDY_ROADS[UNFILTERED_ROADS["ring"]], "scenario_options.noise_scaling": "none"}
+ORIGINAL_ROADS = {**{each: road for road, each in UNFILTERED_ROADS.items()}, UNSCALED_NOISE_ROAD: "ring"}
+"""the road with the filter, by its version without"""
 PAPER_ROADS = ("ring", "figure-eight", "merge")
 FINAL_SHARE = 0.1
 """share of the iterations at the end of a training, over which the convention of the paper averages"""

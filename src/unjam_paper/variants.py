@@ -84,6 +84,7 @@ FIRST_150_SECONDS = {
     **{"trpo.gamma": 0.996, "trpo.gae_lambda": 0.96, "policy.exploration_std": 0.05, "policy.action_duration": 1.5},
 }
 """found by a search on the first half of the episodes of the jammed ring; `best` was found on whole episodes"""
+FILTER = {"scenario_options.safety.active": True}
 EXACT_TRPO = {**NO_EXPERT, **NO_EARLY_STOPPING}
 PPO_AGENT, SAC_AGENT = {"agent": "ppo"}, {"agent": "sac"}
 VARIANTS: dict[str, Variant] = {
@@ -102,6 +103,10 @@ VARIANTS: dict[str, Variant] = {
     "proposed-as-printed": Variant("proposed, Eq. 16 as printed", "paper", {"reward": "eq16-as-printed"}),
     "trpo-exact": Variant("TRPO", "paper-exact", EXACT_TRPO, PAPER_STEP_BUDGET, "trpo"),
     "proposed-exact": Variant("proposed", "paper-exact", NO_EARLY_STOPPING, PAPER_STEP_BUDGET, "proposed"),
+    "trpo-exact-filtered": Variant("TRPO", "paper-exact", {**EXACT_TRPO, **FILTER}, PAPER_STEP_BUDGET, "trpo"),
+    "proposed-exact-filtered": Variant(
+        "proposed", "paper-exact", {**NO_EARLY_STOPPING, **FILTER}, PAPER_STEP_BUDGET, "proposed"
+    ),
     "trpo-exact-million": Variant("TRPO", "paper-exact", EXACT_TRPO, MILLION_STEPS, "trpo"),
     "proposed-exact-million": Variant("proposed", "paper-exact", NO_EARLY_STOPPING, MILLION_STEPS, "proposed"),
     "ours": Variant("ours", "quick", {}),

@@ -15,6 +15,7 @@ from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.files import atomic_write
 from unjam.scenarios.scenario import Scenario
+from unjam.training.config import load_config
 from unjam.training.run_folder import read_config
 from unjam.worlds.episode import check_can_drive
 from unjam.worlds.sumo.backend import SumoBackend
@@ -23,7 +24,7 @@ from unjam_paper.comparison import comparison_study
 from unjam_paper.reproduce import estimated_seconds, find_studies, make_plan, run_plan
 from unjam_paper.results_file import read_parts
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
-from unjam_paper.study import DriverSource, PlannedRun, StudyFolder, evaluate_metrics
+from unjam_paper.study import STUDY_ROADS, DriverSource, PlannedRun, StudyFolder, evaluate_metrics
 from unjam_paper.variants import VARIANTS
 
 Made = tuple[Path, list[str]]
@@ -37,6 +38,14 @@ def test_trainings_of_every_study_have_a_valid_configuration(name: str) -> None:
         config = run.config
         assert config.seed == run.seed
         assert config.make_scenario().horizon > 0
+
+
+@pytest.mark.parametrize("group", ["unfiltered", "to-the-letter"])
+def test_studies_of_the_paper_itself_drive_without_the_safety_filter(group: str) -> None:
+    for name, study in find_studies([group]).items():
+        configs = [run.config for run in study.make_runs(1)]
+        configs += [load_config(changes=STUDY_ROADS[road]) for road in study.roads]
+        assert {each.make_scenario().safety.active for each in configs} == {name.endswith("-filtered")}
 
 
 def test_groups_name_all_studies() -> None:

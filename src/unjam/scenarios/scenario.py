@@ -180,7 +180,8 @@ class Scenario:
     noise: NonNegative = 0.2
     """standard deviation of the acceleration noise of human drivers [m/s2]"""
     noise_scaling: Literal["sqrt-step", "none"] = "sqrt-step"
-    """`sqrt-step`: noise times sqrt(time step), as in Flow; `none`: as in the paper"""
+    """`sqrt-step`: the noise of a step is `noise` times the square root of its duration, as in Flow; `none`: it is
+    `noise`, as Table B1 of the paper reads"""
     emission_class: str = "HBEFA4/PC_petrol_Euro-6ab"
     """SUMO's emission class of every vehicle, for fuel"""
 
