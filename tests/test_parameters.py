@@ -1,3 +1,4 @@
+from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
 import pytest
@@ -6,6 +7,9 @@ from hypothesis import strategies as st
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
+from unjam.drivers import PISaturation
+from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import InputError
 from unjam.parameters import (
     STRICT,
@@ -18,6 +22,7 @@ from unjam.parameters import (
     parse_toml,
     parse_value,
 )
+from unjam.scenarios import FigureEight, Motorway, Ramp, Ring, make_scenario
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -142,3 +147,88 @@ def test_a_key_of_many_parts_is_refused_before_it_takes_memory(part: str) -> Non
             parse_toml(text)
     assert parse_toml(f"{'.'.join([part] * 50)} = 1")
     assert parse_toml(f"a = {[0.5] * 1000}\nb = '{'../' * 50}'")
+
+
+class UndecoratedRing(Ring):
+    length = 130  # pyright: ignore[reportAssignmentType]
+    vehicles: int = 11
+
+
+class RingOfIt(UndecoratedRing):
+    """Replaces nothing."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class DecoratedRing(Ring):
+    length = (130, 130)
+    vehicles: int = 11
+
+
+class SmallEight(FigureEight):
+    radius = 31  # pyright: ignore[reportAssignmentType]
+    extra: float = 1.0
+
+
+class TwoRamps(Motorway):
+    ramps = (Ramp(position=900.0), Ramp(position=1800.0))
+    lanes = 1
+    inflow: float = 1200.0
+
+
+class BusyRamp(Ramp):
+    inflow = 700.0
+
+
+class QuickPI(PISaturation):
+    time_constant = 10.0
+
+
+class WaryFilter(SafetyFilter):
+    time_gap = 2.0
+
+
+class SlowPair(MixedDriver):
+    drivers = (PISaturation(), PISaturation())
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "expected"),
+    [
+        (UndecoratedRing, {"horizon": 5}, {"length": (130, 130), "vehicles": 11, "horizon": 5}),
+        (RingOfIt, {"vehicles": 9}, {"length": (130, 130), "vehicles": 9}),
+        (DecoratedRing, {}, {"length": (130, 130), "vehicles": 11}),
+        (SmallEight, {"extra": 2.0}, {"radius": (31, 31), "extra": 2.0}),
+        (TwoRamps, {}, {"ramps": (Ramp(position=900.0), Ramp(position=1800.0)), "lanes": 1, "inflow": 1200.0}),
+        (BusyRamp, {"position": 10.0}, {"inflow": 700.0, "position": 10.0}),
+        (QuickPI, {"window": 5.0}, {"time_constant": 10.0, "window": 5.0}),
+        (WaryFilter, {}, {"time_gap": 2.0}),
+        (SlowPair, {}, {"drivers": (PISaturation(), PISaturation())}),
+    ],
+)
+def test_values_in_the_body_of_a_class_are_its_defaults(kind: Any, arguments: dict[str, Any], expected: Any) -> None:
+    for made in (kind(**arguments), build_dataclass(kind, arguments, "it")):
+        assert {name: getattr(made, name) for name in expected} == expected
+        assert replace(made) == made
+        with pytest.raises(FrozenInstanceError):
+            setattr(made, next(iter(expected)), 3.0)
+
+
+def test_an_invalid_value_in_the_body_of_a_class_is_refused_in_one_line() -> None:
+    with pytest.raises(InputError, match=r"^scenario Bad\.vehicles: 1 is not allowed; allowed: greater than or equal"):
+        make_scenario(type("Bad", (Ring,), {"vehicles": 1}))
+
+
+def test_computed_values_and_constructors_of_a_subclass_remain_its_own() -> None:
+    class Computed(Ring):
+        @property
+        def horizon(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+            return 7
+
+    class Constructed(PISaturation):
+        window = 4.0
+
+        def __init__(self) -> None:
+            super().__init__(time_constant=3.0)
+
+    assert Computed().horizon == 7
+    assert Constructed().time_constant == 3.0

@@ -3,10 +3,13 @@
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from inspect import get_annotations
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from unjam.errors import InputError, invalid_value, spelling_hint
 
@@ -48,12 +51,43 @@ _DEEP_KEY = re.compile(rf"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{M
 DataclassT = TypeVar("DataclassT")
 
 
+class Subclassable:
+    """Base of dataclasses that users derive from: values in the body of a class are its defaults, decorated or not.
+
+    Without it, a class without a decorator would inherit `__init__` and with it the defaults of its base.
+    """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Give values that replace inherited defaults the types of their fields."""
+        super().__init_subclass__(**options)
+        for base in reversed(cls.__mro__[1:]):
+            _apply_decorator(base)
+        inherited = {each.name: each.type for each in fields(cls)} if is_dataclass(cls) else {}
+        values = {name for name, value in vars(cls).items() if not hasattr(value, "__get__")}  # but no properties
+        replaced = {name: kind for name, kind in inherited.items() if name in values}
+        if replaced:
+            cls.__annotations__ = replaced | get_annotations(cls)
+
+    def __new__(cls, *_: Any, **__: Any) -> Self:
+        """Make an instance of a class that is a dataclass itself."""
+        _apply_decorator(cls)
+        return super().__new__(cls)
+
+
+def _apply_decorator(cls: type[Any]) -> None:
+    """Make a class with fields a dataclass of parameters, as its bases are, unless it is one or has an `__init__`."""
+    is_complete = not get_annotations(cls) or not {"__dataclass_fields__", "__init__"}.isdisjoint(vars(cls))
+    if is_dataclass(cls) and issubclass(cls, Subclassable) and not is_complete:
+        dataclass(frozen=True, config={**STRICT, "validate_default": True, "arbitrary_types_allowed": True})(cls)
+
+
 def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) -> DataclassT:
     """Return `kind(**values)`, or raise `InputError` with one line that names the first invalid value.
 
     `field` is the origin of the values, for the message.
     """
     check_values(values, field)
+    _apply_decorator(kind)
     try:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:

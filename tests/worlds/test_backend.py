@@ -1,5 +1,6 @@
 """Backends: SUMO, the batch, and one of a user's own, which docs/architecture.md shows."""
 
+import json
 import sys
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from unjam.drivers.road_experts import Cruise
 from unjam.drivers.user_driver import FileReference
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError, UnjamError
+from unjam.reports.video import write_video
 from unjam.scenarios import Merge, Ring
 from unjam.scenarios.motorway import ON_RAMP
 from unjam.scenarios.road import ClosedRoad
@@ -78,6 +80,22 @@ def test_a_users_backend_drives_in_this_process_as_an_object(own: str) -> None:
         unjam.drive("ring", "pi", 2, backend=each, **options).rows["pi"] for each in (own, backend_object(own))
     )
     assert [row["mean_speed"] for row in by_name] == [row["mean_speed"] for row in as_object]
+
+
+@pytest.mark.parametrize(("scenario", "kind"), [("ring", "batch"), ("ring", "own"), ("on-ramp", "batch")])
+def test_results_of_every_backend_have_a_report(
+    scenario: str, kind: str, own: str, tmp_path: Path, without_pictures: None
+) -> None:
+    options: dict[str, Any] = {"horizon": 40, **({"penetration_rate": 0.5} if scenario == "on-ramp" else {})}
+    settings: dict[str, Any] = {"backend": own if kind == "own" else kind, "out": tmp_path / "results", "workers": 1}
+    result = unjam.drive(scenario, ["human", "idm"], 1, scenario_options=options, **settings)
+    assert result.report is not None
+    page, is_drawn = result.report.read_text(), scenario == "ring"
+    assert ("The backend does not record where vehicles are" in page) is not is_drawn
+    assert len(json.loads(page.split('application/json">')[1].split("</script>")[0])["drivers"]) == 2 * is_drawn
+    if not is_drawn:
+        with pytest.raises(InputError, match="video: the backend does not record where vehicles are"):
+            write_video(result.plot_episodes["human"], tmp_path / "a.gif", "")
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.local_state import LocalState, ScaledInput
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface, merge_requirements
+from unjam.parameters import Subclassable
 from unjam.physics.arrays import Array
 from unjam.tree import map_leaves, named_parts
 
@@ -36,7 +37,7 @@ class Decision(NamedTuple):
     """memory of the driver after the decision"""
 
 
-class Driver:
+class Driver(Subclassable):
     """Drives any number of CAVs: `(local state, memory) -> (acceleration, memory)`.
 
     A driver holds parameters only. Everything that changes while driving is in `memory`. Therefore the same

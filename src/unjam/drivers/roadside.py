@@ -10,14 +10,14 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.local_state import ROAD_SECTION_LENGTH, SECTIONS_AHEAD
-from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive, Subclassable
 from unjam.physics.arrays import Floats
 
 SpeedSource = Literal["vehicles", "cavs", "detectors", "none"]
 
 
 @dataclass(frozen=True, config=STRICT)
-class RoadsideSettings:
+class RoadsideSettings(Subclassable):
     """What a message contains, and how it differs from the current measurement."""
 
     source: SpeedSource = "vehicles"

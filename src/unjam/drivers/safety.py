@@ -12,7 +12,7 @@ from typing import NamedTuple
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive, Subclassable
 from unjam.physics.arrays import Array, clamp_max, clamp_min
 from unjam.physics.kinematics import max_speed_to_stop, stopping_distance
 
@@ -26,7 +26,7 @@ class ActuatorState(NamedTuple):
 
 
 @dataclass(frozen=True, config=STRICT)
-class Actuator:
+class Actuator(Subclassable):
     """Delay and lag of a vehicle's response to commands: da/dt = (u(t - delay) - a) / lag, exact over each step.
 
     Vehicles with driver assistance systems: lag 0.2 to 0.5 s, delay 0.05 to 0.5 s.
@@ -81,7 +81,7 @@ MAX_LEADER_GAP = 1e6
 
 
 @dataclass(frozen=True, config=STRICT)
-class SafetyFilter:
+class SafetyFilter(Subclassable):
     """Upper bound of the acceleration behind a leader: RSS with a response time of one step, and a minimum time gap.
 
     Sources: Shalev-Shwartz et al. 2017 (arXiv:1708.06374), Definition 1; equal brakes of 6 m/s2 as in the

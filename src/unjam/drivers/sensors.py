@@ -9,7 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import FollowingState
-from unjam.parameters import STRICT, NonNegative
+from unjam.parameters import STRICT, NonNegative, Subclassable
 from unjam.physics.arrays import Array, Floats
 
 MIN_SENSED_GAP = 0.1
@@ -17,7 +17,7 @@ MIN_SENSED_GAP = 0.1
 
 
 @dataclass(frozen=True, config=STRICT)
-class Sensors:
+class Sensors(Subclassable):
     """Errors of the sensed gaps and speeds of neighbors; the own speed is exact."""
 
     gap_error: NonNegative = 0.0

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, Positive
+from unjam.parameters import STRICT, Positive, Subclassable
 from unjam.physics.arrays import Array, clamp_min, square_root
 
 
 @dataclass(frozen=True, config=STRICT)
-class IDMParameters:
+class IDMParameters(Subclassable):
     """Parameters of the Intelligent Driver Model; the defaults are Table B1 of the paper."""
 
     desired_speed: Positive = 30.0

@@ -83,6 +83,7 @@ def render_report(results: Sequence[Results]) -> str:
     columns = summary.report_columns(results)
     panels = [replace(column.episode, driver=column.name) for column in columns if column.episode is not None]
     panels = panels[:MAX_PANELS]
+    drawn = [panel for panel in panels if panel.has_poses]
     single = results[0] if len(results) == 1 else None
     sources = list(zip(summary.folder_names(results), results, strict=True))
     counts = [len(column.rows) for column in columns]
@@ -98,6 +99,7 @@ def render_report(results: Sequence[Results]) -> str:
         cards=summary.key_figures(single) if single else [],
         figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, panels).items()},
         panels=panels,
+        drawn=drawn,
         road_values=list(dict.fromkeys(roads)),
         has_lane_maps=space_time.has_lane_maps(panels),
         baseline_differences=summary.baseline_differences(columns),
@@ -110,7 +112,8 @@ def render_report(results: Sequence[Results]) -> str:
         table=table,
         sources=[(name, result, original_command(result)) for name, result in sources],
         script=_page_file("replay.js"),
-        replay_data=Markup(json.dumps(replay_data(panels)).replace("<", "\\u003c")),
+        undrawn=[panel.driver for panel in panels if not panel.has_poses],
+        replay_data=Markup(json.dumps(replay_data(drawn)).replace("<", "\\u003c")),
     )
 
 

@@ -54,6 +54,11 @@ class PlotEpisode(Episode):
         return len(self.outline) > 0
 
     @property
+    def has_poses(self) -> bool:
+        """Whether it is known where the vehicles are in the plane; some backends do not record it on open roads."""
+        return self.is_closed or len(self.poses) > 0
+
+    @property
     def times(self) -> NDArray[np.float64]:
         """Times of the snapshots [s], shape (T + 1,)."""
         return np.arange(len(self.speeds), dtype=np.float64) * self.control_step

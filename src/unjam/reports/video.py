@@ -8,7 +8,7 @@ from textwrap import fill
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from unjam.errors import DiskError, import_optional, invalid_value
+from unjam.errors import DiskError, InputError, import_optional, invalid_value
 from unjam.files import atomic_write, check_parent_folder
 from unjam.processes import PrivateFolder
 from unjam.reports.figures import CAV_PLOT_COLOR, TEXT_COLOR, color_table
@@ -116,12 +116,14 @@ def episode_scenes(episode: Episode, steps: Sequence[int]) -> Iterator[RoadScene
 def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) -> None:
     """Write a video of an episode, `pace` times as fast as real time; the file name ends in .gif, .webp or .mp4.
 
-    Raise `InputError` for another file format, `DiskError` if its folder does not exist or the disk is full (a previous
-    file is unchanged), and `MissingPartError` for .mp4 without imageio-ffmpeg.
+    Raise `InputError` for another file format or an episode without poses, `DiskError` if its folder does not exist or
+    the disk is full (a previous file is unchanged), and `MissingPartError` for .mp4 without imageio-ffmpeg.
     """
     check_video_format(path)
     check_parent_folder(path)
     episode = to_plot_episode("", episode)
+    if not episode.has_poses:
+        raise InputError("video: the backend does not record where vehicles are in the plane; allowed: backend=sumo")
     stride = max(1, round(pace / FRAMES_PER_SECOND / episode.control_step))
     frames = _video_frames(episode, title, stride)
     seconds = stride * episode.control_step / pace

@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from unjam.drivers.roadside import RoadsideSettings
 from unjam.drivers.safety import SafetyFilter
-from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt
+from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, Subclassable
 from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayGeometry, MotorwayRoad, RampGeometry
 from unjam.scenarios.motorway_vehicles import (
     TRUCK_TYPE_COUNT,
@@ -42,7 +42,7 @@ Section = Annotated[float, Field(ge=50)]
 
 
 @dataclass(frozen=True, config=STRICT)
-class Ramp:
+class Ramp(Subclassable):
     """An on-ramp of a motorway, with its demand."""
 
     position: Positive

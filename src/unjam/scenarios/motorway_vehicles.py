@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive, Subclassable
 from unjam.scenarios.road import VehicleType
 
 Interval = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
@@ -39,7 +39,7 @@ def draw_uniform(generator: np.random.Generator, interval: tuple[float, float]) 
 
 
 @dataclass(frozen=True, config=STRICT)
-class LaneChanging:
+class LaneChanging(Subclassable):
     """How human drivers change lanes: parameters of SUMO's model LC2013, uniform within ranges; None: its default.
 
     A CAV changes lanes as the human driver that it replaces, except for what `cruise` sets. Source:
@@ -82,7 +82,7 @@ class LaneChanging:
 
 
 @dataclass(frozen=True, config=STRICT)
-class Trucks:
+class Trucks(Subclassable):
     """Trucks among the vehicles; none of them becomes a CAV."""
 
     share: Share = 0.0
@@ -125,7 +125,7 @@ class Trucks:
 
 
 @dataclass(frozen=True, config=STRICT)
-class OrdinaryACC:
+class OrdinaryACC(Subclassable):
     """Cars that an ACC drives, without a controller: their drivers change lanes and choose the desired speed."""
 
     share: Share = 0.0

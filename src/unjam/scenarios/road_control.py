@@ -5,7 +5,7 @@ They act on all vehicles, not only on CAVs, and know the exact density of the me
 
 from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive, Subclassable
 
 LIMIT_STEP = 10.0 / 3.6
 """speed limits are multiples of 10 km/h [m/s]"""
@@ -14,7 +14,7 @@ MEASURED_DOWNSTREAM = 200.0
 
 
 @dataclass(frozen=True, config=STRICT)
-class SpeedLimitControl:
+class SpeedLimitControl(Subclassable):
     """A variable speed limit for all vehicles upstream of a merging section, which all of them obey.
 
     Integral control of the density, mainstream traffic flow control as in Carlson, Papamichail and Papageorgiou 2011,
@@ -46,7 +46,7 @@ class SpeedLimitControl:
 
 
 @dataclass(frozen=True, config=STRICT)
-class RampMeter:
+class RampMeter(Subclassable):
     """A ramp meter, which lets vehicles pass one by one: ALINEA, on density.
 
     It is off at its highest rate, which it also has while the queue is close to the entrance of the ramp.

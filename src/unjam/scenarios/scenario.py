@@ -16,7 +16,7 @@ from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.drivers.user_driver import UserFunction
-from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt
+from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, Subclassable
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
 from unjam.physics.idm import IDMArrays, IDMParameters, desired_speed_from_acceleration, idm_acceleration
 from unjam.physics.kinematics import next_speed
@@ -44,7 +44,7 @@ HumanControl = Literal["native", "commanded"]
 
 
 @dataclass(frozen=True, config=STRICT)
-class CruiseControl:
+class CruiseControl(Subclassable):
     """A CAV's own ACC, an IDM as SUMO computes it, and its motivation to change lanes.
 
     Weak acceleration, not a long time gap, makes an ACC worse than human drivers. With 1 s its time gap falls below
@@ -119,7 +119,7 @@ def _spawn_seeds(seed: Sequence[int]) -> list[np.random.SeedSequence]:
 
 
 @dataclass(frozen=True, config=STRICT)
-class Scenario:
+class Scenario(Subclassable):
     """The settings that all scenarios share; each kind of road adds its own."""
 
     title: ClassVar[str]
