@@ -5,7 +5,8 @@ Every error that a user can cause or correct is one of these: one clear line, no
 
 import errno
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
@@ -133,6 +134,17 @@ def unknown_name(field: str, value: object, names: Iterable[str]) -> InputError:
     """Return the error for a name that is not among `names`, with a suggestion."""
     known = list(names)
     return invalid_value(field, value, f"{', '.join(known)}{spelling_hint(value, known)}")
+
+
+@contextmanager
+def naming(prefix: str) -> Iterator[None]:
+    """Let the message of an `InputError` in the block begin with `prefix`."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(prefix):
+            raise
+        raise InputError(f"{prefix}{error}") from None
 
 
 def shorten_list(names: Iterable[str]) -> str:

@@ -4,11 +4,12 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
+from functools import wraps
 from inspect import get_annotations
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from unjam.errors import InputError, invalid_value, spelling_hint
@@ -19,6 +20,8 @@ STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 `unjam drivers` and the documentation show the texts under the fields.
 """
 
+Number = Annotated[float, Strict()]
+"""a number, not a text that contains one"""
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 PositiveInt = Annotated[int, Field(ge=1)]
@@ -94,6 +97,21 @@ def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) 
         raise InputError(validation_message(error, field, kind)) from None
 
 
+def one_line_errors(kind: type[DataclassT]) -> type[DataclassT]:
+    """Let a parameter dataclass that Python code makes raise `InputError` with one line, as `build_dataclass` does."""
+    make: Any = kind.__init__
+
+    @wraps(make)
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            make(self, *args, **kwargs)
+        except ValidationError as error:
+            raise InputError(validation_message(error, kind.__name__, kind)) from None
+
+    kind.__init__ = init
+    return kind
+
+
 def check_values(value: Any, name: str) -> None:
     """Raise `InputError` if `value` contains a huge integer, or a text with NUL.
 
@@ -116,9 +134,11 @@ def check_values(value: Any, name: str) -> None:
 def validation_message(error: ValidationError, field: str, kind: Any = None) -> str:
     """Return the first problem of a pydantic error as `field.name: value is not allowed; allowed: ...`."""
     problem = error.errors()[0]
-    name = ".".join([field, *(str(part) for part in problem["loc"])]).strip(".")
+    positional = {str(index): each for index, each in enumerate(_field_names(kind, ()))}
+    path = [str(part) for part in problem["loc"]]
+    name = ".".join([field, *(positional.get(part, part) for part in path[:1]), *path[1:]]).strip(".")
     if problem["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        *path, last = problem["loc"]
+        *path, last = path
         names = _field_names(kind, path)
         allowed = f"; allowed: {', '.join(sorted(names))}" if names else ""
         return f"{name}: unknown name{spelling_hint(last, names) or allowed}"

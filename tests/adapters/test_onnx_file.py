@@ -250,6 +250,7 @@ def refusal(path: Path) -> str:
     with pytest.raises(InputError) as caught:
         onnx_driver(path)
     text = str(caught.value)
+    assert "policy.onnx" in text or "policy.toml" in text
     assert text.isprintable(), text
     assert len(text) < 500
     return text
@@ -261,7 +262,6 @@ def test_a_hostile_graph_is_refused_in_one_line(name: str, tmp_path: Path) -> No
     made = follower()
     change(made)
     text = refusal(write(tmp_path, made))
-    assert text.startswith("driver policy.onnx: ")
     assert words in text
 
 
@@ -286,7 +286,7 @@ def test_constants_do_not_grow_while_a_graph_is_loaded(tmp_path: Path) -> None:
 
 DESCRIPTIONS = {
     "not TOML": ("inputs = [", "driver policy.toml: not TOML: "),
-    "no inputs": ("", "driver policy.onnx.inputs: missing"),
+    "no inputs": ("", "driver policy.onnx: inputs: missing"),
     "unknown key": ('inputs = ["local"]\nreward = 1', "reward: unknown name"),
     "unknown quantity": ('inputs = [{ quantity = "sped" }]', "quantity: 'sped' is not allowed; allowed: speed, "),
     "code as a feature": ('inputs = ["mine.py:f"]', "inputs: 'mine.py:f' is not allowed; allowed: local, "),
@@ -294,6 +294,18 @@ DESCRIPTIONS = {
     "unknown unit": ('inputs = [{ quantity = "speed", unit = "mph" }]', "unit: 'mph' is not allowed; allowed: m/s,"),
     "scale of zero": ('inputs = [{ quantity = "speed", scale = 0.0 }]', "scale: 0.0 is not allowed; allowed: a number"),
     "file elsewhere": (f'graph = "../policy.onnx"\n{DESCRIPTION}', "graph: '../policy.onnx' is not allowed; "),
+    "scale as text": (
+        'inputs = [{ quantity = "speed", scale = "10" }]',
+        "scale: '10' is not allowed; allowed: a valid",
+    ),
+    "another graph": (
+        f'graph = "other.onnx"\n{DESCRIPTION}',
+        "driver policy.toml: graph: 'other.onnx' is not allowed; allowed: policy.onnx, which was given",
+    ),
+    "optional speed": (
+        'inputs = [{ quantity = "speed", optional = true }]',
+        "optional: True is not allowed; allowed: only for loop_length, route_position",
+    ),
     "reversed limits": (
         'inputs = ["local"]\noutput = { limits = [1.0, -1.0] }',
         "limits: [1.0, -1.0] is not allowed; allowed: a lower and a higher value",

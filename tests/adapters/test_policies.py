@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -5,11 +6,12 @@ import pytest
 import torch
 
 import unjam
-from unjam.adapters import PolicyInput, PolicyOutput, policy_driver
+from unjam.adapters import PolicyDescription, PolicyInput, PolicyMemory, PolicyOutput, policy_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import local_observation
 from unjam.drivers.pi_saturation import PISaturation
+from unjam.drivers.registry import driver_recipe
 from unjam.errors import InputError
 
 SHORT: Any = {"horizon": 40, "cavs": 2}
@@ -104,3 +106,45 @@ def test_single_precision_is_no_excuse_for_rows_that_influence_each_other() -> N
         return (0.1 * state.speed).astype(np.float32) + np.float32(1e-7 * len(state.speed))
 
     unjam.check_driver(rounds)
+
+
+WRONG: dict[str, tuple[Callable[[], Any], str]] = {
+    "a scale of zero": (
+        lambda: PolicyInput("speed", scale=0),
+        "PolicyInput.scale: 0 is not allowed; allowed: a number other than 0",
+    ),
+    "a scale by position": (lambda: PolicyInput("speed", "", 0), "PolicyInput.scale: 0 is not allowed"),
+    "a text": (
+        lambda: PolicyOutput(offset="1"),  # pyright: ignore[reportArgumentType]
+        "PolicyOutput.offset: '1' is not allowed; allowed: a valid number",
+    ),
+    "an unknown name": (lambda: PolicyInput("speed", unitt="m/s"), "unitt: unknown name; did you mean 'unit'?"),  # pyright: ignore[reportCallIssue]
+    "an unknown quantity": (
+        lambda: PolicyOutput("jerk"),  # pyright: ignore[reportArgumentType]
+        "PolicyOutput.quantity: 'jerk' is not allowed; allowed: 'acceleration', ",
+    ),
+    "a missing name": (lambda: PolicyMemory("h"), "PolicyMemory.output: missing"),  # pyright: ignore[reportCallIssue]
+    "reversed limits": (lambda: PolicyOutput(limits=(2, 1)), "PolicyOutput.limits: [2.0, 1.0] is not allowed"),
+    "no inputs": (lambda: PolicyDescription(()), "PolicyDescription.inputs: () is not allowed"),
+    "a name as output": (
+        lambda: policy_driver(len, output="acceleration"),  # pyright: ignore[reportArgumentType]
+        "PolicyDescription.output: 'acceleration' is not allowed",
+    ),
+    "a name as expert": (
+        lambda: policy_driver(len, expert="pi"),  # pyright: ignore[reportArgumentType]
+        "driver: 'pi' is not allowed; allowed: an object, such as unjam.make_driver('pi', 0.1)",
+    ),
+    "a policy in another process": (
+        lambda: driver_recipe(policy_driver(lambda rows: rows[:, 0])),
+        "it drives in its own process only; allowed: the policy as an .onnx file with a description, or path.py:name",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_arguments_in_python_get_one_line(name: str) -> None:
+    make, words = WRONG[name]
+    with pytest.raises(InputError) as caught:
+        make()
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)

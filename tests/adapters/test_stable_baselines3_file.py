@@ -73,6 +73,15 @@ class Runs:
         return Path.touch, (self.file,)
 
 
+def test_a_residual_is_refused_without_its_expert(tmp_path: Path) -> None:
+    model = PPO("MlpPolicy", Space(), seed=1, device="cpu")
+    model.unjam = {"expert": "pi"}  # pyright: ignore[reportAttributeAccessIssue]
+    for policy in (model, save(model, tmp_path)):
+        assert policy_driver(policy, expert=PISaturation()).describe().startswith("pi + ")
+        with pytest.raises(InputError, match="it is a residual; allowed: policy_driver with its expert, 'pi'"):
+            policy_driver(policy)
+
+
 def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
     trap = tmp_path / "executed"
     file = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)

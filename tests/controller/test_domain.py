@@ -44,7 +44,10 @@ def test_states_outside_of_the_certified_domain_are_counted() -> None:
     assert outside_domain_share(replace(controller, parts={}), far) == 0.0
 
 
-def test_only_controllers_on_another_road_get_a_note() -> None:
+def test_controllers_on_another_road_and_models_without_their_control_step_get_a_note() -> None:
     road = scenario_recipe(make_scenario("figure-eight"))
-    names = ["pi", "human", "unjam:figure-eight-tuned", "unjam:ring-tuned"]
-    assert controller_notes(road, names, {}) == ["unjam:ring-tuned was tuned on the ring, not on the figure-eight"]
+    names = ["pi", "human", "unjam:figure-eight-tuned", "unjam:ring-tuned", "ppo.zip"]
+    assert controller_notes(road, names, {}) == [
+        "unjam:ring-tuned was tuned on the ring, not on the figure-eight",
+        "ppo.zip does not contain its control step: here it acts every 0.1 s",
+    ]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.adapters.onnx_policies import linear
 from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
@@ -14,17 +15,21 @@ from tests.learners.test_trpo_ppo import mean_of
 from tests.learners.toy_task import make_policy, shake
 from unjam.controller.file import replay_states
 from unjam.controller.graph import check_graph, run_graph
-from unjam.controller.onnx_graph import onnx_graph
+from unjam.controller.onnx_graph import describe_graph, onnx_graph
 from unjam.drivers import ACC, IDM, LACC, Driver, FollowerStopper, Human, Pacer, PISaturation, ResidualDriver
 from unjam.drivers.network import Network
-from unjam.drivers.observation import observation_size
+from unjam.drivers.observation import feature, observation_size
+from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.registry import driver_from_name
+from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import FileDriver
 from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import InputError, MissingPartError
 from unjam.learners.sac_td3 import SquashedResidualPolicy
 from unjam.learners.settings import PolicySettings
 from unjam.learners.trpo_ppo import ResidualPolicy
+from unjam.onnx_models import parse_model
+from unjam.parameters import build_dataclass, parse_toml
 from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
@@ -157,3 +162,15 @@ def test_without_onnxscript_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, "onnxscript", None)
     with pytest.raises(MissingPartError, match=r"pip install 'unjam\[train\]'"):
         onnx_graph(IDM(), 1.0)
+
+
+@pytest.mark.parametrize("name", ["jam-ahead", "pi", "cruise", "ovm"])
+def test_a_described_graph_needs_of_a_road_what_its_driver_needs(name: str) -> None:
+    driver = driver_from_name(name, 0.1)
+    content = describe_graph(linear(1, [1.0]).SerializeToString(), driver, 1.0, 0.1)
+    (text,) = (each.value for each in parse_model(content).metadata_props)
+    described = build_dataclass(PolicyDescription, parse_toml(text), "")
+    found = merge_requirements(*(feature(each).requirements for each in described.inputs))
+    expected = driver.requirements()
+    assert (found.needs_loop, found.needs_coordinate) == (expected.needs_loop, expected.needs_coordinate)
+    assert found.required_fields >= expected.required_fields

@@ -47,7 +47,7 @@ def test_a_class_of_ones_own_must_come_from_a_file() -> None:
     class Mine(Constant):
         pass
 
-    with pytest.raises(InputError, match="put your class in a file"):
+    with pytest.raises(InputError, match=r"allowed: path\.py:name, your class in a file"):
         driver_recipe(Mine())
 
 

@@ -29,7 +29,7 @@ def test_a_file_drives_beside_drivers_with_names(unjam: Run, tmp_path: Path) -> 
 def test_a_model_with_other_features_and_a_training_are_refused_in_one_line(unjam: Run, tmp_path: Path) -> None:
     training = unjam("train", "ring", "--expert", save_model(tmp_path), "--out", "run")
     assert training.returncode == 2
-    assert training.stderr.startswith("unjam: driver: 'ppo.zip' is not allowed; allowed: ")
+    assert training.stderr.startswith("unjam: driver: 'ppo.zip' is not allowed here: it drives in its own process only")
     assert "path.py:name" in training.stderr
     assert not (tmp_path / "run" / "config.toml").exists()
     driven = unjam("drive", "ring", *SMALL, "-d", save_model(tmp_path, 8), "--episodes", "1")

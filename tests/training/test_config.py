@@ -224,7 +224,7 @@ TEXT = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])
         policy=st.builds(
             PolicySettings,
             hidden=st.lists(st.integers(1, 999), min_size=1).map(tuple),
-            authority=st.floats(1e-300, 1e300),
+            authority=st.floats(1e-300, 2.0),
             learn_exploration_std=st.booleans(),
         ),
         trpo=st.builds(TRPOSettings, gamma=st.floats(0, 1, exclude_min=True, exclude_max=True)),

@@ -99,6 +99,8 @@ class Failing(Idle):
         return collect(self.network())[7]
 class Blind(Idle):
     def network(self): return Network(((np.zeros((1, 1)), np.zeros(1)),), 1.0)
+class Strong(Idle):
+    def network(self): return Network(((np.zeros((self.spec.inputs, 1)), np.zeros(1)),), 100.0)
 class Torch(Idle):
     def network(self): return "a module"
 class Forgetful(Idle):
@@ -138,6 +140,7 @@ def function(spec): return None
         ("Silent", "algorithm: iterate() returns NoneType; allowed: an IterationLog"),
         ("Failing", "agent: mine.py:Failing: IndexError: list index out of range (line 16)"),
         ("Blind", "mine.py:Blind has 1 inputs; allowed: 8, those of policy.inputs"),
+        ("Strong", "mine.py:Strong has an authority of 100.0 m/s2; allowed: at most 1.0 m/s2, AgentSpec.authority"),
         ("Torch", "mine.py:Torch returns str; allowed: an unjam.drivers.network.Network"),
         ("Wordy", "algorithm: loss of the log is 'small'; allowed: a number"),
         ("Stateless", "state() of Stateless cannot be stored: cannot unpack non-iterable NoneType object"),

@@ -17,7 +17,7 @@ from unjam.drivers.onnx_policy import OnnxDriver
 from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, invalid_value, one_line, unknown_name
+from unjam.errors import InputError, invalid_value, naming, one_line, unknown_name
 from unjam.folders import open_folder
 from unjam.onnx_models import MAX_MODEL_BYTES, parse_model
 from unjam.parameters import build_dataclass, parse_toml, split_parameters
@@ -48,14 +48,13 @@ def onnx_driver(
         MissingPartError: onnx or onnxruntime is not installed.
     """
     path = Path(file)
-    if description is not None:
-        content, table = _read(path, MAX_MODEL_BYTES), {}
-    else:
-        content, table = _read_described(path)
-    inner = _expert(table.pop("expert", Constant.name), time_step) if expert is None else as_driver(expert, time_step)
-    if description is None:
-        description = build_dataclass(PolicyDescription, table, f"driver {path.name}")
-    return OnnxDriver(path.name, description, inner, time_step, graph=np.frombuffer(content, np.uint8))
+    content, table = _read_described(path) if description is None else (_read(path, MAX_MODEL_BYTES), {})
+    with naming(f"driver {path.name}: "):
+        named = _expert(table.pop("expert", Constant.name), time_step)
+        inner = named if expert is None else as_driver(expert, time_step)
+        if description is None:
+            description = build_dataclass(PolicyDescription, table, "")
+        return OnnxDriver(path.name, description, inner, time_step, graph=np.frombuffer(content, np.uint8))
 
 
 def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:
@@ -66,10 +65,12 @@ def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:
         if not isinstance(name, str) or Path(name).name != name or not name.endswith(GRAPH_SUFFIX):
             allowed = f"the name of a file in its folder that ends in {GRAPH_SUFFIX}"
             raise invalid_value(f"driver {description_file.name}: graph", name, allowed)
-        graph = path if path.suffix == GRAPH_SUFFIX else path.with_name(name)
-        return _read(graph, MAX_MODEL_BYTES), table
+        if path.suffix == GRAPH_SUFFIX and path.name != name:
+            raise invalid_value(f"driver {description_file.name}: graph", name, f"{path.name}, which was given")
+        return _read(path.with_name(name), MAX_MODEL_BYTES), table
     content = _read(path, MAX_MODEL_BYTES)
-    texts = {each.key: each.value for each in parse_model(content).metadata_props}
+    with naming(f"driver {path.name}: "):
+        texts = {each.key: each.value for each in parse_model(content).metadata_props}
     if DESCRIPTION_KEY not in texts:
         needed = f"{description_file.name}, with the inputs and the output of the graph"
         raise InputError(f"driver {path.name}: its description is missing; needed: {needed}")

@@ -15,7 +15,7 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.observation import FeatureLike, as_features, observation_size
 from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyOutput
 from unjam.drivers.user_driver import DriverLike, UserFunction, as_driver, object_label
-from unjam.errors import InputError, invalid_value
+from unjam.errors import InputError, invalid_value, one_line
 
 
 def policy_driver(
@@ -54,6 +54,9 @@ def policy_driver(
         label, policy = Path(policy).name, read_policy(Path(policy))
     if hasattr(policy, "predict"):
         _check_model(label, policy)
+        added_to = one_line(getattr(policy, "unjam", {}).get("expert", Constant.name))
+        if expert is None and added_to != Constant.name:
+            raise InputError(f"{label}: it is a residual; allowed: policy_driver with its expert, {added_to!r}")
         function, output, size = _predict(policy), _limit_output(output, policy), policy.observation_space.shape[0]
     elif torch is not None and isinstance(policy, torch.nn.Module):
         function = deepcopy(policy).eval()

@@ -73,6 +73,8 @@ class SavedPolicy:
     """weight, shape (outputs, inputs), and bias of each"""
     activation: Callable[[Floats], Floats]
     is_squashed: bool
+    unjam: dict[str, Any]
+    """what `unjam export --sb3` writes: expert, features, action repeat; empty for other models"""
 
     def predict(self, observation: Floats, *, deterministic: bool = True) -> tuple[Floats, None]:
         """Return actions, shape (n, 1), and no state."""
@@ -95,6 +97,7 @@ def read_policy(path: Path) -> SavedPolicy:
         actor = _find_actor(weights)
         activation = _read_activation(data, actor)
         layers = _read_layers(weights, actor)
+        exported = dict(data.get("unjam", {}))
         if acted.shape != (1,) or layers[-1][1].shape != (1,):
             raise ValueError("its actions are not one number")
         if observed.shape != (layers[0][0].shape[1],):
@@ -104,7 +107,7 @@ def read_policy(path: Path) -> SavedPolicy:
     except Exception as error:  # damaged files cause any error, also in torch
         hint = "allowed: an MlpPolicy of Stable-Baselines3 with a Box of one action; others as Python objects"
         raise InputError(f"driver {path.name}: {type(error).__name__}: {one_line(error)}; {hint}") from None
-    return SavedPolicy(observed, acted, layers, activation, actor.is_squashed)
+    return SavedPolicy(observed, acted, layers, activation, actor.is_squashed, exported)
 
 
 def _read_parts(content: bytes, names: Sequence[str] = ()) -> dict[str, bytes]:

@@ -57,8 +57,10 @@ def export_command(
         return
     for file in filter(None, (result.file, result.graph, result.model)):
         console.print(f"{file}: {file.stat().st_size:,} bytes")
-    if result.graph is None and (older := out.with_suffix(".onnx")).exists():
-        err_console.print(f"{older} is older: it is not the graph of this controller; --onnx writes the graph")
+    other = out.with_suffix(".onnx")
+    is_source = source.endswith((".onnx", ".toml")) and Path(source).with_suffix(".onnx").resolve() == other.resolve()
+    if result.graph is None and other.exists() and not is_source:
+        err_console.print(f"note: {other} is not the graph of this controller; --onnx writes the graph")
     err_console.print(f"{result.driver}, verified on {result.sample_steps:,} control steps of a test episode")
 
 

@@ -23,6 +23,8 @@ TABLE_LISTS = ("ramps",)
 """parameters that are lists of tables"""
 MAX_LISTED_PARAMETERS = 3
 """maximum number of parameters in a note"""
+SB3_SUFFIX = ".zip"
+"""end of the names of models of Stable-Baselines3"""
 OUTSIDE_DOMAIN_THRESHOLD = 0.05
 """share of control steps outside of the certified domain from which a note reports it"""
 
@@ -34,6 +36,9 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
     """
     notes = []
     for name in names:
+        if name.endswith(SB3_SUFFIX):
+            step = road["simulation_step"] * road["steps_per_control_step"]
+            notes.append(f"{name} does not contain its control step: here it acts every {step:g} s")
         controller = _find_controller(name)
         if controller is None:
             continue

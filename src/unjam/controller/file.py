@@ -131,7 +131,8 @@ def read_controller(path: Path | str) -> Controller:
             raise InputError(f"controller {file.name}: weights {min(unknown)!r} belong to no network")
         return Controller(driver, manifest, parts, signed_by)
     except UNREADABLE_ERRORS as error:
-        raise InputError(f"controller {file.name}: not a controller: {error}") from None
+        hint = "" if file.suffix == SUFFIX else "; allowed: a .unjam file, which unjam export writes"
+        raise InputError(f"controller {file.name}: not a controller: {error}{hint}") from None
 
 
 def controller_file(path: Path | str) -> Path:

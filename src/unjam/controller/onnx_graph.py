@@ -105,10 +105,14 @@ def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: 
     The description is that of `unjam.adapters.onnx_driver`, as TOML in the metadata `unjam`; `time_step` is the control
     step [s].
     """
-    interface = driver_interface(driver, action_limit)
+    interface, needs = driver_interface(driver, action_limit), driver.requirements()
     action, memory = interface["action"], interface["memory"]
+    is_needed = {"loop_length": needs.needs_loop, "route_position": needs.needs_coordinate}
     description = {
-        "inputs": [{"quantity": each["name"]} for each in interface["observation"]],
+        "inputs": [
+            {"quantity": each["name"]} | ({} if is_needed.get(each["name"], True) else {"optional": True})
+            for each in interface["observation"]
+        ],
         "output": {"tensor": action["name"], "limits": [float(action["low"]), float(action["high"])]},
         "time_step": time_step,
         "memory": [

@@ -54,6 +54,8 @@ class Driver(Subclassable):
     """what it needs, without the drivers that it contains"""
     own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
     """description of its own `memory_features`, in order"""
+    portable_form: ClassVar[str] = "path.py:name, your class in a file"
+    """form of such a driver that other processes can build, for messages, if it is not among the registered ones"""
     is_native: ClassVar[bool] = False
     """whether the simulator itself drives (a human driver): `act` is then not called"""
     action_repeat: int = 1

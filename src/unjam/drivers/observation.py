@@ -31,7 +31,7 @@ from unjam.drivers.local_state import (
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference
 from unjam.errors import InputError, invalid_value, unknown_name
-from unjam.parameters import STRICT
+from unjam.parameters import STRICT, Number, one_line_errors
 from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace, stack_columns
 from unjam.user_code import UserCode
 
@@ -120,6 +120,8 @@ def _adjacent_lane_features(state: LocalState) -> Array:
 
 RELATIVE_SPEEDS = {"leader_relative_speed": "leader_speed", "follower_relative_speed": "follower_speed"}
 """quantities that are the difference of a field of `LocalState` and the own speed"""
+OPTIONAL_QUANTITIES = ("loop_length", "route_position")
+"""quantities that are NaN on roads that do not have them"""
 UNIT_FACTORS = {"m/s": {"m/s": 1.0, "km/h": 3.6}}
 """by SI unit, the allowed units with the number of them in one SI unit; otherwise only the SI unit itself"""
 
@@ -138,9 +140,10 @@ def _check_scale(scale: float) -> float:
     return scale
 
 
-Scale = Annotated[float, AfterValidator(_check_scale)]
+Scale = Annotated[Number, AfterValidator(_check_scale)]
 
 
+@one_line_errors
 @checked_dataclass(frozen=True, config=STRICT, repr=False)
 class PolicyInput:
     """A quantity among the inputs of a network, which is given `(value in unit - offset) / scale`."""
@@ -151,8 +154,10 @@ class PolicyInput:
     unit: str = ""
     """km/h instead of m/s; empty: the SI unit"""
     scale: Scale = 1.0
-    offset: float = 0.0
+    offset: Number = 0.0
     """in the unit"""
+    optional: bool = False
+    """whether roads without it are allowed, where it is NaN: only for `loop_length` and `route_position`"""
     tensor: str = ""
     """input of an ONNX graph, of which this is the next column; empty: that with this name, or the only one"""
 
@@ -160,6 +165,8 @@ class PolicyInput:
         if self._field not in STATE_UNITS:
             raise unknown_name("quantity", self.quantity, [*STATE_UNITS, *RELATIVE_SPEEDS])
         unit_factor(self.unit, STATE_UNITS[self._field])
+        if self.optional and self.quantity not in OPTIONAL_QUANTITIES:
+            raise invalid_value("optional", self.optional, f"only for {', '.join(OPTIONAL_QUANTITIES)}")
 
     def __repr__(self) -> str:
         return repr(self.quantity)
@@ -183,8 +190,8 @@ class PolicyInput:
 
         requirements = Requirements(
             required_fields=frozenset({name}).difference(COMMON_FIELDS),
-            needs_loop=name == "loop_length",
-            needs_coordinate=name == "route_position",
+            needs_loop=name == "loop_length" and not self.optional,
+            needs_coordinate=name == "route_position" and not self.optional,
             needs_arrays=name in FIELD_SIZES,
         )
         label = self.quantity.replace("_", " ") + (f" - {self.offset:g} {unit}" if self.offset else "")

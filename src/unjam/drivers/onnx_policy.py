@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.observation import PolicyInput, observation_size
 from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyMemory
-from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.errors import InputError, invalid_value, naming, unknown_name
 from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session
 
 OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)
@@ -92,7 +92,7 @@ class OnnxDriver(PolicyDriver):
     """bytes of the graph"""
 
     def __post_init__(self) -> None:
-        try:
+        with naming(f"driver {self.label}: "):
             super().__post_init__()
             if self.graph.dtype != np.uint8 or self.graph.ndim != 1:
                 raise InputError("graph: it is not bytes")
@@ -100,9 +100,6 @@ class OnnxDriver(PolicyDriver):
             object.__setattr__(self, "policy", policy)
             object.__setattr__(self, "graph", np.frombuffer(policy.graph, np.uint8))
             _probe(self)
-        except InputError as error:
-            prefix = f"driver {self.label}: "
-            raise InputError(f"{prefix}{str(error).removeprefix(prefix)}") from None
 
     def policy_memory(self, n: int) -> Memory:
         """Return the initial recurrent state of the graph for `n` CAVs."""

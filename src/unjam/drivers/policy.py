@@ -18,7 +18,7 @@ from unjam.drivers.observation import FEATURES, Feature, NetworkInput, PolicyInp
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import ExpertWrapper
 from unjam.errors import InputError, invalid_value, unknown_name
-from unjam.parameters import STRICT, Positive, build_dataclass
+from unjam.parameters import STRICT, Number, build_dataclass, one_line_errors
 from unjam.physics.arrays import Array
 
 POLICY_KEY = "policy"
@@ -28,6 +28,7 @@ REPEAT_TOLERANCE = 1e-6
 """allowed deviation of a number of control steps from an integer"""
 
 
+@one_line_errors
 @dataclass(frozen=True, config=STRICT)
 class PolicyOutput:
     """The output of a policy: `offset + scale * number` is a quantity in a unit."""
@@ -37,9 +38,9 @@ class PolicyOutput:
     unit: str = ""
     """km/h instead of m/s; empty: the SI unit"""
     scale: Scale = 1.0
-    offset: float = 0.0
+    offset: Number = 0.0
     """in the unit"""
-    limits: tuple[float, float] | None = None
+    limits: tuple[Number, Number] | None = None
     """lowest and highest value in the unit; those of an acceleration also limit the expert's and the sum"""
     tensor: str = ""
     """output of an ONNX graph; empty: the only one"""
@@ -62,6 +63,7 @@ class PolicyOutput:
         return (value - state.speed) / time_step if self.quantity == "desired_speed" else value
 
 
+@one_line_errors
 @dataclass(frozen=True, config=STRICT)
 class PolicyMemory:
     """Recurrent state of an ONNX graph: an input and an output whose first axis is the row of the CAV."""
@@ -80,6 +82,7 @@ def _as_input(value: Any) -> NetworkInput:
     return value
 
 
+@one_line_errors
 @dataclass(frozen=True, config=STRICT)
 class PolicyDescription:
     """What the inputs and outputs of a policy mean."""
@@ -87,7 +90,7 @@ class PolicyDescription:
     inputs: Annotated[tuple[Annotated[Any, BeforeValidator(_as_input)], ...], Field(min_length=1)]
     """columns in order: quantities, and names of features as in `policy.inputs`"""
     output: PolicyOutput = field(default_factory=PolicyOutput)
-    time_step: Positive | None = None
+    time_step: Annotated[Number, Field(gt=0)] | None = None
     """control step of the policy, a multiple of that of the road [s]; None: that of the road"""
     memory: tuple[PolicyMemory, ...] = ()
 
@@ -97,6 +100,7 @@ class PolicyDriver(ExpertWrapper):
     """A policy that others have trained, alone or added to an expert; other processes cannot build it."""
 
     own_requirements: ClassVar[Requirements] = Driver.own_requirements
+    portable_form: ClassVar[str] = "the policy as an .onnx file with a description, or path.py:name that loads it"
 
     policy: Callable[[Any, Memory], tuple[Any, Memory]]
     """returns numbers, shape (n,) or (n, 1), and its new memory, for observations, shape (n, inputs)"""

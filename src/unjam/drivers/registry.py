@@ -76,8 +76,10 @@ def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
 
     Raise `InputError` if no other process could build such a driver.
     """
-    if not is_serializable(driver):
-        raise invalid_value("driver", driver.describe(), f"{driver_names()} (put your class in a file: path.py:name)")
+    for each in _all_drivers(driver):
+        if type(each) not in DRIVER_CLASSES.values():
+            reason = "is not allowed here: it drives in its own process only"
+            raise InputError(f"driver: {each.describe()!r} {reason}; allowed: {each.portable_form}")
     return pack(driver, classes={Driver: DRIVER_CLASSES})
 
 

@@ -23,12 +23,15 @@ from unjam.drivers.observation import (
 from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
 from unjam.drivers.user_driver import FileReference
 from unjam.drivers.wrappers import COMPOSITE_CONFIG, DriverWrapper, select_rows
+from unjam.errors import invalid_value
 from unjam.parameters import Positive, PositiveInt
 from unjam.physics.arrays import Array, namespace
 from unjam.tree import map_leaves
 
 EXPERT_KEY, RESIDUAL_KEY, RESIDUAL_AGE_KEY = "expert", "residual", "age"
 """names in the memory: memory of the expert; the repeated residual, and its control steps so far"""
+MAX_AUTHORITY = 2.0
+"""largest authority of a network, as a share of the action limit: from one limit it reaches the other"""
 
 
 class ExpertWrapper(DriverWrapper):
@@ -106,6 +109,8 @@ class ResidualDriver(ExpertWrapper):
     """the user's files of features; if given, the files must have these hashes"""
 
     def __post_init__(self) -> None:
+        if self.network.authority > (highest := MAX_AUTHORITY * self.action_limit):
+            raise invalid_value("network: authority", self.network.authority, f"at most {highest} m/s2")
         object.__setattr__(self, "files", checked_user_files(self.inputs, self.files))
 
     @cached_property

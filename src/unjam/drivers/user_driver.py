@@ -20,7 +20,7 @@ from unjam.drivers.command import answer_as_array
 from unjam.drivers.driver import Driver, Memory, label_with_parameters
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import Requirements, RoadInterface
-from unjam.errors import InputError
+from unjam.errors import InputError, invalid_value
 from unjam.physics.arrays import Array
 from unjam.processes import redirect_user_output
 from unjam.tree import map_leaves
@@ -295,6 +295,8 @@ def as_driver(driver: DriverLike, time_step: float = FileDriver.time_step) -> Dr
 
     Raise `InputError` if it is not a driver.
     """
+    if isinstance(driver, str):
+        raise invalid_value("driver", driver, f"an object, such as unjam.make_driver({driver!r}, {time_step})")
     name = object_label(driver)
     made = driver if isinstance(driver, Driver) else _make_implementation(driver, time_step, f"driver {name}")
     return made if isinstance(made, Driver) else PythonDriver(made, name)

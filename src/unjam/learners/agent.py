@@ -125,6 +125,9 @@ def check_network(name: str, network: Any, spec: AgentSpec) -> Network:
     if network.input_size != spec.inputs:
         allowed = f"allowed: {spec.inputs}, those of policy.inputs"
         raise InputError(f"agent: the network of {name} has {network.input_size} inputs; {allowed}")
+    if network.authority > spec.authority:
+        allowed = f"allowed: at most {spec.authority} m/s2, AgentSpec.authority"
+        raise InputError(f"agent: the network of {name} has an authority of {network.authority} m/s2; {allowed}")
     return network
 
 

@@ -11,6 +11,7 @@ from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers.observation import FeatureName
+from unjam.drivers.residual import MAX_AUTHORITY
 from unjam.drivers.user_driver import is_file_reference
 from unjam.parameters import STRICT, IntAboveOne, NonNegative, NonNegativeInt, Options, Positive, PositiveInt
 
@@ -30,7 +31,7 @@ class PolicySettings:
     """start with a residual of zero, so that the full policy starts as the expert; the paper starts at random"""
     history_features: bool = False
     """add means of own speed, its spread, and gap over ten seconds to some minutes to the expert's memory"""
-    authority: Positive = 1.0
+    authority: Annotated[float, Field(gt=0, le=MAX_AUTHORITY)] = 1.0
     """largest residual, as a share of the action limit"""
     exploration_std: Positive = 0.1
     """initial standard deviation of the exploration noise, as a share of the action limit"""
