@@ -16,12 +16,14 @@ from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study
 from unjam_paper.do_no_harm import DO_NO_HARM
 from unjam_paper.feasible import ENVELOPE, feasible_study, on_ramp_study
 from unjam_paper.figure_6 import FIGURE_6
+from unjam_paper.fuel import FUEL
 from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY
 from unjam_paper.motorway_benchmark import MOTORWAY_BENCHMARK
 from unjam_paper.motorway_ensemble import MOTORWAY_ENSEMBLE
 from unjam_paper.robustness import FIGURE_10, FIGURE_10_UNFILTERED, ROBUSTNESS
 from unjam_paper.study import PAPER_ROADS, UNFILTERED_ROADS, UNSCALED_NOISE_ROAD, Study
 from unjam_paper.theory import FIGURE_8, THEORY
+from unjam_paper.variants import WRONG_BASES
 
 TABLE_1_VARIANTS = ("trpo", "ppo", "sac", "proposed", "without-model", "ours")
 TABLE_2_VARIANTS = ("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed", "ours-without-model", "ours")
@@ -64,6 +66,10 @@ STUDIES: dict[str, Study] = {
     "figure-10": FIGURE_10,
     "theory": THEORY,
     "road-model": road_model_study("ring", "best"),
+    "road-model-wrong-base": comparison_study(
+        "environment steps that a model of the whole ring saves where its human drivers are wrong",
+        tuple(f"best-road-model-{name}" for name in WRONG_BASES),
+    ),
     "road-model-jammed": road_model_study("ring-jammed", "jammed"),
     "road-model-figure-eight": road_model_study("figure-eight", "eight"),
     "road-model-on-ramp": road_model_study("on-ramp", "ramp"),
@@ -91,6 +97,7 @@ STUDIES: dict[str, Study] = {
     "on-ramp-trained": on_ramp_study({"ramp-long": "residual on the expert tuned with the larger budget"}),
     "on-ramp-alternating": on_ramp_study({"ramp-alternating": "residual on unjam:on-ramp-tuned, alternating updates"}),
     "envelope": ENVELOPE,
+    "fuel": FUEL,
     "do-no-harm": DO_NO_HARM,
     "assess-examples": ASSESS_EXAMPLES,
     "all-roads": ALL_ROADS_STUDY,

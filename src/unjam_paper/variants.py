@@ -51,6 +51,15 @@ def reduced_step_variants(
     }
 
 
+BEST_VARIANTS = reduced_step_variants("best", 12_000, 756_000)
+ROAD_MODEL = BEST_VARIANTS["best-road-model"]
+WRONG_BASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "slow": ("other IDM parameters", {"model.humans": {"time_headway": 1.5, "max_acceleration": 2.0}}),
+    "ovm": ("OVM", {"model.base": "ovm"}),
+    "no-base": ("nothing", {"model.base": "none"}),
+}
+"""bases of the model of the whole ring that are not the simulator's human drivers, which keep 1 s and accelerate with
+1 m/s2, with labels; with the other parameters no waves arise"""
 NO_MODEL = {
     **{f"model.{name}": getattr(ModelSettings, name) for name in ("kind", "rollout_starts", "k_max", "update_mode")},
     "model.model_ratio": 0.0,
@@ -112,7 +121,13 @@ VARIANTS: dict[str, Variant] = {
     "ours": Variant("ours", "quick", {}),
     "ours-without-model": Variant("ours without model", "quick", {"model.model_ratio": 0.0}),
     "best": Variant("ours, all steps", "best", {}, None),
-    **reduced_step_variants("best", 12_000, 756_000),
+    **BEST_VARIANTS,
+    **{
+        f"best-road-model-{name}": replace(
+            ROAD_MODEL, label=f"{ROAD_MODEL.label} on {base}", changes={**ROAD_MODEL.changes, **changes}
+        )
+        for name, (base, changes) in WRONG_BASES.items()
+    },
     **reduced_step_variants("jammed", 24_000, 768_000),
     **reduced_step_variants("eight", 6_000, 612_000, horizon=1500),
     **ON_RAMP_VARIANTS,

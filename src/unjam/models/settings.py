@@ -1,5 +1,6 @@
 """Settings of the learned model: how it is fitted, and how long its rollouts are. Free of torch."""
 
+from dataclasses import field
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -8,6 +9,9 @@ from pydantic.dataclasses import dataclass
 from unjam.parameters import STRICT, IntAboveOne, NonNegative, NonNegativeInt, Positive, PositiveInt
 
 BaseName = Literal["idm", "population", "acc", "ovm", "none"]
+IDMName = Literal[
+    "desired_speed", "time_headway", "max_acceleration", "comfortable_deceleration", "exponent", "minimum_gap"
+]
 Device = Literal["cpu", "cuda"]
 ErrorEstimator = Literal["unexplained_variance", "transitions", "total_variation", "training_loss"]
 
@@ -24,6 +28,8 @@ class ModelSettings:
     calibrated population, with its residual; `none`: everything is learned"""
     calibrate_base: bool = False
     """calibrate the IDM of the base in the first iteration on the followers of CAVs; else the road's parameters"""
+    humans: dict[IDMName, Positive] = field(default_factory=dict)
+    """IDM parameters of the base that differ from the road's, as where drivers are not known exactly"""
     members: PositiveInt = 5
     """networks in the ensemble"""
     hidden: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (64, 64)
@@ -67,7 +73,9 @@ class ModelSettings:
     """device of the model and its rollouts"""
 
     @model_validator(mode="after")
-    def _check_estimator(self) -> "ModelSettings":
+    def _check_base_and_estimator(self) -> "ModelSettings":
+        if self.humans and self.base != "idm":
+            raise ValueError("IDM parameters of humans only with the base 'idm'")
         if self.error_estimator == "total_variation" and self.members < 2:
             raise ValueError(f"members: {self.members} is not allowed with total_variation; allowed: >= 2")
         return self

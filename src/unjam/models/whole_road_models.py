@@ -197,6 +197,7 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
                 "idm, each vehicle's own driver model, or none",
             ),
             ("calibrate_base: true", not settings.calibrate_base, "false"),
+            (f"humans: {settings.humans}", not settings.humans, "none"),
         ):
             if not is_allowed:
                 raise InputError(f"model.{setting} is not allowed; allowed: {allowed}, on on-ramps")

@@ -65,8 +65,8 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
         check_device(settings.device, "model.device")
         self.check(task.scenario, settings)
         self.settings, self.task, self.exploration_signs, self.seed = settings, task, exploration_signs, seed
-        self.scenario = task.scenario
-        """the road, with calibrated IDM parameters if the settings ask for them"""
+        self.scenario = replace(task.scenario, humans=replace(task.scenario.humans, **settings.humans))
+        """the road with the IDM parameters of the base, which are calibrated if the settings ask for it"""
         self.data = EnvironmentData(settings.buffer_size)
         self.samples: list[EpisodeSamplesT] = []
         """of the episodes in D_a, oldest first"""

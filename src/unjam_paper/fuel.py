@@ -1,0 +1,95 @@
+"""Fuel on closed roads by two emission models, and how much of it an engine burns without moving the vehicle.
+
+A model with a large idle rate rewards every gain of speed, since each kilometer then takes less time: less fuel is no
+evidence of smoother driving.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from unjam.controller import make_driver
+from unjam.measures.effect import FUEL_METRIC
+from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.metrics import GASOLINE_DENSITY, measure
+from unjam.measures.statistics import metric_estimate, paired_difference
+from unjam.scenarios import make_scenario
+from unjam.training.evaluate import raise_failure
+from unjam.training.seeds import make_test_seeds
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam_paper.results_file import read_part
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table
+
+EMISSION_CLASSES = {"HBEFA4": "HBEFA4/PC_petrol_Euro-6ab", "PHEMlight": "PHEMlight/PC_G_EU4"}
+"""emission classes of SUMO, by model"""
+FUEL_DRIVERS: dict[str, tuple[str, ...]] = {
+    "ring": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-best"),
+    "ring-jammed": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-jammed-best"),
+    "figure-eight": (HUMAN_LABEL, "pi", "unjam:best", "unjam:figure-eight-best"),
+}
+FUEL_SEEDS = 20
+FUEL_PART = "fuel"
+IDLE_SPEED = 0.001
+"""speed below which an engine counts as idle [m/s]"""
+SECONDS_PER_HOUR = 3600.0
+
+
+def idle_rate(episode: Episode) -> float:
+    """Return the fuel rate of vehicles that stand [l/h]; NaN if none does."""
+    speeds = episode.speeds[1 : len(episode.fuel) + 1]
+    standing = episode.fuel[speeds < IDLE_SPEED]
+    return float(np.median(standing)) / GASOLINE_DENSITY * SECONDS_PER_HOUR / 1000.0 if standing.size else np.nan
+
+
+def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers: int) -> Table:
+    """Return the fuel [ml/km], the idle rate [l/h] and the mean speed [m/s] of drivers, one row for each episode."""
+    scenario = make_scenario(road, {"emission_class": emission_class})
+    tasks = [
+        EpisodeTask(scenario, make_driver(name, scenario.control_step), seed, record_details=True)
+        for name in drivers
+        for seed in make_test_seeds(FUEL_SEEDS)
+    ]
+
+    def episode_row(number: int, episode: Episode) -> dict[str, Any]:
+        row = measure(episode)
+        raise_failure([row])
+        driver = drivers[number // FUEL_SEEDS]
+        metrics = {name: row[name] for name in ("seed", "mean_speed", FUEL_METRIC)}
+        return {"driver": driver, **metrics, "idle_rate": idle_rate(episode)}
+
+    with WorkerPool(workers) as pool:
+        return pool.run_and_map(tasks, episode_row)
+
+
+def fuel_table(road: str, folder: Path) -> pd.DataFrame:
+    """Return the fuel of drivers by model, its difference to the human baseline, and what idling alone would burn."""
+    parts, table = read_part(folder, FUEL_PART), dict[str, dict[str, str]]()
+    for model, rows in ((model, parts[f"{road}, {model}"]) for model in EMISSION_CLASSES):
+        rate = float(np.nanmedian([np.nan if row["idle_rate"] is None else row["idle_rate"] for row in rows]))
+        by_driver = {name: [row for row in rows if row["driver"] == name] for name in FUEL_DRIVERS[road]}
+        for name, own in by_driver.items():
+            speed = metric_estimate(own, "mean_speed").mean
+            difference = paired_difference(own, by_driver[HUMAN_LABEL], FUEL_METRIC)
+            cells = table.setdefault(name, {"": name, "mean speed [m/s]": f"{speed:.2f}"})
+            cells[f"{model} [ml/km]"] = f"{metric_estimate(own, FUEL_METRIC).mean:.0f}"
+            is_human = name == HUMAN_LABEL
+            cells[f"{model}, difference"] = NO_VALUE_TEXT if is_human else str(estimate_cell(difference, 0, sign="+"))
+            cells[f"{model}, idling at {rate:.1f} l/h"] = f"{rate * 1e6 / SECONDS_PER_HOUR / speed:.0f}"
+    return pd.DataFrame(table.values())
+
+
+FUEL = Study(
+    title="fuel on closed roads by two emission models, and the share of idling",
+    make_parts=lambda study_folder, seeds: {
+        f"{FUEL_PART}/{road}, {model}": (measure_fuel, (road, emission_class, drivers))
+        for road, drivers in FUEL_DRIVERS.items()
+        for model, emission_class in EMISSION_CLASSES.items()
+    },
+    minutes=10.0,
+    tables={road: partial(fuel_table, road) for road in FUEL_DRIVERS},
+)
