@@ -30,7 +30,7 @@ HUMAN = {**FEASIBLE_ROW, "cav_max_braking": float("nan"), "human_braking_beyond_
         ({"min_time_gap": 0.8, "required_time_gap": 0.0}, "time gap 0.80 s (limit 0.9 s)"),
         ({"cav_min_ttc": 0.9}, "0.90 s to a collision"),
         ({"cav_max_braking": 6.5}, "brakes with 6.5 m/s2"),
-        ({"override_share": 0.013}, "SUMO overrides 1.3 % of its commands"),
+        ({"override_share": 0.013}, "the simulator overrides 1.3 % of its commands"),
         ({"status": "collision", "collisions": 2.0, "min_time_gap": 0.1}, "2 vehicles in contact"),
         ({"status": "failed"}, ""),
         ({"cav_max_braking": float("nan")}, ""),

@@ -20,6 +20,8 @@ from unjam.drivers.road_experts import Cruise
 from unjam.drivers.user_driver import FileReference
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError, UnjamError
+from unjam.measures.feasibility import feasibility
+from unjam.measures.metrics import measure
 from unjam.reports.video import write_video
 from unjam.scenarios import Merge, Ring
 from unjam.scenarios.motorway import ON_RAMP
@@ -111,44 +113,131 @@ def test_what_is_no_backend_is_refused_in_one_line(backend: Any, message: str) -
         run_episode(RING, IDM(), 0, backend=backend)
 
 
-BAD_BACKENDS = """
-from contextlib import nullcontext
-
-class NeedsArguments:
+FAULTY_BACKENDS = """
+class NeedsArguments(IDMRings):
     def __init__(self, address): pass
-    def supports(self, scenario): return ""
-    def open(self, scenario, seed, options): return nullcontext()
 
-class AnswersYes:
+class AnswersYes(IDMRings):
     def supports(self, scenario): return True
-    def open(self, scenario, seed, options): return nullcontext()
 
-class AnswersNothing(AnswersYes):
+class AnswersNothing(IDMRings):
     def supports(self, scenario): pass
 
-class ReturnsTheWorld(AnswersYes):
-    def supports(self, scenario): return ""
-    def open(self, scenario, seed, options): return []
+class ReturnsTheWorld(IDMRings):
+    def open(self, scenario, seed, options): return IDMRing(scenario, seed)
+
+def make_backend(name, **methods):
+    world = type(name + "World", (IDMRing,), methods)
+    return type(name, (IDMRings,), {"open": lambda self, *arguments: nullcontext(world(*arguments[:2]))})
+
+def set_nan(self, commands):
+    IDMRing.simulate(self, commands)
+    if self.control_steps == 20: self.speeds[3] = np.nan
+NaNSpeed = make_backend("NaNSpeed", simulate=set_nan)
+
+change_state = lambda **fields: lambda self: IDMRing.exact_state(self)._replace(**fields)
+NaNGap = make_backend("NaNGap", exact_state=change_state(leader_gap=np.full(1, np.nan)))
+WrongShape = make_backend("WrongShape", exact_state=change_state(leader_gap=np.ones(7)))
+NoState = make_backend("NoState", exact_state=lambda self: {})
+NoGap = make_backend("NoGap", exact_state=change_state(leader_gap=None))
+
+def forget_step(self, command):
+    IDMRing.advance(self, command)
+    self.control_steps = 0
+NoCount = make_backend("NoCount", advance=forget_step)
+
+def move_on(self, commands):
+    IDMRing.simulate(self, commands)
+    self.positions = self.positions + 0.02
+Drifts = make_backend("Drifts", simulate=move_on)
+
+def stretch(self, log):
+    episode = IDMRing.record(self, log)
+    return replace(episode, positions=1.5 * episode.positions)
+Stretches = make_backend("Stretches", record=stretch)
+
+Fails = make_backend("Fails", simulate=lambda self, commands: 1 / 0)
+NoRecord = make_backend("NoRecord", record=lambda self, log: None)
+DropsSteps = make_backend("DropsSteps", record=lambda self, log: replace(
+    IDMRing.record(self, log), speeds=np.zeros((3, 22))))
+
+def ignore(self, command):
+    accelerations = self.limited_accelerations(command)
+    self.recorder.series["requested_accelerations"].extend(accelerations)
+    self.recorder.series["safe_accelerations"].extend(accelerations)
+    self.recorder.series["commanded_speeds"].append(0.0)
+    self.simulate([])
+    self.control_steps += 1
+Ignores = make_backend("Ignores", advance=ignore)
 """
+
+
+@pytest.fixture
+def faulty(own: str) -> str:
+    """The path of the file of the page with faulty backends."""
+    path = Path(own.rpartition(":")[0])
+    imports = "from contextlib import nullcontext\nfrom dataclasses import replace\n"
+    path.write_text(imports + path.read_text() + FAULTY_BACKENDS)
+    return str(path)
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("NeedsArguments", "backend: TypeError when making .*NeedsArguments: .*'address'"),
-        ("AnswersYes", r"backend: supports\(\) returns True; allowed: a reason"),
-        ("AnswersNothing", r"backend: supports\(\) returns None; allowed: a reason"),
-        ("ReturnsTheWorld", r"backend: open\(\) returns list; allowed: a context manager"),
+        ("NeedsArguments", "TypeError: .*'address'"),
+        ("AnswersYes", r"supports\(\) returns True; allowed: a reason"),
+        ("AnswersNothing", r"supports\(\) returns None; allowed: a reason"),
+        ("ReturnsTheWorld", r"open\(\) returns IDMRing; allowed: a context manager"),
+        ("NaNSpeed", "speed of human_3 is nan at 2.1 s; allowed: finite"),
+        ("NoCount", "control_steps is 0 at 0.1 s; allowed: 1"),
+        ("Fails", r"ZeroDivisionError: division by zero \(idm_rings.py, line \d+\)"),
+        ("NaNGap", "leader_gap of cav_0 is nan at 6 s; allowed: finite"),
+        ("WrongShape", r"leader_gap has shape \(7,\) at 6 s; allowed: \(1,\)"),
+        ("NoState", r"local_state\(\) returns dict at 6 s; allowed: LocalState"),
+        ("NoGap", r"local_state\(\) has no leader_gap at 6 s"),
+        ("NoRecord", r"record\(\) returns NoneType at 6 s; allowed: Episode"),
+        ("DropsSteps", r"record\(\) has 2 control steps at 6 s; allowed: 60"),
+        ("Stretches", r"_\d+ has moved .* m according to its positions at 6 s; allowed: .* m, the sum"),
+        ("Drifts", r"route_position of cav_0 is .* in the state at 6 s; allowed: .*, as in the record"),
     ],
 )
-def test_a_faulty_backend_is_refused_in_one_line(name: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "bad.py").write_text(BAD_BACKENDS)
-    for attempt in (
-        lambda backend: run_episode(RING, IDM(), 0, backend=backend),
-        lambda backend: RoadEnv("ring", backend=backend).reset(seed=0),
-    ):
+def test_a_faulty_backend_is_named_with_the_fault_in_one_line(name: str, message: str, faulty: str) -> None:
+    with pytest.raises(InputError, match=rf"^backend: .*idm_rings.py:{name}: .*{message}"):
+        run_episode(RING, Human(), 0, backend=f"{faulty}:{name}")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("NaNGap", "leader_gap of cav_0 is nan at 0 s"), ("NaNSpeed", "speed of human_3 is nan at 2.1 s")],
+)
+def test_the_fault_of_a_backend_is_not_that_of_the_driver_nor_of_an_environment(
+    name: str, message: str, faulty: str
+) -> None:
+    with pytest.raises(InputError, match=f"idm_rings.py:{name}: {message}"):
+        run_episode(RING, PISaturation(), 0, backend=f"{faulty}:{name}")
+    with closing(RoadEnv("ring", backend=f"{faulty}:{name}")) as environment:
+
+        def step_often() -> None:
+            environment.reset(seed=0)
+            for _ in range(30):
+                environment.step(np.zeros(1))
+
         with pytest.raises(InputError, match=message):
-            attempt(f"{tmp_path / 'bad.py'}:{name}")
+            step_often()
+
+
+def test_commands_that_a_backend_does_not_carry_out_are_counted(own: str, faulty: str) -> None:
+    rows = [measure(run_episode(RING, IDM(), 0, backend=each)) for each in (own, f"{faulty}:Ignores")]
+    assert rows[0]["override_share"] == 0.0
+    assert rows[1]["override_share"] > 0.5
+    assert feasibility(rows[1]).startswith("the simulator overrides")
+
+
+def test_a_backend_is_given_as_a_class_too(own: str) -> None:
+    kind = type(backend_object(own))
+    by_class, by_name = (run_episode(RING, IDM(), 0, backend=each).speeds for each in (kind, own))
+    np.testing.assert_array_equal(by_class, by_name)
+    assert unjam.drive("ring", "idm", 1, scenario_options={"horizon": 5}, backend=kind, workers=1).rows["idm"]
 
 
 def test_a_scenario_that_a_backend_does_not_support_is_refused_with_its_reason(own: str) -> None:

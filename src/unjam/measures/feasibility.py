@@ -53,7 +53,7 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
         (cut_in, TOLERANCE + MAX_CUT_IN_BRAKING, f"brakes with {cut_in:.1f} m/s2 after a cut-in"),
         (-row["cav_min_ttc"], TOLERANCE - MIN_FEASIBLE_TTC, f"{row['cav_min_ttc']:.2f} s to a collision"),
         (braking, TOLERANCE + MAX_FEASIBLE_BRAKING, f"brakes with {braking:.1f} m/s2"),
-        (row["override_share"], 0.0, f"SUMO overrides {100 * row['override_share']:.2g} % of its commands"),
+        (row["override_share"], 0.0, f"the simulator overrides {100 * row['override_share']:.2g} % of its commands"),
         (
             human_braking,
             baseline_braking or 0.0,

@@ -409,10 +409,12 @@ METRICS: dict[str, Metric] = {
     "filter_override_share": Metric(
         filter_override_share, "control steps in which the safety filter braked", "", 4, SHARE_BOUNDS
     ),
-    "override_share": Metric(override_share, "commands overridden by SUMO in car following", "", 4, SHARE_BOUNDS),
-    "yield_share": Metric(yield_share, "commands overridden by SUMO at a crossing", "", 4, SHARE_BOUNDS),
+    "override_share": Metric(
+        override_share, "commands overridden by the simulator in car following", "", 4, SHARE_BOUNDS
+    ),
+    "yield_share": Metric(yield_share, "commands overridden by the simulator at a crossing", "", 4, SHARE_BOUNDS),
     "collisions": Metric(collisions, "vehicles in collisions", "", 0),
-    "shield_override_share": Metric(shield_override_share, "commands overridden by SUMO", "", 4, SHARE_BOUNDS),
+    "shield_override_share": Metric(shield_override_share, "commands overridden by the simulator", "", 4, SHARE_BOUNDS),
     "shield_max_braking": Metric(shield_max_braking, "maximum braking added by SUMO", "m/s2"),
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
     "outflow_veh_per_h": Metric(outflow_veh_per_h, "flow", "veh/h", 0),

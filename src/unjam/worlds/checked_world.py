@@ -1,0 +1,185 @@
+"""Checks of a user's backend: an error names its file, and what it measures and records must be consistent numbers."""
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from traceback import walk_tb
+from typing import Any
+
+import numpy as np
+
+from unjam.drivers.command import Command
+from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, LocalState
+from unjam.drivers.user_driver import object_reference
+from unjam.errors import InputError, UnjamError
+from unjam.scenarios.scenario import Scenario
+from unjam.user_code import USER_MODULE_PREFIX
+from unjam.worlds.audit import OVERRIDE_TOLERANCE
+from unjam.worlds.record import Episode, Trajectory
+from unjam.worlds.world import DriverLog
+
+COMMAND_TOLERANCE = 0.01
+"""difference between commanded and actual acceleration that is no override [m/s2]"""
+DISTANCE_TOLERANCE = 1.0, 0.02
+"""difference between a distance and the sum of the speeds that is rounding: [m], and relative to the distance"""
+STATE_TOLERANCE = 0.05
+"""difference between the last recorded and the last measured state that is rounding [m, m/s]"""
+
+
+def backend_label(backend: Any) -> str:
+    """Return the name of a backend as `path.py:name` without folders, or that of its class."""
+    path, _, name = object_reference(kind := type(backend)).rpartition(":")
+    return f"{Path(path).name}:{name}" if path else kind.__name__
+
+
+def call_backend(label: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the result of a function of a user's backend; raise `InputError` with its last executed line if it fails.
+
+    Errors of unjam itself, such as those of a driver, pass through.
+    """
+    try:
+        return function(*arguments)
+    except UnjamError:
+        raise
+    except (Exception, SystemExit) as error:
+        frames = [(frame, line) for frame, line in walk_tb(error.__traceback__) if _is_user_code(frame.f_globals)]
+        where = f" ({Path(frames[-1][0].f_code.co_filename).name}, line {frames[-1][1]})" if frames else ""
+        raise InputError(f"backend: {label}: {type(error).__name__}: {error}{where}") from error
+
+
+def _is_user_code(module: dict[str, Any]) -> bool:
+    return str(module.get("__name__")).startswith(USER_MODULE_PREFIX)
+
+
+class CheckedWorld:
+    """The world of a user's backend, whose states, speeds and record are checked; all else is that of the backend."""
+
+    def __init__(self, world: Any, label: str, scenario: Scenario, measured_fields: Collection[str]) -> None:
+        """Take a world that has not started; drivers read `measured_fields`."""
+        self._world, self._label, self._scenario = world, label, scenario
+        self._required_fields = {*COMMON_FIELDS, *measured_fields}
+        unknown = {"loop_length"} if not scenario.is_closed else set[str]()
+        self._finite_fields = set(COMMON_FIELDS) - unknown - (set() if scenario.has_coordinate else {"route_position"})
+        self._steps = 0
+
+    def __getattr__(self, name: str) -> Any:
+        found = call_backend(self._label, getattr, self._world, name)
+        return partial(call_backend, self._label, found) if callable(found) else found
+
+    def local_state(self) -> LocalState:
+        """Return the state that the CAVs observe now."""
+        return self._check_state(self.__getattr__("local_state")(), "local_state()")
+
+    def exact_state(self) -> LocalState:
+        """Return the exact local state of the CAVs now."""
+        return self._check_state(self.__getattr__("exact_state")(), "exact_state()")
+
+    def advance(self, command: Command | None) -> None:
+        """Make one control step, and check the speeds of all vehicles after it."""
+        self.__getattr__("advance")(command)
+        self._steps += 1
+        if self.control_steps != self._steps:
+            raise self._error(f"control_steps is {self.control_steps}", f"{self._steps}, the number of calls")
+        ids = getattr(self.road, "vehicle_ids", None)
+        speeds = self._as_array("speeds", self.speeds, (len(ids) if ids else np.size(self.speeds),))
+        self._check_finite("speed", speeds, ids or [f"vehicle {row}" for row in range(len(speeds))])
+
+    def record(self, driver_log: DriverLog) -> Episode:
+        """Return the record, in which commands that were not carried out count as overridden."""
+        episode = self.__getattr__("record")(driver_log)
+        if not isinstance(episode, Episode):
+            raise self._error(f"record() returns {type(episode).__name__}", "Episode")
+        if episode.control_steps != self._steps:
+            raise self._error(f"record() has {episode.control_steps} control steps", str(self._steps))
+        if self._scenario.is_closed:
+            self._check_motion(episode)
+        self._check_last_state(episode)
+        return self._count_overrides(episode)
+
+    def _error(self, problem: str, allowed: str, step: int | None = None) -> InputError:
+        time = (self._steps if step is None else step) * self._scenario.control_step
+        return InputError(f"backend: {self._label}: {problem} at {time:g} s; allowed: {allowed}")
+
+    def _as_array(self, name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+        try:
+            array = np.asarray(values, np.float64)
+        except (TypeError, ValueError):
+            raise self._error(f"{name} is {values!r:.60}", "numbers") from None
+        if array.shape != shape:
+            raise self._error(f"{name} has shape {array.shape}", str(shape))
+        return array
+
+    def _check_finite(self, name: str, values: np.ndarray, ids: Any, step: int | None = None) -> None:
+        """Raise `InputError` unless values of shape (vehicles,) are finite."""
+        if not (is_finite := np.isfinite(values)).all():
+            row = int(is_finite.argmin())
+            raise self._error(f"{name} of {ids[row]} is {values[row]}", "finite", step)
+
+    def _check_state(self, state: Any, method: str) -> LocalState:
+        if not isinstance(state, LocalState):
+            raise self._error(f"{method} returns {type(state).__name__}", "LocalState")
+        ids, values_by_name = self.cav_ids, state._asdict()
+        rows = () if np.ndim(state.speed) == 0 and self.is_scalar else (len(ids),)
+        for name, values in values_by_name.items():
+            if values is not None:
+                array = self._as_array(name, values, rows + ((FIELD_SIZES[name],) if name in FIELD_SIZES else ()))
+                if name in self._finite_fields:
+                    self._check_finite(name, np.atleast_1d(array), ids)
+            elif name in self._required_fields:
+                raise self._error(f"{method} has no {name}", "a value for each CAV, which the driver reads")
+        return state
+
+    def _check_motion(self, episode: Episode) -> None:
+        """Raise `InputError` unless vehicles of a closed road move by what their speeds add up to."""
+        shape, ids = (self._steps + 1, len(episode.vehicle_ids)), episode.vehicle_ids
+        speeds, positions, _ = (
+            self._as_array(f"{name} of the record", getattr(episode, name), shape)
+            for name in ("speeds", "positions", "gaps")
+        )
+        for step in range(self._steps + 1):
+            self._check_finite("recorded speed", speeds[step], ids, step)
+            self._check_finite("recorded position", positions[step], ids, step)
+        moved, expected = positions[-1] - positions[0], np.trapezoid(speeds, dx=episode.control_step, axis=0)
+        meters, share = DISTANCE_TOLERANCE
+        off = np.abs(moved - expected) - share * np.abs(expected)
+        row = int(off.argmax())
+        if off[row] > meters:
+            problem = f"{ids[row]} has moved {moved[row]:.1f} m according to its positions"
+            raise self._error(problem, f"{expected[row]:.1f} m, the sum of its speeds")
+
+    def _check_last_state(self, episode: Episode) -> None:
+        """Raise `InputError` unless the record ends with the state of the world."""
+        ids, state = list(self.cav_ids), self.exact_state()
+        rows = {name: row for row, name in enumerate(ids)}
+        names = ("speed", "leader_gap", "route_position")
+        for trip in episode.trajectories:
+            for name in names if trip.step_slice.stop == self._steps and trip.vehicle in rows else ():
+                recorded = float(getattr(trip.states, name)[-1])
+                measured = float(np.atleast_1d(getattr(state, name))[rows[trip.vehicle]])
+                off = measured - recorded
+                if name == "route_position" and self._scenario.is_closed:
+                    off -= episode.loop_length * round(off / episode.loop_length)
+                if abs(off) > STATE_TOLERANCE:
+                    problem = f"{name} of {trip.vehicle} is {measured:.2f} in the state"
+                    raise self._error(problem, f"{recorded:.2f}, as in the record")
+
+    def _count_overrides(self, episode: Episode) -> Episode:
+        """Return the record with all commands that were not carried out as overridden ones in its audit.
+
+        Where CAVs have an ACC, SUMO's human model or a slow actuator, the command is not the actual acceleration.
+        """
+        if not self._scenario.actuator.is_instant or self._scenario.actuation not in ("raw", "shielded"):
+            return episode
+        flags = np.concatenate([np.zeros(0, bool), *map(self._is_ignored, episode.trajectories)])
+        audit, share = episode.audit, float(flags.mean()) if flags.size else 0.0
+        following = replace(audit.following, override_share=max(share, audit.following.override_share))
+        return replace(episode, audit=replace(audit, following=following))
+
+    def _is_ignored(self, trip: Trajectory) -> Any:
+        """Return in which control steps a CAV did not carry out its command, and no braking was recorded as added."""
+        speed, actual = trip.states.speed[1:], np.diff(trip.states.speed) / self._scenario.control_step
+        slower = trip.applied_acceleration - actual
+        is_limited = (speed < OVERRIDE_TOLERANCE) | (speed > self._scenario.top_speed - OVERRIDE_TOLERANCE)
+        is_explained = (slower > 0) & (is_limited | (trip.shield_braking > OVERRIDE_TOLERANCE))
+        return (np.abs(slower) > COMMAND_TOLERANCE) & ~is_explained
