@@ -125,7 +125,7 @@ def _mean(values: pd.Series, digits: int) -> str:
     return str(estimate_cell(found, digits, len(values))) if found.count else "no wave"
 
 
-def claims() -> pd.DataFrame:
+def people_claims() -> pd.DataFrame:
     """Return what the paper says of the knowledge network, and what was measured."""
     rows = figure_6(driver="other", split="trajectories", is_long=False)
     return pd.DataFrame(

@@ -79,6 +79,7 @@ PAPER_COLUMNS = {
 COMPARISON_METRICS = (
     *("return", "return_eq16", "mean_speed", "mean_speed_steady", "speed_limit_ratio_steady", "speed_std_fleet"),
     *("time_to_dissolve", "outflow_veh_per_h", "insertion_backlog_veh", "min_time_gap", "collisions"),
+    "cav_max_braking",
 )
 """metrics of the deterministic policy on test seeds"""
 TRIMMED_SHARE = 0.25

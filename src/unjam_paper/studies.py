@@ -22,7 +22,7 @@ from unjam_paper.motorway_benchmark import MOTORWAY_BENCHMARK
 from unjam_paper.motorway_ensemble import MOTORWAY_ENSEMBLE
 from unjam_paper.robustness import FIGURE_10, FIGURE_10_UNFILTERED, ROBUSTNESS
 from unjam_paper.study import PAPER_ROADS, UNFILTERED_ROADS, UNSCALED_NOISE_ROAD, Study
-from unjam_paper.theory import FIGURE_8, THEORY
+from unjam_paper.theory import FIGURE_8, theory_study
 from unjam_paper.variants import WRONG_BASES
 
 TABLE_1_VARIANTS = ("trpo", "ppo", "sac", "proposed", "without-model", "ours")
@@ -31,6 +31,7 @@ FIGURE_9_VARIANTS = ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed", "
 TABLE_1_TITLE = "TRPO, PPO, SAC, the proposed method and ours on"
 TABLE_2_TITLE = "contribution of each part of the method, on the ring"
 FIGURE_9_TITLE = "PPO and SAC within the framework, on the ring"
+THEORY_TITLE = "measurable quantities of the theorems A1, A2 and A3"
 TABLE_1_STUDIES = {
     f"table-1-{road}": comparison_study(f"{TABLE_1_TITLE} {road}", TABLE_1_VARIANTS, road) for road in PAPER_ROADS
 }
@@ -49,6 +50,7 @@ UNFILTERED_STUDIES = {
         f"{TABLE_2_TITLE}, without the safety filter, noise not scaled", TABLE_2_VARIANTS, UNSCALED_NOISE_ROAD
     ),
     "figure-9-unfiltered": comparison_study(f"{FIGURE_9_TITLE}, without the safety filter", FIGURE_9_VARIANTS, RING),
+    "theory-unfiltered": theory_study(f"{THEORY_TITLE}, without the safety filter", RING, (RING, FIGURE_EIGHT)),
     "figure-10-unfiltered": FIGURE_10_UNFILTERED,
 }
 """the tables and figures of the paper without the safety filter, which it does not have; merges never have it"""
@@ -64,7 +66,7 @@ STUDIES: dict[str, Study] = {
     "figure-8": FIGURE_8,
     "figure-9": comparison_study(FIGURE_9_TITLE, FIGURE_9_VARIANTS),
     "figure-10": FIGURE_10,
-    "theory": THEORY,
+    "theory": theory_study(THEORY_TITLE, "ring", PAPER_ROADS),
     "road-model": road_model_study("ring", "best"),
     "road-model-wrong-base": comparison_study(
         "environment steps that a model of the whole ring saves where its human drivers are wrong",

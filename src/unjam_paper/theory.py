@@ -5,8 +5,8 @@ is measured side by side in one run.
 """
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -30,16 +30,16 @@ from unjam.training.seeds import make_test_seeds
 from unjam.training.train import Trainer
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import read_part, write_figure, write_part
-from unjam_paper.study import PAPER_ROADS, PlannedRun, Study, StudyFolder, Table, planned_runs
+from unjam_paper.study import PlannedRun, Study, StudyFolder, Table, planned_runs
 from unjam_paper.variants import VARIANTS
 
-THEORY_ROAD = "ring"
 MODEL_VARIANTS = ("proposed", "no-initial-policy", "mb-trpo", "ours")
 CONVERGENCE_VARIANTS = ("trpo", "ppo", "sac", "proposed", "ours")
 RANDOM_POLICIES, HIDDEN_UNITS = 10, 64
 """number of untrained networks, and units of each of their two hidden layers"""
 CONVERGENCE_TOLERANCE = 0.05
 """share of the best known return within which a training counts as converged (A2)"""
+TIMED_ROAD = "ring"
 TIMED_VARIANTS = (
     *("trpo", "ppo", "sac", "mb-trpo", "without-model"),
     *("proposed", "proposed-ppo", "proposed-sac", "ours"),
@@ -79,9 +79,9 @@ def untrained_rows(road: str, policies: int, workers: int) -> Table:
     return [*rows, {"road": road, "policy": "expert alone", "mean": returns["expert alone"]}]
 
 
-def convergence_rows(study_folder: StudyFolder, seeds: int) -> Table:
+def convergence_rows(study_folder: StudyFolder, road: str, seeds: int) -> Table:
     """A2: which trainings come within a tolerance of the best known return, and after how many steps."""
-    runs = study_folder.trained_runs(THEORY_ROAD, CONVERGENCE_VARIANTS, seeds)
+    runs = study_folder.trained_runs(road, CONVERGENCE_VARIANTS, seeds)
     best = max(row["return_mean"] for found in runs.values() for run in found for row in run.progress)
     threshold = best - CONVERGENCE_TOLERANCE * abs(best)
     rows = []
@@ -97,9 +97,9 @@ def convergence_rows(study_folder: StudyFolder, seeds: int) -> Table:
     return rows
 
 
-def model_error_history(study_folder: StudyFolder, seeds: int) -> dict[str, list[Table]]:
+def model_error_history(study_folder: StudyFolder, road: str, seeds: int) -> dict[str, list[Table]]:
     """A3: eps_m, k*, the bound and the gap between returns in model and environment, by variant and seed."""
-    runs = study_folder.trained_runs(THEORY_ROAD, MODEL_VARIANTS, seeds)
+    runs = study_folder.trained_runs(road, MODEL_VARIANTS, seeds)
     return {variant: [[_model_facts(row) for row in run.progress] for run in found] for variant, found in runs.items()}
 
 
@@ -129,11 +129,25 @@ def model_error_figure(by_variant: dict[str, list[Table]]) -> Figure:
     return figure
 
 
-def _write_theory(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
-    model = model_error_history(study_folder, seeds)
-    results = {"untrained": read_part(folder, "theory"), "convergence": convergence_rows(study_folder, seeds)}
-    write_part(folder, "theory", {**results, "model": model})
-    write_figure(folder, "model", model_error_figure(model))
+def theory_study(title: str, road: str, untrained_roads: Sequence[str]) -> Study:
+    """Return the study of trainings on a road, and of untrained policies on several."""
+    variants = tuple(dict.fromkeys((*CONVERGENCE_VARIANTS, *MODEL_VARIANTS)))
+
+    def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
+        model = model_error_history(study_folder, road, seeds)
+        results = {"untrained": read_part(folder, "theory"), "convergence": convergence_rows(study_folder, road, seeds)}
+        write_part(folder, "theory", {**results, "model": model})
+        write_figure(folder, "model", model_error_figure(model))
+
+    return Study(
+        title,
+        make_runs=lambda seeds: planned_runs([road], variants, seeds),
+        make_parts=lambda study_folder, seeds: {
+            f"theory/{each}": (untrained_rows, (each, RANDOM_POLICIES)) for each in untrained_roads
+        },
+        write=write,
+        minutes=8.0,
+    )
 
 
 def measure_training_time(steps: int, rounds: int, workers: int) -> dict[str, Any]:
@@ -146,7 +160,7 @@ def measure_training_time(steps: int, rounds: int, workers: int) -> dict[str, An
     measured: dict[str, list[dict[str, float]]] = {variant: [] for variant in TIMED_VARIANTS}
     with WorkerPool(1) as pool, tempfile.TemporaryDirectory() as place:
         for number, variant in product(range(rounds), TIMED_VARIANTS):
-            config = PlannedRun(THEORY_ROAD, variant, number).config
+            config = PlannedRun(TIMED_ROAD, variant, number).config
             # SAC begins earlier, otherwise mostly its start would be measured.
             sac = replace(config.sac, learning_starts=TIMED_START_STEPS)
             evaluation = replace(config.evaluation, validation_interval=0)
@@ -191,15 +205,6 @@ def _time_table(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(**{"relative to TRPO": list(relative)}).fillna("")
 
 
-THEORY = Study(
-    title="measurable quantities of the theorems A1, A2 and A3",
-    make_runs=partial(planned_runs, [THEORY_ROAD], tuple(dict.fromkeys((*CONVERGENCE_VARIANTS, *MODEL_VARIANTS)))),
-    make_parts=lambda study_folder, seeds: {
-        f"theory/{road}": (untrained_rows, (road, RANDOM_POLICIES)) for road in PAPER_ROADS
-    },
-    write=_write_theory,
-    minutes=8.0,
-)
 FIGURE_8 = Study(
     title="training time, measured side by side",
     make_parts=lambda study_folder, seeds: {"time": (measure_training_time, (TIMED_STEPS, TIMING_ROUNDS))},

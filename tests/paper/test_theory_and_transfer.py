@@ -24,7 +24,7 @@ SMALL_VARIANTS = ("plain", "with-model")
 def test_training_time_is_measured_for_all_variants_in_turn(
     monkeypatch: pytest.MonkeyPatch, small_study: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(theory, "THEORY_ROAD", "small")
+    monkeypatch.setattr(theory, "TIMED_ROAD", "small")
     monkeypatch.setattr(theory, "TIMED_VARIANTS", SMALL_VARIANTS)
     results = theory.measure_training_time(320, 2, workers=1)
     found = results["rounds"]
@@ -142,9 +142,8 @@ def test_convergence_is_counted_against_the_best_known_return(
     monkeypatch: pytest.MonkeyPatch, reproduced: Made
 ) -> None:
     folder, _ = reproduced
-    monkeypatch.setattr(theory, "THEORY_ROAD", "small")
     monkeypatch.setattr(theory, "CONVERGENCE_VARIANTS", SMALL_VARIANTS)
-    rows = theory.convergence_rows(StudyFolder(folder), 2)
+    rows = theory.convergence_rows(StudyFolder(folder), "small", 2)
     progress = [
         json.loads(line)["return_mean"]
         for variant in SMALL_VARIANTS
@@ -158,9 +157,8 @@ def test_convergence_is_counted_against_the_best_known_return(
 
 def test_model_errors_are_recorded_over_training(monkeypatch: pytest.MonkeyPatch, reproduced: Made) -> None:
     folder, _ = reproduced
-    monkeypatch.setattr(theory, "THEORY_ROAD", "small")
     monkeypatch.setattr(theory, "MODEL_VARIANTS", ("with-model",))
-    found = theory.model_error_history(StudyFolder(folder), 2)
+    found = theory.model_error_history(StudyFolder(folder), "small", 2)
     run = PlannedRun("small", "with-model", 1)
     rows = (folder / "runs" / run.name / "progress.jsonl").read_text().splitlines()
     last = json.loads(rows[-1])
