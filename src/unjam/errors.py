@@ -24,6 +24,15 @@ class InputError(UnjamError):
     exit_code = 2
 
 
+class RowError(InputError):
+    """An invalid value in a row of CAVs; the loop that drives them adds the name of the CAV and the step."""
+
+    def __init__(self, message: str, row: int = 0) -> None:
+        """Store the row."""
+        super().__init__(message)
+        self.row = row
+
+
 class NoCavError(InputError):
     """A driver had no vehicle to drive: by chance, or because too few vehicles are CAVs."""
 

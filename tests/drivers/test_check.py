@@ -87,7 +87,7 @@ def test_accepts_good_drivers(driver: Any) -> None:
         (MixesRows(), "step 0: row 0 gave .* alone and .* among 8 rows"),
         (WritesIntoMemory(), r"step 0: act\(\) changed the memory"),
         (WritesIntoState(), r"step 0: act\(\) changed the state"),
-        (RemembersNoDict(), r"initial_memory\(8\) returns .*; allowed: a dict of arrays"),
+        (RemembersNoDict(), r"initial_memory\(8\) returns the memory .*; allowed: a dict of arrays"),
         (Forgets(), r"act\(\) returns .*; allowed: \(accelerations, memory\)"),
         (NotFinite(), r"step \d: acceleration is -inf"),
         (WrongShape(), r"step 0: acceleration has shape \(8, 1\)"),

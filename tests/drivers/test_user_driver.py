@@ -9,7 +9,7 @@ from unjam.controller import make_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.residual import ResidualDriver
-from unjam.drivers.user_driver import FileDriver, FileReference
+from unjam.drivers.user_driver import FileDriver, FileReference, as_driver
 from unjam.errors import InputError
 from unjam.scenarios import Merge
 from unjam.worlds.episode import run_episode
@@ -77,7 +77,9 @@ def test_files_of_two_folders_have_neighbours_of_the_same_name(tmp_path: Path) -
     for folder, gain in (("a", -0.1), ("b", 0.3)):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "gains.py").write_text(f"GAIN = {gain}")
-        (tmp_path / folder / "mine.py").write_text("from gains import GAIN\ndef hold(state):\n    return GAIN")
+        (tmp_path / folder / "mine.py").write_text(
+            "from gains import GAIN\ndef hold(state):\n    return GAIN + 0 * state.speed"
+        )
         found.append(FileDriver(tmp_path / folder / "mine.py", "hold"))
     state = random_state(np.random.default_rng(0), 1)
     assert [driver.act(state, {})[0] for driver in found] == [-0.1, 0.3]
@@ -93,6 +95,40 @@ def test_code_that_changes_under_way_is_another_driver(tmp_path: Path) -> None:
     assert driver_recipe(driver)[0] == recipe  # that of what drives, not of what the file has become
     with pytest.raises(InputError, match=r"mine\.py:go: its file has changed since"):
         driver_from_recipe(recipe, arrays)
+
+
+@pytest.mark.parametrize(
+    ("memory", "answer", "words"),
+    [
+        ("None", "state.speed, memory", r"initial_memory\(2\) returns the memory None; allowed: a dict of arrays"),
+        (
+            "{'x': 0.0}",
+            "state.speed, memory",
+            r"initial_memory\(2\) returns 0.0 as 'x' of the memory; allowed: arrays of",
+        ),
+        (
+            "{'x': {'y': np.zeros(3)}}",
+            "state.speed, memory",
+            r".* returns an array of shape \(3,\) as 'x.y' of the memory; allowed: ",
+        ),
+        ("{}", "state.speed, None", r"act\(\) returns the memory None; allowed: a dict of arrays"),
+        ("{}", "state.speed, {'x': 1}", r"act\(\) returns 1 as 'x' of the memory; allowed: arrays of shape \(2, ...\)"),
+        ("{}", "0.3, {}", r"acceleration has shape \(\); allowed: \(2,\), one for each CAV"),
+        ("{}", "[0.3], {}", r"acceleration has shape \(1,\); allowed: \(2,\), one for each CAV"),
+        ("{}", "state.speed[:, None], {}", r"acceleration has shape \(2, 1\); allowed: \(2,\), one for each CAV"),
+        ("{}", "'fast', {}", "acceleration is not numbers: 'fast'"),
+        ("{}", "state.speed", r"act\(\) returns .*; allowed: \(accelerations, memory\)"),
+    ],
+)
+def test_what_a_users_driver_returns_has_one_definition(memory: str, answer: str, words: str, tmp_path: Path) -> None:
+    methods = f"def initial_memory(self, n): return {memory}\n    def act(self, state, memory): return {answer}"
+    (tmp_path / "mine.py").write_text(f"import numpy as np\nclass Mine:\n    {methods}\n")
+    for repeated in (
+        FileDriver(tmp_path / "mine.py", "Mine"),
+        as_driver(FileReference(tmp_path / "mine.py", "Mine").load_object()),
+    ):
+        with pytest.raises(InputError, match=f"Mine: {words}"):
+            repeated.act(random_state(np.random.default_rng(0), 2), repeated.initial_memory(2))
 
 
 def test_a_list_of_accelerations_will_do(tmp_path: Path) -> None:

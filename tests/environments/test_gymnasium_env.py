@@ -303,7 +303,7 @@ def test_a_reward_that_is_not_finite_is_refused_as_in_an_episode(tmp_path: Path)
     (tmp_path / "mine.py").write_text("def nothing(seen): return {'mean': seen.speeds.mean(-1) * float('nan')}")
     environment = RoadEnv("ring", reward=f"{tmp_path}/mine.py:nothing", horizon=40)
     environment.reset(seed=0)
-    with pytest.raises(InputError, match=r"reward: step 0: term 'mean' is nan; allowed: finite"):
+    with pytest.raises(InputError, match=r"reward mine\.py:nothing: step 0: term 'mean' is nan; allowed: finite"):
         environment.step(np.zeros(1, np.float32))
     environment.close()
 

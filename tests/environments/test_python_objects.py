@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import unjam
+from unjam.adapters import policy_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.pi_saturation import PISaturation
@@ -138,7 +139,9 @@ def test_an_expert_is_a_class_or_a_driver(file: Path, mine: dict[str, Any]) -> N
         ({"expert": 5}, "driver int: is neither a function nor a class"),
         ({"features": abs}, "features: .* is not allowed; allowed: a list"),
         ({"features": (5,)}, "int: is not a function of a LocalState"),
-        ({"features": (lambda state: state.speed.mean(),)}, "<lambda>: returns shape"),
+        ({"features": (lambda state: state.speed.mean(),)}, r"<lambda>: feature has shape \(\) for 2 CAVs"),
+        ({"features": (lambda state: np.zeros(1),)}, r"shape \(1,\) for 2 CAVs; allowed: \(2,\) or \(2, m\)"),
+        ({"features": (lambda state: "fast",)}, "<lambda>: feature is not numbers: 'fast'"),
         ({"features": (lambda state: state.speeds,)}, r"<lambda>: AttributeError: .* \(line \d+\)"),
     ],
 )
@@ -147,6 +150,46 @@ def test_other_objects_are_refused_in_one_line(make: Callable[..., Any], argumen
     with pytest.raises(InputError, match=words) as error:
         make(**arguments)
     assert "\n" not in str(error.value)
+
+
+def missing_later(state: LocalState) -> Any:
+    return np.where(state.speed > 0.2, np.nan, state.speed)
+
+
+def growing(state: LocalState) -> Any:
+    return np.zeros((len(state.speed), 1 + int(state.speed.max() == 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("feature", "words"),
+    [
+        (missing_later, r"^missing_later: column 0 is nan; allowed: finite \(cav_0, step \d+\)$"),
+        (growing, r"^growing: feature has shape \(1, 2\) for 1 CAVs; allowed: \(1, 1\) or \(1,\)$"),
+    ],
+)
+def test_an_invalid_feature_is_named_with_cav_and_step(feature: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        gymnasium_steps(features=("local", feature))
+    driver = policy_driver(lambda rows: 1.0 + 0.0 * rows[:, 0], ("local", feature))
+    with pytest.raises(InputError, match=words):
+        unjam.run_episode(unjam.make_scenario("ring", SHORT), driver, 0)
+
+
+def one_number(outcome: Outcome) -> Any:
+    return np.ones(1)
+
+
+def only_total(outcome: Outcome) -> Any:
+    return float(outcome.speeds.sum())
+
+
+@pytest.mark.parametrize("reward", [one_number, only_total])
+def test_a_reward_has_one_value_for_each_step_in_environments_too(reward: Any) -> None:
+    words = rf"^reward {reward.__name__}: term 'reward' has shape .*; allowed: .*, one for each control step$"
+    with pytest.raises(InputError, match=words):
+        gymnasium_steps(reward=reward)
+    with pytest.raises(InputError, match=words):
+        unjam.run_episode(unjam.make_scenario("ring", SHORT), PISaturation(), 0, reward=reward)
 
 
 def test_a_failing_reward_names_its_line() -> None:

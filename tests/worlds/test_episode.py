@@ -311,11 +311,11 @@ def listed(outcome):
 def test_a_reward_that_is_not_finite_is_refused_with_its_term_and_step(
     my_drivers: Path, tmp_path: Path, sumo: SumoBackend
 ) -> None:
-    with pytest.raises(InputError, match="reward: step 0: term 'speed' is nan; allowed: finite"):
+    with pytest.raises(InputError, match=r"reward mine\.py:wrong_reward: step 0: term 'speed' is nan; allowed: finite"):
         run_episode(RING, IDM(), (0,), f"{my_drivers}:wrong_reward", backend=sumo)
     file = tmp_path / "rewards.py"
     file.write_text(BAD_REWARDS)
-    with pytest.raises(InputError, match="reward: step 7: term 'bad' is inf; allowed: finite"):
+    with pytest.raises(InputError, match=r"reward rewards\.py:late: step 7: term 'bad' is inf; allowed: finite"):
         run_episode(RING, IDM(), (0,), f"{file}:late", backend=sumo)
 
 
@@ -323,7 +323,10 @@ def test_a_reward_that_is_not_finite_is_refused_with_its_term_and_step(
 def test_a_reward_of_a_wrong_shape_is_refused(name: str, tmp_path: Path, sumo: SumoBackend) -> None:
     file = tmp_path / "rewards.py"
     file.write_text(BAD_REWARDS)
-    with pytest.raises(InputError, match=r"reward: term '\w+' has shape .*; allowed: \(300,\)"):
+    with pytest.raises(
+        InputError,
+        match=rf"reward rewards\.py:{name}: term '\w+' has shape .*; allowed: \(300,\), one for each control step",
+    ):
         run_episode(RING, IDM(), (0,), f"{file}:{name}", backend=sumo)
 
 

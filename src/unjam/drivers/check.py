@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from unjam.drivers.command import answer_as_array
-from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.driver import Driver, Memory, check_memory
 from unjam.drivers.local_state import ADJACENT_POSITIONS, COMMON_FIELDS, SECTIONS_AHEAD, LocalState
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError
@@ -29,8 +29,7 @@ def check_driver(
     reads_optional_fields = set(driver.requirements().input_fields) > set(COMMON_FIELDS)
     generator, optional_fields = np.random.default_rng(seed), optional_fields or reads_optional_fields
     memory, *single = (driver.initial_memory(count) for count in (rows, *[1] * rows))
-    if not isinstance(memory, dict):
-        raise InputError(f"driver: initial_memory({rows}) returns {memory!r}; allowed: a dict of arrays")
+    check_memory(memory, rows, f"driver: initial_memory({rows})")
     for step in range(steps):
         state = random_state(generator, rows, optional_fields)
         memory_copy, state_copy = map_leaves(np.array, memory), state.map(np.array)
@@ -57,8 +56,8 @@ def check_driver(
 def _call_act(driver: Driver, state: LocalState, memory: Memory, step: int) -> tuple[Any, Memory]:
     try:
         return driver.act(state, memory)
-    except InputError:
-        raise
+    except InputError as error:
+        raise InputError(f"driver: step {step}: {error}") from error
     except Exception as error:  # any error of the user's code is the user's to fix
         raise InputError(f"driver: step {step}: {type(error).__name__}: {error}") from error
 

@@ -35,14 +35,22 @@ class Limits(NamedTuple):
         return cls(-limit, limit)
 
 
-def answer_as_array(answer: Any, rows: int, context: str, quantity: str = "acceleration") -> NDArray[np.float64]:
-    """Return the answer of a driver as an array; raise `InputError` unless it consists of `rows` numbers."""
+def as_numbers(answer: Any, label: str) -> NDArray[np.float64]:
+    """Return the answer of a user's code as an array of any shape; raise `InputError` unless it consists of numbers."""
     try:
-        array = np.asarray(answer, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{context}: {quantity} is not numbers: {answer!r}") from None
+        return np.asarray(answer, np.float64)
+    except (TypeError, ValueError, RuntimeError):  # the last for tensors with a gradient
+        raise InputError(f"{label} is not numbers: {answer!r:.60}") from None
+
+
+def answer_as_array(
+    answer: Any, rows: int, context: str, quantity: str = "acceleration", row_name: str = "CAV"
+) -> NDArray[np.float64]:
+    """Return the answer of a driver or a reward as an array; raise `InputError` unless its shape is (rows,)."""
+    array = as_numbers(answer, f"{context}: {quantity}")
     if array.shape != (rows,):
-        raise InputError(f"{context}: {quantity} has shape {array.shape}; allowed: ({rows},), one for each CAV")
+        allowed = f"allowed: ({rows},), one for each {row_name}"
+        raise InputError(f"{context}: {quantity} has shape {array.shape}; {allowed}")
     return array
 
 

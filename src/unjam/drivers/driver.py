@@ -10,9 +10,10 @@ import numpy as np
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.local_state import LocalState, ScaledInput
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface, merge_requirements
+from unjam.errors import InputError
 from unjam.parameters import Subclassable
 from unjam.physics.arrays import Array
-from unjam.tree import map_leaves, named_parts
+from unjam.tree import leaves, map_leaves, named_parts
 
 Memory = dict[str, Any]
 """State of a driver between control steps: arrays by name, whose first axis is the row of the CAV. A driver that
@@ -149,6 +150,18 @@ class FormulaDriver(Driver):
     """A driver with one formula for arrays, tensors and plain numbers (see `unjam.physics.arrays`)."""
 
     own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
+
+
+def check_memory(memory: Any, rows: int, context: str) -> Memory:
+    """Return the memory of `rows` CAVs that a driver returned; raise `InputError` if it is none."""
+    if not isinstance(memory, dict):
+        raise InputError(f"{context} returns the memory {memory!r:.60}; allowed: a dict of arrays")
+    for name, values in leaves(memory):
+        if (shape := getattr(values, "shape", ()))[:1] != (rows,):
+            found = f"an array of shape {shape}" if shape else f"{values!r:.60}"
+            allowed = f"allowed: arrays of shape ({rows}, ...), one row for each CAV"
+            raise InputError(f"{context} returns {found} as {name!r} of the memory; {allowed}")
+    return memory
 
 
 def label_with_parameters(name: str, parameters: dict[str, Any]) -> str:

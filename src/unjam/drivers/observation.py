@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import AfterValidator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from unjam.drivers.command import as_numbers
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import (
     ADJACENT_POSITIONS,
@@ -30,9 +31,9 @@ from unjam.drivers.local_state import (
 )
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference
-from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.errors import InputError, RowError, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, one_line_errors
-from unjam.physics.arrays import Array, as_column, clip, join_columns, namespace, stack_columns
+from unjam.physics.arrays import Array, Floats, as_column, clip, join_columns, namespace, stack_columns
 from unjam.user_code import UserCode
 
 RELATIVE_SPEED_SCALE = 5.0
@@ -293,29 +294,37 @@ def _file_feature(name: str) -> Feature:
 
 
 def _user_feature(function: UserFunction) -> Feature:
+    example = state_of_ones(LocalState._fields, np.ones, rows=2)
+    size = _feature_columns(function, example).shape[1]
+
     def compute(inputs: FeatureInputs) -> Array:
         like, state = inputs.state.speed, inputs.state
         is_numpy = isinstance(like, np.ndarray)
         if not is_numpy:  # tensors: users' functions take NumPy arrays only
             state = state.map(lambda values: values.double().cpu().numpy())
-        found = np.asarray(function(state), np.float64)
-        found = found[:, None] if found.ndim == 1 else found
+        found = _feature_columns(function, state, size)
+        if not (is_finite := np.isfinite(found)).all():
+            row, column = np.argwhere(~is_finite)[0]
+            raise RowError(f"{function.label}: column {column} is {found[row, column]}; allowed: finite", row)
         return found if is_numpy else namespace(like).as_tensor(found, dtype=like.dtype, device=like.device)
 
-    found = compute(FeatureInputs(state_of_ones(LocalState._fields, np.ones), np.ones(1), Driver(), {}))
-    if found.ndim != 2 or len(found) != 1:
-        allowed = "allowed: (n,) or (n, m) for n CAVs"
-        raise InputError(f"{function.label}: returns shape {found.shape} for one CAV; {allowed}")
-    entries = (ScaledInput(f"{function.label} {number}", 1.0, "") for number in range(found.shape[1]))
+    entries = (ScaledInput(f"{function.label} {number}", 1.0, "") for number in range(size))
     return Feature(compute, tuple(entries), Requirements(reads_any_field=True, needs_arrays=True))
+
+
+def _feature_columns(function: UserFunction, state: LocalState, size: int | None = None) -> Floats:
+    """Return the values of a user's feature, shape (n, size); raise `InputError` if they have another shape."""
+    rows, found = len(state.speed), as_numbers(function(state), f"{function.label}: feature")
+    columns = found[:, None] if found.ndim == 1 else found
+    if columns.ndim != 2 or columns.shape != (rows, columns.shape[1] if size is None else size):
+        allowed = f"({rows},) or ({rows}, m)" if size is None else f"({rows}, {size})" + f" or ({rows},)" * (size == 1)
+        raise InputError(f"{function.label}: feature has shape {found.shape} for {rows} CAVs; allowed: {allowed}")
+    return columns
 
 
 def compute_observation(names: Sequence[NetworkInput], inputs: FeatureInputs) -> Array:
     """Return the input of a network: the features concatenated, shape (n, inputs), no unit."""
-    blocks = [block for name in names if (block := feature(name).compute(inputs)) is not None]
-    if not blocks:
-        raise InputError("policy.inputs: expert_memory alone is not allowed: the expert has no memory features")
-    return join_columns(blocks)
+    return join_columns([block for name in names if (block := feature(name).compute(inputs)) is not None])
 
 
 def observation_inputs(names: Sequence[NetworkInput], expert: Driver) -> tuple[ScaledInput, ...]:
@@ -332,7 +341,12 @@ def observation_size(names: Sequence[NetworkInput], expert: Driver) -> int:
     acceleration, memory = expert.act(state, expert.initial_memory(1))
     if np.shape(acceleration) != (1,):
         raise InputError(f"driver: acceleration has shape {np.shape(acceleration)}; allowed: one for each CAV")
-    return compute_observation(names, FeatureInputs(state, acceleration, expert, memory)).shape[1]
+    remembered = expert.memory_features(memory)
+    columns = 0 if remembered is None else remembered.shape[1]  # of the features without a description
+    size = sum(columns if each.inputs is None else len(each.inputs) for each in map(feature, names))
+    if not size:
+        raise InputError("policy.inputs: expert_memory alone is not allowed: the expert has no memory features")
+    return size
 
 
 def checked_user_files(names: Sequence[str], expected: Sequence[FileReference]) -> tuple[FileReference, ...]:

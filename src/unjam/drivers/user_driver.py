@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from unjam.drivers.command import answer_as_array
-from unjam.drivers.driver import Driver, Memory, label_with_parameters
+from unjam.drivers.driver import Driver, Memory, check_memory, label_with_parameters
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import Requirements, RoadInterface
 from unjam.errors import InputError, invalid_value
@@ -188,28 +188,32 @@ class UserDriver(Driver):
         return self.call_user_code(method, *arguments)
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the initial memory of the user's driver."""
-        return self._call_method("initial_memory", n)
+        """Return the initial memory of the user's driver; raise `InputError` if it is none."""
+        return check_memory(self._call_method("initial_memory", n), n, f"{self.describe()}: initial_memory({n})")
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
         """Return the memory of the user's driver after the warm-up, if it has `recall`."""
-        return self._call_method("recall", memory, history) if hasattr(self.implementation, "recall") else memory
+        if not hasattr(self.implementation, "recall"):
+            return memory
+        found = self._call_method("recall", memory, history)
+        return check_memory(found, len(history.speed), f"{self.describe()}: recall()")
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the user's acceleration and memory; raise `InputError` if the user's code fails."""
-        if np.size(state.speed) == 0:  # the user's code may need a row: the minimum of an empty array is an error
+        """Return the user's acceleration and memory; raise `InputError` if the user's code fails, or one is invalid."""
+        rows, label = np.size(state.speed), self.describe()
+        if rows == 0:  # the user's code may need a row: the minimum of an empty array is an error
             return np.zeros(0), memory
         found = self._call_method("act", state, memory)
         if not (isinstance(found, tuple) and len(found) == 2):
-            raise InputError(f"{self.describe()}: act() returns {found!r:.60}; allowed: (accelerations, memory)")
-        accelerations, memory = found
-        if type(accelerations) in (list, tuple):  # wrappers need arrays
-            accelerations = answer_as_array(accelerations, np.size(state.speed), self.describe())
-        return accelerations, memory
+            raise InputError(f"{label}: act() returns {found!r:.60}; allowed: (accelerations, memory)")
+        numbers, after = answer_as_array(found[0], rows, label), check_memory(found[1], rows, f"{label}: act()")
+        is_single = getattr(found[0], "dtype", None) == np.float32  # stays so: rows may differ by its rounding
+        return numbers.astype(np.float32) if is_single else numbers, after
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gaps of the user's driver, if it has `time_gaps`."""
-        return self._call_method("time_gaps", state, memory) if np.size(state.speed) else None
+        found, rows = self._call_method("time_gaps", state, memory) if np.size(state.speed) else None, len(state.speed)
+        return None if found is None else answer_as_array(found, rows, self.describe(), "time gap")
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the memory features of the user's driver, if it has `memory_features`."""

@@ -33,7 +33,7 @@ from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError,
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
-from unjam.worlds.drive import DriveLoop
+from unjam.worlds.drive import DriveLoop, naming_cav
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
 from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap, validate_reward_terms
 from unjam.worlds.road_world import RoadWorld
@@ -171,7 +171,11 @@ class RoadStepper:
             np.array([float(world.backlog)]),
         )
         step = slice(world.control_steps - 1, world.control_steps)
-        terms = {name: float(value) for name, (value,) in validate_reward_terms(self._reward(outcome), step).items()}
+        if world.control_steps == 1:  # a constant of one number would be right for one step only
+            validate_reward_terms(self._reward, Outcome(*(np.repeat(values, 2, axis=0) for values in outcome)))
+        terms = {
+            name: float(value) for name, (value,) in validate_reward_terms(self._reward, outcome, step.start).items()
+        }
         departed = {name: last_observations[row] for row, name in enumerate(before) if row not in remaining}
         terminated = world.has_crashed
         self._wait_for_cav()  # a crash of human drivers in the meantime ends the episode, but no CAV has caused it
@@ -193,7 +197,8 @@ class RoadStepper:
         return self._world
 
     def _observe(self) -> Observations:
-        observations = self._driver.observation(self.world.local_state(), self._drive_loop.memory)
+        with naming_cav(self.world):
+            observations = self._driver.observation(self.world.local_state(), self._drive_loop.memory)
         self._observations = observations.clip(-MAX_OBSERVATION, MAX_OBSERVATION).astype(np.float32)
         return self._observations
 

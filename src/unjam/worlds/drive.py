@@ -1,6 +1,7 @@
 """The loop in which a driver drives the CAVs of a world."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, carry_over_memory, scalar_memory
 from unjam.drivers.residual import EXPERT_KEY
+from unjam.errors import InputError, RowError
 from unjam.tree import map_leaves
 from unjam.worlds.world import DriverLog, ProgressCallback, RecordT, World
 
@@ -49,20 +51,21 @@ class DriveLoop:
         """Yield each decision after it was carried out; None where the simulator itself drives."""
         world, driver, noise, steps = self.world, self.driver, self._draw_noise, 0
         local_state, decide, advance = world.local_state, driver.decide, world.advance
-        while not world.has_ended:
-            if driver.is_native:
-                decision = None
-                advance(None)
-            else:
-                decision = decide(local_state(), self.memory, noise)
-                self.memory = decision.memory
-                advance(decision.command)
-            if world.remaining_rows is not None or world.entered_count > len(self.initial_memories):
-                self._update_memory()
-            steps += 1
-            if self._on_progress is not None and steps % PROGRESS_CONTROL_STEPS == 0:
-                self._on_progress(steps)
-            yield decision
+        with naming_cav(world):
+            while not world.has_ended:
+                if driver.is_native:
+                    decision = None
+                    advance(None)
+                else:
+                    decision = decide(local_state(), self.memory, noise)
+                    self.memory = decision.memory
+                    advance(decision.command)
+                if world.remaining_rows is not None or world.entered_count > len(self.initial_memories):
+                    self._update_memory()
+                steps += 1
+                if self._on_progress is not None and steps % PROGRESS_CONTROL_STEPS == 0:
+                    self._on_progress(steps)
+                yield decision
 
     def _update_memory(self) -> None:
         """Give each CAV on the road a row of memory, new CAVs at the end."""
@@ -81,6 +84,17 @@ class DriveLoop:
             self.initial_memories.append(map_leaves(lambda values: np.array(values[row], np.float64), self.memory))  # noqa: B023
 
 
+@contextmanager
+def naming_cav(world: Any) -> Iterator[None]:
+    """Add the CAV and the step to the message of a `RowError` in the block, if the world has names of CAVs."""
+    try:
+        yield
+    except RowError as error:
+        if not hasattr(world, "cav_ids"):
+            raise
+        raise InputError(f"{error} ({world.cav_ids[error.row]}, step {world.control_steps})") from None
+
+
 def drive_world(
     world: World[RecordT],
     driver: Driver,
@@ -96,7 +110,8 @@ def finish_drive(drive_loop: DriveLoop) -> Any:
     """Drive to the end of a loop that has just been created, and return the world's record."""
     world, driver = drive_loop.world, drive_loop.driver
     decisions = [decision[1:4] for decision in drive_loop if decision is not None and decision.observation is not None]
-    last = driver.observation(world.local_state(), drive_loop.memory)
+    with naming_cav(world):
+        last = driver.observation(world.local_state(), drive_loop.memory)
     if last is None:
         return world.record(DriverLog())
     memories = [each[EXPERT_KEY] for each in drive_loop.initial_memories]

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unjam.drivers.command import answer_as_array
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference, object_label
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import split_parameters
@@ -197,6 +198,7 @@ def make_reward(text: RewardLike) -> Reward:
             terms[name] = weight * (terms[name] if name in terms else REWARD_TERMS[name](outcome))
         return terms
 
+    weighted_reward.__name__ = text
     return weighted_reward if weights else reward
 
 
@@ -205,6 +207,7 @@ def _user_reward(function: UserFunction) -> Reward:
         terms = function(outcome)
         return terms if isinstance(terms, dict) else {"reward": terms}
 
+    user_reward.__name__ = function.label
     return user_reward
 
 
@@ -220,7 +223,7 @@ def episode_reward_terms(
     parts = [slice(start, min(start + rows, steps)) for start in range(0, max(steps, 1), rows)]
     terms = [
         validate_reward_terms(
-            reward(_step_outcomes(speeds, trajectories, has_crashed and part.stop == steps, backlog, part)), part
+            reward, _step_outcomes(speeds, trajectories, has_crashed and part.stop == steps, backlog, part), part.start
         )
         for part in parts
     ]
@@ -247,13 +250,16 @@ def _step_outcomes(
     return Outcome(np.asfortranarray(speeds[1:][step_range]), accelerations, time_gaps, crashed, waiting)
 
 
-def validate_reward_terms(terms: dict[str, Floats], step_range: slice) -> dict[str, Floats]:
-    """Return a reward's terms; raise `InputError` unless each is finite and has one value per control step."""
-    rows = step_range.stop - step_range.start
-    for name, values in terms.items():
-        if np.shape(values) != (rows,):
-            raise InputError(f"reward: term {name!r} has shape {np.shape(values)}; allowed: ({rows},)")
+def validate_reward_terms(reward: Reward, outcome: Outcome, start: int = 0) -> dict[str, Floats]:
+    """Return the terms of a reward for consecutive control steps, of which `start` is the first.
+
+    Raise `InputError` unless each is finite and has one value per control step.
+    """
+    label, terms = f"reward {object_label(reward)}", dict[str, Floats]()
+    for name, answer in reward(outcome).items():
+        values = answer_as_array(answer, len(outcome.speeds), label, f"term {name!r}", "control step")
         if not np.isfinite(values).all():
             row = int(np.argmax(~np.isfinite(values)))
-            raise InputError(f"reward: step {step_range.start + row}: term {name!r} is {values[row]}; allowed: finite")
-    return {name: np.asarray(values, np.float64) for name, values in terms.items()}
+            raise InputError(f"{label}: step {start + row}: term {name!r} is {values[row]}; allowed: finite")
+        terms[name] = values
+    return terms

@@ -256,13 +256,13 @@ def test_remaining_rows_follow_leaving_and_entering_cavs(simulation: Simulation)
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        (lambda state: np.zeros(len(state.speed) + 1), r"acceleration has shape \(\d+,\); allowed: \(\d+,\)"),
-        (lambda state: state.speed * np.nan, "acceleration of cav_0 is nan; allowed: finite"),
+        (lambda state: np.zeros(len(state.speed) + 1), r"<lambda>: acceleration has shape \(\d+,\); allowed: \(\d+,\)"),
+        (lambda state: state.speed * np.nan, r"driver: step \d+: acceleration of cav_0 is nan; allowed: finite"),
     ],
 )
-def test_a_wrong_answer_is_refused_with_its_step(answer: Any, words: str, sumo: SumoBackend) -> None:
+def test_a_wrong_answer_is_refused(answer: Any, words: str, sumo: SumoBackend) -> None:
     everyone = Merge(penetration_rate=1.0, standing_vehicles=0, horizon=20)
-    with pytest.raises(InputError, match=f"driver: step \\d+: {words}"):
+    with pytest.raises(InputError, match=words):
         run_episode(everyone, as_driver(answer), (0,), backend=sumo)
 
 
