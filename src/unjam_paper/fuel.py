@@ -33,7 +33,6 @@ FUEL_DRIVERS: dict[str, tuple[str, ...]] = {
     "figure-eight": (HUMAN_LABEL, "pi", "unjam:best", "unjam:figure-eight-best"),
 }
 FUEL_SEEDS = 20
-FUEL_PART = "fuel"
 IDLE_SPEED = 0.001
 """speed below which an engine counts as idle [m/s]"""
 SECONDS_PER_HOUR = 3600.0
@@ -68,8 +67,9 @@ def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers
 
 def fuel_table(road: str, folder: Path) -> pd.DataFrame:
     """Return the fuel of drivers by model, its difference to the human baseline, and what idling alone would burn."""
-    parts, table = read_part(folder, FUEL_PART), dict[str, dict[str, str]]()
-    for model, rows in ((model, parts[f"{road}, {model}"]) for model in EMISSION_CLASSES):
+    table: dict[str, dict[str, str]] = {}
+    for model in EMISSION_CLASSES:
+        rows = read_part(folder, f"{road}, {model}")
         rate = float(np.nanmedian([np.nan if row["idle_rate"] is None else row["idle_rate"] for row in rows]))
         by_driver = {name: [row for row in rows if row["driver"] == name] for name in FUEL_DRIVERS[road]}
         for name, own in by_driver.items():
@@ -86,7 +86,7 @@ def fuel_table(road: str, folder: Path) -> pd.DataFrame:
 FUEL = Study(
     title="fuel on closed roads by two emission models, and the share of idling",
     make_parts=lambda study_folder, seeds: {
-        f"{FUEL_PART}/{road}, {model}": (measure_fuel, (road, emission_class, drivers))
+        f"{road}, {model}": (measure_fuel, (road, emission_class, drivers))
         for road, drivers in FUEL_DRIVERS.items()
         for model, emission_class in EMISSION_CLASSES.items()
     },
