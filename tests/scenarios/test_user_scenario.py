@@ -1,12 +1,18 @@
 """Scenarios in the user's Python and TOML files: built in any process, hashed, and refused with a reason."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from unjam.drivers import Human
 from unjam.errors import InputError
-from unjam.scenarios import Motorway, make_scenario, scenario_from_recipe, scenario_recipe
+from unjam.scenarios import SCENARIOS, Motorway, Ring, make_scenario, scenario_from_recipe, scenario_recipe
+from unjam.scenarios.road import ClosedRoad, RoadNetwork
+from unjam.scenarios.road_checks import check_road
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.batch.support import statistically_unsupported_reason
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -106,3 +112,51 @@ def test_invalid_toml_is_refused_in_one_line(tmp_path: Path, text: str, message:
     with pytest.raises(InputError, match=message) as refused:
         make_scenario(str(path))
     assert "\n" not in str(refused.value)
+
+
+def changed_road(**fields: Any) -> Any:
+    """Return a class whose road is that of a ring with other fields."""
+
+    class Changed(Ring):
+        def draw(self, generator: np.random.Generator) -> ClosedRoad:
+            return replace(road := super().draw(generator), **{name: make(road) for name, make in fields.items()})
+
+    return Changed
+
+
+def with_edge(road: ClosedRoad, **fields: Any) -> RoadNetwork:
+    first, *others = road.network.edges
+    return replace(road.network, edges=(first._replace(**fields), *others))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"network": lambda road: with_edge(road, length=65.0)}, r"edges.edge_0.length: 65.0 m .*allowed: 55.0 m"),
+        ({"network": lambda road: with_edge(road, length=np.nan)}, r"edges.edge_0.length: nan m .*allowed: > 0 m"),
+        ({"network": lambda road: with_edge(road, to_node="nowhere")}, r"edges.edge_0.to_node: 'nowhere' .*node_0"),
+        ({"loop_length": lambda road: 2 * road.loop_length}, r"loop_length: 440.0 m .*allowed: 220.0 m, the sum of"),
+        ({"center_line": lambda road: 2 * road.center_line}, r"center_line: 440.0 m .*allowed: 220.0 m, the length"),
+        ({"start_positions": lambda road: 0 * road.start_positions}, r"start_positions: 0.0 m of cav_0 .*without con"),
+        ({"start_positions": lambda road: road.start_positions[::-1]}, r"start_positions: .* in their order"),
+        ({"start_positions": lambda road: road.start_positions + 3.0}, r"entries.cav_0: 0.0 m .*allowed: 3.0 m, as in"),
+        ({"cav_ids": lambda road: ("cav_9",)}, r"cav_ids: 'cav_9' .*allowed: cav_0, human_1"),
+        ({"entries": lambda road: (road.entries[0]._replace(position=70.0),)}, r"entries.cav_0.position: 70 m .*55 m"),
+        ({"routes": lambda road: (road.routes[0]._replace(edges=("edge_0", "edge_2")),)}, r"routes.from_edge_0.edges"),
+    ],
+)
+def test_a_road_that_contradicts_itself_is_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=rf"^Changed: road\.{message}"):
+        changed_road(**fields)(length=(220, 220)).draw_from_seed((0,))
+
+
+def test_what_is_no_road_is_refused() -> None:
+    nothing = type("Nothing", (Ring,), {"draw": lambda self, generator: None})()
+    with pytest.raises(InputError, match=r"Nothing: draw\(\) returns NoneType; allowed: a Road"):
+        nothing.draw_from_seed((0,))
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
+def test_roads_of_the_package_do_not_contradict_themselves(scenario: Scenario) -> None:
+    road, _ = scenario.draw_from_seed((3,))
+    check_road(road, VEHICLE_LENGTH, "it")

@@ -1,6 +1,7 @@
 """What all scenarios share: the settings of a road's traffic, how an episode starts and when it ends."""
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
 from math import inf
@@ -22,7 +23,7 @@ from unjam.physics.idm import IDMArrays, IDMParameters, desired_speed_from_accel
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.population import Population, population_file, read_population
 from unjam.scenarios.road import Road
-from unjam.user_code import USER_MODULE_PREFIX
+from unjam.scenarios.road_checks import check_road
 
 UNLIMITED_ACCELERATION = 20.0
 """acceleration limit of a CAV's vehicle type in SUMO [m/s2]: far above any command, so that only safety clips"""
@@ -307,10 +308,13 @@ class Scenario(Subclassable):
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
         """Return the road of an episode's seed, and the seeds of noise, exploration, simulator and sensors."""
         road, *others = _spawn_seeds(seed)
-        draw: Callable[[np.random.Generator], Road] = self.draw
-        if type(self).__module__.startswith(USER_MODULE_PREFIX):  # an error is reported with its line
-            draw = UserFunction(draw, type(self).__name__, type(self).draw.__code__.co_filename)
-        return draw(np.random.default_rng(road)), others
+        kind, generator = type(self), np.random.default_rng(road)
+        if kind.__module__.partition(".")[0] == "unjam":
+            return self.draw(generator), others
+        file = getattr(sys.modules.get(kind.__module__), "__file__", None) or ""
+        drawn = UserFunction(self.draw, kind.__name__, file)(generator)  # an error is reported with its line
+        check_road(drawn, VEHICLE_LENGTH, kind.__name__)
+        return drawn, others
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of all CAVs that an episode can have."""
