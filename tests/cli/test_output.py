@@ -91,31 +91,36 @@ def test_a_finished_training_is_exported_if_it_gained(messages: StringIO) -> Non
 
 
 @pytest.mark.parametrize(
-    ("drivers", "changes", "command"),
+    ("drivers", "changes", "command", "backend"),
     [
         (
             ["human", "unjam:best"],
             {"population": "unjam:ngsim", "length": [230, 240]},
             "unjam watch ring -d unjam:best --video ring.gif --set population=unjam:ngsim --set 'length=[230, 240]'",
+            "sumo",
         ),
         (
             ["human", "pi"],
             {"cavs": 2, "actuation": "raw"},
             "unjam train ring --expert pi --preset demo --reward eq16 --set scenario_options.cavs=2 "
             "--set scenario_options.actuation=raw",
+            "sumo",
         ),
-        (["unjam:best", "human"], {}, "unjam watch ring -d unjam:best --video ring.gif"),
+        (["unjam:best", "human"], {}, "unjam watch ring -d unjam:best --video ring.gif", "sumo"),
+        (["unjam:best", "human"], {}, "unjam watch ring -d unjam:best --video ring.gif --backend batch", "batch"),
+        (["pi", "human"], {}, "unjam train ring --expert pi --preset demo --reward eq16 --set backend=batch", "batch"),
     ],
 )
 def test_the_command_after_a_drive_is_for_the_same_road(
-    drivers: list[str], changes: dict[str, Any], command: str, messages: StringIO
+    drivers: list[str], changes: dict[str, Any], command: str, backend: str, messages: StringIO
 ) -> None:
-    output.suggest_after_drive("ring", drivers, changes, "eq16")
+    output.suggest_after_drive("ring", drivers, changes, "eq16", backend)
     proposed = messages.getvalue().strip().partition(": ")[2]
     assert proposed == command
     settings = [word for option, word in pairwise(shlex.split(proposed)) if option == "--set"]
-    parsed = parse_assignments(settings, "--set").items()
-    assert {key.removeprefix("scenario_options."): value for key, value in parsed} == changes
+    parsed = parse_assignments(settings, "--set")
+    assert parsed.pop("backend", backend) == backend
+    assert {key.removeprefix("scenario_options."): value for key, value in parsed.items()} == changes
 
 
 def test_the_evaluation_after_a_training_shows_its_progress(

@@ -1,5 +1,6 @@
 """Classes of the user's own are simulated as they are, or refused: never as the class from which they derive."""
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -52,9 +53,20 @@ def test_no_subclass_becomes_its_base_class_in_a_file(kind: type[Scenario]) -> N
 
 
 @pytest.mark.parametrize("kind", [Ring, FigureEight, Motorway])
-def test_no_subclass_is_simulated_in_a_batch(kind: type[Scenario]) -> None:
-    scenario = subclass_of(kind)
+@pytest.mark.parametrize("member", ["draw", "top_speed", "helper"])
+def test_no_subclass_with_code_is_simulated_in_a_batch(kind: type[Scenario], member: str) -> None:
+    changed = {"draw": kind.draw, "top_speed": property(lambda self: 5.0), "helper": len}
+    scenario = subclass_of(kind, **{member: changed[member]})
     assert unsupported_reason(scenario)
     assert statistically_unsupported_reason(scenario)
     with pytest.raises(InputError, match=f"Other{kind.__name__} may have another road than {scenario.title}"):
         run_batch([EpisodeTask(scenario, Human(), (1,))], allow_statistical=True)
+
+
+@pytest.mark.parametrize("kind", [Ring, FigureEight, Motorway])
+def test_a_subclass_with_other_values_is_simulated_in_a_batch_as_its_base(kind: type[Scenario]) -> None:
+    own, base = subclass_of(kind, title="mine", horizon=4), kind(horizon=4)
+    own_speeds, base_speeds = (run_episode(each, Human(), 1, backend="batch").speeds for each in (own, base))
+    np.testing.assert_array_equal(own_speeds, base_speeds)
+    with pytest.raises(InputError, match=r"scenario: simulation_step: 0.7 is not allowed in a batch; allowed: "):
+        run_episode(replace(own, simulation_step=0.7), Human(), 1, backend="batch")

@@ -31,6 +31,15 @@ class BrokenRing(Ring):
 small = LongRing(vehicles=5, horizon=5)
 wide = Motorway(lanes=3, ramps=(Ramp(position=900),))
 number = 3
+
+def make_small():
+    return LongRing(vehicles=5, horizon=5)
+
+def make_text():
+    return "ring"
+
+def fail(lanes):
+    return wide
 """
 
 
@@ -41,12 +50,13 @@ def roads(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_class_and_an_instance_of_a_file_are_driven_in_a_worker(roads: Path) -> None:
+def test_classes_instances_and_functions_of_a_file_are_driven_in_a_worker(roads: Path) -> None:
     scenarios = [make_scenario(f"{roads}:LongRing", {"vehicles": 5, "horizon": 5}), make_scenario(f"{roads}:small")]
-    assert scenarios[0] == scenarios[1]
+    scenarios.append(make_scenario(f"{roads}:make_small"))
+    assert scenarios[0] == scenarios[1] == scenarios[2]
     with WorkerPool(1) as workers:
         episodes = workers.run([EpisodeTask(each, Human(), (1,)) for each in scenarios])
-    assert [episode.loop_length for episode in episodes] == [300.0, 300.0]
+    assert [episode.loop_length for episode in episodes] == [300.0, 300.0, 300.0]
     assert statistically_unsupported_reason(scenarios[0])
 
 
@@ -71,7 +81,9 @@ def test_an_instance_of_a_built_in_class_needs_no_file_in_a_worker(roads: Path) 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("number", r"roads.py:number: is neither a class nor an instance of unjam.scenarios.Scenario"),
+        ("number", r"roads.py:number: 3 is not allowed; allowed: a class or an instance of .*, or a function"),
+        ("make_text", r"roads.py:make_text: 'ring' is not allowed; allowed: a class or an instance of "),
+        ("fail", r"roads.py:fail: TypeError: .*'lanes'"),
         ("Missing", r"roads.py: has no 'Missing'"),
     ],
 )

@@ -92,6 +92,12 @@ def test_results_of_every_backend_have_a_report(
     settings: dict[str, Any] = {"backend": own if kind == "own" else kind, "out": tmp_path / "results", "workers": 1}
     result = unjam.drive(scenario, ["human", "idm"], 1, scenario_options=options, **settings)
     assert result.report is not None
+    (note,) = [each for each in result.notes if each.startswith("simulated by the backend")]
+    extent = "except for rounding" if scenario == "ring" else "in distribution"
+    assert (f"{own}, not by SUMO" if kind == "own" else f"batch: equal to SUMO {extent}") in note
+    stored = json.loads((tmp_path / "results" / "evaluation.json").read_text())
+    names = stored["backend"], result.document()["drivers"][0]["backend"]
+    assert names == (settings["backend"],) * 2
     page, is_drawn = result.report.read_text(), scenario == "ring"
     assert ("The backend does not record where vehicles are" in page) is not is_drawn
     assert len(json.loads(page.split('application/json">')[1].split("</script>")[0])["drivers"]) == 2 * is_drawn

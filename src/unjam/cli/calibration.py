@@ -105,7 +105,7 @@ def tune_command(
     scores = f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {default_score}"
     console.print(scores, soft_wrap=True)
     road = FAMILY[next(iter(roads))].scenario if scenario in ROAD_GROUPS else scenario
-    options = setting_options(changes, reward=reward)
+    options = setting_options(changes, reward=reward, backend=backend)
     print_next_command("drive with it", "drive", road, "--driver", result.file, "--test-seeds", *options)
 
 

@@ -30,7 +30,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.training.evaluate import drive, raise_failure, raise_failures
 from unjam.training.run_folder import lock_new_folder
-from unjam.worlds.backend import check_support, open_backend
+from unjam.worlds.backend import backend_notes, check_support, open_backend
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.backend import SumoBackend
@@ -105,7 +105,8 @@ def drive_command(
             print_notes([f"plain SUMO has the traffic of seed {first['seed']} without CAVs: {command}"])
         if result.report is not None:
             err_console.print(f"report: {result.report}")
-        suggest_after_drive(scenario, driver, changes, reward)
+        is_drawable = all(len(each.outline) or len(each.poses) for each in result.plot_episodes.values())
+        suggest_after_drive(scenario, driver, changes, reward, backend, is_drawable)
     raise_failures(result)
 
 
@@ -148,6 +149,7 @@ def watch_command(
         check_parent_folder(video)
         with open_backend(backend) as simulator:
             check_support(simulator, road)
+        print_notes(backend_notes(backend, road))
         err_console.print("driving")
         with WorkerPool(1) as pool:
             episode = pool.run([EpisodeTask(road, driver, (seed,), record_details=True, backend=backend)])[0]
@@ -157,7 +159,8 @@ def watch_command(
         err_console.print("drawing")
         write_video(episode, video, name, pace)
     if json:
-        print_json({"scenario": scenario, "driver": name, "video": str(video) if video else None, "episode": row})
+        given = {"scenario": scenario, "backend": backend, "driver": name}
+        print_json({**given, "video": str(video) if video else None, "episode": row})
     raise_failure([row])
     if not json and video is not None:
         console.print(str(video))

@@ -144,8 +144,15 @@ def print_next_command(reason: str, *arguments: object) -> None:
     err_console.print(f"{reason}: {shlex.join(['unjam', *map(str, arguments)])}", soft_wrap=True)
 
 
-def suggest_after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[str, Any], reward: str) -> None:
-    """Suggest the next command on the same road: compare with others, train on an expert, or watch."""
+def suggest_after_drive(
+    scenario: str,
+    drivers: Sequence[str],
+    changes: Mapping[str, Any],
+    reward: str,
+    backend: str = "sumo",
+    is_drawable: bool = True,
+) -> None:
+    """Suggest the next command on the same road: compare with others, train on an expert, or watch if possible."""
     controllers = [driver for driver in drivers if driver != "human"]
     if "human" not in drivers:
         print_next_command("compare with human drivers", *_arguments_without_out(), "-d", "human")
@@ -153,16 +160,24 @@ def suggest_after_drive(scenario: str, drivers: Sequence[str], changes: Mapping[
         print_next_command("compare with a controller", *_arguments_without_out(), "-d", "unjam:best")
     elif all(driver.partition(":")[0] in DRIVERS for driver in controllers):
         command = "train", scenario, "--expert", controllers[-1], "--preset", "demo"
-        print_next_command("train on an expert", *command, *setting_options(changes, "scenario_options.", reward))
-    else:
+        options = setting_options(changes, "scenario_options.", reward, backend)
+        print_next_command("train on an expert", *command, *options)
+    elif is_drawable:
         command = "watch", scenario, "-d", controllers[-1], "--video", f"{Path(scenario).stem}.gif"
-        print_next_command("watch it", *command, *setting_options(changes))
+        print_next_command("watch it", *command, *setting_options(changes, backend=backend))
 
 
-def setting_options(changes: Mapping[str, Any], prefix: str = "", reward: str = "") -> Iterator[str]:
-    """Yield the command-line options that set these values, each key with a prefix, and the reward."""
+def setting_options(
+    changes: Mapping[str, Any], prefix: str = "", reward: str = "", backend: str = "sumo"
+) -> Iterator[str]:
+    """Yield the command-line options that set these values, each key with a prefix, the reward, and the backend.
+
+    With a prefix the command has a configuration, of which the backend is a setting.
+    """
     if reward:
         yield from ("--reward", reward)
+    if backend != "sumo":
+        yield from ("--set", f"backend={backend}") if prefix else ("--backend", backend)
     for key, value in changes.items():
         yield from ("--set", f"{prefix}{key}={value if isinstance(value, str) else json.dumps(value)}")
 

@@ -35,7 +35,7 @@ from unjam.worlds.batch.motorway.traffic import LearnedCorrection
 from unjam.worlds.batch.motorway.world import MotorwayBatch, ReplayOptions
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
-from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason
+from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason
 from unjam.worlds.drive import DriveLoop, finish_drive
 from unjam.worlds.episode import add_reward_terms
 from unjam.worlds.record import Episode, Floats
@@ -226,7 +226,7 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
     def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
         """Yield the episodes of a plan, whose starts are samples."""
         signs = self.exploration_signs
-        size = BATCH_KINDS[type(self.scenario)].max_roads
+        size = required_batch_kind(self.scenario).max_roads
         for first in range(0, len(plan.starts), size):
             samples = plan.starts[first : first + size]
             numbers = range(first, first + len(samples))

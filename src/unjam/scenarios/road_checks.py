@@ -51,7 +51,7 @@ def _line_length(points: Floats) -> float:
 
 def _check_network(road: BuiltRoad) -> None:
     """Raise `ValueError` if edges, routes or entries do not fit together."""
-    nodes, edges = ({each.name: each for each in part} for part in (road.network.nodes, road.network.edges))
+    nodes, edges = {node.name: node for node in road.network.nodes}, {edge.name: edge for edge in road.network.edges}
     routes = {route.name: route for route in road.routes}
     for name, edge in edges.items():
         for end in ("from_node", "to_node"):

@@ -1,14 +1,15 @@
-"""The user's own scenarios: classes and instances in Python files, `path.py:name`, and settings in TOML files.
+"""The user's own scenarios: classes, instances and functions in Python files, `path.py:name`, and TOML files.
 
 Python files run as `unjam.user_code` says, only when the user names them. TOML files have settings alone.
 """
 
 from dataclasses import replace
+from inspect import isfunction
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from unjam.drivers.user_driver import FileReference, object_label, object_reference
+from unjam.drivers.user_driver import FileReference, UserFunction, object_label, object_reference
 from unjam.errors import InputError, invalid_value
 from unjam.parameters import build_dataclass, read_toml
 from unjam.scenarios.scenario import Scenario
@@ -30,7 +31,7 @@ def load_python_scenario(text: str) -> Scenario:
 
 
 def _load_object(reference: FileReference, sha256: str = "") -> Scenario | type[Scenario]:
-    """Return the class or instance with a name, of a file that must have the hash if one is given."""
+    """Return the class or instance with a name, or that of a function, of a file that must have a given hash."""
     code = reference.read_code()
     if sha256 not in ("", code.sha256):
         raise InputError(f"{reference}: its file has changed since; allowed: as it was when it was first loaded")
@@ -38,9 +39,12 @@ def _load_object(reference: FileReference, sha256: str = "") -> Scenario | type[
     if key not in _modules:
         _modules[key] = reference.run_file(code)
     found: Any = reference.find_object(_modules[key])
+    if isfunction(found):
+        found = UserFunction(found, str(reference), str(reference.path))()
     kind: type[Any] = found if isinstance(found, type) else type(found)
     if not issubclass(kind, Scenario):
-        raise InputError(f"{reference}: is neither a class nor an instance of unjam.scenarios.Scenario")
+        allowed = "a class or an instance of unjam.scenarios.Scenario, or a function that returns one"
+        raise InputError(f"{reference}: {found!r:.60} is not allowed; allowed: {allowed}")
     if kind.__module__.startswith(USER_MODULE_PREFIX):
         _class_recipes[kind], _ = pack(replace(reference, sha256=code.sha256))
     return found

@@ -33,7 +33,8 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import RunConfig
 from unjam.training.run_folder import lock_new_folder
 from unjam.training.seeds import TRAINING_SEED_LIMIT, make_test_seeds
-from unjam.worlds.backend import BackendLike, check_support, open_backend
+from unjam.worlds.backend import BackendLike, backend_notes, check_support, open_backend
+from unjam.worlds.checked_world import backend_label
 from unjam.worlds.episode import can_drive, check_can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import RewardLike, make_reward, reward_label
@@ -73,6 +74,8 @@ class DriveResult(Evaluation):
     """Episodes of one or several drivers on the same traffic, and the files with them."""
 
     scenario: str = ""
+    backend: str = "sumo"
+    """name of the simulator"""
     folder: Path | None = None
     """folder of the results"""
     report: Path | None = None
@@ -132,6 +135,7 @@ class DriveResult(Evaluation):
             documents.append(
                 {
                     "scenario": self.scenario,
+                    "backend": self.backend,
                     "driver": driver,
                     "feasibility": verdicts[driver],
                     "episodes": rows,
@@ -282,10 +286,11 @@ def evaluate_run(
     metadata = {
         "scenario": Path(config.scenario).name,
         "reward": config.reward or scenario.reward,
+        "backend": config.episode_backend,
         "trained": TRAINED_LABEL,
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
         "controllers": _controller_hashes({TRAINED_LABEL: str(folder)}),
-        "notes": episode_notes(evaluation.rows),
+        "notes": [*episode_notes(evaluation.rows), *backend_notes(config.episode_backend, scenario)],
         "manifest": manifest(),
     }
     target = out or folder
@@ -381,16 +386,19 @@ def drive(
             *episode_notes(evaluation.rows),
             *controller_notes(scenario_recipe(road), drivers, evaluation.plot_episodes),
             *(f"{name} {MISSING_ACC_NOTE}" for name, one in drivers.items() if _lacks_acc(one, road)),
+            *backend_notes(backend, road),
             *road.notes,
         ]
         has_results = any(row["status"] != "failed" for rows in evaluation.rows.values() for row in rows)
         if folder is not None and has_results:
             name = reward_label(reward or road.reward)
-            metadata = {"scenario": Path(scenario).name, "reward": name, "manifest": manifest()}
+            metadata = {"scenario": Path(scenario).name, "reward": name, "backend": backend_label(backend)}
             hashes = _controller_hashes({label: label for label in drivers})
-            save_evaluation(folder, evaluation, {**metadata, "controllers": hashes, "notes": notes})
+            contents = {"manifest": manifest(), "controllers": hashes, "notes": notes}
+            save_evaluation(folder, evaluation, {**metadata, **contents})
             from unjam.reports.html import write_report_page  # imported late: it draws
 
             report = write_report_page([folder], folder / "report.html")
     used_folder = folder if has_results else None
-    return DriveResult(evaluation.rows, evaluation.plot_episodes, scenario, used_folder, report, notes)
+    made_by = scenario, backend_label(backend)
+    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, used_folder, report, notes)

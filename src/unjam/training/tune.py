@@ -36,7 +36,7 @@ from unjam.training.trial_log import TrialLog, TrialVerdict, TuningTrial
 from unjam.tree import named_parts
 from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.batch.run import run_batch, run_batches
-from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason, unsupported_reason
+from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 TUNING_FILE = "tuned.json"
@@ -152,7 +152,7 @@ def tune(
 
     trials: list[TuningTrial] = []
     study = create_study(direction="maximize", sampler=TPESampler(seed=seed, multivariate=True))
-    shares_batches = any(BATCH_KINDS[type(roads[road])].has_own_drivers for road in screened)
+    shares_batches = any(required_batch_kind(roads[road]).has_own_drivers for road in screened)
     batch_size = SCREENING_BATCH_SIZE if screen or shares_batches else 1  # many take as long as few
     for first in range(0, trial_count, batch_size):
         asked = [study.ask(dict(space)) for _ in range(first, min(first + batch_size, trial_count))]
@@ -242,7 +242,7 @@ def _run_in_batch(tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
     import torch
 
     all_tasks = [*chain(*tasks)]
-    if BATCH_KINDS[type(all_tasks[0].scenario)].has_own_drivers:
+    if required_batch_kind(all_tasks[0].scenario).has_own_drivers:
         episodes = iter(run_batches(all_tasks, allow_statistical=True))
     else:
         needs_numpy = any(task.driver.requirements().needs_numpy for task in all_tasks)

@@ -111,6 +111,19 @@ def open_world(
         yield cast(RoadWorld, CheckedWorld(world, label, scenario, options.measured_fields))
 
 
+def backend_notes(backend: BackendLike, scenario: Scenario) -> list[str]:
+    """Return which simulator made the results of a scenario, and how they compare with SUMO's; nothing for SUMO."""
+    label = backend_label(backend)
+    if label in ("sumo", "sumo-gui"):
+        return []
+    if label != "batch":
+        return [f"simulated by the backend {label}, not by SUMO"]
+    from unjam.worlds.batch.support import unsupported_reason
+
+    extent = "in distribution, not in each episode" if unsupported_reason(scenario) else "except for rounding"
+    return [f"simulated by the backend batch: equal to SUMO {extent}"]
+
+
 def check_support(backend: Backend, *scenarios: Scenario) -> None:
     """Raise `InputError` with the reason if a backend cannot simulate one of the scenarios."""
     label = backend_label(backend)

@@ -28,9 +28,12 @@ STATE_TOLERANCE = 0.05
 
 
 def backend_label(backend: Any) -> str:
-    """Return the name of a backend as `path.py:name` without folders, or that of its class."""
-    path, _, name = object_reference(kind := type(backend)).rpartition(":")
-    return f"{Path(path).name}:{name}" if path else kind.__name__
+    """Return the name by which a backend was given; of an object or a class `path.py:name` without folders."""
+    if isinstance(backend, str):
+        return backend
+    kind = backend if isinstance(backend, type) else type(backend)
+    path, _, name = object_reference(kind).rpartition(":")
+    return getattr(kind, "label", "") or (f"{Path(path).name}:{name}" if path else kind.__name__)
 
 
 def call_backend(label: str, function: Callable[..., Any], *arguments: Any) -> Any:

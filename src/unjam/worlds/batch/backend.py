@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from unjam.worlds.backend import WorldOptions, check_support
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.ring.world import RingBatch
-from unjam.worlds.batch.support import BATCH_KINDS, statistically_unsupported_reason
+from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason
 from unjam.worlds.closed_road import loop_scene
 from unjam.worlds.road_world import RoadScene, RoadWorld
 from unjam.worlds.world import DriverLog
@@ -24,6 +24,8 @@ from unjam.worlds.world import DriverLog
 
 class BatchBackend:
     """The batch, with one road at a time; `run_batches` simulates many at once."""
+
+    label: ClassVar[str] = "batch"
 
     def supports(self, scenario: Scenario) -> str:
         """Return why a batch cannot simulate a scenario, at least with SUMO's distribution; empty if it can."""
@@ -33,7 +35,7 @@ class BatchBackend:
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[RoadWorld]:
         """Yield the road of an episode; raise `InputError` if a batch cannot simulate it."""
         check_support(self, scenario)
-        world = SINGLE_ROADS[BATCH_KINDS[type(scenario)].world](scenario, seed)
+        world = SINGLE_ROADS[required_batch_kind(scenario).world](scenario, seed)
         world.measured_fields = options.measured_fields
         yield world
 

@@ -87,7 +87,7 @@ def _run_at_once(
     for task in tasks:
         check_can_drive(task.driver, task.scenario)
     support.check_batch_scenarios(scenarios, allow_statistical)
-    kind = support.BATCH_KINDS[type(first.scenario)]
+    kind = support.required_batch_kind(first.scenario)
     if kind.has_own_drivers and len(tasks) > 1 and any(_depends_on_entry_order(task.driver) for task in tasks):
         # the order must be that of one road
         return [episode for task in tasks for episode in _run_at_once([task], to_array, (), allow_statistical)]
@@ -158,7 +158,7 @@ def warm_up_states(keys: Sequence[_WarmUpKey], upcoming: Sequence[_WarmUpKey]) -
 
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
     """Return the states of rings of one class after their warm-up, simulated in batches."""
-    states, size = dict[_WarmUpKey, WarmUpState](), support.BATCH_KINDS[type(keys[0][0])].max_roads
+    states, size = dict[_WarmUpKey, WarmUpState](), support.required_batch_kind(keys[0][0]).max_roads
     for first in range(0, len(keys), size):
         batch = keys[first : first + size]
         scenarios, seeds, (measured_fields, *_) = zip(*batch, strict=True)
@@ -174,7 +174,7 @@ def run_batches(
     """Return the episodes of tasks of any kinds, in their order; similar ones share batches, see `run_batch`."""
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
-        size = support.BATCH_KINDS[type(task.scenario)].max_roads
+        size = support.required_batch_kind(task.scenario).max_roads
         suitable = (each for each in batches if len(each) < size and _can_share_batch(task, next(iter(each.values()))))
         batch = next(suitable, None)
         if batch is None:
@@ -206,12 +206,12 @@ def run_batched_if_supported(
 def _shared_settings(task: EpisodeTask) -> tuple[object, ...]:
     """Return the settings that tasks must have in common to be simulated at once."""
     is_indivisible = task.driver.is_native or task.driver.network_inputs is not None
-    kind = support.BATCH_KINDS.get(type(task.scenario))
+    kind = support.batch_kind(task.scenario)
     explore = task.explore != 0.0 if kind and kind.has_own_drivers else task.explore
     return task.driver if is_indivisible else None, task.reward, explore
 
 
 def _can_share_batch(first: EpisodeTask, second: EpisodeTask) -> bool:
-    has_equal_drivers = support.BATCH_KINDS[type(first.scenario)].has_own_drivers or first.driver == second.driver
+    has_equal_drivers = support.required_batch_kind(first.scenario).has_own_drivers or first.driver == second.driver
     has_equal_settings = _shared_settings(first) == _shared_settings(second)
     return has_equal_drivers and has_equal_settings and support.differ_only_in_size(first.scenario, second.scenario)

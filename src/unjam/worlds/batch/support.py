@@ -40,7 +40,7 @@ class BatchKind:
 
 def unsupported_reason(scenario: Scenario) -> str:
     """Return why a batch cannot reproduce SUMO's episodes of a scenario exactly; empty if it can."""
-    if (kind := BATCH_KINDS.get(type(scenario))) and not kind.is_exact:
+    if (kind := batch_kind(scenario)) and not kind.is_exact:
         return f"{scenario.title} is not a ring"
     return statistically_unsupported_reason(scenario)
 
@@ -52,7 +52,7 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     decision about the right of way changes the order of the queue, so that only distributions agree. On on-ramps,
     human drivers follow as in SUMO, but all vehicles change lanes at once, and drivers' errors are other draws.
     """
-    if kind := BATCH_KINDS.get(type(scenario)):
+    if kind := batch_kind(scenario):
         return kind.reason(scenario)
     if issubclass(type(scenario), tuple(BATCH_KINDS)):  # a batch has its own formulas of the roads that it knows
         return f"{type(scenario).__name__} may have another road than {scenario.title}; allowed: backend=sumo"
@@ -109,8 +109,10 @@ def _controls(scenario: Scenario) -> tuple[tuple[str, bool, str], ...]:
 
 def _first_reason(scenario: Scenario, *checks: tuple[str, bool, str]) -> str:
     """Return the name, the value and the allowed values of the first setting that is not supported."""
-    failed = ((name, allowed) for name, is_supported, allowed in checks if not is_supported)
-    return next((f"{name}: {attrgetter(name)(scenario)}; allowed: {allowed}" for name, allowed in failed), "")
+    for name, is_supported, allowed in checks:
+        if not is_supported:
+            return f"{name}: {attrgetter(name)(scenario)} is not allowed in a batch; allowed: {allowed}"
+    return ""
 
 
 BATCH_KINDS: dict[type[Scenario], BatchKind] = {
@@ -118,6 +120,29 @@ BATCH_KINDS: dict[type[Scenario], BatchKind] = {
     FigureEight: BatchKind(RingBatch, _figure_eight_reason),
     Motorway: BatchKind(MotorwayBatch, _motorway_reason, max_roads=64, has_own_drivers=True),
 }
+
+
+def batch_kind(scenario: Scenario) -> BatchKind | None:
+    """Return how batches simulate a scenario or, if its class has only other values, its base; None if they cannot."""
+    for kind in type(scenario).__mro__:
+        if kind in BATCH_KINDS:
+            return BATCH_KINDS[kind]
+        if not all(_is_setting(kind, name, value) for name, value in vars(kind).items()):
+            return None
+    return None
+
+
+def _is_setting(kind: type[Any], name: str, value: object) -> bool:
+    """Return whether a member of a user's class is a value of a field, or text about the class, and no other code."""
+    is_field = name in kind.__dataclass_fields__ and not hasattr(value, "__get__")
+    return is_field or name == "title" or name.startswith("__")
+
+
+def required_batch_kind(scenario: Scenario) -> BatchKind:
+    """Return how batches simulate a scenario; raise `InputError` if they cannot."""
+    if (kind := batch_kind(scenario)) is None:
+        raise InputError(f"batch: {statistically_unsupported_reason(scenario)}")
+    return kind
 
 
 def differ_only_in_size(first: Scenario, second: Scenario) -> bool:

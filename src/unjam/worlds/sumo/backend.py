@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 from unjam.errors import EpisodeError, InputError, SumoInputError, UnjamError, as_unjam_error
 from unjam.scenarios import SCENARIO_KINDS
@@ -34,6 +34,8 @@ class SumoBackend(AbstractContextManager["SumoBackend"]):
     The latter runs in a sandboxed process (no writing, no network) for users' networks, and in its own process with a
     warning if libsumo already holds a simulation in this process, unjam's or the user's.
     """
+
+    label: ClassVar[str] = "sumo"
 
     def __init__(self, simulation: Simulation | None = None, transport: Transport | None = None) -> None:
         """Use a simulation, which is not closed at the end, or open one of a transport when it is needed."""
