@@ -25,7 +25,7 @@ class Experience:
     rewards: Float64
     """sums while each residual was held, shape (rows,)"""
     starts: NDArray[np.intp]
-    """first row of each trajectory, shape (trajectories,)"""
+    """index of the first row of each trajectory, of one CAV in one episode, shape (trajectories,)"""
     last_observations: Float32
     """observation at the end of each trajectory, shape (trajectories, inputs + critic inputs)"""
     terminated: NDArray[np.bool_]

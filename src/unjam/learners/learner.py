@@ -24,7 +24,7 @@ class Update(NamedTuple):
     """environment rows of this iteration; None after its first update"""
     model_rows: Experience | None
     share: float
-    """share of the gradient steps of the iteration that this update makes"""
+    """1 / updates of this iteration: learners with a fixed number of gradient steps per iteration make this share"""
     environment_steps: int
     """number of environment steps of all iterations"""
 
