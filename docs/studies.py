@@ -14,7 +14,7 @@ from unjam.measures.statistics import estimate_over_trainings
 from unjam_paper.comparison import COMPARISON_METRICS, estimate_metrics
 from unjam_paper.results_file import read_parts
 from unjam_paper.studies import STUDIES
-from unjam_paper.study import STUDY_ROADS, interval_text, number_text
+from unjam_paper.study import STUDY_ROADS, UNFILTERED_ROADS, interval_text, number_text
 from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES, VARIANTS
 
 FREE = 15.0
@@ -81,15 +81,22 @@ def beyond_own_expert(rows: dict[str, dict[str, Any]], name: str, expert: str) -
 
 
 def paper_convention(study: str, road: str) -> pd.DataFrame:
-    """Return a table in the paper's convention, beside the paper's own numbers."""
+    """Return a table in the paper's convention: the paper's numbers, and ours without and with the safety filter."""
+    with_filter = {row["name"]: row for row in rows_of(study, road)}
+    unfiltered = f"{study}-unfiltered", UNFILTERED_ROADS.get(road, "")
+    is_measured = (RESULTS / f"{unfiltered[0]}.json").is_file()
+    versions = {"without filter": {row["name"]: row for row in rows_of(*unfiltered)}} if is_measured else {}
+    versions["with filter" if road in UNFILTERED_ROADS else "ours"] = with_filter
     table = []
-    for row in rows_of(study, road):
-        cells = {"": row["name"]}
+    for name, row in with_filter.items():
+        cells, reported = {"": name}, row.get("paper") or {}
         for key, heading in PAPER.items():
-            ours, reported = row["paper_convention"][key], (row.get("paper") or {}).get(key)
             digits = 0 if key == "reward" else 2
-            cells[heading] = with_no_break_spaces(f"{ours['mean']:.{digits}f} ± {ours['std']:.{digits}f}")
-            cells[f"{heading}, paper"] = "" if reported is None else f"{reported:.{digits}f}"
+            cells[f"{heading}, paper"] = f"{reported[key]:.{digits}f}" if key in reported else ""
+            for label, rows in versions.items():
+                ours = rows[name]["paper_convention"][key]
+                text = f"{ours['mean']:.{digits}f} ± {ours['std']:.{digits}f}"
+                cells[f"{heading}, {label}"] = with_no_break_spaces(text)
         table.append(cells)
     return pd.DataFrame(table)
 
