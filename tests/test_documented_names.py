@@ -14,7 +14,7 @@ FILE = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]*\w)/?`")
 NAME = re.compile(r"`(?!unjam\.cdx\.json)(unjam(?:_paper)?(?:\.\w+)+)(?:\(\))?`")
 
 MODULE = re.compile(r"`(?:[\w-]+/)*(\w+\.py)`")
-"""a Python file, of which a table of the README may name the last part alone"""
+"""a Python file, of which a table of the architecture may name the last part alone"""
 USERS_FILES = {"my_driver.py"}
 IMPORT = re.compile(r"from (unjam(?:_paper)?[\w.]*) import ([\w, ]+)")
 
@@ -36,8 +36,8 @@ def test_files_and_names_of_a_page_exist(page: Path) -> None:
     assert missing == []
 
 
-def test_python_files_that_the_readme_names_exist() -> None:
-    named = set(MODULE.findall((ROOT / "README.md").read_text(encoding="utf-8")))
+def test_python_files_that_the_architecture_names_exist() -> None:
+    named = set(MODULE.findall((ROOT / "docs/architecture.md").read_text(encoding="utf-8")))
     existing = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
     assert len(named) > 20
     assert named - existing - USERS_FILES == set()
