@@ -19,7 +19,7 @@ from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import IDM, Constant
 from unjam.drivers.registry import driver_from_name
 from unjam.environments.gymnasium_env import RoadEnv
-from unjam.errors import InputError, MissingPartError, UnjamError
+from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
@@ -155,6 +155,21 @@ def test_a_collision_terminates_and_does_not_truncate() -> None:
     environment.close()
     assert terminated
     assert not truncated
+
+
+def test_control_steps_before_the_entry_of_the_cav_count_for_the_horizon() -> None:
+    with closing(RoadEnv("on-ramp", cavs=1, horizon=5, backend="batch")) as environment:
+        passed = environment.reset(seed=0)[1]["control_steps"]
+        steps = 0
+        truncated = False
+        while not truncated:
+            *_, truncated, _ = environment.step(np.zeros(1))
+            steps += 1
+    assert 0 < passed == 5 - steps
+    with closing(RoadEnv("on-ramp", cavs=1, horizon=1, backend="batch")) as environment:
+        message = r"reset: no CAV enters the road within the horizon, 1 control steps; allowed: a longer horizon"
+        with pytest.raises(EpisodeError, match=message):
+            environment.reset(seed=0)
 
 
 def test_the_same_seed_starts_the_same_episode_and_later_ones_differ() -> None:

@@ -246,6 +246,11 @@ def test_a_backend_is_given_as_a_class_too(own: str) -> None:
     assert unjam.drive("ring", "idm", 1, scenario_options={"horizon": 5}, backend=kind, workers=1).rows["idm"]
 
 
+def test_a_backend_without_optional_fields_serves_drivers_that_do_not_need_them(own: str) -> None:
+    for driver in (lambda state: 0.0 * state.speed, unjam.make_driver("unjam:best", RING.control_step)):
+        assert run_episode(replace(RING, horizon=5), driver, 0, backend=own).status == "completed"
+
+
 def test_a_scenario_that_a_backend_does_not_support_is_refused_with_its_reason(own: str) -> None:
     for attempt in (
         lambda: run_episode(Merge(), Human(), 0, backend=own),

@@ -149,7 +149,9 @@ class RoadStepper:
         self._control_steps = iter(self._drive_loop)
         self._wait_for_cav()
         if not world.cav_ids:
-            raise EpisodeError(f"no CAV entered the road in {world.control_steps} control steps")
+            steps = self.scenario.horizon
+            allowed = "allowed: a longer horizon, or more CAVs"
+            raise EpisodeError(f"reset: no CAV enters the road within the horizon, {steps} control steps; {allowed}")
         return self._observe()
 
     def step(self, actions: Any) -> RoadStepResult:
@@ -223,7 +225,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     Observation  ``Box(-50, 50, (5,), float32)``: own speed / 10 m/s; leader speed - own speed / 5 m/s; leader gap /
                  20 m; follower speed - own speed / 5 m/s; follower gap / 20 m; more with ``features``
     Reward       that of the scenario, or ``reward``; its terms are in ``info["reward_terms"]``
-    Start        ``reset(seed=s)`` starts the same episode as ``unjam drive --seed s``, with its warm-up
+    Start        ``reset(seed=s)`` starts the same episode as ``unjam drive --seed s``, with its warm-up; on open roads
+                 it returns when the CAV has entered, and ``info["control_steps"]`` of the horizon have passed
     Terminated   at a collision
     Truncated    at the horizon; on the merge also when the CAV leaves the road
     Time step    one control step: 0.1 s, on the merge 1 s
@@ -287,7 +290,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         """Start an episode: that of `seed`; without one, the next after that of the last seed."""
         super().reset(seed=seed)
         observations = self._road.reset(seed, self.np_random)
-        return observations[0], {"drawn_values": dict(self._road.world.road.drawn_values)}
+        world = self._road.world
+        return observations[0], {"drawn_values": dict(world.road.drawn_values), "control_steps": world.control_steps}
 
     @synchronized
     def step(self, action: Any) -> tuple[Observations, float, bool, bool, dict[str, Any]]:

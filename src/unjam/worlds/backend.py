@@ -19,11 +19,13 @@ class WorldOptions:
     """What a driver, and the user of an episode, want of a world; a backend may ignore what it does not have."""
 
     measured_fields: Collection[str] = ()
-    """optional fields of `LocalState` that the driver reads; measuring others would take time for nothing"""
+    """names of the optional fields of `LocalState` that the driver reads, such as `lane_speeds`; a world may leave the
+    others None, as measuring them takes time"""
     record_details: bool = False
     """whether fuel and, on roads with ends, positions (x, y) are recorded"""
     accepts_floats: bool = False
-    """whether the driver takes floats instead of arrays with one row; see `World.is_scalar`"""
+    """whether a world with a single CAV may give states as floats instead of arrays of shape (1,), which is faster;
+    it then says so in `World.is_scalar`"""
     stop_at_contact: bool = True
     """whether contact of a CAV ends an episode on a user's network; on built-in roads it always does"""
 
@@ -108,7 +110,7 @@ def open_world(
         raise InputError(f"backend: {label}: open() returns {type(context).__name__}; allowed: {allowed}")
     with ExitStack() as stack:
         world = call_backend(label, stack.enter_context, context)
-        yield cast(RoadWorld, CheckedWorld(world, label, scenario, options.measured_fields))
+        yield cast(RoadWorld, CheckedWorld(world, label, scenario))
 
 
 def backend_notes(backend: BackendLike, scenario: Scenario) -> list[str]:

@@ -1,6 +1,6 @@
 """Checks of a user's backend: an error names its file, and what it measures and records must be consistent numbers."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -58,10 +58,9 @@ def _is_user_code(module: dict[str, Any]) -> bool:
 class CheckedWorld:
     """The world of a user's backend, whose states, speeds and record are checked; all else is that of the backend."""
 
-    def __init__(self, world: Any, label: str, scenario: Scenario, measured_fields: Collection[str]) -> None:
-        """Take a world that has not started; drivers read `measured_fields`."""
+    def __init__(self, world: Any, label: str, scenario: Scenario) -> None:
+        """Take a world that has not started."""
         self._world, self._label, self._scenario = world, label, scenario
-        self._required_fields = {*COMMON_FIELDS, *measured_fields}
         unknown = {"loop_length"} if not scenario.is_closed else set[str]()
         self._finite_fields = set(COMMON_FIELDS) - unknown - (set() if scenario.has_coordinate else {"route_position"})
         self._steps = 0
@@ -129,8 +128,8 @@ class CheckedWorld:
                 array = self._as_array(name, values, rows + ((FIELD_SIZES[name],) if name in FIELD_SIZES else ()))
                 if name in self._finite_fields:
                     self._check_finite(name, np.atleast_1d(array), ids)
-            elif name in self._required_fields:
-                raise self._error(f"{method} has no {name}", "a value for each CAV, which the driver reads")
+            elif name in COMMON_FIELDS:
+                raise self._error(f"{method} has no {name}", "a value for each CAV")
         return state
 
     def _check_motion(self, episode: Episode) -> None:
