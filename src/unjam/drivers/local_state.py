@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from math import pi
 from typing import Any, NamedTuple
 
-from unjam.physics.arrays import Array
+from unjam.physics.arrays import Array, namespace
 
 
 class LocalState(NamedTuple):
@@ -97,6 +97,12 @@ def state_of_ones(names: Sequence[str], make_ones: Callable[..., Any], rows: int
     """Return a state in which the fields `names` are ones, as an example input for drivers."""
     shapes = {name: (rows, FIELD_SIZES[name]) if name in FIELD_SIZES else (rows,) for name in names}
     return LocalState(**{name: make_ones(shape) for name, shape in shapes.items()})
+
+
+def observe_neighbor(is_present: Array, gap: Array, speed: Array, own_speed: Array) -> tuple[Array, Array]:
+    """Return speed and gap of neighbors as CAVs observe them; those beyond `MAX_OBSERVED_GAP` count as missing."""
+    xp, is_near = namespace(gap), is_present & (gap < MAX_OBSERVED_GAP)
+    return xp.where(is_near, speed, own_speed), xp.where(is_near, gap, MAX_OBSERVED_GAP)
 
 
 class ScaledInput(NamedTuple):

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
+from unjam.drivers.local_state import LocalState, observe_neighbor
 from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.motorway import Motorway
@@ -127,17 +127,16 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         """Return gaps and speeds of the neighbors on adjacent lanes, as in `LocalState`."""
         order, lane_offset = self._order, 2.0 * self._geometry.length  # lanes one after the other on one axis
         along = self._lane[order] * lane_offset + self._position[order]
-        gaps, speeds = list[Floats](), list[Floats]()
+        found = list[tuple[Floats, Floats]]()
         for lane in (self._lane[rows] + 1, self._lane[rows] - 1):  # left, right
             first_ahead = np.searchsorted(along, lane * lane_offset + self._position[rows])
             for index, sign in ((first_ahead, 1.0), (first_ahead - 1, -1.0)):
                 other = order[index.clip(0, len(order) - 1)]
                 length = self._length[other if sign > 0.0 else rows]
                 gap = sign * (self._position[other] - self._position[rows]) - length
-                is_near = (index >= 0) & (index < len(order)) & (self._lane[other] == lane) & (gap < MAX_OBSERVED_GAP)
-                gaps.append(np.where(is_near, gap, MAX_OBSERVED_GAP))
-                speeds.append(np.where(is_near, self._speed[other], self._speed[rows]))
-        return np.stack(gaps, -1), np.stack(speeds, -1)
+                is_present = (index >= 0) & (index < len(order)) & (self._lane[other] == lane)
+                found.append(observe_neighbor(is_present, gap, self._speed[other], self._speed[rows]))
+        return np.stack([gap for _, gap in found], -1), np.stack([speed for speed, _ in found], -1)
 
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
         return [state for _, state in self._tracked_leaders(names)]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, commanded_time_gaps
-from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
+from unjam.drivers.local_state import LocalState, observe_neighbor
 from unjam.drivers.safety import FollowingState
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.road import BuiltRoad
@@ -38,8 +38,7 @@ def neighbor_state(
     """
     values = [speeds[rows]]
     for neighbors, gaps in ((leaders, leader_gaps(rows, leaders)), (followers, leader_gaps(followers, rows))):
-        is_near = (neighbors >= 0) & (gaps < MAX_OBSERVED_GAP)
-        values += [np.where(is_near, speeds[neighbors], speeds[rows]), np.where(is_near, gaps, MAX_OBSERVED_GAP)]
+        values += observe_neighbor(neighbors >= 0, gaps, speeds[neighbors], speeds[rows])
     return LocalState(*values, route_position=positions[rows], loop_length=np.full(len(rows), np.nan))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, batch_commanded_accelerations, commanded_time_gaps
-from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
+from unjam.drivers.local_state import LocalState, observe_neighbor
 from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.errors import InputError
 from unjam.physics.arrays import Array, Floats
@@ -204,8 +204,7 @@ class MotorwayBatch:
         def neighbor_state(neighbors: NDArray[np.intp], lane_offset: int, direction: float) -> tuple[Floats, Floats]:
             row = neighbors_on_lane(neighbors, vehicles.lane + lane_offset)[rows]
             gap = direction * (vehicles.position[row] - position) - geometry.vehicle_length
-            is_near = (row >= 0) & (gap < MAX_OBSERVED_GAP)
-            return np.where(is_near, vehicles.speed[row], speed), np.where(is_near, gap, MAX_OBSERVED_GAP)
+            return observe_neighbor(row >= 0, gap, vehicles.speed[row], speed)
 
         sides = ((neighbors.leaders, 1.0), (neighbors.followers, -1.0))
         own, left, right = ([neighbor_state(each, offset, sign) for each, sign in sides] for offset in (0, 1, -1))
