@@ -179,9 +179,12 @@ class CheckedWorld:
         return replace(episode, audit=replace(audit, following=following))
 
     def _is_ignored(self, trip: Trajectory) -> Any:
-        """Return in which control steps a CAV did not carry out its command, and no braking was recorded as added."""
+        """Return in which control steps a CAV did not carry out its command, and no added braking was recorded.
+
+        A standing vehicle cannot brake harder, and none exceeds its top speed.
+        """
         speed, actual = trip.states.speed[1:], np.diff(trip.states.speed) / self._scenario.control_step
         slower = trip.applied_acceleration - actual
-        is_limited = (speed < OVERRIDE_TOLERANCE) | (speed > self._scenario.top_speed - OVERRIDE_TOLERANCE)
-        is_explained = (slower > 0) & (is_limited | (trip.shield_braking > OVERRIDE_TOLERANCE))
-        return (np.abs(slower) > COMMAND_TOLERANCE) & ~is_explained
+        is_standing, is_fastest = speed < OVERRIDE_TOLERANCE, speed > self._scenario.top_speed - OVERRIDE_TOLERANCE
+        is_braked = is_fastest | (trip.shield_braking > OVERRIDE_TOLERANCE)
+        return (np.abs(slower) > COMMAND_TOLERANCE) & ~np.where(slower > 0, is_braked, is_standing)
