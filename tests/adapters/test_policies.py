@@ -136,7 +136,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a policy in another process": (
         lambda: driver_recipe(policy_driver(lambda rows: rows[:, 0])),
-        "it drives in its own process only; allowed: the policy as an .onnx file with a description, or path.py:name",
+        "in its own process only; allowed: its .onnx file with a description, or, except in export, path.py:name",
     ),
 }
 

@@ -100,7 +100,7 @@ class PolicyDriver(ExpertWrapper):
     """A policy that others have trained, alone or added to an expert; other processes cannot build it."""
 
     own_requirements: ClassVar[Requirements] = Driver.own_requirements
-    portable_form: ClassVar[str] = "the policy as an .onnx file with a description, or path.py:name that loads it"
+    portable_form: ClassVar[str] = "its .onnx file with a description, or, except in export, path.py:name that loads it"
 
     policy: Callable[[Any, Memory], tuple[Any, Memory]]
     """returns numbers, shape (n,) or (n, 1), and its new memory, for observations, shape (n, inputs)"""
