@@ -218,6 +218,19 @@ def test_an_invalid_value_in_the_body_of_a_class_is_refused_in_one_line() -> Non
         make_scenario(type("Bad", (Ring,), {"vehicles": 1}))
 
 
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        ({"ramps": [Ramp(position=900.0)]}, "mutable default .*list.* for field ramps is not allowed"),
+        ({"__annotations__": {"extra": float}}, "non-default argument 'extra' follows default argument"),
+    ],
+)
+def test_a_class_that_cannot_be_a_dataclass_is_refused_in_one_line(members: dict[str, Any], message: str) -> None:
+    for make in (lambda kind: kind(), make_scenario):
+        with pytest.raises(InputError, match=rf"^class Bad: .*{message}.*$"):
+            make(type("Bad", (Motorway,), dict(members)))
+
+
 def test_computed_values_and_constructors_of_a_subclass_remain_its_own() -> None:
     class Computed(Ring):
         @property

@@ -9,10 +9,19 @@ from inspect import get_annotations
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PydanticUserError,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic.dataclasses import dataclass
 
-from unjam.errors import InputError, invalid_value, spelling_hint
+from unjam.errors import InputError, invalid_value, one_line, spelling_hint
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Configuration of every parameter dataclass: an unknown name or a NaN is an error.
@@ -78,10 +87,16 @@ class Subclassable:
 
 
 def _apply_decorator(cls: type[Any]) -> None:
-    """Make a class with fields a dataclass of parameters, as its bases are, unless it is one or has an `__init__`."""
+    """Make a class with fields a dataclass of parameters, as its bases are, unless it is one or has an `__init__`.
+
+    Raise `InputError` if that is impossible, as with a list as a default or a field without one.
+    """
     is_complete = not get_annotations(cls) or not {"__dataclass_fields__", "__init__"}.isdisjoint(vars(cls))
     if is_dataclass(cls) and issubclass(cls, Subclassable) and not is_complete:
-        dataclass(frozen=True, config={**STRICT, "validate_default": True, "arbitrary_types_allowed": True})(cls)
+        try:
+            dataclass(frozen=True, config={**STRICT, "validate_default": True, "arbitrary_types_allowed": True})(cls)
+        except (TypeError, ValueError, PydanticUserError) as error:
+            raise InputError(f"class {cls.__name__}: {one_line(error)}") from error
 
 
 def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) -> DataclassT:

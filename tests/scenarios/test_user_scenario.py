@@ -24,6 +24,10 @@ class LongRing(Ring):
     def draw(self, generator):
         return Ring(length=(300, 300), vehicles=self.vehicles).draw(generator)
 
+class ShortRing(Ring):
+    length = 120
+    vehicles = 11
+
 class BrokenRing(Ring):
     def draw(self, generator):
         return 1 / 0
@@ -54,9 +58,10 @@ def test_classes_instances_and_functions_of_a_file_are_driven_in_a_worker(roads:
     scenarios = [make_scenario(f"{roads}:LongRing", {"vehicles": 5, "horizon": 5}), make_scenario(f"{roads}:small")]
     scenarios.append(make_scenario(f"{roads}:make_small"))
     assert scenarios[0] == scenarios[1] == scenarios[2]
+    scenarios.append(make_scenario(f"{roads}:ShortRing", {"horizon": 5}))
     with WorkerPool(1) as workers:
         episodes = workers.run([EpisodeTask(each, Human(), (1,)) for each in scenarios])
-    assert [episode.loop_length for episode in episodes] == [300.0, 300.0, 300.0]
+    assert [episode.loop_length for episode in episodes] == [300.0, 300.0, 300.0, 120.0]
     assert statistically_unsupported_reason(scenarios[0])
 
 
@@ -93,7 +98,7 @@ def test_names_that_are_no_scenarios_are_refused(roads: Path, name: str, message
 
 
 def test_an_error_in_the_code_of_a_scenario_is_reported_with_its_line(roads: Path) -> None:
-    with pytest.raises(InputError, match=r"BrokenRing: ZeroDivisionError: division by zero \(line 11\)"):
+    with pytest.raises(InputError, match=r"BrokenRing: ZeroDivisionError: division by zero \(line 15\)"):
         make_scenario(f"{roads}:BrokenRing").draw_from_seed((0,))
 
 

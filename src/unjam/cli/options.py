@@ -24,7 +24,9 @@ ScenarioArgument = Annotated[
 RewardOption = Annotated[
     str, Option("--reward", help="Name of a reward, or your own: path.py:name.", show_default="the scenario's")
 ]
-BackendOption = Annotated[str, Option(help="Simulator: sumo, batch, or your own: path.py:name.")]
+BackendOption = Annotated[
+    str, Option(help="Simulator: sumo, batch (equal on rings, elsewhere in distribution), or your own: path.py:name.")
+]
 SeedOption = Annotated[int, Option("--seed", min=0, help="First seed.")]
 OptunaSeedOption = Annotated[int, Option("--seed", min=0, max=2**32 - 1, help="First seed.")]
 ScenarioSettingsOption = Annotated[list[str] | None, Option("--set", help="Any setting of the scenario: key=value.")]
