@@ -2,12 +2,12 @@
 
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import field, fields, is_dataclass
 from functools import wraps
 from inspect import get_annotations
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar, dataclass_transform
 
 from pydantic import (
     AfterValidator,
@@ -112,19 +112,25 @@ def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) 
         raise InputError(validation_message(error, field, kind)) from None
 
 
-def one_line_errors(kind: type[DataclassT]) -> type[DataclassT]:
-    """Let a parameter dataclass that Python code makes raise `InputError` with one line, as `build_dataclass` does."""
-    make: Any = kind.__init__
+@dataclass_transform(field_specifiers=(field, Field))
+def parameter_dataclass(**options: Any) -> Callable[[type[DataclassT]], type[DataclassT]]:
+    """Decorate as pydantic's `dataclass` does; an invalid value in Python is an `InputError` of one line."""
 
-    @wraps(make)
-    def init(self: Any, *args: Any, **kwargs: Any) -> None:
-        try:
-            make(self, *args, **kwargs)
-        except ValidationError as error:
-            raise InputError(validation_message(error, kind.__name__, kind)) from None
+    def decorate(kind: type[DataclassT]) -> type[DataclassT]:
+        made: Any = dataclass(**options)(kind)
+        make = made.__init__
 
-    kind.__init__ = init
-    return kind
+        @wraps(make)
+        def init(self: Any, *args: Any, **kwargs: Any) -> None:
+            try:
+                make(self, *args, **kwargs)
+            except ValidationError as error:
+                raise InputError(validation_message(error, made.__name__, made)) from None
+
+        made.__init__ = init
+        return made
+
+    return decorate
 
 
 def check_values(value: Any, name: str) -> None:

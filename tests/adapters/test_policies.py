@@ -125,6 +125,10 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a missing name": (lambda: PolicyMemory("h"), "PolicyMemory.output: missing"),  # pyright: ignore[reportCallIssue]
     "reversed limits": (lambda: PolicyOutput(limits=(2, 1)), "PolicyOutput.limits: [2.0, 1.0] is not allowed"),
+    "a parameter of a driver": (
+        lambda: PISaturation(window=-1),
+        "PISaturation.window: -1 is not allowed; allowed: greater than 0",
+    ),
     "no inputs": (lambda: PolicyDescription(()), "PolicyDescription.inputs: () is not allowed"),
     "a name as output": (
         lambda: policy_driver(len, output="acceleration"),  # pyright: ignore[reportArgumentType]

@@ -5,13 +5,12 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, SPEED_SCALE, LocalState, ScaledInput
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.speed_history import empty_window, fill_window, slide_window, window_mean_speed
-from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_min, clip, namespace, stack_columns
 from unjam.physics.idm import IDMArrays, IDMParameters, idm_acceleration
 
@@ -21,7 +20,7 @@ NO_LEADER_GAP = 1e6
 """gap without any effect [m]"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class IDM(IDMParameters, FormulaDriver):
     """A CAV that drives like an ideal human driver, without noise and within the action limit.
 
@@ -36,7 +35,7 @@ class IDM(IDMParameters, FormulaDriver):
         return idm_acceleration(state.speed, state.leader_speed, gap, self), memory
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Human(FormulaDriver):
     """The human baseline: the simulator drives the vehicle as one of its human drivers, with their noise."""
 
@@ -48,7 +47,7 @@ class Human(FormulaDriver):
         return IDM().act(state, memory)
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class OVM(FormulaDriver):
     """Relaxes to an optimal speed that depends on the gap, and to the leader's speed.
 
@@ -82,7 +81,7 @@ class OVM(FormulaDriver):
         return acceleration + self.speed_gain * (state.leader_speed - state.speed), memory
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class BCM(FormulaDriver):
     """Controls towards equal gaps and equal relative speeds ahead and behind, and towards a desired speed.
 
@@ -109,7 +108,7 @@ class BCM(FormulaDriver):
         return self.gap_gain * gaps + self.speed_gain * speeds + free, memory
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class ACC(FormulaDriver):
     """Keeps a constant time gap to the leader, and never drives faster than its set speed.
 
@@ -144,7 +143,7 @@ class ACC(FormulaDriver):
         return namespace(state.speed).minimum(following, free)
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class LACC(FormulaDriver):
     """Linear adaptive cruise control whose acceleration follows its command with a lag.
 
@@ -180,7 +179,7 @@ class LACC(FormulaDriver):
         return acceleration, {"acceleration": acceleration}
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class FollowerStopper(FormulaDriver):
     """Drives at the desired speed while the gap allows it, and below it in three regions of the gap.
 
@@ -235,7 +234,7 @@ class FollowerStopper(FormulaDriver):
         return (command - state.speed) / max(self.time_constant, self.time_step), window
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Constant(FormulaDriver):
     """Commands the same acceleration in every step; only SUMO's own safety check prevents a collision."""
 
@@ -267,7 +266,7 @@ JAM_HEAD_STRATEGY = DrivingStrategy(0.5, 2.0, 1.0)
 """strategy at the downstream end of a jam: a larger outflow makes the jam shorter"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class AdaptiveACC(IDMParameters, FormulaDriver):
     """Follows by the Intelligent Driver Model with parameters that depend on the traffic state.
 

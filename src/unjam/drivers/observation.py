@@ -12,7 +12,6 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator
-from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.command import as_numbers
 from unjam.drivers.driver import Driver, Memory
@@ -32,7 +31,7 @@ from unjam.drivers.local_state import (
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference
 from unjam.errors import InputError, RowError, invalid_value, unknown_name
-from unjam.parameters import STRICT, Number, one_line_errors
+from unjam.parameters import STRICT, Number, parameter_dataclass
 from unjam.physics.arrays import Array, Floats, as_column, clip, join_columns, namespace, stack_columns
 from unjam.user_code import UserCode
 
@@ -144,8 +143,7 @@ def _check_scale(scale: float) -> float:
 Scale = Annotated[Number, AfterValidator(_check_scale)]
 
 
-@one_line_errors
-@checked_dataclass(frozen=True, config=STRICT, repr=False)
+@parameter_dataclass(frozen=True, config=STRICT, repr=False)
 class PolicyInput:
     """A quantity among the inputs of a network, which is given `(value in unit - offset) / scale`."""
 

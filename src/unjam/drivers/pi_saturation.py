@@ -4,16 +4,15 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
 from unjam.drivers.speed_history import empty_window, fill_window, slide_window, window_mean_speed
-from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_min, clip, namespace, stack_columns
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class PISaturation(FormulaDriver):
     """Drives at the mean of its own speed, slightly faster behind a large gap, and follows the leader when close.
 
@@ -89,7 +88,7 @@ class PISaturation(FormulaDriver):
         return stack_columns((mean / SPEED_SCALE, memory["command"] / SPEED_SCALE))
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class PIFromGap(PISaturation):
     """PI with saturation whose mean speed starts with that of human drivers at its first gap.
 

@@ -8,7 +8,6 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.car_following import ACC, Constant
 from unjam.drivers.command import Command, Limits
@@ -18,7 +17,7 @@ from unjam.drivers.observation import FEATURES, Feature, NetworkInput, PolicyInp
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import ExpertWrapper
 from unjam.errors import InputError, invalid_value, unknown_name
-from unjam.parameters import STRICT, Number, build_dataclass, one_line_errors
+from unjam.parameters import STRICT, Number, build_dataclass, parameter_dataclass
 from unjam.physics.arrays import Array
 
 POLICY_KEY = "policy"
@@ -28,8 +27,7 @@ REPEAT_TOLERANCE = 1e-6
 """allowed deviation of a number of control steps from an integer"""
 
 
-@one_line_errors
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class PolicyOutput:
     """The output of a policy: `offset + scale * number` is a quantity in a unit."""
 
@@ -63,8 +61,7 @@ class PolicyOutput:
         return (value - state.speed) / time_step if self.quantity == "desired_speed" else value
 
 
-@one_line_errors
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class PolicyMemory:
     """Recurrent state of an ONNX graph: an input and an output whose first axis is the row of the CAV."""
 
@@ -82,8 +79,7 @@ def _as_input(value: Any) -> NetworkInput:
     return value
 
 
-@one_line_errors
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class PolicyDescription:
     """What the inputs and outputs of a policy mean."""
 

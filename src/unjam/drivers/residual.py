@@ -6,7 +6,6 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, InstanceOf
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
@@ -24,7 +23,7 @@ from unjam.drivers.requirements import Requirements, RoadInterface, merge_requir
 from unjam.drivers.user_driver import FileReference
 from unjam.drivers.wrappers import COMPOSITE_CONFIG, DriverWrapper, select_rows
 from unjam.errors import invalid_value
-from unjam.parameters import Positive, PositiveInt
+from unjam.parameters import Positive, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import Array, namespace
 from unjam.tree import map_leaves
 
@@ -90,7 +89,7 @@ class ExpertWrapper(DriverWrapper):
         return decision.command.acceleration, decision.memory
 
 
-@dataclass(frozen=True, config=COMPOSITE_CONFIG)
+@parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class ResidualDriver(ExpertWrapper):
     """Adds the output of a network to an expert, within the action limit: Eq. 8 of the paper.
 

@@ -8,12 +8,11 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import SECTIONS_AHEAD, LocalState, ScaledInput, lap_angle
 from unjam.drivers.requirements import Requirements
-from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Array, as_column, clamp_min, namespace
 
 Harmonics = tuple[float, ...]
@@ -54,7 +53,7 @@ Found by a search over the pace; at 34 m it is 0.1 m/s lower than in the search 
 """
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Pacer(FormulaDriver):
     """Waits until all vehicles have gathered behind it, then leads them at a pace at which the queue holds.
 
@@ -152,7 +151,7 @@ class Pacer(FormulaDriver):
         return as_column(memory["has_gathered"])
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class JamAbsorber(FormulaDriver):
     """Follows its leader linearly; if the leader is in a jam, it crawls until there is free road ahead.
 
@@ -211,7 +210,7 @@ class JamAbsorber(FormulaDriver):
         return as_column(memory["is_waiting"])
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Cruise(FormulaDriver):
     """Does not limit the vehicle: on roads with ACC, the vehicle's own ACC drives.
 
@@ -226,7 +225,7 @@ class Cruise(FormulaDriver):
         return state.speed * 0.0 + UNBOUNDED_ACCELERATION, memory
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class AdvisorySpeed(FormulaDriver):
     """Drives no faster than a fixed speed on a section upstream of a ramp; elsewhere its own ACC drives.
 
@@ -259,7 +258,7 @@ class AdvisorySpeed(FormulaDriver):
         return namespace(free).where(is_advised, towards, free), memory
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class JamAhead(FormulaDriver):
     """Caps the speed upstream of a ramp or a jam near the mean speed of its own lane a few hundred meters ahead.
 
@@ -330,7 +329,7 @@ class JamAhead(FormulaDriver):
         return xp.where(congested & (ahead < self.jam_speed_ratio * state.allowed_speed), towards, free), memory
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class GapMaker(JamAhead):
     """As `jam-ahead`, with a longer time gap shortly before a merge while there are vehicles on its right.
 

@@ -7,16 +7,15 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.local_state import ROAD_SECTION_LENGTH, SECTIONS_AHEAD
-from unjam.parameters import STRICT, NonNegative, Positive, Subclassable
+from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
 from unjam.physics.arrays import Floats
 
 SpeedSource = Literal["vehicles", "cavs", "detectors", "none"]
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class RoadsideSettings(Subclassable):
     """What a message contains, and how it differs from the current measurement."""
 

@@ -10,9 +10,8 @@ from math import exp
 from typing import NamedTuple
 
 from pydantic import model_validator
-from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, NonNegative, Positive, Subclassable
+from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_max, clamp_min
 from unjam.physics.kinematics import max_speed_to_stop, stopping_distance
 
@@ -25,7 +24,7 @@ class ActuatorState(NamedTuple):
     """commands that have not arrived yet, the next one first"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Actuator(Subclassable):
     """Delay and lag of a vehicle's response to commands: da/dt = (u(t - delay) - a) / lag, exact over each step.
 
@@ -80,7 +79,7 @@ MAX_LEADER_GAP = 1e6
 """finite gap that replaces larger ones in formulas that count steps [m]"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class SafetyFilter(Subclassable):
     """Upper bound of the acceleration behind a leader: RSS with a response time of one step, and a minimum time gap.
 

@@ -5,18 +5,17 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import FollowingState
-from unjam.parameters import STRICT, NonNegative, Subclassable
+from unjam.parameters import STRICT, NonNegative, Subclassable, parameter_dataclass
 from unjam.physics.arrays import Array, Floats
 
 MIN_SENSED_GAP = 0.1
 """smallest gap that a sensor reports, whatever its error [m]"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Sensors(Subclassable):
     """Errors of the sensed gaps and speeds of neighbors; the own speed is exact."""
 

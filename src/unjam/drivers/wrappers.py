@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import numpy as np
 from pydantic import ConfigDict, model_validator
-from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory
@@ -19,7 +18,7 @@ from unjam.drivers.safety import FollowingState, SafetyFilter
 from unjam.drivers.sensors import MIN_SENSED_GAP
 from unjam.drivers.speed_history import MAX_WINDOW_STEPS
 from unjam.errors import InputError
-from unjam.parameters import STRICT, NonNegative, Positive
+from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_min, clip, join_columns, namespace, square_root, stack_columns
 from unjam.tree import map_leaves, named_parts
 
@@ -128,7 +127,7 @@ class MixedDriver(CompositeDriver):
         return "+".join(driver.describe() for driver in self.drivers)
 
 
-@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
+@parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class ImpairedDriver(DriverWrapper):
     """Drives as another driver does with noisy gaps and delayed commands."""
 
@@ -179,7 +178,7 @@ class ImpairedDriver(DriverWrapper):
         return f"{self.driver.describe()} ({', '.join(words) or 'unimpaired'})"
 
 
-@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
+@parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class FilteredDriver(DriverWrapper):
     """Another driver with the limits and the safety filter of a road, for a vehicle without its own filter.
 
@@ -210,7 +209,7 @@ class FilteredDriver(DriverWrapper):
         return f"{self.driver.describe()}, filtered"
 
 
-@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
+@parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class HistoryDriver(DriverWrapper):
     """Drives as another driver does, and keeps means of its own speed, its square, and its gap for a network.
 
@@ -280,7 +279,7 @@ class HistoryDriver(DriverWrapper):
         return f"{self.driver.describe()}, with history"
 
 
-@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
+@parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class QueueFallback(CompositeDriver):
     """Drives by a driver that leads all others in one queue, and by a fallback once that queue has not held.
 
@@ -329,7 +328,7 @@ class QueueFallback(CompositeDriver):
         return f"{self.primary.describe()} while the queue holds, else {self.fallback.describe()}"
 
 
-@checked_dataclass(frozen=True, config=COMPOSITE_CONFIG)
+@parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class RoadTypeSwitch(CompositeDriver):
     """Drives by one of its inner drivers, selected by road type: from the vehicle's map and roadside messages.
 
