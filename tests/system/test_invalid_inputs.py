@@ -63,7 +63,7 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     "unknown reward": ("released, released-merge, eq16", ["drive ring --driver pi --reward gold"]),
     "reward that is not in the file": ("has no 'ghost'", ["drive ring --driver pi --reward mine.py:ghost"]),
     "reward that is NaN": (
-        "reward: step 0: term 'speed' is nan",
+        "reward mine.py:wrong_reward: step 0: term 'speed' is nan",
         ["drive ring --driver pi --reward mine.py:wrong_reward"],
     ),
     "driver file that is missing": ("is not a file", ["drive ring --driver none.py:gentle"]),

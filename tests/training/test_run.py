@@ -383,5 +383,5 @@ def test_invalid_expert_is_reported(tmp_path: Path, my_drivers: Path, learn: Lea
 
 
 def test_invalid_reward_is_reported(tmp_path: Path, my_drivers: Path, learn: Learn) -> None:
-    with pytest.raises(InputError, match="reward: step 0: term 'speed' is nan"):
+    with pytest.raises(InputError, match=r"reward mine\.py:wrong_reward: step 0: term 'speed' is nan"):
         learn(tmp_path / "run", small_config(reward=f"{my_drivers}:wrong_reward"))
