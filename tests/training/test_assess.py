@@ -18,6 +18,7 @@ from unjam.training.assess import (
     AssessmentRequest,
     assess,
     make_request,
+    sensing_notes,
 )
 from unjam.training.selection import ACC_DRIVER, HUMAN_BASELINE, UNCHANGED_ACC_DRIVER, Option
 from unjam.worlds.worker_pool import WorkerPool
@@ -55,6 +56,13 @@ def test_request_has_all_penetration_rates_controllers_and_two_baselines(file: s
     road, driver = usual.make_setup(Option(0.2, "pi"))
     assert road.penetration_rate == 0.2  # pyright: ignore[reportAttributeAccessIssue]
     assert driver.name == "pi"
+
+
+def test_an_assessment_says_what_its_controllers_know_of_the_traffic_ahead(file: str) -> None:
+    delayed = {"roadside.latency": 30.0, "roadside.loss_rate": 0.1}
+    (note,) = sensing_notes(make_request(file, [0.1], 400, 0.02, None, ["unjam:best", "pi"], delayed))
+    assert note.startswith("unjam:best: assumed to know the speeds of all vehicles, late by 30 s, 10 % of the messages")
+    assert sensing_notes(make_request(file, [0.1], 400, 0.02, None, ["follower-stopper", "pi"])) == []
 
 
 def test_acc_baseline_uses_an_acc_even_if_controllers_do_not(file: str) -> None:

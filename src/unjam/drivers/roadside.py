@@ -33,6 +33,20 @@ class RoadsideSettings(Subclassable):
     loss_rate: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """share of lost messages: the last received one is used instead"""
 
+    @property
+    def description(self) -> str:
+        """What controllers know of the traffic ahead, in words."""
+        known = {
+            "vehicles": "the speeds of all vehicles",
+            "cavs": f"the speeds of CAVs in the last {self.averaging_time:g} s",
+            "detectors": f"means of {self.averaging_time:g} s at detectors every {self.detector_spacing:g} m",
+            "none": "nothing",
+        }[self.source]
+        delays = (("late by", self.latency, "s"), ("smoothed over", self.smoothing_time, "s"))
+        parts = [f"{words} {value:g} {unit}" for words, value, unit in delays if value]
+        parts += [f"{100 * self.loss_rate:g} % of the messages lost"] if self.loss_rate else []
+        return ", ".join([known, *(parts or ["without delay"])])
+
 
 class RoadsideMessages:
     """The measurements of a road as received messages, one per control step."""

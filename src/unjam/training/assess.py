@@ -57,6 +57,8 @@ DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
 """default controllers, which suit open roads"""
 ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "speed_gain")
 """settings of the CAVs' ACC that replace a property of the vehicle"""
+SPEEDS_AHEAD = {"lane_speeds", "road_speeds", "congestion"}
+"""fields of a `LocalState` with messages about the traffic ahead"""
 MIN_BASELINE_EPISODES = 20
 """episodes of the baseline to which early ends are related before the last one: two of them are too many"""
 PLOT_EPISODE_COUNT = 2
@@ -240,13 +242,24 @@ def assess(
     document = {
         **metadata,
         **_assessment_document(request, selection, findings, selection_episodes, budget),
-        "notes": [*episode_notes(all_rows), *request.network.notes],
+        "notes": [*episode_notes(all_rows), *request.network.notes, *sensing_notes(request)],
     }
     save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
     save_evaluation(folder, Evaluation(test_rows, plot_episodes), metadata)
     atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
     page = write_assessment(folder, folder / ASSESSMENT_PAGE)
     return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
+
+
+def sensing_notes(request: AssessmentRequest) -> list[str]:
+    """Return what the controllers are assumed to know of the traffic ahead, if any of them reads it."""
+    readers = [
+        name for name, driver in request.drivers.items() if SPEEDS_AHEAD & set(driver.requirements().measured_fields)
+    ]
+    if not readers:
+        return []
+    known = request.network.roadside.description
+    return [f"{', '.join(readers)}: assumed to know {known}; roadside.latency, smoothing_time and loss_rate change it"]
 
 
 def _assessment_document(
