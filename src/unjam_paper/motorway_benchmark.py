@@ -39,6 +39,7 @@ from unjam_paper.motorway_tables import (
     comparison_table,
     delay_change,
     no_harm_table,
+    parameter_effects_table,
     sensing_table,
     sensitivity_table,
     settings_with_breakdown,
@@ -251,6 +252,7 @@ MOTORWAY_BENCHMARK = Study(
     minutes=100.0,
     tables={
         "candidates": candidates_table,
+        "effects": parameter_effects_table,
         "comparison": comparison_table,
         "summary": summary_table,
         "no-harm": no_harm_table,

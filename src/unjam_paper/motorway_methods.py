@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from unjam.parameters import split_parameters
+
 CANDIDATES_PER_METHOD = 18
 """number of candidates of each method"""
 CANDIDATE_SEED = 20261129
@@ -23,6 +25,17 @@ class Candidate:
     driver: str
     settings: Mapping[str, Any]
     """settings of the scenario"""
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All parameters as numbers: a way to change lanes is 1 if it is set, a choice 1 if it is true."""
+        _, parameters = split_parameters(self.driver)
+        values = {**parameters, **self.settings}
+        return {
+            name: float(value is not None) if name in LANE_CHANGING else float(value)
+            for name, value in values.items()
+            if not name.endswith(".active")
+        }
 
 
 @dataclass(frozen=True)

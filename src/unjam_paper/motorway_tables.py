@@ -11,7 +11,7 @@ import pandas as pd
 from unjam.measures.effect import FLOW_METRIC, TIME_METRIC
 from unjam.measures.feasibility import HARD_BRAKING_METRIC, overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
-from unjam.measures.statistics import Estimate, estimate, linearized_ratio, pair_rows, relative_difference
+from unjam.measures.statistics import Estimate, estimate, linearized_ratio, pair_rows, regress, relative_difference
 from unjam.reports.results import replace_null
 from unjam_paper.motorway_ensemble import SETTINGS
 from unjam_paper.motorway_methods import METHODS
@@ -66,6 +66,38 @@ def candidates_table(folder: Path) -> pd.DataFrame:
                 "second round": f"{100 * delay_change(final['episodes'], human):+.0f} %" if final else NO_VALUE_TEXT,
             }
         )
+    return pd.DataFrame(table)
+
+
+def parameter_effects_table(folder: Path) -> pd.DataFrame:
+    """Return how the delay changes with one standard deviation of each parameter among the candidates of its method.
+
+    By linear regression over all episodes of both rounds on settings with a breakdown; the delay is relative to the
+    mean delay of human traffic on the setting. Candidates with default parameters are left out.
+    """
+    human = read_part(folder, HUMAN_PART)
+    times = {
+        number: float(np.mean([row[TIME_METRIC] for row in human if row["setting"] == number]))
+        for number in settings_with_breakdown(human)
+    }
+    table: Table = []
+    for method in METHODS:
+        rows = [row for part in (TUNING_PART, FINAL_PART) for row in read_part(folder, part) if row["method"] == method]
+        numbers, changes = list[list[float]](), list[float]()
+        names = list(METHODS[method].candidate(1).numbers)
+        for row in rows:
+            for episode in row["episodes"] if row["candidate"] else ():
+                if (number := episode["setting"]) in times:
+                    numbers.append([METHODS[method].candidate(row["candidate"]).numbers[name] for name in names])
+                    delay = times[number] - SETTINGS[number].free_flow_time
+                    changes.append((episode[TIME_METRIC] - times[number]) / delay)
+        if not changes:
+            continue
+        effects = regress(np.array(numbers), np.array(changes))
+        table += [
+            {"method": method, "parameter": name, "standard deviation": f"{spread:.3g}", "delay": _percent(effect)}
+            for name, spread, effect in zip(names, np.std(numbers, axis=0), effects, strict=True)
+        ]
     return pd.DataFrame(table)
 
 

@@ -23,6 +23,7 @@ from unjam.measures.statistics import (
     paired_difference,
     paired_differences,
     probability_of_improvement,
+    regress,
     relative_difference,
     summarize,
 )
@@ -364,3 +365,16 @@ def test_a_relative_difference_is_that_of_the_means_and_unknown_relative_to_zero
     assert found.mean == pytest.approx(10.0 / 102.0)
     assert relative_difference(ours, [{**row, "flow": 0.0} for row in others], "flow").count == 0
     assert relative_difference([], others, "flow").count == 0
+
+
+def test_regression_finds_the_effect_of_one_standard_deviation_in_95_percent() -> None:
+    generator, truth, found = np.random.default_rng(0), np.array([2.0, 0.0, -1.0]), 0
+    for _ in range(200):
+        predictors = generator.normal(5.0, [1.0, 3.0, 0.5], (30, 3))
+        spreads = predictors.std(0)
+        effects = regress(predictors, predictors / spreads @ truth + generator.normal(0.0, 4.0, 30))
+        found += sum(each.low <= true <= each.high for each, true in zip(effects, truth, strict=True))
+    assert 0.92 < found / 600 < 0.98
+    exact = regress(np.arange(6.0)[:, None], 3.0 * np.arange(6.0))
+    assert exact[0].mean == pytest.approx(3.0 * np.std(np.arange(6.0)))
+    assert np.isnan(regress(np.ones((6, 1)), np.arange(6.0))[0].low)

@@ -5,6 +5,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from unjam.controller import make_driver
@@ -36,6 +37,7 @@ from unjam_paper.motorway_tables import (
     comparison_table,
     delay_change,
     no_harm_table,
+    parameter_effects_table,
     sensing_table,
     sensitivity_table,
     settings_with_breakdown,
@@ -118,6 +120,21 @@ def test_parts_follow_from_the_results_of_earlier_parts(tmp_path: Path) -> None:
     finalists = [name for name in make_parts(folder, 1) if name.startswith(FINAL_PART)]
     assert len(finalists) == FINALISTS * len(METHODS)
     assert all(int(name.rpartition(" ")[2]) >= CANDIDATES_PER_METHOD - FINALISTS for name in finalists)
+
+
+def test_effects_are_those_of_parameters_on_the_delay(tmp_path: Path) -> None:
+    write_part(tmp_path, HUMAN_PART, human_rows())
+    gaps = [METHODS["ACC"].candidate(number).numbers["cruise.time_gap"] for number in range(1, CANDIDATES_PER_METHOD)]
+    rows = [
+        {"method": "ACC", "candidate": 1 + index, "episodes": candidate_rows(-10.0 * gap)}
+        for index, gap in enumerate(gaps)
+    ]
+    write_part(tmp_path, TUNING_PART, rows)
+    write_part(tmp_path, FINAL_PART, [])
+    table = parameter_effects_table(tmp_path).set_index("parameter")
+    assert set(table["method"]) == {"ACC"}
+    assert float(table.loc["cruise.time_gap", "delay"].split()[0]) == pytest.approx(10.0 * np.std(gaps), abs=0.5)
+    assert float(table.loc["cruise.acceleration", "delay"].split()[0]) == pytest.approx(0.0, abs=0.1)
 
 
 def test_human_traffic_does_not_depend_on_methods() -> None:

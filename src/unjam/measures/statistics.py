@@ -150,6 +150,25 @@ def relative_difference(rows: Sequence[dict[str, Any]], others: Sequence[dict[st
     return estimate(linearized_ratio(values[:, 0] - values[:, 1], values[:, 1]).tolist())
 
 
+def regress(predictors: Any, values: Any) -> list[Estimate]:
+    """Return the change of values with one standard deviation of each predictor, by linear regression with 95 % CIs.
+
+    Predictors have the shape (values, predictors). The CIs assume independent errors of one variance; those of a
+    predictor that is constant, or follows from others, are unknown.
+    """
+    table, result = np.asarray(predictors, np.float64), np.asarray(values, np.float64)
+    spread = table.std(0)
+    design = np.column_stack([np.ones(len(table)), (table - table.mean(0)) / np.where(spread > 0, spread, 1.0)])
+    coefficients, _, rank, _ = np.linalg.lstsq(design, result, rcond=None)
+    degrees = len(result) - rank
+    if rank < design.shape[1] or degrees < 1:
+        return [Estimate(float(each), nan, nan, len(result)) for each in coefficients[1:]]
+    variance = float(np.sum((result - design @ coefficients) ** 2)) / degrees
+    halves = _student_t(float(degrees)) * np.sqrt(variance * np.diag(np.linalg.inv(design.T @ design)))
+    pairs = zip(coefficients[1:].tolist(), halves[1:].tolist(), strict=True)
+    return [Estimate(mean, mean - half, mean + half, len(result)) for mean, half in pairs]
+
+
 def format_difference(difference: Estimate, digits: int = 0) -> str:
     """Return a difference with its sign, and its CI or else the range of the values, as text."""
     if not difference.count:
