@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
+from unicodedata import category
 
 
 class UnjamError(Exception):
@@ -119,7 +120,19 @@ def error_from_name(name: str, message: str) -> UnjamError:
 
 def one_line(value: object, length: int = 200) -> str:
     """Return a text of a stranger on one line of at most `length` letters, without control characters."""
-    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(value).split()))[:length]
+    return printable(" ".join(str(value).split()))[:length]
+
+
+def printable(text: str) -> str:
+    """Return a text for a terminal, with a question mark for each control character and bidirectional mark.
+
+    Otherwise file names, names in TOML files or messages of SUMO could move the cursor, or turn the direction of text.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() or letter == "\n" or category(letter) == "Zs" else "?" for letter in text
+    )
 
 
 def as_unjam_error(error: Exception) -> UnjamError:

@@ -1,5 +1,6 @@
 """Tables, progress and suggested commands are printed as documented."""
 
+import re
 import shlex
 import sys
 from io import StringIO
@@ -9,6 +10,9 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
 
 from unjam.cli import output
 from unjam.cli.train import _TrainingProgress
@@ -135,3 +139,31 @@ def test_the_evaluation_after_a_training_shows_its_progress(
     label = "evaluating on test seeds"
     lines = [f"{label}: {steps} of 3,000 steps" for steps in ("500", "1,000", "2,000")]
     assert messages.getvalue().splitlines() == [label, *lines]
+
+
+HOSTILE_TEXT = "road\x1b[31m\u202ered\x9b2J\x07\u2066"
+
+
+def table_of(text: str) -> Table:
+    table = Table(title=text)
+    table.add_column(text)
+    table.add_row(Text(text, "bold"))
+    return table
+
+
+@pytest.mark.parametrize("printed", [HOSTILE_TEXT, Text(HOSTILE_TEXT), table_of(HOSTILE_TEXT), Panel(HOSTILE_TEXT)])
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_texts_of_strangers_do_not_control_the_terminal(printed: Any, is_terminal: bool) -> None:
+    text = StringIO()
+    console = output.TerminalConsole(file=text, width=80, force_terminal=is_terminal, color_system=None)
+    console.print(printed)
+    assert "red" in text.getvalue()
+    assert not {"\x1b[31m", "\u202e", "\x9b", "\x07", "\u2066"} & set(re.split(r"(\x1b\[31m|.)", text.getvalue()))
+
+
+def test_a_console_keeps_styles_and_no_break_spaces() -> None:
+    text = StringIO()
+    output.TerminalConsole(file=text, width=80, force_terminal=True, color_system="standard").print(
+        Text("1.0\u00a0[0.9, 1.1] – ü", "red")
+    )
+    assert text.getvalue() == "\x1b[31m1.0\u00a0[0.9, 1.1] – ü\x1b[0m\n"

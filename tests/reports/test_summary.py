@@ -2,6 +2,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from unjam.measures.metrics import METRICS
@@ -9,6 +10,7 @@ from unjam.measures.statistics import Estimate, estimate
 from unjam.reports.results import Results
 from unjam.reports.summary import (
     common_baseline,
+    csv_text,
     format_difference,
     key_figures,
     main_finding,
@@ -247,3 +249,9 @@ def test_the_baseline_of_several_folders_ran_the_same_episodes() -> None:
 
 def test_a_difference_shows_its_sign() -> None:
     assert format_difference(Estimate(3.4, -0.6, 7.0, 5)) == "+3 [-1, +7]"
+
+
+def test_csv_has_no_cells_that_a_spreadsheet_calculates() -> None:
+    table = pd.DataFrame({"=a": ["+1", "@x", "-", "plain"], "number": [-1.0, 2.0, 3.0, 4.0]})
+    text = csv_text(table)
+    assert text == "'=a,number\n'+1,-1.0\n'@x,2.0\n'-,3.0\nplain,4.0\n"

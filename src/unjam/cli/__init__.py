@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 from importlib import import_module
+from io import TextIOWrapper
 from itertools import pairwise
 from types import FrameType
 from typing import Annotated, Any
@@ -22,6 +23,7 @@ from unjam.errors import (
     disk_error,
     invalid_value,
     missing_package_error,
+    printable,
     unknown_name,
 )
 from unjam.plugins import load_plugins, plugin_names
@@ -117,6 +119,9 @@ def main() -> None:
     for stream, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, stream) is None:  # a closed stream must not become the next file that is opened
             setattr(sys, stream, open(os.devnull, mode))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # letters that an encoding lacks must not end a command
+            stream.reconfigure(errors="replace")
     mark_as_command_line()
     for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and nohup ignores it
         signum = getattr(signal, name, None)
@@ -179,7 +184,7 @@ def _given_value(error: Exception) -> str:
 def _print_error(message: str, code: int) -> int:
     """Print an error as one line; return the exit code."""
     try:
-        print(f"unjam: {' '.join(message.split())}", file=sys.stderr)
+        print(f"unjam: {printable(' '.join(message.split()))}", file=sys.stderr)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
     return code

@@ -4,21 +4,22 @@ import json
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
 from typing import Any, Self
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
 from unjam.cli.options import DEFAULT_WORKERS
 from unjam.drivers.registry import DRIVERS
-from unjam.errors import InputError, MissingPartError
+from unjam.errors import InputError, MissingPartError, printable
 from unjam.files import to_json
 from unjam.measures.metric_table import TableCell, choose_baseline, metric_table
 from unjam.measures.statistics import Estimate
@@ -32,8 +33,18 @@ NARROW_COLUMN_WIDTHS = 18, 7
 TEXT_COLUMN_WIDTH = 22
 """width of headings and verdicts [characters]: that of most numbers with their intervals"""
 
-console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else PIPED_TABLE_WIDTH)
-err_console = Console(
+
+class TerminalConsole(Console):
+    """A console that shows no control characters of texts from files, whatever prints them."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield the segments of something printed."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(printable(segment.text), segment.style)
+
+
+console = TerminalConsole(highlight=False, markup=False, width=None if sys.stdout.isatty() else PIPED_TABLE_WIDTH)
+err_console = TerminalConsole(
     stderr=True, highlight=False, markup=False, width=None if sys.stderr.isatty() else PIPED_TABLE_WIDTH
 )
 """progress and messages; standard output is for results"""

@@ -261,11 +261,13 @@ def progress_command(
     """
     import pandas as pd
 
+    from unjam.reports.summary import csv_text
+
     rows = read_progress(_find_runs([name], folder)[0].folder)
     if json:
         print_json(rows)
     else:
-        pd.json_normalize(rows).to_csv(sys.stdout, index=False)
+        sys.stdout.write(csv_text(pd.json_normalize(rows)))
 
 
 @runs_command.command("remove")

@@ -10,7 +10,7 @@ from unjam.controller import controller_path
 from unjam.controller.certificate import OperatingDomain
 from unjam.controller.file import CERTIFICATE_PART, Controller, read_controller
 from unjam.drivers.local_state import LocalState
-from unjam.errors import InputError
+from unjam.errors import InputError, one_line
 from unjam.files import UNREADABLE_ERRORS, parse_json
 from unjam.parameters import build_dataclass, flatten_keys
 from unjam.worlds.record import Episode
@@ -69,14 +69,14 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
         return ""
     made = "tuned" if "tuning" in manifest else "trained"
     if trained.get("kind") != road["kind"]:
-        return f"was {made} on the {_printable(trained.get('kind'))}, not on the {road['kind']}"
+        return f"was {made} on the {_value_text(trained.get('kind'))}, not on the {road['kind']}"
     before, now = _flatten_recipe(trained), _flatten_recipe(road)
     known = [name for name in now if name in before and name not in IRRELEVANT_PARAMETERS]
     differ = [name for name in known if not _is_within(before[name], now[name])]
     if not differ:
         return ""
     listed = differ[:MAX_LISTED_PARAMETERS]
-    words = [f"{name} {_printable(now[name])} (there {_printable(before[name])})" for name in listed]
+    words = [f"{name} {_value_text(now[name])} (there {_value_text(before[name])})" for name in listed]
     more = [f"{len(differ) - len(listed)} more"] if len(differ) > len(listed) else []
     return f"was {made} on another {road['kind']}: {', '.join(words + more)}"
 
@@ -92,8 +92,8 @@ def road_description(manifest: dict[str, Any]) -> str:
     road = manifest.get("scenario")
     if not isinstance(road, dict):
         return ""
-    facts = [f"{name} {_printable(road[name])}" for name in KEY_PARAMETERS if road.get(name) is not None]
-    return ", ".join([_printable(road.get("kind")), *facts])
+    facts = [f"{name} {_value_text(road[name])}" for name in KEY_PARAMETERS if road.get(name) is not None]
+    return ", ".join([_value_text(road.get("kind")), *facts])
 
 
 def _is_within(training_value: Any, value: Any) -> bool:
@@ -103,10 +103,9 @@ def _is_within(training_value: Any, value: Any) -> bool:
     return training_value == value or (pair and training_value[0] <= value[0] and value[1] <= training_value[1])
 
 
-def _printable(value: Any) -> str:
-    """Return a value from an untrusted file on one line, without control characters for a terminal."""
-    text = "-".join(map(str, dict.fromkeys(value))) if isinstance(value, list | tuple) else str(value)
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
+def _value_text(value: Any) -> str:
+    """Return a value from an untrusted file on one line; a range as `low-high`."""
+    return one_line("-".join(map(str, dict.fromkeys(value))) if isinstance(value, list | tuple) else value)
 
 
 def outside_domain_share(controller: Controller, states: LocalState) -> float:

@@ -17,6 +17,8 @@ from unjam.reports.results import PlotEpisode, Results
 
 CLOSE_TIME_GAP = 1.0
 """time gap below which the report has a note [s]; the paper's h_max"""
+FORMULA_STARTS = {*"=+-@"}
+"""first letters of a cell that a spreadsheet takes for a formula"""
 MAX_LIMIT_RATIO = 1.01
 """ratio of mean speed to the limit above which the report has a note"""
 COMPARED_METRICS = (
@@ -235,4 +237,13 @@ def episodes_as_csv(columns: Sequence[ReportColumn]) -> str:
     """Return all episodes as CSV: a row per driver and seed, a column per metric; NaN is empty."""
     rows = [{**row, "driver": column.name} for column in columns for row in column.rows]
     table = pd.DataFrame(rows, columns=["driver", "seed", "status", *METRICS])
-    return table.to_csv(index=False, lineterminator="\n")
+    return csv_text(table)
+
+
+def csv_text(table: pd.DataFrame) -> str:
+    """Return a table as CSV; texts that a spreadsheet would calculate begin with an apostrophe."""
+
+    def protect(value: Any) -> Any:
+        return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA_STARTS else value
+
+    return table.rename(columns=protect).map(protect).to_csv(index=False, lineterminator="\n")
