@@ -151,6 +151,16 @@ def protect_folder(folder: Path) -> Iterator[None]:
         _protected.remove(root)
 
 
+def reject_special_files(folder: Path) -> None:
+    """Raise `InputError` if a folder contains a pipe, a socket or a device: reading it could wait forever."""
+    for parent, _, names in os.walk(folder):
+        for path in (Path(parent) / name for name in names):
+            with suppress(OSError):  # a broken link, or removed meanwhile
+                mode = path.stat().st_mode
+                if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+                    raise InputError(f"file: {_short_path(path)!r} is a special file; allowed: regular files")
+
+
 def link_error(path: Path) -> InputError:
     """Return the error for a path that leads out of a folder through a link or `..`."""
     why = "is a symbolic link or leads out of its folder, so nothing is written there"

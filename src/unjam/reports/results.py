@@ -14,6 +14,7 @@ from safetensors.numpy import load_file
 
 from unjam.errors import InputError, resume_hint
 from unjam.files import INVALID_DATA_ERRORS, read_json_lines
+from unjam.folders import reject_special_files
 from unjam.measures.metrics import METRICS
 from unjam.worlds.record import Episode
 
@@ -132,6 +133,7 @@ def read_results(folder: Path) -> Results:
         if not (folder / name).is_file():
             hint = resume_hint(folder) if (folder / "config.toml").exists() else ""
             raise InputError(f"report: {str(folder)!r} has no {name}{hint}")
+    reject_special_files(folder)
     metadata, rows = read_evaluation(folder)
     try:
         stored, episodes = load_file(folder / PLOT_EPISODES_FILE), {}

@@ -21,6 +21,7 @@ from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, is_leftover, make_folder, remove, remove_if_empty, to_json
+from unjam.folders import reject_special_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, read_toml
 from unjam.processes import LOCK_FILE, lock_folder
@@ -143,6 +144,7 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {CONFIG_FILE}")
+    reject_special_files(folder)
     try:
         return load_config(path) if check_trust else build_dataclass(RunConfig, read_toml(path), "")
     except InputError:
