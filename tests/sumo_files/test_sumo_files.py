@@ -187,6 +187,10 @@ BROKEN = {
     "network that is no XML": ("plain words", ROUTES, "", "road.net.xml: cannot be read"),
     "routes that are no XML": (NETWORK, "<routes><vehicle", "", "road.rou.xml: cannot be read"),
     "routes in an unknown encoding": (NETWORK, '<?xml version="1.0" encoding="klingon"?><routes/>', "", "read"),
+    "emission class outside of SUMO": (
+        *(NETWORK, '<routes><vType id="car" emissionClass="PHEMlight/../../x"/><vehicle id="v" type="car"/></routes>'),
+        *("", "road.rou.xml: emissionClass: 'PHEMlight/../../x' is not allowed"),
+    ),
     "no vehicles": (NETWORK, "<routes/>", "", "road.sumocfg: its route and additional files have no vehicle"),
     "configuration that is no XML": (NETWORK, ROUTES, "<configuration>", "road.sumocfg: cannot be read"),
 }

@@ -215,6 +215,10 @@ class XmlReader:
         if tag in OUTPUT_ELEMENTS or (tag == "param" and not is_harmless_parameter(attributes.get("key", ""))):
             self._record_dropped(tag if tag != "param" else f"parameter {attributes['key']}")
             return None
+        if ".." in (emission_class := attributes.get("emissionClass", "")):  # SUMO reads a file of this name
+            allowed = "a class of SUMO, as HBEFA4/PC_petrol_Euro-6ab"
+            file = self._open_files[-1].name
+            raise BrokenFileError(f"{file}: emissionClass: {emission_class!r} is not allowed; allowed: {allowed}")
         harmless = dict(attributes)
         for name in attributes:
             if name == TYPE_LIST:
