@@ -90,15 +90,15 @@ def test_changed_files_of_a_training_are_refused(make: Callable[[Path], RunConfi
     config, run = make(tmp_path), tmp_path / "run"
     with_checkpoint(run, config)
     assert restore_newest_checkpoint(run, {run}, fingerprint(config)) is not None
-    check_run_files(run, config)
+    check_run_files(run, config, "evaluate")
     (run / "progress.jsonl").write_text('{"iteration": 1}\n{"iteration": 2}\n')
     (tmp_path / file).write_text((tmp_path / file).read_text() + " ")
     with pytest.raises(InputError, match=r"evaluate: .* has changed since the checkpoint"):
-        check_run_files(run, config)
+        check_run_files(run, config, "evaluate")
     assert "has changed since the checkpoint" in refusal_message(run, config)
     for checkpoint in (run / "checkpoint").iterdir():
         checkpoint.write_text("{ torn")
-    check_run_files(run, config)  # what is damaged does not tell
+    check_run_files(run, config, "evaluate")  # what is damaged does not tell
 
 
 def test_other_packages_and_kernels_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -115,7 +115,7 @@ class Trainings:
             return 2
         config = load_config(Path(command.argv()[6]))
         folder = Path(command.arguments[-1])
-        folder.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)
         worth = -abs(math.log10(config.trpo.target_kl) + 2)
         expert = EXPERT_RETURNS.get(config.expert, 0.0)
         row = {"iteration": 1, "return_validation": expert + worth, "return_expert": expert}

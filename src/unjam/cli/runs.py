@@ -53,7 +53,7 @@ def evaluate_command(
     if humans is not None and out is None:
         raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
     config = read_config(run)
-    check_run_files(run, config)
+    check_run_files(run, config, "evaluate")
     evaluation = replace(config.evaluation, baselines=tuple(DRIVERS), episodes=episodes)
     options = {**config.scenario_options, **network_changes(humans=humans)}
     config = replace(config, scenario_options=options, evaluation=evaluation)
@@ -106,6 +106,7 @@ def model_command(
     from unjam.training.model_facts import update_model_facts
 
     config = read_config(run)
+    check_run_files(run, config, "model")
     with lock_folder(run):
         facts = update_model_facts(run, config)
         is_evaluated = (run / "evaluation.json").is_file()

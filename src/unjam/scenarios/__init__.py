@@ -15,7 +15,7 @@ from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork, load_user_network
-from unjam.scenarios.user_scenario import CODE_ENTRY, class_recipe, load_class, load_python_scenario, load_toml_scenario
+from unjam.scenarios.user_scenario import CODE_ENTRY, class_recipe, load_class, load_python_scenario, read_toml_scenario
 
 __all__ = ["SCENARIOS", "FigureEight", "Merge", "Motorway", "Ramp", "Ring", "Road", "Scenario", "make_scenario"]
 
@@ -69,7 +69,10 @@ def _base_scenario(scenario: ScenarioLike) -> Scenario:
     if is_file_reference(scenario):
         return load_python_scenario(scenario)
     if scenario.endswith(".toml"):
-        return load_toml_scenario(Path(scenario), TOML_KINDS)
+        kind, values = read_toml_scenario(Path(scenario), TOML_KINDS)
+        return build_dataclass(TOML_KINDS[kind], values, Path(scenario).name)
+    if scenario == Motorway.title:  # the kind of a TOML file, without its settings
+        return Motorway()
     if scenario not in SCENARIOS:
         raise unknown_name("scenario", scenario, [*SCENARIOS, "a .sumocfg or .toml file", "path.py:name"])
     return SCENARIOS[scenario]
@@ -79,7 +82,22 @@ def default_scenario(name: str) -> Scenario | type[Scenario]:
     """Return the scenario or class that a configuration with this scenario starts from; the base class if unknown."""
     if name.endswith(".sumocfg"):
         return UserNetwork
-    return _base_scenario(name) if name in SCENARIOS or name.endswith(".toml") or is_file_reference(name) else Scenario
+    is_known = name in (*SCENARIOS, Motorway.title) or name.endswith(".toml") or is_file_reference(name)
+    return _base_scenario(name) if is_known else Scenario
+
+
+def without_toml_file(values: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration of a run or task that has the content of a scenario's TOML file instead of its name.
+
+    A run holds its road: the file may change later, and another folder may have another one of this name.
+    """
+    name = values.get("scenario")
+    if not isinstance(name, str) or not name.endswith(".toml"):
+        return values
+    kind, settings = read_toml_scenario(Path(name), TOML_KINDS)
+    options = values.get("scenario_options", {})
+    options = merge_changes(settings, nest_keys(options)) if isinstance(options, dict) else options
+    return {**values, "scenario": kind, "scenario_options": options}
 
 
 def example_scenario(name: str) -> Scenario:

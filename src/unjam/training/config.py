@@ -1,5 +1,6 @@
 """The validated configuration of a training run, from TOML, command-line options and Python."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, field, fields, replace
 from math import ceil
@@ -31,7 +32,7 @@ from unjam.parameters import (
     nest_keys,
     read_toml,
 )
-from unjam.scenarios import default_scenario, make_scenario
+from unjam.scenarios import default_scenario, make_scenario, without_toml_file
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
 from unjam.training.seeds import TRAINING_SEED_LIMIT
@@ -252,7 +253,9 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
     file_values = read_toml(file) if file is not None else {}
     if file is not None and _is_in_run_folder(file):  # other files are the user's own
         check_trusted_values(f"config file {file}", file_values)
-    user_values = merge_changes(file_values, nest_keys(changes or {}))
+    user_values = without_toml_file(merge_changes(file_values, nest_keys(changes or {})))
+    if isinstance(tasks := user_values.get("tasks"), list):
+        user_values["tasks"] = [_without_toml_file_of_task(each) for each in tasks]
     scenario_name = str(user_values.get("scenario", RunConfig.scenario))
     scenario = default_scenario(scenario_name)
     for name in user_values.keys() - {each.name for each in fields(RunConfig)}:
@@ -269,6 +272,13 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
         # The row model cannot represent the ACC of a CAV: the default is to have no model.
         values = merge_changes({"model": {"model_ratio": 0.0}}, values)
     return build_dataclass(RunConfig, values, "")
+
+
+def _without_toml_file_of_task(values: Any) -> Any:
+    """Return a task with the content of its TOML file, whose name becomes that of the task."""
+    if not isinstance(values, dict) or (changed := without_toml_file(values)) is values:
+        return values
+    return {"name": re.sub(r"[^\w-]", "-", Path(values["scenario"]).stem), **changed}
 
 
 def _refuse_objects(value: Any, name: str) -> None:

@@ -25,7 +25,7 @@ from unjam.scenarios import example_scenario, scenario_from_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_scenario import CODE_ENTRY
 from unjam.training.evaluate import TRAINED_LABEL, raise_failure
-from unjam.training.run_folder import controller_origin, read_config
+from unjam.training.run_folder import check_run_files, controller_origin, read_config
 from unjam.training.seeds import make_test_seeds
 from unjam.trust import check_trusted, expecting_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -186,6 +186,7 @@ def _read_run_origin(run: str, scenario: str) -> tuple[Scenario, Driver, dict[st
         raise invalid_value("scenario", scenario, "none for a run, which has its own")
     folder = Path(run)
     config = read_config(folder)
+    check_run_files(folder, config, "export")
     road, controller = config.make_scenario(), read_controller(folder)
     metadata = {
         **controller_origin(road, config.make_expert()),

@@ -34,7 +34,7 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
         recipe, arrays = driver_recipe(task.expert)
         weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
         files[f"expert {each.expert}"] = sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)
-        files |= file_hashes((each.reward, each.backend, *each.policy.inputs), task.scenario)
+        files |= file_hashes((each.scenario, each.reward, each.backend, *each.policy.inputs), task.scenario)
     settings = flatten_keys(asdict(replace(config, steps=1, workers=1)))
     entries = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
     return json.loads(to_json(entries))

@@ -273,11 +273,11 @@ def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], byt
                 yield path, dict(json.loads(header["__metadata__"]["state"])), data
 
 
-def check_run_files(folder: Path, config: RunConfig) -> None:
+def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
     """Raise `InputError` if files that a run was trained with have changed; unknown without a valid checkpoint."""
     newest = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
     if stored := newest.get("fingerprint"):
-        check_file_hashes(stored, fingerprint(config), "evaluate")
+        check_file_hashes(stored, fingerprint(config), command)
 
 
 def _remove_old_checkpoints(folder: Path) -> None:
