@@ -35,7 +35,7 @@ PARTS: tuple[FeatureName, ...] = ("local", "expert_acceleration", "expert_memory
 
 
 def residual_driver(expert: Driver, action_repeat: int = 1, limit: float = 1.0) -> ResidualDriver:
-    network = random_network(observation_size(PARTS, expert))
+    network = replace(random_network(observation_size(PARTS, expert)), authority=min(1.0, 2.0 * limit))
     return ResidualDriver(expert, network, limit, PARTS, action_repeat)
 
 
@@ -243,7 +243,7 @@ def test_non_finite_values_raise_error() -> None:
 
 
 def test_action_limit_clips_expert_and_sum() -> None:
-    driver, data = crash_course(limit=0.5)
+    driver, data = crash_course(limit=0.1)
     commands: list[torch.Tensor] = []
 
     class RecordingDynamics(ToyDynamics):
@@ -251,9 +251,9 @@ def test_action_limit_clips_expert_and_sum() -> None:
             commands.append(acceleration)
             return super().step(state, acceleration, drawn_values)
 
-    strong = replace(driver, expert=IDM(), network=random_network(6))
+    strong = replace(driver, expert=IDM(), network=replace(random_network(6, seed=1, scale=1.0), authority=0.2))
     roll_out(strong, RecordingDynamics(), prepare_starts(data, data.start_indices(), IDM(), "cpu"), 20, None)
-    assert torch.stack(commands).abs().max() == 0.5
+    assert torch.stack(commands).abs().max() == pytest.approx(0.1)
     assert torch.stack(commands).unique().numel() > 10
 
 
