@@ -64,7 +64,7 @@ def test_results_equal_the_committed_ones_in_any_environment() -> None:
     assert run(OPERATIONS, **UNPINNED) == GOLDEN["operations"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @needs_avx2
 @pytest.mark.parametrize("variable", UNPINNED)
 def test_each_variable_changes_only_its_kinds(variable: str) -> None:
@@ -77,6 +77,7 @@ def test_each_variable_changes_only_its_kinds(variable: str) -> None:
     assert changed_kinds or not has_effect.get(variable, True)
 
 
+@pytest.mark.long
 @needs_avx2
 def test_trainings_of_all_learners_end_with_the_committed_bits() -> None:
     program = (

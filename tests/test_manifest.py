@@ -94,6 +94,7 @@ OF_RECORDED_PEOPLE = {"field/field", "field/ngsim-drivers"}
 """without a CAV"""
 
 
+@pytest.mark.long
 def test_no_result_with_cavs_is_older_than_the_safety_filter() -> None:
     older = set[str]()
     for path in RESULTS.glob("*.json"):

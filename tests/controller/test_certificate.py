@@ -125,7 +125,7 @@ def test_a_certificate_becomes_a_part_of_the_file_and_is_tried_again(tmp_path: P
     assert "No contact in" in (tmp_path / "page.html").read_text()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_certificate_that_was_changed_is_refused_even_with_a_right_hash(tmp_path: Path) -> None:
     file = written(tmp_path)
     controller = read_controller(file)

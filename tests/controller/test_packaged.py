@@ -54,6 +54,7 @@ def test_another_name_lists_those_that_there_are(name: str) -> None:
         make_driver(f"{PACKAGED_PREFIX}{name}", 0.1)
 
 
+@pytest.mark.long
 def test_the_rings_earns_more_than_its_expert_on_every_seed() -> None:
     found = unjam.drive("ring", ["unjam:ring-gap-tuned", "unjam:ring-best"], episodes=2, workers=1)
     gain = paired_difference(found.rows["unjam:ring-best"], found.rows["unjam:ring-gap-tuned"], "return")

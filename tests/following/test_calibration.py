@@ -64,7 +64,7 @@ def test_each_driver_gets_its_own_headway_and_the_typical_other_parameters(
     assert progress == [3]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_groups_do_not_influence_each_other() -> None:
     joint = calibrate_groups(groups(), PAPER_IDM, ("time_headway",))
     separate = [calibrate_groups([group], PAPER_IDM, ("time_headway",))[0] for group in groups()]

@@ -23,7 +23,7 @@ def trajectories() -> list[FollowingTrajectory]:
     ]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_each_driver_has_its_headway_and_the_common_parameters(trajectories: list[FollowingTrajectory]) -> None:
     progress: list[tuple[int, int]] = []
     population = fit_drivers(trajectories, FitDriversSettings(calibration=QUICK), lambda *done: progress.append(done))
@@ -121,7 +121,7 @@ def test_filters_select_trajectories(data: Path) -> None:
     assert len(fit_drivers_from_files([data], CHANGES, filters={"kind": "human"}).population.drivers) == 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_drivers_of_several_files_have_different_names(data: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.parquet"
     write_table(other, [{}])
@@ -148,7 +148,7 @@ def test_missing_output_folder_is_refused_before_the_calibration(data: Path, tmp
         fit_drivers_from_files([data], CHANGES, out=tmp_path / "gone" / "drivers.json")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_drivers_of_files_with_the_same_name_have_different_names(data: Path, tmp_path: Path) -> None:
     days = [tmp_path / day / data.name for day in ("monday", "tuesday")]
     for day in days:

@@ -92,7 +92,7 @@ def calibrated_trajectories(seeds: range) -> CalibratedTrajectories:
     return CalibratedTrajectories(trajectories, [PAPER_IDM] * len(trajectories))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_multi_step_residual_reduces_the_gap_error() -> None:
     network, errors = fit_multi_step(
         calibrated_trajectories(range(4)), calibrated_trajectories(range(4, 6)), LIMITS, MULTI_STEP, seed=0

@@ -81,6 +81,7 @@ def test_correction_changes_speeds_per_control_step() -> None:
     assert np.nanmean(replay(False, correction=1e-9).speeds) == pytest.approx(np.nanmean(without.speeds), rel=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_sample_interval")
 def test_base_step_differs_from_the_record_by_perception_errors(batch_episodes: list[Episode]) -> None:
     samples = motorway_samples(batch_episodes[0], 0, ROAD)

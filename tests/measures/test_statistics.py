@@ -81,6 +81,7 @@ def coverage_by_kind(returns: dict[str, np.ndarray], count: int) -> dict[str, fl
     return {kind: coverage_of_resampled(of, count) for kind, of in pools.items()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", COUNTS)
 def test_intervals_of_real_returns_have_the_stated_coverage(count: int) -> None:
     returns = returns_on_ring()

@@ -48,7 +48,7 @@ def test_exact_base_leaves_only_noise(episodes: list[Episode]) -> None:
     assert float(model.noise) == pytest.approx(RING.noise_per_step * RING.simulation_step, rel=0.05)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("base", ["none", "ovm"])
 def test_networks_learn_what_the_base_lacks(episodes: list[Episode], base: str) -> None:
     _, found = fitted(episodes, base=base, epochs=20)
@@ -58,7 +58,7 @@ def test_networks_learn_what_the_base_lacks(episodes: list[Episode], base: str) 
     assert found.errors["unexplained_variance"] == pytest.approx((step.model / step.change) ** 2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_right_of_way_and_noise_are_no_model_error_on_a_figure_eight(figure_eights: list[Episode]) -> None:
     model, found = fitted(figure_eights, EIGHT)
     sigma = EIGHT.noise_per_step * EIGHT.simulation_step
@@ -67,7 +67,7 @@ def test_right_of_way_and_noise_are_no_model_error_on_a_figure_eight(figure_eigh
     assert float(model.noise) == sigma
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_networks_learn_what_the_base_lacks_on_a_figure_eight(figure_eights: list[Episode]) -> None:
     _, found = fitted(figure_eights, EIGHT, base="none", epochs=20)
     sigma, step = EIGHT.noise_per_step * EIGHT.simulation_step, found.one_step["speed"]

@@ -10,6 +10,7 @@ from unjam_paper.results_file import read_part, write_part
 from unjam_paper.study import StudyFolder
 
 
+@pytest.mark.long
 def test_idle_engines_of_one_model_burn_twice_as_much_as_those_of_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

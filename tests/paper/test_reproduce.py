@@ -69,6 +69,7 @@ def test_a_training_of_two_studies_is_planned_once(tmp_path: Path) -> None:
     assert both.seconds(4) < both.seconds(2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", STUDIES)
 def test_drivers_of_every_study_can_drive_its_roads(name: str, tmp_path: Path) -> None:
     """Controllers of trainings are missing here; all other drivers have the control step of their road."""

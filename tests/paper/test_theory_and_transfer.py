@@ -80,6 +80,7 @@ def test_controllers_and_experts_are_evaluated_under_other_conditions(reproduced
     assert gain["noise", "trained"] == pytest.approx(ours - theirs)
 
 
+@pytest.mark.long
 def test_all_episodes_of_figure_5_have_the_same_traffic(monkeypatch: pytest.MonkeyPatch, reproduced: Made) -> None:
     folder, _ = reproduced
     monkeypatch.setattr(comparison, "FIGURE_5_VARIANTS", SMALL_VARIANTS)

@@ -63,6 +63,7 @@ def test_step_and_horizon_are_those_of_the_configuration_unless_set(
     assert (found.simulation_step, found.horizon) == (step, horizon)
 
 
+@pytest.mark.long
 def test_vehicles_that_depart_before_the_begin_are_left_out(tmp_path: Path, sumo: SumoBackend) -> None:
     departing = (f'<vehicle id="{at}" type="car" route="along" depart="{at}"/>' for at in (0, 5, 40, 60))
     road = str(straight(tmp_path, "".join(departing)))
@@ -74,6 +75,7 @@ def test_vehicles_that_depart_before_the_begin_are_left_out(tmp_path: Path, sumo
     assert (len(early.vehicle_ids), len(late.vehicle_ids)) == (4, 2)
 
 
+@pytest.mark.long
 def test_a_begin_after_the_end_that_the_configuration_names_needs_another_end(
     tmp_path: Path, sumo: SumoBackend
 ) -> None:

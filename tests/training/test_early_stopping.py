@@ -84,7 +84,7 @@ def test_training_ends_when_patience_is_over(monkeypatch: pytest.MonkeyPatch, tm
     assert found == [6.0, 5.5, 5.8]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_callback_can_end_the_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     returns = iter([5.0, 4.0, 6.0])  # of the expert, after two iterations, and where it ends
     monkeypatch.setattr(Trainer, "validation_returns", lambda *given: [next(returns)])

@@ -194,7 +194,7 @@ def test_interrupted_run_of_any_learner_ends_unchanged(tmp_path: Path, agent: st
     assert outcome(tmp_path / "run") == outcome(tmp_path / "one go")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_learners_give_different_results(uninterrupted_run: Path, tmp_path: Path, learn: Learn) -> None:
     for agent, key in {"ppo": "clip_fraction", "sac": "critic_loss", "td3": "critic_loss"}.items():
         learn(tmp_path / agent, small_config(agent=agent))

@@ -203,7 +203,7 @@ def test_several_roads_maximize_the_mean_gain(tmp_path: Path) -> None:
     assert set(written["scenario"]) == set(roads)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_only_supported_roads_are_screened(tmp_path: Path) -> None:
     roads = {"ring": SMALL, "eight": FigureEight(horizon=80)}
     each = TUNING_EPISODES_PER_ROAD * (60 + 80)
@@ -240,7 +240,7 @@ def test_changed_reward_file_is_refused(tmp_path: Path) -> None:
             tune(*arguments)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_finalists_are_different_and_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     driven: list[str] = []
     actual = tuning._run_drivers

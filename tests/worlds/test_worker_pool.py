@@ -180,6 +180,7 @@ def test_a_worker_continues_with_the_next_task(workers: WorkerPool) -> None:
     assert len(first) == 1
 
 
+@pytest.mark.long
 def test_progress_is_reported_for_each_task() -> None:
     reported: list[tuple[int, int]] = []
     with WorkerPool(2) as workers:
@@ -259,7 +260,7 @@ def test_a_worker_stopped_while_idle_is_noticed_also_by_a_task_larger_than_the_p
     assert fingerprint(found) == fingerprint(run_episode(SHORT, large, (0,)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_driver_that_always_kills_its_process_fails_alone_after_three_attempts(drivers: Path) -> None:
     good = [EpisodeTask(SHORT, IDM(), (seed,)) for seed in range(4)]
     bad = EpisodeTask(SHORT, FileDriver(drivers, "kills_its_process"), (7, 8))

@@ -92,6 +92,7 @@ def test_human_rings_follow_the_papers_equations(human_rings: tuple[int, list[Ep
     assert spread.std > 0.1  # waves of different size, or the comparison would say little
 
 
+@pytest.mark.long
 def test_human_rings_agree_with_flow(human_rings: tuple[int, list[Episode]]) -> None:
     length, episodes = human_rings
     flow = FLOW_HUMAN[length]

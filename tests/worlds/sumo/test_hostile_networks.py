@@ -153,6 +153,7 @@ def test_harmless_files_are_read_without_a_copy_or_message(tmp_path: Path, caplo
     assert (found.dropped_items, found.replaced_options, found.copy_sources, caplog.records) == ((), (), {}, [])
 
 
+@pytest.mark.long
 def test_dropped_outputs_change_no_vehicle(tmp_path: Path, sumo: SumoBackend) -> None:
     plain, noted = (tmp_path / name for name in ("plain", "noted"))
     episodes = []
@@ -171,6 +172,7 @@ def test_dropped_outputs_change_no_vehicle(tmp_path: Path, sumo: SumoBackend) ->
     assert not (tmp_path / "canary").exists()
 
 
+@pytest.mark.long
 def test_options_and_files_that_only_simulate_are_used(tmp_path: Path, sumo: SumoBackend) -> None:
     path = straight(tmp_path, COLUMN)
     scenario = make_scenario(str(path), {"cav_types": ["van"], "horizon": 200})
@@ -184,6 +186,7 @@ def test_options_and_files_that_only_simulate_are_used(tmp_path: Path, sumo: Sum
     assert np.nanmean(slow.speeds) < 12 < np.nanmean(fast.speeds)
 
 
+@pytest.mark.long
 def test_folders_with_blanks_and_commas_give_the_same_traffic(tmp_path: Path, sumo: SumoBackend) -> None:
     episodes = []
     for name in ("plain", "with a blank, a comma; and $HOME"):
@@ -194,6 +197,7 @@ def test_folders_with_blanks_and_commas_give_the_same_traffic(tmp_path: Path, su
     assert fingerprint(episodes[0]) == fingerprint(episodes[1])
 
 
+@pytest.mark.long
 def test_compressed_and_strangely_encoded_files_are_copied(tmp_path: Path, sumo: SumoBackend) -> None:
     path = straight(tmp_path, COLUMN)
     scenario = make_scenario(str(path), {"penetration_rate": 0.5, "horizon": 50})

@@ -222,7 +222,7 @@ def test_from_standstill_human_traffic_stays_jammed_and_pi_makes_it_worse(human:
     assert all(episode.backlog[-1] > 5 for episode in [*human, *pi])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_from_an_empty_road_human_traffic_flows_freely(human: list[Episode]) -> None:
     free = episodes_of(Human(), range(2), standing_vehicles=0)
     assert fleet_mean(free) == pytest.approx(19.9, rel=0.06)

@@ -352,6 +352,7 @@ def test_a_ramp_meter_does_not_let_its_queue_reach_the_entrance(sumo: SumoBacken
     assert episode.backlog.max() <= 3
 
 
+@pytest.mark.long
 def test_vehicles_do_not_brake_hard_for_a_speed_limit(sumo: SumoBackend) -> None:
     control = SpeedLimitControl(active=True, target_density=1.0, gain=1.0, length=800.0, acceleration_length=500.0)
     braking = [

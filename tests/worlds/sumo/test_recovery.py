@@ -24,6 +24,7 @@ TRUCKS = OpenTestRoad((RoadSection(1500.0, 2, 36.0),), (0.8,), trucks=0.25)
 """a road without a bottleneck, on which cars overtake trucks and then cut in"""
 
 
+@pytest.mark.long
 def test_an_acc_that_restores_its_gap_after_cut_ins_is_feasible(
     tmp_path: Path, sumo: SumoBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:

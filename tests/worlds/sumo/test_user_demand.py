@@ -52,6 +52,7 @@ def test_persons_without_a_vehicle_are_not_demand(tmp_path: Path) -> None:
         read_sumo_files(two_edges(tmp_path, PERSONS.format(how='modes="public"')))
 
 
+@pytest.mark.long
 def test_an_episode_waits_for_vehicles_of_calibrators_as_sumo_does(tmp_path: Path, sumo: SumoBackend) -> None:
     file = straight(tmp_path, "", end=300.0, step=0.5, options='<additional-files value="more.add.xml"/>')
     (tmp_path / "more.add.xml").write_text(f'<additional><vType id="slow" speedDev="0"/>{CALIBRATOR}</additional>')

@@ -28,7 +28,9 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam.worlds.world import DriverLog
 
 
-@pytest.fixture(scope="module", params=["ramp", "cross", "grid"])
+@pytest.fixture(
+    scope="module", params=["ramp", *(pytest.param(name, marks=pytest.mark.long) for name in ("cross", "grid"))]
+)
 def file(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp(request.param)
     return grid(folder) if request.param == "grid" else game(folder, request.param)
@@ -245,6 +247,7 @@ def test_a_heavy_vehicle_keeps_its_properties_as_a_cav(tmp_path: Path) -> None:
     assert 'mass="3000"' in traffic
 
 
+@pytest.mark.long
 def test_an_episode_ends_when_the_last_vehicle_has_arrived(tmp_path: Path, sumo: SumoBackend) -> None:
     scenario = scenario_of(straight(tmp_path, COLUMN), penetration_rate=1.0, horizon=4000)
     episode = run_episode(scenario, IDM(), (0,), backend=sumo)
@@ -422,6 +425,7 @@ def test_a_network_that_breaks_later_fails_its_episode_and_nothing_else(tmp_path
     assert mended.status == "completed"
 
 
+@pytest.mark.long
 def test_a_fast_cav_stops_behind_a_standing_vehicle_beyond_sensor_range(tmp_path: Path, sumo: SumoBackend) -> None:
     stands = '<vehicle id="stands" type="van" route="along" depart="0" departPos="900"><stop lane="road_0" '
     stands += 'endPos="905" duration="100"/></vehicle>'

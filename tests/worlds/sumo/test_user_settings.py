@@ -82,7 +82,7 @@ def test_vehicles_that_are_removed_after_a_collision_have_not_arrived(tmp_path: 
     assert episode.arrivals == len(episode.vehicle_ids) - still_there - episode.teleports
 
 
-@pytest.mark.parametrize("settings", ["", WARN, NONE])
+@pytest.mark.parametrize("settings", ["", *(pytest.param(each, marks=pytest.mark.long) for each in (WARN, NONE))])
 def test_a_collision_of_a_cav_ends_the_episode_even_if_sumo_counts_none(
     settings: str, tmp_path: Path, sumo: SumoBackend
 ) -> None:

@@ -198,6 +198,7 @@ def test_brakes_are_those_of_the_filter_or_of_the_vehicle_if_these_are_weaker(
     assert (limits["car"].acceleration, limits["car"].emergency_deceleration) == (2.6, 6.0)
 
 
+@pytest.mark.long
 def test_set_speed_caps_count_as_delay(tmp_path: Path, simulation: Simulation) -> None:
     file = network(tmp_path, CAR + SPARSE)
     free = drive(simulation, file, make_driver("cruise", 0.1), end=150.0)
@@ -210,6 +211,7 @@ def test_set_speed_caps_count_as_delay(tmp_path: Path, simulation: Simulation) -
     assert slow.limit_speed == pytest.approx(free.limit_speed, rel=0.15)
 
 
+@pytest.mark.long
 def test_cars_parked_off_the_road_have_no_allowed_speed(tmp_path: Path, sumo: SumoBackend) -> None:
     stop = '<stop lane="road_0" endPos="300" duration="30" parking="true"/>'
     cars = f'<vehicle id="parked" type="car" route="along" depart="0">{stop}</vehicle>'
