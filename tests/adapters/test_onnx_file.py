@@ -128,6 +128,22 @@ def test_recurrent_state_belongs_to_each_cav(tmp_path: Path) -> None:
     np.testing.assert_allclose(second, 1.5 + 2.0 * STATE.speed, rtol=1e-6)
 
 
+@pytest.mark.parametrize("time_step", [0.1, 0.3])
+def test_an_age_that_all_cavs_share_changes_nothing(time_step: float, tmp_path: Path) -> None:
+    node = helper.make_node("Add", ["h", "x"], ["h_next"])
+    copy = helper.make_node("Identity", ["h_next"], ["y"])
+    names = ("x", "h"), ("y", "h_next")
+    inputs, outputs = ([value(name, ("n", 1)) for name in each] for each in names)
+    description = RECURRENT.replace("[1.0, 2.0]", "0.5") + f"time_step = {time_step}"
+    driver = onnx_driver(write(tmp_path, model([node, copy], inputs, outputs), description))
+    memory = driver.initial_memory(6)
+    shared = memory | ({"age": 0.0} if "age" in memory else {})  # as in the batch
+    for _ in range(7):
+        expected_acceleration, memory = driver.act(STATE, memory)
+        acceleration, shared = driver.act(STATE, shared)
+        np.testing.assert_array_equal(acceleration, expected_acceleration)
+
+
 def test_a_graph_for_one_row_runs_once_for_each_cav(tmp_path: Path) -> None:
     path = tmp_path / "one.onnx"
     path.write_bytes(linear(5, [1.0, -2.0, 0.5, 1.0, 0.25], rows=1).SerializeToString())

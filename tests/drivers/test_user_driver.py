@@ -1,4 +1,6 @@
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -7,12 +9,16 @@ from tests.conftest import random_network
 from unjam import check_driver
 from unjam.controller import make_driver
 from unjam.drivers.check import random_state
-from unjam.drivers.registry import driver_from_recipe, driver_recipe
+from unjam.drivers.observation import FeatureInputs, as_features, compute_observation
+from unjam.drivers.pi_saturation import PISaturation
+from unjam.drivers.registry import driver_from_recipe, driver_recipe, user_code_recipes
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.user_driver import FileDriver, FileReference, as_driver
 from unjam.errors import InputError
-from unjam.scenarios import Merge
+from unjam.scenarios import Merge, make_scenario
+from unjam.worlds.backend import open_backend
 from unjam.worlds.episode import run_episode
+from unjam.worlds.reward import Outcome, make_reward
 
 
 def test_a_function_becomes_a_driver(my_drivers: Path) -> None:
@@ -90,7 +96,7 @@ def test_code_that_changes_under_way_is_another_driver(tmp_path: Path) -> None:
     file.write_text("def go(state):\n    return 0.5 + 0.0 * state.speed\n")
     driver = make_driver(f"{file}:go", 0.1)
     recipe, arrays = driver_recipe(driver)
-    assert driver_from_recipe(recipe, arrays) == driver
+    assert driver_recipe(driver_from_recipe(recipe, arrays))[0] == recipe
     file.write_text(file.read_text().replace("0.5", "0.1"))
     assert driver_recipe(driver)[0] == recipe  # that of what drives, not of what the file has become
     with pytest.raises(InputError, match=r"mine\.py:go: its file has changed since"):
@@ -151,3 +157,85 @@ def test_only_the_command_line_keeps_what_a_file_prints_off_its_results(
     path.write_text("print('loading')\n\ndef gentle(state):\n    return 0.0 * state.speed\n")
     FileReference(path, "gentle").load_object()
     assert tuple(capsys.readouterr()) == expected
+
+
+CODE = """
+from unjam.scenarios.ring import Ring
+
+NUMBER = {0}
+
+def number(rows):
+    return NUMBER + 0.0 * rows[4]
+
+class Road(Ring):
+    horizon = NUMBER
+
+class Simulator:
+    number = NUMBER
+
+    def supports(self, scenario):
+        return ""
+
+    def open(self, scenario, seed, options):
+        raise NotImplementedError
+"""
+STATE = random_state(np.random.default_rng(0), 3)
+OUTCOME = Outcome(np.ones((3, 2)), np.ones((3, 1)), np.ones((3, 1)), np.zeros(3, bool), np.zeros(3))
+
+
+def number_of_feature(file: str) -> Any:
+    (made,) = as_features((f"{file}:number",))
+    return compute_observation((made,), FeatureInputs(STATE, STATE.speed, PISaturation(), {}))[0, 0]
+
+
+def number_of_policy(file: str) -> Any:
+    driver = ResidualDriver(PISaturation(), random_network(1), 1.0, (f"{file}:number",))
+    return driver.observation(STATE, driver.initial_memory(3))[0, 0]
+
+
+def number_of_backend(file: str) -> Any:
+    with open_backend(f"{file}:Simulator") as found:
+        return cast(Any, found).number
+
+
+NUMBERS: dict[str, Callable[[str], Any]] = {
+    "feature": number_of_feature,
+    "policy": number_of_policy,
+    "reward": lambda file: make_reward(f"{file}:number")(OUTCOME)["reward"][0],
+    "driver": lambda file: make_driver(f"{file}:number", 0.1).act(STATE, {})[0][0],
+    "scenario": lambda file: make_scenario(f"{file}:Road").horizon,
+    "backend": number_of_backend,
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_a_name_means_the_present_code_of_the_present_folder(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for number, folder in enumerate(("a", "b", "b"), 1):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        monkeypatch.chdir(tmp_path / folder)
+        Path("mine.py").write_text(CODE.format(number))
+        found.append(NUMBERS[kind]("mine.py"))
+    assert found == [1, 2, 3]
+
+
+def test_a_policy_keeps_the_features_that_it_was_made_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(CODE.format(1))
+    driver = ResidualDriver(PISaturation(), random_network(1), 1.0, ("mine.py:number",))
+    recipe, arrays = driver_recipe(driver)
+    Path("elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    assert [each["path"] for each in user_code_recipes(recipe)] == [str(tmp_path / "mine.py")]
+    assert driver_recipe(driver_from_recipe(recipe, arrays))[0] == recipe
+    Path("mine.py").write_text(CODE.format(2))
+    (tmp_path / "mine.py").write_text(CODE.format(3))
+    assert driver.observation(STATE, driver.initial_memory(3))[0, 0] == 1
+    with pytest.raises(InputError, match=r"mine\.py:number: its file has changed since"):
+        driver_from_recipe(recipe, arrays)
+    with pytest.raises(InputError, match="allowed: features whose files the recipe lists"):
+        user_code_recipes({**recipe, "files": []})
+    with pytest.raises(InputError, match=r"files: .* is not allowed; allowed: \['mine\.py:number'\], as in inputs"):
+        driver_from_recipe({**recipe, "files": 2 * recipe["files"]}, arrays)

@@ -185,6 +185,18 @@ def test_training_works_without_an_expert(tmp_path: Path) -> None:
     assert result.report.is_file()
 
 
+@pytest.mark.long
+def test_code_that_changes_in_a_training_ends_it(tmp_path: Path) -> None:
+    code, folder = tmp_path / "mine.py", tmp_path / "run"
+    code.write_text("def number(state):\n    return state.speed / 20\n")
+    config = small_config(policy__inputs=["local", f"{code}:number"])
+    with pytest.raises(
+        InputError, match=r"train: .*mine\.py has changed since the checkpoint; allowed: as it was then"
+    ):
+        train(config, folder, on_iteration=lambda row: code.write_text("def number(state):\n    return state.speed\n"))
+    assert [row["iteration"] for row in read_progress(folder)] == [1]
+
+
 def test_nonempty_run_folder_is_not_changed(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="is not empty; allowed: a new folder"):

@@ -5,8 +5,8 @@ A user's own feature is a function of a `LocalState` that returns an array of sh
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Any, NamedTuple
 
@@ -33,7 +33,6 @@ from unjam.drivers.user_driver import FileReference, UserFunction, is_file_refer
 from unjam.errors import InputError, RowError, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, parameter_dataclass
 from unjam.physics.arrays import Array, Floats, as_column, clip, join_columns, namespace, stack_columns
-from unjam.user_code import UserCode
 
 RELATIVE_SPEED_SCALE = 5.0
 GAP_SCALE = 20.0
@@ -266,10 +265,14 @@ def as_features(features: Sequence[FeatureLike]) -> tuple[NetworkInput, ...]:
     """Return features, functions among them as `Feature`; raise `InputError` if it is no list, or one is invalid."""
     if isinstance(features, str) or not isinstance(features, Sequence) or not features:
         raise invalid_value("features", features, "a list of features, like ('local', 'expert_acceleration')")
-    return tuple(
-        each if isinstance(each, NetworkInput) else _user_feature(UserFunction.from_object(each, "a LocalState"))
-        for each in features
-    )
+    return tuple(map(_as_network_input, features))
+
+
+def _as_network_input(candidate: FeatureLike) -> NetworkInput:
+    if isinstance(candidate, str) and is_file_reference(candidate):
+        return feature(candidate)
+    is_known = isinstance(candidate, NetworkInput)
+    return candidate if is_known else _user_feature(UserFunction.from_object(candidate, "a LocalState"))
 
 
 def feature(name: NetworkInput) -> Feature:
@@ -278,17 +281,13 @@ def feature(name: NetworkInput) -> Feature:
         return name if isinstance(name, Feature) else name.feature
     if name not in FEATURES and not is_file_reference(name):
         raise unknown_name("features", name, [*FEATURES, "path.py:name"])
-    return FEATURES[name] if name in FEATURES else _file_feature(name)
+    return FEATURES[name] if name in FEATURES else load_feature(FileReference.parse(name))[0]
 
 
-@cache
-def _user_code(name: str) -> UserCode:
-    return FileReference.parse(name).read_code()
-
-
-@cache
-def _file_feature(name: str) -> Feature:
-    return _user_feature(FileReference.parse(name).load_function("a LocalState", _user_code(name)))
+def load_feature(file: FileReference) -> tuple[Feature, FileReference]:
+    """Return a user's feature, and its reference with the hash of the code; `InputError` as `load_object_once`."""
+    found, file = file.load_object_once()
+    return _user_feature(file.as_function(found, "a LocalState")), file
 
 
 def _user_feature(function: UserFunction) -> Feature:
@@ -345,25 +344,3 @@ def observation_size(names: Sequence[NetworkInput], expert: Driver) -> int:
     if not size:
         raise InputError("policy.inputs: expert_memory alone is not allowed: the expert has no memory features")
     return size
-
-
-def checked_user_files(names: Sequence[str], expected: Sequence[FileReference]) -> tuple[FileReference, ...]:
-    """Return the files of the user's own features, loaded again if their code was not that in `expected`.
-
-    Raise `InputError` if it still is not.
-    """
-    hashes, own = {file: file.sha256 for file in expected}, [each for each in names if each not in FEATURES]
-
-    def read_files() -> list[FileReference]:
-        return [replace(FileReference.parse(name), sha256=_user_code(name).sha256) for name in own]
-
-    def has_changed(file: FileReference) -> bool:
-        return hashes.get(file, file.sha256) != file.sha256
-
-    if any(map(has_changed, read_files())):
-        _user_code.cache_clear()
-        _file_feature.cache_clear()
-    for file in filter(has_changed, read_files()):
-        allowed = "allowed: as it was when the driver was made"
-        raise InputError(f"driver recipe: the code {str(file.path)!r} of a feature has changed; {allowed}")
-    return tuple(read_files())

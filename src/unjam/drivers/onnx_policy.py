@@ -188,7 +188,7 @@ def _shape_text(shape: tuple[int, ...] | None) -> str:
 
 def _probe(driver: OnnxDriver) -> None:
     """Raise `InputError` unless a graph runs, returns numbers, and treats each row by itself."""
-    size = observation_size(driver.inputs, driver.expert)
+    size = observation_size(driver.features, driver.expert)
     observation = np.random.default_rng(0).uniform(0.0, 1.0, (PROBE_ROWS, size))
     initial = driver.policy_memory(PROBE_ROWS)
     together, after = driver.evaluate(observation, initial)

@@ -106,7 +106,7 @@ class PolicyDriver(ExpertWrapper):
     expert: Driver = field(default_factory=Constant)
     time_step: float | None = None
     """control step of the road [s]; None: any, as neither the output nor the action repeat depends on it"""
-    inputs: tuple[NetworkInput, ...] = field(init=False)
+    features: tuple[NetworkInput, ...] = field(init=False)
     action_repeat: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class PolicyDriver(ExpertWrapper):
             raise invalid_value("time_step", policy_step, f"multiples of the road's control step, {road_step:g} s")
         if output.quantity != "desired_speed" and policy_step is None:
             object.__setattr__(self, "time_step", None)
-        object.__setattr__(self, "inputs", self.description.inputs)
+        object.__setattr__(self, "features", self.description.inputs)
         object.__setattr__(self, "action_repeat", round(ratio))
 
     @cached_property

@@ -105,7 +105,7 @@ def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
     except ValueError as error:
         raise InputError(f"driver recipe: {error}") from None
     for each in (each for each in _all_drivers(driver) if isinstance(each, ResidualDriver)):
-        if each.network.input_size != (size := observation_size(each.inputs, each.expert)):
+        if each.network.input_size != (size := observation_size(each.features, each.expert)):
             raise InputError(f"network: {each.network.input_size} inputs are not allowed; allowed: {size}")
     return driver
 
@@ -120,10 +120,9 @@ def user_code_recipes(recipe: Any) -> list[Recipe]:
     files = [part for part in parts if part["kind"] == "file"]
     for residual in (part for part in parts if part["kind"] == "residual"):
         listed = residual.get("files", [])
-        for reference in (FileReference.parse(name) for name in residual.get("inputs", []) if name not in FEATURES):
-            if (str(reference.path), reference.name) not in [(file["path"], file["name"]) for file in listed]:
-                allowed = "features whose files the recipe lists with their hashes"
-                raise invalid_value("driver recipe: input", f"{reference.path}:{reference.name}", allowed)
+        if not listed and (own := [name for name in residual.get("inputs", []) if name not in FEATURES]):
+            allowed = "features whose files the recipe lists with their hashes"
+            raise invalid_value("driver recipe: input", own[0], allowed)
         files += listed
     return files
 

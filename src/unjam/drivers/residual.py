@@ -12,11 +12,13 @@ from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState, ScaledInput
 from unjam.drivers.network import Network
 from unjam.drivers.observation import (
+    FEATURES,
     FeatureInputs,
     FeatureName,
-    checked_user_files,
+    NetworkInput,
     compute_observation,
     feature,
+    load_feature,
     observation_inputs,
 )
 from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
@@ -39,17 +41,17 @@ class ExpertWrapper(DriverWrapper):
     inner_key: ClassVar[str] = EXPERT_KEY
 
     expert: Driver
-    inputs: Any
-    """features that determine the residual"""
+    features: tuple[NetworkInput, ...]
+    """they determine the residual"""
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return those of the expert and of the features."""
-        return merge_requirements(super().requirements(road), *(feature(each).requirements for each in self.inputs))
+        return merge_requirements(super().requirements(road), *(feature(each).requirements for each in self.features))
 
     @property
     def network_inputs(self) -> tuple[ScaledInput, ...]:
         """Its features, in order."""
-        return observation_inputs(self.inputs, self.expert)
+        return observation_inputs(self.features, self.expert)
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the expert and, with an action repeat, the residual and its age."""
@@ -71,12 +73,12 @@ class ExpertWrapper(DriverWrapper):
         if is_due is False:  # only for plain numbers: the residual is not computed
             observation, residual = (), memory[RESIDUAL_KEY]
         else:
-            observation = compute_observation(self.inputs, FeatureInputs(state, expert, self.expert, expert_memory))
+            observation = compute_observation(self.features, FeatureInputs(state, expert, self.expert, expert_memory))
             residual, after = self.residual(observation, state, memory, noise)
             if is_due is not True:
                 residual = namespace(residual).where(is_due, residual, memory[RESIDUAL_KEY])
                 after = map_leaves(partial(select_rows, is_due), after, memory)
-        after = {EXPERT_KEY: expert_memory, **after}
+        after = {**memory, EXPERT_KEY: expert_memory, **after}
         if repeat > 1:
             after |= {RESIDUAL_KEY: residual, RESIDUAL_AGE_KEY: memory[RESIDUAL_AGE_KEY] + 1.0}
         total = expert + residual
@@ -110,7 +112,15 @@ class ResidualDriver(ExpertWrapper):
     def __post_init__(self) -> None:
         if self.network.authority > (highest := MAX_AUTHORITY * self.action_limit):
             raise invalid_value("network: authority", self.network.authority, f"at most {highest} m/s2")
-        object.__setattr__(self, "files", checked_user_files(self.inputs, self.files))
+        own = [FileReference.parse(name) for name in self.inputs if name not in FEATURES]
+        files = self.files or own  # those of a recipe have absolute paths, and hashes
+        if list(map(str, own)) != list(map(str, files)):
+            raise invalid_value("files", list(map(str, files)), f"{list(map(str, own))}, as in inputs")
+        loaded = list(map(load_feature, files))
+        found = iter(loaded)
+        features = tuple(FEATURES.get(name) or next(found)[0] for name in self.inputs)
+        object.__setattr__(self, "features", features)
+        object.__setattr__(self, "files", tuple(file for _, file in loaded))
 
     @cached_property
     def limits(self) -> Limits:
@@ -132,7 +142,7 @@ class ResidualDriver(ExpertWrapper):
         """Return the current input of the network, also while its residual is repeated."""
         acceleration, after = self.expert.act(state, memory[EXPERT_KEY])
         inputs = FeatureInputs(state, self.limits.clip(acceleration), self.expert, after)
-        return compute_observation(self.inputs, inputs)
+        return compute_observation(self.features, inputs)
 
     def describe(self) -> str:
         """Return the description of the expert, and that there is a residual."""

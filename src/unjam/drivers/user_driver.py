@@ -7,7 +7,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import RLock
 from traceback import extract_tb
@@ -29,6 +29,8 @@ from unjam.user_code import UserCode, read_code
 
 _module_lock = RLock()
 """held while a file runs: its modules then have their short names in the global `sys.modules`"""
+_modules: dict[tuple[Path, str], ModuleType] = {}
+"""modules that run once in a process, by path and hash of their code"""
 
 
 def is_file_reference(text: str) -> bool:
@@ -124,20 +126,35 @@ class FileReference:
     def read_code(self) -> UserCode:
         """Return the current code of the file.
 
-        Raise `InputError` if it is missing, unreadable or not Python, or imports a compiled module of its folder.
+        Raise `InputError` if it is missing, unreadable or not Python, imports a compiled module of its folder, or does
+        not have the hash of the reference.
         """
         if not os.path.isfile(self.path):
             raise InputError(f"Python file: {str(self.path)!r} is not a file")
         if self.path.suffix != ".py":
             raise InputError(f"Python file: {str(self.path)!r} is not a Python file")
         try:
-            return read_code(self.path)
+            code = read_code(self.path)
         except OSError as error:
             raise InputError(f"Python file: {str(error.filename)!r}: {error.strerror}") from None
+        if self.sha256 not in ("", code.sha256):
+            raise InputError(f"{self}: its file has changed since; allowed: as it was when it was first loaded")
+        return code
 
     def load_object(self, code: UserCode | None = None) -> Any:
         """Run the file, from `code` if given, and return the object with the name; raise `InputError` as both parts."""
         return self.find_object(self.run_file(code or self.read_code()))
+
+    def load_object_once(self) -> tuple[Any, "FileReference"]:
+        """Return the object with the name, and the reference with its hash; the same code runs once in a process.
+
+        Raise `InputError` as `load_object`.
+        """
+        code = self.read_code()
+        key = self.path, code.sha256
+        if key not in _modules:
+            _modules[key] = self.run_file(code)
+        return self.find_object(_modules[key]), replace(self, sha256=code.sha256)
 
     def run_file(self, code: UserCode) -> ModuleType:
         """Run the code of the file and return its module; raise `InputError` if it fails."""
@@ -156,9 +173,8 @@ class FileReference:
             raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public}")
         return getattr(module, self.name)
 
-    def load_function(self, argument: str, code: UserCode | None = None) -> UserFunction:
-        """Return the function with the name, which takes `argument`; raise `InputError` if it is not a function."""
-        found = self.load_object(code)
+    def as_function(self, found: Any, argument: str) -> UserFunction:
+        """Return the object with the name as a function of `argument`; raise `InputError` if it is not a function."""
         if not callable(found) or inspect.isclass(found):
             raise InputError(f"{self}: is not a function of {argument}")
         return UserFunction(_as_numpy_function(found), str(self), str(self.path))
@@ -231,8 +247,6 @@ class FileDriver(FileReference, UserDriver):
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", self.path.resolve())
         code = self.read_code()
-        if self.sha256 and self.sha256 != code.sha256:
-            raise InputError(f"{self}: its file has changed since; allowed: as it was when it was first loaded")
         made = _make_implementation(self.load_object(code), self.time_step, str(self), self.parameters)
         object.__setattr__(self, "implementation", made)
         object.__setattr__(self, "sha256", code.sha256)

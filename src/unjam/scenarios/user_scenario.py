@@ -3,10 +3,8 @@
 Python files run as `unjam.user_code` says, only when the user names them. TOML files have settings alone.
 """
 
-from dataclasses import replace
 from inspect import isfunction
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from unjam.drivers.user_driver import FileReference, UserFunction, object_label, object_reference
@@ -18,8 +16,6 @@ from unjam.user_code import USER_MODULE_PREFIX
 
 CODE_ENTRY = "code"
 """entry of a recipe with path, name and hash of the user's class"""
-_modules: dict[tuple[Path, str], ModuleType] = {}
-"""by path and hash of the code: running a file again would make other classes"""
 _class_recipes: dict[type[Scenario], dict[str, Any]] = {}
 """path, name and hash of the classes that Python files define"""
 
@@ -30,15 +26,9 @@ def load_python_scenario(text: str) -> Scenario:
     return build_dataclass(found, {}, text) if isinstance(found, type) else found
 
 
-def _load_object(reference: FileReference, sha256: str = "") -> Scenario | type[Scenario]:
-    """Return the class or instance with a name, or that of a function, of a file that must have a given hash."""
-    code = reference.read_code()
-    if sha256 not in ("", code.sha256):
-        raise InputError(f"{reference}: its file has changed since; allowed: as it was when it was first loaded")
-    key = reference.path, code.sha256
-    if key not in _modules:
-        _modules[key] = reference.run_file(code)
-    found: Any = reference.find_object(_modules[key])
+def _load_object(reference: FileReference) -> Scenario | type[Scenario]:
+    """Return the class or instance with a name, or that of a function; a second run would make other classes."""
+    found, reference = reference.load_object_once()
     if isfunction(found):
         found = UserFunction(found, str(reference), str(reference.path))()
     kind: type[Any] = found if isinstance(found, type) else type(found)
@@ -46,7 +36,7 @@ def _load_object(reference: FileReference, sha256: str = "") -> Scenario | type[
         allowed = "a class or an instance of unjam.scenarios.Scenario, or a function that returns one"
         raise InputError(f"{reference}: {found!r:.60} is not allowed; allowed: {allowed}")
     if kind.__module__.startswith(USER_MODULE_PREFIX):
-        _class_recipes[kind], _ = pack(replace(reference, sha256=code.sha256))
+        _class_recipes[kind], _ = pack(reference)
     return found
 
 
@@ -66,10 +56,10 @@ def class_recipe(kind: type[Scenario]) -> dict[str, Any]:
 def load_class(code: dict[str, Any]) -> type[Scenario]:
     """Return the class of a recipe; raise `InputError` if its file has changed."""
     try:
-        reference, sha256 = FileReference(Path(code["path"]), code["name"]), code["sha256"]
+        reference = FileReference(Path(code["path"]), code["name"], sha256=code["sha256"])
     except (KeyError, TypeError):
         raise invalid_value("scenario.code", code, "a table with path, name and sha256") from None
-    found = _load_object(reference, sha256)
+    found = _load_object(reference)
     return found if isinstance(found, type) else type(found)
 
 

@@ -29,12 +29,12 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
     `settings` has all but steps and workers, by name; `files` the hashes of the experts and of the user's code and
     networks; `packages` and `kernels` the numerical environment.
     """
-    files = file_hashes((config.agent,))
+    files = code_hashes(config)
     for each, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):
         recipe, arrays = driver_recipe(task.expert)
         weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
         files[f"expert {each.expert}"] = sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)
-        files |= file_hashes((each.scenario, each.reward, each.backend, *each.policy.inputs), task.scenario)
+        files |= file_hashes((), task.scenario)
     settings = flatten_keys(asdict(replace(config, steps=1, workers=1)))
     entries = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
     return json.loads(to_json(entries))
@@ -49,6 +49,13 @@ def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
     for part in ("packages", "kernels"):
         if stored[part] != current[part]:
             _LOG.warning("resume: other %s than in the checkpoint: the result may differ", part)
+
+
+def code_hashes(config: RunConfig) -> dict[str, str]:
+    """Return hashes of the code of the user's agent, backend, features, rewards and roads, by path."""
+    tasks = config.task_configs().values()
+    names = [name for task in tasks for name in (task.scenario, task.reward)]
+    return file_hashes([config.agent, config.backend, *config.policy.inputs, *names])
 
 
 def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:

@@ -40,6 +40,7 @@ from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
 from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert, raise_failure
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
+from unjam.training.fingerprint import check_file_hashes, code_hashes, fingerprint
 from unjam.training.model_facts import no_facts_reason, write_model_facts
 from unjam.training.run_folder import (
     PROGRESS_FILE,
@@ -47,7 +48,6 @@ from unjam.training.run_folder import (
     check_config,
     controller_origin,
     create_run_folder,
-    fingerprint,
     make_new_folder,
     read_config,
     restore_newest_checkpoint,
@@ -302,6 +302,8 @@ class Trainer:
             started, validation = time.perf_counter(), self.validate(has_ended=True)
             seconds["validation"] += time.perf_counter() - started
             whole, *tasks = self._progress_rows(log, validation)
+        now = self._fingerprint["files"] | code_hashes(self.config)
+        check_file_hashes(self._fingerprint, {"files": now}, "train")  # an iteration of changed code is not stored
         for folder, row in [*zip(self.folders, tasks, strict=False), (self.folder, whole)]:
             append_line(folder / PROGRESS_FILE, to_json(row))
         self._save_checkpoint()

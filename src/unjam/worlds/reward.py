@@ -188,7 +188,7 @@ def make_reward(text: RewardLike) -> Reward:
             raise invalid_value(f"reward {name}: {term}", weight, "a number")
     if not is_file_reference(name) and name not in REWARDS:
         raise unknown_name("reward", name, [*REWARDS, "path.py:name"])
-    reward = REWARDS.get(name) or _user_reward(FileReference.parse(name).load_function("an Outcome"))
+    reward = REWARDS.get(name) or _file_reward(FileReference.parse(name))
 
     def weighted_reward(outcome: Outcome) -> dict[str, Array]:
         terms = dict(reward(outcome))
@@ -200,6 +200,10 @@ def make_reward(text: RewardLike) -> Reward:
 
     weighted_reward.__name__ = text
     return weighted_reward if weights else reward
+
+
+def _file_reward(reference: FileReference) -> Reward:
+    return _user_reward(reference.as_function(reference.load_object(), "an Outcome"))
 
 
 def _user_reward(function: UserFunction) -> Reward:
