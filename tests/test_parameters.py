@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
@@ -8,8 +9,9 @@ from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
 from unjam.drivers import PISaturation
-from unjam.drivers.safety import SafetyFilter
-from unjam.drivers.wrappers import MixedDriver
+from unjam.drivers.registry import driver_recipe
+from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.drivers.wrappers import FilteredDriver, MixedDriver
 from unjam.errors import InputError
 from unjam.parameters import (
     STRICT,
@@ -22,7 +24,9 @@ from unjam.parameters import (
     parse_toml,
     parse_value,
 )
+from unjam.physics.idm import IDMParameters
 from unjam.scenarios import FigureEight, Motorway, Ramp, Ring, make_scenario
+from unjam.scenarios.scenario import CruiseControl
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -211,6 +215,46 @@ def test_values_in_the_body_of_a_class_are_its_defaults(kind: Any, arguments: di
         assert replace(made) == made
         with pytest.raises(FrozenInstanceError):
             setattr(made, next(iter(expected)), 3.0)
+
+
+class Zero(SafetyFilter):
+    def limit(self, acceleration: Any, *_: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return 0.0 * acceleration
+
+
+class Sloped(IDMParameters):
+    grade: float = 0.0
+
+
+class Computed(CruiseControl):
+    time_gap = property(lambda self: 3.0)  # pyright: ignore[reportAssignmentType]
+
+
+class Late(Actuator):
+    def next_state(self) -> None:
+        """Replace nothing of the base."""
+
+
+class LateRamp(Ramp):
+    def starts(self) -> float:
+        return 60.0
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Ring(safety=Zero()), "scenario Ring.safety: the class Zero with its 'limit'"),
+        (lambda: Ring(humans=Sloped()), "scenario Ring.humans: the class Sloped with its 'grade'"),
+        (lambda: Ring(cruise=Computed()), "scenario Ring.cruise: the class Computed with its 'time_gap'"),
+        (lambda: Ring(actuator=Late()), "scenario Ring.actuator: the class Late with its 'next_state'"),
+        (lambda: make_scenario(type("A", (Ring,), {"safety": Zero()})), "scenario A.safety: the class Zero"),
+        (lambda: Motorway(ramps=(LateRamp(position=900.0),)), "scenario Motorway.ramps: the class LateRamp"),
+        (lambda: driver_recipe(FilteredDriver(PISaturation(), 1.0, Zero(), 0.1)), "driver .*safety: the class Zero"),
+    ],
+)
+def test_code_of_a_part_that_records_do_not_store_is_refused(make: Callable[[], Any], words: str) -> None:
+    with pytest.raises(InputError, match=rf"^{words}.* is not allowed; allowed: .*, or a class of other values"):
+        make()
 
 
 def test_an_invalid_value_in_the_body_of_a_class_is_refused_in_one_line() -> None:

@@ -99,6 +99,25 @@ def _apply_decorator(cls: type[Any]) -> None:
             raise InputError(f"class {cls.__name__}: {one_line(error)}") from error
 
 
+def check_part(name: str, part: Any) -> None:
+    """Raise `InputError` if a part of a record has a user's class with more than other values of its base's fields.
+
+    Records store the values of their parts alone: code and further fields would be ignored.
+    """
+    if not isinstance(part, Subclassable):
+        return
+    kinds = type(part).__mro__
+    known = next(each for each in kinds if each.__module__.partition(".")[0] == "unjam")
+    values: Any = known.__dataclass_fields__
+    for kind in kinds[: kinds.index(known)]:
+        for member in (*get_annotations(kind), *vars(kind)):
+            is_value = member in values and not hasattr(vars(kind).get(member), "__get__")
+            if not is_value and not member.startswith("__"):
+                allowed = f"{known.__name__}, or a class of other values for its fields"
+                label = f"the class {type(part).__name__} with its {member!r}"
+                raise InputError(f"{name}: {label} is not allowed; allowed: {allowed}")
+
+
 def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) -> DataclassT:
     """Return `kind(**values)`, or raise `InputError` with one line that names the first invalid value.
 

@@ -52,4 +52,6 @@ def test_a_file_whose_folder_has_a_plus_in_its_name_is_one_driver(tmp_path: Path
     path = tmp_path / "my+drivers" / "mine.py"
     path.parent.mkdir()
     path.write_text(my_drivers.read_text())
-    assert make_driver(f"{path}:gentle", 0.1) == FileDriver(path, "gentle")
+    gentle = FileDriver(path, "gentle")
+    assert make_driver(f"{path}:gentle", 0.1) == gentle
+    assert make_driver(f"{path}:gentle+pi+idm", 0.1) == MixedDriver((gentle, PISaturation(), IDM()))

@@ -3,7 +3,7 @@ from typing import Any
 import pytest
 
 from unjam.drivers import Constant, FollowerStopper, PISaturation
-from unjam.drivers.registry import driver_from_name, driver_from_recipe, driver_recipe
+from unjam.drivers.registry import DRIVER_CLASSES, driver_from_name, driver_from_recipe, driver_recipe, is_serializable
 from unjam.errors import InputError
 
 
@@ -43,12 +43,15 @@ def test_wrong_names_and_values_get_one_clear_line(text: str, words: str) -> Non
     assert "\n" not in str(caught.value)
 
 
-def test_a_class_of_ones_own_must_come_from_a_file() -> None:
+def test_a_class_of_ones_own_must_come_from_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     class Mine(Constant):
         pass
 
-    with pytest.raises(InputError, match=r"allowed: path\.py:name, your class in a file"):
-        driver_recipe(Mine())
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"allowed: path\.py:name, your class in a file"):
+            driver_recipe(Mine())
+        assert not is_serializable(Mine())
+        monkeypatch.setitem(DRIVER_CLASSES, "mine", Mine)  # workers do not know what one process registers
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.user_driver import as_driver
-from unjam.drivers.wrappers import HistoryDriver, ImpairedDriver, MixedDriver, RoadTypeSwitch
+from unjam.drivers.wrappers import DriverWrapper, HistoryDriver, ImpairedDriver, MixedDriver, RoadTypeSwitch
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
 from unjam.tree import map_leaves
@@ -90,6 +91,31 @@ def test_where_cavs_come_and_go_drivers_take_turns_as_they_enter(sumo: SumoBacke
     assert len(entered) > 2
     for number, stay in enumerate(entered):
         assert set(stay.applied_acceleration) == {0.1 if number % 2 == 0 else 0.2}
+
+
+@dataclass(frozen=True)
+class Half(DriverWrapper):
+    """A wrapper of a user's, in NumPy."""
+
+    driver: Driver
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        acceleration, after = self.driver.act(state, memory["inner"])
+        return np.clip(0.5 * acceleration, -0.2, 0.2)[: len(state.speed)], {"inner": after}
+
+
+class NumPyIDM(IDM):
+    """A formula of a user's whose answer for a single CAV is a number of NumPy."""
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Any, Memory]:
+        acceleration, after = super().act(state, memory)
+        return np.clip(acceleration, -0.2, 0.2), after
+
+
+@pytest.mark.parametrize("driver", [Half(IDM()), NumPyIDM()])
+def test_a_class_of_a_user_in_numpy_drives_a_single_cav(driver: Driver, sumo: SumoBackend) -> None:
+    episode = run_episode(Ring(horizon=20), driver, (0,), backend=sumo)
+    assert np.abs(episode.trajectories[0].applied_acceleration).max() == pytest.approx(0.2)
 
 
 def test_a_mixture_is_named_and_written_down_like_any_driver() -> None:

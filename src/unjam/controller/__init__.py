@@ -42,8 +42,11 @@ def make_driver(name: str, time_step: float) -> Driver:
             `+`, which CAVs use in turn.
         time_step: control step of the road [s].
     """
-    is_path = os.path.exists(name) or os.path.exists(name.rpartition(":")[0])
-    parts = [] if is_path else _MIXTURE_SEPARATOR.split(name)
+    path, _, rest = name.rpartition(":")
+    parts = [] if os.path.exists(name) else _MIXTURE_SEPARATOR.split(name)
+    if os.path.exists(path):  # its own name may contain a separator
+        first, *others = _MIXTURE_SEPARATOR.split(rest)
+        parts = [f"{path}:{first}", *others]
     if len(parts) > 1:
         return MixedDriver(tuple(make_driver(part, time_step) for part in parts))
     if name.startswith(PACKAGED_PREFIX):

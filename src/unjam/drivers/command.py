@@ -73,7 +73,7 @@ def commanded_accelerations(command: Command | None, limits: Limits, names: Sequ
     """
     found: Array = () if command is None else command.acceleration
     rows = len(names)
-    is_float = type(found) is float and rows == 1
+    is_float = isinstance(found, float) and rows == 1
     if is_float and isfinite(found):  # the fast path, in every step of a simulator
         return [limits.clip(found)]
     context = f"driver: step {step}"

@@ -14,7 +14,6 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FEATURES, Feature, NetworkInput, PolicyInput, Scale, unit_factor
-from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import ExpertWrapper
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, build_dataclass, parameter_dataclass
@@ -95,7 +94,6 @@ class PolicyDescription:
 class PolicyDriver(ExpertWrapper):
     """A policy that others have trained, alone or added to an expert; other processes cannot build it."""
 
-    own_requirements: ClassVar[Requirements] = Driver.own_requirements
     portable_form: ClassVar[str] = "its .onnx file with a description, or, except in export, path.py:name that loads it"
 
     policy: Callable[[Any, Memory], tuple[Any, Memory]]

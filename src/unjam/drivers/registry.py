@@ -25,8 +25,8 @@ from unjam.drivers.wrappers import (
 )
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.files import to_json
-from unjam.parameters import build_dataclass, check_values, split_parameters, validation_message
-from unjam.tree import Arrays, pack, unpack
+from unjam.parameters import build_dataclass, check_part, check_values, split_parameters, validation_message
+from unjam.tree import Arrays, named_parts, pack, unpack
 
 _DRIVER_CLASSES = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
@@ -77,9 +77,12 @@ def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
     Raise `InputError` if no other process could build such a driver.
     """
     for each in _all_drivers(driver):
-        if type(each) not in DRIVER_CLASSES.values():
+        if not _is_portable(each):
             reason = "is not allowed here: it drives in its own process only"
             raise InputError(f"driver: {each.describe()!r} {reason}; allowed: {each.portable_form}")
+        for name, part in (named_parts(each) or {}).items():
+            if not isinstance(part, Driver):
+                check_part(f"driver {each.describe()}: {name}", part)
     return pack(driver, classes={Driver: DRIVER_CLASSES})
 
 
@@ -92,7 +95,13 @@ def _all_drivers(driver: Driver) -> Iterator[Driver]:
 
 def is_serializable(driver: Driver) -> bool:
     """Return whether another process can build a driver; drivers defined in a notebook drive in their own process."""
-    return all(type(each) in DRIVER_CLASSES.values() for each in _all_drivers(driver))
+    return all(map(_is_portable, _all_drivers(driver)))
+
+
+def _is_portable(driver: Driver) -> bool:
+    """Return whether other processes have the class of a driver; what this process alone registers is unknown there."""
+    kind = type(driver)
+    return kind in DRIVER_CLASSES.values() and kind.__module__.partition(".")[0] == "unjam"
 
 
 def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:

@@ -21,7 +21,7 @@ from unjam.drivers.observation import (
     load_feature,
     observation_inputs,
 )
-from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
+from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface, merge_requirements
 from unjam.drivers.user_driver import FileReference
 from unjam.drivers.wrappers import COMPOSITE_CONFIG, DriverWrapper, select_rows
 from unjam.errors import invalid_value
@@ -97,6 +97,8 @@ class ResidualDriver(ExpertWrapper):
 
     Any driver can be the expert, including another `ResidualDriver`.
     """
+
+    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
     expert: Driver
     network: InstanceOf[Network]

@@ -49,8 +49,6 @@ def select_rows(condition: Array, if_true: Array, if_false: Array) -> Array:
 class CompositeDriver(Driver):
     """A driver that contains other drivers in fields of a dataclass; the field `driver` has the memory name `inner`."""
 
-    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
-
     @cached_property
     def inner_drivers(self) -> dict[str, Driver]:
         """The drivers in its fields, in order."""
@@ -131,8 +129,6 @@ class MixedDriver(CompositeDriver):
 class ImpairedDriver(DriverWrapper):
     """Drives as another driver does with noisy gaps and delayed commands."""
 
-    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
-
     driver: Driver
     delay: NonNegative = 0.0
     """delay of a command, rounded to whole control steps [s]"""
@@ -186,6 +182,8 @@ class FilteredDriver(DriverWrapper):
     actuator delay. On a road with the same filter and one simulation step per control step, nothing changes.
     """
 
+    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
+
     driver: Driver
     action_limit: Positive
     """largest acceleration in either direction that the driver may command [m/s2]"""
@@ -215,6 +213,8 @@ class HistoryDriver(DriverWrapper):
 
     Until an averaging time has passed, its mean is that of all control steps so far.
     """
+
+    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
     driver: Driver
     time_step: Positive

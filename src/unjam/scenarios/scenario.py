@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import field
+from dataclasses import field, fields
 from functools import cached_property
 from math import inf
 from pathlib import Path
@@ -17,7 +17,7 @@ from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.drivers.user_driver import UserFunction
-from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, Subclassable
+from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, Subclassable, check_part
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
 from unjam.physics.idm import IDMArrays, IDMParameters, desired_speed_from_acceleration, idm_acceleration
 from unjam.physics.kinematics import next_speed
@@ -185,6 +185,14 @@ class Scenario(Subclassable):
     `noise`, as Table B1 of the paper reads"""
     emission_class: str = "HBEFA4/PC_petrol_Euro-6ab"
     """SUMO's emission class of every vehicle, for fuel"""
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> Self:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            for part in value if isinstance(value, tuple) else (value,):
+                check_part(f"scenario {type(self).__name__}.{each.name}", part)
+        return self
 
     @model_validator(mode="after")
     def _check_filter_and_acc(self) -> Self:
