@@ -181,7 +181,7 @@ def resume_hint(folder: object) -> str:
     return f"; resume with: unjam train --resume {shlex.quote(str(folder))}"
 
 
-def spelling_hint(value: object, names: Iterable[str]) -> str:
-    """Return `; did you mean 'ring'?`, or an empty text if no name is similar."""
-    close = get_close_matches(str(value), list(names), 1)
+def spelling_hint(value: object, names: Iterable[str], similarity: float = 0.6) -> str:
+    """Return `; did you mean 'ring'?`, or an empty text if no name is similar; a `similarity` of 1 is equality."""
+    close = get_close_matches(str(value), list(names), 1, similarity)
     return f"; did you mean {close[0]!r}?" if close else ""

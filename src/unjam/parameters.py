@@ -3,9 +3,10 @@
 import os
 import re
 from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import field, fields, is_dataclass
-from functools import wraps
-from inspect import get_annotations
+from functools import cache, wraps
+from inspect import get_annotations, getattr_static
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar, dataclass_transform
 
@@ -58,6 +59,8 @@ MAX_INTEGER_BITS = 63
 """maximum number of bits of the absolute value of an integer"""
 MAX_KEY_PARTS = 100
 """parts of a key between its dots"""
+CERTAIN_SIMILARITY = 0.8
+"""from which on a name in the body of a class is taken for a misspelt field"""
 _DEEP_KEY = re.compile(rf"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){{{MAX_KEY_PARTS}}}""")
 
 DataclassT = TypeVar("DataclassT")
@@ -70,13 +73,27 @@ class Subclassable:
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Give values that replace inherited defaults the types of their fields."""
+        """Give values that replace inherited defaults the types of their fields, those of other bases included.
+
+        Raise `InputError` for a value with the misspelt name of a field.
+        """
         super().__init_subclass__(**options)
         for base in reversed(cls.__mro__[1:]):
             _apply_decorator(base)
-        inherited = {each.name: each.type for each in fields(cls)} if is_dataclass(cls) else {}
-        values = {name for name, value in vars(cls).items() if not hasattr(value, "__get__")}  # but no properties
-        replaced = {name: kind for name, kind in inherited.items() if name in values}
+        if not is_dataclass(cls):
+            return
+        inherited, replaced = {each.name: each.type for each in fields(cls)}, dict[str, Any]()
+        first = next(base for base in cls.__mro__[1:] if is_dataclass(base))
+        for base in cls.__mro__[: cls.__mro__.index(first)]:  # itself, and plain classes that precede the first one
+            own = get_annotations(base)
+            for name, value in list(vars(base).items()):
+                if name in inherited and name not in replaced and not hasattr(value, "__get__"):  # but no properties
+                    replaced[name] = own.get(name, inherited[name])
+                    setattr(cls, name, value)
+                elif name in own or name.startswith("_") or hasattr(first, name) or hasattr(value, "__get__"):
+                    continue
+                elif hint := spelling_hint(name, inherited, CERTAIN_SIMILARITY):
+                    raise InputError(f"class {cls.__name__}: {name}: unknown name{hint}")
         if replaced:
             cls.__annotations__ = replaced | get_annotations(cls)
 
@@ -84,6 +101,18 @@ class Subclassable:
         """Make an instance of a class that is a dataclass itself."""
         _apply_decorator(cls)
         return super().__new__(cls)
+
+
+@cache
+def replaced_member(kind: type[Any], base: type[Any], ignored: AbstractSet[str] = frozenset()) -> str:
+    """Return a member of a base that a class derived from it replaces, other than by values of fields; empty: none."""
+    names, missing = {each.name for each in fields(base)}, object()
+    for name in dir(base):
+        own, inherited = (getattr_static(each, name, missing) for each in (kind, base))
+        is_value = name in names and not hasattr(own, "__get__")
+        if own is not inherited and own != inherited and not (is_value or name in ignored or name.startswith("__")):
+            return name
+    return ""
 
 
 def _apply_decorator(cls: type[Any]) -> None:

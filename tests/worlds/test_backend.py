@@ -1,6 +1,7 @@
 """Backends: SUMO, the batch, and one of a user's own, which docs/architecture.md shows."""
 
 import json
+import re
 import sys
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -16,12 +17,15 @@ import unjam
 from tests.test_architecture import EXAMPLES
 from unjam.controller.file import sha256_of_file
 from unjam.drivers import IDM, Constant, Human, PISaturation
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.road_experts import Cruise
+from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.user_driver import FileReference
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError, UnjamError
 from unjam.measures.feasibility import feasibility
 from unjam.measures.metrics import measure
+from unjam.physics.arrays import Array
 from unjam.reports.video import write_video
 from unjam.scenarios import Merge, Ring
 from unjam.scenarios.motorway import ON_RAMP
@@ -51,7 +55,7 @@ def backend_object(reference: str) -> Any:
 
 
 def test_a_users_backend_runs_the_same_episode_by_name_as_an_object_and_in_a_worker(own: str) -> None:
-    ring = replace(RING, warmup=20, cavs=2)
+    ring = replace(RING, cavs=2)
     here = run_episode(ring, PISaturation(), 3, backend=own)
     with WorkerPool(1) as workers:
         (there,) = workers.run([EpisodeTask(ring, PISaturation(), (3,), backend=own)])
@@ -233,9 +237,10 @@ def test_the_fault_of_a_backend_is_not_that_of_the_driver_nor_of_an_environment(
 
 
 def test_commands_that_a_backend_does_not_carry_out_are_counted(own: str, faulty: str) -> None:
-    stopping = Constant(acceleration=-0.73)  # a standing vehicle cannot brake any more
-    warm = replace(RING, warmup=60)
-    shares = [measure(run_episode(warm, each, 0, backend=own))["override_share"] for each in (IDM(), stopping)]
+    def stop(state: LocalState) -> Array:  # a standing vehicle cannot brake any more
+        return np.where(state.route_position < 1.0, 0.5, -0.73)
+
+    shares = [measure(run_episode(RING, each, 0, backend=own))["override_share"] for each in (IDM(), stop)]
     assert shares == [0.0, 0.0]
     row = measure(run_episode(RING, IDM(), 0, backend=f"{faulty}:Ignores"))
     assert row["override_share"] > 0.5
@@ -263,6 +268,33 @@ def test_a_scenario_that_a_backend_does_not_support_is_refused_with_its_reason(o
     ):
         with pytest.raises(InputError, match=r"scenario: (merge|figure-eight) is not a ring"):
             attempt()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"warmup": 100}, r"warmup: 100 is not allowed: the backend does not read it; allowed: 0"),
+        ({"population": "unjam:ngsim"}, r"population: 'unjam:ngsim' is not allowed: .*; allowed: ''"),
+        ({"actuation": "raw"}, r"actuation: 'raw' is not allowed: .*; allowed: 'shielded'"),
+        ({"safety": SafetyFilter(time_gap=2.0)}, r"safety: SafetyFilter\(.*time_gap=2.0.* is not allowed"),
+    ],
+)
+def test_a_setting_that_a_backend_does_not_read_must_have_its_default(
+    change: dict[str, Any], message: str, own: str
+) -> None:
+    supports = backend_object(own).supports
+    assert not supports(replace(RING, noise=0.4, cavs=3))
+    assert re.match(message, supports(replace(RING, **change)))
+    with_default = type("Mine", (Ring,), change)  # of its class, not of the kind that the backend knows
+    assert re.match(message, supports(with_default()))
+
+
+def test_a_member_of_a_users_class_that_a_backend_does_not_read_is_refused(own: str) -> None:
+    supports = backend_object(own).supports
+    assert not supports(type("Stretched", (Ring,), {"draw": TrackScenario.draw})())
+    assert supports(type("Fast", (Ring,), {"top_speed": 5.0})()).startswith(
+        "Fast.top_speed is not allowed: the backend"
+    )
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,8 @@ class FileReference:
             with _module_lock, redirect_user_output():
                 return code.run()
         except (Exception, SystemExit) as error:  # any error of the user's code is the user's to fix
-            raise InputError(f"{self.path.name}: {type(error).__name__} when loading it: {error}") from error
+            reason = "" if isinstance(error, InputError) else f"{type(error).__name__} when loading it: "
+            raise InputError(f"{self.path.name}: {reason}{error}") from error
 
     def find_object(self, module: ModuleType) -> Any:
         """Return the object of a module with the name; raise `InputError` if it has none."""

@@ -2,16 +2,19 @@
 
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol, cast
 
 from unjam.drivers.user_driver import FileReference, is_file_reference
 from unjam.errors import InputError, unknown_name
+from unjam.parameters import replaced_member
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.checked_world import CheckedWorld, backend_label, call_backend
 from unjam.worlds.road_world import RoadWorld
 
 BACKEND_NAMES = ("sumo", "sumo-gui", "batch")
+TEXT_MEMBERS = frozenset({"title", "reward", "description", "limit_description", "notes"})
+"""members of a scenario's class that no simulator reads"""
 
 
 @dataclass(frozen=True)
@@ -34,10 +37,13 @@ DEFAULT_OPTIONS = WorldOptions()
 
 
 class Backend(Protocol):
-    """A simulator. One that holds resources is a context manager, too, which releases them."""
+    """A simulator. One that holds resources is a context manager, too, which releases them.
+
+    It must carry out or refuse all settings of a scenario, and everything that the user's own class replaces.
+    """
 
     def supports(self, scenario: Scenario) -> str:
-        """Return why it cannot simulate a scenario; empty if it can."""
+        """Return why it cannot simulate a scenario; empty if it can. `unread_reason` refuses unknown settings."""
         ...
 
     def open(
@@ -124,6 +130,26 @@ def backend_notes(backend: BackendLike, scenario: Scenario) -> list[str]:
 
     extent = "in distribution, not in each episode" if unsupported_reason(scenario) else "except for rounding"
     return [f"simulated by the backend batch: equal to SUMO {extent}"]
+
+
+def unread_reason(scenario: Scenario, kind: type[Scenario], names: Collection[str]) -> str:
+    """Return why a backend for one `kind` of road, which reads only the members `names`, cannot simulate a scenario.
+
+    Empty if it can: all other settings have the defaults of `kind`, and the class of the scenario replaces no other
+    member. `SimulatedRoad` calls `draw`, which reads the settings of the road and `population`, and itself reads
+    `simulation_step`, `horizon`, `action_limit`, `safety`, `actuator` and `sensors`.
+    """
+    if not isinstance(scenario, kind):
+        return f"{scenario.title} is not a {kind.title}"
+    if member := replaced_member(type(scenario), kind, TEXT_MEMBERS | set(names)):
+        allowed = "classes with other values of settings alone, or backend=sumo"
+        return f"{type(scenario).__name__}.{member} is not allowed: the backend does not read it; allowed: {allowed}"
+    defaults = kind()
+    for name in [each.name for each in fields(kind) if each.name not in names]:
+        value, default = getattr(scenario, name), getattr(defaults, name)
+        if value != default:
+            return f"{name}: {value!r} is not allowed: the backend does not read it; allowed: {default!r}"
+    return ""
 
 
 def check_support(backend: Backend, *scenarios: Scenario) -> None:

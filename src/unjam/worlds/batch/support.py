@@ -6,11 +6,13 @@ from operator import attrgetter
 from typing import Any
 
 from unjam.errors import InputError
+from unjam.parameters import replaced_member
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_vehicles import LaneChanging
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
+from unjam.worlds.backend import TEXT_MEMBERS, unread_reason
 from unjam.worlds.batch.human_idm import MIN_LOOK_AHEAD
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.ring.world import RingBatch
@@ -54,9 +56,8 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     """
     if kind := batch_kind(scenario):
         return kind.reason(scenario)
-    if issubclass(type(scenario), tuple(BATCH_KINDS)):  # a batch has its own formulas of the roads that it knows
-        return f"{type(scenario).__name__} may have another road than {scenario.title}; allowed: backend=sumo"
-    return f"{scenario.title} is not a ring"
+    base = next((base for base in BATCH_KINDS if isinstance(scenario, base)), None)
+    return unread_reason(scenario, base or Ring, [each.name for each in fields(scenario)])
 
 
 def _ring_reason(scenario: Ring) -> str:
@@ -124,18 +125,8 @@ BATCH_KINDS: dict[type[Scenario], BatchKind] = {
 
 def batch_kind(scenario: Scenario) -> BatchKind | None:
     """Return how batches simulate a scenario or, if its class has only other values, its base; None if they cannot."""
-    for kind in type(scenario).__mro__:
-        if kind in BATCH_KINDS:
-            return BATCH_KINDS[kind]
-        if not all(_is_setting(kind, name, value) for name, value in vars(kind).items()):
-            return None
-    return None
-
-
-def _is_setting(kind: type[Any], name: str, value: object) -> bool:
-    """Return whether a member of a user's class is a value of a field, or text about the class, and no other code."""
-    is_field = name in kind.__dataclass_fields__ and not hasattr(value, "__get__")
-    return is_field or name == "title" or name.startswith("__")
+    found = ((base, kind) for base, kind in BATCH_KINDS.items() if isinstance(scenario, base))
+    return next((kind for base, kind in found if not replaced_member(type(scenario), base, TEXT_MEMBERS)), None)
 
 
 def required_batch_kind(scenario: Scenario) -> BatchKind:
