@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,6 +10,7 @@ from tests.conftest import random_network
 from unjam import check_driver
 from unjam.controller import make_driver
 from unjam.drivers.check import random_state
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FeatureInputs, as_features, compute_observation
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.registry import driver_from_recipe, driver_recipe, user_code_recipes
@@ -16,6 +18,8 @@ from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.user_driver import FileDriver, FileReference, as_driver
 from unjam.errors import InputError
 from unjam.scenarios import Merge, make_scenario
+from unjam.training.config import load_config
+from unjam.training.run_folder import check_config
 from unjam.worlds.backend import open_backend
 from unjam.worlds.episode import run_episode
 from unjam.worlds.reward import Outcome, make_reward
@@ -239,3 +243,50 @@ def test_a_policy_keeps_the_features_that_it_was_made_with(tmp_path: Path, monke
         user_code_recipes({**recipe, "files": []})
     with pytest.raises(InputError, match=r"files: .* is not allowed; allowed: \['mine\.py:number'\], as in inputs"):
         driver_from_recipe({**recipe, "files": 2 * recipe["files"]}, arrays)
+
+
+def jerk(outcome: Outcome) -> Any:
+    return -np.abs(np.diff(outcome.accelerations, axis=0, prepend=outcome.accelerations[:1])).mean(-1)
+
+
+def centered(rows: Any) -> Any:
+    return rows[4] - rows[4].mean()
+
+
+def cumulative(outcome: Outcome) -> Any:
+    return {"fine": outcome.backlog, "sum": np.cumsum(outcome.speeds.mean(-1))}
+
+
+def previous(state: LocalState) -> Any:
+    return np.column_stack([state.speed, np.roll(state.speed, 1)])
+
+
+@pytest.mark.parametrize(
+    ("load", "function", "unit"),
+    [
+        (make_reward, jerk, "control steps"),
+        (make_reward, centered, "control steps"),
+        (make_reward, cumulative, "control steps"),
+        (lambda each: as_features((each,)), centered, "CAVs"),
+        (lambda each: as_features((each,)), previous, "CAVs"),
+    ],
+)
+def test_functions_whose_rows_depend_on_each_other_are_refused(
+    load: Callable[[Any], Any], function: Callable[[Any], Any], unit: str
+) -> None:
+    with pytest.raises(InputError, match=rf"{function.__name__}: {unit} influence each other; allowed: rows that are"):
+        load(function)
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_allowed"), [({"backend": "batch"}, False), ({"model.model_ratio": 0.0}, True), ({}, False)]
+)
+def test_an_expert_whose_cavs_influence_each_other_drives_no_batch(
+    changes: dict[str, Any], is_allowed: bool, tmp_path: Path
+) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("def centered(state):\n    return 0.5 * (state.speed.mean() - state.speed)\n")
+    config = load_config(changes={"expert": f"{file}:centered", **changes})
+    words = r"driver mine\.py:centered: CAVs influence each other; allowed: rows that are computed independently"
+    with nullcontext() if is_allowed else pytest.raises(InputError, match=words):
+        check_config(config)

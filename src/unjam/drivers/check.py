@@ -1,18 +1,21 @@
 """The check of a user's own driver against the contract of all drivers."""
 
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 
 from unjam.drivers.command import answer_as_array
 from unjam.drivers.driver import Driver, Memory, check_memory
-from unjam.drivers.local_state import ADJACENT_POSITIONS, COMMON_FIELDS, SECTIONS_AHEAD, LocalState
+from unjam.drivers.local_state import ADJACENT_POSITIONS, COMMON_FIELDS, SECTIONS_AHEAD, LocalState, state_of_ones
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError
 from unjam.tree import leaves, map_leaves
 
 MAX_ROW_DIFFERENCE, MAX_SINGLE_PRECISION_DIFFERENCE = 1e-12, 1e-5
 """largest differences between the accelerations of n rows at once and of n single rows [m/s2]"""
+PROBE_ROWS, MAX_PROBE_DIFFERENCE = 4, 1e-4
+"""rows of `check_row_independence`, and the allowed difference, relative to the largest number"""
 
 
 def check_driver(
@@ -51,6 +54,25 @@ def check_driver(
                 found = f"row {row} gave {alone!r} alone and {among!r} among {rows} rows"
                 raise InputError(f"driver: step {step}: {found}")
         memory = after
+
+
+def check_row_independence(
+    compute: Callable[[slice], Any], label: str, unit: str = "CAVs", rows: int = PROBE_ROWS
+) -> None:
+    """Raise `InputError` if the first axis of what `compute` returns for `rows` rows is not the rows by themselves."""
+    together = np.asarray(compute(slice(rows)))
+    alone = np.concatenate([compute(slice(row, row + 1)) for row in range(rows)])
+    tolerance = MAX_PROBE_DIFFERENCE * max(1.0, float(np.abs(np.nan_to_num(alone)).max(initial=0.0)))
+    if together.shape != alone.shape or not np.allclose(together, alone, rtol=0.0, atol=tolerance, equal_nan=True):
+        raise InputError(f"{label}: {unit} influence each other; allowed: rows that are computed independently")
+
+
+def probe_state(fields: Collection[str] = LocalState._fields) -> LocalState:
+    """Return random rows for `check_row_independence`, with the given optional fields."""
+    state = random_state(np.random.default_rng(0), PROBE_ROWS, optional_fields=True)
+    filled = {name: values for name, values in state._asdict().items() if values is not None}
+    others = {name: None for name in LocalState._fields if name not in (*COMMON_FIELDS, *fields)}
+    return state_of_ones(LocalState._fields, np.ones, PROBE_ROWS)._replace(**filled | others)
 
 
 def _call_act(driver: Driver, state: LocalState, memory: Memory, step: int) -> tuple[Any, Memory]:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import AfterValidator
 
+from unjam.drivers.check import check_row_independence, probe_state
 from unjam.drivers.command import as_numbers
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import (
@@ -293,6 +294,8 @@ def load_feature(file: FileReference) -> tuple[Feature, FileReference]:
 def _user_feature(function: UserFunction) -> Feature:
     example = state_of_ones(LocalState._fields, np.ones, rows=2)
     size = _feature_columns(function, example).shape[1]
+    random = probe_state()
+    check_row_independence(lambda rows: _feature_columns(function, random.select(rows), size), function.label)
 
     def compute(inputs: FeatureInputs) -> Array:
         like, state = inputs.state.speed, inputs.state

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unjam.drivers.check import PROBE_ROWS, check_row_independence
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.observation import PolicyInput, observation_size
 from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyMemory
@@ -19,8 +20,6 @@ TYPES: dict[int, type[np.floating[Any]]] = {1: np.float32, 11: np.float64}
 """allowed types of inputs and outputs, by their numbers in ONNX"""
 MAX_MEMORY_NUMBERS = 100_000
 """maximum count of numbers in the recurrent state of one CAV"""
-PROBE_ROWS, MAX_PROBE_DIFFERENCE = 3, 1e-4
-"""CAVs in the check that rows are independent, and the allowed difference, relative to the largest number"""
 
 
 class Tensor(NamedTuple):
@@ -191,10 +190,10 @@ def _probe(driver: OnnxDriver) -> None:
     size = observation_size(driver.features, driver.expert)
     observation = np.random.default_rng(0).uniform(0.0, 1.0, (PROBE_ROWS, size))
     initial = driver.policy_memory(PROBE_ROWS)
-    together, after = driver.evaluate(observation, initial)
+    _, after = driver.evaluate(observation, initial)
     for name, rows in initial.items():
         if np.shape(after[name]) != rows.shape:
             raise InputError(f"memory {name!r}: returns shape {np.shape(after[name])}; allowed: {rows.shape}")
-    alone = [driver.evaluate(row[None], driver.policy_memory(1))[0][0] for row in observation]
-    if not np.allclose(together, alone, rtol=0.0, atol=MAX_PROBE_DIFFERENCE * max(1.0, np.abs(together).max())):
-        raise InputError("graph: CAVs influence each other; allowed: rows that are computed independently")
+    check_row_independence(
+        lambda rows: driver.evaluate(observation[rows], driver.policy_memory(len(observation[rows])))[0], "graph"
+    )

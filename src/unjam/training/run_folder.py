@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from unjam.controller import make_driver
 from unjam.controller.file import sha256_of
+from unjam.drivers.check import PROBE_ROWS, check_row_independence, probe_state
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.drivers.registry import driver_recipe
@@ -30,6 +31,7 @@ from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
+from unjam.tree import map_leaves
 from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.episode import can_drive, check_can_drive, check_policy_inputs
 from unjam.worlds.reward import make_reward
@@ -55,6 +57,8 @@ def check_config(config: RunConfig) -> None:
         expert = task.make_expert()
         check_can_drive(expert, scenario)
         driver_recipe(expert)  # workers build it
+        if task.backend == "batch" or config.model.model_ratio > 0:  # which drive many roads at once
+            _check_rows(expert, scenario)
         observation_size(task.policy.inputs, expert)
         make_reward(task.reward or scenario.reward)
         with open_backend(task.episode_backend) as backend:
@@ -74,6 +78,16 @@ def check_config(config: RunConfig) -> None:
         from unjam.learners.agent import check_agent  # its file may import torch
 
         check_agent(config.agent)
+
+
+def _check_rows(expert: Driver, scenario: Scenario) -> None:
+    """Raise `InputError` if the CAVs that an expert drives influence each other."""
+    state, memory = probe_state(scenario.provided_fields), expert.initial_memory(PROBE_ROWS)
+
+    def accelerations(rows: slice) -> Any:
+        return expert.act(state.select(rows), map_leaves(lambda values: values[rows], memory))[0]
+
+    check_row_independence(accelerations, f"driver {expert.describe()}")
 
 
 def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> None:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unjam.drivers.check import PROBE_ROWS, check_row_independence
 from unjam.drivers.command import answer_as_array
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference, object_label
 from unjam.errors import InputError, invalid_value, unknown_name
@@ -212,7 +213,24 @@ def _user_reward(function: UserFunction) -> Reward:
         return terms if isinstance(terms, dict) else {"reward": terms}
 
     user_reward.__name__ = function.label
+
+    def terms_of(rows: slice) -> Floats:
+        return np.stack([*validate_reward_terms(user_reward, _random_outcome(rows)).values()], -1)
+
+    try:
+        terms_of(slice(None))
+    except (InputError, ValueError):  # it fits other roads than this small one; an error is reported where it drives
+        return user_reward
+    check_row_independence(terms_of, f"reward {function.label}", "control steps")
     return user_reward
+
+
+def _random_outcome(rows: slice, vehicles: int = 6, cavs: int = 2) -> Outcome:
+    """Return the same random control steps in each call, of which `rows` are selected."""
+    generator = np.random.default_rng(0)
+    speeds, accelerations = generator.uniform(0, 20, (PROBE_ROWS, vehicles)), generator.normal(size=(PROBE_ROWS, cavs))
+    time_gaps, crashed = generator.uniform(0.5, 3, (PROBE_ROWS, cavs)), np.arange(PROBE_ROWS) == 1
+    return Outcome(*(each[rows] for each in (speeds, accelerations, time_gaps, crashed, 10 * speeds[:, 0])))
 
 
 def episode_reward_terms(
