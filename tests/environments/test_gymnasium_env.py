@@ -335,3 +335,17 @@ def test_a_reward_that_is_not_finite_is_refused_as_in_an_episode(tmp_path: Path)
 def test_what_cannot_be_observed_or_added_to_is_told(asked: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         RoadEnv("ring", **asked)
+
+
+@pytest.mark.parametrize("action", ["abc", [0.1, 0.2], [], np.inf, [np.nan], None])
+def test_an_action_that_is_not_one_finite_number_is_refused_in_one_line(action: Any) -> None:
+    with (
+        closing(RoadEnv("ring", horizon=5)) as single,
+        closing(unjam.parallel_env("ring", cavs=2, horizon=5)) as several,
+    ):
+        single.reset(seed=0)
+        several.reset(seed=0)
+        with pytest.raises(InputError, match=r"^step: action"):
+            single.step(action)
+        with pytest.raises(InputError, match=r"^step: cav_"):
+            several.step(dict.fromkeys(several.agents, action))

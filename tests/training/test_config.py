@@ -279,3 +279,8 @@ def test_conflict_with_all_tasks_of_a_preset_is_refused(changes: dict[str, Any],
     with pytest.raises(InputError, match=re.escape(f"{name} is not allowed; allowed: none with the preset rings")):
         load_config(None, "rings", changes)
     assert load_config(None, "rings", {"scenario_options.horizon": 200}).make_tasks()[0].scenario.horizon == 200
+
+
+def test_options_of_a_users_agent_are_refused_with_an_agent_of_the_package() -> None:
+    with pytest.raises(InputError, match=r"user\.options is not allowed; allowed: none for the agent trpo"):
+        load_config(changes={"user.options": {"x": 1}})

@@ -10,12 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.conftest import random_network
 from tests.worlds.sumo.user_networks import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
+from unjam.drivers.registry import driver_from_name
 from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.user_driver import FileDriver
 from unjam.errors import InputError
@@ -564,3 +566,30 @@ def test_a_worker_has_limited_memory_on_a_users_network(drivers: Path, tmp_path:
         )
     assert set(free.trajectories[0].applied_acceleration) == {-0.5}
     assert set(limited.trajectories[0].applied_acceleration) == {0.5}
+
+
+RANDOM_DRIVER = """
+import random
+import numpy as np
+
+class Noisy:
+    def __init__(self):
+        self.offset = np.random.normal()
+
+    def initial_memory(self, n):
+        return {}
+
+    def act(self, state, memory):
+        return 0.0 * state.speed + self.offset + np.random.normal(0.0, 0.3) + random.gauss(0.0, 0.3), memory
+"""
+
+
+def test_a_driver_with_global_random_numbers_gives_the_same_episode_in_every_worker(tmp_path: Path) -> None:
+    (tmp_path / "noisy.py").write_text(RANDOM_DRIVER)
+    task = EpisodeTask(Ring(horizon=20), driver_from_name(f"{tmp_path / 'noisy.py'}:Noisy", 0.1), (5,))
+    speeds = list[Any]()
+    for _ in range(2):
+        with WorkerPool(2) as workers:
+            speeds += [episode.speeds for episode in workers.run([replace(task, seed=(4,)), task, task])[1:]]
+    for other in speeds[1:]:
+        np.testing.assert_array_equal(other, speeds[0])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from unjam.controller import make_expert
 from unjam.drivers.car_following import Constant
-from unjam.drivers.command import Command, Limits
+from unjam.drivers.command import Command, Limits, as_numbers
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import (
@@ -39,6 +39,14 @@ from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap, vali
 from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
+
+
+def as_action(action: Any, name: str) -> float:
+    """Return the action of one CAV as a number [m/s2]; raise `InputError` unless it is a single finite one."""
+    values = as_numbers(action, f"step: {name}")
+    if values.size != 1 or not np.isfinite(values).all():
+        raise InputError(f"step: {name}: {action!r:.60} is not allowed; allowed: one finite number")
+    return values.item()
 
 
 class ExternalDriver(Driver):
@@ -296,7 +304,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     @synchronized
     def step(self, action: Any) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Advance one control step."""
-        result = self._road.step(np.asarray(action, np.float64).reshape(1))
+        result = self._road.step([as_action(action, "action")])
         observation = next(iter(result.departed.values())) if result.departed else result.observations[0]
         truncated = result.truncated or (bool(result.departed) and not result.terminated)
         return observation, result.reward, result.terminated, truncated, {"reward_terms": result.reward_terms}

@@ -10,7 +10,7 @@ from pettingzoo import ParallelEnv
 
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.environments.gymnasium_env import RoadStepper
+from unjam.environments.gymnasium_env import RoadStepper, as_action
 from unjam.environments.threads import synchronized
 from unjam.errors import InputError
 from unjam.worlds.backend import BackendLike
@@ -76,7 +76,7 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
             raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each of the agents")
         previous, departed = self.agents, self._departed_agents
         agents = self._assign_agents(self._road.world.cav_ids)
-        result = self._road.step([0.0 if agent in departed else np.asarray(actions[agent]).item() for agent in agents])
+        result = self._road.step([0.0 if agent in departed else as_action(actions[agent], agent) for agent in agents])
         has_ended = result.terminated or result.truncated
         leaving, present = (
             {agent: each for agent, each in zip(self._assign_agents(ids), rows, strict=True) if agent not in departed}

@@ -18,7 +18,7 @@ from unjam.drivers.observation import observation_inputs
 from unjam.drivers.user_driver import is_file_reference, object_label, object_reference
 from unjam.drivers.wrappers import HistoryDriver
 from unjam.errors import InputError, invalid_value
-from unjam.learners.settings import AgentSettings, PolicySettings
+from unjam.learners.settings import AGENT_NAMES, AgentSettings, PolicySettings
 from unjam.models.settings import ModelSettings
 from unjam.parameters import (
     STRICT,
@@ -163,6 +163,7 @@ class RunConfig(AgentSettings):
         checks = (
             (self.backend == "batch" and all(reasons), "backend: batch", f"sumo ({reasons[0]})"),
             (policy.reward_after_exit and model == "row", "policy.reward_after_exit: true", "false with a row model"),
+            (self.user.options and self.agent in AGENT_NAMES, "user.options", f"none for the agent {self.agent}"),
             (no_memory, "policy.history_features: true", "false without the input expert_memory"),
             (no_validation, f"evaluation.patience: {patience}", "0 without validations"),
             (model == "road" and device != "cpu", f"model.device: {device}", "cpu, for road models"),

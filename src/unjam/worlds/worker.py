@@ -4,12 +4,15 @@ Started by `unjam.worlds.worker_pool` as `python -m unjam.worlds.worker`.
 """
 
 import gc
+import random
 import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import cache, partial
 from typing import IO, Any
+
+import numpy as np
 
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import as_unjam_error
@@ -46,6 +49,9 @@ def _answer_request(
     try:
         if "files" in request:  # what the parent has read of the files; changed files are read again
             take_answer(request["scenario"]["file"], request["files"])
+        numbers = np.random.SeedSequence(request["seed"]).generate_state(4)
+        random.seed(numbers.tobytes())  # for code of the user that draws from the global generators
+        np.random.seed(numbers)
         scenario = scenario_from_recipe(request["scenario"])
         if scenario.reads_user_files:
             enter_sandbox()
