@@ -1,6 +1,7 @@
+import re
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -13,6 +14,7 @@ from unjam.drivers.registry import driver_recipe
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.wrappers import FilteredDriver, MixedDriver
 from unjam.errors import InputError
+from unjam.following.calibration import CalibrationSettings
 from unjam.parameters import (
     STRICT,
     NonNegative,
@@ -289,3 +291,19 @@ def test_computed_values_and_constructors_of_a_subclass_remain_its_own() -> None
 
     assert Computed().horizon == 7
     assert Constructed().time_constant == 3.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Ring(horizon=0), "Ring.horizon: 0 is not allowed"),
+        (lambda: Ring(cavs=23), "Ring.cavs: 23 is not allowed; allowed: <= vehicles, 22"),
+        (lambda: type("Short", (Ring,), {"horizon": 0})(), "Short.horizon: 0 is not allowed"),
+        (lambda: IDMParameters(exponent=-1.0), "IDMParameters.exponent: -1.0 is not allowed"),
+        (lambda: cast(Any, CalibrationSettings)(pears=0), "CalibrationSettings.pears: unknown name"),
+    ],
+)
+def test_an_invalid_value_in_python_is_one_line(make: Any, message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)) as refused:
+        make()
+    assert "\n" not in str(refused.value)

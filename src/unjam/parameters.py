@@ -122,8 +122,9 @@ def _apply_decorator(cls: type[Any]) -> None:
     """
     is_complete = not get_annotations(cls) or not {"__dataclass_fields__", "__init__"}.isdisjoint(vars(cls))
     if is_dataclass(cls) and issubclass(cls, Subclassable) and not is_complete:
+        config: ConfigDict = {**STRICT, "validate_default": True, "arbitrary_types_allowed": True}
         try:
-            dataclass(frozen=True, config={**STRICT, "validate_default": True, "arbitrary_types_allowed": True})(cls)
+            parameter_dataclass(frozen=True, config=config)(cls)
         except (TypeError, ValueError, PydanticUserError) as error:
             raise InputError(f"class {cls.__name__}: {one_line(error)}") from error
 

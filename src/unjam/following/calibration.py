@@ -13,7 +13,6 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from pydantic.dataclasses import dataclass as checked_dataclass
 
 from unjam.drivers.local_state import LocalState
 from unjam.following.leader_replay import (
@@ -25,7 +24,7 @@ from unjam.following.leader_replay import (
     simulate_followers,
 )
 from unjam.following.trajectories import Floats, FollowingTrajectory, Segments, make_segments, trajectories_behind_cavs
-from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt
+from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.idm import IDMArrays, IDMParameters
 from unjam.scenarios.scenario import Scenario
 
@@ -34,7 +33,7 @@ ParameterRange = tuple[Positive, Positive]
 HiddenSizes = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
 
 
-@checked_dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class CalibrationSettings:
     """Ranges and budget of the search; the exponent of the IDM is always 4."""
 
@@ -67,7 +66,7 @@ class CalibrationSettings:
     """seed of the differential evolution"""
 
 
-@checked_dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class MultiStepSettings:
     """Settings of a network that learns a residual from simulation behind recorded leaders, see `fit_multi_step`."""
 

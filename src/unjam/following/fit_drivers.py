@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.network import Network
 from unjam.errors import InputError, invalid_value, shorten_list, unknown_name
@@ -24,7 +23,7 @@ from unjam.following.calibration import (
 from unjam.following.loaders import ReadOptions, read_trajectories
 from unjam.following.trajectories import FollowingTrajectory, select_splits, split_by_driver
 from unjam.manifest import manifest, without_folders
-from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclass, nest_keys
+from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclass, nest_keys, parameter_dataclass
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios.population import Population
 
@@ -42,7 +41,7 @@ FILTER_FIELDS = ("kind", "split", "driver")
 """fields by which trajectories can be selected"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class FitDriversSettings:
     """Settings for the calibration of a population."""
 

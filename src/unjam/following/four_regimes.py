@@ -8,10 +8,9 @@ from dataclasses import field
 
 import numpy as np
 from pydantic import model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.following.trajectories import Floats, FollowingTrajectory
-from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt
+from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import IDMParameters, desired_gap, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
@@ -26,7 +25,7 @@ UniformRange = tuple[float, float]
 """smallest and largest value of a uniform distribution"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class FourRegimesSettings:
     """Settings of the data set. A range is that of a uniform distribution, from which each trajectory draws a value.
 

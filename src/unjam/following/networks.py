@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic.dataclasses import dataclass as checked_dataclass
 from torch import Tensor, nn
 
 from unjam.adam import Adam
@@ -40,7 +39,7 @@ from unjam.following.trajectories import (
     following_samples,
     make_segments,
 )
-from unjam.parameters import STRICT, Positive, PositiveInt
+from unjam.parameters import STRICT, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMArrays, IDMParameters, stack_idm_parameters
 from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
@@ -51,7 +50,7 @@ MAX_GRADIENT_NORM = 1.0
 """norm to which gradients are clipped; through many simulated steps they can become very large"""
 
 
-@checked_dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class NetworkSettings:
     """Settings of a network that learns single accelerations (`fit_one_step`); the defaults are those of the paper."""
 

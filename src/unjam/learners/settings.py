@@ -8,18 +8,26 @@ from dataclasses import field
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.observation import FeatureName
 from unjam.drivers.residual import MAX_AUTHORITY
 from unjam.drivers.user_driver import is_file_reference
-from unjam.parameters import STRICT, IntAboveOne, NonNegative, NonNegativeInt, Options, Positive, PositiveInt
+from unjam.parameters import (
+    STRICT,
+    IntAboveOne,
+    NonNegative,
+    NonNegativeInt,
+    Options,
+    Positive,
+    PositiveInt,
+    parameter_dataclass,
+)
 
 Discount = Annotated[float, Field(gt=0, lt=1)]
 UnitInterval = Annotated[float, Field(ge=0, le=1)]
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class PolicySettings:
     """The residual network and its exploration."""
 
@@ -70,7 +78,7 @@ class PolicySettings:
         return max(1, round(self.action_duration / control_step))
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class LearnerSettings:
     """Settings of every learner."""
 
@@ -82,7 +90,7 @@ class LearnerSettings:
     """discount from one action of the network to the next"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class TRPOSettings(LearnerSettings):
     """Trust region policy optimization; the preset `paper` has the values of Table B5 where these differ."""
 
@@ -97,7 +105,7 @@ class TRPOSettings(LearnerSettings):
     critic_weight_decay: NonNegative = 1e-3
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class PPOSettings(LearnerSettings):
     """Proximal policy optimization; the defaults are the values of Table B3, except for larger iterations."""
 
@@ -112,7 +120,7 @@ class PPOSettings(LearnerSettings):
     critic_learning_rate: Positive = 1e-3
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class OffPolicySettings(LearnerSettings):
     """Settings of off-policy learners, which also learn from earlier iterations."""
 
@@ -135,7 +143,7 @@ class OffPolicySettings(LearnerSettings):
     """newest rows in the replay buffer, one per action"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class SACSettings(OffPolicySettings):
     """Soft actor-critic; the preset `paper` has the values of Table B4 where these differ."""
 
@@ -149,7 +157,7 @@ class SACSettings(OffPolicySettings):
     """of the residual as a share of its authority: -1 is that of noise with a standard deviation of 0.09"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class TD3Settings(OffPolicySettings):
     """Twin delayed deep deterministic policy gradient; the values of Fujimoto et al. 2018 where they fit."""
 
@@ -163,7 +171,7 @@ class TD3Settings(OffPolicySettings):
     """largest such noise, as a share of the authority"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class UserAgentSettings(LearnerSettings):
     """Settings of an agent of the user's own."""
 
@@ -185,7 +193,7 @@ AgentName = Annotated[str, AfterValidator(_check_agent_name)]
 """one of `AGENT_NAMES`, or `path.py:Class`"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class AgentSettings:
     """The chosen learner, and the settings of each one in the table of its name."""
 

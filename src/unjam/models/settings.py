@@ -4,9 +4,16 @@ from dataclasses import field
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, IntAboveOne, NonNegative, NonNegativeInt, Positive, PositiveInt
+from unjam.parameters import (
+    STRICT,
+    IntAboveOne,
+    NonNegative,
+    NonNegativeInt,
+    Positive,
+    PositiveInt,
+    parameter_dataclass,
+)
 
 BaseName = Literal["idm", "population", "acc", "ovm", "none"]
 IDMName = Literal[
@@ -16,7 +23,7 @@ Device = Literal["cpu", "cuda"]
 ErrorEstimator = Literal["unexplained_variance", "transitions", "total_variation", "training_loss"]
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class ModelSettings:
     """The learned model (the paper's virtual environment), its fit, and the length of its rollouts."""
 

@@ -6,13 +6,12 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, Positive, Subclassable
+from unjam.parameters import STRICT, Positive, Subclassable, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_min, square_root
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class IDMParameters(Subclassable):
     """Parameters of the Intelligent Driver Model; the defaults are Table B1 of the paper."""
 

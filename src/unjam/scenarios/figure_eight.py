@@ -6,9 +6,8 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, NonNegative, NumberOrRange, PositiveInt
+from unjam.parameters import STRICT, NonNegative, NumberOrRange, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import Array
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import EdgeSpan, LoopScenario
@@ -47,7 +46,7 @@ def lane_lengths(radius: Array) -> tuple[Array, ...]:
     return *upper, radius, CROSSING_LINK, radius, OUTER_LINK, arc, OUTER_LINK
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class FigureEight(LoopScenario):
     """Two loops of equal radius that cross at a junction without signals; each episode draws the radius.
 

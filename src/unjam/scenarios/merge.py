@@ -7,11 +7,10 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.drivers.safety import SafetyFilter
-from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt
+from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
@@ -35,7 +34,7 @@ PLATOON_SIZE = 30
 HIGHWAY_BRANCH, RAMP_BRANCH = 0, 1
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Merge(Scenario):
     """A highway of 700 m that a ramp joins 100 m before its end; some highway vehicles are CAVs.
 

@@ -6,11 +6,10 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.roadside import RoadsideSettings
 from unjam.drivers.safety import SafetyFilter
-from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, Subclassable
+from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, Subclassable, parameter_dataclass
 from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayGeometry, MotorwayRoad, RampGeometry
 from unjam.scenarios.motorway_vehicles import (
     TRUCK_TYPE_COUNT,
@@ -41,7 +40,7 @@ Section = Annotated[float, Field(ge=50)]
 """length of a part of the road [m]"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Ramp(Subclassable):
     """An on-ramp of a motorway, with its demand."""
 
@@ -67,7 +66,7 @@ class Ramp(Subclassable):
         return RampGeometry(self.position, merge_end, self.length, self.speed_limit)
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Motorway(Scenario):
     """A motorway with any number of on-ramps, and a peak of demand.
 

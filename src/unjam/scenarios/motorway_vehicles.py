@@ -4,9 +4,8 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, NonNegative, Positive, Subclassable
+from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
 from unjam.scenarios.road import VehicleType
 
 Interval = Annotated[tuple[float, float], Field(min_length=2, max_length=2)]
@@ -38,7 +37,7 @@ def draw_uniform(generator: np.random.Generator, interval: tuple[float, float]) 
     return round(float(generator.uniform(*interval)), 4)
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class LaneChanging(Subclassable):
     """How human drivers change lanes: parameters of SUMO's model LC2013, uniform within ranges; None: its default.
 
@@ -81,7 +80,7 @@ class LaneChanging(Subclassable):
         return tuple(values.items())
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Trucks(Subclassable):
     """Trucks among the vehicles; none of them becomes a CAV."""
 
@@ -124,7 +123,7 @@ class Trucks(Subclassable):
         )
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class OrdinaryACC(Subclassable):
     """Cars that an ACC drives, without a controller: their drivers change lanes and choose the desired speed."""
 

@@ -7,9 +7,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
-from unjam.parameters import STRICT, NumberOrRange, PositiveInt
+from unjam.parameters import STRICT, NumberOrRange, PositiveInt, parameter_dataclass
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_polyline
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
@@ -31,7 +30,7 @@ class EdgeSpan(NamedTuple):
         return self.start + self.length
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class LoopScenario(Scenario):
     """A closed road; each episode draws its size."""
 
@@ -145,7 +144,7 @@ class LoopScenario(Scenario):
         return tuple(reversed(ids) if self.is_first_leading else ids)
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Ring(LoopScenario):
     """Vehicles on a circle, evenly spaced and standing at the start; each episode draws the length.
 

@@ -3,9 +3,7 @@
 They act on all vehicles, not only on CAVs, and know the exact density of the merging section.
 """
 
-from pydantic.dataclasses import dataclass
-
-from unjam.parameters import STRICT, NonNegative, Positive, Subclassable
+from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
 
 LIMIT_STEP = 10.0 / 3.6
 """speed limits are multiples of 10 km/h [m/s]"""
@@ -13,7 +11,7 @@ MEASURED_DOWNSTREAM = 200.0
 """the density is that from the begin of the merging section to this far downstream of its end [m]"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class SpeedLimitControl(Subclassable):
     """A variable speed limit for all vehicles upstream of a merging section, which all of them obey.
 
@@ -45,7 +43,7 @@ class SpeedLimitControl(Subclassable):
         return min(speed_limit, max(self.min_limit, round(share * speed_limit / LIMIT_STEP) * LIMIT_STEP))
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class RampMeter(Subclassable):
     """A ramp meter, which lets vehicles pass one by one: ALINEA, on density.
 

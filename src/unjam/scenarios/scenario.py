@@ -10,14 +10,22 @@ from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.command import Limits
 from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.drivers.user_driver import UserFunction
-from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, Subclassable, check_part
+from unjam.parameters import (
+    STRICT,
+    NonNegative,
+    NonNegativeInt,
+    Positive,
+    PositiveInt,
+    Subclassable,
+    check_part,
+    parameter_dataclass,
+)
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
 from unjam.physics.idm import IDMArrays, IDMParameters, desired_speed_from_acceleration, idm_acceleration
 from unjam.physics.kinematics import next_speed
@@ -44,7 +52,7 @@ Actuation = Literal["shielded", "raw", "flow", "cruise"]
 HumanControl = Literal["native", "commanded"]
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class CruiseControl(Subclassable):
     """A CAV's own ACC, an IDM as SUMO computes it, and its motivation to change lanes.
 
@@ -119,7 +127,7 @@ def _spawn_seeds(seed: Sequence[int]) -> list[np.random.SeedSequence]:
     return np.random.SeedSequence(list(seed)).spawn(5)
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Scenario(Subclassable):
     """The settings that all scenarios share; each kind of road adds its own."""
 

@@ -10,11 +10,10 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 
 from unjam.drivers.roadside import RoadsideSettings
 from unjam.errors import InputError, invalid_value
-from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, build_dataclass
+from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, build_dataclass, parameter_dataclass
 from unjam.scenarios.road import UserNetworkRoad
 from unjam.scenarios.scenario import CruiseControl, Scenario
 from unjam.sumo_files import SumoFiles, read_sumo_files
@@ -47,7 +46,7 @@ DROPPED_DEVICE_SHARE = re.compile(rf"option {DEVICE_SHARE.pattern}")
 _LOGGER = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class UserNetwork(Scenario):
     """A network of the user, from its .sumocfg file; human drivers drive as its vehicle types say.
 
