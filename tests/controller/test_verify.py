@@ -285,4 +285,4 @@ def test_what_a_stranger_wrote_of_the_road_stays_on_its_line_and_out_of_the_term
         manifest["scenario"] = {"kind": "ring\nchecked signature: by 'maker.pub'\x1b[31m"}
 
     (said,) = [each.detail for each in verify_controller_file(write_changed(tmp_path, forge)) if each.part == "road"]
-    assert said == "made for the ring?checked signature: by 'maker.pub'?[31m"
+    assert said == "made for the ring checked signature: by 'maker.pub'?[31m"
