@@ -128,11 +128,8 @@ def printable(text: str) -> str:
 
     Otherwise file names, names in TOML files or messages of SUMO could move the cursor, or turn the direction of text.
     """
-    if text.isprintable():
-        return text
-    return "".join(
-        letter if letter.isprintable() or letter == "\n" or category(letter) == "Zs" else "?" for letter in text
-    )
+    hidden = {letter for letter in text if not letter.isprintable() and letter != "\n" and category(letter) != "Zs"}
+    return "".join("?" if letter in hidden else letter for letter in text) if hidden else text
 
 
 def as_unjam_error(error: Exception) -> UnjamError:

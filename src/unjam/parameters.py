@@ -129,6 +129,11 @@ def _apply_decorator(cls: type[Any]) -> None:
             raise InputError(f"class {cls.__name__}: {one_line(error)}") from error
 
 
+def is_packaged(kind: type[Any]) -> bool:
+    """Return whether a class is part of unjam, not the user's own."""
+    return kind.__module__.partition(".")[0] == "unjam"
+
+
 def check_part(name: str, part: Any) -> None:
     """Raise `InputError` if a part of a record has a user's class with more than other values of its base's fields.
 
@@ -137,7 +142,7 @@ def check_part(name: str, part: Any) -> None:
     if not isinstance(part, Subclassable):
         return
     kinds = type(part).__mro__
-    known = next(each for each in kinds if each.__module__.partition(".")[0] == "unjam")
+    known = next(filter(is_packaged, kinds))
     values: Any = known.__dataclass_fields__
     for kind in kinds[: kinds.index(known)]:
         for member in (*get_annotations(kind), *vars(kind)):

@@ -120,7 +120,7 @@ def main() -> None:
         if getattr(sys, stream) is None:  # a closed stream must not become the next file that is opened
             setattr(sys, stream, open(os.devnull, mode))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # letters that an encoding lacks must not end a command
+        if isinstance(stream, TextIOWrapper):  # letters outside of an encoding must not end a command
             stream.reconfigure(errors="replace")
     mark_as_command_line()
     for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and nohup ignores it

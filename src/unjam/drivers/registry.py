@@ -25,7 +25,14 @@ from unjam.drivers.wrappers import (
 )
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.files import to_json
-from unjam.parameters import build_dataclass, check_part, check_values, split_parameters, validation_message
+from unjam.parameters import (
+    build_dataclass,
+    check_part,
+    check_values,
+    is_packaged,
+    split_parameters,
+    validation_message,
+)
 from unjam.tree import Arrays, named_parts, pack, unpack
 
 _DRIVER_CLASSES = (
@@ -101,7 +108,7 @@ def is_serializable(driver: Driver) -> bool:
 def _is_portable(driver: Driver) -> bool:
     """Return whether other processes have the class of a driver; what this process alone registers is unknown there."""
     kind = type(driver)
-    return kind in DRIVER_CLASSES.values() and kind.__module__.partition(".")[0] == "unjam"
+    return kind in DRIVER_CLASSES.values() and is_packaged(kind)
 
 
 def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:

@@ -15,7 +15,7 @@ from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork, load_user_network
-from unjam.scenarios.user_scenario import CODE_ENTRY, class_recipe, load_class, load_python_scenario, read_toml_scenario
+from unjam.scenarios.user_scenario import CODE_ENTRY, class_recipe, load_class, load_python_scenario, load_toml_scenario
 
 __all__ = ["SCENARIOS", "FigureEight", "Merge", "Motorway", "Ramp", "Ring", "Road", "Scenario", "make_scenario"]
 
@@ -69,8 +69,7 @@ def _base_scenario(scenario: ScenarioLike) -> Scenario:
     if is_file_reference(scenario):
         return load_python_scenario(scenario)
     if scenario.endswith(".toml"):
-        kind, values = read_toml_scenario(Path(scenario), TOML_KINDS)
-        return build_dataclass(TOML_KINDS[kind], values, Path(scenario).name)
+        return load_toml_scenario(Path(scenario), TOML_KINDS)[0]
     if scenario == Motorway.title:  # the kind of a TOML file, without its settings
         return Motorway()
     if scenario not in SCENARIOS:
@@ -94,10 +93,10 @@ def without_toml_file(values: dict[str, Any]) -> dict[str, Any]:
     name = values.get("scenario")
     if not isinstance(name, str) or not name.endswith(".toml"):
         return values
-    kind, settings = read_toml_scenario(Path(name), TOML_KINDS)
+    road, settings = load_toml_scenario(Path(name), TOML_KINDS)
     options = values.get("scenario_options", {})
     options = merge_changes(settings, nest_keys(options)) if isinstance(options, dict) else options
-    return {**values, "scenario": kind, "scenario_options": options}
+    return {**values, "scenario": road.title, "scenario_options": options}
 
 
 def example_scenario(name: str) -> Scenario:

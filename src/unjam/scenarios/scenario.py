@@ -24,6 +24,7 @@ from unjam.parameters import (
     PositiveInt,
     Subclassable,
     check_part,
+    is_packaged,
     parameter_dataclass,
 )
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
@@ -325,7 +326,7 @@ class Scenario(Subclassable):
         """Return the road of an episode's seed, and the seeds of noise, exploration, simulator and sensors."""
         road, *others = _spawn_seeds(seed)
         kind, generator = type(self), np.random.default_rng(road)
-        if kind.__module__.partition(".")[0] == "unjam":
+        if is_packaged(kind):
             return self.draw(generator), others
         file = getattr(sys.modules.get(kind.__module__), "__file__", None) or ""
         drawn = UserFunction(self.draw, kind.__name__, file)(generator)  # an error is reported with its line

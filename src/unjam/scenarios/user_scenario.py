@@ -63,11 +63,10 @@ def load_class(code: dict[str, Any]) -> type[Scenario]:
     return found if isinstance(found, type) else type(found)
 
 
-def read_toml_scenario(path: Path, kinds: dict[str, type[Scenario]]) -> tuple[str, dict[str, Any]]:
-    """Return the kind of road of a TOML file, by default a motorway, and its settings, which are valid."""
+def load_toml_scenario(path: Path, kinds: dict[str, type[Scenario]]) -> tuple[Scenario, dict[str, Any]]:
+    """Return the scenario of a TOML file, by default a motorway, and the settings that the file names."""
     values = read_toml(path, "scenario file")
     kind = values.pop("kind", "motorway")
     if kind not in kinds:
         raise invalid_value(f"scenario file {path}: kind", kind, ", ".join(kinds))
-    build_dataclass(kinds[kind], values, path.name)
-    return kind, values
+    return build_dataclass(kinds[kind], values, path.name), values
