@@ -120,8 +120,13 @@ def is_running(process: int) -> bool:
 
 def has_ended(process: int) -> bool:
     """Whether a process without its parent has ended, even if no process has waited for it yet."""
+    if not is_running(process):
+        return True
     state = Path(f"/proc/{process}/stat")
-    return not is_running(process) or (state.exists() and state.read_text().rpartition(") ")[2][0] == "Z")
+    try:
+        return state.read_text().rpartition(") ")[2][0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):  # between the two questions, or a system without /proc
+        return not is_running(process)
 
 
 def tasks_of_all_kinds(my_drivers: Path) -> list[EpisodeTask]:
