@@ -239,8 +239,11 @@ def settings_table(folder: Path) -> pd.DataFrame:
         rows = capacities[str(setting.number)]["episodes"]
         facts = {
             TARGETS[name].name: str(estimate_cell(estimate(fact_values(rows, name)), TARGETS[name].digits))
-            for name in ("highest_flow", "discharge", "capacity_drop", "wave_speed")
+            for name in ("highest_flow", "discharge", "capacity_drop")
         }
+        # The median, because the estimate of a single episode may be many times any real speed.
+        wave, speeds = TARGETS["wave_speed"], fact_values(rows, "wave_speed")
+        facts[f"{wave.name}: median (episodes)"] = f"{np.median(speeds):.{wave.digits}f} ({len(speeds)})"
         factors = {each.name.replace("_", " "): getattr(setting, each.name) for each in fields(setting)[1:]}
         times = {"free travel time [s]": setting.free_flow_time, "unavoidable delay [s]": setting.unavoidable_delay}
         texts = {name: f"{value:.0f}" for name, value in times.items()}

@@ -16,7 +16,14 @@ from unjam_paper.human_traffic import (
     make_candidate,
     total_deviation,
 )
-from unjam_paper.motorway_ensemble import CAPACITY_PART, FREE_FLOW_PART, LEVELS, SETTINGS, SETTINGS_PER_HALF
+from unjam_paper.motorway_ensemble import (
+    CAPACITY_PART,
+    FREE_FLOW_PART,
+    LEVELS,
+    SETTINGS,
+    SETTINGS_PER_HALF,
+    settings_table,
+)
 from unjam_paper.results_file import read_part
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -70,6 +77,12 @@ def test_capacities_and_free_travel_times_are_those_of_the_results() -> None:
         flows = [row["highest_flow"] for row in capacities[str(setting.number)]["episodes"]]
         assert setting.capacity / setting.traffic["lanes"] == pytest.approx(sum(flows) / len(flows), abs=0.5)
         assert setting.free_flow_time == pytest.approx(times[str(setting.number)]["travel_time"], abs=0.05)
+
+
+def test_waves_of_the_ensemble_travel_at_possible_speeds() -> None:
+    table = settings_table(RESULTS / "motorway-ensemble.json")
+    name = next(each for each in table.columns if each.startswith(TARGETS["wave_speed"].name))
+    assert all(10.0 < float(each.split()[0]) < 30.0 for each in table[name])
 
 
 def test_no_delay_is_unavoidable_below_capacity_and_more_the_higher_the_demand() -> None:
