@@ -1,11 +1,12 @@
 """Tables of how people drive, from results/figure-6.json and results/field.json."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from tables import results_part
+from verdicts import Finding, compare
 
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.statistics import estimate
@@ -127,59 +128,76 @@ def _mean(values: pd.Series, digits: int) -> str:
 
 def people_claims() -> pd.DataFrame:
     """Return what the paper says of the knowledge network, and what was measured."""
-    rows = figure_6(driver="other", split="trajectories", is_long=False)
+    findings = {
+        "faster convergence": _passes(),
+        "lower loss": _final_loss(),
+        "lower error at every size of the data": _sizes("error", lambda errors: errors),
+        "smaller spread at every size": _sizes(
+            "distance from the median", lambda errors: abs(errors - errors.median())
+        ),
+        "it captures what real drivers do": _one_step(),
+        "the residual improves on IDM": _driving_on(),
+    }
     return pd.DataFrame(
-        [
-            {"the paper": words, "here": verdict, "number": number}
-            for words, verdict, number in (
-                _loss(rows),
-                _sizes(rows, "lower error at every size of the data", "mean"),
-                _sizes(rows, "smaller spread at every size", "std"),
-                _one_step(),
-                _driving_on(),
-            )
-        ]
+        {"the paper": words, "here": verdict, "number": number} for words, (verdict, number) in findings.items()
     )
 
 
-def _loss(rows: pd.DataFrame) -> tuple[str, str, str]:
-    whole = rows[(rows["size"] == 1.0) & (rows["network"] != "nearest row")]
-    reached = {}
-    for network, found in whole.groupby("network"):
+def _networks(size: float) -> dict[str, pd.DataFrame]:
+    """Return the rows with and without IDM for a size of the data, ordered by repeat."""
+    rows = figure_6(driver="other", split="trajectories", is_long=False, size=size)
+    labels = {"knowledge": "with IDM", "vanilla": "without"}
+    return {label: rows[rows["network"] == network] for network, label in labels.items()}
+
+
+def _passes() -> Finding:
+    passes = {}
+    for label, found in _networks(1.0).items():
         limit = 1.05 * float(found["noise"].iloc[0]) ** 2
-        curves = [np.array(curve) for curve in found["training_loss"]]
-        passes = [int(np.argmax(curve <= limit)) + 1 if (curve <= limit).any() else len(curve) for curve in curves]
-        reached[str(network)] = float(np.mean(passes))
-    held = reached["knowledge"] < reached["vanilla"]
-    with_idm, without = (f"{reached[name]:.0f}" for name in ("knowledge", "vanilla"))
-    number = f"passes to a loss 5 % above the noise: {with_idm} with IDM, {without} without"
-    return "faster convergence", "held" if held else "not held", number
+        curves = [np.array([*curve, -np.inf]) for curve in found["training_loss"]]  # all passes if never
+        passes[label] = np.array([np.argmax(curve <= limit) + 1 for curve in curves])
+    verdict, numbers = compare(passes, "with IDM", larger=False, digits=1, unit="repeats")
+    return verdict, f"passes to a loss 5 % above the noise: {numbers}"
 
 
-def _sizes(rows: pd.DataFrame, words: str, how: str) -> tuple[str, str, str]:
-    found = rows[rows["network"] != "nearest row"].groupby(["size", "network"])["driver_error"].agg(how)
-    table = found.unstack()
-    better = table["knowledge"] < table["vanilla"]
-    names = [f"{100 * size:g} %" for size in table.index]
-    held = [name for name, one in zip(names, better, strict=True) if one]
-    verdict = "held" if better.all() else "not held" if not better.any() else f"held at {', '.join(held)} alone"
-    number = "; ".join(
-        f"{name}: {row['knowledge']:.4f} and {row['vanilla']:.4f}"
-        for name, (_, row) in zip(names, table.iterrows(), strict=True)
-    )
-    return words, verdict, f"with and without IDM [m/s²]: {number}"
+def _final_loss() -> Finding:
+    losses = {
+        label: np.array([curve[-1] for curve in found["training_loss"]]) for label, found in _networks(1.0).items()
+    }
+    verdict, numbers = compare(losses, "with IDM", larger=False, digits=5, unit="repeats")
+    return verdict, f"loss after the last pass [m²/s⁴]: {numbers}"
 
 
-def _one_step() -> tuple[str, str, str]:
+def _sizes(what: str, statistic: Callable[[pd.Series], pd.Series]) -> Finding:
+    """Judge a statistic of the errors of the repeats with and without IDM, by size of the data."""
+    numbers, sizes = list[str](), dict[str, list[str]]()
+    for size in (0.01, 0.1, 0.3, 0.5, 1.0):
+        values = {label: statistic(found["driver_error"]).to_numpy() for label, found in _networks(size).items()}
+        verdict, text = compare(values, "with IDM", larger=False, digits=4, unit="repeats")
+        sizes.setdefault(verdict, []).append(f"{100 * size:g} %")
+        numbers.append(f"{100 * size:g} %: {text}")
+    verdict = "; ".join(f"{verdict} at {', '.join(found)}" for verdict, found in sizes.items())
+    return verdict, f"{what} [m/s²]: {'. '.join(numbers)}"
+
+
+def _one_step() -> Finding:
+    values = {
+        "with IDM": _of_seeds("one_step", "knowledge, paper's IDM clipped"),
+        "without": _of_seeds("one_step", "vanilla"),
+    }
+    verdict, numbers = compare(values, "with IDM", larger=False, digits=3)
+    return verdict, f"error of one step, 218 drivers of NGSIM [m/s²]: {numbers}"
+
+
+def _driving_on() -> Finding:
+    own, idm = _of_seeds("gap", "knowledge, IDM"), _of_seeds("gap", "IDM")
+    values = {"with the residual": own, "IDM alone": np.full(len(own), idm.mean())}
+    verdict, numbers = compare(values, "with the residual", larger=False, digits=2)
+    return verdict, f"error of the gap, driving on, 218 drivers of NGSIM [m]: {numbers}"
+
+
+def _of_seeds(name: str, model: str) -> np.ndarray:
+    """Return the error of a model on the 218 other drivers, for each seed."""
     rows = rows_of("field/field")
-    rows = rows[(rows["data_set"] == "ngsim") & (rows["test"] == "other drivers")]
-    means = rows.groupby("model")["one_step"].mean()
-    knowledge, alone = means["knowledge, paper's IDM clipped"], means["vanilla"]
-    number = f"one step, NGSIM, 218 drivers: {knowledge:.3f} m/s² with IDM, {alone:.3f} without"
-    return "it captures what real drivers do", "held" if knowledge < alone else "not held", number
-
-
-def _driving_on() -> tuple[str, str, str]:
-    idm, knowledge = (gap_error(model, test="other drivers") for model in ("IDM", "knowledge, IDM"))
-    number = f"error of the gap, driving on: {knowledge:.2f} m with the residual, {idm:.2f} m without"
-    return "the residual improves on IDM", "held" if knowledge < idm else "not held", number
+    rows = rows[(rows["data_set"] == "ngsim") & (rows["test"] == "other drivers") & (rows["model"] == model)]
+    return rows.sort_values("seed")[name].to_numpy()

@@ -23,7 +23,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
 from unjam.training.evaluate import TRAINED_LABEL
 from unjam.training.road_family import NGSIM_IDM
-from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics
+from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics, training_curves
 from unjam_paper.results_file import StudyPart, read_part, write_part
 from unjam_paper.study import (
     STUDY_ROADS,
@@ -162,6 +162,8 @@ def _transfer_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPar
 def _write_figure_10(roads: tuple[str, ...], study_folder: StudyFolder, seeds: int, folder: Path) -> None:
     tables = (comparison_rows(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads)
     write_part(folder, "table", [row for rows in tables for row in rows])
+    curves = {road: training_curves(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads}
+    write_part(folder, "curves", curves)
 
 
 def _transfer_table(folder: Path) -> pd.DataFrame:

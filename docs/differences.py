@@ -1,0 +1,378 @@
+"""The table of all that differs from the paper: settings are read from the code, effects from results/."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cache
+from math import sqrt
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from tables import mean_of, results_part, rows_of
+
+from unjam.measures.statistics import paired_difference
+from unjam.parameters import flatten_keys
+from unjam.training.config import load_config
+from unjam_paper.study import UNFILTERED_ROADS, interval_text, trainings_text
+from unjam_paper.variants import VARIANTS
+
+PRESETS = {"default": "", "`paper`": "paper", "`paper-exact`": "paper-exact"}
+"""presets by their heading; the studies of tables and figures use `paper`"""
+NOT_MEASURED = "not measured"
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One difference, or one choice that the paper leaves open."""
+
+    what: str
+    paper: str
+    """what the paper says, and where"""
+    settings: tuple[str, ...] = ()
+    """names of the settings that it is about, those of the scenario as `scenario.NAME`; their values are shown"""
+    note: str = ""
+    """what the values mean, or what unjam does with all presets where there is no setting"""
+    effect: Callable[[], str] = lambda: NOT_MEASURED
+    """returns the measured effect, with its source"""
+    road: str = "ring"
+
+
+def by_study(study: str, effect: Callable[[], str]) -> Callable[[], str]:
+    """Return an effect that is shown once its study has results."""
+
+    def measured() -> str:
+        try:
+            return f"{effect()} (`results/{study}.json`)"
+        except FileNotFoundError:
+            return f"not yet measured (`unjam reproduce {study}`)"
+
+    return measured
+
+
+def filter_effect() -> str:
+    """Return the returns of TRPO and the paper's method on the ring without and with the safety filter."""
+    texts = []
+    for name in ("TRPO", "proposed"):
+        values = []
+        for study, road in (("table-1-ring-unfiltered", UNFILTERED_ROADS["ring"]), ("table-1-ring", "ring")):
+            rows = {row["name"]: row for row in results_part(f"{study}/table") if row["road"] == road}
+            best = rows[rows[name]["gain_reference"]["expert"]]["return"]["mean"]
+            values.append(best + float(np.mean(rows[name]["gains"])))
+        texts.append(f"{name} {values[0]:,.0f} without and {values[1]:,.0f} with it")
+    return f"return on test seeds, ring: {', '.join(texts)}"
+
+
+def noise_effect() -> str:
+    """Return the standard deviation across vehicles of human traffic on the ring with both kinds of noise."""
+    rows = [row for row in results_part("table-2-unscaled-noise/table") if row["name"] == "human"]
+    own = next(row for row in results_part("table-2/table") if row["name"] == "human")
+    stds = [row["speed_std_fleet"]["mean"] for row in (*rows, own)]
+    return f"standard deviation across vehicles of human traffic: {stds[0]:.2f} m/s unscaled, {stds[1]:.2f} scaled"
+
+
+def expert_effect() -> str:
+    """Return the differences of the return of PI as in the paper to the default one."""
+    texts = []
+    for road in ("ring", "ring-jammed"):
+        rows = rows_of(f"experts/all-on-{road}")
+        difference = paired_difference(rows["pi:time_constant=0"], rows["pi"], "return")
+        texts.append(f"{interval_text(asdict(difference), 0, '+,')} on `{road}`")
+    return f"return of the paper's PI, difference to the default one: {', '.join(texts)} (`results/experts.json`)"
+
+
+def selection_effect() -> str:
+    """Return the differences of the last to the best checkpoint."""
+    curves = results_part("table-1-ring/curves")["ring"]
+    texts = []
+    for name, label in (("trpo", "TRPO"), ("ppo", "PPO"), ("sac", "SAC"), ("proposed", "proposed")):
+        values = np.array(curves[name]["return_validation"])
+        texts.append(f"{label} {trainings_text(values[:, -1] - values.max(1), 0, '+')}")
+    return f"return of the last checkpoint, difference to the best: {', '.join(texts)} (`results/table-1-ring.json`)"
+
+
+def exact_effect() -> str:
+    """Return the returns on test seeds of trainings with all of `paper-exact`, but with the filter."""
+    trainings = results_part("to-the-letter-ring-filtered/paper-exact")
+    returns = {name: sorted(round(each["test_return"]) for each in found) for name, found in trainings.items()}
+    texts = (f"{VARIANTS[name].label} {', '.join(f'{each:,}' for each in found)}" for name, found in returns.items())
+    source = "`results/to-the-letter-ring-filtered.json`"
+    return (
+        f"not alone; all of `paper-exact` but with the filter, returns of the trainings: {'; '.join(texts)} ({source})"
+    )
+
+
+def stop_effect() -> str:
+    """Return how many trainings the rule would have ended."""
+    trainings = results_part("to-the-letter-ring-filtered/paper-exact").values()
+    ends = [each["converged"] for found in trainings for each in found]
+    steps = [each["steps"] for each in ends if each]
+    return (
+        f"it would end {len(steps)} of {len(ends)} trainings, after {min(steps):,} to {max(steps):,} steps "
+        "(`results/to-the-letter-ring-filtered.json`)"
+    )
+
+
+def reward_effect() -> str:
+    """Return the mean speed of trainings with Eq. 16 as printed and as meant."""
+    rows = {row["name"]: row["mean_speed"]["mean"] for row in results_part("eq16/table")}
+    speeds = [rows[f"proposed, Eq. 16 as {how}"] for how in ("printed", "meant")]
+    return f"mean speed {speeds[0]:.2f} m/s as printed, {speeds[1]:.2f} as meant (`results/eq16.json`)"
+
+
+def merge_effect() -> str:
+    """Return the return of human traffic on the merge with other gaps and starts."""
+    rows = results_part("research-notes/merge-level")["rows"]
+    human = {
+        (row["gap"], row["standing_vehicles"]): row["return"]["mean"]
+        for row in rows
+        if row["driver"] == "human baseline"
+    }
+    values = human[2.5, 5], human[2.5, 0], human[0.0, 5]
+    return (
+        "return of human traffic {:.0f}; {:.0f} from an empty road; {:.0f} without SUMO's gap "
+        "(`results/research-notes.json`)".format(*values)
+    )
+
+
+def impatience_effect() -> str:
+    """Return the speed of human traffic on the figure eight with other impatience."""
+    parts = {"": "figure-eight-32", " with impatience 0": "figure-eight-32-impatience=0"}
+    parts[" with 1"] = "figure-eight-32-impatience=1"
+    texts = (f"{mean_of(f'experts/{part}', 'human', 'mean_speed'):.2f} m/s{what}" for what, part in parts.items())
+    return f"human traffic, radius 32 m: {', '.join(texts)} (`results/experts.json`)"
+
+
+def speed_effect() -> str:
+    """Return both speeds of a training."""
+    row = next(row for row in results_part("table-1-ring/table") if row["name"] == "TRPO")
+    own, fleet = row["paper_convention"]["speed"]["mean"], row["mean_speed"]["mean"]
+    return (
+        f"TRPO, ring: {own:.2f} m/s in the paper's convention, {fleet:.2f} on test seeds (`results/table-1-ring.json`)"
+    )
+
+
+NOISE_STEP = 0.2 * sqrt(0.1)
+TRAFFIC = (
+    Difference(
+        "safety filter of the CAV",
+        "none: only the box of ±1 m/s² (4.1.2)",
+        ("scenario.safety.active", "scenario.safety.time_gap"),
+        effect=by_study("table-1-ring-unfiltered", filter_effect),
+    ),
+    Difference(
+        "SUMO's own safety of the CAV",
+        "not stated",
+        ("scenario.actuation",),
+        "SUMO brakes before contact, and the override is counted",
+    ),
+    Difference(
+        "noise of human drivers",
+        "standard deviation 0.2 (4.1.1), N(0, 0.2) (Table B1); it cites Flow, which scales it by the root of the step",
+        ("scenario.noise", "scenario.noise_scaling"),
+        f"{NOISE_STEP:.3f} m/s² in a step of 0.1 s",
+        by_study("table-2-unscaled-noise", noise_effect),
+    ),
+    Difference(
+        "human drivers",
+        "IDM (4.1.1)",
+        ("scenario.human_control",),
+        "SUMO's IDM; on figure eight and merge IDM commands above SUMO's layer for safety and right of way",
+    ),
+    Difference(
+        "length of an episode, warm-up",
+        "not stated",
+        ("scenario.horizon", "scenario.warmup"),
+        "1,500 on the figure eight, 600 of 1 s on the merge: as in the authors' code and Flow",
+    ),
+    Difference(
+        "sizes of the ring in one iteration",
+        "varies between episodes (4.1.1)",
+        ("stratified",),
+        "`true`: the episodes of an iteration cover the range evenly",
+    ),
+    Difference(
+        "right of way on the figure eight",
+        "vehicles obey it (4.1.1)",
+        ("scenario.right_of_way", "scenario.impatience"),
+        effect=impatience_effect,
+        road="figure-eight",
+    ),
+    Difference(
+        "start of the merge, gap that SUMO keeps",
+        "not stated",
+        ("scenario.standing_vehicles",),
+        "2.5 m, as in Flow",
+        merge_effect,
+        road="merge",
+    ),
+    Difference(
+        "control step of the merge",
+        "not stated",
+        ("scenario.simulation_step", "scenario.steps_per_control_step"),
+        "as in Flow: one command for 1 s",
+        road="merge",
+    ),
+    Difference(
+        "reward",
+        "Eq. 16: its first term falls with the speed",
+        ("reward",),
+        "that of the authors' code; on the merge `released-merge`; `eq16` and `eq16-as-printed` are options",
+        reward_effect,
+    ),
+)
+CONTROLLER = (
+    Difference(
+        "expert",
+        "PI, command reached within one step (Eq. 9 to 11, Table B2)",
+        ("expert",),
+        "the default approaches the command in 3 s",
+        expert_effect,
+    ),
+    Difference(
+        "inputs of the policy", "own speed, relative speeds and gaps of leader and follower (4.1.2)", ("policy.inputs",)
+    ),
+    Difference("first residual", "random parameters (3.3.2)", ("policy.zero_init",), "`true`: zero", exact_effect),
+    Difference("exploration, as a share of the action limit", "not stated", ("policy.exploration_std",)),
+    Difference("time for which a residual is held [s]", "one step (3.3.2)", ("policy.action_duration",)),
+    Difference(
+        "value network",
+        "state-value function of the state (3.3.2)",
+        ("policy.privileged_critic", "policy.normalize_value"),
+        "`true`: it knows the ring's length; it is scaled by the first returns",
+    ),
+    Difference(
+        "critics of SAC",
+        "as Haarnoja et al. (2018): no normalization",
+        (),
+        "layer normalization in both hidden layers (`NormalizedReLU` in `src/unjam/learners/sac_td3.py`)",
+    ),
+    Difference(
+        "end of an episode at its horizon",
+        "not stated; terminal in the authors' code for TRPO and PPO",
+        (),
+        "not terminal: the value of the last state is added",
+    ),
+)
+LEARNING = (
+    Difference("TRPO: discount, largest KL", "0.995, 0.01 (Table B5)", ("trpo.gamma", "trpo.target_kl")),
+    Difference(
+        "environment steps in an iteration",
+        "not stated; 6,000 in the authors' code",
+        ("trpo.steps_per_iteration", "ppo.steps_per_iteration"),
+    ),
+    Difference(
+        "SAC: temperature", "0.2 (Table B4)", ("sac.temperature", "sac.reward_scale"), "second: factor of rewards"
+    ),
+    Difference(
+        "SAC: first 10,000 steps",
+        '"start steps" (Table B4)',
+        ("sac.start_policy",),
+        "`uniform`: random actions; `expert`: the expert with noise",
+    ),
+    Difference("SAC: gradient steps for each environment step", "not stated", ("sac.gradient_steps_per_step",)),
+    Difference(
+        "environment steps of a training",
+        "not stated; 4,000,000 in the authors' code",
+        ("steps",),
+        "300,000 in the studies of tables and figures",
+        exact_effect,
+    ),
+    Difference(
+        "trainings of each learner", "3 (4.2.1)", (), "5 on the ring, 3 of Figures 9 and 10 and on the other roads"
+    ),
+    Difference(
+        "which checkpoint counts",
+        "the last (captions of Tables 1 and 2)",
+        ("evaluation.validation_interval",),
+        "iterations between validations, the best of which counts; 0: the last checkpoint",
+        selection_effect,
+    ),
+    Difference(
+        "end of a training",
+        "when the mean return has not risen over some iterations (3.3.2)",
+        ("evaluation.convergence_window",),
+        "0: all steps are made",
+        stop_effect,
+    ),
+    Difference(
+        "average speed",
+        "of all vehicles (4.2.1); the values are those of the CAV in the authors' code",
+        (),
+        "both are shown",
+        speed_effect,
+    ),
+)
+MODEL = (
+    Difference("networks of the model", "one (Eq. 4)", ("model.members",)),
+    Difference(
+        "where the base predicts better",
+        "the network is added (Eq. 4)",
+        ("model.fallback_to_base",),
+        "`true`: the base alone",
+        exact_effect,
+    ),
+    Difference("noise in the model", "none: the sum of base and network (Eq. 4)", ("model.add_noise",)),
+    Difference("model error", "total variation to the environment (3.4, A3)", ("model.error_estimator",)),
+    Difference("rollouts: sensitivity κ, longest", "2, 500 (Table B6)", ("model.kappa", "model.k_max")),
+    Difference("model steps for each environment step", "not stated", ("model.model_ratio",)),
+    Difference(
+        "where rollouts start",
+        "sampled from the buffer of all experience (3.1)",
+        ("model.rollout_starts",),
+        "at random steps of the newest episodes",
+    ),
+    Difference(
+        "mean speed of all vehicles, in the model",
+        "not stated: the state has three vehicles (4.1.2)",
+        (),
+        "approximated by that of the three, the network corrects it",
+    ),
+)
+DIFFERENCES = {
+    "Roads, traffic and reward": TRAFFIC,
+    "Expert and policy": CONTROLLER,
+    "Learning and evaluation": LEARNING,
+    "Model": MODEL,
+}
+"""differences by topic"""
+
+
+@cache
+def settings_of(preset: str, road: str) -> dict[str, Any]:
+    """Return all settings of a training with a preset by name, those of the scenario as `scenario.NAME`."""
+    config = load_config(preset=preset, changes={"scenario": road})
+    scenario = config.make_scenario()
+    own = {"scenario": asdict(scenario), "reward": config.reward or scenario.reward}
+    return flatten_keys({**asdict(config), **own})
+
+
+def unlisted_settings() -> list[str]:
+    """Return the settings in which presets differ that have no row."""
+    listed = {name for rows in DIFFERENCES.values() for row in rows for name in row.settings}
+    by_preset = [settings_of(preset, "ring") for preset in PRESETS.values()]
+    differing = {name for name in by_preset[0] if len({repr(each[name]) for each in by_preset}) > 1}
+    return sorted(differing - listed - {"preset"})
+
+
+def setting_text(value: Any) -> str:
+    """Return the value of a setting as pages show it."""
+    if isinstance(value, (tuple, list)):
+        return "`" + ", ".join(map(str, value)) + "`"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
+    return f"`{value}`" if isinstance(value, str) else f"{value:,g}" if isinstance(value, float) else f"{value:,}"
+
+
+def differences_table() -> pd.DataFrame:
+    """Return a row for each difference: the paper, the settings in each preset, and the measured effect."""
+    table = []
+    for topic, rows in DIFFERENCES.items():
+        for row in rows:
+            names = ", ".join(f"`{name.removeprefix('scenario.')}`" for name in row.settings)
+            cells = {"": topic, "what": f"{row.what} ({names})" if names else row.what, "the paper": row.paper}
+            topic = ""
+            for heading, preset in PRESETS.items():
+                values = settings_of(preset, row.road)
+                cells[heading] = ", ".join(setting_text(values[name]) for name in row.settings)
+            table.append({**cells, "note": row.note, "measured effect": row.effect()})
+    return pd.DataFrame(table)
