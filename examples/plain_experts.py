@@ -156,7 +156,8 @@ def jam_ahead(p: Any, s: State, m: Any) -> float:
     ahead = sum(told) / len(told) if told else math.inf
     jammed = ahead < p.jam_speed_ratio * s.allowed_speed
     jammed = jammed and max(s.congestion[p.first_section : p.last_section + 1], default=0.0) >= 0.5
-    if not told or not (jammed if math.isnan(s.distance_to_merge) else s.distance_to_merge > 0.0):
+    slow = p.free_speed_ratio is None or ahead < p.free_speed_ratio * s.allowed_speed
+    if not told or not (jammed if math.isnan(s.distance_to_merge) else s.distance_to_merge > 0.0 and slow):
         return cruise(p, s, m)
     wanted = ahead + p.speed_margin + p.margin_by_penetration * s.penetration_rate
     cap = min(max(wanted, p.min_speed), s.allowed_speed)
@@ -182,6 +183,12 @@ def adaptive_acc(p: Any, s: State, m: Any) -> float:
     fitting.comfortable_deceleration = p.comfortable_deceleration * braking
     fitting.desired_speed = p.desired_speed if math.isnan(s.allowed_speed) else s.allowed_speed
     return idm(fitting, s._replace(leader_gap=s.leader_gap if s.leader_gap < 100.0 else 1e6), m)
+
+
+def advisory_speed(p: Any, s: State, m: Any) -> float:
+    if not p.last_distance < s.distance_to_merge < p.first_distance:
+        return cruise(p, s, m)
+    return max((p.advised_speed - s.speed) / p.time_constant, -p.max_deceleration)
 
 
 def constant(p: Any, s: State, m: Any) -> float:
@@ -212,4 +219,5 @@ def remember(m: SimpleNamespace, s: State, time_step: float) -> tuple[float, ...
 
 EXPERTS = {"idm": idm, "pi": pi, "follower-stopper": follower_stopper, "acc": acc, "lacc": acc, "bcm": bcm}
 EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant": constant}
+EXPERTS |= {"advisory-speed": advisory_speed}
 EXPERTS |= {"cruise": cruise, "jam-ahead": jam_ahead, "pi-from-gap": pi_from_gap, "adaptive-acc": adaptive_acc}

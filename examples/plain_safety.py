@@ -2,23 +2,47 @@
 
 import math
 from types import SimpleNamespace
+from typing import Any
 
 from plain_experts import State
 
 
-def highest(f: SimpleNamespace, s: State, step: float) -> float:
+class Actuator:
+    """Delay and lag with which a vehicle carries out commands; a recipe without them means a car without."""
+
+    def __init__(self, recipe: dict[str, Any], step: float) -> None:
+        lag = recipe.get("lag", 0.0)
+        self.step, self.decay = step, math.exp(-step / lag) if lag else 0.0
+        self.acceleration, self.pending = 0.0, [0.0] * round(recipe.get("delay", 0.0) / step)
+
+    def apply(self, command: float, speed: float) -> None:
+        """Give a command: the first one pending becomes effective in this step."""
+        arriving, *self.pending = *self.pending, command
+        acceleration = self.acceleration * self.decay + arriving * (1.0 - self.decay)
+        self.acceleration = max(acceleration, -speed / self.step)
+
+    def equivalent_speed(self, speed: float, acceleration: float, braking: float) -> float:
+        """The speed of a car without lag that drives at least as far."""
+        return speed + self.step * self.decay / (1.0 - self.decay) * (acceleration + braking)
+
+
+def highest(f: SimpleNamespace, s: State, step: float, actuator: Actuator) -> float:
     """The highest acceleration after which it can still stop, and keep its time gap [m/s2]."""
     if not f.active:
         return math.inf
     leader, room = max(s.leader_speed - f.speed_error, 0.0), s.leader_gap - f.gap_error - f.standstill_gap
+    speed = actuator.equivalent_speed(s.speed, actuator.acceleration, f.braking)
+    for command in actuator.pending:
+        speed = max(speed + command * step, actuator.equivalent_speed(0.0, 0.0, f.braking))
+        room -= speed * step
     allowed = speed_to_stop_within(room + stopping(leader, f.leader_braking, step), f.braking, step)
     if f.time_gap:
-        c, later = f.time_gap_braking, max(leader - f.time_gap_braking * step, 0.0)
+        c, later = f.time_gap_braking, max(leader - f.time_gap_braking * step * (len(actuator.pending) + 1), 0.0)
         end = room + stopping(leader, c, step)
         near = (end - stopping(later, c, step)) / (f.time_gap + step)
         far = speed_to_stop_within(end - c * (f.time_gap + step / 2.0) ** 2 / 2.0, c, step)
         allowed = min(allowed, near, max(far, later + f.time_gap * c))
-    return max((allowed - s.speed) / step, -f.braking)
+    return max((allowed - speed) / step, -f.braking)
 
 
 def stopping(speed: float, braking: float, step: float) -> float:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from plain_experts import EXPERTS, State, clip, nearness, remember
-from plain_safety import highest
+from plain_safety import Actuator, highest
 
 
 class Driver:
@@ -27,6 +27,7 @@ class Driver:
         self.r, self.memory, self.age, self.held = recipe, SimpleNamespace(), 0, 0.0
         if recipe["kind"] in ("filtered", "history"):
             self.inner = Driver(recipe["driver"], weights)
+            self.actuator = Actuator(recipe.get("actuator", {}), recipe["time_step"])
         elif recipe["kind"] == "residual":
             self.expert = Driver(recipe["expert"], weights)
             self.layers = [[weights[part["array"]] for part in layer] for layer in recipe["network"]["layers"]]
@@ -42,7 +43,10 @@ class Driver:
         if self.r["kind"] == "filtered":
             wanted = clip(self.inner.act(s), -self.r["action_limit"], self.r["action_limit"])
             self.memory = self.inner.memory
-            return min(wanted, highest(SimpleNamespace(**self.r["safety"]), s, self.r["time_step"]))
+            safety, step = SimpleNamespace(**self.r["safety"]), self.r["time_step"]
+            command = min(wanted, highest(safety, s, step, self.actuator))
+            self.actuator.apply(command, s.speed)
+            return command
         if self.r["kind"] == "history":
             wanted, own = self.inner.act(s), remember(self.memory, s, self.r["time_step"])
             self.memory.features = (*getattr(self.inner.memory, "features", ()), *own)

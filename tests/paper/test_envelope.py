@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from unjam.controller import PACKAGED_PREFIX, certificate, packaged_names
+from unjam.controller import PACKAGED_PREFIX, certificate, packaged_names, string_stability
 from unjam.scenarios import Ring
 from unjam_paper import feasible
 from unjam_paper.feasible import ENVELOPE
@@ -45,7 +45,7 @@ def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(feasible, "LANE_SECONDS", 60.0)
     monkeypatch.setattr(feasible, "impaired_rings", lambda warmup: iter([("late", short)]))
     monkeypatch.setattr(certificate, "ATTACK_GENERATIONS", 1)
-    monkeypatch.setattr(certificate, "STRING_SPEED_RATIOS", ())
+    monkeypatch.setattr(string_stability, "OPERATING_SPEED_RATIOS", ())
 
     ENVELOPE.run(StudyFolder(tmp_path), 1, tmp_path, 1)
 

@@ -19,7 +19,7 @@ from unjam.controller.file import SAMPLE_PART, replay_states, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.local_state import MAX_OBSERVED_GAP
 from unjam.drivers.registry import driver_from_name
-from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.wrappers import FilteredDriver, HistoryDriver, MixedDriver
 from unjam.worlds.sumo.networks import sumo_program
 
@@ -81,6 +81,7 @@ def test_the_plain_reader_drives_as_unjam_without_it(tmp_path: Path) -> None:
         residual(PISaturation(), hold=10, parts=("merge_proximity", "distance_to_merge")),
         FilteredDriver(residual(PISaturation(), hold=10), 1.0, SafetyFilter(gap_error=0.5), 0.1),
         FilteredDriver(driver_from_name("constant:acceleration=1", 0.1), 1.5, SafetyFilter(time_gap=0.0), 0.1),
+        FilteredDriver(residual(PISaturation(), hold=10), 1.0, SafetyFilter(), 0.1, Actuator(delay=0.2, lag=0.3)),
     ]
     states = perceived(700)
     paths = [write_controller(driver, tmp_path / f"{number}.unjam", states) for number, driver in enumerate(drivers)]

@@ -101,6 +101,10 @@ def certify_command(
     worst = certificate["worst_cases"]
     tests = f"{worst['steps']:,} steps behind braking and adversarial leaders: {worst['contacts']} contacts"
     console.print(f"{tests}, min gap {worst['min_gap']:.2f} m", soft_wrap=True)
+    for each in certificate["string_stability"]:
+        verdict = "not string stable" if each["amplified_band"] else "string stable"
+        largest = f"largest gain {max(each['gains']):.2f} at {each['peak_frequency']:.3g} Hz"
+        console.print(f"at {each['speed']:g} m/s: {verdict}, {largest}", soft_wrap=True)
     err_console.print(f"page: {target}")
 
 

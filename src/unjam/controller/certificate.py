@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from unjam.controller.file import SAMPLE_PART, Controller, Floats, read_sample
+from unjam.controller.string_stability import StringStability, measure_string_stability, operating_speeds
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, FollowingState
@@ -14,7 +15,7 @@ from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
 from unjam.files import reject_damaged
 from unjam.parameters import build_dataclass
-from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
+from unjam.physics.idm import IDMParameters
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import CarFollowingWorld
 
@@ -26,16 +27,8 @@ ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12
 """cross-entropy method: maneuvers in a generation, generations, and elites that determine the next generation"""
 MAX_LEADER_ACCELERATION = 3.0
 """largest acceleration of an adversarial leader [m/s2]"""
-MIN_MOVING_SPEED, STRING_SPEED_RATIOS = 1.0, (0.5, 0.9)
-"""speed above which time gaps and string stability are evaluated [m/s]; speeds for string stability, as shares of the
-highest visited speed"""
-OSCILLATION_FREQUENCIES, OSCILLATION_AMPLITUDE = np.geomspace(0.04, 3.0, 20), 0.05
-"""frequencies at which leaders oscillate [rad/s], and amplitude of their speed as a share of its mean; it is small, so
-that the response is nearly linear"""
-SETTLING_SECONDS, MEASURED_PERIODS, MIN_MEASURED_SECONDS = 100.0, 2, 200.0
-"""settling time [s]; number of measured periods, and minimum measured time [s]"""
-MAX_FOLLOWERS, GAIN_TOLERANCE = 60, 5e-3
-"""maximum number of human drivers behind a CAV; gains up to one plus the tolerance count as one"""
+MIN_MOVING_SPEED = 1.0
+"""speed above which time gaps are evaluated [m/s]"""
 
 
 @dataclass(frozen=True)
@@ -53,24 +46,6 @@ class WorstCases:
     max_braking: float
     attack: tuple[float, ...]
     """the leader's accelerations with the smallest gap, one per second"""
-
-
-@dataclass(frozen=True)
-class StringStability:
-    """Response to speed oscillations of the leader around one speed [m/s] at several frequencies [rad/s]."""
-
-    speed: float
-    frequencies: tuple[float, ...]
-    gains: tuple[float, ...]
-    """amplitude of the CAV divided by that of the leader, at each frequency"""
-    human_gains: tuple[float, ...]
-    """gain of a human driver at each frequency, by the linearized IDM"""
-    peak_frequency: float
-    """frequency of the CAV's largest gain"""
-    amplified_band: tuple[float, ...]
-    """smallest and largest frequency with a gain of the CAV above one; empty if there is none"""
-    max_stable_followers: int
-    """maximum number of human drivers behind the CAV without amplification at any frequency"""
 
 
 @dataclass(frozen=True)
@@ -129,8 +104,8 @@ def make_certificate(controller: Controller) -> dict[str, Any]:
         road = controller.manifest["scenario"]
         humans = build_dataclass(IDMParameters, road["humans"], "controller: humans")
         actuator = build_dataclass(Actuator, road.get("actuator", {}), "controller: actuator")
-    if not actuator.is_instant:
-        raise InputError("certify: actuators with delay or lag are not allowed; allowed: actuator.delay and lag 0")
+    if driver.actuator != actuator:
+        raise InputError(f"certify: a filter for {driver.actuator} is not allowed on its road; allowed: {actuator}")
     return asdict(certify_driver(driver, states, humans))
 
 
@@ -151,17 +126,18 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
         raise InputError(f"certify: the driver is not allowed on {road.title}: {reason}")
 
     def simulate(initial_states: FollowingState, leader_accelerations: Floats) -> FollowingState:
-        world = CarFollowingWorld(initial_states, leader_accelerations, driver.limits, driver.time_step, loop)
+        world = CarFollowingWorld(
+            initial_states, leader_accelerations, driver.limits, driver.time_step, loop, driver.actuator
+        )
         return drive_world(world, driver)
 
     states = FollowingState(*visited_states[:3])
     ranges = [(float(values.min()), float(values.max())) for values in states]
-    speeds = [round(ratio * float(states.speed.max()), 1) for ratio in STRING_SPEED_RATIOS]
-    speeds = [speed for speed in speeds if MIN_MOVING_SPEED < speed < humans.desired_speed]
+    speeds = operating_speeds(float(states.speed.mean()), humans)
     return Certificate(
         _worst_cases(simulate, states, driver, np.random.default_rng(0)),
         _comfort(states.speed, driver.time_step),
-        _test_strings(simulate, speeds, driver.time_step, humans) if speeds else (),
+        measure_string_stability(driver, speeds, humans, loop),
         OperatingDomain(*ranges),
     )
 
@@ -171,7 +147,8 @@ def _worst_cases(
 ) -> WorstCases:
     """Simulate stops of leaders from every visited state, and search for worse maneuvers."""
     safety, step = driver.safety, driver.time_step
-    is_safe = safety.max_acceleration(states, step) > -safety.braking  # the filter promises nothing elsewhere
+    actuation = driver.actuator, driver.actuator.initial_state(states.speed, step)
+    is_safe = safety.max_acceleration(states, step, actuation) > -safety.braking  # it promises nothing elsewhere
     states = FollowingState(*(values[is_safe] for values in states))
     rows = len(states.speed)
     stop = np.full((round(LEADER_STOP_SECONDS / step), rows), -safety.leader_braking)
@@ -225,66 +202,3 @@ def _search_attacks(
         mean, spread = elites.mean(0), elites.std(0) + 0.2
     steps = ATTACK_GENERATIONS * ATTACK_POPULATION * pieces * repeats
     return *min(worst, key=lambda each: each[0].gap.min()), steps
-
-
-def _test_strings(
-    simulate: FollowingSimulator, speeds: list[float], step: float, humans: IDMParameters
-) -> tuple[StringStability, ...]:
-    """Simulate leaders with oscillations of all speeds and frequencies at once, each with one CAV behind it."""
-    seconds = SETTLING_SECONDS + max(MIN_MEASURED_SECONDS, MEASURED_PERIODS * 2.0 * np.pi / OSCILLATION_FREQUENCIES[0])
-    times: Floats = step * np.arange(round(seconds / step) + 1, dtype=np.float64)
-    phases = OSCILLATION_FREQUENCIES * np.clip(times - SETTLING_SECONDS, 0.0, None)[:, None]
-    means = np.repeat(speeds, len(OSCILLATION_FREQUENCIES))
-    gaps = np.repeat([equilibrium_gap(speed, humans) for speed in speeds], len(OSCILLATION_FREQUENCIES))
-    leaders = means * np.tile(1.0 + OSCILLATION_AMPLITUDE * np.sin(phases), len(speeds))
-    record = simulate(FollowingState(means, means, gaps), np.diff(leaders, axis=0) / step)
-    responses = np.split(record.speed, len(speeds), axis=1)
-    pairs = zip(speeds, responses, strict=True)
-    return tuple(_string_stability(speed, response, times, humans) for speed, response in pairs)
-
-
-def _string_stability(speed: float, responses: Floats, times: Floats, humans: IDMParameters) -> StringStability:
-    """Return the result for one mean speed; `responses` has the shape (times, frequencies) [m/s]."""
-    pairs = zip(responses.T, OSCILLATION_FREQUENCIES, strict=True)
-    amplitudes = np.array([_amplitude(response, times, frequency) for response, frequency in pairs])
-    gains = amplitudes / (OSCILLATION_AMPLITUDE * speed)
-    amplified = OSCILLATION_FREQUENCIES[gains > 1.0 + GAIN_TOLERANCE]
-    human_gains = human_gain(OSCILLATION_FREQUENCIES, speed, humans)
-    stable = [n for n in range(MAX_FOLLOWERS + 1) if (gains * human_gains**n).max() <= 1.0 + GAIN_TOLERANCE]
-    return StringStability(
-        speed,
-        tuple(OSCILLATION_FREQUENCIES.tolist()),
-        tuple(gains.tolist()),
-        tuple(human_gains.tolist()),
-        float(OSCILLATION_FREQUENCIES[int(np.argmax(gains))]),
-        (float(amplified[0]), float(amplified[-1])) if len(amplified) else (),
-        max(stable, default=0),
-    )
-
-
-def _amplitude(values: Floats, times: Floats, frequency: float) -> float:
-    """Return the amplitude at a frequency over the last whole periods within the measured time."""
-    period = 2.0 * np.pi / frequency
-    duration = max(1, int((times[-1] - SETTLING_SECONDS) / 2.0 / period)) * period
-    measured = times > times[-1] - duration
-    wave = (values[measured] - values[measured].mean()) * np.exp(-1j * frequency * times[measured])
-    return float(2.0 * np.abs(wave.mean()))
-
-
-def human_gain(frequencies: Floats, speed: float, humans: IDMParameters) -> Floats:
-    """Return the gain of a human driver by the linearized IDM at equilibrium: own amplitude over the leader's.
-
-    |(f_dv j w + f_s) / ((j w)^2 + (f_dv - f_v) j w + f_s)|, where f(s, dv, v) is the acceleration, dv the
-    leader's speed minus the own, and f_v its derivative at constant dv.
-    Source: Treiber and Kesting 2013, Traffic Flow Dynamics, chapter 15.
-    """
-    gap, small = equilibrium_gap(speed, humans), 1e-5
-
-    def f(s: float, dv: float, v: float) -> float:
-        return float(idm_acceleration(v, v + dv, s, humans))
-
-    f_s = (f(gap + small, 0.0, speed) - f(gap - small, 0.0, speed)) / (2.0 * small)
-    f_dv = (f(gap, small, speed) - f(gap, -small, speed)) / (2.0 * small)
-    f_v = (f(gap, 0.0, speed + small) - f(gap, 0.0, speed - small)) / (2.0 * small)
-    s = 1j * frequencies
-    return np.abs((f_dv * s + f_s) / (s**2 + (f_dv - f_v) * s + f_s))

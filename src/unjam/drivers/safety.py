@@ -43,7 +43,11 @@ class Actuator(Subclassable):
 
     def initial_state(self, like: Array, step: float) -> ActuatorState:
         """Return the state without acceleration and commands, for vehicles in the shape of `like`."""
-        return ActuatorState(0.0 * like, (0.0 * like,) * round(self.delay / step))
+        return ActuatorState(0.0 * like, (0.0 * like,) * self.delay_steps(step))
+
+    def delay_steps(self, step: float) -> int:
+        """Return the number of simulation steps until a command arrives."""
+        return round(self.delay / step)
 
     def apply_command(self, command: Array, speed: Array, state: ActuatorState, step: float) -> ActuatorState:
         """Return the state after a command, with the acceleration for this step; brakes cannot reverse a vehicle."""
@@ -64,6 +68,10 @@ class Actuator(Subclassable):
     def _lag_decay(self, step: float) -> float:
         """Return the share of the difference to a command that remains after one step."""
         return exp(-step / self.lag) if self.lag else 0.0
+
+
+INSTANT_ACTUATOR = Actuator()
+"""a vehicle that responds to commands at once"""
 
 
 class FollowingState(NamedTuple):

@@ -14,7 +14,7 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface
 from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION
-from unjam.drivers.safety import FollowingState, SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, ActuatorState, FollowingState, SafetyFilter
 from unjam.drivers.sensors import MIN_SENSED_GAP
 from unjam.drivers.speed_history import MAX_WINDOW_STEPS
 from unjam.errors import InputError
@@ -34,6 +34,8 @@ SPEED_STD_SCALE, MEAN_GAP_SCALE = 2.0, 20.0
 """divisors of the standard deviation of speed [m/s] and of the mean gap [m] in network inputs"""
 MEAN_KEYS = ("mean_speed", "mean_square", "mean_gap")
 """names of the means in the memory, before their averaging time"""
+MAX_DELAY_ERROR = 1e-9
+"""allowed difference between the delay of an actuator and whole control steps [s]"""
 MAX_GATHERING_TIME = 30.0
 """time in which all vehicles gather if their queue fits on the road [s]"""
 MIN_SHARED_PENETRATION_RATE = 0.06
@@ -178,8 +180,9 @@ class ImpairedDriver(DriverWrapper):
 class FilteredDriver(DriverWrapper):
     """Another driver with the limits and the safety filter of a road, for a vehicle without its own filter.
 
-    Controllers are exported in this form: the driver carries the proven filter with it, for a vehicle without
-    actuator delay. On a road with the same filter and one simulation step per control step, nothing changes.
+    Controllers are exported in this form: the driver carries the proven filter with it, which knows the actuator of
+    the vehicle and its pending commands. On a road with the same filter and actuator and one simulation step per
+    control step, nothing changes.
     """
 
     own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
@@ -190,17 +193,46 @@ class FilteredDriver(DriverWrapper):
     safety: SafetyFilter
     time_step: Positive
     """control step [s]"""
+    actuator: Actuator = INSTANT_ACTUATOR
+    """delay and lag of the vehicle that carries out the commands"""
+
+    @model_validator(mode="after")
+    def _check_delay(self) -> "FilteredDriver":
+        delay, step = self.actuator.delay, self.time_step
+        if abs(delay - step * self.actuator.delay_steps(step)) > MAX_DELAY_ERROR:
+            raise ValueError(f"actuator.delay: {delay:g} is not allowed; allowed: whole control steps of {step:g} s")
+        return self
 
     @cached_property
     def limits(self) -> Limits:
         """Limits of the result: those of the driver, and the brakes of the vehicle."""
         return Limits(-max(self.action_limit, self.safety.braking), self.action_limit)
 
+    def initial_memory(self, n: int) -> Memory:
+        """Return the memory of the inner driver, and an actuator without acceleration and pending commands."""
+        at_rest = self.actuator.initial_state(np.zeros(n), self.time_step)
+        return {**super().initial_memory(n), **self._actuator_memory(at_rest)}
+
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the filtered acceleration of the inner driver, and the new memory."""
         acceleration, after = self.driver.act(state, memory[INNER_KEY])
         acceleration = clip(acceleration, -self.action_limit, self.action_limit)
-        return self.safety.limit(acceleration, FollowingState(*state[:3]), self.time_step), {INNER_KEY: after}
+        following, actuator, step = FollowingState(*state[:3]), self.actuator, self.time_step
+        if actuator.is_instant:
+            return self.safety.limit(acceleration, following, step), {INNER_KEY: after}
+        before = ActuatorState(memory["acceleration"], tuple(memory[key] for key in self._pending_keys))
+        command = self.safety.limit(acceleration, following, step, (actuator, before))
+        responding = actuator.apply_command(command, state.speed, before, step)
+        return command, {INNER_KEY: after, **self._actuator_memory(responding)}
+
+    @cached_property
+    def _pending_keys(self) -> tuple[str, ...]:
+        return tuple(f"pending_{number}" for number in range(self.actuator.delay_steps(self.time_step)))
+
+    def _actuator_memory(self, state: ActuatorState) -> Memory:
+        if self.actuator.is_instant:
+            return {}
+        return {"acceleration": state.acceleration, **dict(zip(self._pending_keys, state.pending, strict=True))}
 
     def describe(self) -> str:
         """Return the inner driver, and that it is filtered."""

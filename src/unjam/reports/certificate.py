@@ -34,6 +34,7 @@ def write_certificate_page(name: str, driver: FilteredDriver, certificate: dict[
         safety=driver.safety,
         step=f"{driver.time_step:g}",
         string_stability=strings,
+        actuator=driver.actuator,
         attack_figure=data_uri(_attack_figure(worst["attack"])),
         string_figure=data_uri(_string_figure(strings)),
         domain=[(label, certificate["domain"][key], unit) for label, key, unit in DOMAIN_QUANTITIES],
@@ -49,8 +50,8 @@ def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
         if each["amplified_band"]:
             low, high = each["amplified_band"]
             notes.append(
-                f"At {each['speed']:g} m/s it amplifies oscillations between {low:.2f} and {high:.2f} rad/s, by up to "
-                f"{max(each['gains']):.2f} times; so it stabilizes no human drivers behind it there."
+                f"At {each['speed']:g} m/s it amplifies oscillations between {low:.3g} and {high:.3g} Hz, by up to "
+                f"{max(each['gains']):.2f} times: it is not string stable."
             )
     return notes
 
@@ -73,7 +74,7 @@ def _string_figure(string_stability: list[dict[str, Any]]) -> Figure:
         axes.semilogx(each["frequencies"], each["gains"], color=CAV_PLOT_COLOR, label="controller")
         human = {"color": LINE_COLORS[2], "ls": "--", "label": "human driver (IDM)"}
         axes.semilogx(each["frequencies"], each["human_gains"], **human)
-        axes.set(xlabel="frequency [rad/s]", title=f"{each['speed']:g} m/s")
+        axes.set(xlabel="frequency [Hz]", title=f"{each['speed']:g} m/s")
     panels[0].set_ylabel("gain")
     panels[0].legend()
     return figure

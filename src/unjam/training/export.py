@@ -127,12 +127,9 @@ def export_controller(
         reason = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
         raise InputError(f"export: {driver.describe()} is not allowed: {reason}; allowed: drivers without Python code")
     model = _residual_model(driver, metadata) if stable_baselines3 else None
-    if road.safety.active and not road.actuator.is_instant:
-        latency = f"actuator.delay {road.actuator.delay:g}, actuator.lag {road.actuator.lag:g}"
-        raise InputError(f"export: {latency} is not allowed: the filter of a file ignores them; allowed: 0 and 0")
     if road.safety.active and not isinstance(driver, FilteredDriver):
         max_acceleration = (driver.limits or road.acceleration_limits).highest
-        driver = FilteredDriver(driver, max_acceleration, road.safety, road.control_step)
+        driver = FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
     low, high = driver.limits or road.acceleration_limits
     limit = max(-low, high)
     backend = read_config(source).episode_backend if source.is_dir() else "sumo"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, Limits, commanded_accelerations
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.safety import FollowingState
+from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, FollowingState
 from unjam.physics.arrays import Array, Floats
 from unjam.physics.kinematics import next_speed
 from unjam.tree import Arrays
@@ -143,10 +143,15 @@ class CarFollowingWorld(_OfflineWorld):
         limits: Limits,
         step: float,
         loop_length: float = np.nan,
+        actuator: Actuator = INSTANT_ACTUATOR,
     ) -> None:
-        """Take the pairs' initial state, arrays of shape (n,), and leaders' accelerations [m/s2], shape (T, n)."""
+        """Take the pairs' initial state, arrays of shape (n,), and leaders' accelerations [m/s2], shape (T, n).
+
+        The CAVs start without acceleration and pending commands.
+        """
         self.limits, self._step = limits, step
         self._states = [FollowingState(*(np.array(values, np.float64) for values in initial_state))]
+        self._actuator, self._actuator_state = actuator, actuator.initial_state(self._states[0].speed, step)
         self._leader_accelerations = np.asarray(leader_accelerations, np.float64)
         self.cav_count = self.entered_count = len(initial_state.speed)
         self._position, self._loop_length = np.zeros(self.cav_count), np.full(self.cav_count, loop_length)
@@ -166,7 +171,9 @@ class CarFollowingWorld(_OfflineWorld):
         """Make one step of all pairs."""
         assert command is not None
         before, step = self._states[-1], self._step
-        speed = next_speed(before.speed, self.limits.clip(np.asarray(command.acceleration)), step)
+        acceleration = self.limits.clip(np.asarray(command.acceleration))
+        self._actuator_state = self._actuator.apply_command(acceleration, before.speed, self._actuator_state, step)
+        speed = next_speed(before.speed, self._actuator_state.acceleration, step)
         leader = next_speed(before.leader_speed, self._leader_accelerations[len(self._states) - 1], step)
         self._position = self._position + speed * step
         self._states.append(FollowingState(speed, leader, before.gap + (leader - speed) * step))

@@ -1,0 +1,136 @@
+"""String stability: how strongly a vehicle passes on small oscillations of its leader's speed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from unjam.drivers.safety import FollowingState
+from unjam.drivers.wrappers import FilteredDriver
+from unjam.physics.arrays import Floats
+from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
+from unjam.worlds.drive import drive_world
+from unjam.worlds.world import CarFollowingWorld
+
+OSCILLATION_FREQUENCIES = np.geomspace(0.001, 1.0, 25)
+"""frequencies at which leaders oscillate [Hz]: from waves of a quarter of an hour to sways of a second"""
+OSCILLATION_AMPLITUDE = 0.05
+"""amplitude of a leader's speed as a share of its mean; small, so that the response is nearly linear"""
+SETTLING_SECONDS = 300.0
+"""time behind a leader with constant speed, before the oscillations start"""
+GAIN_TOLERANCE = 0.02
+"""a vehicle counts as string stable with gains up to one plus this tolerance"""
+OPERATING_SPEED_RATIOS = (0.5, 1.0, 1.5)
+"""speeds at which vehicles are tested, as shares of the mean speed of CAVs on their road"""
+MIN_OPERATING_SPEED = 1.0
+"""smallest speed of a test [m/s]"""
+MAX_FOLLOWERS = 60
+"""maximum number of human drivers behind a CAV"""
+
+
+@dataclass(frozen=True)
+class StringStability:
+    """Response to oscillations of the leader around one speed [m/s] at several frequencies [Hz]."""
+
+    speed: float
+    frequencies: tuple[float, ...]
+    gains: tuple[float, ...]
+    """amplitude of the CAV divided by that of the leader, at each frequency"""
+    human_gains: tuple[float, ...]
+    """gain of a human driver at each frequency, by the linearized IDM"""
+    peak_frequency: float
+    """frequency of the CAV's largest gain"""
+    amplified_band: tuple[float, ...]
+    """smallest and largest frequency that the CAV amplifies beyond the tolerance; empty if there is none"""
+    max_stable_followers: int
+    """maximum number of human drivers behind the CAV without amplification by all of them together"""
+
+
+def operating_speeds(mean_speed: float, humans: IDMParameters) -> list[float]:
+    """Return the speeds of the tests for a road on which CAVs drive with a mean speed [m/s]."""
+    speeds = (round(ratio * mean_speed, 1) for ratio in OPERATING_SPEED_RATIOS)
+    return [speed for speed in speeds if MIN_OPERATING_SPEED < speed < humans.desired_speed]
+
+
+def measure_string_stability(
+    driver: FilteredDriver, speeds: Sequence[float], humans: IDMParameters, loop_length: float = np.nan
+) -> tuple[StringStability, ...]:
+    """Return the response of a vehicle at each speed [m/s], in simulations that are deterministic.
+
+    `humans` drive behind it; `loop_length` is that of its closed road [m].
+    """
+    gains = string_gains(driver, speeds, humans, loop_length)
+    return tuple(_string_stability(*each, humans) for each in zip(speeds, gains, strict=True))
+
+
+def string_gains(
+    driver: FilteredDriver, speeds: Sequence[float], humans: IDMParameters, loop_length: float = np.nan
+) -> Floats:
+    """Return the gain at each speed [m/s] and each of the `OSCILLATION_FREQUENCIES`, shape (speeds, frequencies).
+
+    All leaders are simulated at once, each with one CAV behind it. The filter, the limits and the actuator of the
+    driver act, and the CAV starts with the gap of human drivers.
+    """
+    if not speeds:
+        return np.zeros((0, len(OSCILLATION_FREQUENCIES)))
+    step, count = driver.time_step, len(OSCILLATION_FREQUENCIES)
+    times: Floats = step * np.arange(round((SETTLING_SECONDS + 1.0 / OSCILLATION_FREQUENCIES[0]) / step) + 1.0)
+    phases = 2.0 * np.pi * OSCILLATION_FREQUENCIES * np.clip(times - SETTLING_SECONDS, 0.0, None)[:, None]
+    means = np.repeat(speeds, count)
+    gaps = np.repeat([equilibrium_gap(speed, humans) for speed in speeds], count)
+    leaders = means * np.tile(1.0 + OSCILLATION_AMPLITUDE * np.sin(phases), len(speeds))
+    start = FollowingState(means, means, gaps)
+    world = CarFollowingWorld(start, np.diff(leaders, axis=0) / step, driver.limits, step, loop_length, driver.actuator)
+    responses = drive_world(world, driver).speed.reshape(len(times), len(speeds), count)
+    amplitudes = [
+        [_amplitude(response, times, each) for response, each in zip(rows, OSCILLATION_FREQUENCIES, strict=True)]
+        for rows in responses.transpose(1, 2, 0)
+    ]
+    return np.array(amplitudes) / (OSCILLATION_AMPLITUDE * np.array(speeds)[:, None])
+
+
+def human_gain(frequencies: Floats, speed: float, humans: IDMParameters) -> Floats:
+    """Return the gain of a human driver at frequencies [Hz], by the linearized IDM at equilibrium.
+
+    |(f_dv j w + f_s) / ((j w)^2 + (f_dv - f_v) j w + f_s)|, where f(s, dv, v) is the acceleration, dv the
+    leader's speed minus the own, f_v its derivative at constant dv, and w the frequency in rad/s.
+    Source: Treiber and Kesting 2013, Traffic Flow Dynamics, chapter 15.
+    """
+    gap, small = equilibrium_gap(speed, humans), 1e-5
+
+    def f(s: float, dv: float, v: float) -> float:
+        return float(idm_acceleration(v, v + dv, s, humans))
+
+    f_s = (f(gap + small, 0.0, speed) - f(gap - small, 0.0, speed)) / (2.0 * small)
+    f_dv = (f(gap, small, speed) - f(gap, -small, speed)) / (2.0 * small)
+    f_v = (f(gap, 0.0, speed + small) - f(gap, 0.0, speed - small)) / (2.0 * small)
+    s = 2j * np.pi * frequencies
+    return np.abs((f_dv * s + f_s) / (s**2 + (f_dv - f_v) * s + f_s))
+
+
+def _string_stability(speed: float, gains: Floats, humans: IDMParameters) -> StringStability:
+    frequencies = OSCILLATION_FREQUENCIES
+    amplified = frequencies[gains > 1.0 + GAIN_TOLERANCE]
+    human_gains = human_gain(frequencies, speed, humans)
+    stable = [n for n in range(MAX_FOLLOWERS + 1) if (gains * human_gains**n).max() <= 1.0 + GAIN_TOLERANCE]
+    return StringStability(
+        speed,
+        tuple(frequencies.tolist()),
+        tuple(gains.tolist()),
+        tuple(human_gains.tolist()),
+        float(frequencies[int(np.argmax(gains))]),
+        (float(amplified[0]), float(amplified[-1])) if len(amplified) else (),
+        max(stable, default=0),
+    )
+
+
+def _amplitude(values: Floats, times: Floats, frequency: float) -> float:
+    """Return the amplitude at a frequency [Hz] over its last whole periods, at most half of the measured time.
+
+    Of the lowest frequency, there is only one period.
+    """
+    period = 1.0 / frequency
+    duration = max(1, int((times[-1] - SETTLING_SECONDS) / 2.0 / period)) * period
+    measured = times > times[-1] - duration
+    wave = (values[measured] - values[measured].mean()) * np.exp(-2j * np.pi * frequency * times[measured])
+    return float(2.0 * np.abs(wave.mean()))
