@@ -43,8 +43,8 @@ with at most 6 m/s²). Verdicts are about trainings without it; where these are 
 and the verdict with the filter stand here. Merges have no filter in either column.
 
 - *Held* and *not held*: the 95 % interval of the difference lies on one side of zero. It is over trainings, those of
-  the same seed paired, all on the same seeds of traffic. A claim about several others holds if each interval does, and
-  does not hold if one lies on the other side; the difference that decides is shown.
+  the same seed paired, on one set of traffic seeds: other seeds would widen it. A claim about several others holds if
+  each interval is on its side, and does not hold if one is on the other side; the difference that decides is shown.
 - *Undecided*: the interval includes zero. Brackets have an interval, parentheses the range where trainings form two
   groups, which have no interval.
 - *By the expert alone*: the residual is not shown to be better than PI, its expert, without any learning. The paper has
