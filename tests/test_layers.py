@@ -167,6 +167,11 @@ def test_only_the_command_line_prints_with_its_libraries() -> None:
     assert {part_of(module) for module in found - {"unjam_paper/cli.py"}} == {"cli"}
 
 
+def test_dataclasses_are_checked_in_one_way_whose_errors_are_one_line() -> None:
+    found = {module for module, tree in MODULES.items() if "pydantic.dataclasses" in imported_modules(tree)}
+    assert found == {"parameters.py"}
+
+
 def test_signatures_are_checked_in_one_place() -> None:
     assert importers({"cryptography"}) == {"controller/signature.py"}
     assert "cryptography" not in loaded_by("import unjam.controller.verify")

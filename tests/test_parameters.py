@@ -29,6 +29,7 @@ from unjam.parameters import (
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import FigureEight, Motorway, Ramp, Ring, make_scenario
 from unjam.scenarios.scenario import CruiseControl
+from unjam.training.config import EvaluationSettings, RunConfig
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -300,10 +301,15 @@ def test_computed_values_and_constructors_of_a_subclass_remain_its_own() -> None
         (lambda: Ring(cavs=23), "Ring.cavs: 23 is not allowed; allowed: <= vehicles, 22"),
         (lambda: type("Short", (Ring,), {"horizon": 0})(), "Short.horizon: 0 is not allowed"),
         (lambda: IDMParameters(exponent=-1.0), "IDMParameters.exponent: -1.0 is not allowed"),
+        (lambda: RunConfig(steps=0), "steps: 0 is not allowed; allowed: greater than or equal to 1"),
+        (lambda: replace(RunConfig(), backend="batch", scenario="merge"), "backend: batch is not allowed"),
+        (lambda: RunConfig(scenario_options={"horizon": 0}), "scenario ring.horizon: 0 is not allowed"),
+        (lambda: cast(Any, RunConfig)(trpo={"gamma": 2}), "trpo.gamma: 2 is not allowed; allowed: less than 1"),
+        (lambda: EvaluationSettings(episodes=0), "EvaluationSettings.episodes: 0 is not allowed"),
         (lambda: cast(Any, CalibrationSettings)(pears=0), "CalibrationSettings.pears: unknown name"),
     ],
 )
 def test_an_invalid_value_in_python_is_one_line(make: Any, message: str) -> None:
-    with pytest.raises(InputError, match=re.escape(message)) as refused:
+    with pytest.raises(InputError, match="^" + re.escape(message)) as refused:
         make()
     assert "\n" not in str(refused.value)

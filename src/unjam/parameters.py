@@ -167,8 +167,11 @@ def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) 
 
 
 @dataclass_transform(field_specifiers=(field, Field))
-def parameter_dataclass(**options: Any) -> Callable[[type[DataclassT]], type[DataclassT]]:
-    """Decorate as pydantic's `dataclass` does; an invalid value in Python is an `InputError` of one line."""
+def parameter_dataclass(label: str | None = None, **options: Any) -> Callable[[type[DataclassT]], type[DataclassT]]:
+    """Decorate as pydantic's `dataclass` does; an invalid value in Python is an `InputError` of one line.
+
+    The line begins with `label`, by default the name of the class.
+    """
 
     def decorate(kind: type[DataclassT]) -> type[DataclassT]:
         made: Any = dataclass(**options)(kind)
@@ -179,7 +182,7 @@ def parameter_dataclass(**options: Any) -> Callable[[type[DataclassT]], type[Dat
             try:
                 make(self, *args, **kwargs)
             except ValidationError as error:
-                raise InputError(validation_message(error, made.__name__, made)) from None
+                raise InputError(validation_message(error, made.__name__ if label is None else label, made)) from None
 
         made.__init__ = init
         return made

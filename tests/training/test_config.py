@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,7 +12,7 @@ from unjam.drivers import PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.errors import InputError
 from unjam.learners.settings import AGENT_NAMES, PolicySettings, TRPOSettings
-from unjam.parameters import merge_changes, read_toml
+from unjam.parameters import merge_changes, nest_keys, read_toml
 from unjam.training.config import EvaluationSettings, RunConfig, load_config, to_toml
 from unjam.training.presets import preset_values
 from unjam.training.seeds import TEST_SEED, VALIDATION_SEED
@@ -281,6 +282,29 @@ def test_conflict_with_all_tasks_of_a_preset_is_refused(changes: dict[str, Any],
     assert load_config(None, "rings", {"scenario_options.horizon": 200}).make_tasks()[0].scenario.horizon == 200
 
 
-def test_options_of_a_users_agent_are_refused_with_an_agent_of_the_package() -> None:
-    with pytest.raises(InputError, match=r"user\.options is not allowed; allowed: none for the agent trpo"):
-        load_config(changes={"user.options": {"x": 1}})
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"user.options": {"x": 1}}, "user.options: {'x': 1} is not allowed; allowed: none for the agent trpo"),
+        ({"agent": "td3", "user.gamma": 0.5}, "user.gamma: 0.5 is not allowed; allowed: none for the agent td3"),
+        *(
+            ({"agent": "my.py:A", **values}, f"{name} is not allowed; allowed: none for the agent my.py:A")
+            for values, name in (
+                ({"trpo.gamma": 0.5}, "trpo.gamma: 0.5"),
+                ({"sac": {"tau": 0.1}, "user.gamma": 0.5}, "sac.tau: 0.1"),
+            )
+        ),
+    ],
+)
+def test_settings_of_an_agent_of_another_kind_are_refused(changes: dict[str, Any], line: str, tmp_path: Path) -> None:
+    (tmp_path / "my.toml").write_text(tomli_w.dumps(nest_keys(changes)))
+    for make in (lambda: load_config(changes=changes), lambda: load_config(tmp_path / "my.toml")):
+        with pytest.raises(InputError) as refused:
+            make()
+        assert str(refused.value) == line
+
+
+def test_settings_of_a_preset_for_other_agents_are_left_out(tmp_path: Path) -> None:
+    made = load_config(preset="rings", changes={"agent": "my.py:A"})
+    (tmp_path / "config.toml").write_text(to_toml(made))
+    assert load_config(tmp_path / "config.toml") == made

@@ -16,6 +16,7 @@ from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.errors import InputError
 from unjam.learners.algorithm import TaskEpisodes
+from unjam.learners.settings import unused_tables
 from unjam.reports.results import read_progress
 from unjam.training.config import RunConfig, load_config
 from unjam.training.run_folder import create_run_folder, load_checkpoint, resume_run_folder, save_checkpoint
@@ -43,6 +44,8 @@ def small_config(**changes: Any) -> RunConfig:
         "steps": 2 * STEPS,
         "workers": 1,
     }
+    unused = unused_tables(changes.get("agent", "trpo"))
+    small = {key: value for key, value in small.items() if key not in unused}
     return load_config(changes={**small, **{key.replace("__", "."): value for key, value in changes.items()}})
 
 

@@ -65,6 +65,8 @@ def test_trial_differs_from_the_base_only_in_its_values() -> None:
     changed = trial_config(BASE, {"trpo.gamma": 0.5, "scenario_options.vehicles": 7})
     assert (changed.trpo.gamma, changed.make_scenario().possible_cav_ids()) == (0.5, ("cav_0",))
     assert trial_config(changed, {"trpo.gamma": BASE.trpo.gamma, "scenario_options.vehicles": 8}) == BASE
+    preset, agent = load_config(preset="rings"), {"agent": "my.py:A"}
+    assert trial_config(preset, agent) == load_config(preset="rings", changes=agent)
 
 
 def test_validation_gain_is_the_best_validation_minus_the_expert(tmp_path: Path) -> None:

@@ -7,14 +7,13 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, StrictFloat, StrictInt, StrictStr
-from pydantic.dataclasses import dataclass
 
 from unjam import __version__
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import STATE_UNITS
 from unjam.errors import InputError, invalid_value
 from unjam.files import parse_json
-from unjam.parameters import STRICT, build_dataclass
+from unjam.parameters import STRICT, build_dataclass, parameter_dataclass
 from unjam.tree import leaves
 
 MANIFEST_FORMAT = 5
@@ -23,7 +22,7 @@ JsonObject = dict[str, Any]
 _StrictPositive = Annotated[StrictFloat, Field(gt=0)]
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class Manifest:
     """Names and types of all entries of a manifest; no other entry is allowed."""
 

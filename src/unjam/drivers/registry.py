@@ -5,7 +5,6 @@ from inspect import signature
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, AdaptiveACC, Constant, FollowerStopper, Human
 from unjam.drivers.driver import Driver, Recipe
@@ -25,14 +24,7 @@ from unjam.drivers.wrappers import (
 )
 from unjam.errors import InputError, invalid_value, spelling_hint
 from unjam.files import to_json
-from unjam.parameters import (
-    build_dataclass,
-    check_part,
-    check_values,
-    is_packaged,
-    split_parameters,
-    validation_message,
-)
+from unjam.parameters import build_dataclass, check_part, check_values, is_packaged, split_parameters
 from unjam.tree import Arrays, named_parts, pack, unpack
 
 _DRIVER_CLASSES = (
@@ -116,8 +108,6 @@ def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
     check_values(recipe, "driver recipe")
     try:
         driver = unpack(Driver, recipe, weights, {Driver: DRIVER_CLASSES})
-    except ValidationError as error:
-        raise InputError(validation_message(error, "driver recipe")) from None
     except ValueError as error:
         raise InputError(f"driver recipe: {error}") from None
     for each in (each for each in _all_drivers(driver) if isinstance(each, ResidualDriver)):

@@ -4,7 +4,7 @@ A new learner of the package needs a file that makes it, its settings here, whic
 `AgentSettings`; one of a user's own needs none of this: `agent = "path.py:Class"`.
 """
 
-from dataclasses import field
+from dataclasses import field, fields
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
@@ -193,6 +193,11 @@ AgentName = Annotated[str, AfterValidator(_check_agent_name)]
 """one of `AGENT_NAMES`, or `path.py:Class`"""
 
 
+def unused_tables(agent: str) -> tuple[str, ...]:
+    """Return the tables that must be empty with an agent; a configuration may have settings for all of the package."""
+    return ("user",) if agent in AGENT_NAMES else AGENT_NAMES
+
+
 @parameter_dataclass(frozen=True, config=STRICT)
 class AgentSettings:
     """The chosen learner, and the settings of each one in the table of its name."""
@@ -209,3 +214,14 @@ class AgentSettings:
     def learner(self) -> LearnerSettings:
         """The settings of the chosen agent."""
         return getattr(self, self.agent if self.agent in AGENT_NAMES else "user")
+
+    @property
+    def unused_setting(self) -> str:
+        """A setting without use that differs from its default, with its value; empty: none."""
+        for name in unused_tables(self.agent):
+            settings = getattr(self, name)
+            for each in fields(settings):
+                value = getattr(settings, each.name)
+                if value != getattr(type(settings)(), each.name):
+                    return f"{name}.{each.name}: {value!r}"
+        return ""

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import tomli_w
 from pydantic import AfterValidator, Field, model_validator
-from pydantic.dataclasses import dataclass
 from pydantic_core import ArgsKwargs
 
 from unjam.drivers.car_following import Constant
@@ -18,7 +17,7 @@ from unjam.drivers.observation import observation_inputs
 from unjam.drivers.user_driver import is_file_reference, object_label, object_reference
 from unjam.drivers.wrappers import HistoryDriver
 from unjam.errors import InputError, invalid_value
-from unjam.learners.settings import AGENT_NAMES, AgentSettings, PolicySettings
+from unjam.learners.settings import AgentSettings, PolicySettings, unused_tables
 from unjam.models.settings import ModelSettings
 from unjam.parameters import (
     STRICT,
@@ -30,6 +29,7 @@ from unjam.parameters import (
     flatten_keys,
     merge_changes,
     nest_keys,
+    parameter_dataclass,
     read_toml,
 )
 from unjam.scenarios import default_scenario, make_scenario, without_toml_file
@@ -46,7 +46,7 @@ CONFIG_FILE = "config.toml"
 """the configuration in the folder of a run or of a search"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class EvaluationSettings:
     """Validation and evaluation of a run, with the deterministic policy; their steps do not count as training."""
 
@@ -88,7 +88,7 @@ class EvaluationSettings:
         return since >= self.patience
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass(frozen=True, config=STRICT)
 class TaskConfig:
     """One of several roads of a training; missing and empty entries are those of the run."""
 
@@ -103,7 +103,7 @@ class TaskConfig:
     """name of its folder; empty: the scenario's"""
 
 
-@dataclass(frozen=True, config=STRICT)
+@parameter_dataclass("", frozen=True, config=STRICT)
 class RunConfig(AgentSettings):
     """One training run. Every key can be set in a TOML file, by `--set key=value`, and in Python."""
 
@@ -163,7 +163,7 @@ class RunConfig(AgentSettings):
         checks = (
             (self.backend == "batch" and all(reasons), "backend: batch", f"sumo ({reasons[0]})"),
             (policy.reward_after_exit and model == "row", "policy.reward_after_exit: true", "false with a row model"),
-            (self.user.options and self.agent in AGENT_NAMES, "user.options", f"none for the agent {self.agent}"),
+            (self.unused_setting, self.unused_setting, f"none for the agent {self.agent}"),
             (no_memory, "policy.history_features: true", "false without the input expert_memory"),
             (no_validation, f"evaluation.patience: {patience}", "0 without validations"),
             (model == "road" and device != "cpu", f"model.device: {device}", "cpu, for road models"),
@@ -222,10 +222,7 @@ class RunConfig(AgentSettings):
 
     def make_scenario(self) -> Scenario:
         """Return the scenario with its options."""
-        try:
-            return make_scenario(self.scenario, self.scenario_options)
-        except InputError as error:
-            raise ValueError(str(error)) from None
+        return make_scenario(self.scenario, self.scenario_options)
 
     def make_expert(self) -> Driver:
         """Return the driver to which the residual is added."""
@@ -267,7 +264,8 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
         values = {**preset_values(preset, scenario_name), "preset": preset}
         if "tasks" in values and "tasks" not in user_values:
             _check_preset_conflicts(preset, values["tasks"], user_values)
-    values = merge_changes(values, user_values)
+    unused = unused_tables({"agent": RunConfig.agent, **values, **user_values}["agent"])
+    values = merge_changes({key: value for key, value in values.items() if key not in unused}, user_values)
     model = values.get("model", {})
     if scenario.actuation == "cruise" and isinstance(model, dict) and model.get("kind", "row") == "row":
         # The row model cannot represent the ACC of a CAV: the default is to have no model.

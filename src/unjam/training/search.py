@@ -18,6 +18,7 @@ from optuna.trial import TrialState, create_trial
 
 from unjam.errors import InputError, UnjamError, invalid_value
 from unjam.files import atomic_write, to_json
+from unjam.learners.settings import unused_tables
 from unjam.manifest import manifest
 from unjam.parameters import merge_changes, nest_keys
 from unjam.reports.results import read_progress, validation_gains
@@ -41,7 +42,9 @@ def check_search_space(base: RunConfig, space: SearchSpace) -> None:
 
 def trial_config(base: RunConfig, values: dict[str, Any]) -> RunConfig:
     """Return a configuration with some values changed; keys may have dots."""
-    return load_config(changes=merge_changes(asdict(base), nest_keys(values)))
+    unused = unused_tables(values.get("agent", base.agent))
+    kept = {key: value for key, value in asdict(base).items() if key not in unused}
+    return load_config(changes=merge_changes(kept, nest_keys(values)))
 
 
 @dataclass(frozen=True)

@@ -167,5 +167,5 @@ def test_it_is_no_exact_road_and_driven_only_where_that_is_asked_for() -> None:
 
 def test_a_training_on_it_may_be_batched() -> None:
     assert RunConfig(scenario="figure-eight", backend="batch").backend == "batch"
-    with pytest.raises(ValueError, match="backend"):
+    with pytest.raises(InputError, match="backend"):
         RunConfig(scenario="merge", backend="batch")
