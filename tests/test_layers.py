@@ -336,6 +336,7 @@ CHANGES_THE_PROCESS = {
     "following/networks": "in the command line",
     "unjam_paper/theory": "in the command line",
     "worlds/worker": "in a worker",
+    "worlds/episode": "for the length of an episode, under a lock, and restored",
     "worlds/messages": "in a worker, or in a process that runs SUMO",
     "cli/__init__": "in the command line",
     "cli/controllers": "in the command line",

@@ -237,3 +237,14 @@ def test_objects_without_a_file_are_refused_without_a_guess() -> None:
             unjam.load_config(changes={"expert": value})
         with pytest.raises(InputError, match=r"^expert: .*allowed: path\.py:name$"):
             replace(RunConfig(), expert=value)
+
+
+def test_an_episode_of_a_seed_draws_the_same_numbers_from_torch_and_restores_its_generator() -> None:
+    def noisy(state: LocalState) -> Any:
+        return 0.0 * state.speed + torch.rand(1).item()
+
+    before, ring = torch.get_rng_state(), unjam.make_scenario("ring", {"horizon": 5})
+    first, other, again = (unjam.run_episode(ring, noisy, seed).speeds for seed in (1, 2, 1))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert torch.equal(torch.get_rng_state(), before)

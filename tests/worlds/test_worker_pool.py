@@ -1,4 +1,5 @@
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -17,9 +18,8 @@ from tests.conftest import random_network
 from tests.worlds.sumo.user_networks import straight
 from tests.worlds.test_record import fingerprint
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation, ResidualDriver
-from unjam.drivers.registry import driver_from_name
 from unjam.drivers.safety import SafetyFilter
-from unjam.drivers.user_driver import FileDriver
+from unjam.drivers.user_driver import FileDriver, FileReference
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
@@ -589,12 +589,19 @@ class Noisy:
 """
 
 
-def test_a_driver_with_global_random_numbers_gives_the_same_episode_in_every_worker(tmp_path: Path) -> None:
+def test_a_driver_with_global_random_numbers_gives_the_same_episode_in_every_process(tmp_path: Path) -> None:
     (tmp_path / "noisy.py").write_text(RANDOM_DRIVER)
-    task = EpisodeTask(Ring(horizon=20), driver_from_name(f"{tmp_path / 'noisy.py'}:Noisy", 0.1), (5,))
+    reference = FileReference.parse(f"{tmp_path / 'noisy.py'}:Noisy")
+    task = EpisodeTask(Ring(horizon=20), FileDriver(reference.path, reference.name), (5,))
     speeds = list[Any]()
     for _ in range(2):
         with WorkerPool(2) as workers:
             speeds += [episode.speeds for episode in workers.run([replace(task, seed=(4,)), task, task])[1:]]
+    states = [(random.seed(1), random.getstate())[1], (np.random.seed(2), np.random.get_state())[1]]
+    kind = reference.load_object()
+    speeds += [run_episode(task.scenario, kind, seed).speeds for seed in (5, 4, 5)][::2]
+    with ThreadPoolExecutor(2) as threads:
+        list(threads.map(lambda seed: run_episode(task.scenario, kind, seed), (1, 2)))
+    np.testing.assert_equal([random.getstate(), np.random.get_state()], states)
     for other in speeds[1:]:
         np.testing.assert_array_equal(other, speeds[0])

@@ -1,9 +1,13 @@
 """Episodes as a pure function: `run_episode(scenario, driver, seed) -> Episode`."""
 
-from collections.abc import Sequence
+import random
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from operator import index
-from typing import SupportsIndex
+from typing import Any, SupportsIndex
 
 import numpy as np
 
@@ -18,6 +22,10 @@ from unjam.worlds.drive import drive_world
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import Reward, RewardLike, episode_reward_terms, make_reward
 from unjam.worlds.world import ProgressCallback
+
+_generators_lock = threading.Lock()
+_generator_states: list[tuple[Any, Any, Any]] = []
+"""states of the global generators before the first of the running blocks of `seeded_generators`, for each of them"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +59,7 @@ def run_episode(
     """Run one episode and return its record.
 
     The result depends only on scenario, driver, seed, reward, `explore`, backend and `stop_at_contact`, not on the
-    process, earlier episodes in it, or the clock.
+    process, earlier episodes in it, or the clock. For the user's code the global generators are seeded meanwhile.
 
     Args:
         scenario: road, traffic and horizon.
@@ -74,17 +82,45 @@ def run_episode(
             stepped or closed a simulation through libsumo meanwhile (`LostWorkerError`).
         UnjamError: another episode runs in the backend.
     """
-    driver, seed = as_driver(driver, scenario.control_step), as_seed(seed)
+    seed = as_seed(seed)
+    with seeded_generators(seed):
+        driver = as_driver(driver, scenario.control_step)  # makes an object of a class
     check_can_drive(driver, scenario)
     reward_function = make_reward(reward or scenario.reward)
     needs = driver.requirements(scenario.interface)
     options = WorldOptions(needs.measured_fields, record_details, not needs.needs_arrays, stop_at_contact)
-    with open_backend(backend) as simulator:
+    with seeded_generators(seed), open_backend(backend) as simulator:
         check_support(simulator, scenario)
         with open_world(simulator, scenario, seed, options) as world:
             episode = drive_world(world, driver, explore, on_progress=on_progress)
-    check_has_cavs(episode, driver)
-    return add_reward_terms(episode, reward_function)
+        check_has_cavs(episode, driver)
+        return add_reward_terms(episode, reward_function)
+
+
+@contextmanager
+def seeded_generators(seed: Sequence[int]) -> Iterator[None]:
+    """Seed the global generators of Python, NumPy and torch (on the CPU, if it is loaded) for code of the user.
+
+    They are restored when the last of several blocks ends; other threads must not draw from them meanwhile.
+    """
+    numbers, torch = np.random.SeedSequence(seed).generate_state(4), sys.modules.get("torch")
+    with _generators_lock:
+        now = random.getstate(), np.random.get_state(), torch and torch.get_rng_state()
+        _generator_states.append(_generator_states[0] if _generator_states else now)
+        random.seed(numbers.tobytes())
+        np.random.seed(numbers)
+        if torch:
+            torch.default_generator.manual_seed(int(numbers[0]))
+    try:
+        yield
+    finally:
+        with _generators_lock:
+            python_state, numpy_state, torch_state = _generator_states.pop()
+            if not _generator_states:
+                random.setstate(python_state)
+                np.random.set_state(numpy_state)
+                if torch and torch_state is not None:
+                    torch.set_rng_state(torch_state)
 
 
 def as_seed(seed: SupportsIndex | Sequence[int]) -> tuple[int, ...]:

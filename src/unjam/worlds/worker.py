@@ -4,7 +4,6 @@ Started by `unjam.worlds.worker_pool` as `python -m unjam.worlds.worker`.
 """
 
 import gc
-import random
 import sys
 import time
 from collections.abc import Callable
@@ -12,15 +11,13 @@ from contextlib import ExitStack
 from functools import cache, partial
 from typing import IO, Any
 
-import numpy as np
-
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import as_unjam_error
 from unjam.scenarios import scenario_from_recipe
 from unjam.sumo_files import take_answer
 from unjam.tree import Arrays, pack
 from unjam.worlds.backend import Backend, open_backend
-from unjam.worlds.episode import run_episode
+from unjam.worlds.episode import run_episode, seeded_generators
 from unjam.worlds.messages import answer_requests, open_answer_pipe, write_message
 from unjam.worlds.record import failed_episode
 from unjam.worlds.sumo.backend import SumoBackend
@@ -49,13 +46,11 @@ def _answer_request(
     try:
         if "files" in request:  # what the parent has read of the files; changed files are read again
             take_answer(request["scenario"]["file"], request["files"])
-        numbers = np.random.SeedSequence(request["seed"]).generate_state(4)
-        random.seed(numbers.tobytes())  # for code of the user that draws from the global generators
-        np.random.seed(numbers)
-        scenario = scenario_from_recipe(request["scenario"])
-        if scenario.reads_user_files:
-            enter_sandbox()
-        driver = driver_from_recipe(request["driver"], arrays)
+        with seeded_generators(request["seed"]):  # a user's file or class may draw from them, too
+            scenario = scenario_from_recipe(request["scenario"])
+            if scenario.reads_user_files:
+                enter_sandbox()
+            driver = driver_from_recipe(request["driver"], arrays)
         options = {name: request[name] for name in ("seed", "reward", "explore", "record_details", "stop_at_contact")}
         options |= {"backend": open_once(request["backend"]), "on_progress": send_progress}
         content, record_arrays = pack(run_episode(scenario, driver, **options))
