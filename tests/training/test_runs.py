@@ -3,6 +3,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tomli_w
 
 import unjam
 from unjam.errors import InputError
@@ -55,6 +56,23 @@ def test_runs_are_listed_with_state_and_steps(under: Path) -> None:
     assert gain.mean == pytest.approx(7.0)
     assert found["deep/ring-002"].gains == {"": None}
     assert [run.name for run in unjam.list_runs(under, "merge")] == ["merge-001"]
+
+
+@pytest.mark.parametrize("key", ["scenario", "tasks"])
+def test_the_code_of_a_foreign_road_does_not_run_when_runs_are_listed_and_read(
+    key: str, under: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    code, ran = under / "merge-001" / "road.py", under / "ran"
+    code.write_text(f"open({str(ran)!r}, 'w').close()\nfrom unjam.scenarios import Ring\n")
+    road = f"{code}:Ring"
+    changes = {"tasks": [{"scenario": road}]} if key == "tasks" else {key: road}
+    (under / "merge-001" / "config.toml").write_text(tomli_w.dumps(changes))
+    assert [run.name for run in unjam.list_runs(under)] == ["deep/ring-002", "ring-001"]
+    assert f"merge-001 is not listed: config file {under / 'merge-001'}" in caplog.text
+    for read in (read_run, remove_run):
+        with pytest.raises(InputError, match="names Python code"):
+            read(under / "merge-001")
+    assert not ran.exists()
 
 
 def test_only_differing_settings_are_listed(under: Path) -> None:

@@ -32,6 +32,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
 from unjam.tree import map_leaves
+from unjam.trust import check_trusted_values
 from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.episode import can_drive, check_can_drive, check_policy_inputs
 from unjam.worlds.reward import make_reward
@@ -153,14 +154,19 @@ def _write_manifest(folder: Path) -> None:
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     """Return the configuration of a run folder; raise `InputError` if it is none, or of another format.
 
-    With `check_trust` also if the configuration names untrusted Python code; without, nothing of it may be run.
+    Also if the configuration names untrusted Python code: without `check_trust` only if its roads do, whose code runs
+    here; nothing else of it may be run then.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {CONFIG_FILE}")
     reject_special_files(folder)
     try:
-        return load_config(path) if check_trust else build_dataclass(RunConfig, read_toml(path), "")
+        if check_trust:
+            return load_config(path)
+        values = read_toml(path)
+        check_trusted_values(f"config file {path}", {name: values.get(name) for name in ("scenario", "tasks")})
+        return build_dataclass(RunConfig, values, "")
     except InputError:
         with suppress(OSError, ValueError, RecursionError, AttributeError, KeyError):
             made = json.loads((folder / MANIFEST_FILE).read_text())

@@ -1,8 +1,8 @@
 """Listing, comparing and removing run folders."""
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,8 @@ from unjam.processes import check_not_locked, is_locked
 from unjam.reports.results import EVALUATION_FILE, damaged_results_error, read_evaluation, read_progress
 from unjam.training.config import CONFIG_FILE, RunConfig
 from unjam.training.run_folder import MANIFEST_FILE, read_config
+
+_LOG = logging.getLogger(__name__)
 
 RunState = Literal["running", "finished", "stopped", "damaged"]
 
@@ -68,8 +70,10 @@ def _run_folders(root: Path) -> Iterator[tuple[Path, RunConfig]]:
     for place, subfolders, files in os.walk(root):
         if {CONFIG_FILE, MANIFEST_FILE} <= set(files):
             subfolders.clear()  # the tasks of a run are not runs
-            with suppress(UnjamError):  # folders of other versions or programs
+            try:
                 yield Path(place), read_config(Path(place), check_trust=False)
+            except UnjamError as error:  # it is of another version or program, or its road is untrusted code
+                _LOG.warning("%s is not listed: %s", place, error)
 
 
 def read_run(folder: Path, name: str = "") -> Run:
