@@ -31,12 +31,11 @@ INTRODUCTION = """# Claims of the paper
 
 *Knowledge-informed model-based residual reinforcement learning*
 ([arXiv:2408.17380](https://arxiv.org/abs/2408.17380)): its empirical claims compared with trainings of this package.
-Settings are those of the paper where it states them (`--preset paper`), with 300,000 environment steps for each
-training instead of the 4,000,000 of its authors' code. Returns "on test seeds" are of the deterministic controller that
-validation chose, on 20 seeds that played no part in training or selection; other numbers of trainings are of training
-episodes, exploration included. There are five trainings on the ring, and three of Figures 9 and 10 and on the other
-roads: verdicts are about these trainings, with these settings.
-[What differs from the paper](#what-differs-from-the-paper) is the last table.
+They have the values of its Tables B2 to B6 (`--preset paper`) and 300,000 environment steps each, instead of the
+4,000,000 of its authors' code; [all that differs](#what-differs-from-the-paper) is in the last table. Returns "on
+test seeds" are of the deterministic controller that validation chose, on 20 seeds that played no part in training or
+selection; other numbers of trainings are of training episodes, exploration included. There are five trainings on the
+ring, and three of Figures 9 and 10 and on the other roads: verdicts are about these trainings, with these settings.
 
 **The paper has no safety filter; unjam has one by default** (a time gap of 1 s, no contact behind leaders that brake
 with at most 6 m/s²). Verdicts are about trainings without it; where these are not yet measured, only the numbers
@@ -49,6 +48,8 @@ and the verdict with the filter stand here. Merges have no filter in either colu
   groups, which have no interval.
 - *By the expert alone*: the residual is not shown to be better than PI, its expert, without any learning. The paper has
   no results of its expert alone.
+
+Numbers of verdicts:
 
 """
 DIFFERENCES = """<!-- differences -->
