@@ -191,6 +191,17 @@ def advisory_speed(p: Any, s: State, m: Any) -> float:
     return max((p.advised_speed - s.speed) / p.time_constant, -p.max_deceleration)
 
 
+def smooth_acc(p: Any, s: State, m: Any) -> float:
+    before = getattr(m, "mean", s.leader_speed)
+    weight = 1.0 - math.exp(-p.time_step / p.averaging_time) if p.averaging_time else 1.0
+    m.mean = before + weight * (s.leader_speed - before)
+    m.features = (m.mean / 10.0,)
+    excess = s.leader_gap - p.standstill_gap - p.time_gap * s.speed
+    command = m.mean + p.leader_weight * (s.leader_speed - m.mean)
+    command += clip(p.gap_gain * excess, -p.catch_up_speed, p.catch_up_speed)
+    return (command - s.speed) / max(p.time_constant, p.time_step)
+
+
 def constant(p: Any, s: State, m: Any) -> float:
     return p.acceleration
 
@@ -219,5 +230,5 @@ def remember(m: SimpleNamespace, s: State, time_step: float) -> tuple[float, ...
 
 EXPERTS = {"idm": idm, "pi": pi, "follower-stopper": follower_stopper, "acc": acc, "lacc": acc, "bcm": bcm}
 EXPERTS |= {"ovm": ovm, "pacer": pacer, "jam-absorber": jam_absorber, "constant": constant}
-EXPERTS |= {"advisory-speed": advisory_speed}
+EXPERTS |= {"advisory-speed": advisory_speed, "smooth-acc": smooth_acc}
 EXPERTS |= {"cruise": cruise, "jam-ahead": jam_ahead, "pi-from-gap": pi_from_gap, "adaptive-acc": adaptive_acc}

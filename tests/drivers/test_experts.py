@@ -23,6 +23,8 @@ EXPERTS = [
     "follower-stopper:desired_speed=4",
     "acc",
     "acc:time_gap=2,set_speed=5",
+    "smooth-acc",
+    "smooth-acc:averaging_time=0,time_constant=0,history_factor=0.2",
     "lacc:lag=0.4",
     "lacc:lag=0.01",
     "bcm:desired_speed=4",

@@ -168,7 +168,7 @@ def test_the_plain_reader_is_short() -> None:
         len((EXAMPLES / name).read_text().splitlines())
         for name in ("run_controller.py", "plain_experts.py", "plain_safety.py")
     ]
-    assert max(lines) < 225
+    assert max(lines) < 240
     assert lines[0] < 135
 
 

@@ -1,6 +1,7 @@
 """Calibration: `unjam tune` of experts, `unjam calibrate` of user networks, `unjam fit-drivers` of human drivers."""
 
 from dataclasses import asdict, replace
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,7 +41,7 @@ CALIBRATION_COLUMNS = {
 def tune_command(
     *,
     scenario: opt.ScenarioArgument,
-    expert: Annotated[str, Option("--expert", help="Name of the expert, as in unjam drivers.")] = "pi",
+    expert: Annotated[str, Option("--expert", help="Name of the expert, as in unjam drivers.")] = "smooth-acc",
     steps: Annotated[int, Option(min=1, help="Maximum number of control steps of all trials together.")] = 2_000_000,
     vary: Annotated[
         list[str] | None,
@@ -61,6 +62,14 @@ def tune_command(
             show_default="where the batch simulator supports the road",
         ),
     ] = None,
+    max_string_gain: Annotated[
+        float | None,
+        Option(
+            min=1.0,
+            help="Largest amplification of a leader's oscillations, 0.001 to 1 Hz, on closed roads; inf: any.",
+            show_default="1.02 on closed roads",
+        ),
+    ] = None,
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     out: opt.OutOption = None,
     json: opt.JsonOption = False,
@@ -68,16 +77,18 @@ def tune_command(
     """Tune the parameters of an expert with Optuna.
 
     Trials are evaluated on tuning seeds, with the limits and the safety filter of the road; infeasible ones are
-    rejected. The tuned expert is a controller that every command accepts. To continue a stopped tuning, repeat
-    the command with the same --out.
+    rejected, and settings that amplify oscillations are not tried. The tuned expert is a controller that every
+    command accepts. To continue a stopped tuning, repeat the command with the same --out.
 
     Examples:
 
-    - unjam tune ring --expert pi
-    - unjam tune figure-eight --expert pacer --vary gathering_speed=1..3 --steps 300000
-    - unjam tune rings --expert pi         (also shared-rings, figure-eights, motorways, or all-roads)
+    - unjam tune ring
+    - unjam tune ring --expert pi --max-string-gain inf       (pi always amplifies some frequency)
+    - unjam tune on-ramp --expert jam-ahead --vary min_speed=2..8 --steps 300000
+    - unjam tune rings         (also shared-rings, figure-eights, motorways, or all-roads)
     """
     from unjam.training.search_space import default_search_space, expert_search_space
+    from unjam.training.string_limit import MAX_STRING_GAIN
     from unjam.training.tune import tune
 
     changes = opt.merge_settings(changes, opt.parse_settings(settings))
@@ -93,8 +104,13 @@ def tune_command(
     space = expert_search_space(vary, space) if vary else space
     folder = opt.new_folder(out, f"tune-{Path(scenario).stem}")
     on_message = (lambda line: None) if json else err_console.print
+    if max_string_gain is None:
+        max_string_gain = MAX_STRING_GAIN if any(road.is_closed for road in roads.values()) else inf
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), WorkerPool(workers) as pool:
-        result = tune(roads, expert, space, steps, folder, pool, reward, seed, backend, on_message, screen)
+        result = tune(
+            *(roads, expert, space, steps, folder, pool, reward, seed, backend, on_message, screen),
+            max_string_gain=max_string_gain,
+        )
     best, default = result.best, result.default
     if json:
         counts = {"environment_steps": result.environment_steps, "batch_steps": result.batch_steps}

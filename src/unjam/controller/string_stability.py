@@ -48,8 +48,8 @@ class StringStability:
 
 def operating_speeds(mean_speed: float, humans: IDMParameters) -> list[float]:
     """Return the speeds of the tests for a road on which CAVs drive with a mean speed [m/s]."""
-    speeds = (round(ratio * mean_speed, 1) for ratio in OPERATING_SPEED_RATIOS)
-    return [speed for speed in speeds if MIN_OPERATING_SPEED < speed < humans.desired_speed]
+    speeds = {max(round(ratio * mean_speed, 1), MIN_OPERATING_SPEED) for ratio in OPERATING_SPEED_RATIOS}
+    return sorted(speed for speed in speeds if speed < humans.desired_speed)
 
 
 def measure_string_stability(

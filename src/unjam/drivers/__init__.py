@@ -9,8 +9,9 @@ from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.registry import DRIVERS
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.road_experts import JamAbsorber, Pacer
+from unjam.drivers.smooth_acc import SmoothACC
 from unjam.drivers.user_driver import DriverLike, as_driver
 
 __all__ = ["ACC", "BCM", "DRIVERS", "IDM", "LACC", "OVM", "Command", "Constant", "Decision", "Driver", "DriverLike"]
 __all__ += ["FollowerStopper", "Human", "JamAbsorber", "Limits", "LocalState", "Memory", "PIFromGap", "PISaturation"]
-__all__ += ["Pacer", "ResidualDriver", "as_driver", "check_driver"]
+__all__ += ["Pacer", "ResidualDriver", "SmoothACC", "as_driver", "check_driver"]

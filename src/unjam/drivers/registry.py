@@ -13,6 +13,7 @@ from unjam.drivers.onnx_policy import OnnxDriver
 from unjam.drivers.pi_saturation import PIFromGap, PISaturation
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.road_experts import AdvisorySpeed, Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
+from unjam.drivers.smooth_acc import SmoothACC
 from unjam.drivers.user_driver import FileDriver, FileReference, is_file_reference
 from unjam.drivers.wrappers import (
     FilteredDriver,
@@ -28,7 +29,7 @@ from unjam.parameters import build_dataclass, check_part, check_values, is_packa
 from unjam.tree import Arrays, named_parts, pack, unpack
 
 _DRIVER_CLASSES = (
-    *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, LACC, BCM, OVM),
+    *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, SmoothACC, LACC, BCM, OVM),
     *(Pacer, JamAbsorber, Cruise, AdvisorySpeed, JamAhead, GapMaker, AdaptiveACC, Constant),
 )
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _DRIVER_CLASSES}

@@ -27,6 +27,7 @@ from unjam.scenarios.user_scenario import CODE_ENTRY
 from unjam.training.evaluate import TRAINED_LABEL, raise_failure
 from unjam.training.run_folder import check_run_files, controller_origin, read_config
 from unjam.training.seeds import make_test_seeds
+from unjam.training.string_limit import driver_with_filter
 from unjam.trust import check_trusted, expecting_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -127,9 +128,8 @@ def export_controller(
         reason = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
         raise InputError(f"export: {driver.describe()} is not allowed: {reason}; allowed: drivers without Python code")
     model = _residual_model(driver, metadata) if stable_baselines3 else None
-    if road.safety.active and not isinstance(driver, FilteredDriver):
-        max_acceleration = (driver.limits or road.acceleration_limits).highest
-        driver = FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
+    if road.safety.active:
+        driver = driver_with_filter(driver, road)
     low, high = driver.limits or road.acceleration_limits
     limit = max(-low, high)
     backend = read_config(source).episode_backend if source.is_dir() else "sumo"

@@ -1,6 +1,7 @@
 """Tuning of an expert's parameters with as many environment steps as a training: the baseline for trained controllers.
 
-`unjam tune`, with Optuna, on its own seeds, under the same limits and safety filter. Infeasible settings do not count.
+`unjam tune`, with Optuna, on its own seeds, under the same limits and safety filter. Infeasible settings do not count,
+and those that amplify oscillations of the leader more than allowed are not tried.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,14 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from optuna import create_study
-from optuna.samplers import TPESampler
-from optuna.trial import TrialState
 
 from unjam.controller.file import SUFFIX, controller_bytes
 from unjam.drivers.driver import label_with_parameters
 from unjam.drivers.registry import driver_from_name
-from unjam.errors import InputError, UnjamError, unknown_name
+from unjam.errors import InputError, UnjamError, invalid_value, unknown_name
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_feasibility
@@ -32,6 +30,8 @@ from unjam.training.fingerprint import file_hashes
 from unjam.training.run_folder import controller_origin
 from unjam.training.search_space import SearchSpace
 from unjam.training.seeds import tuning_seeds
+from unjam.training.setting_sampler import SettingSampler, invalid_reason
+from unjam.training.string_limit import find_operating_points
 from unjam.training.trial_log import TrialLog, TrialVerdict, TuningTrial
 from unjam.tree import named_parts
 from unjam.worlds.backend import check_support, open_backend
@@ -48,6 +48,8 @@ TUNING_FINALISTS = 5
 """trials that run again on twice as many other seeds, because the best of many trials is partly lucky"""
 SCREENING_BATCH_SIZE = 8
 """trials that are screened at once, each on its own rings"""
+STRING_GAIN_SEED = -1
+"""key of string gains in the log, in place of the first seed: they need no episode"""
 
 TuningRunner = Callable[[list[list[EpisodeTask]]], list[EpisodeRows]]
 """runs the tasks of each driver on one road, in SUMO or in a batch, and measures their episodes"""
@@ -82,6 +84,7 @@ def tune(
     backend: str = "sumo",
     on_message: Callable[[str], None] = lambda line: None,
     screen: bool | None = False,
+    max_string_gain: float = inf,
 ) -> TuningResult:
     """Search the parameters of an expert, and write `tuned.json` and the expert as `EXPERT.unjam` into a folder.
 
@@ -101,10 +104,11 @@ def tune(
         on_message: called with a line for each trial.
         screen: whether trials run in batches on roads that support it (on several roads: exactly), and only the
             finalists and the default in SUMO; None: if any road supports it; not with another backend.
+        max_string_gain: settings with a larger string gain on a closed road are refused before they are tried.
 
     Raises:
         InputError: too few steps, a wrong parameter, no road that supports batches, or another folder.
-        UnjamError: all trials are infeasible.
+        UnjamError: all trials are infeasible, or too many settings in a row have too large string gains.
     """
     known = named_parts(driver_from_name(expert, 1.0)) or {}
     for key in space:
@@ -123,6 +127,8 @@ def tune(
         check_support(simulator, *roads.values())
     other = "" if backend == "sumo" else f"trials run in {backend}"
     reasons = {road: other or unsupported(scenario) for road, scenario in roads.items()}
+    if max_string_gain < inf and not any(scenario.is_closed for scenario in roads.values()):
+        raise invalid_value("max_string_gain", max_string_gain, f"inf on {next(iter(roads))}: it is no closed road")
     if screen and all(reasons.values()):
         raise InputError(f"screen: {next(iter(reasons.values()))}")
     screened = [road for road, reason in reasons.items() if screen is not False and not reason]
@@ -130,7 +136,9 @@ def tune(
     request = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
     files = file_hashes([reward, backend], *roads.values())
     request |= {"files": files} if files else {}
+    request |= {"max_string_gain": max_string_gain} if max_string_gain < inf else {}
     log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
+    points = find_operating_points(roads, workers) if max_string_gain < inf else {}
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
     trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)
 
@@ -142,7 +150,7 @@ def tune(
         settings: list[dict[str, Any]], first: int, count: int, runners: Mapping[str, TuningRunner]
     ) -> list[TuningTrial]:
         drivers = [label_with_parameters(expert, values) for values in settings]
-        scores: dict[str, TrialVerdict] = {each: (None, why) for each in drivers if (why := _invalid_reason(each))}
+        scores: dict[str, TrialVerdict] = {each: (None, why) for each in drivers if (why := invalid_reason(each))}
         new = [each for each in drivers if each not in scores and (first, each) not in log.verdicts]
         new = list(dict.fromkeys(new))
         for driver, rows in zip(new, _run_drivers(roads, new, first, count, (reward, backend), runners), strict=True):
@@ -150,25 +158,33 @@ def tune(
         scores |= {each: log.verdicts[first, each] for each in drivers if each not in scores}
         return [TuningTrial(each, values, *scores[each]) for each, values in zip(drivers, settings, strict=True)]
 
+    def string_gain(driver: str) -> float:
+        key = STRING_GAIN_SEED, driver
+        if key not in log.verdicts:
+            gains = [each.string_gain(driver_from_name(driver, each.road.control_step)) for each in points.values()]
+            log.add(*key, (max(gains, default=0.0), "largest string gain"))
+        return log.verdicts[key][0] or 0.0
+
     trials: list[TuningTrial] = []
-    study = create_study(direction="maximize", sampler=TPESampler(seed=seed, multivariate=True))
+    sampler = SettingSampler(expert, space, seed, string_gain, max_string_gain if points else inf)
     shares_batches = any(required_batch_kind(roads[road]).has_own_drivers for road in screened)
     batch_size = SCREENING_BATCH_SIZE if screen or shares_batches else 1  # many take as long as few
     for first in range(0, trial_count, batch_size):
-        asked = [study.ask(dict(space)) for _ in range(first, min(first + batch_size, trial_count))]
-        rounded = [{key: _round_digits(value) for key, value in each.params.items()} for each in asked]
-        for each, trial in zip(asked, score_settings(rounded, 0, episodes, trial_runners), strict=True):
-            study.tell(each, trial.score, state=TrialState.FAIL if trial.score is None else None)
+        asked = sampler.ask(min(batch_size, trial_count - first))
+        tried = score_settings([values for _, values in asked], 0, episodes, trial_runners)
+        for (each, _), trial in zip(asked, tried, strict=True):
+            sampler.tell(each, trial.score)
             trials.append(trial)
             result = trial.verdict if trial.score is None else f"{trial.score:.4g}"
             on_message(f"{len(trials)} of {trial_count}: {trial.driver}: {result}")
     ranked = sorted((each for each in trials if each.score is not None), key=_score_of, reverse=True)
     best_values = list({each.driver: each.values for each in ranked}.values())[:TUNING_FINALISTS]
     *finalists, default = score_settings([*best_values, {}], episodes, 2 * episodes, sumo_runners)
-    best = max((*finalists, default), key=_score_of)
+    is_default_allowed = not points or string_gain(default.driver) <= max_string_gain
+    best = max((*finalists, default) if is_default_allowed else finalists, key=_score_of)
     if best.score is None:
         raise UnjamError(f"all {trial_count} settings of {expert} are infeasible: {default.verdict}")
-    trial_runs = len({trial.driver for trial in trials if not _invalid_reason(trial.driver)})
+    trial_runs = len({trial.driver for trial in trials if not invalid_reason(trial.driver)})
     batch_steps = trial_runs * episodes * sum(roads[road].horizon for road in screened)
     unused_steps = (TUNING_FINALISTS - len(best_values)) * 2 * trial_steps
     sumo_steps = trial_runs * trial_steps + final_steps - unused_steps - batch_steps
@@ -182,6 +198,7 @@ def tune(
         "batch_steps": batch_steps,
         "best": asdict(best),
         "default": asdict(default),
+        **({"string_gain": string_gain(best.driver), "max_string_gain": max_string_gain} if points else {}),
     }
     driver = driver_from_name(best.driver, scenario.control_step)
     atomic_write(result.file, controller_bytes(driver, {**controller_origin(scenario, driver), "tuning": tuning}))
@@ -193,15 +210,6 @@ def tune(
 
 def _score_of(trial: TuningTrial) -> float:
     return -inf if trial.score is None else trial.score
-
-
-def _invalid_reason(driver: str) -> str:
-    """Return why a driver cannot be made, as for parameters that contradict each other; or an empty text."""
-    try:
-        driver_from_name(driver, 1.0)
-    except InputError as error:
-        return str(error)
-    return ""
 
 
 def _run_drivers(
@@ -262,7 +270,3 @@ def _score_rows(rows_by_road: Mapping[str, EpisodeRows], human_rows: Mapping[str
     (rows,) = rows_by_road.values()
     verdict = overall_feasibility([{**row, HARD_BRAKING_METRIC: 0.0} for row in rows])
     return float(np.mean([row["return"] for row in rows])) if verdict == FEASIBLE else None, verdict
-
-
-def _round_digits(value: Any) -> Any:
-    return float(f"{value:.4g}") if isinstance(value, float) else value

@@ -1,0 +1,75 @@
+"""An ACC that follows the mean speed of its leader: the linear expert that can be string stable."""
+
+from math import exp
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from unjam.drivers.driver import FormulaDriver, Memory
+from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
+from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
+from unjam.physics.arrays import Array, clip, namespace, stack_columns
+
+
+@parameter_dataclass(frozen=True, config=STRICT)
+class SmoothACC(FormulaDriver):
+    """Drives at the mean speed of its leader, slightly faster or slower to keep a time gap in the long run.
+
+    The gap absorbs what the leader oscillates. How much a linear controller can attenuate without amplifying any
+    other frequency is limited by its time gap (Bode's integral, see `docs/controller.md`): `pi`, whose gap does not
+    grow with speed, always amplifies some frequency. The defaults are string stable with an actuator lag of 0.3 s and
+    a delay of 0.2 s.
+    """
+
+    name: ClassVar[str] = "smooth-acc"
+    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("mean leader speed", SPEED_SCALE, "m/s"),)
+
+    averaging_time: NonNegative = 8.0
+    """time constant of the exponential mean of the leader's speed [s]"""
+    leader_weight: Annotated[float, Field(ge=0, le=1)] = 0.2
+    """weight of the leader's present speed; the mean has the rest"""
+    time_gap: NonNegative = 6.0
+    """time gap in the long run [s]"""
+    standstill_gap: NonNegative = 2.0
+    """gap in the long run at standstill [m]"""
+    gap_gain: NonNegative = 0.2
+    """speed above the mean per meter of excess gap [1/s]"""
+    catch_up_speed: Positive = 3.0
+    """largest difference to the mean speed because of the gap [m/s]"""
+    time_constant: NonNegative = 1.5
+    """time constant of the approach to the commanded speed [s]; 0: one time step"""
+    history_factor: NonNegative = 1.0
+    """share of the mean in the warm-up that is the first mean: with a smaller one it first opens a gap"""
+    time_step: Positive = 0.1
+    """control step [s]; set by the road"""
+
+    def initial_memory(self, n: int) -> Memory:
+        """Return an unknown mean (NaN)."""
+        return {"mean_leader_speed": np.full(n, np.nan)}
+
+    def recall(self, memory: Memory, history: LocalState) -> Memory:
+        """Return `memory` with a share of the mean of the leader's speeds in the warm-up."""
+        mean = memory["mean_leader_speed"]
+        for step in range(history.leader_speed.shape[1]):
+            mean = self._update_mean(mean, history.leader_speed[:, step])
+        return {"mean_leader_speed": self.history_factor * mean}
+
+    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the acceleration towards the commanded speed, and the new memory."""
+        mean = self._update_mean(memory["mean_leader_speed"], state.leader_speed)
+        excess_gap = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
+        catch_up = clip(self.gap_gain * excess_gap, -self.catch_up_speed, self.catch_up_speed)
+        command = mean + self.leader_weight * (state.leader_speed - mean) + catch_up
+        acceleration = (command - state.speed) / max(self.time_constant, self.time_step)
+        return acceleration, {"mean_leader_speed": mean}
+
+    def memory_features(self, memory: Memory) -> Array:
+        """Return the mean leader speed, scaled, shape (n, 1)."""
+        return stack_columns((memory["mean_leader_speed"] / SPEED_SCALE,))
+
+    def _update_mean(self, mean: Array, leader_speed: Array) -> Array:
+        xp = namespace(leader_speed)
+        mean = xp.where(xp.isnan(mean), leader_speed, mean)
+        weight = 1.0 - exp(-self.time_step / self.averaging_time) if self.averaging_time else 1.0
+        return mean + weight * (leader_speed - mean)

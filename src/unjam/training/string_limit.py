@@ -1,0 +1,63 @@
+"""The limit on the string gain of CAVs on closed roads, for tuning and training."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from unjam.controller.string_stability import GAIN_TOLERANCE, operating_speeds, string_gains
+from unjam.drivers.car_following import Human
+from unjam.drivers.driver import Driver
+from unjam.drivers.wrappers import FilteredDriver
+from unjam.measures.metrics import measure
+from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.scenario import Scenario
+from unjam.training.evaluate import raise_failure
+from unjam.training.seeds import tuning_seeds
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+
+MAX_STRING_GAIN = 1.0 + GAIN_TOLERANCE
+"""largest gain of a controller that counts as string stable"""
+HUMAN_EPISODES = 2
+"""episodes of human traffic that determine the operating speeds of a road"""
+
+
+def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
+    """Return a driver with the limits, the safety filter and the actuator of a road, unless it has a filter."""
+    if isinstance(driver, FilteredDriver):
+        return driver
+    max_acceleration = (driver.limits or road.acceleration_limits).highest
+    return FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Where the string gain of CAVs on a closed road is measured."""
+
+    road: Scenario
+    loop_length: float
+    """length of the closed road [m]"""
+    speeds: tuple[float, ...]
+    """speeds of the leader [m/s]"""
+
+    def string_gain(self, driver: Driver) -> float:
+        """Return the largest gain at any speed and frequency, with filter and actuator of the road."""
+        gains = string_gains(driver_with_filter(driver, self.road), self.speeds, self.road.humans, self.loop_length)
+        return float(gains.max(initial=0.0))
+
+
+def find_operating_points(roads: Mapping[str, Scenario], workers: WorkerPool) -> dict[str, OperatingPoint]:
+    """Return the operating points of the closed roads: around the mean speed of human traffic on tuning seeds."""
+    closed = {name: road for name, road in roads.items() if road.is_closed}
+    tasks = [EpisodeTask(road, Human(), seed) for road in closed.values() for seed in tuning_seeds(HUMAN_EPISODES)]
+    rows = workers.run_and_map(tasks, lambda index, episode: measure(episode))
+    raise_failure(rows)
+    points: dict[str, OperatingPoint] = {}
+    for number, (name, road) in enumerate(closed.items()):
+        own = rows[number * HUMAN_EPISODES : (number + 1) * HUMAN_EPISODES]
+        mean_speed = float(np.mean([row["mean_speed"] for row in own]))
+        drawn, _ = road.draw_from_seed(tuning_seeds(1)[0])
+        loop_length = drawn.loop_length if isinstance(drawn, ClosedRoad) else inf
+        points[name] = OperatingPoint(road, loop_length, tuple(operating_speeds(mean_speed, road.humans)))
+    return points
