@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from people import figure_6
 from tables import mean_of, results_part, rows_of
 
 from unjam.measures.statistics import paired_difference
@@ -63,11 +64,14 @@ def filter_effect() -> str:
 
 
 def noise_effect() -> str:
-    """Return the standard deviation across vehicles of human traffic on the ring with both kinds of noise."""
-    rows = [row for row in results_part("table-2-unscaled-noise/table") if row["name"] == "human"]
-    own = next(row for row in results_part("table-2/table") if row["name"] == "human")
-    stds = [row["speed_std_fleet"]["mean"] for row in (*rows, own)]
-    return f"standard deviation across vehicles of human traffic: {stds[0]:.2f} m/s unscaled, {stds[1]:.2f} scaled"
+    """Return how human traffic on the ring, and the speed with the paper's PI, differ between both kinds of noise."""
+    texts = []
+    for what, study in (("unscaled", "table-2-unscaled-noise"), ("scaled", "table-2")):
+        rows = {row["name"]: row for row in results_part(f"{study}/table")}
+        speeds = [rows[name]["mean_speed"]["mean"] for name in ("PI (paper)", "human")]
+        std = rows["human"]["speed_std_fleet"]["mean"]
+        texts.append(f"{what} {std:.2f} m/s, {speeds[0] - speeds[1]:+.2f} m/s")
+    return f"standard deviation across vehicles of human traffic, mean speed with PI beyond it: {'; '.join(texts)}"
 
 
 def expert_effect() -> str:
@@ -140,6 +144,16 @@ def impatience_effect() -> str:
     parts[" with 1"] = "figure-eight-32-impatience=1"
     texts = (f"{mean_of(f'experts/{part}', 'human', 'mean_speed'):.2f} m/s{what}" for what, part in parts.items())
     return f"human traffic, radius 32 m: {', '.join(texts)} (`results/experts.json`)"
+
+
+def data_effect() -> str:
+    """Return the errors of the networks of Figure 6 with few data of another driver and of the IDM in the model."""
+    texts = []
+    for driver, what in (("other", "with another driver"), ("same", "with the same IDM")):
+        rows = figure_6(driver=driver, split="trajectories", is_long=False, size=0.01)
+        errors = rows.groupby("network")["driver_error"].mean()
+        texts.append(f"{errors['knowledge']:.3f} with IDM and {errors['vanilla']:.3f} without {what}")
+    return f"error with 1 % of the data [m/s²]: {'; '.join(texts)} (`results/figure-6.json`)"
 
 
 def speed_effect() -> str:
@@ -293,6 +307,13 @@ LEARNING = (
         ("evaluation.convergence_window",),
         "0: all steps are made",
         stop_effect,
+    ),
+    Difference(
+        "data of Figure 6",
+        "262,630 rows in four regimes of Mo et al. (2021), 20 % for the test at random (4.2.2)",
+        (),
+        "as many rows made alike, with another driver than the IDM in the model; test trajectories are in no training",
+        data_effect,
     ),
     Difference(
         "average speed",
