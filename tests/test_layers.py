@@ -25,7 +25,7 @@ ORDER = (
 )
 """each may import those before it, and none after it"""
 EVERYWHERE = {
-    *("", "adam", "child_processes", "errors", "files", "folders", "kernels", "manifest", "onnx_models"),
+    *("", "adam", "child_processes", "errors", "file_names", "files", "folders", "kernels", "manifest", "onnx_models"),
     *("parameters", "plugins", "processes", "sandbox", "tree", "trust", "user_code"),
 }
 """modules that every part may import: they import none of the layers"""

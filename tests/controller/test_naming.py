@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import numpy as np
@@ -48,10 +49,23 @@ def test_several_joined_by_a_plus_share_the_cavs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(actions(made.drivers[1]), actions(residual(IDM())))
 
 
-def test_a_file_whose_folder_has_a_plus_in_its_name_is_one_driver(tmp_path: Path, my_drivers: Path) -> None:
-    path = tmp_path / "my+drivers" / "mine.py"
-    path.parent.mkdir()
-    path.write_text(my_drivers.read_text())
-    gentle = FileDriver(path, "gentle")
-    assert make_driver(f"{path}:gentle", 0.1) == gentle
-    assert make_driver(f"{path}:gentle+pi+idm", 0.1) == MixedDriver((gentle, PISaturation(), IDM()))
+@pytest.mark.parametrize("text", ["{}", "{}+pi+idm", "pi+{}", "{}+pi.py:gentle+{}", "idm+{}+pi:window=1e+1"])
+@pytest.mark.parametrize("path", ["my+drivers/mine.py", "a+b.py", "pi.py"])
+def test_a_plus_in_the_path_of_a_file_separates_no_drivers(
+    path: str, text: str, tmp_path: Path, my_drivers: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in map(Path, ("pi.py", path)):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(my_drivers.read_text())
+    mine = FileDriver(Path(path), "gentle")
+    drivers = {
+        "{}": mine,
+        "pi": PISaturation(),
+        "idm": IDM(),
+        "pi.py:gentle": FileDriver(Path("pi.py"), "gentle"),
+        "pi:window=1e+1": PISaturation(window=10),
+    }
+    expected = tuple(drivers[part] for part in re.split(r"\+(?=\D)", text))
+    made = make_driver(text.replace("{}", f"{path}:gentle"), 0.1)
+    assert made == (expected[0] if len(expected) == 1 else MixedDriver(expected))

@@ -59,7 +59,7 @@ def unjam(tmp_path: Path, preloaded: Run) -> Run:
             return preloaded(*words, folder=tmp_path, pictures=pictures)
         return subprocess.run(
             [UNJAM, *words],
-            cwd=tmp_path,
+            cwd=options.pop("cwd", tmp_path),
             env={**os.environ, **PLAIN, **(environment or {})},
             capture_output=True,
             text=True,

@@ -25,6 +25,14 @@ TINY_RUN = [
     *["--set", "evaluation.validation_episodes=1", "--set", "evaluation.validation_interval=2"],
 ]
 
+CALM = """
+def gentle(state):
+    return 0.1 * (state.leader_speed - state.speed)
+
+def calm(outcome):
+    return {"speed": outcome.speeds.mean(1)}
+"""
+
 REQUIRED_METRICS = [
     "mean_speed",
     "mean_speed_steady",
@@ -75,6 +83,16 @@ def test_train_on_several_roads_prints_a_table_for_each(unjam: Run, tmp_path: Pa
     assert [line for line in ran.stdout.splitlines() if line in ("ring:", "short:")] == ["ring:", "short:"]
     assert ran.stdout.count("Compared with the human") == ran.stdout.count("Return difference to its expert") == 2
     assert {"ring", "short", "report.html"} <= {path.name for path in (tmp_path / "run").iterdir()}
+
+
+@pytest.mark.long
+def test_a_run_that_names_files_is_usable_in_a_process_with_another_working_folder(unjam: Run, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(CALM)
+    command = [*TINY_RUN, "--expert", "mine.py:gentle", "--reward", "./mine.py:calm", "--set", "model.model_ratio=0"]
+    document(unjam(*command, "--steps", 160, "--out", "runs/a", "--json", pictures=False))
+    (tmp_path / "elsewhere").mkdir()
+    evaluated = document(unjam("evaluate", "../runs/a", "--episodes", 1, "--json", cwd=tmp_path / "elsewhere"))
+    assert {"mine.py:gentle", "trained"} <= {entry["driver"] for entry in evaluated["drivers"]}
 
 
 @pytest.mark.slow

@@ -12,10 +12,9 @@ import torch
 from tests.training.test_run import small_config
 from tests.worlds.sumo.user_networks import straight
 from unjam.errors import InputError
-from unjam.training.config import RunConfig, load_config, to_toml
+from unjam.training.config import MANIFEST_FILE, RunConfig, load_config, to_toml
 from unjam.training.export import ControllerStore
 from unjam.training.run_folder import (
-    MANIFEST_FILE,
     append_lineage,
     check_fingerprint,
     check_run_files,

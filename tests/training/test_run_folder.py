@@ -1,15 +1,27 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 import pytest
 
 from tests.training.test_run import STEPS, small_config
 from tests.worlds.sumo.user_networks import straight
+from unjam.controller import packaged_file
 from unjam.errors import InputError
+from unjam.scenarios.population import population_file
 from unjam.training.config import load_config
-from unjam.training.run_folder import check_config, create_run_folder, read_config, resume_run_folder
+from unjam.training.fingerprint import fingerprint
+from unjam.training.run_folder import (
+    check_config,
+    check_run_files,
+    create_run_folder,
+    read_config,
+    restore_newest_checkpoint,
+    resume_run_folder,
+    save_checkpoint,
+)
 from unjam.training.train import train
 
 
@@ -125,3 +137,61 @@ def test_run_with_tuple_options_resumes(tmp_path: Path) -> None:
     create_run_folder(tmp_path, config)
     resume_run_folder(tmp_path, config)
     assert read_config(tmp_path).make_scenario() == config.make_scenario()
+
+
+CODE = """
+from unjam.scenarios import Ring
+
+class Road(Ring):
+    length, vehicles, horizon = (120, 130), 8, 100
+
+def gentle(state):
+    return 0.1 * (state.leader_speed - state.speed)
+
+def calm(outcome):
+    return {"speed": outcome.speeds.mean(1)}
+
+def doubled(state):
+    return 2.0 * state.speed[:, None]
+"""
+NAMES = {
+    "scenario": "my+code/mine.py:Road",
+    "scenario_options": {"population": "./people.json"},
+    "expert": "pi:window=1e+1+my+code/mine.py:gentle+my+code/mine.py:gentle",
+    "reward": "my+code/mine.py:calm",
+    "policy__inputs": ["local", "my+code/mine.py:doubled"],
+    "evaluation__baselines": ["human", "idm+best.unjam"],
+    "model__model_ratio": 0.0,
+}
+
+
+@pytest.mark.parametrize("name", ["", "ring"])
+def test_names_of_files_are_those_of_the_folder_in_which_the_run_was_started(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, run = tmp_path / "my project", tmp_path / "my project" / "runs" / "a"
+    for folder in (project, tmp_path / "elsewhere" / "deep"):  # which has other files with these names
+        (folder / "my+code").mkdir(parents=True)
+        (folder / "my+code" / "mine.py").write_text(CODE if folder == project else "")
+        (folder / "ring").mkdir()
+        copyfile(population_file("unjam:ngsim"), folder / "people.json")
+        copyfile(packaged_file("best"), folder / "best.unjam")
+    monkeypatch.chdir(project)
+    config = small_config(**NAMES, **({"tasks": [{"name": name, "weight": 2.0}]} if name else {}))
+    create_run_folder(run, config)
+    made, stored = config.make_tasks(), (run / "config.toml").read_text()
+    save_checkpoint(run / "checkpoint", {"iteration": 1, "fingerprint": fingerprint(config)}, {})
+    (run / "progress.jsonl").touch()
+    monkeypatch.chdir(tmp_path / "elsewhere" / "deep")
+    found = read_config(Path("../../my project/runs/a"))
+    for task, expected in zip(found.make_tasks(), made, strict=True):
+        assert (task.expert, task.weight) == (expected.expert, expected.weight)
+        assert replace(task.scenario, population="./people.json") == expected.scenario
+    assert found.evaluation.baselines == ("human", f"idm+{project / 'best.unjam'}")
+    check_config(found)
+    check_run_files(run, found, "evaluate")
+    assert restore_newest_checkpoint(run, {run}, fingerprint(found))
+    resume_run_folder(run, replace(found, steps=9 * STEPS))
+    assert (run / "config.toml").read_text() == stored.replace(f"steps = {2 * STEPS}", f"steps = {9 * STEPS}", 1)
+    monkeypatch.chdir(project)
+    assert read_config(run) == replace(config, steps=9 * STEPS)

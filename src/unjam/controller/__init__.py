@@ -5,7 +5,6 @@ weights in safetensors and, in exported files, a recorded sample and an ONNX gra
 """
 
 import os
-import re
 from pathlib import Path
 
 from unjam.controller.file import (
@@ -22,14 +21,13 @@ from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.drivers.user_driver import DriverLike, as_driver, is_file_reference
 from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import invalid_value
+from unjam.file_names import split_names
 from unjam.files import PACKAGED_PREFIX
 
 __all__ = ["controller_bytes", "load_controller", "make_driver", "make_expert", "packaged_file", "packaged_names"]
 
 DEFAULT_DRIVER = "unjam:best"
 """driver of commands without `--driver`: the controller for all roads"""
-_MIXTURE_SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")
-"""+ between two drivers of a mixture, but not that in 1e+5"""
 
 
 def make_driver(name: str, time_step: float) -> Driver:
@@ -42,11 +40,7 @@ def make_driver(name: str, time_step: float) -> Driver:
             `+`, which CAVs use in turn.
         time_step: control step of the road [s].
     """
-    path, _, rest = name.rpartition(":")
-    parts = [] if os.path.exists(name) else _MIXTURE_SEPARATOR.split(name)
-    if os.path.exists(path):  # its own name may contain a separator
-        first, *others = _MIXTURE_SEPARATOR.split(rest)
-        parts = [f"{path}:{first}", *others]
+    parts = split_names(name)
     if len(parts) > 1:
         return MixedDriver(tuple(make_driver(part, time_step) for part in parts))
     if name.startswith(PACKAGED_PREFIX):

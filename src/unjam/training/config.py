@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, field, fields, replace
 from math import ceil
 from pathlib import Path
@@ -17,6 +18,8 @@ from unjam.drivers.observation import observation_inputs
 from unjam.drivers.user_driver import is_file_reference, object_label, object_reference
 from unjam.drivers.wrappers import HistoryDriver
 from unjam.errors import InputError, invalid_value
+from unjam.file_names import absolute_names
+from unjam.files import parse_json
 from unjam.learners.settings import AgentSettings, PolicySettings, unused_tables
 from unjam.models.settings import ModelSettings
 from unjam.parameters import (
@@ -42,8 +45,8 @@ from unjam.worlds.backend import check_backend_name
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import Task
 
-CONFIG_FILE = "config.toml"
-"""the configuration in the folder of a run or of a search"""
+CONFIG_FILE, MANIFEST_FILE = "config.toml", "manifest.json"
+"""the configuration in the folder of a run or of a search, and the origin of a run"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -248,7 +251,7 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
     range, an unreadable file, a file in a run folder that names untrusted Python code, and a function, a class or a
     driver, because a training imports them in other processes, by `path.py:name`.
     """
-    file_values = read_toml(file) if file is not None else {}
+    file_values = read_values(file) if file is not None else {}
     if file is not None and _is_in_run_folder(file):  # other files are the user's own
         check_trusted_values(f"config file {file}", file_values)
     user_values = without_toml_file(merge_changes(file_values, nest_keys(changes or {})))
@@ -271,6 +274,25 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
         # The row model cannot represent the ACC of a CAV: the default is to have no model.
         values = merge_changes({"model": {"model_ratio": 0.0}}, values)
     return build_dataclass(RunConfig, values, "")
+
+
+def read_values(file: Path) -> dict[str, Any]:
+    """Return the values of a configuration file, in which a run names files relative to the folder of its start.
+
+    In another working folder these names become absolute. Files that are not there are those of the working folder, as
+    they are for other configurations.
+    """
+    values, start = read_toml(file), _start_folder(file.absolute().parent)
+    return values if start == Path.cwd() else absolute_names(values, start)
+
+
+def _start_folder(run: Path) -> Path:
+    """Return the working folder in which a run or the run of a task was started; the present one if unknown."""
+    for folder in (run, run.parent):
+        with suppress(OSError, ValueError, LookupError, TypeError):
+            if (folder / MANIFEST_FILE).is_file():
+                return (folder / parse_json((folder / MANIFEST_FILE).read_bytes())["start_folder"]).resolve()
+    return Path.cwd()
 
 
 def _without_toml_file_of_task(values: Any) -> Any:

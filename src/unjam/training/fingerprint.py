@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -43,7 +44,7 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
 def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
     """Raise `InputError` if a setting, the expert or a user file has changed; warn of other packages and kernels."""
     for name, value in current["settings"].items():
-        if name in stored["settings"] and stored["settings"][name] != value:
+        if name in stored["settings"] and _without_folders(stored["settings"][name]) != _without_folders(value):
             raise invalid_value(f"resume: {name}", value, f"{stored['settings'][name]!r}, as in the checkpoint")
     check_file_hashes(stored, current, "resume")
     for part in ("packages", "kernels"):
@@ -60,9 +61,18 @@ def code_hashes(config: RunConfig) -> dict[str, str]:
 
 def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:
     """Raise `InputError` if the expert or a file of the user has changed."""
-    for name in sorted(stored["files"].keys() | current["files"].keys()):
-        if stored["files"].get(name) != current["files"].get(name):
-            raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
+    before, now = (
+        {(_without_folders(name.removeprefix("expert ")), sha256): name for name, sha256 in each["files"].items()}
+        for each in (stored, current)
+    )
+    if changed := before.keys() ^ now.keys():
+        name = {**now, **before}[min(changed)]
+        raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
+
+
+def _without_folders(value: Any) -> str:
+    """Return a JSON value as a text without the folders of files, which depend on the working folder."""
+    return re.sub(r'[^+"]*/', "", json.dumps(value))
 
 
 def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:

@@ -5,12 +5,15 @@ is written at the end of each iteration, and named by iteration and hash; the ne
 """
 
 import json
+import os
 import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import tomli_w
 
 from unjam.controller import make_driver
 from unjam.controller.file import sha256_of
@@ -29,7 +32,7 @@ from unjam.processes import LOCK_FILE, lock_folder
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
+from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig, load_config, read_values, to_toml
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
 from unjam.tree import map_leaves
 from unjam.trust import check_trusted_values
@@ -43,7 +46,7 @@ if TYPE_CHECKING:
 CHECKPOINT_FORMAT = 7
 """format of run folders and their checkpoints; other formats are refused"""
 MAX_CHECKPOINTS = 2
-MANIFEST_FILE, PROGRESS_FILE = "manifest.json", "progress.jsonl"
+PROGRESS_FILE = "progress.jsonl"
 CHECKPOINT_NAME = re.compile(r"\d{6,}-[0-9a-f]{64}\.safetensors")
 """file name of a checkpoint: iteration and hash of the content"""
 ROW_MODEL_FIELDS = {"distance_to_crossing", "penetration_rate"}
@@ -148,7 +151,8 @@ def create_run_folder(folder: Path, config: RunConfig) -> None:
 
 
 def _write_manifest(folder: Path) -> None:
-    atomic_write(folder / MANIFEST_FILE, to_json({"format": CHECKPOINT_FORMAT, **manifest()}, indent=1))
+    facts = {"format": CHECKPOINT_FORMAT, "start_folder": os.path.relpath(Path.cwd(), folder.resolve()), **manifest()}
+    atomic_write(folder / MANIFEST_FILE, to_json(facts, indent=1))
 
 
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
@@ -164,7 +168,7 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     try:
         if check_trust:
             return load_config(path)
-        values = read_toml(path)
+        values = read_values(path)
         check_trusted_values(f"config file {path}", {name: values.get(name) for name in ("scenario", "tasks")})
         return build_dataclass(RunConfig, values, "")
     except InputError:
@@ -193,8 +197,9 @@ def resume_run_folder(folder: Path, config: RunConfig) -> None:
     done = max((row.get("environment_steps", 0) for row in progress), default=0)
     if config.steps < min(before.steps, done):
         raise invalid_value("steps", config.steps, f">= {done}, which are done")
-    if config != before:
-        atomic_write(folder / CONFIG_FILE, to_toml(config))
+    if config != before:  # names of files remain as they are
+        changed = {**read_toml(folder / CONFIG_FILE), "steps": config.steps, "workers": config.workers}
+        atomic_write(folder / CONFIG_FILE, tomli_w.dumps(changed))
     if not (folder / MANIFEST_FILE).is_file():  # the run was stopped before it wrote the manifest
         _write_manifest(folder)
 

@@ -13,8 +13,8 @@ from unjam.measures.statistics import Estimate, paired_difference
 from unjam.parameters import flatten_keys
 from unjam.processes import check_not_locked, is_locked
 from unjam.reports.results import EVALUATION_FILE, damaged_results_error, read_evaluation, read_progress
-from unjam.training.config import CONFIG_FILE, RunConfig
-from unjam.training.run_folder import MANIFEST_FILE, read_config
+from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig
+from unjam.training.run_folder import read_config
 
 _LOG = logging.getLogger(__name__)
 
