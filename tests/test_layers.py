@@ -237,7 +237,7 @@ UNSAFE_BUT = {
     "cli/catalog.py: draw_road(scene, max_speed, caption).save(content, 'PNG')": BUFFER,
     "adapters/stable_baselines3_export.py: stable_baselines3_model(driver, agent).save(content)": BUFFER,
     "reports/figures.py: figure.savefig(content, format='svg', dpi=DPI, metadata={'Date': None})": BUFFER,
-    "reports/figures.py: figure.savefig(content, format='png', dpi=dpi)": BUFFER,
+    "reports/figures.py: figure.savefig(content, format='png', dpi=DPI)": BUFFER,
     "reports/figures.py: opaque.quantize(256, Image.Quantize.MAXCOVERAGE).save(content, 'PNG')": BUFFER,
     "reports/video.py: next(frames).save(content, kind, save_all=True, append_images=frames, "
     "duration=durations, loop=0)": BUFFER,

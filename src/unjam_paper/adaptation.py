@@ -27,7 +27,7 @@ from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.drive import finish_drive
 from unjam_paper.all_roads import PI_ON_RINGS_LABEL, PI_TUNED_ON_RINGS
-from unjam_paper.results_file import read_part, write_figure
+from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, mean_text
 
 ADAPTATION_EPISODES = 20
@@ -149,10 +149,8 @@ def adaptation_table(name: str, folder: Path) -> pd.DataFrame:
         speeds, times = results["speeds"], settling_times(**results)
         slowest = np.array([_moving_average(values[CHANGE_SECOND:]).min() for values in speeds])
         median = np.median(np.where(np.isfinite(times), times, np.inf))  # episodes that never settle come last
-        row = {
-            "": label,
-            "before [m/s]": mean_text(speeds[:, CHANGE_SECOND - FINAL_SECONDS : CHANGE_SECOND].mean(1), 2),
-        }
+        before = speeds[:, CHANGE_SECOND - FINAL_SECONDS : CHANGE_SECOND]
+        row = {"": label, "before [m/s]": mean_text(before.mean(1), 2)}
         row |= {"slowest ten seconds after [m/s]": mean_text(slowest, 2)}
         row |= {"last minute [m/s]": mean_text(speeds[:, -FINAL_SECONDS:].mean(1), 2)}
         row |= {"settled": f"{np.isfinite(times).sum()} of {len(times)}"}
@@ -186,9 +184,7 @@ ADAPTATION = Study(
         for number, name in enumerate(ROAD_CHANGES)
         for position, driver in enumerate(ADAPTATION_DRIVERS.values())
     },
-    write=lambda study_folder, seeds, folder: write_figure(
-        folder, "adaptation", adaptation_figure(folder), reduce_colors=True
-    ),
     minutes=10.0,
     tables={name: partial(adaptation_table, name) for name in ROAD_CHANGES},
+    figures={"adaptation": adaptation_figure},
 )

@@ -33,7 +33,7 @@ from unjam.measures.statistics import (
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam.reports.results import PlotEpisode, read_results, validation_gains
 from unjam.reports.space_time import trajectory_figure
-from unjam.training.config import load_config
+from unjam.training.config import RunConfig, load_config
 from unjam.worlds.record import Floats
 from unjam_paper.results_file import read_part, write_figure, write_part
 from unjam_paper.study import (
@@ -158,7 +158,7 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
     row["paper"] = dict(zip(PAPER_COLUMNS, reported, strict=True)) if reported else None
     for name in COMPARISON_METRICS:
         is_comparable = name != "return" or metric == "return"  # returns of another reward are not comparable
-        values = [_finite_mean(run.rows, name) if is_comparable else nan for run in runs]
+        values = [estimate([row[name] for row in run.rows]).mean if is_comparable else nan for run in runs]
         row[name] = asdict(estimate_over_trainings(values, TRIMMED_SHARE, METRICS[name].bounds))
     differences = paired_differences([run.rows for run in runs], reference_rows[best], metric)
     validated = [gains for run in runs if (gains := validation_gains(run.progress))]
@@ -187,10 +187,6 @@ def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
     return {"mean": float(np.mean(values)), "std": float(np.std(values))} if values else {"mean": nan, "std": nan}
 
 
-def _finite_mean(rows: Table, name: str) -> float:
-    return estimate([row[name] for row in rows]).mean
-
-
 def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
     """Return the curves of a road by variant: the steps, and each quantity at these steps, one list per seed.
 
@@ -217,21 +213,17 @@ def _resample(grid: np.ndarray, progress: Table, name: str) -> list[float]:
 
 
 def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
-    """Return the best and the last checkpoint on validation seeds, and how many trainings kept the untrained network.
-
-    In older tables without `untrained_count`, a gain of zero means that the untrained network was kept.
-    """
+    """Return the best and the last checkpoint on validation seeds, and how often the untrained network was kept."""
     curves, table = read_part(folder, "curves")[road], []
     for row in read_part(folder, "table"):
         if "return_validation" in curves.get(row.get("variant"), {}):
             values = np.array(curves[row["variant"]]["return_validation"])
             best, last = values.max(1), values[:, -1]
-            untrained = row.get("untrained_count", sum(gain == 0 for gain in row["gains"]))
             difference = estimate_over_trainings(last - best, bounds=(-inf, 0.0))
             cells = {"": row["name"], "trainings": len(values), "best trained": number_text(best.mean(), 0)}
             cells |= {"last checkpoint": number_text(last.mean(), 0)}
             cells |= {"last − best": str(estimate_cell(difference, 0, sign="+"))}
-            table.append({**cells, "kept the untrained network": f"{untrained} of {len(values)}"})
+            table.append({**cells, "kept the untrained network": f"{row['untrained_count']} of {len(values)}"})
     return pd.DataFrame(table)
 
 
@@ -372,7 +364,7 @@ def efficiency_table(road: str, variants: Sequence[str], step_counts: Sequence[i
     The first variant is the one with the model.
     """
     curves, (modeled, *others) = read_part(folder, "curves")[road], variants
-    returns = {name: partial(_returns_after, curves[name], _first_validation(road, name)) for name in variants}
+    returns = {name: partial(_returns_after, PlannedRun(road, name, 0).config, curves[name]) for name in variants}
     rows = [
         {"": VARIANTS[name].label, **{f"{at:,}": trainings_text(after(at), 0) for at in step_counts}}
         for name, after in returns.items()
@@ -385,15 +377,9 @@ def efficiency_table(road: str, variants: Sequence[str], step_counts: Sequence[i
     return pd.DataFrame(rows)
 
 
-def _first_validation(road: str, variant: str) -> int:
-    """Return the number of steps before the first validation of a training."""
-    config = PlannedRun(road, variant, 0).config
-    return config.learner.steps_per_iteration * (config.evaluation.validation_interval or 1)
-
-
-def _returns_after(curve: dict[str, list[float]], first_validation: int, steps: int) -> Floats:
+def _returns_after(config: RunConfig, curve: dict[str, list[float]], steps: int) -> Floats:
     """Return the validation return of each training after some steps; NaN outside of its validated range."""
     trainings = curve["return_validation"]
-    if steps < first_validation:
+    if steps < config.learner.steps_per_iteration * (config.evaluation.validation_interval or 1):
         return np.full(len(trainings), np.nan)
     return np.array([np.interp(steps, curve["steps"], each, np.nan, np.nan) for each in trainings])

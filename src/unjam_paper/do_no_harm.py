@@ -104,44 +104,35 @@ def _rate_label(driver: str, rate: float) -> str:
     return f"{driver}, {100 * rate:g} %"
 
 
-def _evaluate_rate(results: Mapping[str, Any], rate: float) -> HarmVerdict:
-    labels = (_rate_label(driver, rate) for driver in (TESTED_CONTROLLER, ACC_BASELINE))
-    rows, acc_rows = (results["rows"].get(label, []) for label in labels)
-    breakdowns = [row["breakdown"] for row in results["rows"].get(HUMAN_LABEL, [])]
+def _evaluate_rate(rows: Mapping[str, Table], rate: float) -> HarmVerdict:
+    own, acc = (rows.get(_rate_label(driver, rate), []) for driver in (TESTED_CONTROLLER, ACC_BASELINE))
+    breakdowns = [row["breakdown"] for row in rows.get(HUMAN_LABEL, [])]
     is_frequent = 2 * sum(breakdowns) >= max(len(breakdowns), 1)  # on at least half of the seeds
-    return evaluate_harm(rows, acc_rows, is_frequent)
+    return evaluate_harm(own, acc, is_frequent)
 
 
 def measure_harm(controller: str, road: OpenTestRoad, workers: int) -> dict[str, Any]:
     """Return the rows of all drivers on a road, with as many seeds as the verdicts need."""
-    results: dict[str, Any] = {"rows": {}}
+    all_rows: dict[str, Table] = {}
     with TemporaryDirectory() as folder, WorkerPool(workers) as pool:
         file = write_road_files(road, Path(folder))
-        while rates := [rate for rate in PENETRATION_RATES if _needs_seeds(results, rate)]:
-            for label, rows in _run_seed_batch(file, road, results, rates, pool).items():
-                results["rows"].setdefault(label, []).extend(rows)
-    return results
+        while rates := [rate for rate in PENETRATION_RATES if _needs_seeds(all_rows, rate)]:
+            first = len(all_rows.get(HUMAN_LABEL, ()))
+            for label, rows in _run_seed_batch(file, road, first, rates, pool).items():
+                all_rows.setdefault(label, []).extend(rows)
+    return {"rows": all_rows}
 
 
-def _read_results(study: Path) -> dict[str, Any]:
-    """Return the results by road, with NaN for null."""
-    results: dict[str, Any] = read_part(study, RESULTS_PART)
-    return {
-        name: {"rows": {label: list(map(replace_null, rows)) for label, rows in road["rows"].items()}}
-        for name, road in results.items()
-    }
-
-
-def _needs_seeds(results: Mapping[str, Any], rate: float) -> bool:
-    count = len(results["rows"].get(_rate_label(ACC_BASELINE, rate), ()))
-    return count < MAX_SEEDS and _evaluate_rate(results, rate).verdict == UNDECIDED
+def _needs_seeds(rows: Mapping[str, Table], rate: float) -> bool:
+    count = len(rows.get(_rate_label(ACC_BASELINE, rate), ()))
+    return count < MAX_SEEDS and _evaluate_rate(rows, rate).verdict == UNDECIDED
 
 
 def _run_seed_batch(
-    file: Path, road: OpenTestRoad, results: Mapping[str, Any], rates: Sequence[float], pool: WorkerPool
+    file: Path, road: OpenTestRoad, first: int, rates: Sequence[float], pool: WorkerPool
 ) -> dict[str, Table]:
-    """Return the rows of the next seeds by label: the human baseline, and at these rates both drivers."""
-    seeds = make_test_seeds(SEED_BATCH, first=len(results["rows"].get(HUMAN_LABEL, ())))
+    """Return the rows of seeds from number `first` on by label: the human baseline, and at these rates both drivers."""
+    seeds = make_test_seeds(SEED_BATCH, first)
     drivers = {HUMAN_LABEL: (HUMAN_LABEL, rates[0])}
     drivers |= {_rate_label(name, rate): (name, rate) for rate in rates for name in (ACC_BASELINE, TESTED_CONTROLLER)}
     tasks = list[EpisodeTask]()
@@ -164,10 +155,11 @@ def _run_seed_batch(
 def harm_table(folder: Path) -> pd.DataFrame:
     """Return the comparison with the ACC alone and the verdict, for each road and penetration rate."""
     table: Table = []
-    for (name, results), rate in product(_read_results(folder).items(), PENETRATION_RATES):
-        road, rows = OPEN_TEST_ROADS[name], results["rows"]
+    for (name, results), rate in product(read_part(folder, RESULTS_PART).items(), PENETRATION_RATES):
+        road = OPEN_TEST_ROADS[name]
+        rows = {label: list(map(replace_null, each)) for label, each in results["rows"].items()}
         acc, own = (rows[_rate_label(driver, rate)] for driver in (ACC_BASELINE, TESTED_CONTROLLER))
-        verdict, breakdowns = _evaluate_rate(results, rate), [row["breakdown"] for row in rows[HUMAN_LABEL]]
+        verdict, breakdowns = _evaluate_rate(rows, rate), [row["breakdown"] for row in rows[HUMAN_LABEL]]
         table.append(
             {
                 "road": name,

@@ -35,7 +35,7 @@ from unjam.following.trajectories import (
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
-from unjam_paper.results_file import read_part, write_figure, write_part
+from unjam_paper.results_file import read_part, write_part
 from unjam_paper.study import Study, StudyFolder, Table
 
 SplitKind = Literal["trajectories", "rows", "released"]
@@ -190,13 +190,12 @@ def _rms(error: Floats) -> float:
 
 
 def _write_figure_6(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
-    """Write the rows, with the losses of fits to all data only, and the figure."""
-    rows: Table = [*read_part(folder, "figure-6").values()]
+    """Write the rows, with the losses of fits to all data only."""
     stored = [
-        {key: value for key, value in row.items() if row["size"] == 1.0 or not key.endswith("_loss")} for row in rows
+        {key: value for key, value in row.items() if row["size"] == 1.0 or not key.endswith("_loss")}
+        for row in read_part(folder, "figure-6").values()
     ]
     write_part(folder, "figure-6", {"rows": stored})
-    write_figure(folder, "figure-6", figure_6(rows))
 
 
 @rc_context(PLOT_STYLE)
@@ -255,4 +254,5 @@ FIGURE_6 = Study(
     },
     write=_write_figure_6,
     minutes=25.0,
+    figures={"figure-6": lambda folder: figure_6(read_part(folder, "figure-6")["rows"])},
 )

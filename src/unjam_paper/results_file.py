@@ -40,9 +40,9 @@ def write_part(folder: Path, name: str, part: Any) -> None:
     atomic_write(folder / f"{name}.json", to_json(part, indent=1))
 
 
-def write_figure(folder: Path, name: str, figure: Figure, reduce_colors: bool = False) -> None:
+def write_figure(folder: Path, name: str, figure: Figure) -> None:
     """Write a figure of a study into its working folder."""
-    atomic_write(folder / f"{name}.png", png_bytes(figure, reduce_colors=reduce_colors))
+    atomic_write(folder / f"{name}.png", png_bytes(figure))
 
 
 def write_results(path: Path, parts: Mapping[str, Any]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
@@ -27,7 +28,7 @@ from unjam.training.run_folder import read_config
 from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Floats
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, write_part
+from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, write_figure, write_part
 from unjam_paper.variants import VARIANTS
 
 STUDY_ROADS: dict[str, dict[str, Any]] = {
@@ -163,13 +164,15 @@ class Study:
     """returns what can be measured with the results so far, by name of the part, or as PART/ENTRY; arguments: folder of
     all studies, seeds"""
     write: Callable[[StudyFolder, int, Path], None] = lambda study_folder, seeds, folder: None
-    """writes figures, and parts that need no measurement; the last argument is the folder of this study"""
+    """writes parts that need no measurement, and figures of trainings; the last argument is the folder of this study"""
     roads: tuple[str, ...] = ()
     """roads on which the reference drivers are evaluated"""
     minutes: float = 0.0
     """duration of `run` on two cores"""
     tables: Mapping[str, Callable[[Path], pd.DataFrame]] = field(default_factory=dict)
     """tables of its page by name, made from its results"""
+    figures: Mapping[str, Callable[[Path], Figure]] = field(default_factory=dict)
+    """figures of its page by name, made from its results"""
 
     def run(self, study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
         """Measure the parts that have no current results, and write everything into the study's folder.
@@ -184,6 +187,8 @@ class Study:
         self.write(study_folder, seeds, folder)
         for name, table in self.tables.items():
             atomic_write(folder / f"{name}.csv", table(folder).to_csv(index=False))
+        for name, draw in self.figures.items():
+            write_figure(folder, name, draw(folder))
 
 
 def write_manifest(folder: Path, **metadata: Any) -> None:

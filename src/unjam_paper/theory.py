@@ -29,7 +29,7 @@ from unjam.training.run_folder import create_run_folder
 from unjam.training.seeds import make_test_seeds
 from unjam.training.train import Trainer
 from unjam.worlds.worker_pool import WorkerPool
-from unjam_paper.results_file import read_part, write_figure, write_part
+from unjam_paper.results_file import read_part, write_part
 from unjam_paper.study import PlannedRun, Study, StudyFolder, Table, planned_runs
 from unjam_paper.variants import VARIANTS
 
@@ -137,7 +137,6 @@ def theory_study(title: str, road: str, untrained_roads: Sequence[str]) -> Study
         model = model_error_history(study_folder, road, seeds)
         results = {"untrained": read_part(folder, "theory"), "convergence": convergence_rows(study_folder, road, seeds)}
         write_part(folder, "theory", {**results, "model": model})
-        write_figure(folder, "model", model_error_figure(model))
 
     return Study(
         title,
@@ -147,6 +146,7 @@ def theory_study(title: str, road: str, untrained_roads: Sequence[str]) -> Study
         },
         write=write,
         minutes=8.0,
+        figures={"model": lambda folder: model_error_figure(read_part(folder, "theory")["model"])},
     )
 
 
@@ -181,10 +181,6 @@ def measure_training_time(steps: int, rounds: int, workers: int) -> dict[str, An
     return {"rounds": measured, "median": medians, "relative_to_trpo": relative}
 
 
-def _write_time(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
-    write_figure(folder, "time", training_time_bars(read_part(folder, "time")["median"]))
-
-
 def training_time_bars(seconds: dict[str, dict[str, float]]) -> Figure:
     """Draw the parts of training as one stacked bar per variant."""
     bars = {VARIANTS[variant].label: parts for variant, parts in seconds.items()}
@@ -208,7 +204,7 @@ def _time_table(folder: Path) -> pd.DataFrame:
 FIGURE_8 = Study(
     title="training time, measured side by side",
     make_parts=lambda study_folder, seeds: {"time": (measure_training_time, (TIMED_STEPS, TIMING_ROUNDS))},
-    write=_write_time,
     minutes=12.0,
     tables={"training time": _time_table},
+    figures={"time": lambda folder: training_time_bars(read_part(folder, "time")["median"])},
 )

@@ -174,7 +174,7 @@ def test_the_checkpoint_table_has_the_best_and_the_last_checkpoint(tmp_path: Pat
     curves = {"trpo": {"return_validation": [[1.0, 9.0, 5.0], [2.0, 3.0, 3.0], [1.0, 6.0, 0.0]]}}
     rows = [
         {"name": "PI", "gains": []},
-        {"name": "TRPO", "variant": "trpo", "gains": [0.0, 2.0, 0.0]},
+        {"name": "TRPO", "variant": "trpo", "gains": [0.0, 2.0, 0.0], "untrained_count": 2},
         {"name": "SAC", "variant": "sac", "gains": [1.0, 2.0, 3.0]},  # another reward: returns are not comparable
     ]
     (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
@@ -190,7 +190,7 @@ def test_a_training_with_other_settings_is_refused(reproduced: Made) -> None:
     config = folder / "runs/small/plain/0/config.toml"
     before = config.read_text()
     try:
-        atomic_write(config, before.replace("gamma = 0.99", "gamma = 0.9"))
+        atomic_write(config, before.replace("stratified = true", "stratified = false"))
         with pytest.raises(InputError, match="was trained with other settings; allowed: a new folder"):
             make_plan(["small"], 2, StudyFolder(folder))
     finally:

@@ -74,11 +74,11 @@ def data_uri(figure: Figure) -> str:
     return f"data:image/svg+xml;base64,{base64.b64encode(drawing).decode()}"
 
 
-def png_bytes(figure: Figure, dpi: int = DPI, reduce_colors: bool = True) -> bytes:
-    """Return a figure as a PNG, by default of 256 colors."""
+def png_bytes(figure: Figure) -> bytes:
+    """Return a figure as a PNG of 256 colors."""
     content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=dpi)
-    return _reduce_colors(content.getvalue()) if reduce_colors else content.getvalue()
+    figure.savefig(content, format="png", dpi=DPI)
+    return _reduce_colors(content.getvalue())
 
 
 def _reduce_colors(png: bytes) -> bytes:
