@@ -289,12 +289,15 @@ def collisions(road: str) -> Callable[[Version], Finding]:
     """Return how to judge that collisions are rare."""
 
     def judge_collisions(version: Version) -> Finding:
-        rows = [row for row in version.rows(f"table-1-{road}", road).values() if row["is_learned"]]
+        rows = [version.rows(f"table-1-{road}", road)[each] for each in TABLE_1]
         most = max(row["collisions"]["largest"] for row in rows)
         episodes = sum(row["trainings"] * row["episodes"] for row in rows)
         gap = min(row["min_time_gap"]["mean"] for row in rows)
         numbers = f"at most {most:.2f} vehicles in an episode, of {episodes} episodes"
         numbers += f"; mean of the smallest time gaps {gap:.2f} s with the worst learner"
+        braking = [row["cav_max_braking"]["largest"] or 0.0 for row in rows if "cav_max_braking" in row]
+        if braking:  # older results do not have it
+            numbers += f", of the hardest braking {max(braking):.1f} m/s² in the worst training"
         causes = "SUMO's brakes and the filter" if version.has_filter and road in UNFILTERED_ROADS else "SUMO's brakes"
         return f"{HELD}{BY_CONSTRUCTION} of {causes}" if most < RARE else NOT_HELD, numbers
 

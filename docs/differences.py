@@ -196,7 +196,7 @@ TRAFFIC = (
         "length of an episode, warm-up",
         "not stated",
         ("scenario.horizon", "scenario.warmup"),
-        "1,500 on the figure eight, 600 of 1 s on the merge: as in the authors' code and Flow",
+        "Flow drives 750 steps before; 1,500 on the figure eight as in the authors' code, 600 of 1 s on the merge",
     ),
     Difference(
         "sizes of the ring in one iteration",
@@ -212,10 +212,10 @@ TRAFFIC = (
         road="figure-eight",
     ),
     Difference(
-        "start of the merge, gap that SUMO keeps",
+        "start of the merge, right of way, limits of brakes",
         "not stated",
-        ("scenario.standing_vehicles",),
-        "2.5 m, as in Flow",
+        ("scenario.standing_vehicles", "scenario.right_of_way", "scenario.enforce_human_limits"),
+        "as in Flow, as is the gap of 2.5 m that SUMO keeps for human drivers",
         merge_effect,
         road="merge",
     ),
@@ -256,7 +256,7 @@ CONTROLLER = (
     ),
     Difference(
         "critics of SAC",
-        "as Haarnoja et al. (2018): no normalization",
+        "those of Haarnoja et al. (2018), without normalization (4.2.1)",
         (),
         "layer normalization in both hidden layers (`NormalizedReLU` in `src/unjam/learners/sac_td3.py`)",
     ),
@@ -275,7 +275,13 @@ LEARNING = (
         ("trpo.steps_per_iteration", "ppo.steps_per_iteration"),
     ),
     Difference(
-        "SAC: temperature", "0.2 (Table B4)", ("sac.temperature", "sac.reward_scale"), "second: factor of rewards"
+        "PPO: gradient steps of an epoch", "not stated", ("ppo.minibatches",), "1: one on all rows of an iteration"
+    ),
+    Difference(
+        "SAC: temperature",
+        "0.2 (Table B4)",
+        ("sac.temperature", "sac.learn_temperature", "sac.reward_scale"),
+        "learned in the authors' code; the last is a factor of the rewards",
     ),
     Difference(
         "SAC: first 10,000 steps",
