@@ -2,8 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import field, fields, is_dataclass
 from functools import cache, wraps
 from inspect import get_annotations, getattr_static
@@ -104,15 +103,22 @@ class Subclassable:
 
 
 @cache
-def replaced_member(kind: type[Any], base: type[Any], ignored: AbstractSet[str] = frozenset()) -> str:
-    """Return a member of a base that a class derived from it replaces, other than by values of fields; empty: none."""
-    names, missing = {each.name for each in fields(base)}, object()
-    for name in dir(base):
+def changed_members(kind: type[Any], base: type[Any]) -> list[str]:
+    """Return the members of a class that differ from those of its base, other than values of the base's fields."""
+    kinds, values, missing = kind.__mro__, {each.name for each in fields(base)}, object()
+    changed = list[str]()
+    for name in sorted({name for each in kinds[: kinds.index(base)] for name in (*get_annotations(each), *vars(each))}):
         own, inherited = (getattr_static(each, name, missing) for each in (kind, base))
-        is_value = name in names and not hasattr(own, "__get__")
-        if own is not inherited and own != inherited and not (is_value or name in ignored or name.startswith("__")):
-            return name
-    return ""
+        is_value = name in values and not hasattr(own, "__get__")
+        is_same = own is not missing and (own is inherited or own == inherited)
+        if not (is_value or is_same or name.startswith("__")):
+            changed.append(name)
+    return changed
+
+
+def replaced_member(kind: type[Any], base: type[Any], ignored: Collection[str]) -> str:
+    """Return a member of a base that a class derived from it replaces, other than by values of fields; empty: none."""
+    return next((name for name in changed_members(kind, base) if hasattr(base, name) and name not in ignored), "")
 
 
 def _apply_decorator(cls: type[Any]) -> None:
@@ -141,16 +147,11 @@ def check_part(name: str, part: Any) -> None:
     """
     if not isinstance(part, Subclassable):
         return
-    kinds = type(part).__mro__
-    known = next(filter(is_packaged, kinds))
-    values: Any = known.__dataclass_fields__
-    for kind in kinds[: kinds.index(known)]:
-        for member in (*get_annotations(kind), *vars(kind)):
-            is_value = member in values and not hasattr(vars(kind).get(member), "__get__")
-            if not is_value and not member.startswith("__"):
-                allowed = f"{known.__name__}, or a class of other values for its fields"
-                label = f"the class {type(part).__name__} with its {member!r}"
-                raise InputError(f"{name}: {label} is not allowed; allowed: {allowed}")
+    known = next(filter(is_packaged, type(part).__mro__))
+    if members := changed_members(type(part), known):
+        allowed = f"{known.__name__}, or a class of other values for its fields"
+        label = f"the class {type(part).__name__} with its {members[0]!r}"
+        raise InputError(f"{name}: {label} is not allowed; allowed: {allowed}")
 
 
 def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) -> DataclassT:
