@@ -80,23 +80,21 @@ def parameter_effects_table(folder: Path) -> pd.DataFrame:
         number: float(np.mean([row[TIME_METRIC] for row in human if row["setting"] == number]))
         for number in settings_with_breakdown(human)
     }
+    delays = {number: time - SETTINGS[number].free_flow_time for number, time in times.items()}
+    rows = [row for part in (TUNING_PART, FINAL_PART) for row in read_part(folder, part) if row["candidate"]]
     table: Table = []
-    for method in METHODS:
-        rows = [row for part in (TUNING_PART, FINAL_PART) for row in read_part(folder, part) if row["method"] == method]
-        numbers, changes = list[list[float]](), list[float]()
-        names = list(METHODS[method].candidate(1).numbers)
-        for row in rows:
-            for episode in row["episodes"] if row["candidate"] else ():
-                if (number := episode["setting"]) in times:
-                    numbers.append([METHODS[method].candidate(row["candidate"]).numbers[name] for name in names])
-                    delay = times[number] - SETTINGS[number].free_flow_time
-                    changes.append((episode[TIME_METRIC] - times[number]) / delay)
-        if not changes:
+    for name, method in METHODS.items():
+        own = [(method.candidate(row["candidate"]).numbers, row["episodes"]) for row in rows if row["method"] == name]
+        samples = [(numbers, each) for numbers, episodes in own for each in episodes if each["setting"] in times]
+        if not samples:
             continue
-        effects = regress(np.array(numbers), np.array(changes))
+        parameters = list(method.candidate(1).numbers)
+        values = np.array([[numbers[parameter] for parameter in parameters] for numbers, _ in samples])
+        changes = [(each[TIME_METRIC] - times[each["setting"]]) / delays[each["setting"]] for _, each in samples]
+        effects = regress(values, np.array(changes))
         table += [
-            {"method": method, "parameter": name, "standard deviation": f"{spread:.3g}", "delay": _percent(effect)}
-            for name, spread, effect in zip(names, np.std(numbers, axis=0), effects, strict=True)
+            {"method": name, "parameter": parameter, "standard deviation": f"{spread:.3g}", "delay": _percent(effect)}
+            for parameter, spread, effect in zip(parameters, np.std(values, axis=0), effects, strict=True)
         ]
     return pd.DataFrame(table)
 
