@@ -118,13 +118,15 @@ class Toy:
     target: Target = constant_target
     episodes: int = 8
     action_repeat: int = 1
+    string_gain: Callable[[Network], float] | None = None
     iterations: list[Iteration] = field(default_factory=list)
     networks: list[Network] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         settings = self.settings or QUICK[self.agent]
         model = ModelSettings(model_ratio=0.0)
-        self.spec = ToySpec([Task(Ring(), PISaturation())], self.policy, model, settings.gamma, self.seed)
+        tasks = [Task(Ring(), PISaturation())]
+        self.spec = ToySpec(tasks, self.policy, model, settings.gamma, self.seed, self.string_gain)
         self.learner = make_agent(self.agent, settings, self.spec)
         self.algorithm = Algorithm1(self.spec, self.learner)
         self.collector = Collector(self.collect)

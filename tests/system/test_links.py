@@ -29,7 +29,7 @@ TRIAL = {**ROAD, "trpo.steps_per_iteration": 160, "steps": 160, "evaluation.vali
 SEARCH = ["search", "ring", *(word for key, value in TRIAL.items() for word in ("--set", f"{key}={value}"))]
 SEARCH += ["--vary", "trpo.target_kl=0.01,0.02", "--workers", "1", "--out", "searched"]
 TUNE = ["tune", "ring", "--length", "60", "--vehicles", "5", "--set", "horizon=20", "--expert", "pi"]
-TUNE += ["--max-string-gain", "inf"]
+TUNE += ["--max-string-gain", "0"]
 TUNE += ["--vary", "window=10,30", "--steps", "3000", "--out", "tuned"]
 ASSESS = ["assess", "straight.sumocfg", "--penetration-rates", "0.5", "-d", "acc", "--set", "horizon=40", "-n", "36"]
 FIT = ["fit-drivers", "data.parquet", "--set", "calibration.generations=2", "--out", "files/people.json"]

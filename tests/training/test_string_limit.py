@@ -1,20 +1,25 @@
 """Tuning keeps to settings that do not amplify the oscillations of their leaders."""
 
-from math import inf
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from optuna.distributions import FloatDistribution
 
-from unjam.controller import string_stability
+from tests.pictures import empty_pictures
+from tests.training.test_run import small_config
+from unjam.controller import load_controller, string_stability
 from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError, UnjamError
+from unjam.reports.results import read_progress
 from unjam.scenarios import Ring
 from unjam.scenarios.motorway import ON_RAMP
 from unjam.training import setting_sampler
 from unjam.training.search_space import SearchSpace
 from unjam.training.string_limit import MAX_STRING_GAIN, find_operating_points
+from unjam.training.train import train
 from unjam.training.trial_log import TRIALS_FILE
 from unjam.training.tune import STRING_GAIN_SEED, TUNING_EPISODES, TUNING_FINALISTS, tune
 from unjam.worlds.worker_pool import WorkerPool
@@ -59,7 +64,7 @@ def test_an_expert_that_always_amplifies_ends_the_tuning_with_its_smallest_gain(
 
 
 def test_a_limit_on_an_open_road_is_refused(tmp_path: Path) -> None:
-    message = "max_string_gain: 1.02 is not allowed; allowed: inf on on-ramp"
+    message = "max_string_gain: 1.02 is not allowed; allowed: 0 on on-ramp"
     with WorkerPool(1) as workers, pytest.raises(InputError, match=message):
         tune({"on-ramp": ON_RAMP}, "jam-ahead", {}, 10**9, tmp_path, workers, max_string_gain=1.02)
 
@@ -67,6 +72,34 @@ def test_a_limit_on_an_open_road_is_refused(tmp_path: Path) -> None:
 def test_without_a_limit_no_gain_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("unjam.training.tune.find_operating_points")
     with WorkerPool(1) as workers:
-        found = tune({"ring": SMALL}, "pi", {}, STEPS, tmp_path, workers, max_string_gain=inf)
-    assert "string_gain" not in (tmp_path / "tuned.json").read_text()
+        found = tune({"ring": SMALL}, "pi", {}, STEPS, tmp_path, workers, max_string_gain=0.0)
+    assert "string_gain" not in json.loads((tmp_path / "tuned.json").read_text())
     assert found.best.score is not None
+
+
+@pytest.mark.long
+def test_a_trained_controller_keeps_the_limit(tmp_path: Path) -> None:
+    changes = {"expert": "smooth-acc", "policy__max_string_gain": 1.02, "policy__exploration_std": 0.3}
+    config = small_config(**changes, model__model_ratio=0.0, trpo__target_kl=1.0)
+    with empty_pictures():
+        train(config, tmp_path / "run")
+    rows = read_progress(tmp_path / "run")
+    assert all(0.0 <= row["learner"]["kept_update"] <= 1.0 for row in rows)
+    with WorkerPool(1) as workers:
+        (point,) = find_operating_points({"": config.make_scenario()}, workers).values()
+    assert point.string_gain(load_controller(tmp_path / "run")) <= 1.02
+
+
+@pytest.mark.parametrize(
+    ("changes", "allowed"),
+    [
+        ({"scenario_options__warmup": 300}, "at least 1.*, the gain of its first policy, or another expert"),
+        ({"scenario": "merge", "scenario_options": {}}, "none on merge: it is no closed road"),
+    ],
+)
+def test_a_training_that_cannot_keep_the_limit_is_refused(
+    changes: dict[str, Any], allowed: str, tmp_path: Path
+) -> None:
+    config = small_config(policy__max_string_gain=1.02, model__model_ratio=0.0, **changes)
+    with pytest.raises(InputError, match=f"policy.max_string_gain: 1.02 is not allowed; allowed: {allowed}"):
+        train(config, tmp_path / "run")

@@ -1,7 +1,6 @@
 """Calibration: `unjam tune` of experts, `unjam calibrate` of user networks, `unjam fit-drivers` of human drivers."""
 
 from dataclasses import asdict, replace
-from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -65,8 +64,8 @@ def tune_command(
     max_string_gain: Annotated[
         float | None,
         Option(
-            min=1.0,
-            help="Largest amplification of a leader's oscillations, 0.001 to 1 Hz, on closed roads; inf: any.",
+            min=0.0,
+            help="Largest amplification of a leader's oscillations, 0.001 to 1 Hz, on closed roads; 0: any.",
             show_default="1.02 on closed roads",
         ),
     ] = None,
@@ -83,7 +82,7 @@ def tune_command(
     Examples:
 
     - unjam tune ring
-    - unjam tune ring --expert pi --max-string-gain inf       (pi always amplifies some frequency)
+    - unjam tune ring --expert pi --max-string-gain 0       (pi always amplifies some frequency)
     - unjam tune on-ramp --expert jam-ahead --vary min_speed=2..8 --steps 300000
     - unjam tune rings         (also shared-rings, figure-eights, motorways, or all-roads)
     """
@@ -105,7 +104,7 @@ def tune_command(
     folder = opt.new_folder(out, f"tune-{Path(scenario).stem}")
     on_message = (lambda line: None) if json else err_console.print
     if max_string_gain is None:
-        max_string_gain = MAX_STRING_GAIN if any(road.is_closed for road in roads.values()) else inf
+        max_string_gain = MAX_STRING_GAIN if any(road.is_closed for road in roads.values()) else 0.0
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), WorkerPool(workers) as pool:
         result = tune(
             *(roads, expert, space, steps, folder, pool, reward, seed, backend, on_message, screen),

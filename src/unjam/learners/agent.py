@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -34,6 +34,8 @@ class AgentSpec:
     """discount from one action of the network to the next"""
     seed: int
     """of the whole run"""
+    string_gain: Callable[[Network], float] | None = None
+    """largest string gain of the full policy with a network, on all tasks; None: it has no limit"""
 
     @property
     def inputs(self) -> int:

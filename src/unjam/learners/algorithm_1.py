@@ -5,17 +5,18 @@ environment experience and D_v model experience, k* the rollout length of Eq. 15
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 
 from unjam.drivers.network import Network
+from unjam.errors import InputError, invalid_value
 from unjam.learners.agent import AgentSpec, check_state, is_algorithm, make_agent
 from unjam.learners.algorithm import Algorithm, Collector, IterationLog, Tensors, seed_iteration, tensors_with_prefix
 from unjam.learners.experience import Experience, environment_experience, join_experience
-from unjam.learners.learner import Learner, Update, policy_distance
+from unjam.learners.learner import Learner, Update, limit_update, policy_distance
 from unjam.learners.model_rollouts import ModelRollouts
 from unjam.learners.settings import LearnerSettings
 
@@ -32,6 +33,8 @@ class Algorithm1:
         tasks = range(len(spec.tasks) if spec.model.model_ratio > 0 else 0)
         self.model_rollouts = [ModelRollouts(spec, index) for index in tasks]
         """of each task, with its model and D_a; empty: model-free"""
+        if spec.string_gain is not None:
+            self._check_limit(spec.string_gain)
 
     def network(self) -> Network:
         """Return pi_theta."""
@@ -44,6 +47,7 @@ class Algorithm1:
         """
         learner, model_rollouts = self.learner, self.model_rollouts
         timed_parts = ("fit", "roll_out", "update") if model_rollouts else ("update",)
+        timed_parts += ("string_gain",) if self.spec.string_gain is not None else ()
         seconds: dict[str, float] = dict.fromkeys(timed_parts, 0.0)
 
         # Line 4: collect transitions from the environment using pi_theta and pi_H, ...
@@ -54,6 +58,7 @@ class Algorithm1:
         stride = -(-len(environment_rows.rewards) // MAX_COMPARED_ROWS)
         compared = torch.as_tensor(environment_rows.observations[::stride])
         before = learner.residual_distribution(compared)
+        parameters = [each.detach().clone() for each in learner.policy_parameters()]
 
         # ... and add them to D_a. Line 5: train T on D_a. Line 6: eps_m gives the rollout length k*.
         for each, task_episodes in zip(model_rollouts, episodes, strict=False):  # none: model-free
@@ -79,6 +84,9 @@ class Algorithm1:
                     learner.check_parameters(collect.iteration)
 
         log = learner.log()
+        if self.spec.string_gain is not None:
+            with _measure_seconds(seconds, "string_gain"):
+                log |= {"kept_update": limit_update(learner, parameters, self._is_allowed)}
         eps_pi = policy_distance(before, learner.residual_distribution(compared))
         log |= {"eps_pi_mean": float(eps_pi.mean()), "eps_pi_max": float(eps_pi.max())}
         for each in model_rollouts:
@@ -86,6 +94,20 @@ class Algorithm1:
             each.facts["bound"] = each.bound(each.k_star, log["eps_pi_max"], eps_m)
         model_steps = sum(each.model_steps for each in model_rollouts)
         return IterationLog(log, model_steps, [each.facts for each in model_rollouts], seconds)
+
+    def _check_limit(self, string_gain: Callable[[Network], float]) -> None:
+        """Raise `InputError` if the string gain of the first policy is too large, or updates cannot be taken back."""
+        if not self.learner.policy_parameters():
+            name = type(self.learner).__name__
+            raise InputError(f"policy.max_string_gain: {name} has no policy_parameters(), as such a limit needs")
+        limit = self.spec.policy.max_string_gain
+        if not self._is_allowed(self.network()):
+            allowed = f"at least {string_gain(self.network()):.3f}, the gain of its first policy, or another expert"
+            raise invalid_value("policy.max_string_gain", limit, allowed)
+
+    def _is_allowed(self, network: Network) -> bool:
+        string_gain = self.spec.string_gain
+        return string_gain is None or string_gain(network) <= self.spec.policy.max_string_gain
 
     def _plan_updates(self, environment_steps: int) -> list[tuple[bool, int, int]]:
         """Return the updates of this iteration: (with environment rows, part of the model rows, number of parts).
@@ -126,7 +148,11 @@ class Algorithm1:
 def make_algorithm(agent: str, settings: LearnerSettings, spec: AgentSpec) -> Algorithm:
     """Return the algorithm of an agent: the user's own, or Algorithm 1 with the learner."""
     made = make_agent(agent, settings, spec)
-    return made if is_algorithm(made) else Algorithm1(spec, made)
+    if not is_algorithm(made):
+        return Algorithm1(spec, made)
+    if spec.string_gain is not None:
+        raise invalid_value("policy.max_string_gain", spec.policy.max_string_gain, f"none with {agent}, an algorithm")
+    return made
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Learners: what updates the policy in Algorithm 1, from environment and model experience."""
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -13,6 +14,8 @@ from unjam.learners.algorithm import Tensors
 from unjam.learners.experience import Experience, join_experience
 from unjam.physics.arrays import square_root
 
+MAX_HALVINGS = 4
+"""number of times that an update is halved before it is taken back"""
 MIN_STD = 1e-6
 """smallest standard deviation at which policies are compared [m/s2]"""
 
@@ -69,6 +72,10 @@ class Learner(Protocol):
     def set_value_scale(self, environment_rows: Experience) -> None:
         """Set the scale of the values from the rows of the first iteration."""
 
+    def policy_parameters(self) -> list[Tensor]:
+        """Return the parameters of the policy, of which an update can be taken back; empty: not supported."""
+        return []
+
     def residual_distribution(self, observations: Tensor) -> Normal:
         """Return the distribution of the residual at n observations, before any squashing, shape (n,)."""
         network = self.network()
@@ -83,6 +90,23 @@ class Learner(Protocol):
         """Raise `UnjamError` if a parameter is not finite."""
         if not all(np.isfinite(part).all() for layer in self.network().layers for part in layer):
             raise UnjamError(f"learner: a weight is not finite in iteration {iteration}")
+
+
+def limit_update(learner: Learner, before: Sequence[Tensor], is_allowed: Callable[[Network], bool]) -> float:
+    """Take back so much of an update of the policy that its network is allowed; return the remaining share.
+
+    `before` are copies of the parameters before the update, which are allowed. Each try halves the update; after
+    `MAX_HALVINGS` nothing of it remains.
+    """
+    parameters = learner.policy_parameters()
+    changes = [parameter.detach() - old for parameter, old in zip(parameters, before, strict=True)]
+    share = 1.0
+    while share and not is_allowed(learner.network()):
+        share = share / 2.0 if share > 0.5**MAX_HALVINGS else 0.0
+        with torch.no_grad():
+            for parameter, old, change in zip(parameters, before, changes, strict=True):
+                parameter.copy_(old + share * change)
+    return share
 
 
 def policy_distance(p: Normal, q: Normal) -> Tensor:

@@ -141,6 +141,10 @@ class OffPolicyLearner(SB3Learner):
         self.buffer: MixedReplayBuffer = self.sb3.replay_buffer
         self._due_gradient_steps = 0
 
+    def policy_parameters(self) -> list[Tensor]:
+        """Return the parameters of the policy."""
+        return list(self.sb3.policy.actor.parameters())
+
     def exploring_network(self, environment_steps: int) -> Network:
         """Return the policy as a NumPy network; before the first update, the start policy of the settings."""
         if not self.is_learning(environment_steps) and self.settings.start_policy == "uniform":

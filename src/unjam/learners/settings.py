@@ -59,6 +59,9 @@ class PolicySettings:
     privileged_critic: bool = True
     """give the value network what the episode drew (the ring's length); else it takes a large gap for a longer and
     faster ring, and the policy learns to fall back"""
+    max_string_gain: NonNegative = 0.0
+    """largest amplification of the oscillations of a leader by the full policy, with filter and actuator, at 0.001 to
+    1 Hz, on closed roads: updates beyond it are partly or wholly taken back; 0: any"""
     normalize_value: bool = True
     """scale the value network by the returns of the first iteration (sac: shift by its mean reward); starting at zero,
     it needs tens of iterations to reach values of 150"""

@@ -140,6 +140,10 @@ class OnPolicyLearner(SB3Learner):
             returns = discounted_returns(environment_rows, self.gamma)
             self.sb3.policy.scale_value(float(returns.mean()), float(max(returns.std(), 1e-3)))
 
+    def policy_parameters(self) -> list[Tensor]:
+        """Return the parameters of the policy."""
+        return [parameter for name, parameter in self.sb3.policy.named_parameters() if "value" not in name]
+
     @torch.no_grad()
     def residual_distribution(self, observations: Tensor) -> Normal:
         """Return mean and standard deviation of the residual."""

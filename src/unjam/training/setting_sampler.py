@@ -1,7 +1,6 @@
 """Proposals of settings for a tuning, none of which has too large a string gain."""
 
 from collections.abc import Callable
-from math import inf
 from typing import Any
 
 from optuna import create_study
@@ -35,9 +34,9 @@ class SettingSampler:
         space: SearchSpace,
         seed: int,
         string_gain: Callable[[str], float],
-        max_string_gain: float = inf,
+        max_string_gain: float = 0.0,
     ) -> None:
-        """Take the function that measures the string gain of a driver's name; it is not called without a limit."""
+        """Take the function that measures the string gain of a driver's name; it is not called with the limit 0."""
         self._expert, self._space = expert, space
         self._string_gain, self._max_string_gain = string_gain, max_string_gain
         self._study = create_study(direction="maximize", sampler=TPESampler(seed=seed, multivariate=True))
@@ -49,7 +48,7 @@ class SettingSampler:
         while len(accepted) < count:
             trial = self._study.ask(dict(self._space))
             values = {key: _round_digits(value) for key, value in trial.params.items()}
-            if self._max_string_gain < inf and not self._is_allowed(trial, values, refused):
+            if self._max_string_gain and not self._is_allowed(trial, values, refused):
                 continue
             accepted.append((trial, values))
             refused = []

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,7 +17,7 @@ from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import is_file_reference
-from unjam.errors import UnjamError
+from unjam.errors import UnjamError, invalid_value
 from unjam.files import append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
 from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
@@ -55,6 +55,7 @@ from unjam.training.run_folder import (
     save_checkpoint,
 )
 from unjam.training.seeds import VALIDATION_SEED
+from unjam.training.string_limit import find_operating_points
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
 from unjam.trust import expecting_code
 from unjam.worlds.batch.run import run_batched_if_supported
@@ -209,7 +210,8 @@ class Trainer:
         self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
         self.folders = [folder / task.name for task in self.tasks]
-        self.spec = AgentSpec(self.tasks, config.policy, config.model, config.learner.gamma, config.seed)
+        string_gain = self._string_gain_function() if config.policy.max_string_gain else None
+        self.spec = AgentSpec(self.tasks, config.policy, config.model, config.learner.gamma, config.seed, string_gain)
         self.collector = Collector(self.collect)
         seed_iteration(config.seed, 0)
         with reporting_user_errors(config.agent):
@@ -232,6 +234,19 @@ class Trainer:
             self._expert_returns = state["expert_returns"]
             self._sampler.restore(state["sampler"])
             append_lineage(folder, state["iteration"])
+
+    def _string_gain_function(self) -> Callable[[Network], float]:
+        """Return the function that measures the largest string gain of the policy on all closed roads."""
+        points = find_operating_points({task.name: task.scenario for task in self.tasks}, self.workers)
+        if not points:
+            allowed = f"none on {self.config.scenario}: it is no closed road"
+            raise invalid_value("policy.max_string_gain", self.config.policy.max_string_gain, allowed)
+
+        def string_gain(network: Network) -> float:
+            drivers = zip(self.tasks, self.make_drivers(network), strict=True)
+            return max(points[task.name].string_gain(driver) for task, driver in drivers if task.name in points)
+
+        return string_gain
 
     def train(self) -> None:
         """Learn until the configured environment steps; an interruption loses at most the current iteration."""

@@ -84,7 +84,7 @@ def tune(
     backend: str = "sumo",
     on_message: Callable[[str], None] = lambda line: None,
     screen: bool | None = False,
-    max_string_gain: float = inf,
+    max_string_gain: float = 0.0,
 ) -> TuningResult:
     """Search the parameters of an expert, and write `tuned.json` and the expert as `EXPERT.unjam` into a folder.
 
@@ -104,7 +104,7 @@ def tune(
         on_message: called with a line for each trial.
         screen: whether trials run in batches on roads that support it (on several roads: exactly), and only the
             finalists and the default in SUMO; None: if any road supports it; not with another backend.
-        max_string_gain: settings with a larger string gain on a closed road are refused before they are tried.
+        max_string_gain: settings with a larger string gain on a closed road are not tried; 0: any are.
 
     Raises:
         InputError: too few steps, a wrong parameter, no road that supports batches, or another folder.
@@ -127,8 +127,8 @@ def tune(
         check_support(simulator, *roads.values())
     other = "" if backend == "sumo" else f"trials run in {backend}"
     reasons = {road: other or unsupported(scenario) for road, scenario in roads.items()}
-    if max_string_gain < inf and not any(scenario.is_closed for scenario in roads.values()):
-        raise invalid_value("max_string_gain", max_string_gain, f"inf on {next(iter(roads))}: it is no closed road")
+    if max_string_gain and not any(scenario.is_closed for scenario in roads.values()):
+        raise invalid_value("max_string_gain", max_string_gain, f"0 on {next(iter(roads))}: it is no closed road")
     if screen and all(reasons.values()):
         raise InputError(f"screen: {next(iter(reasons.values()))}")
     screened = [road for road, reason in reasons.items() if screen is not False and not reason]
@@ -136,9 +136,9 @@ def tune(
     request = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
     files = file_hashes([reward, backend], *roads.values())
     request |= {"files": files} if files else {}
-    request |= {"max_string_gain": max_string_gain} if max_string_gain < inf else {}
+    request |= {"max_string_gain": max_string_gain} if max_string_gain else {}
     log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
-    points = find_operating_points(roads, workers) if max_string_gain < inf else {}
+    points = find_operating_points(roads, workers) if max_string_gain else {}
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
     trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)
 
@@ -166,7 +166,7 @@ def tune(
         return log.verdicts[key][0] or 0.0
 
     trials: list[TuningTrial] = []
-    sampler = SettingSampler(expert, space, seed, string_gain, max_string_gain if points else inf)
+    sampler = SettingSampler(expert, space, seed, string_gain, max_string_gain)
     shares_batches = any(required_batch_kind(roads[road]).has_own_drivers for road in screened)
     batch_size = SCREENING_BATCH_SIZE if screen or shares_batches else 1  # many take as long as few
     for first in range(0, trial_count, batch_size):
