@@ -130,14 +130,18 @@ class Version:
         return {label: each[:, part].mean(1) for label, each in self.curves(name, road, variants, quantity).items()}
 
 
+Assessment = Callable[[Version], Finding]
+"""what the results of a version say of a claim"""
+
+
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, and how results judge it."""
+    """A claim of the paper, and how results of a version assess it."""
 
     text: str
     study: str
     road: str
-    judge: Callable[[Version], Finding]
+    assess: Assessment
     depends_on_filter: bool = True
     has_unfiltered_study: bool = True
     """whether a study measures it without the filter"""
@@ -159,7 +163,7 @@ class Claim:
 
     def _finding(self, version: Version) -> Finding:
         try:
-            return self.judge(version)
+            return self.assess(version)
         except MissingResultsError:
             return NOT_MEASURED, NO_VALUE_TEXT
 
@@ -174,7 +178,7 @@ def paper_values(road: str, column: int, digits: int, variants: Sequence[str] = 
     return list_values({label_of(each): PAPER_RESULTS[road, each][column] for each in variants}, digits)
 
 
-def larger_return(study: str, road: str, variant: str, *others: str) -> Callable[[Version], Finding]:
+def larger_return(study: str, road: str, variant: str, *others: str) -> Assessment:
     """Return how to judge that a variant has a larger return on test seeds than others, and whether its expert has it.
 
     The expert counts for variants that add a residual to it.
@@ -204,7 +208,7 @@ def curve_extreme(
     variants: Sequence[str] = TABLE_1,
     larger: bool = True,
     digits: int = 2,
-) -> Callable[[Version], Finding]:
+) -> Assessment:
     """Return how to judge that the first variant has the largest (smallest) value in a part of the training."""
 
     def judge_means(version: Version) -> Finding:
@@ -217,7 +221,7 @@ def curve_extreme(
 
 def late_change(
     study: str, road: str, variant: str, quantity: str, what: str, larger: bool, digits: int = 2
-) -> Callable[[Version], Finding]:
+) -> Assessment:
     """Return how to judge that a quantity rises (falls) from the third to the last quarter of the training."""
 
     def judge_change(version: Version) -> Finding:
@@ -232,9 +236,7 @@ def late_change(
     return judge_change
 
 
-def first_arrival(
-    study: str, road: str, variant: str, *others: str, is_last: bool = False
-) -> Callable[[Version], Finding]:
+def first_arrival(study: str, road: str, variant: str, *others: str, is_last: bool = False) -> Assessment:
     """Return how to judge that a variant reaches 0.9 of TRPO's final return first, or last."""
 
     def judge_steps(version: Version) -> Finding:
@@ -252,9 +254,7 @@ def first_arrival(
     return judge_steps
 
 
-def fluctuation(
-    study: str, road: str, variant: str, *others: str, larger: bool = False
-) -> Callable[[Version], Finding]:
+def fluctuation(study: str, road: str, variant: str, *others: str, larger: bool = False) -> Assessment:
     """Return how to judge that the curve of a variant changes less (more) between points, in its second half."""
 
     def judge_changes(version: Version) -> Finding:
@@ -266,7 +266,7 @@ def fluctuation(
     return judge_changes
 
 
-def compared_with_idm(road: str, metric: str, what: str, larger: bool) -> Callable[[Version], Finding]:
+def compared_with_idm(road: str, metric: str, what: str, larger: bool) -> Assessment:
     """Return how to judge that all vehicles have a larger (smaller) value with the method than with IDM in the CAV."""
 
     def judge_metric(version: Version) -> Finding:
@@ -285,7 +285,7 @@ def compared_with_idm(road: str, metric: str, what: str, larger: bool) -> Callab
     return judge_metric
 
 
-def collisions(road: str) -> Callable[[Version], Finding]:
+def collisions(road: str) -> Assessment:
     """Return how to judge that collisions are rare."""
 
     def judge_collisions(version: Version) -> Finding:
@@ -402,7 +402,7 @@ def model_error_falls(version: Version) -> Finding:
     return worst(findings)
 
 
-def knowledge_in_model(part: slice, what: str) -> Callable[[Version], Finding]:
+def knowledge_in_model(part: slice, what: str) -> Assessment:
     """Return how to judge that the model error is smaller with IDM in the model, without an expert."""
 
     def judge_errors(version: Version) -> Finding:
@@ -414,7 +414,7 @@ def knowledge_in_model(part: slice, what: str) -> Callable[[Version], Finding]:
     return judge_errors
 
 
-def better_start(road: str) -> Callable[[Version], Finding]:
+def better_start(road: str) -> Assessment:
     """Return how to judge that untrained residuals on the expert have larger returns than untrained policies alone."""
 
     def judge_untrained(version: Version) -> Finding:
@@ -464,7 +464,7 @@ def gain_over_expert(version: Version) -> Finding:
 
 def of_table_1(
     text: str,
-    make_judge: Callable[[str, str], Callable[[Version], Finding]],
+    make_assessment: Callable[[str, str], Assessment],
     column: int = 0,
     digits: int = 0,
     roads: Sequence[str] = PAPER_ROADS,
@@ -478,7 +478,7 @@ def of_table_1(
     for road in roads:
         lowest = label_of(min(TABLE_1, key=lambda each: PAPER_RESULTS[road, each][column]))
         words = text.format(road=road, values=paper_values(road, column, digits), lowest=lowest)
-        claims.append(Claim(words, f"table-1-{road}", road, make_judge(f"table-1-{road}", road)))
+        claims.append(Claim(words, f"table-1-{road}", road, make_assessment(f"table-1-{road}", road)))
     return claims
 
 
@@ -489,8 +489,8 @@ def with_ten_trainings(road: str) -> Claim:
     return Claim(text, study, road, larger_return(study, road, "proposed", "trpo"))
 
 
-def of_ring(study: str, *claims: tuple[str, Callable[[Version], Finding]]) -> list[Claim]:
-    """Return claims on one study of the ring, from their texts and judges."""
+def of_ring(study: str, *claims: tuple[str, Assessment]) -> list[Claim]:
+    """Return claims on one study of the ring, from their texts and assessments."""
     return [Claim(text, study, "ring", each) for text, each in claims]
 
 
@@ -527,7 +527,7 @@ CLAIMS: dict[str, Sequence[Claim]] = {
         *of_ring(
             "table-1-ring",
             (
-                f"PPO's final return is 42 % lower (in its own table {PPO_LOSS:.0f} %), ring",
+                f"PPO's final return is lower (by 42 %; in its own table {PPO_LOSS:.0f} %), ring",
                 curve_extreme(
                     *("table-1-ring", "ring"),
                     **{"variants": ("ppo", "proposed"), "quantity": "return_mean", "larger": False},

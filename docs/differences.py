@@ -151,7 +151,7 @@ def data_effect() -> str:
     texts = []
     for driver, what in (("other", "with another driver"), ("same", "with the same IDM")):
         rows = figure_6(driver=driver, split="trajectories", is_long=False, size=0.01)
-        errors = rows.groupby("network")["driver_error"].mean()
+        errors = {network: found["driver_error"].mean() for network, found in rows.groupby("network")}
         texts.append(f"{errors['knowledge']:.3f} with IDM and {errors['vanilla']:.3f} without {what}")
     return f"error with 1 % of the data [m/s²]: {'; '.join(texts)} (`results/figure-6.json`)"
 
