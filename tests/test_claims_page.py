@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.system.conftest import ROOT
+from unjam_paper.studies import STUDIES
 
 
 @pytest.fixture
@@ -28,6 +29,7 @@ def test_the_page_of_claims_is_that_of_the_results_with_a_row_for_each_claim(
     for heading, listed in claims.CLAIMS.items():
         assert len(tables[heading]) == (len(listed) or len(claims.people_claims()))
     rows = [row for table in tables.values() for row in table.to_dict("records")]
+    assert {row["command"].strip("`").removeprefix("unjam reproduce ") for row in rows} <= set(STUDIES)
     unmeasured = [row for row in rows if row["verdict"] == claims.NOT_MEASURED]
     assert all(row["we get, without the filter"] == "–" for row in unmeasured)
 
