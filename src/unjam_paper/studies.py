@@ -21,6 +21,7 @@ from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY
 from unjam_paper.motorway_benchmark import MOTORWAY_BENCHMARK
 from unjam_paper.motorway_ensemble import MOTORWAY_ENSEMBLE
 from unjam_paper.robustness import FIGURE_10, FIGURE_10_UNFILTERED, ROBUSTNESS
+from unjam_paper.string_stability import STRING_STABILITY
 from unjam_paper.study import PAPER_ROADS, UNFILTERED_ROADS, UNSCALED_NOISE_ROAD, Study
 from unjam_paper.theory import FIGURE_8, theory_study
 from unjam_paper.variants import WRONG_BASES
@@ -100,6 +101,7 @@ STUDIES: dict[str, Study] = {
     "on-ramp-alternating": on_ramp_study({"ramp-alternating": "residual on unjam:on-ramp-tuned, alternating updates"}),
     "envelope": ENVELOPE,
     "fuel": FUEL,
+    "string-stability": STRING_STABILITY,
     "do-no-harm": DO_NO_HARM,
     "assess-examples": ASSESS_EXAMPLES,
     "all-roads": ALL_ROADS_STUDY,

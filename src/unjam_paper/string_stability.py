@@ -1,0 +1,156 @@
+"""What string stability costs on rings: experts tuned with several limits on their string gain.
+
+CAVs have the actuator of a usual car. Without a limit, controllers that calm a ring amplify oscillations that are
+slower than a lap and cannot arise there, but on a motorway.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from optuna.distributions import FloatDistribution
+
+from unjam.controller import make_driver
+from unjam.drivers.registry import driver_from_name
+from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.statistics import metric_estimate, paired_difference
+from unjam.reports.figures import LINE_COLORS, new_figure
+from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import Scenario
+from unjam.training.evaluate import evaluate, raise_failures
+from unjam.training.search_space import SearchSpace, default_search_space
+from unjam.training.seeds import make_test_seeds
+from unjam.training.string_limit import find_operating_points
+from unjam.training.tune import tune
+from unjam.worlds.worker_pool import WorkerPool
+from unjam_paper.results_file import read_part
+from unjam_paper.study import Study, Table
+
+STRING_ROADS = ("ring", "ring-jammed")
+STANDARD_ACTUATOR = {"delay": 0.2, "lag": 0.3}
+"""delay and lag of a usual car [s]"""
+GAIN_LIMITS = (1.02, 1.1, 1.2, 1.4, 0.0)
+"""largest allowed string gains; 0: any"""
+TUNING_STEPS, STRING_SEEDS = 3_000_000, 20
+"""control steps of each tuning; test seeds of each tuned expert"""
+SMOOTH_ACC_SPACE: SearchSpace = {
+    "averaging_time": FloatDistribution(1.0, 60.0, log=True),
+    "leader_weight": FloatDistribution(0.0, 0.6),
+    "time_gap": FloatDistribution(0.5, 16.0, log=True),
+    "standstill_gap": FloatDistribution(0.0, 5.0),
+    "gap_gain": FloatDistribution(0.02, 0.6, log=True),
+    "catch_up_speed": FloatDistribution(0.5, 5.0, log=True),
+    "time_constant": FloatDistribution(0.3, 4.0, log=True),
+    "history_factor": FloatDistribution(0.0, 1.1),
+}
+STORED_METRICS = ("seed", "return", "mean_speed", "speed_std_fleet_steady", "min_time_gap", "feasibility")
+
+
+def string_road(name: str) -> Scenario:
+    """Return a ring whose CAVs have the actuator of a usual car."""
+    return make_scenario(name, {"actuator": STANDARD_ACTUATOR})
+
+
+def measure_tuned(road: str, expert: str, limit: float, workers: int) -> Table:
+    """Return an expert that was tuned with a limit on its string gain, with its gain and its test episodes."""
+    scenario = string_road(road)
+    space = SMOOTH_ACC_SPACE if expert == "smooth-acc" else default_search_space(expert, scenario.control_step)
+    with WorkerPool(workers) as pool, tempfile.TemporaryDirectory() as folder:
+        tuned = tune(
+            *({road: scenario}, expert, space, TUNING_STEPS, Path(folder, "tuned"), pool),
+            screen=True,
+            max_string_gain=limit,
+        )
+        driver = driver_from_name(tuned.best.driver, scenario.control_step)
+        gain = find_operating_points({road: scenario}, pool)[road].string_gain(driver)
+    episodes = measure_episodes(scenario, tuned.best.driver, workers)
+    return [{"expert": expert, "limit": limit, "driver": tuned.best.driver, "gain": gain, "episodes": episodes}]
+
+
+def measure_episodes(scenario: Scenario, driver: str, workers: int) -> Table:
+    """Return the metrics of a driver on test seeds."""
+    with WorkerPool(workers) as pool:
+        made = {driver: make_driver(driver, scenario.control_step)}
+        evaluation = evaluate(scenario, made, make_test_seeds(STRING_SEEDS), pool)
+    raise_failures(evaluation)
+    return [{name: row[name] for name in STORED_METRICS} for row in evaluation.rows[driver]]
+
+
+def measure_human_baseline(road: str, workers: int) -> Table:
+    """Return the test episodes of the human baseline."""
+    return [
+        {"expert": HUMAN_LABEL, "limit": 0.0, "episodes": measure_episodes(string_road(road), HUMAN_LABEL, workers)}
+    ]
+
+
+def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
+    """Return the tuned experts of a road, and the test episodes of the human baseline."""
+    rows = read_part(folder, road)
+    (human,) = (row for row in rows if row["expert"] == HUMAN_LABEL)
+    return [row for row in rows if row is not human], human["episodes"]
+
+
+def string_table(road: str, folder: Path) -> pd.DataFrame:
+    """Return gain, return, mean speed and their differences to the human baseline, by expert and limit."""
+    rows, human = tuned_rows(road, folder)
+    return pd.DataFrame(
+        {
+            "expert": row["expert"],
+            "largest gain allowed": f"{row['limit']:g}" if row["limit"] else "any",
+            "its gain": f"{row['gain']:.2f}",
+            "return": f"{metric_estimate(row['episodes'], 'return').mean:.0f}",
+            "return, difference to human": str(
+                estimate_cell(paired_difference(row["episodes"], human, "return"), 0, sign="+")
+            ),
+            "mean speed [m/s]": f"{metric_estimate(row['episodes'], 'mean_speed').mean:.2f}",
+            "speed, difference to human [m/s]": str(
+                estimate_cell(paired_difference(row["episodes"], human, "mean_speed"), 2, sign="+")
+            ),
+        }
+        for row in rows
+    )
+
+
+def string_figure(folder: Path) -> Figure:
+    """Draw the return of the tuned experts over their string gain, for each road."""
+    figure = new_figure(3.0)
+    panels: Sequence[Any] = figure.subplots(1, len(STRING_ROADS), squeeze=False)[0]
+    for axes, road in zip(panels, STRING_ROADS, strict=True):
+        rows, human = tuned_rows(road, folder)
+        axes.axhline(np.mean([row["return"] for row in human]), color=LINE_COLORS[2], ls="--", label="human drivers")
+        for color, expert in zip(LINE_COLORS, dict.fromkeys(row["expert"] for row in rows), strict=False):
+            own = sorted((row for row in rows if row["expert"] == expert), key=lambda row: row["gain"])
+            returns = [metric_estimate(row["episodes"], "return") for row in own]
+            bars = [[each.mean - each.low for each in returns], [each.high - each.mean for each in returns]]
+            axes.errorbar(
+                *([row["gain"] for row in own], [each.mean for each in returns], bars),
+                color=color,
+                marker="o",
+                label=expert,
+            )
+        axes.axvline(1.02, color="0.7", lw=0.8)
+        axes.set(title=road, xlabel="largest string gain", ylabel="return")
+    panels[0].legend()
+    return figure
+
+
+STRING_STABILITY = Study(
+    title="what string stability costs on rings: experts tuned with limits on their string gain",
+    make_parts=lambda study_folder, seeds: {
+        **{f"{road}/{HUMAN_LABEL}": (measure_human_baseline, (road,)) for road in STRING_ROADS},
+        **{
+            f"{road}/smooth-acc {limit:g}": (measure_tuned, (road, "smooth-acc", limit))
+            for road in STRING_ROADS
+            for limit in GAIN_LIMITS
+        },
+        **{f"{road}/pi-from-gap 0": (measure_tuned, (road, "pi-from-gap", 0.0)) for road in STRING_ROADS},
+    },
+    minutes=150.0,
+    tables={road: partial(string_table, road) for road in STRING_ROADS},
+    figures={"trade-off": string_figure},
+)

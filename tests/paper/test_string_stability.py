@@ -1,0 +1,45 @@
+"""What string stability costs: the study of tuned experts."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unjam.controller import string_stability as gains
+from unjam.scenarios import Ring, Scenario
+from unjam_paper import string_stability as study
+from unjam_paper.results_file import write_part
+from unjam_paper.string_stability import (
+    STRING_ROADS,
+    measure_human_baseline,
+    measure_tuned,
+    string_figure,
+    string_table,
+)
+
+
+@pytest.mark.long
+def test_experts_are_tuned_within_their_limits_and_compared_with_human_drivers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    road = study.string_road
+
+    def short_road(name: str) -> Scenario:
+        made = road(name)
+        assert isinstance(made, Ring)
+        return replace(made, horizon=40, warmup=200, vehicles=8, length=(80, 90))
+
+    monkeypatch.setattr(study, "string_road", short_road)
+    monkeypatch.setattr(study, "STRING_SEEDS", 2)
+    monkeypatch.setattr(study, "TUNING_STEPS", (12 * 8 + 2 * 8) * 40)
+    monkeypatch.setattr(gains, "OSCILLATION_FREQUENCIES", np.geomspace(0.01, 0.2, 3))
+    monkeypatch.setattr(gains, "SETTLING_SECONDS", 30.0)
+    for name in STRING_ROADS:
+        rows = [measure_tuned(name, "smooth-acc", limit, 1)[0] for limit in (1.1, 0.0)]
+        assert rows[0]["gain"] <= 1.1
+        write_part(tmp_path, name, [*measure_human_baseline(name, 1), *rows])
+        table = string_table(name, tmp_path)
+        assert list(table["largest gain allowed"]) == ["1.1", "any"]
+        assert table["return, difference to human"].str.contains(" to ").all()
+    assert len(string_figure(tmp_path).axes) == len(STRING_ROADS)
