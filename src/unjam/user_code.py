@@ -12,7 +12,7 @@ import importlib.util
 import linecache
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.abc import InspectLoader
@@ -242,10 +242,7 @@ class _Modules(InspectLoader):
             module = self._load(inner)
             if not fromlist:
                 return self._load(top)
-            for item in self._imported_items(module, fromlist):
+            for item in getattr(module, "__all__", ()) if "*" in fromlist else fromlist:
                 if f"{inner}.{item}" in self._code.modules and not hasattr(module, item):
                     self._load(f"{inner}.{item}")
             return module
-
-    def _imported_items(self, module: ModuleType, fromlist: Sequence[str]) -> Iterator[str]:
-        yield from getattr(module, "__all__", ()) if "*" in fromlist else fromlist

@@ -288,7 +288,7 @@ def feature(name: NetworkInput) -> Feature:
 def load_feature(file: FileReference) -> tuple[Feature, FileReference]:
     """Return a user's feature, and its reference with the hash of the code; `InputError` as `load_object_once`."""
     found, file = file.load_object_once()
-    return _user_feature(file.as_function(found, "a LocalState")), file
+    return _user_feature(UserFunction.from_object(found, "a LocalState", file)), file
 
 
 def _user_feature(function: UserFunction) -> Feature:

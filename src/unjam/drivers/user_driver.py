@@ -61,22 +61,28 @@ class UserFunction:
     """path of its code"""
 
     @classmethod
-    def from_object(cls, candidate: Any, argument: str) -> "UserFunction":
-        """Return a function of this process, which takes `argument`; raise `InputError` if it is not a function."""
-        label = object_label(candidate)
+    def from_object(cls, candidate: Any, argument: str, reference: "FileReference | None" = None) -> "UserFunction":
+        """Return a function of `argument`, of this process or a file; raise `InputError` if it is not a function."""
+        label = str(reference or object_label(candidate))
         if not callable(candidate) or inspect.isclass(candidate):
             raise InputError(f"{label}: is not a function of {argument}")
         code = getattr(candidate, "__code__", None) or getattr(type(candidate).__call__, "__code__", None)
-        return cls(_as_numpy_function(candidate), label, getattr(code, "co_filename", ""))
+        file = str(reference.path) if reference else getattr(code, "co_filename", "")
+        return cls(_as_numpy_function(candidate), label, file)
 
     def __call__(self, *arguments: Any) -> Any:
         """Return the result of the function; raise `InputError` with its last executed line if it fails."""
         try:
             return self.function(*arguments)
         except (Exception, SystemExit) as error:
-            lines = [str(frame.lineno) for frame in extract_tb(error.__traceback__) if frame.filename == self.file]
-            line = f" (line {lines[-1]})" if lines else ""
+            line = last_line(error, self.file)
             raise InputError(f"{self.label}: {type(error).__name__}: {error}{line}") from error
+
+
+def last_line(error: BaseException, file: str) -> str:
+    """Return ` (line N)` with the last line of a file that was executed before an error; empty if none was."""
+    lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
+    return f" (line {lines[-1]})" if lines else ""
 
 
 def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -173,12 +179,6 @@ class FileReference:
             public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
             raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public}")
         return getattr(module, self.name)
-
-    def as_function(self, found: Any, argument: str) -> UserFunction:
-        """Return the object with the name as a function of `argument`; raise `InputError` if it is not a function."""
-        if not callable(found) or inspect.isclass(found):
-            raise InputError(f"{self}: is not a function of {argument}")
-        return UserFunction(_as_numpy_function(found), str(self), str(self.path))
 
 
 class UserDriver(Driver):

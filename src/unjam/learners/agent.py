@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from traceback import extract_tb
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
-from unjam.drivers.user_driver import FileReference, is_file_reference
+from unjam.drivers.user_driver import FileReference, is_file_reference, last_line
 from unjam.errors import InputError, UnjamError
 from unjam.learners.settings import LearnerSettings, PolicySettings, UserAgentSettings
 from unjam.models.settings import ModelSettings
@@ -153,11 +152,9 @@ def reporting_user_errors(name: str) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as error:
         reference = FileReference.parse(name) if is_file_reference(name) else None
-        frames = extract_tb(error.__traceback__) if reference else ()
-        lines = [str(frame.lineno) for frame in frames if reference and frame.filename == str(reference.path)]
-        if not lines:
+        if not (line := last_line(error, str(reference.path)) if reference else ""):
             raise
-        raise InputError(f"agent: {reference}: {type(error).__name__}: {error} (line {lines[-1]})") from error
+        raise InputError(f"agent: {reference}: {type(error).__name__}: {error}{line}") from error
 
 
 def _user_class(name: str) -> type[Any]:

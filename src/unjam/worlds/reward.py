@@ -204,7 +204,7 @@ def make_reward(text: RewardLike) -> Reward:
 
 
 def _file_reward(reference: FileReference) -> Reward:
-    return _user_reward(reference.as_function(reference.load_object(), "an Outcome"))
+    return _user_reward(UserFunction.from_object(reference.load_object(), "an Outcome", reference))
 
 
 def _user_reward(function: UserFunction) -> Reward:
