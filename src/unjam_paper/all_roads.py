@@ -16,16 +16,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from unjam.controller import PACKAGED_PREFIX, make_driver
+from unjam.measures import gain
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
-from unjam.measures.gain import (
-    MAX_GAIN,
-    MIN_GAIN,
-    EpisodeRows,
-    gain_by_seed,
-    is_gain_negligible,
-    normalized_gain,
-    performance,
-)
+from unjam.measures.gain import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import estimate, estimate_on_shared_seeds, format_difference
@@ -220,7 +213,7 @@ def best_feasible_driver(rows: Mapping[str, EpisodeRows]) -> str:
     feasible = [
         label for label, own in rows.items() if label == HUMAN_LABEL or overall_feasibility(own, baseline) == FEASIBLE
     ]
-    return max(feasible, key=lambda label: float(np.mean([performance(row) for row in rows[label]])))
+    return max(feasible, key=lambda label: float(np.mean([gain.performance(row) for row in rows[label]])))
 
 
 def road_gains(folder: Path, parts: Sequence[str] = ("training", *UNSEEN_PARTS)) -> dict[str, dict[str, Any]]:
@@ -234,13 +227,13 @@ def road_gains(folder: Path, parts: Sequence[str] = ("training", *UNSEEN_PARTS))
         if not number.isdecimal() or results["part"] not in parts:
             continue
         rows: dict[str, EpisodeRows] = {label: list(map(replace_null, own)) for label, own in results["rows"].items()}
-        best = [performance(row) for row in rows[results["best"]]]
+        best = [gain.performance(row) for row in rows[results["best"]]]
         baseline = rows.pop(HUMAN_LABEL)
         roads[results["road"]] = {
             **{key: results[key] for key in ("part", "best")},
-            "has_potential_gain": not is_gain_negligible(baseline, best),
-            "gains": {label: normalized_gain(own, baseline, best) for label, own in rows.items()},
-            "by_seed": {label: gain_by_seed(own, baseline, best) for label, own in rows.items()},
+            "has_potential_gain": not gain.is_gain_negligible(baseline, best),
+            "gains": {label: gain.normalized_gain(own, baseline, best) for label, own in rows.items()},
+            "by_seed": {label: gain.gain_by_seed(own, baseline, best) for label, own in rows.items()},
             "speeds": {label: np.array([row["mean_speed"] for row in own]) for label, own in rows.items()},
             "verdicts": {label: overall_feasibility(own, baseline) for label, own in rows.items()},
         }
@@ -303,14 +296,14 @@ def all_roads_figure(folder: Path) -> Figure:
     figure = new_figure(0.3 * len(roads) + 1.0)
     axes = figure.subplots()
     # The pale half of the color map: numbers stay legible on it.
-    image = axes.imshow(values, cmap="RdYlGn", vmin=-2 * MAX_GAIN, vmax=2 * MAX_GAIN, aspect="auto")
+    image = axes.imshow(values, cmap="RdYlGn", vmin=-2 * gain.MAX_GAIN, vmax=2 * gain.MAX_GAIN, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
         axes.text(column, row, f"{value:+.2f}", ha="center", va="center", color=TEXT_COLOR, fontsize=8)
     axes.set_xticks(range(len(FAMILY_DRIVERS)), list(FAMILY_DRIVERS), rotation=40, ha="right", rotation_mode="anchor")
     marks = {"training": "", "combination": " (new combination)", "axis": " (new)"}
     axes.set_yticks(range(len(roads)), [f"{name}{marks[road['part']]}" for name, road in roads.items()])
     axes.grid(visible=False)
-    figure.colorbar(image, ax=axes, label=f"gain, limited to {MIN_GAIN:g} to {MAX_GAIN:g}", shrink=0.5)
+    figure.colorbar(image, ax=axes, label=f"gain, limited to {gain.MIN_GAIN:g} to {gain.MAX_GAIN:g}", shrink=0.5)
     return figure
 
 

@@ -18,18 +18,10 @@ import pandas as pd
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from unjam.measures import statistics
 from unjam.measures.feasibility import feasibility_by_driver, overall_feasibility
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import (
-    estimate,
-    estimate_crossed,
-    estimate_over_trainings,
-    metric_estimate,
-    paired_difference,
-    paired_differences,
-    probability_of_improvement,
-)
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam.reports.results import PlotEpisode, read_results, validation_gains
 from unjam.reports.space_time import trajectory_figure
@@ -122,7 +114,7 @@ def comparison_study(title: str, variants: Sequence[str], road: str = "ring") ->
 def best_expert(reference_rows: dict[str, Table], metric: str = "return") -> str:
     """Return the label of the expert with the largest mean of a metric."""
     experts = [label for label in reference_rows if label not in NON_EXPERTS]
-    return max(experts, key=lambda label: metric_estimate(reference_rows[label], metric).mean)
+    return max(experts, key=lambda label: statistics.metric_estimate(reference_rows[label], metric).mean)
 
 
 def return_metric(road: str, variant: str) -> str:
@@ -139,7 +131,7 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
         row = {"road": road, "name": label, "is_learned": False, "trainings": 0, "episodes": len(found)}
         row |= {"best_expert": label == best, "feasibility": verdicts[label]}
         row |= estimate_metrics(found, COMPARISON_METRICS)
-        row["gain_over_best_expert"] = asdict(paired_difference(found, references[best], metric))
+        row["gain_over_best_expert"] = asdict(statistics.paired_difference(found, references[best], metric))
         convention = {
             key: _mean_and_std([row[name] for row in found if np.isfinite(row[name])])
             for key, (name, _) in PAPER_COLUMNS.items()
@@ -158,9 +150,9 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
     row["paper"] = dict(zip(PAPER_COLUMNS, reported, strict=True)) if reported else None
     for name in COMPARISON_METRICS:
         is_comparable = name != "return" or metric == "return"  # returns of another reward are not comparable
-        values = [estimate([row[name] for row in run.rows]).mean if is_comparable else nan for run in runs]
-        row[name] = asdict(estimate_over_trainings(values, TRIMMED_SHARE, METRICS[name].bounds))
-    differences = paired_differences([run.rows for run in runs], reference_rows[best], metric)
+        values = [statistics.estimate([row[name] for row in run.rows]).mean if is_comparable else nan for run in runs]
+        row[name] = asdict(statistics.estimate_over_trainings(values, TRIMMED_SHARE, METRICS[name].bounds))
+    differences = statistics.paired_differences([run.rows for run in runs], reference_rows[best], metric)
     validated = [gains for run in runs if (gains := validation_gains(run.progress))]
     convention = {
         key: _mean_and_std([run.final_training_mean(name) for run in runs]) for key, (_, name) in PAPER_COLUMNS.items()
@@ -169,8 +161,8 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
         **row,
         "paper_convention": convention,
         "gain_reference": {"expert": best, "metric": metric},
-        "gain_over_best_expert": asdict(estimate_crossed(differences)),
-        "probability_of_improvement": asdict(probability_of_improvement(differences)),
+        "gain_over_best_expert": asdict(statistics.estimate_crossed(differences)),
+        "probability_of_improvement": asdict(statistics.probability_of_improvement(differences)),
         "untrained_count": sum(best <= 0 for best, _ in validated),
         "feasibility": [overall_feasibility(run.rows, reference_rows["human"]) for run in runs],
         "seconds": float(np.mean([run.seconds for run in runs])),
@@ -180,7 +172,7 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
 
 def estimate_metrics(rows: Table, names: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return the mean of metrics over episodes with its confidence interval, by metric."""
-    return {name: asdict(metric_estimate(rows, name)) for name in names}
+    return {name: asdict(statistics.metric_estimate(rows, name)) for name in names}
 
 
 def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
@@ -219,7 +211,7 @@ def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
         if "return_validation" in curves.get(row.get("variant"), {}):
             values = np.array(curves[row["variant"]]["return_validation"])
             best, last = values.max(1), values[:, -1]
-            difference = estimate_over_trainings(last - best, bounds=(-inf, 0.0))
+            difference = statistics.estimate_over_trainings(last - best, bounds=(-inf, 0.0))
             cells = {"": row["name"], "trainings": len(values), "best trained": number_text(best.mean(), 0)}
             cells |= {"last checkpoint": number_text(last.mean(), 0)}
             cells |= {"last − best": str(estimate_cell(difference, 0, sign="+"))}
@@ -241,7 +233,7 @@ def curve_figure(road: str, curves: dict[str, Any], reference_rows: dict[str, Ta
                 axes.fill_between(steps, values.min(0), values.max(0), color=color, alpha=0.15, lw=0)
                 axes.plot(steps, values.mean(0), color=color, lw=1.5, label=VARIANTS[variant].label)
         for (reference, rows), style in zip(reference_rows.items(), ("--", ":"), strict=False):
-            value = metric_estimate(rows, metric if name == "return_mean" else name).mean
+            value = statistics.metric_estimate(rows, metric if name == "return_mean" else name).mean
             axes.axhline(value, color=TEXT_COLOR, lw=1.0, ls=style, label=reference)
         axes.margins(x=0.01)
         axes.set(title=f"{road}: {label}", xlabel="environment steps [thousands]")

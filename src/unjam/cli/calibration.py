@@ -7,15 +7,8 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.cli import options as opt
-from unjam.cli.output import (
-    ProgressReporter,
-    console,
-    err_console,
-    new_table,
-    print_json,
-    print_next_command,
-    setting_options,
-)
+from unjam.cli import output
+from unjam.cli.output import console, err_console, print_json
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
 from unjam.scenarios.population import write_population
@@ -120,8 +113,8 @@ def tune_command(
     scores = f"{best.driver}: {best.score:.4g} on tuning seeds; {default.driver}: {default_score}"
     console.print(scores, soft_wrap=True)
     road = FAMILY[next(iter(roads))].scenario if scenario in ROAD_GROUPS else scenario
-    options = setting_options(changes, reward=reward, backend=backend)
-    print_next_command("drive with it", "drive", road, "--driver", result.file, "--test-seeds", *options)
+    options = output.setting_options(changes, reward=reward, backend=backend)
+    output.print_next_command("drive with it", "drive", road, "--driver", result.file, "--test-seeds", *options)
 
 
 def calibrate_command(
@@ -171,7 +164,7 @@ def calibrate_command(
     if json:
         print_json({"file": str(result.file), **calibration_document(replace(result, trials=[]))})
         return
-    table = new_table(("metric", "unit"), ("original", "calibrated", "difference"))
+    table = output.new_table(("metric", "unit"), ("original", "calibrated", "difference"))
     for name, columns in result.estimates().items():
         label, unit, digits = CALIBRATION_COLUMNS[name]
         cells = (
@@ -183,7 +176,7 @@ def calibrate_command(
     console.print(", ".join(f"{name} x {factor:g}" for name, factor in result.factors.items()), soft_wrap=True)
     times = {"--begin": begin, "--end": end}
     time_options = [word for name, time in times.items() if time is not None for word in (name, f"{time:g}")]
-    print_next_command("assess it", "assess", result.file, *time_options)
+    output.print_next_command("assess it", "assess", result.file, *time_options)
 
 
 def fit_drivers_command(
@@ -227,7 +220,7 @@ def fit_drivers_command(
     changes: dict[str, Any] = {"residual": residual, "seed": seed, **opt.parse_settings(settings)}
     columns = tuple(name for name in driver.split(",") if name)
     filters = {name: str(value) for name, value in opt.parse_settings(select, "--select").items()}
-    with ProgressReporter("calibrating drivers") as reporter:
+    with output.ProgressReporter("calibrating drivers") as reporter:
         fit = fit_drivers_from_files(data, changes, format, drop_bad_rows, columns, filters, out, reporter)
     write_population(out, fit.population)
     if json:
@@ -237,7 +230,7 @@ def fit_drivers_command(
         err_console.print(line)
     population: Any = fit.population
     typical = asdict(population.typical)
-    table = new_table(("parameter",), ("one for all", "mean", "std", "quartiles of the drivers"))
+    table = output.new_table(("parameter",), ("one for all", "mean", "std", "quartiles of the drivers"))
     for name, statistics in population.parameter_statistics().items():
         values = (typical[name], statistics["mean"], statistics["std"])
         quartiles = "  ".join(f"{value:.2f}" for value in statistics["quartiles"])

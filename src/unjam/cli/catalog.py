@@ -88,7 +88,6 @@ def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
 
 
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
-
     seconds = scenario.warmup * scenario.simulation_step
     end = "in training, a collision of a CAV" if scenario.reads_user_files else "a collision"
     return [

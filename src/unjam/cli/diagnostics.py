@@ -132,7 +132,6 @@ def _try_check(name: str, run: Callable[[], str], remedy: str) -> HealthCheck:
 
 
 def _cache_check() -> HealthCheck:
-
     folder = cache_folder()
     try:
         make_folder(folder)
@@ -151,7 +150,6 @@ def _sandbox_check() -> HealthCheck:
 
 
 def _run_test_episode() -> str:
-
     with WorkerPool(1) as pool:
         episode = pool.run([EpisodeTask(Ring(length=(230, 230), horizon=100), PISaturation(), (0,))])[0]
     if not episode.has_run:

@@ -7,15 +7,8 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.cli import options as opt
-from unjam.cli.output import (
-    ProgressReporter,
-    console,
-    err_console,
-    print_json,
-    print_metrics,
-    print_notes,
-    suggest_after_drive,
-)
+from unjam.cli import output
+from unjam.cli.output import console, err_console, print_json
 from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
@@ -87,26 +80,26 @@ def drive_command(
         changes = (ACC_SETTINGS if scenario.endswith(".sumocfg") else {}) | changes
     total = make_scenario(scenario, changes).horizon * episodes * len(driver)
     folder = opt.new_folder(out, f"drive-{Path(scenario).stem}") if report else None
-    with ProgressReporter(f"driving {Path(scenario).name}", "steps", total) as progress:
+    with output.ProgressReporter(f"driving {Path(scenario).name}", "steps", total) as progress:
         options = workers, folder, progress.update, test_seeds, backend
         result = drive(scenario, driver, episodes, seed, changes, reward, *options)
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
-        print_metrics(result.rows)
+        output.print_metrics(result.rows)
         for label, effect in effects_by_driver(result.rows).items():
             if count := effect.flow.count:
                 seeds = f"{count} paired seed{'' if count == 1 else 's'}"
                 console.print(f"{label} compared with human drivers, {seeds}: {effect.summary}", soft_wrap=True)
-        print_notes(result.notes)
+        output.print_notes(result.notes)
         if scenario.endswith(".sumocfg"):
             first = next(iter(result.rows.values()))[0]
             command = f"sumo -c {scenario} --seed {first['sumo_seed']}"
-            print_notes([f"plain SUMO has the traffic of seed {first['seed']} without CAVs: {command}"])
+            output.print_notes([f"plain SUMO has the traffic of seed {first['seed']} without CAVs: {command}"])
         if result.report is not None:
             err_console.print(f"report: {result.report}")
         is_drawable = all(len(each.outline) or len(each.poses) for each in result.plot_episodes.values())
-        suggest_after_drive(scenario, driver, changes, reward, backend, is_drawable)
+        output.suggest_after_drive(scenario, driver, changes, reward, backend, is_drawable)
     raise_failures(result)
 
 
@@ -141,7 +134,7 @@ def watch_command(
     (name,) = drivers
     road = make_scenario(scenario, opt.merge_settings(changes, opt.parse_settings(settings)))
     driver = make_driver(name, road.control_step)
-    print_notes(controller_notes(scenario_recipe(road), [name], {}))
+    output.print_notes(controller_notes(scenario_recipe(road), [name], {}))
     if video is None:
         episode = watch_in_window(road, driver, (seed,), pace)
     else:
@@ -149,12 +142,12 @@ def watch_command(
         check_parent_folder(video)
         with open_backend(backend) as simulator:
             check_support(simulator, road)
-        print_notes(backend_notes(backend, road))
+        output.print_notes(backend_notes(backend, road))
         err_console.print("driving")
         with WorkerPool(1) as pool:
             episode = pool.run([EpisodeTask(road, driver, (seed,), record_details=True, backend=backend)])[0]
     row = measure(episode)
-    print_notes(episode_notes({name: [row]}))
+    output.print_notes(episode_notes({name: [row]}))
     if episode.has_run and video is not None:
         err_console.print("drawing")
         write_video(episode, video, name, pace)
@@ -225,7 +218,7 @@ def assess_command(
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
     request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)
     folder = opt.new_folder(out, f"assess-{Path(scenario).stem}")
-    progress = ProgressReporter("assessing, at most", "steps", request.network.horizon * episodes)
+    progress = output.ProgressReporter("assessing, at most", "steps", request.network.horizon * episodes)
     with lock_new_folder(folder), progress, WorkerPool(workers) as pool:
         assessment = assess(request, folder, pool, progress.update, (lambda line: None) if json else err_console.print)
     if json:

@@ -9,17 +9,9 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from unjam.cli import output
 from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, check_page_path, network_changes
-from unjam.cli.output import (
-    ProgressReporter,
-    console,
-    err_console,
-    new_table,
-    print_json,
-    print_metrics,
-    print_next_command,
-    print_notes,
-)
+from unjam.cli.output import console, err_console, print_json
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, resume_hint
 from unjam.measures.statistics import format_difference
@@ -67,7 +59,7 @@ def evaluate_command(
     total = evaluation_steps(config, run)
     target = out or run
     with lock_folder(target) if out is None else lock_new_folder(out):
-        with ProgressReporter("evaluating", "steps", total) as progress, WorkerPool(workers) as pool:
+        with output.ProgressReporter("evaluating", "steps", total) as progress, WorkerPool(workers) as pool:
             evaluation = evaluate_run(run, config, pool, progress.update, out)
         page = write_report_page([target], target / "report.html")
     results = read_results(target)
@@ -77,9 +69,9 @@ def evaluate_command(
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in evaluation.rows.items()]
         print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})
         return
-    print_metrics(evaluation.rows)
+    output.print_metrics(evaluation.rows)
     console.print(main_finding(results), soft_wrap=True)
-    print_notes(results.metadata["notes"])
+    output.print_notes(results.metadata["notes"])
     err_console.print(f"report: {page}")
 
 
@@ -116,11 +108,11 @@ def model_command(
         return
     lines = [model.rollout_summary(read_progress(run))]
     if "waves" in facts:
-        table = new_table(("second half of the episode",), model.WAVE_HEADINGS)
+        table = output.new_table(("second half of the episode",), model.WAVE_HEADINGS)
         for label, row in model.wave_rows(facts):
             table.add_row(label, *row)
     else:
-        table = new_table(("root mean square", "unit"), model.error_headings(facts))
+        table = output.new_table(("root mean square", "unit"), model.error_headings(facts))
         for row in model.error_rows(facts):
             table.add_row(row["label"], row["unit"], *row["cells"])
         lines = [model.error_verdict(facts), *lines, model.bound_summary(facts)]
@@ -202,7 +194,7 @@ def list_runs_command(
         condition = f" on {scenario}" if scenario else ""
         err_console.print(f"no runs{condition} in {folder}; start one: unjam train ring --preset demo")
         return
-    table = new_table(("run", "scenario", "preset", "state"), ("steps", "difference to expert"))
+    table = output.new_table(("run", "scenario", "preset", "state"), ("steps", "difference to expert"))
     for run in runs:
         steps = f"{run.steps:,}" if run.state == "finished" else f"{run.steps:,} of {run.config.steps:,}"
         for number, (road, config) in enumerate(run.config.task_configs().items()):
@@ -213,7 +205,6 @@ def list_runs_command(
 
 
 def _gain_text(gain: Any) -> str:
-
     return format_difference(gain) if gain else "–"
 
 
@@ -234,7 +225,7 @@ def compare_command(
     if json:
         print_json({"runs": [run.document() for run in runs], "settings": settings})
         return
-    table = new_table(("", *(run.name for run in runs)))
+    table = output.new_table(("", *(run.name for run in runs)))
     table.add_row("state", *(run.state for run in runs))
     table.add_row("steps done", *(f"{run.steps:,}" for run in runs))
     for road in dict.fromkeys(road for run in runs for road in run.gains):
@@ -245,7 +236,9 @@ def compare_command(
     console.print(table)
     if not settings:
         console.print("the settings of these runs are the same")
-    print_next_command("compare them on one page", "report", *(run.folder for run in runs), "--out", "compared.html")
+    output.print_next_command(
+        "compare them on one page", "report", *(run.folder for run in runs), "--out", "compared.html"
+    )
 
 
 @runs_command.command("progress")
@@ -302,6 +295,5 @@ def remove_command(
 
 
 def _find_runs(names: Sequence[str], folder: Path) -> list[Any]:
-
     runs = (read_run(find_run(name, folder), name) for name in names)
     return list({run.folder.resolve(): run for run in runs}.values())

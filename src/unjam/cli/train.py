@@ -137,7 +137,6 @@ class _TrainingProgress(output.ProgressReporter):
 
     def show_evaluation(self, episode: tuple[str, int], steps: int) -> None:
         """Show the progress of the evaluation after the training."""
-
         if not self._done:
             roads = self._config.task_configs().items()
             self._total = sum(evaluation_steps(road, self._folder / name) for name, road in roads)

@@ -11,15 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from unjam.reports.figures import (
-    CAV_PLOT_COLOR,
-    MAX_PLOT_TIMES,
-    PLOT_STYLE,
-    SPEED_COLORMAP,
-    TEXT_COLOR,
-    new_figure,
-    short_label,
-)
+from unjam.reports import figures
 from unjam.reports.results import Float32s, PlotEpisode
 
 SPEED_FIELD_POSITIONS = 250
@@ -33,7 +25,7 @@ MIN_SAMPLES_PER_CELL = 4
 MAX_LANE_MAPS = 4
 """maximum number of lane maps; of more lanes, those with the most traffic are drawn"""
 HUMAN_LINE_STYLE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
-CAV_LINE_STYLE: dict[str, Any] = {"colors": CAV_PLOT_COLOR, "linewidths": 1.6}
+CAV_LINE_STYLE: dict[str, Any] = {"colors": figures.CAV_PLOT_COLOR, "linewidths": 1.6}
 
 
 def speed_scale(episodes: Sequence[PlotEpisode]) -> Normalize:
@@ -58,7 +50,7 @@ def episode_grid(episodes: Sequence[PlotEpisode], rows: Sequence[PanelRow], heig
     count = len(episodes)
     columns = 2 if count == 4 else min(count, 3)
     blocks = -(-count // columns)
-    figure, heights = new_figure(height * blocks + 0.3), [row.height for row in rows] * blocks
+    figure, heights = figures.new_figure(height * blocks + 0.3), [row.height for row in rows] * blocks
     panels = figure.subplots(len(heights), columns, sharex=True, squeeze=False, height_ratios=heights)
     scale, longest = speed_scale(episodes), max(episode.times[-1] for episode in episodes)
     for number, episode in enumerate(episodes):
@@ -68,7 +60,7 @@ def episode_grid(episodes: Sequence[PlotEpisode], rows: Sequence[PanelRow], heig
             row.draw(axes, episode, scale)
             axes.set_xlim(0, longest)
             if index == 0:
-                axes.set_title(short_label(episode.driver), fontsize=10)
+                axes.set_title(figures.short_label(episode.driver), fontsize=10)
             if column == 0:
                 axes.set_ylabel(row.label)
             if index == len(rows) - 1 and number + columns >= count:
@@ -77,7 +69,7 @@ def episode_grid(episodes: Sequence[PlotEpisode], rows: Sequence[PanelRow], heig
     for axes in panels.flat:
         axes.set_visible(bool(axes.collections))
     figure.align_ylabels(panels[:, 0])
-    bar = figure.colorbar(ScalarMappable(scale, SPEED_COLORMAP), ax=panels, shrink=0.8, pad=0.02, aspect=30)
+    bar = figure.colorbar(ScalarMappable(scale, figures.SPEED_COLORMAP), ax=panels, shrink=0.8, pad=0.02, aspect=30)
     bar.set_label("speed [m/s]")
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     return figure
@@ -94,7 +86,7 @@ def add_vehicle_lines(axes: Axes, times: np.ndarray, positions: np.ndarray, max_
     axes.add_collection(LineCollection(segments, rasterized=True, **style))
 
 
-@rc_context(PLOT_STYLE)
+@rc_context(figures.PLOT_STYLE)
 def trajectory_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """Draw the position of every vehicle over time, and the speed; a panel per driver.
 
@@ -115,20 +107,20 @@ def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> 
         extent = 0.0, max(episode.loop_length for episode in episodes)
 
     def draw(axes: Axes, episode: PlotEpisode, scale: Normalize) -> None:
-        stride = max(1, len(episode.times) // MAX_PLOT_TIMES)
+        stride = max(1, len(episode.times) // figures.MAX_PLOT_TIMES)
         arrays = (episode.times, _branch_positions(episode, branch, is_main), episode.speeds)
         times, positions, speeds = (array[::stride] for array in arrays)
         axes.grid(False)
         axes.set_ylim(*extent)
         for start, end in episode.crossings:
-            axes.axhspan(start, end, color=TEXT_COLOR, alpha=0.15, lw=0, zorder=1.5, rasterized=True)
+            axes.axhspan(start, end, color=figures.TEXT_COLOR, alpha=0.15, lw=0, zorder=1.5, rasterized=True)
         loop_length, max_step, width = 0.0, np.inf, 0.5  # open roads have many vehicles
         grid = np.linspace(*extent, SPEED_FIELD_POSITIONS)
         if episode.is_closed:
             loop_length, max_step, width = episode.loop_length, episode.loop_length / 2, 1.0  # no line over the seam
             positions, grid = positions % loop_length, np.linspace(0.0, loop_length, SPEED_FIELD_POSITIONS)
         field = speed_field(positions, speeds, grid, loop_length)
-        axes.pcolormesh(times, grid, field, cmap=SPEED_COLORMAP, norm=scale, rasterized=True)
+        axes.pcolormesh(times, grid, field, cmap=figures.SPEED_COLORMAP, norm=scale, rasterized=True)
         is_cav = np.isin(np.arange(speeds.shape[1]), episode.cav_columns)
         for group, style in ((~is_cav, HUMAN_LINE_STYLE), (is_cav, CAV_LINE_STYLE)):
             style = {**style, "linewidths": width * style["linewidths"]}
@@ -184,7 +176,7 @@ def space_time_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     return lane_map_figure(episodes) if has_lane_maps(episodes) else trajectory_figure(episodes)
 
 
-@rc_context(PLOT_STYLE)
+@rc_context(figures.PLOT_STYLE)
 def lane_map_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """Draw the mean speed in cells of time and road, a row per lane from left to right, a column per driver.
 
@@ -246,10 +238,10 @@ def _lane_row(first: PlotEpisode, lane: int, extent: tuple[float, float, float],
         axes.grid(False)
         rows, columns = speeds.shape
         edges = np.linspace(0.0, longest + episode.control_step, columns + 1), np.linspace(start, end, rows + 1)
-        axes.pcolormesh(*edges, speeds, cmap=SPEED_COLORMAP, norm=scale, rasterized=True)
+        axes.pcolormesh(*edges, speeds, cmap=figures.SPEED_COLORMAP, norm=scale, rasterized=True)
         axes.set_ylim(start, end)
         cavs = episode.cav_columns
         positions = np.where(episode.lane_indices[:, cavs] == lane, episode.positions[:, cavs], np.nan)
-        add_vehicle_lines(axes, episode.times, positions, np.inf, colors=CAV_PLOT_COLOR, linewidths=0.35)
+        add_vehicle_lines(axes, episode.times, positions, np.inf, colors=figures.CAV_PLOT_COLOR, linewidths=0.35)
 
     return PanelRow(f"{first.lane_names[lane]}\n[m]", max((end - start) / max_span, 0.3), draw)

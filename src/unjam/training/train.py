@@ -36,24 +36,13 @@ from unjam.measures.statistics import Estimate
 from unjam.processes import lock_folder
 from unjam.reports.html import write_report_page
 from unjam.reports.results import read_progress
+from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
 from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert, raise_failure
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
 from unjam.training.fingerprint import check_file_hashes, code_hashes, fingerprint
 from unjam.training.model_facts import no_facts_reason, write_model_facts
-from unjam.training.run_folder import (
-    PROGRESS_FILE,
-    append_lineage,
-    check_config,
-    controller_origin,
-    create_run_folder,
-    make_new_folder,
-    read_config,
-    restore_newest_checkpoint,
-    resume_run_folder,
-    save_checkpoint,
-)
 from unjam.training.seeds import VALIDATION_SEED
 from unjam.training.string_limit import find_operating_points
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
@@ -167,15 +156,15 @@ def train_in_process(
     progress: EvaluationProgress | None = None,
 ) -> dict[str, RowsByDriver]:
     """Train in this process, as `train` does; return the rows of the evaluation by task and driver."""
-    check_config(config)  # before anything is written
+    run_folder.check_config(config)  # before anything is written
     if not is_file_reference(config.agent):
         learner_class(config.learner)  # a package that is missing is reported before anything is written
     if resume:
-        read_config(folder)
+        run_folder.read_config(folder)
     else:
-        make_new_folder(folder, f", or --resume {folder}")
+        run_folder.make_new_folder(folder, f", or --resume {folder}")
     with expecting_code(), lock_folder(folder):
-        (resume_run_folder if resume else create_run_folder)(folder, config)
+        (run_folder.resume_run_folder if resume else run_folder.create_run_folder)(folder, config)
         with ExitStack() as locks, WorkerPool(config.workers) as workers:
             for task_folder in [folder / name for name in config.task_configs() if name]:
                 make_folder(task_folder)
@@ -221,7 +210,7 @@ class Trainer:
         self._sampler = TaskSampler(self.tasks, config.task_sampling, self._expert_returns)
         self._controllers = ControllerStore(self.folders)
         self._fingerprint = fingerprint(config)
-        if checkpoint := restore_newest_checkpoint(folder, {folder, *self.folders}, self._fingerprint):
+        if checkpoint := run_folder.restore_newest_checkpoint(folder, {folder, *self.folders}, self._fingerprint):
             state, tensors = checkpoint
             is_stopped = config.evaluation.should_stop_early(read_progress(folder))
             is_finished = is_stopped or state["environment_steps"] >= config.steps
@@ -233,7 +222,7 @@ class Trainer:
             self._best_validation = state["best_validation"]
             self._expert_returns = state["expert_returns"]
             self._sampler.restore(state["sampler"])
-            append_lineage(folder, state["iteration"])
+            run_folder.append_lineage(folder, state["iteration"])
 
     def _string_gain_function(self) -> Callable[[Network], float]:
         """Return the function that measures the largest string gain of the policy on all closed roads."""
@@ -320,7 +309,7 @@ class Trainer:
         now = self._fingerprint["files"] | code_hashes(self.config)
         check_file_hashes(self._fingerprint, {"files": now}, "train")  # an iteration of changed code is not stored
         for folder, row in [*zip(self.folders, tasks, strict=False), (self.folder, whole)]:
-            append_line(folder / PROGRESS_FILE, to_json(row))
+            append_line(folder / run_folder.PROGRESS_FILE, to_json(row))
         self._save_checkpoint()
         stopped = self._on_iteration(whole) is False
         if stopped and validation is None and not early:
@@ -338,7 +327,7 @@ class Trainer:
             "expert_returns": self._expert_returns,
         }
         own = {f"{ALGORITHM_PREFIX}{name}": tensor for name, tensor in tensors.items()}
-        save_checkpoint(self.folder / "checkpoint", state, own | self._controllers.tensors())
+        run_folder.save_checkpoint(self.folder / "checkpoint", state, own | self._controllers.tensors())
 
     @property
     def _counters(self) -> dict[str, int]:
@@ -409,7 +398,7 @@ class Trainer:
 
     def _save_controllers(self, network: Network, is_best: bool) -> None:
         contents = [
-            controller_bytes(driver, {**controller_origin(task.scenario, task.expert), **self._counters})
+            controller_bytes(driver, {**run_folder.controller_origin(task.scenario, task.expert), **self._counters})
             for task, driver in zip(self.tasks, self.make_drivers(network), strict=True)
         ]
         self._controllers.save(contents, is_best)
