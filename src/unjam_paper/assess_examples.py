@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -46,15 +46,8 @@ MOTORWAY_FLOW, RAMP_FLOW = 3000.0, 500.0
 ON_RAMP_DEMAND = replace(ON_RAMP, peak=(100.0, 700.0), horizon=int(EPISODE_SECONDS))
 DEMAND_SEED = 1
 """the built-in scenario that is exported, and the seed of its demand"""
-
-
-@dataclass(frozen=True)
-class Example:
-    """A road and the penetration rate of its assessment."""
-
-    write: Callable[[Path], Path]
-    """writes its files into a folder and returns the configuration"""
-    rate: float
+Example = tuple[Callable[[Path], Path], float]
+"""writes the files of a road into a folder and returns the configuration; and the penetration rate of its assessment"""
 
 
 def write_grid(folder: Path) -> Path:
@@ -123,13 +116,14 @@ def write_on_ramp(folder: Path) -> Path:
 
 
 EXAMPLES: dict[str, Example] = {
-    "a free road": Example(partial(write_road_files, OpenTestRoad((RoadSection(3000.0, 2, 25.0),), (0.15,))), 0.1),
-    "a signalised grid": Example(write_grid, 0.1),
-    "a road with 15 % trucks": Example(
-        partial(write_road_files, OpenTestRoad((RoadSection(3000.0, 2, 33.0),), (0.75,), trucks=0.15)), 0.1
+    "a free road": (partial(write_road_files, OpenTestRoad((RoadSection(3000.0, 2, 25.0),), (0.15,))), 0.1),
+    "a signalised grid": (write_grid, 0.1),
+    "a road with 15 % trucks": (
+        partial(write_road_files, OpenTestRoad((RoadSection(3000.0, 2, 33.0),), (0.75,), trucks=0.15)),
+        0.1,
     ),
-    "an on-ramp with SUMO's default vehicles": Example(write_ramp, 0.05),
-    "the scenario on-ramp as files": Example(write_on_ramp, 0.1),
+    "an on-ramp with SUMO's default vehicles": (write_ramp, 0.05),
+    "the scenario on-ramp as files": (write_on_ramp, 0.1),
 }
 
 
@@ -138,7 +132,8 @@ def assess_example(name: str, rate: float, max_episodes: int, precision: float, 
     with TemporaryDirectory() as place, WorkerPool(workers) as pool:
         road, results = Path(place, "road"), Path(place, "assessment")
         road.mkdir()
-        request = make_request(str(EXAMPLES[name].write(road)), [rate], max_episodes, precision)
+        write_files, _ = EXAMPLES[name]
+        request = make_request(str(write_files(road)), [rate], max_episodes, precision)
         assessment = assess(request, results, pool, on_message=partial(print, flush=True))
     document = assessment.document
     return {
@@ -196,8 +191,8 @@ def _difference_text(row: Mapping[str, Any], name: str, digits: int) -> str:
 ASSESS_EXAMPLES = Study(
     title="assessments of five small roads",
     make_parts=lambda study_folder, seeds: {
-        f"{EXAMPLES_PART}/{name}": (assess_example, (name, example.rate, MAX_EPISODES, PRECISION))
-        for name, example in EXAMPLES.items()
+        f"{EXAMPLES_PART}/{name}": (assess_example, (name, rate, MAX_EPISODES, PRECISION))
+        for name, (_, rate) in EXAMPLES.items()
     },
     minutes=25.0,
     tables={"roads": examples_table},

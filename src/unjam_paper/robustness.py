@@ -4,7 +4,7 @@ Two studies: packaged controllers with single changes (`robustness`), and other 
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import product
 from math import nan
@@ -159,11 +159,14 @@ def _transfer_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPar
     return {f"transfer/{road}": (transfer_rows, (road, drivers)) for road in TRANSFER_ROADS}
 
 
-def _write_figure_10(roads: tuple[str, ...], study_folder: StudyFolder, seeds: int, folder: Path) -> None:
-    tables = (comparison_rows(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads)
-    write_part(folder, "table", [row for rows in tables for row in rows])
-    curves = {road: training_curves(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads}
-    write_part(folder, "curves", curves)
+def _figure_10_study(title: str, roads: tuple[str, ...]) -> Study:
+    def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
+        tables = (comparison_rows(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads)
+        write_part(folder, "table", [row for rows in tables for row in rows])
+        curves = {road: training_curves(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads}
+        write_part(folder, "curves", curves)
+
+    return Study(title, lambda seeds: planned_runs(roads, VOLUME_VARIANTS, seeds), write=write, roads=roads)
 
 
 def _transfer_table(folder: Path) -> pd.DataFrame:
@@ -184,19 +187,13 @@ ROBUSTNESS = Study(
     minutes=20.0,
     tables={road: partial(_robustness_table, road) for road in ROAD_CONDITIONS},
 )
-UNFILTERED_VOLUME_ROADS = tuple(UNFILTERED_ROADS[road] for road in VOLUME_ROADS)
-FIGURE_10_UNFILTERED = Study(
-    title="5, 11 and 22 vehicles, trained for each, without the safety filter",
-    make_runs=lambda seeds: planned_runs(UNFILTERED_VOLUME_ROADS, VOLUME_VARIANTS, seeds),
-    write=partial(_write_figure_10, UNFILTERED_VOLUME_ROADS),
-    roads=UNFILTERED_VOLUME_ROADS,
+FIGURE_10_UNFILTERED = _figure_10_study(
+    "5, 11 and 22 vehicles, trained for each, without the safety filter",
+    tuple(UNFILTERED_ROADS[road] for road in VOLUME_ROADS),
 )
-FIGURE_10 = Study(
-    title="5, 11 and 22 vehicles, trained for each, and transfer between them",
-    make_runs=lambda seeds: planned_runs(VOLUME_ROADS, VOLUME_VARIANTS, seeds),
+FIGURE_10 = replace(
+    _figure_10_study("5, 11 and 22 vehicles, trained for each, and transfer between them", VOLUME_ROADS),
     make_parts=_transfer_parts,
-    write=partial(_write_figure_10, VOLUME_ROADS),
-    roads=VOLUME_ROADS,
     minutes=3.0,
     tables={"transfer": _transfer_table},
 )

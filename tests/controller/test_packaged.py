@@ -22,7 +22,7 @@ from unjam.measures.feasibility import FEASIBLE, overall_feasibility
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import paired_difference
 from unjam.scenarios import FigureEight, Ring
-from unjam.training.presets import preset_scenarios, preset_values
+from unjam.training.presets import all_presets, preset_values
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
@@ -44,7 +44,7 @@ def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
 
 
 def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
-    best = {f"{scenario}-best" for scenario in {*preset_scenarios("best")} - {"merge"}}  # where nothing is drivable
+    best = {f"{scenario}-best" for scenario in {*all_presets()["best"]["on"]} - {"merge"}}  # where nothing is drivable
     assert {name for name in packaged_names() if not name.endswith("-tuned")} == {"best", *best}
 
 

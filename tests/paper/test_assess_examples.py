@@ -17,8 +17,8 @@ from unjam_paper.study import StudyFolder
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_a_road_of_the_examples_carries_traffic(name: str, tmp_path: Path, sumo: SumoBackend) -> None:
-    example = EXAMPLES[name]
-    scenario = make_scenario(str(example.write(tmp_path)), {"penetration_rate": example.rate, "end": 60.0})
+    write_files, rate = EXAMPLES[name]
+    scenario = make_scenario(str(write_files(tmp_path)), {"penetration_rate": rate, "end": 60.0})
     episode = run_episode(scenario, Human(), (1,), backend=sumo)
     assert (episode.status, episode.teleports, episode.warnings) == ("completed", 0, ())
     assert len(episode.vehicle_ids) > 5
@@ -29,15 +29,15 @@ def test_a_road_of_the_examples_carries_traffic(name: str, tmp_path: Path, sumo:
 def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    road, out = EXAMPLES["an on-ramp with SUMO's default vehicles"], tmp_path / "out"
+    (write_files, _), out = EXAMPLES["an on-ramp with SUMO's default vehicles"], tmp_path / "out"
     out.mkdir()
     written = list[Path]()
 
     def write(folder: Path) -> Path:
         written.append(folder)
-        return road.write(folder)
+        return write_files(folder)
 
-    short: dict[str, Example] = {"first": Example(write, 0.3)}
+    short: dict[str, Example] = {"first": (write, 0.3)}
     monkeypatch.setattr(assess_examples, "EXAMPLES", short)
     monkeypatch.setattr(assess_examples, "MAX_EPISODES", 15)
     monkeypatch.setattr(open_test_roads, "EPISODE_SECONDS", 60.0)
@@ -51,7 +51,7 @@ def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
     assert acc["travel_time"] == pytest.approx(human["travel_time"] + acc["difference"]["mean"])
     assert len(found["sentences"]) == 2
     assert list(examples_table(out)["driver"]) == ["human", "cruise", controller["driver"]]
-    short["second"] = Example(write, 0.3)
+    short["second"] = (write, 0.3)
     ASSESS_EXAMPLES.run(StudyFolder(tmp_path), 1, out, 2)
     assert len(written) == 2
     assert list(read_part(out, EXAMPLES_PART)) == ["first", "second"]

@@ -5,9 +5,9 @@ import pytest
 
 from unjam.drivers import PISaturation
 from unjam.training.config import RunConfig, load_config
-from unjam.training.presets import preset_names, preset_scenarios, preset_values
+from unjam.training.presets import all_presets, preset_values
 
-PRESETS = [name for name in preset_names() if not preset_scenarios(name) or name == "demo"]
+PRESETS = [name for name, values in all_presets().items() if "on" not in values or name == "demo"]
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -25,24 +25,17 @@ def _packaged_presets() -> dict[str, dict[str, Any]]:
 
 
 @cache
-def _all_presets() -> dict[str, dict[str, Any]]:
-    """Return the packaged presets and those of other packages, which are imported for it."""
+def all_presets() -> dict[str, dict[str, Any]]:
+    """Return the packaged presets and those of other packages, which are imported for it, by name.
+
+    The entry `on` of a preset has settings of their own for some scenarios.
+    """
     return reduce(operator.or_, load_plugins("unjam.presets").values(), _packaged_presets())
-
-
-def preset_names() -> list[str]:
-    """Return the names of all presets."""
-    return list(_all_presets())
-
-
-def preset_scenarios(preset: str) -> list[str]:
-    """Return the scenarios for which a preset has settings of their own."""
-    return list(_all_presets()[preset].get("on", {}))
 
 
 def preset_values(preset: str, scenario: str) -> dict[str, Any]:
     """Return what a preset changes on a scenario; raise `InputError` if there is no such preset."""
-    presets = _packaged_presets() if preset in _packaged_presets() else _all_presets()
+    presets = _packaged_presets() if preset in _packaged_presets() else all_presets()
     if preset not in presets:
         raise unknown_name("preset", preset, presets)
     by_scenario = presets[preset].get("on", {})
