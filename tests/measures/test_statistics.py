@@ -279,19 +279,17 @@ def test_bimodality_is_detected_with_few_false_positives(count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "trainings", "words"),
+    ("low", "high", "words"),
     [
-        (1.0, 3.0, 10, "The residual increases the return."),
-        (1.0, 3.0, 9, "The return increases in 9 trainings; a verdict on the residual needs 10 trainings."),
-        (-3.0, -1.0, 1, "The return decreases in one training; a verdict on the residual needs 10 trainings."),
-        (-3.0, -1.0, 12, "The residual decreases the return."),
-        (-1.0, 3.0, 50, "No gain is shown: the confidence interval contains zero."),
-        (0.0, 0.0, 50, "No gain is shown: the confidence interval contains zero."),
-        (np.nan, np.nan, 50, "No conclusion: there is no confidence interval."),
+        (1.0, 3.0, "The return increases in one training; a verdict on the residual needs 10 trainings."),
+        (-3.0, -1.0, "The return decreases in one training; a verdict on the residual needs 10 trainings."),
+        (-1.0, 3.0, "No gain is shown: the confidence interval contains zero."),
+        (0.0, 0.0, "No gain is shown: the confidence interval contains zero."),
+        (np.nan, np.nan, "No conclusion: there is no confidence interval."),
     ],
 )
-def test_gain_verdict_follows_from_interval_and_trainings(low: float, high: float, trainings: int, words: str) -> None:
-    assert gain_verdict(Estimate((low + high) / 2, low, high, 20), trainings) == words
+def test_gain_verdict_of_a_training_follows_from_its_interval(low: float, high: float, words: str) -> None:
+    assert gain_verdict(Estimate((low + high) / 2, low, high, 20)) == words
 
 
 def test_bimodality_needs_two_values_per_group() -> None:

@@ -197,17 +197,14 @@ def format_ci(value: Estimate, format_spec: str) -> str:
     return f"({value.smallest:{format_spec}} to {value.largest:{format_spec}})"
 
 
-def gain_verdict(gain: Estimate, trainings: int = 1) -> str:
-    """Return a verdict on the difference of the return to that of the expert, as a sentence."""
+def gain_verdict(gain: Estimate) -> str:
+    """Return a verdict on the difference of the return of one training to that of its expert, as a sentence."""
     if isnan(gain.low):
         return "No conclusion: there is no confidence interval."
     if gain.low <= 0 <= gain.high:
         return "No gain is shown: the confidence interval contains zero."
     change = "increases" if gain.low > 0 else "decreases"
-    if trainings < MIN_VERDICT_TRAININGS:
-        count = "one training" if trainings == 1 else f"{trainings} trainings"
-        return f"The return {change} in {count}; a verdict on the residual needs {MIN_VERDICT_TRAININGS} trainings."
-    return f"The residual {change} the return."
+    return f"The return {change} in one training; a verdict on the residual needs {MIN_VERDICT_TRAININGS} trainings."
 
 
 def estimate_over_trainings(
