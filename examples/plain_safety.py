@@ -31,18 +31,37 @@ def highest(f: SimpleNamespace, s: State, step: float, actuator: Actuator) -> fl
     if not f.active:
         return math.inf
     leader, room = max(s.leader_speed - f.speed_error, 0.0), s.leader_gap - f.gap_error - f.standstill_gap
+    within_time_gap = time_gap_bound(f, s.speed, leader, room, step, actuator) if f.time_gap else math.inf
     speed = actuator.equivalent_speed(s.speed, actuator.acceleration, f.braking)
     for command in actuator.pending:
         speed = max(speed + command * step, actuator.equivalent_speed(0.0, 0.0, f.braking))
         room -= speed * step
     allowed = speed_to_stop_within(room + stopping(leader, f.leader_braking, step), f.braking, step)
-    if f.time_gap:
-        c, later = f.time_gap_braking, max(leader - f.time_gap_braking * step * (len(actuator.pending) + 1), 0.0)
-        end = room + stopping(leader, c, step)
+    return max(min((allowed - speed) / step, within_time_gap), -f.braking)
+
+
+def time_gap_bound(f: SimpleNamespace, v: float, leader: float, room: float, step: float, actuator: Actuator) -> float:
+    """The highest command that keeps the time gap while both brake with `time_gap_braking` after it [m/s2]."""
+    c, change, decay, a = f.time_gap_braking, f.time_gap_braking * step, actuator.decay, actuator.acceleration
+    if not decay and not actuator.pending:
+        later, end = max(leader - change, 0.0), room + stopping(leader, c, step)
         near = (end - stopping(later, c, step)) / (f.time_gap + step)
         far = speed_to_stop_within(end - c * (f.time_gap + step / 2.0) ** 2 / 2.0, c, step)
-        allowed = min(allowed, near, max(far, later + f.time_gap * c))
-    return max((allowed - speed) / step, -f.braking)
+        return (min(near, max(far, later + f.time_gap * c)) - v) / step
+    for command in actuator.pending:
+        a = max(a * decay + command * (1.0 - decay), -v / step)
+        v, leader = v + a * step, max(leader - change, 0.0)
+        room += (leader - v) * step
+    fading = step * decay / (1.0 - decay) * (a + c)
+    equivalent, remaining, distance, allowed = v + fading, 1.0, 0.0, 20.0 + c
+    for number in range(1, int((equivalent + allowed * step) / change) + 2):
+        remaining *= decay
+        v, leader = equivalent - change * number - fading * remaining, max(leader - change, 0.0)
+        room += (leader - v) * step
+        gained = step * (1.0 - remaining)
+        distance += step * gained
+        allowed = min(allowed, (room - f.time_gap * v) / (distance + f.time_gap * gained))
+    return allowed - c
 
 
 def stopping(speed: float, braking: float, step: float) -> float:

@@ -17,13 +17,15 @@ from unjam.controller.file import replay_states
 from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.onnx_graph import describe_graph, onnx_graph
 from unjam.drivers import ACC, IDM, LACC, Driver, FollowerStopper, Human, Pacer, PISaturation, ResidualDriver
+from unjam.drivers.car_following import Constant
 from unjam.drivers.network import Network
 from unjam.drivers.observation import feature, observation_size
 from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.registry import driver_from_name
 from unjam.drivers.requirements import merge_requirements
+from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.user_driver import FileDriver
-from unjam.drivers.wrappers import MixedDriver
+from unjam.drivers.wrappers import FilteredDriver, MixedDriver
 from unjam.errors import InputError, MissingPartError
 from unjam.learners.sac_td3 import SquashedResidualPolicy
 from unjam.learners.settings import PolicySettings
@@ -114,8 +116,10 @@ def test_the_graph_of_every_expert_answers_what_the_expert_answers(name: str) ->
         residual(residual(PISaturation(), 1, hold=3), 2, hold=5),
         MixedDriver((PISaturation(), IDM(), residual(ACC()))),
         residual(Human()),
+        FilteredDriver(Constant(1.0), 1.0, SafetyFilter(), 0.1),
+        FilteredDriver(Constant(1.0), 1.0, SafetyFilter(), 0.1, Actuator(delay=0.2, lag=0.3)),
     ],
-    ids=["nested", "mixed", "residual on human"],
+    ids=["nested", "mixed", "residual on human", "filter", "filter with actuator"],
 )
 def test_the_graph_of_drivers_put_together_answers_what_they_answer(driver: Driver) -> None:
     same(driver)

@@ -167,6 +167,64 @@ def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
     assert tensors[0].item() == pytest.approx(limited, abs=1e-9)
 
 
+SLOW_ACTUATORS = st.sampled_from([each for each in ACTUATORS if each is not None])
+
+
+@given(
+    *(SLOW_ACTUATORS, SPEEDS, SPEEDS, GAPS, STEPS),
+    st.floats(-6.0, 2.0),
+    st.lists(st.floats(-6.0, 2.0), min_size=7, max_size=7),
+)
+def test_the_bound_of_a_slow_actuator_is_the_same_for_plain_numbers_rows_and_tensors(
+    actuator: Actuator,
+    speed: float,
+    leader_speed: float,
+    gap: float,
+    step: float,
+    acceleration: float,
+    commands: list[float],
+) -> None:
+    pending = commands[: actuator.delay_steps(step)]
+    plain = FollowingState(speed, leader_speed, gap)
+    bound = SafetyFilter().max_acceleration(plain, step, (actuator, ActuatorState(acceleration, tuple(pending))))
+    for rows in (lambda value: np.array([value, 1.0]), lambda value: torch.tensor([value, 1.0], dtype=torch.float64)):
+        state = ActuatorState(rows(acceleration), tuple(rows(each) for each in pending))
+        found = SafetyFilter().max_acceleration(FollowingState(*map(rows, plain)), step, (actuator, state))
+        assert float(found[0]) == pytest.approx(bound, abs=1e-9)
+
+
+def smallest_margin(
+    command: float, safety: SafetyFilter, actuator: Actuator, state: FollowingState, start: ActuatorState, step: float
+) -> float:
+    """Return the smallest gap beyond the time gap after a command, while both then brake as hard as it assumes."""
+    speed, leader, gap = state
+    margins, arriving = list[float](), len(start.pending)
+    for number in range(400):
+        wanted = command if number == 0 else -safety.time_gap_braking
+        start = actuator.apply_command(wanted, speed, start, step)
+        speed = next_speed(speed, start.acceleration, step)
+        leader = next_speed(leader, -safety.time_gap_braking, step)
+        gap += (leader - speed) * step
+        if number >= arriving:
+            margins.append(gap - safety.standstill_gap - safety.time_gap * speed)
+        if speed == 0.0 == leader:
+            break
+    return min(margins)
+
+
+@given(SLOW_ACTUATORS, st.floats(0.0, 30.0), st.floats(0.0, 30.0), st.floats(2.0, 80.0), st.floats(-3.0, 2.0))
+def test_the_time_gap_of_a_slow_actuator_is_kept_and_no_more(
+    actuator: Actuator, speed: float, leader_speed: float, gap: float, acceleration: float
+) -> None:
+    safety, step = SafetyFilter(braking=100.0, leader_braking=100.0), 0.1  # contact never limits it first
+    state = FollowingState(speed, leader_speed, gap)
+    start = ActuatorState(acceleration, (acceleration,) * actuator.delay_steps(step))
+    bound = safety.max_acceleration(state, step, (actuator, start))
+    if -safety.time_gap_braking < bound < 10.0:
+        assert smallest_margin(bound, safety, actuator, state, start, step) >= -1e-9
+        assert smallest_margin(bound + 1e-3, safety, actuator, state, start, step) < 0.0
+
+
 @given(SPEEDS, SPEEDS, st.floats(-3.0, 3.0))
 def test_without_a_leader_commands_are_not_limited(speed: float, leader_speed: float, wanted: float) -> None:
     for actuation in (None, (Actuator(lag=0.3), ActuatorState(0.0))):

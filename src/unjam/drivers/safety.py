@@ -6,6 +6,7 @@ brakes hard; otherwise it brakes as hard as necessary.
 `docs/safety.md` states the assumptions and proves both properties for the discrete steps of the simulator.
 """
 
+import sys
 from math import exp
 from typing import NamedTuple
 
@@ -52,7 +53,7 @@ class Actuator(Subclassable):
     def apply_command(self, command: Array, speed: Array, state: ActuatorState, step: float) -> ActuatorState:
         """Return the state after a command, with the acceleration for this step; brakes cannot reverse a vehicle."""
         arriving, *pending = *state.pending, command
-        decay = self._lag_decay(step)
+        decay = self.decay(step)
         acceleration = state.acceleration * decay + arriving * (1.0 - decay)
         return ActuatorState(clamp_min(acceleration, -speed / step), tuple(pending))
 
@@ -62,10 +63,10 @@ class Actuator(Subclassable):
         z = v + T (a + `braking`) with T = h r / (1 - r), where r is the share of the difference to a command that
         remains after one step of length h. For any command u, one step turns z into z + h u: as without lag.
         """
-        decay = self._lag_decay(step)
+        decay = self.decay(step)
         return speed + step * decay / (1.0 - decay) * (state.acceleration + braking)
 
-    def _lag_decay(self, step: float) -> float:
+    def decay(self, step: float) -> float:
         """Return the share of the difference to a command that remains after one step."""
         return exp(-step / self.lag) if self.lag else 0.0
 
@@ -83,6 +84,10 @@ class FollowingState(NamedTuple):
     """own front bumper to the leader's rear bumper; infinite without a leader"""
 
 
+MAX_COMMAND = 20.0
+"""largest acceleration that a vehicle with delay or lag can be allowed [m/s2]"""
+MAX_TRACED_SPEED = 50.0
+"""highest speed for which an exported graph of a filter with delay or lag keeps time gaps [m/s]"""
 MAX_LEADER_GAP = 1e6
 """finite gap that replaces larger ones in formulas that count steps [m]"""
 
@@ -146,7 +151,8 @@ class SafetyFilter(Subclassable):
         """Return the highest acceleration that may be commanded; maximum braking if none may."""
         leader = clamp_min(state.leader_speed - self.speed_error, 0.0)
         gap = clamp_max(state.gap, MAX_LEADER_GAP) - (self.gap_error + self.standstill_gap)
-        speed, delay_steps = state.speed, 0
+        bounded = FollowingState(state.speed, leader, gap)
+        speed = state.speed
         if actuation is not None:
             actuator, actuator_state = actuation
             standing = actuator.equivalent_speed(0.0 * speed, ActuatorState(0.0 * speed), self.braking, step)
@@ -154,21 +160,49 @@ class SafetyFilter(Subclassable):
             for command in actuator_state.pending:
                 speed = clamp_min(speed + command * step, standing)
                 gap = gap - speed * step
-            delay_steps = len(actuator_state.pending)
         end = gap + stopping_distance(leader, self.leader_braking, step)
-        allowed = max_speed_to_stop(end, self.braking, step)
-        if self.time_gap:
-            allowed = clamp_max(allowed, self._max_speed_for_time_gap(leader, gap, delay_steps, step))
-        return clamp_min((allowed - speed) / step, -self.braking)
+        allowed = (max_speed_to_stop(end, self.braking, step) - speed) / step
+        if self.time_gap and actuation is not None:
+            allowed = clamp_max(allowed, self._max_command_for_time_gap(bounded, step, *actuation))
+        elif self.time_gap:
+            allowed = clamp_max(allowed, (self._max_speed_for_time_gap(leader, gap, step) - speed) / step)
+        return clamp_min(allowed, -self.braking)
 
-    def _max_speed_for_time_gap(self, leader_speed: Array, gap: Array, delay_steps: int, step: float) -> Array:
+    def _max_command_for_time_gap(
+        self, state: FollowingState, step: float, actuator: Actuator, actuator_state: ActuatorState
+    ) -> Array:
+        """Return the highest command that keeps the minimum time gap if both brake with `time_gap_braking` after it.
+
+        After the pending commands, and with n further ones of that braking, own speed and gap are linear in the
+        command as long as the vehicle moves; each n gives a bound. `state.gap` is reduced by the standstill gap.
+        """
+        braking, time_gap, decay = self.time_gap_braking, self.time_gap, actuator.decay(step)
+        (speed, leader, gap), acceleration = state, actuator_state.acceleration
+        for command in actuator_state.pending:
+            acceleration = clamp_min(acceleration * decay + command * (1.0 - decay), -speed / step)
+            speed = speed + acceleration * step
+            leader = clamp_min(leader - braking * step, 0.0)
+            gap = gap + (leader - speed) * step
+        fading = step * decay / (1.0 - decay) * (acceleration + braking)
+        equivalent, remaining, distance, above = speed + fading, 1.0, 0.0, MAX_COMMAND + braking
+        allowed = 0.0 * speed + above
+        for number in range(1, _steps_to_standstill(equivalent + above * step, braking * step) + 1):
+            remaining *= decay
+            speed = equivalent - braking * step * number - fading * remaining
+            leader = clamp_min(leader - braking * step, 0.0)
+            gap = gap + (leader - speed) * step
+            gained = step * (1.0 - remaining)  # speed and distance by each m/s2 of the command above the braking
+            distance += step * gained
+            allowed = clamp_max(allowed, (gap - time_gap * speed) / (distance + time_gap * gained))
+        return allowed - braking
+
+    def _max_speed_for_time_gap(self, leader_speed: Array, gap: Array, step: float) -> Array:
         """Return the highest speed that keeps the minimum time gap while both brake with `time_gap_braking`.
 
-        A command takes `delay_steps` to arrive; `gap` is reduced by the distance driven in the meantime, and by the
-        standstill gap.
+        `gap` is reduced by the standstill gap.
         """
         braking, time_gap = self.time_gap_braking, self.time_gap
-        later = clamp_min(leader_speed - braking * step * (delay_steps + 1.0), 0.0)
+        later = clamp_min(leader_speed - braking * step, 0.0)
         end = gap + stopping_distance(leader_speed, braking, step)
         near = (end - stopping_distance(later, braking, step)) / (time_gap + step)
         # At closing speeds above this one, the time gap has its minimum at some later speed.
@@ -191,6 +225,15 @@ class SafetyFilter(Subclassable):
             and speed * (speed / own + step) / 2.0 + own * step * step / 8.0
             <= gap + leader * (leader / others - step) / 2.0
         )
+
+
+def _steps_to_standstill(speed: Array, change: float) -> int:
+    """Return after how many steps the fastest vehicle stands that slows by `change` in each [m/s]."""
+    if type(speed) is not float:
+        torch = sys.modules.get("torch")
+        is_traced = torch is not None and torch.compiler.is_compiling()
+        speed = MAX_TRACED_SPEED if is_traced else float(speed.max()) if len(speed) else 0.0
+    return int(speed / change) + 1
 
 
 class CAVActuation:
