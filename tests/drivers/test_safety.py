@@ -88,8 +88,8 @@ def test_a_leader_who_brakes_as_hard_as_allowed_is_never_touched(
     safety: SafetyFilter, actuator: Actuator | None
 ) -> None:
     for step, seed in ((0.1, 0), (0.5, 1)):
-        pursuit = Pursuit(safety, actuator, step, 4000, seed)
-        assert len(pursuit.ahead.gap) > 1000
+        pursuit = Pursuit(safety, actuator, step, 2000, seed)
+        assert len(pursuit.ahead.gap) > 500
         nearest = np.minimum(pursuit.ahead.gap, safety.standstill_gap)
         leader = np.zeros(len(nearest))
         for number in range(round(30.0 / step)):
@@ -105,7 +105,7 @@ def test_a_leader_who_brakes_as_hard_as_allowed_is_never_touched(
 def test_the_floor_holds_behind_who_brakes_no_harder_than_it_allows_for(
     safety: SafetyFilter, actuator: Actuator | None
 ) -> None:
-    pursuit = Pursuit(safety, actuator, 0.1, 4000, 2)
+    pursuit = Pursuit(safety, actuator, 0.1, 2000, 2)
     leader = np.zeros(len(pursuit.ahead.gap))
     for number in range(300):
         if number % 20 == 0:

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import state_of
+from unjam.controller import string_stability
 from unjam.controller.string_stability import GAIN_TOLERANCE, measure_string_stability
 from unjam.drivers import LocalState, SmoothACC
 from unjam.drivers.safety import Actuator, SafetyFilter
@@ -35,9 +36,12 @@ def test_a_share_of_the_mean_of_the_warm_up_is_the_first_mean(factor: float) -> 
     assert memory["mean_leader_speed"] == pytest.approx(3.0 * factor)
 
 
-@pytest.mark.long
-def test_the_defaults_are_string_stable_with_a_slow_actuator_and_human_drivers_behind() -> None:
+def test_the_defaults_are_string_stable_with_a_slow_actuator_and_human_drivers_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(string_stability, "OSCILLATION_FREQUENCIES", np.geomspace(0.005, 0.5, 12))
+    monkeypatch.setattr(string_stability, "SETTLING_SECONDS", 100.0)
     driver = FilteredDriver(SmoothACC(), 1.0, SafetyFilter(), 0.1, Actuator(delay=0.2, lag=0.3))
-    for each in measure_string_stability(driver, [2.0, 4.0, 12.0], PAPER_IDM):
+    for each in measure_string_stability(driver, [2.0, 12.0], PAPER_IDM):
         assert max(each.gains) <= 1.0 + GAIN_TOLERANCE
         assert each.max_stable_followers >= 10

@@ -19,7 +19,7 @@ from unjam_paper.string_stability import (
 )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_experts_are_tuned_within_their_limits_and_compared_with_human_drivers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
