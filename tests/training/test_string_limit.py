@@ -35,7 +35,7 @@ def few_frequencies(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(string_stability, "SETTLING_SECONDS", 40.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_settings_that_amplify_are_never_tried_and_a_resumed_tuning_knows_them(tmp_path: Path) -> None:
     def run() -> tuple[list[str], float]:
         with WorkerPool(1) as workers:
