@@ -54,7 +54,7 @@ Seeds = Sequence[tuple[int, ...]]
 EpisodeRunner = Callable[[list[EpisodeTask]], EpisodeRows]
 """runs tasks and returns the result of `family_metrics` for each of them, in their order"""
 PI_TUNED_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
-"""result of `unjam tune rings --expert pi`"""
+"""result of `unjam tune rings --expert pi --max-string-gain 0`"""
 PI_TUNED_ON_ALL = (
     "pi:window=24.09,catch_up_speed=0.9343,gap_lower=2.263,gap_upper=88.15,safe_gap=4.505,"
     "safe_gap_rule=closing,time_constant=1.18,first_command=zero"

@@ -57,17 +57,19 @@ PI_LONG_TUNED = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
     "safe_gap=1.037,safe_gap_rule=closing,time_constant=0.8318,first_command=own-speed"
 )
-"""result of `unjam tune ring --expert pi --steps 12000000`; that of `pi-from-gap` is `unjam:ring-gap-tuned`"""
+"""result of `unjam tune ring --expert pi --max-string-gain 0 --steps 12000000`; that of `pi-from-gap` is
+`unjam:ring-gap-tuned`"""
 GAP_PI_JAMMED_LONG_TUNED = (
     "pi-from-gap:window=23,catch_up_speed=2.916,gap_lower=6,gap_upper=80,safe_gap=2,"
     "time_constant=2.976,fade_time=26,history_factor=0"
 )
-"""result of `unjam tune ring-jammed --expert pi-from-gap --steps 12000000` within the ranges of
+"""result of `unjam tune ring-jammed --expert pi-from-gap --max-string-gain 0 --steps 12000000` within the ranges of
 `unjam:ring-jammed-tuned`, which had half of these steps: results/tuned.json has both commands"""
 PACER_LONG_TUNED = (
     "pacer:use_tuned=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )
-"""result of `unjam tune figure-eight --expert pacer --reward eq16 --steps 4860000`, without parameters that have no
+"""result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`, without
+parameters that have no
 effect; with 600,000 steps it is `unjam:figure-eight-tuned`"""
 OTHER_ROAD_LABEL = "residual trained on the other road"
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
