@@ -261,7 +261,8 @@ def test_a_car_with_lag_drives_no_farther_than_its_equivalent(
     ("values", "line"),
     [
         ({"leader_braking": 5.0}, "leader_braking: 5 is not allowed; allowed: >= braking, 6"),
-        ({"time_gap_braking": 7.0}, "time_gap_braking: 7 is not allowed; allowed: <= braking, 6"),
+        ({"time_gap_braking": 7.0}, "time_gap_braking: 7 is not allowed; allowed: 0.5 to braking, 6"),
+        ({"time_gap_braking": 1e-6}, "time_gap_braking: 1e-06 is not allowed; allowed: 0.5 to braking, 6"),
         ({"time_gap": -1.0}, "time_gap: -1.0 is not allowed; allowed: greater than or equal to 0"),
     ],
 )
@@ -269,3 +270,9 @@ def test_brakes_that_prove_nothing_are_refused(values: dict[str, float], line: s
     with pytest.raises(InputError) as refused:
         build_dataclass(SafetyFilter, values, "safety")
     assert line in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["delay", "lag"])
+def test_an_actuator_that_would_fill_the_memory_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match=f"actuator.{name}: 1000000000.0 is not allowed; allowed: less than or"):
+        build_dataclass(Actuator, {name: 1e9}, "actuator")

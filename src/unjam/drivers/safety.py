@@ -8,9 +8,9 @@ brakes hard; otherwise it brakes as hard as necessary.
 
 import sys
 from math import exp
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_max, clamp_min
@@ -25,6 +25,12 @@ class ActuatorState(NamedTuple):
     """commands that have not arrived yet, the next one first"""
 
 
+Latency = Annotated[float, Field(ge=0, le=60)]
+"""delay or time constant of an actuator; a pending command needs memory in each step [s]"""
+MIN_TIME_GAP_BRAKING = 0.5
+"""smallest braking with which a filter can keep a time gap: it follows the plan to standstill step by step [m/s2]"""
+
+
 @parameter_dataclass(frozen=True, config=STRICT)
 class Actuator(Subclassable):
     """Delay and lag of a vehicle's response to commands: da/dt = (u(t - delay) - a) / lag, exact over each step.
@@ -32,9 +38,9 @@ class Actuator(Subclassable):
     Vehicles with driver assistance systems: lag 0.2 to 0.5 s, delay 0.05 to 0.5 s.
     """
 
-    delay: NonNegative = 0.0
+    delay: Latency = 0.0
     """time until a command arrives, rounded to whole simulation steps [s]"""
-    lag: NonNegative = 0.0
+    lag: Latency = 0.0
     """time constant with which the acceleration follows [s]"""
 
     @property
@@ -112,7 +118,7 @@ class SafetyFilter(Subclassable):
     """minimum time gap, beyond the standstill gap, behind a leader that brakes with at most `time_gap_braking` [s];
     0: none"""
     time_gap_braking: Positive = 4.5
-    """braking with which the minimum time gap is kept, at most `braking` [m/s2]"""
+    """braking with which the minimum time gap is kept, from 0.5 to `braking` [m/s2]"""
     gap_error: NonNegative = 0.0
     """largest error of the sensed gap [m]"""
     speed_error: NonNegative = 0.0
@@ -123,8 +129,9 @@ class SafetyFilter(Subclassable):
         own, leader, time_gap = self.braking, self.leader_braking, self.time_gap_braking
         if leader < own:  # else the gap may be smallest before both stand
             raise ValueError(f"leader_braking: {leader:g} is not allowed; allowed: >= braking, {own:g}")
-        if time_gap > own:
-            raise ValueError(f"time_gap_braking: {time_gap:g} is not allowed; allowed: <= braking, {own:g}")
+        if not MIN_TIME_GAP_BRAKING <= time_gap <= own:
+            allowed = f"{MIN_TIME_GAP_BRAKING:g} to braking, {own:g}"
+            raise ValueError(f"time_gap_braking: {time_gap:g} is not allowed; allowed: {allowed}")
         return self
 
     def limit(
