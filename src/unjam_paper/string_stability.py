@@ -15,25 +15,21 @@ import pandas as pd
 from matplotlib.figure import Figure
 from optuna.distributions import FloatDistribution
 
-from unjam.controller import make_driver
 from unjam.drivers.registry import driver_from_name
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.statistics import metric_estimate, paired_difference
 from unjam.reports.figures import LINE_COLORS, new_figure
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.training.evaluate import evaluate, raise_failures
+from unjam.training.road_family import ACTUATOR_LATENCY
 from unjam.training.search_space import SearchSpace, default_search_space
-from unjam.training.seeds import make_test_seeds
 from unjam.training.string_limit import find_operating_points
 from unjam.training.tune import tune
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import read_part
-from unjam_paper.study import Study, Table
+from unjam_paper.study import Study, Table, evaluate_drivers
 
 STRING_ROADS = ("ring", "ring-jammed")
-STANDARD_ACTUATOR = {"delay": 0.2, "lag": 0.3}
-"""delay and lag of a usual car [s]"""
 GAIN_LIMITS = (1.02, 1.1, 1.2, 1.4, 0.0)
 """largest allowed string gains; 0: any"""
 TUNING_STEPS, STRING_SEEDS = 3_000_000, 20
@@ -53,7 +49,7 @@ STORED_METRICS = ("seed", "return", "mean_speed", "speed_std_fleet_steady", "min
 
 def string_road(name: str) -> Scenario:
     """Return a ring whose CAVs have the actuator of a usual car."""
-    return make_scenario(name, {"actuator": STANDARD_ACTUATOR})
+    return make_scenario(name, {"actuator": ACTUATOR_LATENCY})
 
 
 def measure_tuned(road: str, expert: str, limit: float, workers: int) -> Table:
@@ -74,11 +70,8 @@ def measure_tuned(road: str, expert: str, limit: float, workers: int) -> Table:
 
 def measure_episodes(scenario: Scenario, driver: str, workers: int) -> Table:
     """Return the metrics of a driver on test seeds."""
-    with WorkerPool(workers) as pool:
-        made = {driver: make_driver(driver, scenario.control_step)}
-        evaluation = evaluate(scenario, made, make_test_seeds(STRING_SEEDS), pool)
-    raise_failures(evaluation)
-    return [{name: row[name] for name in STORED_METRICS} for row in evaluation.rows[driver]]
+    rows = evaluate_drivers(scenario, {driver: driver}, STRING_SEEDS, workers)[driver]
+    return [{name: row[name] for name in STORED_METRICS} for row in rows]
 
 
 def measure_human_baseline(road: str, workers: int) -> Table:

@@ -18,7 +18,7 @@ from unjam.scenarios import Ring
 from unjam.scenarios.motorway import ON_RAMP
 from unjam.training import setting_sampler
 from unjam.training.search_space import SearchSpace
-from unjam.training.string_limit import MAX_STRING_GAIN, find_operating_points
+from unjam.training.string_limit import MAX_STRING_GAIN, OperatingPoint, find_operating_points
 from unjam.training.train import train
 from unjam.training.trial_log import TRIALS_FILE
 from unjam.training.tune import TUNING_EPISODES, TUNING_FINALISTS, tune
@@ -105,3 +105,13 @@ def test_a_training_that_cannot_keep_the_limit_is_refused(
     config = small_config(policy__max_string_gain=1.02, model__model_ratio=0.0, **changes)
     with pytest.raises(InputError, match=f"policy.max_string_gain: 1.02 is not allowed; allowed: {allowed}"):
         train(config, tmp_path / "run")
+
+
+def test_infeasible_trials_of_an_expert_with_an_amplifying_default_end_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("unjam.training.tune._score_rows", lambda rows, human_rows: (None, "brakes too hard"))
+    monkeypatch.setattr(OperatingPoint, "string_gain", lambda self, driver: 1.0 + float(driver.catch_up_speed == 1.0))
+    space: SearchSpace = {"catch_up_speed": FloatDistribution(2.0, 3.0)}
+    with WorkerPool(1) as workers, pytest.raises(UnjamError, match="all 2 settings of pi are infeasible"):
+        tune({"ring": SMALL}, "pi", space, STEPS, tmp_path, workers, max_string_gain=MAX_STRING_GAIN)

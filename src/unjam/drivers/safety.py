@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_max, clamp_min
-from unjam.physics.kinematics import max_speed_to_stop, stopping_distance
+from unjam.physics.kinematics import max_speed_to_stop, next_speed, stopping_distance
 
 
 class ActuatorState(NamedTuple):
@@ -184,19 +184,18 @@ class SafetyFilter(Subclassable):
         command as long as the vehicle moves; each n gives a bound. `state.gap` is reduced by the standstill gap.
         """
         braking, time_gap, decay = self.time_gap_braking, self.time_gap, actuator.decay(step)
-        (speed, leader, gap), acceleration = state, actuator_state.acceleration
-        for command in actuator_state.pending:
-            acceleration = clamp_min(acceleration * decay + command * (1.0 - decay), -speed / step)
-            speed = speed + acceleration * step
-            leader = clamp_min(leader - braking * step, 0.0)
+        speed, leader, gap = state
+        for _ in actuator_state.pending:
+            actuator_state = actuator.apply_command(-braking, speed, actuator_state, step)
+            speed, leader = next_speed(speed, actuator_state.acceleration, step), next_speed(leader, -braking, step)
             gap = gap + (leader - speed) * step
-        fading = step * decay / (1.0 - decay) * (acceleration + braking)
-        equivalent, remaining, distance, above = speed + fading, 1.0, 0.0, MAX_COMMAND + braking
+        equivalent = actuator.equivalent_speed(speed, actuator_state, braking, step)
+        fading, remaining, distance, above = equivalent - speed, 1.0, 0.0, MAX_COMMAND + braking
         allowed = 0.0 * speed + above
         for number in range(1, _steps_to_standstill(equivalent + above * step, braking * step) + 1):
             remaining *= decay
             speed = equivalent - braking * step * number - fading * remaining
-            leader = clamp_min(leader - braking * step, 0.0)
+            leader = next_speed(leader, -braking, step)
             gap = gap + (leader - speed) * step
             gained = step * (1.0 - remaining)  # speed and distance by each m/s2 of the command above the braking
             distance += step * gained

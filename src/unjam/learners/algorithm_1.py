@@ -100,9 +100,9 @@ class Algorithm1:
         if not self.learner.policy_parameters():
             name = type(self.learner).__name__
             raise InputError(f"policy.max_string_gain: {name} has no policy_parameters(), as such a limit needs")
-        limit = self.spec.policy.max_string_gain
-        if not self._is_allowed(self.network()):
-            allowed = f"at least {string_gain(self.network()):.3f}, the gain of its first policy, or another expert"
+        limit, gain = self.spec.policy.max_string_gain, string_gain(self.network())
+        if gain > limit:
+            allowed = f"at least {gain:.3f}, the gain of its first policy, or another expert"
             raise invalid_value("policy.max_string_gain", limit, allowed)
 
     def _is_allowed(self, network: Network) -> bool:

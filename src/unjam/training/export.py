@@ -27,7 +27,6 @@ from unjam.scenarios.user_scenario import CODE_ENTRY
 from unjam.training.evaluate import TRAINED_LABEL, raise_failure
 from unjam.training.run_folder import check_run_files, controller_origin, read_config
 from unjam.training.seeds import make_test_seeds
-from unjam.training.string_limit import driver_with_filter
 from unjam.trust import check_trusted, expecting_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -158,6 +157,14 @@ def export_controller(
     if model is not None and model_file is not None:
         atomic_write(model_file, model)
     return ExportResult(out, graph_file, model_file, driver.describe(), len(states.speed))
+
+
+def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
+    """Return a driver with the limits, the safety filter and the actuator of a road, unless it has a filter."""
+    if isinstance(driver, FilteredDriver):
+        return driver
+    max_acceleration = (driver.limits or road.acceleration_limits).highest
+    return FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
 
 
 def _residual_model(driver: Driver, metadata: dict[str, Any]) -> bytes:

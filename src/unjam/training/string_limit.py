@@ -2,18 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf
+from math import nan
 
 import numpy as np
 
 from unjam.controller.string_stability import GAIN_TOLERANCE, operating_speeds, string_gains
 from unjam.drivers.car_following import Human
 from unjam.drivers.driver import Driver
-from unjam.drivers.wrappers import FilteredDriver
 from unjam.measures.metrics import measure
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.training.evaluate import raise_failure
+from unjam.training.export import driver_with_filter
 from unjam.training.seeds import tuning_seeds
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -23,21 +23,13 @@ HUMAN_EPISODES = 2
 """episodes of human traffic that determine the operating speeds of a road"""
 
 
-def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
-    """Return a driver with the limits, the safety filter and the actuator of a road, unless it has a filter."""
-    if isinstance(driver, FilteredDriver):
-        return driver
-    max_acceleration = (driver.limits or road.acceleration_limits).highest
-    return FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
-
-
 @dataclass(frozen=True)
 class OperatingPoint:
     """Where the string gain of CAVs on a closed road is measured."""
 
     road: Scenario
     loop_length: float
-    """length of the closed road [m]"""
+    """length of the closed road [m]; NaN: unknown"""
     speeds: tuple[float, ...]
     """speeds of the leader [m/s]"""
 
@@ -58,6 +50,6 @@ def find_operating_points(roads: Mapping[str, Scenario], workers: WorkerPool) ->
         own = rows[number * HUMAN_EPISODES : (number + 1) * HUMAN_EPISODES]
         mean_speed = float(np.mean([row["mean_speed"] for row in own]))
         drawn, _ = road.draw_from_seed(tuning_seeds(1)[0])
-        loop_length = drawn.loop_length if isinstance(drawn, ClosedRoad) else inf
+        loop_length = drawn.loop_length if isinstance(drawn, ClosedRoad) else nan
         points[name] = OperatingPoint(road, loop_length, tuple(operating_speeds(mean_speed, road.humans)))
     return points

@@ -181,8 +181,8 @@ def tune(
     best_values = list({each.driver: each.values for each in ranked}.values())[:TUNING_FINALISTS]
     *finalists, default = score_settings([*best_values, {}], episodes, 2 * episodes, sumo_runners)
     is_default_allowed = not points or string_gain(default.driver) <= max_string_gain
-    best = max((*finalists, default) if is_default_allowed else finalists, key=_score_of)
-    if best.score is None:
+    best = max((*finalists, default) if is_default_allowed else finalists, key=_score_of, default=None)
+    if best is None or best.score is None:
         raise UnjamError(f"all {trial_count} settings of {expert} are infeasible: {default.verdict}")
     trial_runs = len({trial.driver for trial in trials if not invalid_reason(trial.driver)})
     batch_steps = trial_runs * episodes * sum(roads[road].horizon for road in screened)
