@@ -3,10 +3,10 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from tests.following.synthetic_trajectories import idm_driver
+from tests.recordings.synthetic_trajectories import idm_driver
 from unjam.following.calibration import CalibrationSettings, calibrate_groups, calibrate_idm, gap_objective
-from unjam.following.trajectories import FollowingTrajectory, make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.recordings.trajectories import FollowingTrajectory, make_segments
 
 QUICK = CalibrationSettings(generations=40)
 DRIVER = IDMParameters(time_headway=0.9, max_acceleration=1.4, comfortable_deceleration=2.0, minimum_gap=2.5)

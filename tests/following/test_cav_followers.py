@@ -5,9 +5,9 @@ import pytest
 
 from unjam.drivers import LocalState, PISaturation
 from unjam.following.calibration import calibrate_human_drivers
-from unjam.following.trajectories import trajectories_behind_cavs
 from unjam.models.environment_data import EnvironmentData, Recording
 from unjam.physics.idm import IDMParameters
+from unjam.recordings.trajectories import trajectories_behind_cavs
 from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
 

@@ -4,12 +4,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.following.synthetic_trajectories import idm_driver, write_table
+from tests.recordings.synthetic_trajectories import idm_driver, write_table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings, MultiStepSettings
 from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files, unit_warnings
-from unjam.following.trajectories import FollowingTrajectory
 from unjam.physics.idm import IDMParameters
+from unjam.recordings.trajectories import FollowingTrajectory
 
 HEADWAYS = (0.9, 1.1, 1.3, 1.5, 1.7)
 QUICK = CalibrationSettings(generations=15)

@@ -3,8 +3,8 @@ import pytest
 
 from unjam.errors import InputError
 from unjam.following.four_regimes import REGIMES, FourRegimesSettings, make_four_regimes
-from unjam.following.trajectories import following_samples
 from unjam.parameters import build_dataclass
+from unjam.recordings.trajectories import following_samples
 
 
 def test_default_row_count_is_that_of_the_paper() -> None:

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.following.synthetic_trajectories import follower, idm_driver
+from tests.recordings.synthetic_trajectories import follower, idm_driver
 from unjam.following.leader_replay import (
     add_residual,
     as_driver_model,
@@ -13,8 +13,8 @@ from unjam.following.leader_replay import (
     individual_idm,
     simulate_followers,
 )
-from unjam.following.trajectories import Floats, make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.recordings.trajectories import Floats, make_segments
 from unjam.scenarios.population import residual_inputs
 
 QUICK = IDMParameters(time_headway=0.8, max_acceleration=1.5)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.following.synthetic_trajectories import follower, idm_driver
+from tests.recordings.synthetic_trajectories import follower, idm_driver
 from unjam.following.leader_replay import AccelerationBounds, add_residual, idm_function, simulate_followers
 from unjam.following.networks import (
     CalibratedTrajectories,
@@ -13,8 +13,8 @@ from unjam.following.networks import (
     fit_multi_step,
     fit_one_step,
 )
-from unjam.following.trajectories import FollowingSamples, following_samples, make_segments
 from unjam.physics.idm import PAPER_IDM, IDMParameters
+from unjam.recordings.trajectories import FollowingSamples, following_samples, make_segments
 from unjam.scenarios.population import residual_inputs
 
 SETTINGS = NetworkSettings(hidden=(16, 16), learning_rate=1e-2, epochs=40, batch_size=128)

@@ -8,9 +8,9 @@ import pytest
 
 from unjam.following.four_regimes import FourRegimesSettings
 from unjam.following.networks import NetworkSettings
-from unjam.following.trajectories import FollowingSamples
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_speed
+from unjam.recordings.trajectories import FollowingSamples
 from unjam_paper import figure_6
 from unjam_paper.figure_6 import (
     NEAREST_ROW,

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from tests.faults.processes import SETTINGS, TINY
-from tests.following.synthetic_trajectories import write_table
+from tests.recordings.synthetic_trajectories import write_table
 from tests.system.conftest import UNJAM, Run
 from tests.worlds.sumo.user_networks import game, straight
 

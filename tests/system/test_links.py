@@ -12,7 +12,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.faults.links import KINDS, plant, state_of, with_temporary_names
-from tests.following.synthetic_trajectories import write_table
+from tests.recordings.synthetic_trajectories import write_table
 from tests.system.conftest import PLAIN, UNJAM, Run
 from tests.system.test_calibrate import CALIBRATE, DEMAND, ROWS
 from tests.system.test_commands import SMALL, TINY_RUN

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.adapters.onnx_policies import follower, write
-from tests.following.synthetic_trajectories import write_table
+from tests.recordings.synthetic_trajectories import write_table
 from tests.system.conftest import ROOT, Run
 from tests.worlds.sumo.user_networks import straight
 

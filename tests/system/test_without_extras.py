@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.following.synthetic_trajectories import write_table
+from tests.recordings.synthetic_trajectories import write_table
 from tests.system.conftest import PLAIN, ROOT
 from tests.worlds.sumo.user_networks import straight
 from unjam.adapters.stable_baselines3_file import DATA_PART, POLICY_PART

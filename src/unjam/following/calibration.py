@@ -23,9 +23,9 @@ from unjam.following.leader_replay import (
     replace_parameters,
     simulate_followers,
 )
-from unjam.following.trajectories import Floats, FollowingTrajectory, Segments, make_segments, trajectories_behind_cavs
 from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.idm import IDMArrays, IDMParameters
+from unjam.recordings.trajectories import Floats, FollowingTrajectory, Segments, make_segments, trajectories_behind_cavs
 from unjam.scenarios.scenario import Scenario
 
 ParameterRange = tuple[Positive, Positive]

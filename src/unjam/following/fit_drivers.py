@@ -20,11 +20,11 @@ from unjam.following.calibration import (
     calibrate_groups,
     calibrate_idm,
 )
-from unjam.following.loaders import ReadOptions, read_trajectories
-from unjam.following.trajectories import FollowingTrajectory, select_splits, split_by_driver
 from unjam.manifest import manifest, without_folders
 from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclass, nest_keys, parameter_dataclass
 from unjam.physics.idm import IDMParameters
+from unjam.recordings.loaders import ReadOptions, read_trajectories
+from unjam.recordings.trajectories import FollowingTrajectory, select_splits, split_by_driver
 from unjam.scenarios.population import Population
 
 DriverProgress = Callable[[int, int], object]

@@ -9,11 +9,11 @@ from dataclasses import field
 import numpy as np
 from pydantic import model_validator
 
-from unjam.following.trajectories import Floats, FollowingTrajectory
 from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import IDMParameters, desired_gap, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
+from unjam.recordings.trajectories import Floats, FollowingTrajectory
 
 REGIMES = ("acceleration", "deceleration", "cruising", "emergency braking")
 TREIBER_IDM = IDMParameters(desired_speed=33.3, time_headway=1.6, max_acceleration=0.73, comfortable_deceleration=1.67)

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.car_following import MIN_IDM_GAP
-from unjam.following.trajectories import Floats, Segments
 from unjam.physics.arrays import Array, clamp_min, clip, namespace
 from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMArrays, IDMParameters, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
+from unjam.recordings.trajectories import Floats, Segments
 from unjam.scenarios.population import residual_inputs
 
 AccelerationFunction = Callable[[Array, Array, Array], Array]

@@ -31,7 +31,10 @@ from unjam.following.leader_replay import (
     idm_function,
     simulate_followers,
 )
-from unjam.following.trajectories import (
+from unjam.parameters import STRICT, Positive, PositiveInt, parameter_dataclass
+from unjam.physics.arrays import Floats
+from unjam.physics.idm import IDMArrays, IDMParameters, stack_idm_parameters
+from unjam.recordings.trajectories import (
     SEGMENT_FIELDS,
     FollowingSamples,
     FollowingTrajectory,
@@ -39,9 +42,6 @@ from unjam.following.trajectories import (
     following_samples,
     make_segments,
 )
-from unjam.parameters import STRICT, Positive, PositiveInt, parameter_dataclass
-from unjam.physics.arrays import Floats
-from unjam.physics.idm import IDMArrays, IDMParameters, stack_idm_parameters
 from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
 
 MEAN_SQUARE_OFFSET = 1e-2

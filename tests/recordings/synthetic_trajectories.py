@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 
 from unjam.following.leader_replay import AccelerationFunction, follow_leader, idm_function
-from unjam.following.trajectories import FollowingTrajectory
 from unjam.physics.idm import IDMParameters, equilibrium_gap
+from unjam.recordings.trajectories import FollowingTrajectory
 
 STEP = 0.1
 

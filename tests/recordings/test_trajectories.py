@@ -3,16 +3,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.following.synthetic_trajectories import idm_driver
+from tests.recordings.synthetic_trajectories import idm_driver
 from unjam.errors import InputError
-from unjam.following.trajectories import (
+from unjam.physics.idm import PAPER_IDM
+from unjam.recordings.trajectories import (
     FollowingTrajectory,
     following_samples,
     make_segments,
     select_splits,
     split_by_driver,
 )
-from unjam.physics.idm import PAPER_IDM
 
 
 def trajectories_of(count: int, drivers: int) -> list[FollowingTrajectory]:

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from unjam.errors import InputError, shorten_list, unknown_name
-from unjam.following.tables import read_table
-from unjam.following.trajectories import FollowingTrajectory, even_times
 from unjam.physics.arrays import Floats
+from unjam.recordings.tables import read_table
+from unjam.recordings.trajectories import FollowingTrajectory, even_times
 
 TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
 """required columns of a plain table; `pair` identifies follower and leader, the others are in s, m/s, m/s and m"""
@@ -97,8 +97,12 @@ def read_trajectories(path: Path, format: str = "", options: ReadOptions | None 
     """
     if format and format not in FILE_FORMATS:
         raise unknown_name("format", format, FILE_FORMATS)
-    frame = read_table(path)
-    return FILE_FORMATS[format or _detect_format(frame)](frame, path, options or ReadOptions())
+    return trajectories_of_table(read_table(path), path, options or ReadOptions(), format)
+
+
+def trajectories_of_table(frame: pd.DataFrame, path: Path, options: ReadOptions, format: str = "") -> ReadResult:
+    """Return the trajectories of the table of a file; `format` as in `read_trajectories`."""
+    return FILE_FORMATS[format or _detect_format(frame)](frame, path, options)
 
 
 def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
@@ -108,7 +112,7 @@ def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
     if options.driver_columns and "driver" not in frame:
         _check_columns(frame, options.driver_columns, path)
         frame["driver"] = _join_columns(frame, options.driver_columns)
-    return _split_trajectories(_to_numeric(frame, TABLE_COLUMNS[1:]), path, options)
+    return split_trajectories(to_numeric(frame, TABLE_COLUMNS[1:]), path, options)
 
 
 def _convert_ngsim(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
@@ -152,7 +156,7 @@ def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadR
     is_free = vehicles["gap"] < 0
     driver = frame["vehicle_id"].astype(str)
     vehicles = vehicles.assign(pair=_join_columns(frame, key), driver=driver, kind="simulated")
-    return _split_trajectories(vehicles.loc[~is_free], path, options, {"no leader": int(np.sum(is_free))})
+    return split_trajectories(vehicles.loc[~is_free], path, options, {"no leader": int(np.sum(is_free))})
 
 
 def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
@@ -178,7 +182,7 @@ def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: Rea
         leader_speed=vehicles["speed_ahead"],
         gap=vehicles["front_ahead"] - vehicles["length_ahead"] - vehicles["front"],
     )
-    return _split_trajectories(frame, path, options, {"no leader, or leader not recorded": int(np.sum(is_free))})
+    return split_trajectories(frame, path, options, {"no leader, or leader not recorded": int(np.sum(is_free))})
 
 
 def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
@@ -209,7 +213,7 @@ def _convert_openacc(frame: pd.DataFrame, path: Path, options: ReadOptions) -> R
         name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
         driver = name + suffix if len(set(kind)) > 1 else name  # a change of kind is a change of driver
         parts.append(part.assign(pair=f"{path.stem}-{number + 1}" + suffix, driver=driver, kind=kind))
-    return _split_trajectories(pd.concat(parts), path, options)
+    return split_trajectories(pd.concat(parts), path, options)
 
 
 FILE_FORMATS: dict[str, Callable[[pd.DataFrame, Path, ReadOptions], ReadResult]] = {
@@ -241,7 +245,7 @@ def _select_columns(
 ) -> pd.DataFrame:
     """Return the column `line`, and these columns as numbers under new names."""
     _check_columns(frame, names, path)
-    numbers = _to_numeric(frame.loc[:, ["line", *names]], names)
+    numbers = to_numeric(frame.loc[:, ["line", *names]], names)
     return numbers.rename(columns=dict(zip(names, new_names, strict=True)))
 
 
@@ -263,7 +267,7 @@ def _join_columns(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
     return pd.Series(np.array(names, object)[group.to_numpy()], frame.index)
 
 
-def _to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
+def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     """Return the table with these columns as numbers; other values become NaN, which makes their rows bad.
 
     A number may have commas between thousands. The column `not_numeric` has the first other value of each row.
@@ -283,7 +287,7 @@ def _to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     return frame.assign(**columns, not_numeric=not_numeric)
 
 
-def _split_trajectories(
+def split_trajectories(
     frame: pd.DataFrame, path: Path, options: ReadOptions, skipped_rows: dict[str, int] | None = None
 ) -> ReadResult:
     """Return the trajectories of a table with the columns `line`, `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`.

@@ -10,8 +10,8 @@ import pytest
 
 from tests.worlds.sumo.user_networks import built
 from unjam.errors import InputError
-from unjam.following.loaders import METERS_PER_FOOT, ReadOptions, read_trajectories
-from unjam.following.tables import NGSIM_COLUMN_ORDER
+from unjam.recordings.loaders import METERS_PER_FOOT, ReadOptions, read_trajectories
+from unjam.recordings.tables import NGSIM_COLUMN_ORDER
 from unjam.worlds.sumo.networks import sumo_program
 
 SHORT = ReadOptions(min_seconds=1.0)
