@@ -20,7 +20,7 @@ TEXTS = {
 MODULES = {module: ast.parse(text) for module, text in TEXTS.items()}
 
 ORDER = (
-    *("sumo_files", "physics", "drivers", "scenarios", "worlds", "measures", "models", "learners"),
+    *("sumo_files", "physics", "drivers", "recordings", "scenarios", "worlds", "measures", "models", "learners"),
     *("training", "cli", "unjam_paper"),
 )
 """each may import those before it, and none after it"""
@@ -32,13 +32,13 @@ EVERYWHERE = {
 ALLOWED = {
     "adapters": {"physics", "drivers"},
     "controller": {"adapters", "physics", "drivers", "worlds"},
-    "following": {"sumo_files", "physics", "drivers", "scenarios"},
-    "reports": {"physics", "drivers", "scenarios", "worlds", "measures"},
+    "following": {"sumo_files", "physics", "drivers", "recordings", "scenarios"},
+    "reports": {"physics", "drivers", "recordings", "scenarios", "worlds", "measures"},
     "models": {"following"},
     "training": {"adapters", "controller", "reports"},
     "cli": {"controller", "following", "reports"},
     "unjam_paper": {"controller", "following", "reports"},
-    "environments": {"controller", "physics", "drivers", "scenarios", "worlds", "reports"},
+    "environments": {"controller", "physics", "drivers", "recordings", "scenarios", "worlds", "reports"},
 }
 """what else a part may import"""
 LAZY = {

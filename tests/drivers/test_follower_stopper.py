@@ -3,6 +3,7 @@ import pytest
 
 from tests.conftest import state_of
 from unjam.drivers import FollowerStopper, LocalState
+from unjam.errors import InputError
 
 
 def test_flows_reference_values() -> None:
@@ -46,3 +47,12 @@ def test_history_of_the_warm_up_determines_the_desired_speed() -> None:
     memory = driver.recall(driver.initial_memory(1), LocalState(*([history] * 7)))
     found, _ = driver.act(state_of([0.0], [3.0], [50.0]), memory)
     assert found[0] == pytest.approx(30.0)
+
+
+def test_borders_of_the_version_for_motorways_are_time_gaps() -> None:
+    driver = FollowerStopper(desired_speed=30.0, boundary_time_gaps=(0.4, 0.6, 0.8))
+    for gap, expected_speed in ((8.0, 0.0), (10.0, 10.0), (12.0, 20.0), (14.0, 25.0), (16.0, 30.0)):
+        found, _ = driver.act(state_of([20.0], [20.0], [gap]), driver.initial_memory(1))
+        assert found[0] * 0.1 + 20.0 == pytest.approx(expected_speed, abs=1e-9)
+    with pytest.raises(InputError, match="boundary_time_gaps"):
+        FollowerStopper(boundary_time_gaps=(0.8, 0.6, 0.4))

@@ -276,3 +276,23 @@ def test_brakes_that_prove_nothing_are_refused(values: dict[str, float], line: s
 def test_an_actuator_that_would_fill_the_memory_is_refused(name: str) -> None:
     with pytest.raises(InputError, match=f"actuator.{name}: 1000000000.0 is not allowed; allowed: less than or"):
         build_dataclass(Actuator, {name: 1e9}, "actuator")
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(FILTERS), SLOW_ACTUATORS, STEPS)
+def test_plans_of_braking_that_are_left_out_would_change_nothing(
+    seed: int, safety: SafetyFilter, actuator: Actuator, step: float
+) -> None:
+    generator, rows = np.random.default_rng(seed), 64
+    speed = generator.uniform(0.0, 40.0, rows) * (generator.random(rows) > 0.1)
+    leader = np.maximum(speed + generator.normal(0.0, 8.0, rows), 0.0)
+    state = FollowingState(speed, leader, generator.exponential(generator.choice([5.0, 30.0, 90.0]), rows))
+    pending = tuple(generator.uniform(-6.0, 3.0, rows) for _ in range(actuator.delay_steps(step)))
+    start = ActuatorState(np.maximum(generator.uniform(-6.0, 3.0, rows), -speed / step), pending)
+    wanted = generator.uniform(-6.0, 3.0, rows)
+    expected = np.minimum(wanted, safety.max_acceleration(state, step, (actuator, start)))
+    np.testing.assert_allclose(safety.limit(wanted, state, step, (actuator, start)), expected, atol=1e-9)
+    for row in range(3):
+        own = ActuatorState(start.acceleration[row].item(), tuple(each[row].item() for each in pending))
+        plain = FollowingState(*(values[row].item() for values in state))
+        found = safety.limit(wanted[row].item(), plain, step, (actuator, own))
+        assert found == pytest.approx(expected[row], abs=1e-9)

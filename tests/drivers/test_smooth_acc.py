@@ -45,3 +45,34 @@ def test_the_defaults_are_string_stable_with_a_slow_actuator_and_human_drivers_b
     for each in measure_string_stability(driver, [2.0, 12.0], PAPER_IDM):
         assert max(each.gains) <= 1.0 + GAIN_TOLERANCE
         assert each.max_stable_followers >= 10
+
+
+LIMITED = SmoothACC(acceleration_limit=0.2, braking_limit=0.3, largest_gap=100.0, time_gap=2.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "leader_speed", "gap", "expected"),
+    [
+        (20.0, 25.0, 60.0, 0.2),  # faster leader: the limit
+        (20.0, 18.0, 42.0, -0.3),  # slower leader: the limit
+        (20.0, 10.0, 62.0, -(10.0**2) / (2 * (62.0 - 2.0 - 20.0))),  # the leader would be reached too early
+        (20.0, 26.0, 110.0, 1.5),  # beyond the largest gap
+    ],
+)
+def test_limits_hold_unless_a_gap_requires_more(speed: float, leader_speed: float, gap: float, expected: float) -> None:
+    found, _ = LIMITED.act(state_of([speed], [leader_speed], [gap]), {"mean_leader_speed": np.array([leader_speed])})
+    assert found[0] == pytest.approx(expected)
+    plain = LocalState(speed, leader_speed, gap, speed, gap, 0.0, 0.0)
+    alone, _ = LIMITED.act(plain, {"mean_leader_speed": leader_speed})
+    assert alone == pytest.approx(expected)
+
+
+def test_the_largest_gap_is_kept_behind_a_leader_that_drives_away() -> None:
+    memory, speed, gap, largest = LIMITED.initial_memory(1), 10.0, 30.0, 0.0
+    for step in range(3000):
+        leader = min(25.0, 10.0 + 0.1 * step * 0.5)
+        acceleration, memory = LIMITED.act(state_of([speed], [leader], [gap]), memory)
+        speed = max(0.0, speed + float(np.clip(acceleration[0], -3.0, 1.5)) * 0.1)
+        gap += (leader - speed) * 0.1
+        largest = max(largest, gap)
+    assert largest < 103.5

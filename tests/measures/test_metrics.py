@@ -14,7 +14,7 @@ from unjam.drivers import LocalState
 from unjam.measures.metrics import METRICS, measure
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import Audit, FollowingStatistics, following_statistics
-from unjam.worlds.closed_road import loop_neighbors, loop_state
+from unjam.worlds.ordered_road import loop_neighbors, loop_state
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode
 from unjam.worlds.reward import episode_reward_terms
 

@@ -202,7 +202,8 @@ def test_a_time_gap_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> 
 
 
 def test_rewards_are_found_by_name() -> None:
-    assert set(REWARDS) == {"released", "released-merge", "eq16", "eq16-as-printed", "power", "travel-time"}
+    names = "released", "released-merge", "eq16", "eq16-as-printed", "power", "travel-time", "smooth-following"
+    assert set(REWARDS) == set(names)
     assert make_reward("released") is released_reward
 
 
@@ -252,6 +253,6 @@ def test_an_error_in_a_users_reward_is_reported_with_its_line(tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", ["fame", "", "Released", "released "])
 def test_an_unknown_reward_lists_the_known_ones(name: str) -> None:
-    known = "released, released-merge, eq16, eq16-as-printed, power, travel-time, path.py:name"
+    known = "released, released-merge, eq16, eq16-as-printed, power, travel-time, smooth-following, path.py:name"
     with pytest.raises(InputError, match=f"reward: {name!r} is not allowed; allowed: {known}"):
         make_reward(name)

@@ -117,6 +117,8 @@ def scenario_changes(
     warmup: Annotated[int | None, Option(help="Human-only simulation steps before the CAVs take over.")] = None,
     penetration_rate: Annotated[float | None, Option(help="Share of CAVs, on open roads.")] = None,
     cav_types: Annotated[str | None, Option(help="Vehicle types of CAVs on your own network: car,truck.")] = None,
+    recordings: Annotated[str | None, Option(help="Recorded speeds: a file or a folder, on the road recorded.")] = None,
+    platoon: Annotated[str | None, Option(help="Vehicles behind the recorded one: 'human*2 cav human*20'.")] = None,
     network: dict[str, Any],
 ) -> dict[str, Any]:
     """Return the scenario settings that the options of a command set."""
@@ -128,6 +130,8 @@ def scenario_changes(
         "warmup": warmup,
         "penetration_rate": penetration_rate,
         "cav_types": cav_types.split(",") if cav_types else None,
+        "recordings": None if recordings is None else str(Path(recordings).absolute()),
+        "platoon": platoon,
     }
     return _without_none(changes) | network
 

@@ -185,7 +185,7 @@ class FollowerStopper(FormulaDriver):
 
     In the field experiment the desired speed was an external estimate of the speed of traffic. By default it is the
     mean speed of the leader over the last `window` seconds: with the own mean, a stopped vehicle would never start.
-    Source: Stern et al. 2018, Transp. Res. C 89:205-221, section 3.1.
+    Source: Stern et al. 2018, Transp. Res. C 89:205-221, section 3.1; with time gaps: Lichtlé et al. 2022, ICRA.
     """
 
     name: ClassVar[str] = "follower-stopper"
@@ -198,6 +198,9 @@ class FollowerStopper(FormulaDriver):
     """boundaries of the three regions at equal speeds [m]"""
     decelerations: tuple[Positive, Positive, Positive] = (1.5, 1.0, 0.5)
     """decelerations by which the boundaries grow with the closing speed [m/s2]"""
+    boundary_time_gaps: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
+    """time gaps of the boundaries, where these are farther than `gaps` [s]; 0.4, 0.6 and 0.8 in the version for
+    motorways, which follows the leader's speed (a `window` of one step)"""
     time_constant: NonNegative = 0.0
     """time constant of the approach to the command [s]; 0: one time step"""
     time_step: Positive = 0.1
@@ -208,6 +211,8 @@ class FollowerStopper(FormulaDriver):
         stop, follow, free = self.gaps
         if not stop < follow < free:
             raise ValueError(f"gaps: {list(self.gaps)} is not allowed; allowed: each larger than the previous one")
+        if list(times := self.boundary_time_gaps) != sorted(times):
+            raise ValueError(f"boundary_time_gaps: {list(times)} is not allowed; allowed: in ascending order")
         return self
 
     def initial_memory(self, n: int) -> Memory:
@@ -220,18 +225,24 @@ class FollowerStopper(FormulaDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed, and the new memory."""
-        xp = namespace(state.speed)
         window = slide_window(memory, state.leader_speed)
         mean = window_mean_speed(window)
         desired = mean if self.desired_speed is None else mean * 0.0 + self.desired_speed
+        return self.acceleration(state, desired), window
+
+    def acceleration(self, state: LocalState, desired: Array) -> Array:
+        """Return the acceleration of `act` towards a desired speed of each row [m/s]."""
+        xp = namespace(state.speed)
         closing = xp.minimum(state.leader_speed - state.speed, state.speed * 0.0)
-        regions = zip(self.gaps, self.decelerations, strict=True)
-        stop, follow, free = (gap + closing**2 / (2.0 * deceleration) for gap, deceleration in regions)
+        stop, follow, free = (
+            clamp_min(state.speed * time_gap, gap) + closing**2 / (2.0 * deceleration)
+            for gap, time_gap, deceleration in zip(self.gaps, self.boundary_time_gaps, self.decelerations, strict=True)
+        )
         gap = state.leader_gap
         leading = xp.minimum(state.leader_speed, desired)
         slowing = leading * clip((gap - stop) / (follow - stop), 0.0, 1.0)
         command = slowing + (desired - leading) * clip((gap - follow) / (free - follow), 0.0, 1.0)
-        return (command - state.speed) / max(self.time_constant, self.time_step), window
+        return (command - state.speed) / max(self.time_constant, self.time_step)
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

@@ -10,6 +10,7 @@ import sys
 from math import exp
 from typing import Annotated, NamedTuple
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
@@ -150,6 +151,8 @@ class SafetyFilter(Subclassable):
             return acceleration
         if type(acceleration) is float and actuation is None and self._is_clearly_safe(acceleration, state, step):
             return acceleration
+        if actuation is not None and not _is_torch(acceleration):
+            return self._limit_unclear(acceleration, state, step, *actuation)
         return clamp_max(acceleration, self.max_acceleration(state, step, actuation))
 
     def max_acceleration(
@@ -216,6 +219,47 @@ class SafetyFilter(Subclassable):
         far = max_speed_to_stop(end - braking * (time_gap + step / 2.0) ** 2 / 2.0, braking, step)
         return clamp_max(near, clamp_min(far, matters))
 
+    def _limit_unclear(
+        self, acceleration: Array, state: FollowingState, step: float, actuator: Actuator, actuator_state: ActuatorState
+    ) -> Array:
+        """Return the allowed part of an acceleration, for which plans of braking are only made where they matter.
+
+        Until it stands, the vehicle is never faster than `top`, and drives at most as far as one that first keeps this
+        speed until the command arrives, and then brakes without lag. The gap to a leader that brakes equally hard is
+        smallest now or at the end. So the bounds below suffice for any plan.
+        """
+        speed, leader, gap = state
+        gap = gap - (self.gap_error + self.standstill_gap)
+        leader, rest = clamp_min(leader - self.speed_error, 0.0), clamp_min(acceleration, 0.0)
+        for pending in actuator_state.pending:
+            rest = rest + clamp_min(pending, 0.0)
+        standing = actuator.equivalent_speed(0.0 * speed, ActuatorState(0.0 * speed), self.braking, step)
+        top = speed + clamp_min(actuator.equivalent_speed(0.0 * speed, actuator_state, self.braking, step), 0.0)
+        top = clamp_min(top, standing) + step * rest
+        first = step * (len(actuator_state.pending) + 1) * top
+
+        def margin(braking: float, leader_braking: float) -> Array:
+            return stopping_distance(leader, leader_braking, step) - first - stopping_distance(top, braking, step)
+
+        braking = self.time_gap_braking
+        at_end = gap + margin(self.braking, self.leader_braking)
+        with_time_gap = gap + clamp_max(margin(braking, braking), 0.0) - self.time_gap * top
+        is_unclear = (at_end < 0.0) | (with_time_gap < 0.0)
+        if type(acceleration) is float:
+            actuation = actuator, actuator_state
+            return (
+                clamp_max(acceleration, self.max_acceleration(state, step, actuation)) if is_unclear else acceleration
+            )
+        rows = np.flatnonzero(is_unclear)
+        if len(rows) == 0:
+            return acceleration
+        limited = np.array(acceleration)
+        pending = tuple(each[rows] for each in actuator_state.pending)
+        own = actuator, ActuatorState(actuator_state.acceleration[rows], pending)
+        near = FollowingState(*(values[rows] for values in state))
+        limited[rows] = np.minimum(limited[rows], self.max_acceleration(near, step, own))
+        return limited
+
     def _is_clearly_safe(self, acceleration: float, state: FollowingState, step: float) -> bool:
         """Return whether simple bounds prove an acceleration safe; they take a third of the time of the formulas."""
         speed, leader, gap = state
@@ -231,6 +275,10 @@ class SafetyFilter(Subclassable):
             and speed * (speed / own + step) / 2.0 + own * step * step / 8.0
             <= gap + leader * (leader / others - step) / 2.0
         )
+
+
+def _is_torch(array: Array) -> bool:
+    return type(array) is not float and not isinstance(array, (np.ndarray, np.generic))
 
 
 def _steps_to_standstill(speed: Array, change: float) -> int:

@@ -9,7 +9,16 @@ from pydantic import Field
 from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
 from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
-from unjam.physics.arrays import Array, clip, namespace, stack_columns
+from unjam.physics.arrays import Array, clamp_max, clamp_min, clip, namespace, stack_columns
+
+MIN_TIME_GAP = 1.0
+"""time gap that is kept free when a braking beyond the limit is computed [s]"""
+MIN_ROOM = 1.0
+"""[m]"""
+GAP_LIMIT_TIME = 3.0
+"""time constant with which the largest gap is approached, critically damped [s]"""
+MAX_CATCH_UP = 1.5
+"""acceleration with which the largest gap is kept [m/s2]"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -39,6 +48,13 @@ class SmoothACC(FormulaDriver):
     """largest difference to the mean speed because of the gap [m/s]"""
     time_constant: NonNegative = 1.5
     """time constant of the approach to the commanded speed [s]; 0: one time step"""
+    acceleration_limit: Positive | None = None
+    """largest acceleration, except to keep the largest gap [m/s2]; None: that of the road"""
+    braking_limit: Positive | None = None
+    """hardest braking, unless it must be harder to reach the leader's speed at a time gap of 1 s [m/s2];
+    None: that of the road"""
+    largest_gap: Positive | None = None
+    """gap that it does not exceed, if the leader's acceleration allows it [m]; None: any"""
     history_factor: NonNegative = 1.0
     """share of the mean in the warm-up that is the first mean: with a smaller one it first opens a gap"""
     time_step: Positive = 0.1
@@ -62,7 +78,24 @@ class SmoothACC(FormulaDriver):
         catch_up = clip(self.gap_gain * excess_gap, -self.catch_up_speed, self.catch_up_speed)
         command = mean + self.leader_weight * (state.leader_speed - mean) + catch_up
         acceleration = (command - state.speed) / max(self.time_constant, self.time_step)
-        return acceleration, {"mean_leader_speed": mean}
+        return self._within_limits(acceleration, state), {"mean_leader_speed": mean}
+
+    def _within_limits(self, acceleration: Array, state: LocalState) -> Array:
+        """Return accelerations within the own limits, beyond which only the gaps matter."""
+        xp, (speed, leader_speed, gap, *_) = namespace(state.speed), state
+        if self.acceleration_limit is not None:
+            acceleration = clamp_max(acceleration, self.acceleration_limit)
+        if self.braking_limit is not None:
+            room = clamp_min(gap - self.standstill_gap - MIN_TIME_GAP * speed, MIN_ROOM)
+            needed = clamp_min(speed - leader_speed, 0.0) ** 2 / (2.0 * room)
+            needed = xp.where(needed > self.braking_limit, needed, needed * 0.0 + self.braking_limit)
+            acceleration = xp.maximum(acceleration, -needed)
+        if self.largest_gap is not None:
+            needed = (2.0 * (leader_speed - speed) + (gap - self.largest_gap) / GAP_LIMIT_TIME) / GAP_LIMIT_TIME
+            acceleration = xp.where(
+                needed > acceleration, xp.minimum(needed, 0.0 * needed + MAX_CATCH_UP), acceleration
+            )
+        return acceleration
 
     def memory_features(self, memory: Memory) -> Array:
         """Return the mean leader speed, scaled, shape (n, 1)."""

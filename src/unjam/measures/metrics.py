@@ -1,17 +1,28 @@
 """Metrics of an episode, with units and sources."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from math import inf, isfinite, nan, prod
+from math import inf, isfinite, nan
 from typing import Any, Literal
 
 import numpy as np
 
+from unjam.measures.averages import mean_of_present, mean_over_cavs, per_kilometer, per_step
 from unjam.measures.feasibility import feasibility
+from unjam.measures.platoon_metrics import (
+    amplification,
+    cav_fuel_by_power,
+    cav_gap_95,
+    cav_max_gap,
+    cav_mean_gap,
+    fuel_by_power,
+    human_fuel_by_power,
+    time_behind_leader,
+)
 from unjam.scenarios.scenario import sumo_seed
 from unjam.worlds.audit import BRAKING_THRESHOLDS, OVERRIDE_TOLERANCE, BrakingStatistics
-from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats, Trajectory
-from unjam.worlds.reward import MAX_REWARD_CELLS, episode_reward_terms, eq16_reward
+from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats
+from unjam.worlds.reward import episode_reward_terms, eq16_reward
 
 STEADY_STATE_STEPS = 1000
 """number of control steps at the end of an episode that are its steady state; in a shorter episode the second half"""
@@ -35,39 +46,9 @@ def _steady_state(values: Floats) -> Floats:
     return values[-STEADY_STATE_STEPS:] if len(values) > STEADY_STATE_STEPS else values[len(values) // 2 :]
 
 
-def _mean_over_cavs(episode: Episode, function: Callable[[Trajectory], Any]) -> float:
-    values = [function(trajectory) for trajectory in episode.trajectories]
-    return float(np.mean(values)) if values else nan
-
-
-def _chunks(speeds: Floats) -> Iterator[Floats]:
-    """Return the rows in chunks, so that hours of traffic are not copied as a whole."""
-    rows = max(1, MAX_REWARD_CELLS // max(1, prod(speeds.shape[1:])))
-    return (speeds[start : start + rows] for start in range(0, len(speeds), rows))
-
-
-def _mean_of_present(speeds: Floats, transform: Callable[[Floats], Any] = np.asarray) -> float:
-    """Return the mean of `transform` over all vehicle-steps on the road; NaN without any."""
-    total, count = 0.0, 0
-    for chunk in _chunks(speeds):
-        present = chunk[~np.isnan(chunk)]
-        total, count = total + float(transform(present).sum()), count + present.size
-    return total / count if count else nan
-
-
-def _per_step(function: Callable[..., Floats], speeds: Floats) -> Floats:
-    """Return `np.nanmean` or the like of each step; NaN for steps without vehicles."""
-    results = []
-    for chunk in _chunks(speeds):
-        occupied = ~np.isnan(chunk).all(axis=1)
-        results.append(np.full(len(chunk), np.nan))
-        results[-1][occupied] = function(chunk[occupied], axis=1)
-    return np.concatenate([np.zeros(0), *results])
-
-
 def mean_speed(episode: Episode) -> float:
     """Mean over all vehicles and all steps of the episode, start-up included [m/s]."""
-    return _mean_of_present(episode.speeds[1:])
+    return mean_of_present(episode.speeds[1:])
 
 
 def mean_speed_step_average(episode: Episode) -> float:
@@ -75,17 +56,17 @@ def mean_speed_step_average(episode: Episode) -> float:
 
     On an open road a step with few vehicles counts as much as one in a jam.
     """
-    return _mean_of_present(_per_step(np.nanmean, episode.speeds[1:]))
+    return mean_of_present(per_step(np.nanmean, episode.speeds[1:]))
 
 
 def mean_speed_steady(episode: Episode) -> float:
     """Mean over all vehicles in the last 1,000 steps [m/s]; of a shorter episode, in its second half."""
-    return _mean_of_present(_steady_state(episode.speeds[1:]))
+    return mean_of_present(_steady_state(episode.speeds[1:]))
 
 
 def mean_speed_second_half(episode: Episode) -> float:
     """Mean over all vehicles in the second half of the episode [m/s]."""
-    return _mean_of_present(episode.speeds[1 + episode.control_steps // 2 :])
+    return mean_of_present(episode.speeds[1 + episode.control_steps // 2 :])
 
 
 def speed_std_fleet(episode: Episode) -> float:
@@ -93,22 +74,22 @@ def speed_std_fleet(episode: Episode) -> float:
 
     It is the size of the waves: zero when all vehicles have the same speed. Stern et al. 2018, section 4.
     """
-    return _mean_of_present(_per_step(np.nanstd, episode.speeds[1:]))
+    return mean_of_present(per_step(np.nanstd, episode.speeds[1:]))
 
 
 def speed_std_fleet_steady(episode: Episode) -> float:
     """Standard deviation of speed across vehicles, averaged over the steady state [m/s]."""
-    return _mean_of_present(_per_step(np.nanstd, _steady_state(episode.speeds[1:])))
+    return mean_of_present(per_step(np.nanstd, _steady_state(episode.speeds[1:])))
 
 
 def speed_std_cav(episode: Episode) -> float:
     """Standard deviation over time of the CAV's own speed [m/s]: the paper's `speed std` (Table 1)."""
-    return _mean_over_cavs(episode, lambda trajectory: np.std(trajectory.states.speed[1:]))
+    return mean_over_cavs(episode, lambda trajectory: np.std(trajectory.states.speed[1:]))
 
 
 def cav_mean_speed(episode: Episode) -> float:
     """Mean over time of the CAV's own speed [m/s]: the paper's `average speed` (Table 1)."""
-    return _mean_over_cavs(episode, lambda trajectory: np.mean(trajectory.states.speed[1:]))
+    return mean_over_cavs(episode, lambda trajectory: np.mean(trajectory.states.speed[1:]))
 
 
 def speed_limit_ratio(episode: Episode) -> float:
@@ -135,7 +116,7 @@ def return_eq16(episode: Episode) -> float:
 
 def mean_abs_accel(episode: Episode) -> float:
     """Mean absolute commanded acceleration of the CAV [m/s2]; of a human driver, the actual one."""
-    return _mean_over_cavs(episode, lambda trajectory: np.abs(trajectory.applied_acceleration).mean())
+    return mean_over_cavs(episode, lambda trajectory: np.abs(trajectory.applied_acceleration).mean())
 
 
 def mean_abs_jerk(episode: Episode) -> float:
@@ -161,7 +142,7 @@ def min_ttc(episode: Episode) -> float:
 
 def share_standing(episode: Episode) -> float:
     """Share of vehicle-seconds spent below 0.1 m/s."""
-    return _mean_of_present(episode.speeds[1:], lambda speeds: speeds < STANDING_SPEED)
+    return mean_of_present(episode.speeds[1:], lambda speeds: speeds < STANDING_SPEED)
 
 
 def time_to_dissolve(episode: Episode) -> float:
@@ -169,7 +150,7 @@ def time_to_dissolve(episode: Episode) -> float:
 
     The wave is dissolved when the standard deviation of speed across vehicles stays below 0.3 m/s for 60 s.
     """
-    spread = _per_step(np.nanstd, episode.speeds)
+    spread = per_step(np.nanstd, episode.speeds)
     calm = np.isnan(spread) | (spread < MAX_CALM_SPEED_STD)
     steps = round(MIN_CALM_SECONDS / episode.control_step)
     if calm[0] or len(calm) < steps:
@@ -188,12 +169,12 @@ def collisions(episode: Episode) -> float:
 
 def filter_override_share(episode: Episode) -> float:
     """Share of the CAV's control steps in which the safety filter braked harder than its driver."""
-    return _mean_over_cavs(episode, lambda trajectory: (trajectory.filter_braking > 0).mean())
+    return mean_over_cavs(episode, lambda trajectory: (trajectory.filter_braking > 0).mean())
 
 
 def shield_override_share(episode: Episode) -> float:
     """Share of the CAV's commands that SUMO's safety check changed."""
-    return _mean_over_cavs(episode, lambda trajectory: (trajectory.shield_braking > OVERRIDE_TOLERANCE).mean())
+    return mean_over_cavs(episode, lambda trajectory: (trajectory.shield_braking > OVERRIDE_TOLERANCE).mean())
 
 
 def shield_max_braking(episode: Episode) -> float:
@@ -207,15 +188,15 @@ def fuel_ml_per_km(episode: Episode) -> float:
     SUMO's emission model, where it was recorded: https://sumo.dlr.de/docs/Models/Emissions.html. HBEFA4 burns 2.2 l/h
     at standstill: on closed roads most of this is time, so that less of it is no evidence of smoother driving.
     """
-    distance = sum(float(np.nansum(chunk)) for chunk in _chunks(episode.speeds[1:])) * episode.control_step
-    if episode.fuel.size == 0 or distance == 0:
+    if episode.fuel.size == 0:
         return nan
-    return float(np.nansum(episode.fuel)) * episode.control_step / GASOLINE_DENSITY / (distance / 1000.0)
+    return per_kilometer(episode, float(np.nansum(episode.fuel)) / GASOLINE_DENSITY, episode.speeds)
 
 
 def outflow_veh_per_h(episode: Episode) -> float:
     """Flow [veh/h]. On a closed road: distance of all vehicles over length and time (Edie 1963). On an open
-    road: vehicles that left it over the planned duration; with a demand peak, in its last ten minutes.
+    road: vehicles that left it over the planned duration; with a demand peak, in its last ten minutes. Behind a
+    recorded vehicle: distance of the platoon over its length and time.
     """
     step, steps = episode.control_step, episode.control_steps
     if episode.demand_peak[1] > 0:
@@ -225,6 +206,9 @@ def outflow_veh_per_h(episode: Episode) -> float:
         left = (present[:-1] & ~present[1:]).sum()
         return float(left * 3600.0 / max(end - begin, 1) / step)
     hours, planned = steps * step / 3600.0, np.nan_to_num(episode.planned_duration) / 3600.0
+    if episode.has_recorded_leader:
+        length = episode.replayed_motion[1:, 0, 0] - episode.positions[1:, 0]
+        return float(episode.speeds[1:].sum() * 3600.0 / length.sum())
     if np.isnan(episode.loop_length):
         return episode.arrivals / (hours if episode.status == "collision" else max(hours, planned))
     distance = np.nansum(episode.positions[-1] - episode.positions[0])
@@ -418,6 +402,14 @@ METRICS: dict[str, Metric] = {
     "shield_override_share": Metric(shield_override_share, "commands overridden by the simulator", "", 4, SHARE_BOUNDS),
     "shield_max_braking": Metric(shield_max_braking, "maximum braking added by SUMO", "m/s2"),
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
+    "fuel_by_power": Metric(fuel_by_power, "fuel by power", "ml/km", 1),
+    "cav_fuel_by_power": Metric(cav_fuel_by_power, "CAV's fuel by power", "ml/km", 1),
+    "human_fuel_by_power": Metric(human_fuel_by_power, "human drivers' fuel by power", "ml/km", 1),
+    "cav_mean_gap": Metric(cav_mean_gap, "CAV's mean gap", "m", 1),
+    "cav_gap_95": Metric(cav_gap_95, "CAV's gap, 95 %", "m", 1),
+    "cav_max_gap": Metric(cav_max_gap, "CAV's largest gap", "m", 1),
+    "time_behind_leader": Metric(time_behind_leader, "time behind the recorded vehicle", "s", 1),
+    "amplification": Metric(amplification, "speed std of the last over the recorded vehicle", "", 2),
     "outflow_veh_per_h": Metric(outflow_veh_per_h, "flow", "veh/h", 0),
     "travel_time": Metric(mean_travel_time, "travel time, departure delay included", "s", 1),
     **{

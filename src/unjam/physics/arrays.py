@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 
 _FLOAT_NAMESPACE = SimpleNamespace(
     minimum=min,
+    maximum=max,
     floor=math.floor,
     isnan=math.isnan,
     cos=math.cos,
@@ -30,7 +31,7 @@ _FLOAT_NAMESPACE = SimpleNamespace(
 
 
 def namespace(array: Array) -> Any:
-    """Return the module with `where`, `minimum`, `floor`, `isnan`, `cos` and `sin` for this kind of number.
+    """Return the module with `where`, `minimum`, `maximum`, `floor`, `isnan`, `cos` and `sin` for this kind of number.
 
     It is `numpy`, `torch`, or a namespace with these functions for plain floats.
     """

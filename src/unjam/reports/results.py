@@ -28,7 +28,7 @@ MODEL_FILE = "model.json"
 """facts about the learned model of a run"""
 VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "poses", "lane_indices")
 """arrays with a row per time and a column per vehicle"""
-PLOT_ARRAYS = (*VEHICLE_ARRAYS, "outline", "backlog", "lane_lines")
+PLOT_ARRAYS = (*VEHICLE_ARRAYS, "replayed_motion", "outline", "backlog", "lane_lines")
 """arrays of an episode that figures need"""
 FULL_RATE_ARRAYS = ("speeds", "backlog")
 """arrays that an episode has for every control step, not only for snapshots"""

@@ -92,7 +92,7 @@ def trajectory_figure(episodes: Sequence[PlotEpisode]) -> Figure:
 
     A stop-and-go wave is a dark band that runs against the direction of travel. Sections where the road crosses
     itself are shaded. On a merge road the ramp has a panel below that of the main road; on a user network, the
-    most frequent route is shown.
+    most frequent route is shown. Behind a recorded vehicle, positions are those relative to it.
     """
     branches = list(dict.fromkeys(branch for episode in episodes for branch in episode.branches)) or [""]
     rows = [_branch_row(episodes, branch, number == 0) for number, branch in enumerate(branches)]
@@ -108,7 +108,11 @@ def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> 
 
     def draw(axes: Axes, episode: PlotEpisode, scale: Normalize) -> None:
         stride = max(1, len(episode.times) // figures.MAX_PLOT_TIMES)
-        arrays = (episode.times, _branch_positions(episode, branch, is_main), episode.speeds)
+        arrays = (
+            episode.times,
+            _branch_positions(episode, branch, is_main),
+            _with_replayed(episode, episode.speeds, 1),
+        )
         times, positions, speeds = (array[::stride] for array in arrays)
         axes.grid(False)
         axes.set_ylim(*extent)
@@ -126,16 +130,27 @@ def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> 
             style = {**style, "linewidths": width * style["linewidths"]}
             add_vehicle_lines(axes, times, positions[:, group], max_step, **style)
 
-    return PanelRow(f"{branch} [m]" if branch else "position along the road [m]", 3.0 if is_main else 1.0, draw)
+    is_moving = any(episode.has_recorded_leader for episode in episodes)
+    label = "position behind the recorded vehicle [m]" if is_moving else "position along the road [m]"
+    return PanelRow(f"{branch} [m]" if branch else label, 3.0 if is_main else 1.0, draw)
+
+
+def _with_replayed(episode: PlotEpisode, values: np.ndarray, index: int) -> np.ndarray:
+    """Return values of all vehicles, shape (T + 1, N), with those of a recorded vehicle as the last column."""
+    if not episode.has_recorded_leader:
+        return values
+    return np.column_stack([values, episode.replayed_motion[..., index]])
 
 
 def _branch_positions(episode: PlotEpisode, branch: str, is_main: bool) -> np.ndarray:
     """Return the positions of the vehicles while they are on a branch, shape (T + 1, N); NaN elsewhere.
 
-    Vehicles of other branches are on the main one downstream of the merge.
+    Vehicles of other branches are on the main one downstream of the merge. A recorded vehicle is one more, and the
+    origin of all positions.
     """
     if not branch:
-        return episode.positions
+        positions = _with_replayed(episode, episode.positions, 0)
+        return positions - positions[:, -1:] if episode.has_recorded_leader else positions
     own = np.array(episode.branches) == branch
     merged = episode.positions >= 0
     return np.where(own | merged if is_main else own & ~merged, episode.positions, np.nan)

@@ -14,7 +14,7 @@ from unjam.processes import PrivateFolder
 from unjam.reports.figures import CAV_PLOT_COLOR, TEXT_COLOR, color_table
 from unjam.reports.results import to_plot_episode
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.closed_road import poses_along
+from unjam.worlds.ordered_road import poses_along
 from unjam.worlds.record import Episode
 from unjam.worlds.road_world import RoadScene
 

@@ -11,13 +11,25 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
 from unjam.scenarios.motorway import MOTORWAY_SCENARIOS, Motorway, Ramp
 from unjam.scenarios.population import read_population
+from unjam.scenarios.recorded import Recorded
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork, load_user_network
 from unjam.scenarios.user_scenario import CODE_ENTRY, class_recipe, load_class, load_python_scenario, load_toml_scenario
 
-__all__ = ["SCENARIOS", "FigureEight", "Merge", "Motorway", "Ramp", "Ring", "Road", "Scenario", "make_scenario"]
+__all__ = [
+    "SCENARIOS",
+    "FigureEight",
+    "Merge",
+    "Motorway",
+    "Ramp",
+    "Recorded",
+    "Ring",
+    "Road",
+    "Scenario",
+    "make_scenario",
+]
 
 SCENARIOS: dict[str, Scenario] = {
     "ring": Ring(),
@@ -27,11 +39,12 @@ SCENARIOS: dict[str, Scenario] = {
     "figure-eight-30": FigureEight(radius=(30, 30)),
     "merge": Merge(),
     **MOTORWAY_SCENARIOS,
+    "recorded": Recorded(),
 }
 
 EXAMPLE_PENETRATION_RATE = 0.1
 """penetration rate of a user network as an example"""
-TOML_KINDS: dict[str, type[Scenario]] = {kind.title: kind for kind in (Ring, FigureEight, Merge, Motorway)}
+TOML_KINDS: dict[str, type[Scenario]] = {kind.title: kind for kind in (Ring, FigureEight, Merge, Motorway, Recorded)}
 """kinds of road that a TOML file describes, by title"""
 SCENARIO_KINDS = {**TOML_KINDS, UserNetwork.title: UserNetwork}
 """all kinds of road"""

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from math import inf
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -115,11 +116,13 @@ class BuiltRoad(Road):
     routes: tuple[Route, ...]
     entries: tuple[Entry, ...]
     """in order of time"""
+    has_entry_checks: bool = True
+    """whether SUMO inserts a vehicle only where its gap is safe"""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClosedRoad(BuiltRoad):
-    """A loop with one lane: vehicles neither enter nor leave nor overtake."""
+class OrderedRoad(BuiltRoad):
+    """A road with one lane on which the same vehicles drive in the same order all the time."""
 
     vehicle_ids: tuple[str, ...]
     """all vehicles, in their order along the road"""
@@ -128,15 +131,44 @@ class ClosedRoad(BuiltRoad):
     start_positions: NDArray[np.float64]
     """front bumper of each vehicle along the route at the start [m]"""
     loop_length: float
-    """length of the closed road [m]"""
+    """length of a closed road [m]; infinite on a road with ends"""
+    center_line: NDArray[np.float64]
+    """center line of a closed road: rows (coordinate along the route, x, y) [m]; no rows: straight"""
+    replayed_speeds: NDArray[np.float64] | None
+    """speeds of the last of `vehicle_ids`, the first on the road, at the start and after each simulation step if it
+    replays a recording [m/s], shape (S + 1,)"""
     crossings: tuple[tuple[float, float], ...] = ()
     """sections where the road crosses itself, and SUMO itself drives commanded human drivers [m]"""
-    center_line: NDArray[np.float64]
-    """the road's center line: rows (coordinate along the route, x, y) [m]"""
+
+    @property
+    def driven_count(self) -> int:
+        """Number of vehicles with a driver: all, or all but the last, which replays a recording."""
+        return len(self.vehicle_ids) - (self.replayed_speeds is not None)
+
+    @property
+    def start_speed(self) -> float:
+        """Speed of all vehicles at the start [m/s]."""
+        return 0.0 if self.replayed_speeds is None else float(self.replayed_speeds[0])
 
     def provided_penetration_rate(self, required_fields: Collection[str]) -> float | None:
         """Return the penetration rate if it is among the fields that a driver requires, else None."""
-        return len(self.cav_ids) / len(self.vehicle_ids) if "penetration_rate" in required_fields else None
+        return len(self.cav_ids) / self.driven_count if "penetration_rate" in required_fields else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedRoad(OrderedRoad):
+    """A loop with one lane: vehicles neither enter nor leave nor overtake."""
+
+    replayed_speeds: None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedRoad(OrderedRoad):
+    """A platoon on a straight road behind a vehicle that replays a recording."""
+
+    replayed_speeds: NDArray[np.float64]
+    loop_length: float = inf
+    center_line: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 class VehicleType(NamedTuple):

@@ -185,6 +185,9 @@ class Episode:
     """front bumpers along the route, not wrapped [m], shape (T // snapshot_stride + 1, N)"""
     gaps: Floats = field(default_factory=lambda: np.zeros((1, 0)))
     """net gap to the leader [m], shape (T // snapshot_stride + 1, N)"""
+    replayed_motion: Floats = field(default_factory=lambda: np.zeros((1, 0, 2)))
+    """positions [m] and speeds [m/s] of the k vehicles that replay recordings, shape (T + 1, k, 2): no vehicle of the
+    others, but the leader of the first"""
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """fuel rate in each step [mg/s], shape (T, N), on a road with ends total (T,); (0, 0) if not recorded"""
     outline: Floats = field(default_factory=lambda: np.zeros((0, 3)))
@@ -237,6 +240,11 @@ class Episode:
         columns = self.vehicle_columns or range(len(self.vehicle_ids))
         column = dict(zip(self.vehicle_ids, columns, strict=True))
         return list(dict.fromkeys(column[name] for name in self.cav_ids))
+
+    @property
+    def has_recorded_leader(self) -> bool:
+        """Whether the first vehicle on the road replays a recording."""
+        return self.replayed_motion.shape[1] > 0
 
     @property
     def has_run(self) -> bool:

@@ -28,6 +28,8 @@ CRASH_CLOSURE_STEPS = 2_400
 """control steps for which a crash closes a road in the travel-time reward: a whole on-ramp episode"""
 MIN_CRASH_BACKLOG = 200
 """minimum number of vehicles that a crash stops, as more would enter: about 160 (3,700 veh/h for 154 s) drive there"""
+MAX_CALM_TIME_GAP, STANDING_TIME_GAP = 5.0, 60.0
+"""time gap beyond which a CAV lags behind, and that of a vehicle that practically stands [s]"""
 STANDSTILL_SPEED = 1e-3
 """lower limit of the speed in time gaps [m/s]"""
 MAX_REWARD_CELLS = 4_000_000
@@ -107,6 +109,20 @@ def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
     return {"speed": speed, "time_gap": gaps, "lower_bound": clamp_min(-speed - gaps, 0.0)}
 
 
+def smooth_following_reward(outcome: Outcome) -> dict[str, Array]:
+    """Reward calm driving of CAVs in a platoon: minus their mean squared acceleration, and -10 at a crash.
+
+    Time gaps below 1 s, and the part of those beyond 5 s, count as much as 0.1 m2/s4 for each second.
+    """
+    late = clamp_min(outcome.time_gaps - MAX_CALM_TIME_GAP, 0.0) * (outcome.time_gaps < STANDING_TIME_GAP)
+    return {
+        "comfort": acceleration_penalty(outcome),
+        "time_gap": 0.1 * time_gap_penalty(outcome),
+        "late": -0.1 * _nan_sum(late),
+        "crash": -10.0 * outcome.has_crashed,
+    }
+
+
 def power_reward(outcome: Outcome) -> dict[str, Array]:
     """Reward flow and speed together: the distance that all vehicles cover, times their mean speed; 0 at a crash.
 
@@ -159,6 +175,7 @@ REWARDS: dict[str, Reward] = {
     "eq16-as-printed": printed_eq16_reward,
     "power": power_reward,
     "travel-time": travel_time_reward,
+    "smooth-following": smooth_following_reward,
 }
 
 

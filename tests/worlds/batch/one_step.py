@@ -9,8 +9,8 @@ from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.batch.figure_eight.crossing import FigureEightMovement
 from unjam.worlds.batch.human_idm import Leader
-from unjam.worlds.closed_road import NOISE_BLOCK_STEPS
 from unjam.worlds.episode import run_episode
+from unjam.worlds.ordered_road import NOISE_BLOCK_STEPS
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation

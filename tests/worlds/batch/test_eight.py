@@ -161,7 +161,7 @@ def test_it_is_no_exact_road_and_driven_only_where_that_is_asked_for() -> None:
     assert unsupported_reason(SHORT)
     assert not statistically_unsupported_reason(SHORT)
     assert not statistically_unsupported_reason(Ring())
-    with pytest.raises(InputError, match="is not a ring"):
+    with pytest.raises(InputError, match="is neither a ring nor a recorded road"):
         run_batch(tasks(SHORT, "pi", range(1)))
 
 

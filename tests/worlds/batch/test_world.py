@@ -308,7 +308,7 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
 @pytest.mark.parametrize(
     ("scenario", "why"),
     [
-        (FigureEight(), "is not a ring"),
+        (FigureEight(), "is neither a ring nor a recorded road"),
         (replace(SHORT, human_control="commanded"), "human_control: commanded"),
         (replace(SHORT, safety=NO_FILTER), "SUMO's own check"),
         (replace(SHORT, actuation="flow"), "SUMO's own check"),

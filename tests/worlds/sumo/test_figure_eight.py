@@ -17,7 +17,7 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.scenario import MIN_CAV_GAP
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend, make_traffic
-from unjam.worlds.sumo.closed_road import ClosedTraffic
+from unjam.worlds.sumo.ordered_road import OrderedTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -49,7 +49,7 @@ def test_agrees_with_flow_within_six_percent_without_collision() -> None:
 
 def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
     traffic = make_traffic(FigureEight(cavs=14), (3,), simulation)
-    assert isinstance(traffic, ClosedTraffic)
+    assert isinstance(traffic, OrderedTraffic)
     traffic.start(is_controlled=True)
     ids, compared = traffic.road.vehicle_ids, 0
     for _ in range(400):
@@ -110,7 +110,7 @@ def test_sumo_drives_human_driven_vehicles_on_the_crossing(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traffic = make_traffic(FigureEight(radius=(32, 32)), (0,), simulation)
-    assert isinstance(traffic, ClosedTraffic)
+    assert isinstance(traffic, OrderedTraffic)
     commands: list[tuple[str, float]] = []
     monkeypatch.setattr(
         simulation, "command_speeds", lambda ids, speeds: commands.extend(zip(ids, speeds, strict=True))

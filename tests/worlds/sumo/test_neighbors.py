@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.scenarios import Ring
-from unjam.worlds.closed_road import loop_neighbors, loop_state
+from unjam.worlds.ordered_road import loop_neighbors, loop_state
 from unjam.worlds.sumo.backend import make_traffic
-from unjam.worlds.sumo.closed_road import ClosedTraffic
+from unjam.worlds.sumo.ordered_road import OrderedTraffic
 from unjam.worlds.sumo.simulation import Simulation
 
 CAR = 5.0
@@ -89,7 +89,7 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
     steps = 300
     ring = Ring(length=(length, length), vehicles=vehicles, cavs=cavs, warmup=40, horizon=steps)
     traffic = make_traffic(ring, (3,), simulation)
-    assert isinstance(traffic, ClosedTraffic)
+    assert isinstance(traffic, OrderedTraffic)
     traffic.start(is_controlled=True)
     pushes = np.random.default_rng(0).uniform(-0.6, 1.0, (steps, cavs))
     names, seen = traffic.road.vehicle_ids, []
@@ -114,7 +114,7 @@ def test_leaders_and_gaps_in_running_traffic_are_sumos(
 def test_positions_are_sumos_own_along_the_road(simulation: Simulation) -> None:
     ring = Ring(length=(222, 222), warmup=30, horizon=400)
     traffic = make_traffic(ring, (1,), simulation)
-    assert isinstance(traffic, ClosedTraffic)
+    assert isinstance(traffic, OrderedTraffic)
     traffic.start(is_controlled=False)
     for _ in range(400):
         traffic.advance(None)

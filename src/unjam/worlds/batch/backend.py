@@ -15,9 +15,10 @@ from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import WorldOptions, check_support
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD
 from unjam.worlds.batch.motorway.world import MotorwayBatch
+from unjam.worlds.batch.ring.recorded import RecordedBatch
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason
-from unjam.worlds.closed_road import loop_scene
+from unjam.worlds.ordered_road import ordered_scene
 from unjam.worlds.road_world import RoadScene, RoadWorld
 from unjam.worlds.world import DriverLog
 
@@ -72,8 +73,8 @@ class SingleRing(_SingleRoad, RingBatch):
 
     @property
     def speeds(self) -> Floats:
-        """Of all vehicles [m/s]."""
-        return self._speed[:-1, 0]
+        """Of all vehicles with a driver [m/s]."""
+        return self._speed[: self.road.driven_count, 0]
 
     def last_applied_acceleration(self) -> Floats:
         """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2]."""
@@ -81,7 +82,11 @@ class SingleRing(_SingleRoad, RingBatch):
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""
-        return loop_scene(self.road, self._position[:, 0], self.speeds)
+        return ordered_scene(self.road, self._position[:, 0], self._speed[:-1, 0])
+
+
+class SingleRecordedRoad(SingleRing, RecordedBatch):
+    """One recorded road of a batch."""
 
 
 class SingleMotorway(_SingleRoad, MotorwayBatch):
@@ -127,4 +132,8 @@ class SingleMotorway(_SingleRoad, MotorwayBatch):
         return changes / self.scenario.control_step
 
 
-SINGLE_ROADS: dict[type, Any] = {RingBatch: SingleRing, MotorwayBatch: SingleMotorway}
+SINGLE_ROADS: dict[type, Any] = {
+    RingBatch: SingleRing,
+    RecordedBatch: SingleRecordedRoad,
+    MotorwayBatch: SingleMotorway,
+}

@@ -18,7 +18,7 @@ from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
 from unjam.physics.idm import IDMArrays, IDMParameters, fast_power, idm_acceleration, stack_idm_parameters
 from unjam.physics.kinematics import next_speed, stopping_distance
 from unjam.scenarios.ring import RING_EDGES
-from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.road import OrderedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.batch.noise import ArrayFactory
 
@@ -97,14 +97,14 @@ def look_ahead_distance(max_speed: Array, time_headway: Array, braking: Array, s
     return max_speed * (step + time_headway) + stopping_distance(max_speed, braking, step)
 
 
-def lane_end_leader(speed: Array, position: Array, loop_length: Array, parameters: HumanParameters) -> Leader:
+def lane_end_leader(speed: Array, distance: Array, parameters: HumanParameters) -> Leader:
     """Return the leader of drivers above their desired speed: the end of their lane, as a standing vehicle.
 
-    Arguments as of `leaders`. The gap is at least that of SUMO's `getSecureGap` at the desired speed.
+    `distance` is that to the end [m]; the gap is at least that of SUMO's `getSecureGap` at the desired speed.
     """
-    lane_length, desired = loop_length / RING_EDGES, parameters.desired_speed
+    desired = parameters.desired_speed
     secure_gap = desired * (parameters.time_headway + desired / parameters.interaction_scale)
-    return Leader(0.0 * speed, clamp_min(lane_length - position % lane_length, secure_gap))
+    return Leader(0.0 * speed, clamp_min(distance, secure_gap))
 
 
 def ring_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
@@ -125,7 +125,7 @@ def human_idm_speed(speed: Array, leader_speed: Array, gap: Array, parameters: H
     gap = clamp_min(gap, SUMO_MIN_GAP)
     acceleration = idm_acceleration(speed, leader_speed, gap, parameters, fast_power)
     desired = next_speed(speed, clamp_min(acceleration, -EMERGENCY_BRAKING), step)
-    desired = clamp_max(desired, parameters.desired_speed)
+    desired = clamp_min(clamp_max(desired, parameters.desired_speed), speed - EMERGENCY_BRAKING * step)
     return desired * (desired > STANDSTILL_ACCELERATION * step)
 
 
@@ -135,9 +135,20 @@ def human_ring_speed(
     """Return the speeds of human drivers after a step on a ring, before noise [m/s]; arguments as of `leaders`."""
     xp, visible = namespace(speed), leaders(speed, position, leader, loop_length, parameters, step)
     new_speed = reduce(xp.minimum, (human_idm_speed(speed, *each, parameters, step) for each in visible))
-    is_too_fast = speed > parameters.desired_speed  # because of noise
+    lane_length = loop_length / RING_EDGES
+    return slow_to_desired_speed(new_speed, speed, lane_length - position % lane_length, parameters, step)
+
+
+def slow_to_desired_speed(
+    new_speed: Array, speed: Array, distance_to_end: Array, parameters: HumanParameters, step: float
+) -> Array:
+    """Return the speeds after a step where drivers above their desired speed slow down for the end of their lane.
+
+    Shapes: any, broadcast together. Units: m/s, m/s, m, s.
+    """
+    xp, is_too_fast = namespace(speed), speed > parameters.desired_speed  # because of noise
     if bool(is_too_fast.any()):
-        end = lane_end_leader(speed, position, loop_length, parameters)
+        end = lane_end_leader(speed, distance_to_end, parameters)
         slower = human_idm_speed(speed, *end, without_minimum_gap(parameters), step)
         braking = clamp_min(parameters.comfortable_deceleration, MIN_OVERSPEED_BRAKING)
         min_speed = speed - braking * step - OVERSPEED_BRAKING_TOLERANCE
@@ -150,7 +161,7 @@ def without_minimum_gap(parameters: HumanParameters) -> IDMArrays:
     return IDMArrays(*(getattr(parameters, name) for name in IDMArrays._fields))._replace(minimum_gap=0.0)
 
 
-def human_parameters(roads: Sequence[ClosedRoad], shared: IDMParameters, to_array: ArrayFactory) -> HumanParameters:
+def human_parameters(roads: Sequence[OrderedRoad], shared: IDMParameters, to_array: ArrayFactory) -> HumanParameters:
     """Return the parameters of the human drivers of W roads: shared, or of each vehicle, shape (vehicles, W)."""
     if not roads[0].human_parameters:
         return shared

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from unjam.physics.arrays import Array, Floats, namespace
-from unjam.worlds.closed_road import NOISE_BLOCK_STEPS
+from unjam.worlds.ordered_road import NOISE_BLOCK_STEPS
 
 ArrayFactory = Callable[[Floats], Array]
 """makes arrays of the library and precision of a batch"""

@@ -10,11 +10,13 @@ from unjam.parameters import replaced_member
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_vehicles import LaneChanging
+from unjam.scenarios.recorded import Recorded
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import TEXT_MEMBERS, unread_reason
 from unjam.worlds.batch.human_idm import MIN_LOOK_AHEAD
 from unjam.worlds.batch.motorway.world import MotorwayBatch
+from unjam.worlds.batch.ring.recorded import RecordedBatch
 from unjam.worlds.batch.ring.world import RingBatch
 
 MAX_SIMULATION_STEP = 0.37
@@ -43,7 +45,7 @@ class BatchKind:
 def unsupported_reason(scenario: Scenario) -> str:
     """Return why a batch cannot reproduce SUMO's episodes of a scenario exactly; empty if it can."""
     if (kind := batch_kind(scenario)) and not kind.is_exact:
-        return f"{scenario.title} is not a ring"
+        return f"{scenario.title} is neither a ring nor a recorded road"
     return statistically_unsupported_reason(scenario)
 
 
@@ -60,7 +62,7 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     return unread_reason(scenario, base or Ring, [each.name for each in fields(scenario)])
 
 
-def _ring_reason(scenario: Ring) -> str:
+def _ring_reason(scenario: Ring | Recorded) -> str:
     is_native = "human_control", scenario.human_control == "native", "native"
     return _first_reason(scenario, is_native, *_controls(scenario))
 
@@ -118,6 +120,7 @@ def _first_reason(scenario: Scenario, *checks: tuple[str, bool, str]) -> str:
 
 BATCH_KINDS: dict[type[Scenario], BatchKind] = {
     Ring: BatchKind(RingBatch, _ring_reason, is_exact=True),
+    Recorded: BatchKind(RecordedBatch, _ring_reason, is_exact=True),
     FigureEight: BatchKind(RingBatch, _figure_eight_reason),
     Motorway: BatchKind(MotorwayBatch, _motorway_reason, max_roads=64, has_own_drivers=True),
 }

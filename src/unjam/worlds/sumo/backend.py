@@ -7,13 +7,13 @@ from typing import Any, ClassVar
 from unjam.errors import EpisodeError, InputError, SumoInputError, UnjamError, as_unjam_error
 from unjam.scenarios import SCENARIO_KINDS
 from unjam.scenarios.motorway_road import MotorwayRoad
-from unjam.scenarios.road import ClosedRoad, MergeRoad, Road, UserNetworkRoad
+from unjam.scenarios.road import ClosedRoad, MergeRoad, RecordedRoad, Road, UserNetworkRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import DEFAULT_OPTIONS, WorldOptions
-from unjam.worlds.sumo.closed_road import ClosedTraffic
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.merge_road import MergingTraffic
 from unjam.worlds.sumo.motorway import MotorwayTraffic
+from unjam.worlds.sumo.ordered_road import OrderedTraffic, RecordedTraffic
 from unjam.worlds.sumo.sandboxed import open_simulation
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.traffic import Traffic
@@ -21,9 +21,10 @@ from unjam.worlds.sumo.transports import Transport
 from unjam.worlds.sumo.user_network import UserNetworkTraffic
 
 TRAFFIC_CLASSES: dict[type[Road], type[Traffic[Any]]] = {
-    ClosedRoad: ClosedTraffic,
+    ClosedRoad: OrderedTraffic,
     MergeRoad: MergingTraffic,
     MotorwayRoad: MotorwayTraffic,
+    RecordedRoad: RecordedTraffic,
     UserNetworkRoad: UserNetworkTraffic,
 }
 

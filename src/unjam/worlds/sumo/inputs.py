@@ -80,11 +80,12 @@ def _built_road_inputs(
         lines.append(xml_element("route", id=route.name, edges=" ".join(route.edges), repeat=laps))
     for entry in road.entries:
         own_type = f"of_{entry.name}"
+        is_unchecked = own_type in humans or not road.has_entry_checks
         attributes = {
             "id": entry.name,
             "type": entry.vehicle_type or (own_type if own_type in humans else "human"),
             # SUMO would not insert a vehicle below the gap that its driver keeps.
-            "insertionChecks": "collision" if entry.vehicle_type else "none" if own_type in humans else None,
+            "insertionChecks": "collision" if entry.vehicle_type else "none" if is_unchecked else None,
             "route": entry.route,
             "depart": f"{entry.time:.2f}",
             "departPos": "base" if entry.vehicle_type else repr(entry.position),

@@ -29,6 +29,8 @@ MIN_CONTACT_OVERLAP = 0.01
 """overlap that is not a rounding error [m]"""
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
 """SUMO's speed mode for each kind of actuation: bit 0 is the check for a safe speed"""
+NO_SPEED_CHECKS = 32
+"""SUMO's speed mode without any check, not even of the right of way"""
 SAFE_SPEED_BIT = 1
 """the bit that stays without right of way: surprised vehicles still stop"""
 ACCELERATION_LIMIT_BITS = 2 | 4
@@ -289,6 +291,11 @@ class Simulation(AbstractContextManager["Simulation"]):
         mode = _speed_mode("flow", right_of_way) | (ACCELERATION_LIMIT_BITS if has_acceleration_limits else 0)
         for name in ids:
             self._sumo.vehicle.setSpeedMode(name, mode)
+
+    def replay(self, name: str, max_speed: float) -> None:
+        """Let a vehicle obey `command_speeds` without any check, at up to `max_speed` [m/s]."""
+        self._sumo.vehicle.setSpeedMode(name, NO_SPEED_CHECKS)
+        self.set_max_speed(name, max_speed)
 
     def change_type(self, name: str, kind: str, is_modified_later: bool = False) -> None:
         """Change the type of a vehicle without changing its speed factor, which SUMO would draw again.

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from unjam.physics.arrays import Array
-from unjam.scenarios.ring import LoopScenario
-from unjam.scenarios.road import ClosedRoad
-from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.scenarios.road import OrderedRoad
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.batch.human_idm import CONTACT_GAP
-from unjam.worlds.closed_road import ClosedRoadLog
+from unjam.worlds.ordered_road import OrderedRoadLog
 from unjam.worlds.record import Episode, Floats, common_fields
 from unjam.worlds.world import DriverLog
 
@@ -20,7 +19,7 @@ FindContacts = Callable[[Array, Array, Array], Array]
 
 
 def make_ring_episodes(
-    rings: Iterable[tuple[LoopScenario, ClosedRoad, Sequence[int], int, bool]],
+    rings: Iterable[tuple[Scenario, OrderedRoad, Sequence[int], int, bool]],
     start_positions: Floats,
     series: dict[str, list[Array]],
     find_contacts: FindContacts,
@@ -34,7 +33,7 @@ def make_ring_episodes(
     Args:
         rings: scenario, road, seed, number of control steps, and whether there was a collision.
         start_positions: front bumpers at the start [m], shape (vehicles, W).
-        series: those of `ClosedRoadLog` by name; arrays of shape (vehicles, W) or (CAVs * W,) for each step.
+        series: those of `OrderedRoadLog` by name; arrays of shape (vehicles, W) or (CAVs * W,) for each step.
         find_contacts: see `FindContacts`.
         driver_log: the driver's decisions.
         penetration_rate: as reported to the CAVs; None: not reported.
@@ -52,7 +51,7 @@ def make_ring_episodes(
         counts = {"requested_accelerations": count, "speeds": step_count + 1}
         own: dict[str, Any] = {name: each[: counts.get(name, step_count), :, ring] for name, each in values.items()}
         own |= {"has_crashed": has_crashed, "penetration_rate": penetration_rate}
-        log = ClosedRoadLog(scenario, road, start_positions[:, ring], **own)
+        log = OrderedRoadLog(scenario, road, start_positions[:, ring], **own)
         motion = log.speeds_and_positions()
         position = motion[1][:, -1]
         # The leader's position is not wrapped: a vehicle that touches its leader may be a little beyond it.

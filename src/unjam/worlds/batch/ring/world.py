@@ -19,8 +19,7 @@ from unjam.drivers.sensors import SensorReadings
 from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
 from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
-from unjam.scenarios.ring import LoopScenario
-from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.road import ClosedRoad, OrderedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.batch.figure_eight.crossing import CrossingMemory, FigureEightMovement, figure_eight_contacts
 from unjam.worlds.batch.human_idm import (
@@ -34,7 +33,7 @@ from unjam.worlds.batch.human_idm import (
 )
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, NoiseState, QuickNoise, SeededNoise, WorldSeeds
 from unjam.worlds.batch.ring.record import as_numpy, make_ring_episodes
-from unjam.worlds.closed_road import MAX_RECALL_SECONDS
+from unjam.worlds.ordered_road import MAX_RECALL_SECONDS
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam.worlds.world import DriverLog, ProgressCallback
@@ -75,7 +74,7 @@ class RingBatch:
 
     def __init__(
         self,
-        scenarios: Sequence[LoopScenario],
+        scenarios: Sequence[Scenario],
         seeds: Sequence[Sequence[int]],
         to_array: ArrayFactory = np.asarray,
         keep_record: bool = True,
@@ -92,7 +91,7 @@ class RingBatch:
         """
         scenario = self.scenario = scenarios[0]
         drawn = [each.draw_from_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
-        roads, generator_seeds = [cast(ClosedRoad, road) for road, _ in drawn], [others for _, others in drawn]
+        roads, generator_seeds = [cast(OrderedRoad, road) for road, _ in drawn], [others for _, others in drawn]
         self._scenarios, self._seeds, self._keep_record, self._to_array = scenarios, seeds, keep_record, to_array
         self.roads, self._is_controlled = roads, False
         vehicles, cavs = len(roads[0].vehicle_ids), len(roads[0].cav_ids)
@@ -106,11 +105,13 @@ class RingBatch:
         loops, step = np.array([road.loop_length for road in roads]), scenario.simulation_step
         self._loop_lengths, self._cav_loop_lengths = to_array(loops), to_array(np.tile(loops, cavs))
         start = np.stack([road.start_positions for road in roads], 1)
-        self._set_motion(np.zeros((vehicles, len(roads))), start, loops)
+        self._set_motion(np.tile([road.start_speed for road in roads], (vehicles, 1)), start, loops)
         self._human_parameters, self._human_model = human_parameters(roads, scenario.humans, to_array), human_model
         self._figure_eight, self._find_contacts = None, ring_contacts
         if roads[0].crossings:
-            self._figure_eight = FigureEightMovement(scenario, roads, self._cav_indices, to_array, human_model)
+            self._figure_eight = FigureEightMovement(
+                scenario, cast(Sequence[ClosedRoad], roads), self._cav_indices, to_array, human_model
+            )
             self._find_contacts = figure_eight_contacts
         crossings = zip(*(road.crossings for road in roads), strict=True)
         self._crossing_starts = [to_array(np.tile([start for start, _ in each], cavs)) for each in crossings]
@@ -128,7 +129,7 @@ class RingBatch:
     @classmethod
     def from_tasks(cls, tasks: Sequence[EpisodeTask], to_array: ArrayFactory) -> Self:
         """Return the rings of tasks."""
-        scenarios = [cast(LoopScenario, task.scenario) for task in tasks]
+        scenarios = [task.scenario for task in tasks]
         return cls(scenarios, [task.seed for task in tasks], to_array)
 
     def values_of_cavs(self, values: Array) -> Array:
@@ -145,7 +146,7 @@ class RingBatch:
         cav_series = "requested_accelerations", "safe_accelerations", "commanded_speeds"
         self._series = {"speeds": [self._speed[:-1]], **{name: [] for name in ("noise_free_speeds", *cav_series)}}
         self._start_positions = as_numpy(self._position)
-        zeros = self._loop_lengths * 0.0
+        zeros = self._speed[0] * 0.0
         self._is_running, self.crashed_roads, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
         """whether each road still counts, whether there was a collision on it, and its control steps, shape (W,)"""
 
@@ -235,7 +236,7 @@ class RingBatch:
             position % loop,
             loop,
             distance_to_crossing=reduce(namespace(position).minimum, distances) if distances else None,
-            penetration_rate=None if rate is None else loop * 0.0 + rate,
+            penetration_rate=None if rate is None else position * 0.0 + rate,
         )
 
     def _following_state(self) -> FollowingState:
@@ -284,7 +285,7 @@ class RingBatch:
         self._position = next_position(self._position, moved, step)
         if self._figure_eight or bool((self._gap < CONTACT_GAP).any()):
             contacts = self._find_contacts(self._position, self._gap, self._loop_lengths)
-            self.crashed_roads = self.crashed_roads | contacts.any(0)
+            self.crashed_roads = self.crashed_roads | (contacts.any(0) & (self._is_running > 0.0))
         self._speed = xp.concatenate([speeds, speeds[:1]])
         if self._keep_record:
             self._series["noise_free_speeds"].append(moved)
@@ -315,7 +316,7 @@ class RingBatch:
         """Return the record of each ring since the start, without rewards; none if records are not kept."""
         if not self._keep_record:
             return ()
-        steps, crashed = as_numpy(self._control_step_counts).astype(int), as_numpy(self._is_running) == 0.0
+        steps, crashed = as_numpy(self._control_step_counts).astype(int), as_numpy(self.crashed_roads) > 0.0
         rings = zip(self._scenarios, self.roads, self._seeds, steps.tolist(), crashed.tolist(), strict=True)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
         return make_ring_episodes(rings, self._start_positions, self._series, self._find_contacts, driver_log, rate)

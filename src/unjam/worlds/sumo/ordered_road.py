@@ -1,4 +1,4 @@
-"""Traffic on a closed road: the same vehicles in the same order from the first step to the last.
+"""Traffic on a road with one lane: the same vehicles in the same order from the first step to the last.
 
 The inner loop works on lists of plain floats. Between two steps of SUMO the caches are cold, and a NumPy call on 22
 numbers then takes longer than a list comprehension.
@@ -20,17 +20,17 @@ from unjam.physics.arrays import Array, clamp_min
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import gap_on_loop, next_speed
 from unjam.scenarios.population import apply_population
-from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.road import OrderedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds import closed_road
+from unjam.worlds import ordered_road
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.road_world import RoadScene
 from unjam.worlds.sumo.traffic import NO_SPEED_COMMAND, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 
-class ClosedTraffic(Traffic[ClosedRoad]):
-    """The SUMO environment of a closed road."""
+class OrderedTraffic(Traffic[OrderedRoad]):
+    """The SUMO environment of a road with one lane and always the same vehicles."""
 
     def _prepare(self) -> None:
         scenario, simulation, road, vehicles = self.scenario, self._simulation, self.road, len(self.road.vehicle_ids)
@@ -38,8 +38,8 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self.is_scalar = self.options.accepts_floats and self.cav_count == 1
         self._collided_vehicles: set[str] = set()
         self._cav_indices = [road.vehicle_ids.index(name) for name in road.cav_ids]
-        self._neighbors = closed_road.loop_neighbors(np.array(self._cav_indices), vehicles)
-        self._scalar_neighbors = closed_road.loop_neighbors(self._cav_indices[0], vehicles)
+        self._neighbors = ordered_road.loop_neighbors(np.array(self._cav_indices), vehicles)
+        self._scalar_neighbors = ordered_road.loop_neighbors(self._cav_indices[0], vehicles)
         self._commands_humans = scenario.human_control == "commanded"
         self._idm_parameters = self._human_parameters(road.vehicle_ids)
         tracked = range(vehicles) if self._commands_humans else np.concatenate(self._neighbors).tolist()
@@ -48,7 +48,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         if self._commands_humans:
             simulation.command_humans(road.vehicle_ids, scenario.right_of_way, scenario.enforce_human_limits)
         self._exploration_noise: Any = None
-        self.speeds = simulation.speeds(road.vehicle_ids)
+        self._speeds = simulation.speeds(road.vehicle_ids)
         self._check_all_present()
         self._reset_log()
 
@@ -60,7 +60,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def _reset_log(self) -> None:
         start = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
-        self._recorder = closed_road.ClosedRoadRecorder(self.scenario, self.road, start, self.speeds)
+        self._recorder = ordered_road.OrderedRoadRecorder(self.scenario, self.road, start, self._speeds)
         self._series = self._recorder.series
         self._fuel: list[Sequence[float]] = []
 
@@ -76,10 +76,10 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         self._warm_up(self._simulate, on_progress)
         if scenario.warmup and scenario.remember_warmup:
             stride = scenario.steps_per_control_step
-            count = round(closed_road.MAX_RECALL_SECONDS / scenario.control_step)
+            count = round(ordered_road.MAX_RECALL_SECONDS / scenario.control_step)
             moments = list(range(scenario.warmup - stride, -1, -stride))[:count]
             series = self.speeds_and_positions()
-            history = closed_road.loop_state(*series, self._neighbors, *self._loop_arguments)
+            history = ordered_road.loop_state(*series, self._neighbors, *self._loop_arguments)
             history = history.select(np.s_[:, moments[::-1]])
         self.is_controlled = is_controlled
         if is_controlled:
@@ -92,10 +92,10 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Return the exact local state of the CAVs now."""
         tracked = self._tracked_positions
         if self.is_scalar:
-            return closed_road.loop_state(self.speeds, tracked, self._scalar_neighbors, *self._loop_arguments)
-        positions = np.full(len(self.speeds), np.nan)
+            return ordered_road.loop_state(self._speeds, tracked, self._scalar_neighbors, *self._loop_arguments)
+        positions = np.full(len(self._speeds), np.nan)
         positions[list(tracked)] = list(tracked.values())
-        state = closed_road.loop_state(np.array(self.speeds), positions, self._neighbors, *self._loop_arguments)
+        state = ordered_road.loop_state(np.array(self._speeds), positions, self._neighbors, *self._loop_arguments)
         return state.as_read_only()
 
     def advance(self, command: Command | None) -> None:
@@ -112,7 +112,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             self._fuel.append(self._simulation.fuel(self.road.vehicle_ids))
 
     def _drive_cavs(self, accelerations: list[float]) -> None:
-        speeds, positions, step = self.speeds, self._tracked_positions, self.scenario.simulation_step
+        speeds, positions, step = self._speeds, self._tracked_positions, self.scenario.simulation_step
         loop, last, apply_acceleration = self.road.loop_length, len(speeds) - 1, self.filtered_acceleration
         safe, commanded = [], []
         for name, index, acceleration in zip(self.cav_ids, self._cav_indices, accelerations, strict=True):
@@ -144,7 +144,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
             if min(speeds) < 0.0:
                 speeds = [clamp_min(speed, 0.0) for speed in speeds]
             simulation.replace_speeds(self._human_ids, compress(speeds, self._human_mask))
-        self.speeds = speeds
+        self._speeds = speeds
         self._series["speeds"].fromlist(speeds)
         if colliding := simulation.colliding_vehicles():
             self._collided_vehicles.update(colliding)
@@ -157,7 +157,7 @@ class ClosedTraffic(Traffic[ClosedRoad]):
 
     def _command_humans(self) -> None:
         """Command speeds of the IDM with noise, as Flow does it; on a crossing SUMO drives."""
-        scenario, road, speeds, positions = self.scenario, self.road, self.speeds, self._tracked_positions
+        scenario, road, speeds, positions = self.scenario, self.road, self._speeds, self._tracked_positions
         noise = self._next_speed_noise() if scenario.noise > 0 else [0.0] * len(speeds)
         step, loop, crossings = scenario.simulation_step, road.loop_length, road.crossings
         population = scenario.driver_population
@@ -196,12 +196,12 @@ class ClosedTraffic(Traffic[ClosedRoad]):
     def _next_speed_noise(self) -> list[float]:
         """Return the noise of each speed in this step [m/s]; zero for CAVs."""
         if not self._noise_rows:
-            draws = self.noise_generator.standard_normal((closed_road.NOISE_BLOCK_STEPS, len(self._human_mask)))
+            draws = self.noise_generator.standard_normal((ordered_road.NOISE_BLOCK_STEPS, len(self._human_mask)))
             scale = self.scenario.noise_per_step * self.scenario.simulation_step
             self._noise_rows = (draws * np.where(self._human_mask, scale, 0.0)).tolist()[::-1]
         return self._noise_rows.pop()
 
-    def _make_log(self) -> closed_road.ClosedRoadLog:
+    def _make_log(self) -> ordered_road.OrderedRoadLog:
         fuel = np.array(self._fuel) if self.options.record_details else np.zeros((0, 0))
         rate = self._penetration_rate
         return self._recorder.make_log(has_crashed=self.has_crashed, fuel=fuel, penetration_rate=rate)
@@ -221,8 +221,38 @@ class ClosedTraffic(Traffic[ClosedRoad]):
         """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
         return self._recorder.last_applied_acceleration()
 
+    @property
+    def speeds(self) -> list[float]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Speeds of all vehicles with a driver [m/s]."""
+        return self._speeds[: self.road.driven_count]
+
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""
         self._simulation.check()
         positions = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
-        return closed_road.loop_scene(self.road, positions, self.speeds)
+        return ordered_road.ordered_scene(self.road, positions, self._speeds)
+
+
+class RecordedTraffic(OrderedTraffic):
+    """The SUMO environment of a recorded road, whose first vehicle replays a recording."""
+
+    def _prepare(self) -> None:
+        *_, self._replayed_id = self.road.vehicle_ids
+        self._upcoming_speeds = np.asarray(self.road.replayed_speeds)[:0:-1].tolist()
+        # Not as they enter: SUMO inserts no vehicle above its desired speed.
+        ids = self.road.vehicle_ids
+        self._simulation.replace_speeds(ids, [self.road.start_speed] * len(ids))
+        self._simulation.replay(self._replayed_id, self.scenario.top_speed)
+        super()._prepare()
+
+    def _set_human_vehicles(self, ids: Sequence[str]) -> None:
+        super()._set_human_vehicles([name for name in ids if name != self._replayed_id])
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the recording or the horizon has ended, or the episode has ended early."""
+        return super().has_ended or len(self._upcoming_speeds) < self.scenario.steps_per_control_step
+
+    def _simulate(self) -> None:
+        self._simulation.command_speeds([self._replayed_id], [self._upcoming_speeds.pop()])
+        super()._simulate()

@@ -1,16 +1,17 @@
-"""Closed roads with one lane: neighbors, the log of an episode, and the record made from it."""
+"""Roads with one lane and always the same vehicles: neighbors, the log of an episode, and the record made from it."""
 
 from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from math import inf, nan
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import LocalState, observe_neighbor
 from unjam.physics.kinematics import gap_on_loop, next_position
-from unjam.scenarios.road import ClosedRoad
+from unjam.scenarios.road import OrderedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.audit import OVERRIDE_TOLERANCE, Audit, braking_statistics, following_statistics
 from unjam.worlds.record import Episode, Floats, Trajectory, make_trajectory
@@ -46,11 +47,11 @@ def loop_state(
     crossings: tuple[tuple[float, float], ...] = (),
     penetration_rate: float | None = None,
 ) -> LocalState:
-    """Return the local state of the vehicles `neighbors.own` on a closed road; floats for integer indices.
+    """Return the local state of the vehicles `neighbors.own`; floats for integer indices.
 
     Speeds [m/s] and positions of front bumpers, not wrapped [m], are in road order: arrays of shape (vehicles,) or
-    (vehicles, moments), or lists. `crossings` are ranges where the road crosses itself [m]. `penetration_rate` is
-    that reported by a service; None: there is no such service.
+    (vehicles, moments), or lists. An infinite `loop_length` [m] is that of a road with ends. `crossings` are ranges
+    where the road crosses itself [m]. `penetration_rate` is that reported by a service; None: there is no such service.
     """
     own, leader, follower = neighbors
     speed, position = speeds[own], positions[own]
@@ -63,13 +64,22 @@ def loop_state(
         position % loop_length,
         loop_length if type(position) is float else np.full(position.shape, loop_length),
     )
+    if loop_length == inf:
+        state = without_loop(state)
     if penetration_rate is not None:
-        state = state._replace(penetration_rate=state.loop_length * 0.0 + penetration_rate)
+        state = state._replace(penetration_rate=speed * 0.0 + penetration_rate)
     if not crossings:
         return state
     distances = [(start - position) % loop_length for start, _ in crossings]
     nearest = min(distances) if type(position) is float else np.minimum.reduce(distances)
     return state._replace(distance_to_crossing=nearest)
+
+
+def without_loop(state: LocalState) -> LocalState:
+    """Return a state on a road with ends that was computed on an infinite loop."""
+    speed, gap = state.speed, state.follower_gap
+    follower = observe_neighbor(gap < inf, gap, state.follower_speed, speed)
+    return state._replace(follower_speed=follower[0], follower_gap=follower[1], loop_length=speed * nan)
 
 
 def poses_along(outline: Floats, positions: Floats, loop_length: float) -> Floats:
@@ -86,11 +96,11 @@ def poses_along(outline: Floats, positions: Floats, loop_length: float) -> Float
 
 
 @dataclass(frozen=True)
-class ClosedRoadLog:
-    """Log of a closed road: D control steps of S simulation steps in all, N vehicles, C of them CAVs."""
+class OrderedRoadLog:
+    """Log of a road: D control steps of S simulation steps in all, N vehicles, C of them CAVs."""
 
     scenario: Scenario
-    road: ClosedRoad
+    road: OrderedRoad
     start_positions: Floats
     """front bumpers at the start of the log, not wrapped [m], shape (N,)"""
     noise_free_speeds: Floats
@@ -141,7 +151,7 @@ class ClosedRoadLog:
         speeds, positions = (values[:, ::stride] for values in speeds_and_positions)
         control_steps = speeds.shape[1] - 1
         gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
-        states = self._local_states(speeds, positions)
+        states, driven = self._local_states(speeds, positions), road.driven_count
         applied, filter_braking = self._applied_and_filtered()
         shield_braking = self._added_braking().reshape(control_steps, -1, len(road.cav_ids)).max(1).clip(0.0, None)
         trajectories = list[Trajectory]()
@@ -154,13 +164,14 @@ class ClosedRoadLog:
             trajectories.append(make_trajectory(*trip, *commands, terminated=self.has_crashed, driver_log=driver_log))
         return Episode(
             **common_fields,
-            vehicle_ids=road.vehicle_ids,
+            vehicle_ids=road.vehicle_ids[:driven],
             cav_ids=road.cav_ids,
-            speeds=np.ascontiguousarray(speeds.T),
-            positions=np.ascontiguousarray(positions.T),
-            gaps=np.ascontiguousarray(gaps.T),
-            fuel=self.fuel,
-            loop_length=road.loop_length,
+            speeds=np.ascontiguousarray(speeds[:driven].T),
+            positions=np.ascontiguousarray(positions[:driven].T),
+            gaps=np.ascontiguousarray(gaps[:driven].T),
+            fuel=self.fuel[:, :driven],
+            replayed_motion=np.stack([positions[driven:].T, speeds[driven:].T], -1),
+            loop_length=nan if road.loop_length == inf else road.loop_length,
             crossings=road.crossings,
             outline=road.center_line,
             trajectories=tuple(trajectories),
@@ -172,7 +183,8 @@ class ClosedRoadLog:
         step, time_gap = self.scenario.simulation_step, self.scenario.safety.time_gap
         states = self._local_states(speeds, positions).map(lambda values: values.T)
         followed = states.speed, states.leader_speed, states.leader_gap
-        accelerations, is_cav = np.diff(speeds, axis=1) / step, np.zeros(len(speeds), bool)
+        accelerations = np.diff(speeds[: self.road.driven_count], axis=1) / step
+        is_cav = np.zeros(len(accelerations), bool)
         is_cav[self.cav_indices] = len(self.requested_accelerations) > 0
         near_crossing = np.zeros(1, bool)
         for start, end in self.road.crossings:
@@ -210,22 +222,22 @@ class ClosedRoadLog:
         return (commanded - moved) / self.scenario.simulation_step
 
 
-class ClosedRoadRecorder:
-    """Collects the rows of a `ClosedRoadLog` while an episode runs; `series` has them by name, one after the other."""
+class OrderedRoadRecorder:
+    """Collects the rows of a `OrderedRoadLog` while an episode runs; `series` has them by name, one after the other."""
 
-    def __init__(self, scenario: Scenario, road: ClosedRoad, start_positions: Floats, speeds: Iterable[float]) -> None:
+    def __init__(self, scenario: Scenario, road: OrderedRoad, start_positions: Floats, speeds: Iterable[float]) -> None:
         """Start with the positions of front bumpers, not wrapped [m], and the speeds [m/s] of all vehicles."""
         self._arguments = scenario, road, start_positions
         names = "noise_free_speeds", "requested_accelerations", "safe_accelerations", "commanded_speeds"
         self.series = {name: array("d") for name in names} | {"speeds": array("d", speeds)}
 
-    def make_log(self, **fields: Any) -> ClosedRoadLog:
+    def make_log(self, **fields: Any) -> OrderedRoadLog:
         """Return the log so far, with other `fields`."""
         _, road, _ = self._arguments
         widths: dict[str, int] = dict.fromkeys(("noise_free_speeds", "speeds"), len(road.vehicle_ids))
         for name, values in self.series.items():
             fields[name] = np.array(values).reshape(-1, widths.get(name, len(road.cav_ids)))
-        return ClosedRoadLog(*self._arguments, **fields)
+        return OrderedRoadLog(*self._arguments, **fields)
 
     def last_applied_acceleration(self) -> Floats:
         """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
@@ -234,7 +246,12 @@ class ClosedRoadRecorder:
         return np.array(self.series["safe_accelerations"][-count:]).reshape(-1, len(road.cav_ids)).mean(0)
 
 
-def loop_scene(road: ClosedRoad, positions: Floats, speeds: Any) -> RoadScene:
+def ordered_scene(road: OrderedRoad, positions: Floats, speeds: Any) -> RoadScene:
     """Return a picture of all vehicles with positions along the road, not wrapped [m], and speeds [m/s]."""
-    poses, is_cav = poses_along(road.center_line, positions, road.loop_length), np.isin(road.vehicle_ids, road.cav_ids)
-    return RoadScene(road.center_line[:, 1:], poses, np.array(speeds), is_cav)
+    is_cav = np.isin(road.vehicle_ids, road.cav_ids)
+    if len(road.center_line):
+        poses, line = poses_along(road.center_line, positions, road.loop_length), road.center_line[:, 1:]
+    else:  # straight
+        poses = np.stack([positions, 0.0 * positions, 0.0 * positions], -1)
+        line = np.array([[positions[0] - VEHICLE_LENGTH, 0.0], [positions[-1], 0.0]])
+    return RoadScene(line, poses, np.array(speeds), is_cav)

@@ -1,0 +1,77 @@
+"""Metrics of fuel by power, of the gaps of CAVs, and of a platoon behind a recorded vehicle."""
+
+from math import nan
+from typing import Any
+
+import numpy as np
+
+from unjam.measures.averages import mean_over_cavs, per_kilometer
+from unjam.physics.fuel import fuel_rate
+from unjam.worlds.record import Episode
+from unjam.worlds.reward import MAX_REWARD_CELLS
+
+
+def fuel_by_power(episode: Episode) -> float:
+    """Fuel of all vehicles by the power that a mid-size petrol car needs [ml/km], with 0.9 l/h at standstill.
+
+    Treiber and Kesting 2013, Traffic Flow Dynamics, section 20.4.
+    """
+    return _fuel_by_power(episode, np.s_[:])
+
+
+def cav_fuel_by_power(episode: Episode) -> float:
+    """Fuel of the CAVs by power [ml/km], as `fuel_by_power`; NaN without CAVs."""
+    return _fuel_by_power(episode, episode.cav_columns)
+
+
+def human_fuel_by_power(episode: Episode) -> float:
+    """Fuel of the human drivers by power [ml/km], as `fuel_by_power`; NaN without any."""
+    return _fuel_by_power(episode, np.setdiff1d(np.arange(episode.speeds.shape[1]), episode.cav_columns))
+
+
+def _fuel_by_power(episode: Episode, columns: Any) -> float:
+    """Return the fuel of the vehicles in some columns; acceleration is the change of speed in a control step."""
+    speeds, fuel, rows = episode.speeds[:, columns], 0.0, max(1, MAX_REWARD_CELLS // max(1, episode.speeds.shape[1]))
+    for start in range(0, len(speeds) - 1, rows):
+        part = speeds[start : start + rows + 1]
+        fuel += float(np.nansum(fuel_rate(part[1:], np.diff(part, axis=0) / episode.control_step)))
+    return per_kilometer(episode, fuel, speeds)
+
+
+def cav_mean_gap(episode: Episode) -> float:
+    """Mean gap of the CAV to its leader [m]; in front of a free road the gap is limited to what CAVs observe."""
+    return mean_over_cavs(episode, lambda trajectory: np.mean(trajectory.states.leader_gap[1:]))
+
+
+def cav_gap_95(episode: Episode) -> float:
+    """Gap of the CAV to its leader that it exceeds in 5 % of the time [m]."""
+    return mean_over_cavs(episode, lambda trajectory: np.quantile(trajectory.states.leader_gap[1:], 0.95))
+
+
+def cav_max_gap(episode: Episode) -> float:
+    """Largest gap of a CAV to its leader [m]; NaN without CAVs."""
+    return float(max((trajectory.states.leader_gap.max() for trajectory in episode.trajectories), default=np.nan))
+
+
+def time_behind_leader(episode: Episode) -> float:
+    """Time by which the last vehicle is behind the recorded one at the end [s]; NaN on other roads.
+
+    What it is longer than with human drivers is time that the platoon has lost.
+    """
+    if not episode.has_recorded_leader:
+        return nan
+    passed = float(
+        np.interp(episode.positions[-1, 0], episode.replayed_motion[:, 0, 0], np.arange(len(episode.speeds)))
+    )
+    return (episode.control_steps - passed) * episode.control_step
+
+
+def amplification(episode: Episode) -> float:
+    """Standard deviation over time of the last vehicle's speed over that of the recorded vehicle; NaN elsewhere.
+
+    Above 1 the platoon amplifies the waves of the vehicle ahead, below 1 it dampens them.
+    """
+    if not episode.has_recorded_leader:
+        return nan
+    spread = float(np.std(episode.replayed_motion[1:, 0, 1]))
+    return float(np.std(episode.speeds[1:, 0])) / spread if spread else nan

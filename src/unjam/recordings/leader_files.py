@@ -1,0 +1,63 @@
+"""Read the speeds of recorded vehicles: plain tables of speeds, drives on I-24, and the leaders of trajectories."""
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from unjam.errors import InputError
+from unjam.recordings.leaders import LeaderRecording
+from unjam.recordings.loaders import ReadOptions, split_trajectories, to_numeric, trajectories_of_table
+from unjam.recordings.tables import read_table
+from unjam.sumo_files import file_stamp
+
+SPEED_UNITS = {"speed": 1.0, "speed_kmh": 1.0 / 3.6, "speed_mph": 0.44704}
+"""columns of a table of speeds, one of them, and their unit in m/s"""
+I24_COLUMNS = ("Time", "Velocity", "SpaceGap", "DrivingDir")
+"""columns by which drives of the CIRCLES experiment on I-24 are recognized; their speeds are in km/h"""
+MIN_SECONDS = 20.0
+"""shortest recording [s]"""
+MAX_ACCELERATION = 8.0
+"""acceleration that a vehicle may exceed in one of a thousand samples [m/s2]: in km/h, a jam would exceed it"""
+RARE_SHARE = 1e-3
+
+
+def read_leaders(path: Path) -> list[LeaderRecording]:
+    """Return the recordings in a file, which is read once: of tables with leaders, those of the leaders.
+
+    Raises:
+        InputError: the file is missing, has no speeds or implausible ones, or a row is bad.
+    """
+    return list(_read_leaders(path, file_stamp(path)))
+
+
+@lru_cache(64)
+def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, ...]:
+    frame, options = read_table(path), ReadOptions(min_seconds=MIN_SECONDS)
+    names = set(map(str, frame.columns))
+    if names.issuperset(I24_COLUMNS):
+        frame = pd.DataFrame({"line": frame["line"], "time": frame["Time"], "speed_kmh": frame["Velocity"]})
+        names = set(frame.columns)
+    frame = frame.rename(columns={name: "time" for name in ("t", "Time") if "time" not in names and name in names})
+    column = next((name for name in SPEED_UNITS if name in names), "")
+    if column and "time" in frame and "leader_speed" not in names:
+        read = split_trajectories(_follower_table(frame, column, path.stem), path, options)
+    else:
+        read = trajectories_of_table(frame, path, options)
+    found = tuple(LeaderRecording(each.name, each.time_step, each.leader_speed) for each in read.trajectories)
+    for each in found:
+        changes = np.abs(np.diff(each.speed)) / each.time_step
+        if float(np.mean(changes > MAX_ACCELERATION)) > RARE_SHARE:
+            raise InputError(
+                f"{path.name}: accelerations of {each.name} beyond {MAX_ACCELERATION:g} m/s2 are not allowed; are its "
+                f"speeds in m/s? other units have columns of their own: {', '.join(list(SPEED_UNITS)[1:])}"
+            )
+    return found
+
+
+def _follower_table(frame: pd.DataFrame, column: str, pair: str) -> pd.DataFrame:
+    """Return a table of speeds as one of trajectories, whose leader is the recorded vehicle."""
+    table = to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])
+    speed = table[column] * SPEED_UNITS[column]
+    return table.assign(pair=pair, speed=speed, leader_speed=speed, gap=0.0)

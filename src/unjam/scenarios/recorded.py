@@ -1,0 +1,208 @@
+"""The recorded road: a platoon on one lane behind a vehicle that drives as a real one was recorded.
+
+Source of the idea: Lichtlé et al. 2022, Deploying traffic smoothing cruise controllers learned from trajectory data,
+ICRA, whose drives on I-24 are the usual recordings.
+"""
+
+import re
+from dataclasses import field, replace
+from functools import cached_property
+from math import ceil
+from pathlib import Path
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from unjam.drivers.command import Limits
+from unjam.drivers.safety import Actuator
+from unjam.errors import InputError
+from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, parameter_dataclass
+from unjam.physics.arrays import Floats
+from unjam.physics.idm import IDMParameters, equilibrium_gap
+from unjam.recordings.leaders import LeaderRecording, recording_files
+from unjam.scenarios.road import Edge, Entry, Node, RecordedRoad, RoadNetwork, Route
+from unjam.scenarios.scenario import MAX_HORIZON, VEHICLE_LENGTH, Scenario
+
+LEADER_ID = "leader"
+EDGE_NAME = "road"
+MAX_RECORDED_SPEED = 70.0
+"""[m/s]"""
+ROAD_LENGTH_STEP = 5000.0
+"""lengths of roads are multiples of it, so that few networks are made [m]"""
+MAX_FREE_SPEED_SHARE = 0.95
+"""share of the desired speed up to which vehicles start with the gap of steady driving"""
+MAX_VEHICLES = 1000
+ARTIFICIAL_SECONDS = 600.0
+ARTIFICIAL_STEP = 0.1
+ARTIFICIAL_SPEEDS, ARTIFICIAL_PERIODS = (6.0, 20.0), (40.0, 200.0)
+"""ranges of the mean speed [m/s] and of the periods [s] of artificial waves"""
+
+
+@parameter_dataclass(frozen=True, config=STRICT)
+class Recorded(Scenario):
+    """A platoon on one lane behind a vehicle that repeats recorded speeds; each episode draws a recording.
+
+    The recorded vehicle does not react, nobody changes lanes, and nobody cuts in. All vehicles start with its speed
+    and the gaps of steady driving. Without recordings, it drives through artificial waves.
+    """
+
+    title: ClassVar[str] = "recorded"
+    reward: ClassVar[str] = "smooth-following"
+    is_closed: ClassVar[bool] = False
+    size_parameter: ClassVar[str] = "recordings"
+    """the parameter in which the roads of a batch may differ"""
+
+    recordings: str = ""
+    """a file with speeds, or a folder of them, see `unjam.recordings.leader_files`; empty: artificial waves"""
+    platoon: str = "cav human*5"
+    """vehicles behind the recorded one, from front to back, like `human*2 cav human*20`"""
+    begin: NonNegative = 0.0
+    """time in the recording at which an episode begins [s]"""
+    window: NonNegative = 0.0
+    """duration of the random part of a recording that each episode has [s]; 0: all of it"""
+    horizon: Annotated[PositiveInt, Field(le=MAX_HORIZON)] = 20_000
+    """most control steps in an episode, which ends with its recording"""
+    action_limit: Positive = 3.0
+    """hardest braking that a CAV can command [m/s2]"""
+    max_acceleration: Positive = 1.5
+    """largest acceleration that a CAV can command [m/s2]"""
+    actuator: Actuator = field(default_factory=lambda: Actuator(delay=0.2, lag=0.3))
+    humans: IDMParameters = field(
+        default_factory=lambda: IDMParameters(
+            desired_speed=45.0, max_acceleration=1.3, comfortable_deceleration=2.0, time_headway=1.0
+        )
+    )
+    """as in the source of this road"""
+    noise: NonNegative = 0.3
+
+    @model_validator(mode="after")
+    def _check_settings(self) -> Self:
+        kinds = self.vehicle_kinds
+        if self.warmup:
+            raise ValueError(f"warmup: {self.warmup} is not allowed on a recorded road; allowed: 0")
+        if "cav" not in kinds or len(kinds) > MAX_VEHICLES:
+            raise ValueError(
+                f"platoon: {self.platoon!r} is not allowed; allowed: a CAV, and <= {MAX_VEHICLES} vehicles"
+            )
+        try:
+            _ = self.user_files
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @cached_property
+    def vehicle_kinds(self) -> tuple[str, ...]:
+        """`cav` or `human` for each vehicle behind the recorded one, from front to back."""
+        kinds = list[str]()
+        for word in self.platoon.split():
+            match = re.fullmatch(r"(cav|human)(?:\*([1-9]\d{0,3}))?", word)
+            if match is None:
+                raise ValueError(f"platoon: {word!r} is not allowed; allowed: cav, human, cav*2, human*5, ...")
+            kinds += [match[1]] * int(match[2] or 1)
+        return tuple(kinds)
+
+    @property
+    def acceleration_limits(self) -> Limits:
+        """Accelerations that a CAV can command."""
+        return Limits(-self.action_limit, self.max_acceleration)
+
+    @property
+    def user_files(self) -> list[Path]:
+        """The recordings, and the file of calibrated drivers."""
+        return [*(recording_files(Path(self.recordings)) if self.recordings else []), *super().user_files]
+
+    @property
+    def top_speed(self) -> float:
+        """Speed limit of the road [m/s]: above all recorded speeds and desired speeds."""
+        return max(MAX_RECORDED_SPEED, super().top_speed)
+
+    @property
+    def provided_fields(self) -> tuple[str, ...]:
+        """Optional fields of a `LocalState` that this road provides."""
+        return ("penetration_rate",)
+
+    @property
+    def notes(self) -> list[str]:
+        """What a replay cannot know."""
+        made = [] if self.recordings else ["artificial waves, no recording: name one with --set recordings=FILE"]
+        return [*made, "the recorded vehicle does not react, and nobody changes lanes or cuts in"]
+
+    def stratum(self, index: int, count: int) -> Self:
+        """Return this road with the recordings of one of `count` equal parts, if there are as many files."""
+        if not self.recordings or len(files := recording_files(Path(self.recordings))) < count:
+            return self
+        return replace(self, recordings=str(files[index * len(files) // count]))
+
+    def draw(self, generator: np.random.Generator) -> RecordedRoad:
+        """Return the road with the speeds of a random recording, or of a random part of it."""
+        number, recording = self._draw_recording(generator)
+        room = recording.seconds - self.begin
+        if room < self.control_step:
+            raise InputError(
+                f"begin: {self.begin:g} s is not allowed; allowed: < {recording.seconds:g} s, the duration of "
+                f"{recording.name}"
+            )
+        start, seconds = self.begin, min(room, self.horizon * self.control_step)
+        if self.window and self.window < room:
+            start += float(generator.uniform(0.0, room - self.window))
+            seconds = min(self.window, seconds)
+        speeds = recording.speeds_at(start, seconds, self.simulation_step)
+        return self.build(speeds, {"recording": float(number), "begin": start}, generator)
+
+    def build(self, speeds: Floats, drawn_values: dict[str, float], generator: np.random.Generator) -> RecordedRoad:
+        """Return the road behind a vehicle with given speeds in all simulation steps [m/s], shape (S + 1,)."""
+        ids = (LEADER_ID, *(f"{kind}_{number}" for number, kind in enumerate(self.vehicle_kinds)))[::-1]
+        people, speed = self.draw_humans(ids, generator), float(speeds[0])
+        spaces = [VEHICLE_LENGTH + self._start_gap(speed, people.get(name, self.humans)) for name in ids[:-1]]
+        positions = VEHICLE_LENGTH + np.concatenate([[0.0], np.cumsum(spaces)])
+        distance = float(positions[-1] + speeds.sum() * self.simulation_step)
+        length = ROAD_LENGTH_STEP * ceil(distance / ROAD_LENGTH_STEP + 0.5)
+        nodes = Node("begin", 0.0, 0.0), Node("end", length, 0.0)
+        return RecordedRoad(
+            network=RoadNetwork(nodes, (Edge(EDGE_NAME, "begin", "end", length),), self.top_speed),
+            routes=(Route(EDGE_NAME, (EDGE_NAME,)),),
+            entries=tuple(Entry(name, EDGE_NAME, at) for name, at in zip(ids, positions.tolist(), strict=True)),
+            has_entry_checks=False,
+            vehicle_ids=ids,
+            cav_ids=tuple(name for name in ids if name.startswith("cav")),
+            start_positions=positions,
+            replayed_speeds=speeds,
+            limit_speed=float(speeds[1:].mean()),
+            drawn_values=drawn_values,
+            human_parameters=people,
+        )
+
+    def possible_cav_ids(self) -> tuple[str, ...]:
+        """Return the ids of the CAVs, in their order along the road."""
+        names = (f"{kind}_{number}" for number, kind in enumerate(self.vehicle_kinds))
+        return tuple(name for name in names if name.startswith("cav"))[::-1]
+
+    def _draw_recording(self, generator: np.random.Generator) -> tuple[int, LeaderRecording]:
+        """Return a random recording and the number of its file; all files are equally likely."""
+        if not self.recordings:
+            return 0, artificial_waves(generator)
+        from unjam.recordings.leader_files import read_leaders  # pandas takes half a second
+
+        files = recording_files(Path(self.recordings))
+        number = int(generator.integers(len(files)))
+        found = read_leaders(files[number])
+        return number, found[int(generator.integers(len(found)))]
+
+    def _start_gap(self, speed: float, human: IDMParameters) -> float:
+        return equilibrium_gap(min(speed, MAX_FREE_SPEED_SHARE * human.desired_speed), human)
+
+    def _fact_values(self) -> tuple[str, str, str, str]:
+        source = f"recordings of {self.recordings}" if self.recordings else "artificial waves"
+        cavs = sum(kind == "cav" for kind in self.vehicle_kinds)
+        road = f"one lane behind a vehicle with the speeds of {source}"
+        return road, f"{len(self.vehicle_kinds)} ({cavs} CAV)", "that vehicle's", "the mean speed of that vehicle"
+
+
+def artificial_waves(generator: np.random.Generator) -> LeaderRecording:
+    """Return the speeds of a vehicle in stop-and-go waves: three sinusoids of random periods around a random mean."""
+    times = ARTIFICIAL_STEP * np.arange(round(ARTIFICIAL_SECONDS / ARTIFICIAL_STEP) + 1)
+    mean, periods = generator.uniform(*ARTIFICIAL_SPEEDS), generator.uniform(*ARTIFICIAL_PERIODS, 3)
+    phases = generator.uniform(0.0, 2.0 * np.pi, 3)
+    waves = np.sin(2.0 * np.pi * times[:, None] / periods + phases) * generator.uniform(0.1, 0.5, 3) * mean
+    return LeaderRecording("artificial waves", ARTIFICIAL_STEP, np.maximum(mean + waves.sum(1), 0.0))

@@ -1,0 +1,74 @@
+"""W recorded roads as one world: platoons behind vehicles that replay recordings, stepped as arrays."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from unjam.drivers.local_state import LocalState
+from unjam.physics.arrays import Array, namespace
+from unjam.scenarios.scenario import Scenario
+from unjam.worlds.batch.human_idm import CONTACT_GAP, Leader, human_idm_speed, slow_to_desired_speed
+from unjam.worlds.batch.noise import ArrayFactory
+from unjam.worlds.batch.ring.world import RingBatch
+from unjam.worlds.ordered_road import without_loop
+
+
+class RecordedBatch(RingBatch):
+    """W recorded roads of one platoon, each with its own seed and recording; they equal SUMO's except for rounding.
+
+    A road whose recording has ended is still simulated, behind a vehicle of constant speed, but no longer counted.
+    """
+
+    def __init__(
+        self,
+        scenarios: Sequence[Scenario],
+        seeds: Sequence[Sequence[int]],
+        to_array: ArrayFactory = np.asarray,
+        **options: Any,
+    ) -> None:
+        """Put the vehicles on the roads; arguments as of `RingBatch`."""
+        super().__init__(scenarios, seeds, to_array, **options)
+        recorded = [np.asarray(road.replayed_speeds) for road in self.roads]
+        longest = max(map(len, recorded))
+        padded = [np.pad(speeds, (0, longest - len(speeds)), "edge") for speeds in recorded]
+        self._replayed_speeds, self._next_sample = to_array(np.stack(padded, 1)), 1
+        counts = [(len(speeds) - 1) // scenarios[0].steps_per_control_step for speeds in recorded]
+        self._ends = to_array(np.minimum(counts, scenarios[0].horizon).astype(np.float64))
+        self._road_ends = to_array(np.array([road.network.edges[0].length for road in self.roads]))
+        self._noise_scale[-1] = 0.0
+        self._find_contacts = platoon_contacts
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether all recordings, or the horizon, have ended."""
+        return self.control_steps >= float(self._ends.max())
+
+    def exact_state(self) -> LocalState:
+        """Return the exact local state of the CAVs now."""
+        return without_loop(super().exact_state())
+
+    def advance(self, command: Any) -> None:
+        """Simulate one control step with the same command throughout; None: the CAVs stay human."""
+        super().advance(command)
+        self._is_running = self._is_running * (self.control_steps < self._ends)
+
+    def _human_speeds(self, speed: Array, leader: Leader) -> Array:
+        if self._human_model is not None:
+            return self._human_model(speed, *leader)
+        parameters, step = self._human_parameters, self.scenario.simulation_step
+        new_speed = human_idm_speed(speed, *leader, parameters, step)
+        return slow_to_desired_speed(new_speed, speed, self._road_ends - self._position, parameters, step)
+
+    def _next_speeds(self, speed: Array, leader: Leader, cav_speeds: Array | None) -> tuple[Array, Array]:
+        moved, speeds = super()._next_speeds(speed, leader, cav_speeds)
+        replayed = self._replayed_speeds[self._next_sample : self._next_sample + 1]
+        self._next_sample = min(self._next_sample + 1, len(self._replayed_speeds) - 1)
+        xp = namespace(replayed)
+        moved, speeds = (xp.concatenate([each[:-1], replayed]) for each in (moved, speeds))
+        return moved, speeds
+
+
+def platoon_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
+    """Return which vehicles touch the vehicle ahead; shapes as of `ring_contacts`."""
+    return gap < CONTACT_GAP

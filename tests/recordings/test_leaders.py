@@ -1,0 +1,84 @@
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.recordings.synthetic_trajectories import idm_driver, write_table
+from unjam.errors import InputError
+from unjam.physics.idm import IDMParameters
+from unjam.recordings.leader_files import read_leaders
+from unjam.recordings.leaders import recording_files
+
+TIMES = 0.1 * np.arange(600)
+SPEEDS = 15.0 + 5.0 * np.sin(TIMES / 8.0)
+
+
+def write(path: Path, **columns: object) -> Path:
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize(("column", "unit"), [("speed", 1.0), ("speed_kmh", 3.6), ("speed_mph", 1.0 / 0.44704)])
+def test_a_table_of_speeds_names_its_unit(tmp_path: Path, column: str, unit: float) -> None:
+    (found,) = read_leaders(write(tmp_path / "drive.csv", time=TIMES, **{column: unit * SPEEDS}))
+    assert found.name == "drive"
+    assert found.time_step == pytest.approx(0.1)
+    np.testing.assert_allclose(found.speed, SPEEDS, atol=1e-9)
+
+
+def test_drives_on_i24_are_in_kilometers_per_hour(tmp_path: Path) -> None:
+    path = tmp_path / "2021-03-08.csv"
+    times = 1615244286.2 + TIMES
+    write(path, Time=times, Velocity=3.6 * SPEEDS, SpaceGap=30.0, DrivingDir="West")
+    (found,) = read_leaders(path)
+    np.testing.assert_allclose(found.speed, SPEEDS, atol=1e-5)
+
+
+def test_of_trajectories_the_leaders_are_replayed(tmp_path: Path) -> None:
+    write_table(path := tmp_path / "pairs.csv", [{}])
+    (found,) = read_leaders(path)
+    expected = idm_driver(IDMParameters(time_headway=0.9), seconds=20.0).leader_speed
+    np.testing.assert_allclose(found.speed, expected, atol=1e-6)
+
+
+def test_speeds_in_another_unit_are_refused_by_their_accelerations(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="are its speeds in m/s"):
+        read_leaders(write(tmp_path / "drive.csv", time=TIMES, speed=25.0 + 25.0 * np.sin(TIMES)))
+
+
+def test_a_missing_second_ends_a_recording(tmp_path: Path) -> None:
+    times = np.where(TIMES < 30.0, TIMES, TIMES + 5.0)
+    names = [each.name for each in read_leaders(write(tmp_path / "drive.csv", time=times, speed=SPEEDS))]
+    assert names == ["drive", "drive/2"]
+
+
+def test_other_steps_are_interpolated(tmp_path: Path) -> None:
+    (found,) = read_leaders(write(tmp_path / "drive.csv", time=TIMES, speed=SPEEDS))
+    speeds = found.speeds_at(2.0, 10.0, 0.25)
+    assert len(speeds) == 41
+    np.testing.assert_allclose(speeds, np.interp(2.0 + 0.25 * np.arange(41), TIMES, SPEEDS))
+
+
+@pytest.mark.parametrize(
+    ("columns", "reason"),
+    [
+        ({"time": TIMES, "pace": SPEEDS}, "no column 'pair'"),
+        ({"time": TIMES, "speed": np.where(TIMES == 3.0, np.nan, SPEEDS)}, "line 32: speed: nan is not allowed"),
+        ({"time": TIMES[:50], "speed": SPEEDS[:50]}, "no trajectory lasts 20 s"),
+    ],
+)
+def test_other_files_are_refused_in_one_line(tmp_path: Path, columns: dict[str, object], reason: str) -> None:
+    with pytest.raises(InputError, match=reason) as caught:
+        read_leaders(write(tmp_path / "drive.csv", **columns))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_has_files_with_known_suffixes(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"recordings: .* allowed: a folder with files that end in \.csv"):
+        recording_files(tmp_path)
+    for name in ("b.csv", "a.csv", "notes.md"):
+        (tmp_path / name).touch()
+    assert [path.name for path in recording_files(tmp_path)] == ["a.csv", "b.csv"]
+    with pytest.raises(InputError, match="recordings"):
+        recording_files(tmp_path / "missing.csv")

@@ -1,0 +1,88 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from unjam.errors import InputError
+from unjam.physics.idm import idm_acceleration
+from unjam.scenarios import Recorded, make_scenario, scenario_from_recipe, scenario_recipe
+
+TIMES = 0.1 * np.arange(900)
+
+
+def write_drive(path: Path, mean: float = 15.0) -> Path:
+    pd.DataFrame({"time": TIMES, "speed": mean + 0.3 * mean * np.sin(TIMES / 8.0)}).to_csv(path, index=False)
+    return path
+
+
+def test_a_platoon_is_written_from_front_to_back() -> None:
+    road = Recorded(platoon="human*2 cav human").draw(np.random.default_rng(0))
+    assert road.vehicle_ids == ("human_3", "cav_2", "human_1", "human_0", "leader")
+    assert road.cav_ids == ("cav_2",)
+    assert road.driven_count == 4
+    assert Recorded(platoon="cav human cav").possible_cav_ids() == ("cav_2", "cav_0")
+
+
+@pytest.mark.parametrize(
+    "platoon", ["human*5", "", "cav*0", "cav human*5000", "cav, human", "truck cav", "cav*-1", "cav**2"]
+)
+def test_other_platoons_are_refused(platoon: str) -> None:
+    with pytest.raises(InputError, match="platoon"):
+        make_scenario("recorded", {"platoon": platoon})
+
+
+def test_everybody_starts_in_equilibrium_behind_the_recorded_vehicle() -> None:
+    scenario = Recorded()
+    road = scenario.draw(np.random.default_rng(3))
+    gaps, speed = np.diff(road.start_positions) - 5.0, road.start_speed
+    np.testing.assert_allclose(idm_acceleration(speed, speed, gaps, scenario.humans), 0.0, atol=1e-9)
+
+
+def test_an_episode_has_a_random_part_of_a_random_recording(tmp_path: Path) -> None:
+    for number, mean in enumerate((10.0, 20.0)):
+        write_drive(tmp_path / f"{number}.csv", mean)
+    scenario = Recorded(recordings=str(tmp_path), window=30.0)
+    roads = [scenario.draw(np.random.default_rng(seed)) for seed in range(40)]
+    assert {road.drawn_values["recording"] for road in roads} == {0.0, 1.0}
+    starts = [road.drawn_values["begin"] for road in roads]
+    assert 0.0 <= min(starts) < 10.0 < 45.0 < max(starts) <= 60.0
+    assert all(len(road.replayed_speeds) == 301 for road in roads)
+
+
+def test_parts_of_the_recordings_are_strata(tmp_path: Path) -> None:
+    for number in range(4):
+        write_drive(tmp_path / f"{number}.csv")
+    parts = [Recorded(recordings=str(tmp_path)).stratum(index, 4) for index in range(4)]
+    assert [Path(part.recordings).name for part in parts] == ["0.csv", "1.csv", "2.csv", "3.csv"]
+
+
+def test_a_begin_after_the_end_is_refused(tmp_path: Path) -> None:
+    scenario = Recorded(recordings=str(write_drive(tmp_path / "a.csv")), begin=90.0)
+    with pytest.raises(InputError, match=r"begin: 90 s is not allowed; allowed: < 89.9 s"):
+        scenario.draw(np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [({"recordings": "missing.csv"}, "recordings: 'missing.csv'"), ({"warmup": 10}, "warmup: 10 is not allowed")],
+)
+def test_settings_without_a_meaning_are_refused(changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        make_scenario("recorded", changes)
+
+
+def test_a_recipe_makes_the_same_scenario(tmp_path: Path) -> None:
+    scenario = replace(Recorded(recordings=str(write_drive(tmp_path / "a.csv"))), platoon="human cav")
+    assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
+    assert scenario.user_files == [tmp_path / "a.csv"]
+
+
+def test_the_network_is_long_enough_and_shared() -> None:
+    roads = [Recorded().draw(np.random.default_rng(seed)) for seed in range(10)]
+    for road in roads:
+        (edge,) = road.network.edges
+        assert edge.length > road.start_positions[-1] + 0.1 * road.replayed_speeds.sum() + 1000.0
+    assert len({road.network for road in roads}) < 5
