@@ -61,15 +61,15 @@ def plan_speeds(leader_speeds: Sequence[Floats], start_gaps: Sequence[float], st
     numbers = torch.arange(len(knots))[:, None]
     is_free = (numbers > 0) & (numbers < ends)
     weights = _interpolation(longest, knot_steps)
-    grid_weights = weights[grid].to_sparse_csr()
+    grid_weights = weights[grid].to_sparse()
 
     def loss(changes: Floats) -> tuple[float, Floats]:
         change = torch.tensor(changes.reshape(knots.shape), requires_grad=True)
-        speed = (grid_weights @ (knots + change * is_free)).clip(0.0, None)
+        speed = torch.sparse.mm(grid_weights, knots + change * is_free).clip(0.0, None)
         value = _loss(speed, ahead, is_counted, step * stride, limits)
         value.backward()
         assert change.grad is not None
-        return float(value), change.grad.numpy().ravel()
+        return value.item(), change.grad.numpy().ravel()
 
     found = minimize(loss, np.zeros(knots.numel()), jac=True, method="L-BFGS-B", options=OPTIMIZER_OPTIONS)
     speeds = (weights @ (knots + torch.tensor(found.x.reshape(knots.shape)) * is_free)).clip(0.0, None).numpy()

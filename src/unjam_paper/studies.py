@@ -20,6 +20,7 @@ from unjam_paper.fuel import FUEL
 from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY
 from unjam_paper.motorway_benchmark import MOTORWAY_BENCHMARK
 from unjam_paper.motorway_ensemble import MOTORWAY_ENSEMBLE
+from unjam_paper.recorded_roads import RECORDED_ROADS
 from unjam_paper.robustness import FIGURE_10, FIGURE_10_UNFILTERED, ROBUSTNESS
 from unjam_paper.string_stability import STRING_STABILITY
 from unjam_paper.study import PAPER_ROADS, UNFILTERED_ROADS, UNSCALED_NOISE_ROAD, Study
@@ -102,6 +103,7 @@ STUDIES: dict[str, Study] = {
     "envelope": ENVELOPE,
     "fuel": FUEL,
     "string-stability": STRING_STABILITY,
+    "recorded-roads": RECORDED_ROADS,
     "do-no-harm": DO_NO_HARM,
     "assess-examples": ASSESS_EXAMPLES,
     "all-roads": ALL_ROADS_STUDY,

@@ -88,13 +88,14 @@ def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
 
 
 def _common_facts(scenario: Any) -> list[tuple[str, str]]:
+    lowest, highest = scenario.acceleration_limits
     seconds = scenario.warmup * scenario.simulation_step
     end = "in training, a collision of a CAV" if scenario.reads_user_files else "a collision"
     return [
         ("episode", f"{scenario.horizon:,} control steps of {scenario.control_step:g} s; {end} ends it"),
         ("warm-up", f"{scenario.warmup} human-only steps ({seconds:g} s) before control, not counted"),
         ("human drivers", scenario.human_description),
-        ("action", f"acceleration within ±{scenario.action_limit:g} m/s2, {scenario.actuation}"),
+        ("action", f"acceleration from {lowest:g} to {highest:g} m/s2, {scenario.actuation}"),
         ("observation", "; ".join(map(str, FEATURES["local"].inputs or ()))),
         ("reward", scenario.reward),
     ]

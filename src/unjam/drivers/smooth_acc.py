@@ -1,6 +1,5 @@
 """An ACC that follows the mean speed of its leader: the linear expert that can be string stable."""
 
-from math import exp
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -11,8 +10,10 @@ from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
 from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_max, clamp_min, clip, namespace, stack_columns
 
-MIN_TIME_GAP = 1.0
+FREE_TIME_GAP = 1.0
 """time gap that is kept free when a braking beyond the limit is computed [s]"""
+MIN_AVERAGING = 1e-9
+"""averaging time that stands for none [s]"""
 MIN_ROOM = 1.0
 """[m]"""
 GAP_LIMIT_TIME = 3.0
@@ -77,7 +78,7 @@ class SmoothACC(FormulaDriver):
         excess_gap = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
         catch_up = clip(self.gap_gain * excess_gap, -self.catch_up_speed, self.catch_up_speed)
         command = mean + self.leader_weight * (state.leader_speed - mean) + catch_up
-        acceleration = (command - state.speed) / max(self.time_constant, self.time_step)
+        acceleration = (command - state.speed) / clamp_min(self.time_constant, self.time_step)
         return self._within_limits(acceleration, state), {"mean_leader_speed": mean}
 
     def _within_limits(self, acceleration: Array, state: LocalState) -> Array:
@@ -86,7 +87,7 @@ class SmoothACC(FormulaDriver):
         if self.acceleration_limit is not None:
             acceleration = clamp_max(acceleration, self.acceleration_limit)
         if self.braking_limit is not None:
-            room = clamp_min(gap - self.standstill_gap - MIN_TIME_GAP * speed, MIN_ROOM)
+            room = clamp_min(gap - self.standstill_gap - FREE_TIME_GAP * speed, MIN_ROOM)
             needed = clamp_min(speed - leader_speed, 0.0) ** 2 / (2.0 * room)
             needed = xp.where(needed > self.braking_limit, needed, needed * 0.0 + self.braking_limit)
             acceleration = xp.maximum(acceleration, -needed)
@@ -104,5 +105,6 @@ class SmoothACC(FormulaDriver):
     def _update_mean(self, mean: Array, leader_speed: Array) -> Array:
         xp = namespace(leader_speed)
         mean = xp.where(xp.isnan(mean), leader_speed, mean)
-        weight = 1.0 - exp(-self.time_step / self.averaging_time) if self.averaging_time else 1.0
+        time = clamp_min(self.averaging_time, MIN_AVERAGING)
+        weight = 1.0 - namespace(time).exp(-self.time_step / time)
         return mean + weight * (leader_speed - mean)

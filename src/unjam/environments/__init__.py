@@ -7,6 +7,7 @@ ENVIRONMENT_ARGUMENTS = {
     "unjam/FigureEight-v0": {"scenario": "figure-eight"},
     "unjam/Merge-v0": {"scenario": "merge", "cavs": 1},
     "unjam/OnRamp-v0": {"scenario": "on-ramp", "cavs": 1},
+    "unjam/Recorded-v0": {"scenario": "recorded"},
     "unjam/UserNetwork-v0": {"scenario": "my.sumocfg", "cavs": 1},
 }
 """arguments of `RoadEnv`, by the Gymnasium id of the environment"""

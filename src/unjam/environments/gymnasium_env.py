@@ -222,8 +222,9 @@ class RoadStepper:
 class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     """One CAV among human drivers, in SUMO.
 
-    ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``, ``"unjam/OnRamp-v0"``, with
-    any parameter of the scenario: ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
+    ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``, ``"unjam/OnRamp-v0"``,
+    ``"unjam/Recorded-v0"``, with any parameter of the scenario:
+    ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
     On a user network the CAV is the first that the penetration rate selects, and SUMO runs in a sandboxed process:
     ``gymnasium.make("unjam/UserNetwork-v0", scenario="my.sumocfg", penetration_rate=0.1)``.
 

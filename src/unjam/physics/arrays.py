@@ -25,13 +25,14 @@ _FLOAT_NAMESPACE = SimpleNamespace(
     floor=math.floor,
     isnan=math.isnan,
     cos=math.cos,
+    exp=math.exp,
     sin=math.sin,
     where=lambda condition, then, otherwise: then if condition else otherwise,
 )
 
 
 def namespace(array: Array) -> Any:
-    """Return the module with `where`, `minimum`, `maximum`, `floor`, `isnan`, `cos` and `sin` for this kind of number.
+    """Return the module with `where` and the functions of `_FLOAT_NAMESPACE` for this kind of number.
 
     It is `numpy`, `torch`, or a namespace with these functions for plain floats.
     """

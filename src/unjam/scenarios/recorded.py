@@ -81,7 +81,7 @@ class Recorded(Scenario):
         kinds = self.vehicle_kinds
         if self.warmup:
             raise ValueError(f"warmup: {self.warmup} is not allowed on a recorded road; allowed: 0")
-        if "cav" not in kinds or len(kinds) > MAX_VEHICLES:
+        if not self.cavs or len(kinds) > MAX_VEHICLES:
             raise ValueError(
                 f"platoon: {self.platoon!r} is not allowed; allowed: a CAV, and <= {MAX_VEHICLES} vehicles"
             )
@@ -101,6 +101,11 @@ class Recorded(Scenario):
                 raise ValueError(f"platoon: {word!r} is not allowed; allowed: cav, human, cav*2, human*5, ...")
             kinds += [match[1]] * int(match[2] or 1)
         return tuple(kinds)
+
+    @property
+    def cavs(self) -> int:
+        """Number of CAVs."""
+        return self.vehicle_kinds.count("cav")
 
     @property
     def acceleration_limits(self) -> Limits:
@@ -194,9 +199,8 @@ class Recorded(Scenario):
 
     def _fact_values(self) -> tuple[str, str, str, str]:
         source = f"recordings of {self.recordings}" if self.recordings else "artificial waves"
-        cavs = sum(kind == "cav" for kind in self.vehicle_kinds)
         road = f"one lane behind a vehicle with the speeds of {source}"
-        return road, f"{len(self.vehicle_kinds)} ({cavs} CAV)", "that vehicle's", "the mean speed of that vehicle"
+        return road, f"{len(self.vehicle_kinds)} ({self.cavs} CAV)", "that vehicle's", "the mean speed of that vehicle"
 
 
 def artificial_waves(generator: np.random.Generator) -> LeaderRecording:

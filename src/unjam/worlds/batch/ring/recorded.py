@@ -40,6 +40,16 @@ class RecordedBatch(RingBatch):
         self._find_contacts = platoon_contacts
 
     @property
+    def platoon_speeds(self) -> Array:
+        """Speeds of all vehicles behind the recorded ones, from the last to the first [m/s], shape (vehicles, W)."""
+        return self._speed[:-2]
+
+    @property
+    def is_running(self) -> Array:
+        """1 for each road that still counts, else 0, shape (W,)."""
+        return self._is_running
+
+    @property
     def has_ended(self) -> bool:
         """Whether all recordings, or the horizon, have ended."""
         return self.control_steps >= float(self._ends.max())

@@ -1,0 +1,122 @@
+"""Search of a controller's parameters on recorded roads, where many candidates drive at once.
+
+The cross-entropy method: each generation is drawn around the best candidates of the last one.
+"""
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Any, NamedTuple
+
+import numpy as np
+from optuna.distributions import FloatDistribution
+
+from unjam.drivers.driver import Driver
+from unjam.physics.arrays import Floats
+from unjam.physics.fuel import fuel_rate
+from unjam.scenarios import Recorded
+from unjam.worlds.batch.ring.recorded import RecordedBatch
+from unjam.worlds.batch.run import start_batch_drive
+
+GENERATION_SIZE, GENERATIONS = 32, 20
+ELITE_SHARE, KEPT_SHARE, SMALLEST_SPREAD = 0.2, 0.3, 0.03
+"""share of candidates that define the next generation; share of the last distribution that stays; smallest standard
+deviation of a parameter, relative to its range"""
+MAX_MEAN_GAP, LARGEST_GAP, SMALLEST_TIME_GAP = 73.0, 105.0, 1.0
+"""limits of a candidate: the gaps of the published controller [m], and a time gap [s]"""
+MEAN_GAP_PRICE, MAX_GAP_PRICE, TIME_GAP_PRICE = 0.3, 0.2, 20.0
+"""fuel [%] that each meter and each second beyond them counts"""
+MARGIN = 0.5
+"""by which limits are kept in the search [m]"""
+
+
+class RowScores(NamedTuple):
+    """What candidates did on n roads; arrays of shape (candidates, n)."""
+
+    fuel: Floats
+    """of the platoon by power per distance [ml/m]"""
+    mean_gap: Floats
+    """of the CAV [m]"""
+    max_gap: Floats
+    min_time_gap: Floats
+    """[s], while the CAV is faster than 1 m/s"""
+
+
+def with_parameter_rows(driver: Driver, parameters: Mapping[str, Floats], roads: int) -> Driver:
+    """Return a driver with one value of each parameter for each candidate, every one of them on `roads` roads."""
+    made = copy(driver)
+    for name, values in parameters.items():
+        object.__setattr__(made, name, np.repeat(values, roads))
+    return made
+
+
+def measure_candidates(
+    scenarios: Sequence[Recorded], driver: Driver, parameters: Mapping[str, Floats] | None = None
+) -> RowScores:
+    """Return the scores of a driver with each set of parameters; without them, of the driver itself."""
+    roads, candidates = len(scenarios), len(next(iter(parameters.values()))) if parameters else 1
+    world = RecordedBatch(list(scenarios) * candidates, [(0,)] * (roads * candidates), keep_record=False)
+    loop = start_batch_drive(world, with_parameter_rows(driver, parameters, roads) if parameters else driver)
+    step, before = scenarios[0].control_step, world.platoon_speeds
+    totals = np.zeros((4, roads * candidates))
+    max_gap, min_time_gap = np.zeros(roads * candidates), np.full(roads * candidates, np.inf)
+    is_running = np.array(world.is_running)
+    for _ in loop:
+        speeds, gap = world.platoon_speeds, world.exact_state().leader_gap
+        fuel = fuel_rate(speeds, (speeds - before) / step).sum(0)
+        totals += is_running * np.stack([fuel, speeds.sum(0), gap, np.ones_like(gap)])
+        max_gap = np.maximum(max_gap, gap * is_running)
+        own = speeds[-1]
+        time_gap = np.where((own > 1.0) & (is_running > 0.0), gap / np.maximum(own, 1.0), np.inf)
+        min_time_gap = np.minimum(min_time_gap, time_gap)
+        before, is_running = speeds, np.array(world.is_running)
+    fuel, distance, gaps, steps = totals
+    rows = fuel / distance, gaps / steps, max_gap, min_time_gap
+    return RowScores(*(each.reshape(candidates, roads) for each in rows))
+
+
+def search_parameters(
+    scenarios: Sequence[Recorded], driver: Driver, space: Mapping[str, FloatDistribution], human: RowScores, seed: int
+) -> list[dict[str, Any]]:
+    """Return the best candidate so far after each generation: its parameters, fuel relative to human drivers [%], gaps.
+
+    Scores count the fuel, and what exceeds the limits.
+    """
+    generator = np.random.default_rng(seed)
+    mean, spread = np.full(len(space), 0.5), np.full(len(space), 0.35)
+    best: dict[str, Any] = {"score": np.inf}
+    history = list[dict[str, Any]]()
+    for generation in range(GENERATIONS):
+        if generation == 0:
+            points = generator.random((GENERATION_SIZE, len(space)))
+        else:
+            points = np.clip(mean + spread * generator.standard_normal((GENERATION_SIZE, len(space))), 0.0, 1.0)
+        parameters = {
+            name: _scale(points[:, column], distribution) for column, (name, distribution) in enumerate(space.items())
+        }
+        scores = measure_candidates(scenarios, driver, parameters)
+        fuel = 100.0 * (scores.fuel / human.fuel - 1.0).mean(1)
+        mean_gap, max_gap, time_gap = scores.mean_gap.mean(1), scores.max_gap.max(1), scores.min_time_gap.min(1)
+        total = (
+            fuel
+            + MEAN_GAP_PRICE * np.maximum(mean_gap - MAX_MEAN_GAP + MARGIN, 0.0)
+            + MAX_GAP_PRICE * np.maximum(max_gap - LARGEST_GAP + MARGIN, 0.0)
+            + TIME_GAP_PRICE * np.maximum(SMALLEST_TIME_GAP - time_gap, 0.0)
+        )
+        order = np.argsort(total)
+        elite = points[order[: round(ELITE_SHARE * GENERATION_SIZE)]]
+        kept = KEPT_SHARE if generation else 0.0
+        mean = kept * mean + (1.0 - kept) * elite.mean(0)
+        spread = np.maximum(kept * spread + (1.0 - kept) * elite.std(0), SMALLEST_SPREAD)
+        first = int(order[0])
+        if total[first] < best["score"]:
+            found = {name: round(float(values[first]), 4) for name, values in parameters.items()}
+            numbers = {"fuel": fuel, "mean_gap": mean_gap, "max_gap": max_gap, "min_time_gap": time_gap}
+            best = {"score": float(total[first]), "parameters": found}
+            best |= {name: float(values[first]) for name, values in numbers.items()}
+        history.append({"generation": generation, **best})
+    return history
+
+
+def _scale(points: Floats, distribution: FloatDistribution) -> Floats:
+    low, high = distribution.low, distribution.high
+    return low * (high / low) ** points if distribution.log else low + (high - low) * points

@@ -1,0 +1,94 @@
+"""Controllers behind recorded vehicles: search of parameters, plans, and the study."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.adapters.onnx_policies import linear, write
+from unjam.controller import make_driver
+from unjam.errors import InputError
+from unjam.physics.fuel import fuel_rate
+from unjam_paper import fuel_optimal_plan, parameter_search
+from unjam_paper.fuel_optimal_plan import PlanLimits, plan_speeds
+from unjam_paper.parameter_search import measure_candidates
+from unjam_paper.recorded_roads import (
+    PLAN_LABEL,
+    PUBLISHED_FILE,
+    RECORDED_ROADS,
+    RECORDINGS_FOLDER,
+    training_drives,
+    tuned_name,
+    untuned_driver,
+)
+from unjam_paper.study import StudyFolder
+
+STEP = 0.1
+DESCRIPTION = """inputs = [{ quantity = "speed" }, { quantity = "leader_speed" }, { quantity = "leader_gap" }]
+output = { quantity = "acceleration" }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder of studies with three drives, one of them a test drive, and a network with three inputs."""
+    drives = tmp_path / RECORDINGS_FOLDER
+    drives.mkdir(parents=True)
+    times = STEP * np.arange(400)
+    for number, name in enumerate(("2021-03-01_a", "2021-03-02_b", "2021-04-01_c")):
+        speeds = 15.0 + 4.0 * np.sin(times / (6.0 + number))
+        pd.DataFrame({"time": times, "speed": speeds}).to_csv(drives / f"{name}.csv", index=False)
+    write(tmp_path / "recordings", linear(3, [-0.2, 0.15, 0.01]), DESCRIPTION, Path(PUBLISHED_FILE).stem)
+    return tmp_path
+
+
+def test_test_drives_are_not_read(folder: Path) -> None:
+    assert [Path(each.recordings).stem for each in training_drives(folder)] == ["2021-03-01_a", "2021-03-02_b"]
+
+
+def test_missing_drives_are_named_with_their_source(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"recorded-roads: .* has no drives; .*doi\.org"):
+        training_drives(tmp_path)
+
+
+@pytest.mark.parametrize("method", ["smooth-acc", "acc"])
+def test_candidates_that_drive_at_once_equal_those_that_drive_alone(folder: Path, method: str) -> None:
+    scenarios = training_drives(folder)
+    parameters = {"time_gap": np.array([1.5, 2.5, 3.5]), "gap_gain": np.array([0.02, 0.05, 0.2])}
+    together = measure_candidates(scenarios, untuned_driver(method), parameters)
+    for number in range(3):
+        values = {name: float(each[number]) for name, each in parameters.items()}
+        alone = measure_candidates(scenarios, make_driver(tuned_name([{"parameters": values}], method), STEP))
+        for many, one in zip(together, alone, strict=True):
+            np.testing.assert_allclose(many[number], one[0], rtol=1e-9)
+
+
+def test_a_plan_saves_fuel_within_its_limits() -> None:
+    times = STEP * np.arange(901)
+    leader = 14.0 + 5.0 * np.sin(times * 2.0 * np.pi / 30.0)
+    limits = PlanLimits(largest_gap=60.0)
+    (speed,) = plan_speeds([leader], [20.0], STEP, limits)
+    gap = 20.0 + STEP * np.cumsum((leader - speed)[1:])
+    assert gap.max() < 61.0
+    assert (gap - limits.standstill_gap - speed[1:]).min() > -1.0
+    assert speed[[0, -1]] == pytest.approx(leader[[0, -1]])
+
+    def fuel(speeds: np.ndarray) -> float:
+        return float(fuel_rate(speeds[1:], np.diff(speeds) / STEP).sum() / speeds[1:].sum())
+
+    assert fuel(speed) < 0.85 * fuel(leader)
+
+
+def test_the_study_tunes_first_and_compares_all_drivers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parameter_search, "GENERATIONS", 5)
+    monkeypatch.setattr(parameter_search, "GENERATION_SIZE", 6)
+    monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
+    study = folder / "recorded-roads"
+    RECORDED_ROADS.run(StudyFolder(folder), 1, study, 1)
+    table = pd.read_csv(study / "drivers.csv")
+    names = [name.partition(":")[0] for name in table["driver"]]
+    assert names == ["human", "follower-stopper", "published", "smooth-acc", "acc", PLAN_LABEL]
+    assert table["fuel of the platoon [%]"].tolist()[0] == "–"
+    search = pd.read_csv(study / "search.csv")
+    assert list(search["method"]) == ["smooth-acc", "acc"]
