@@ -104,7 +104,9 @@ def training_drives(folder: Path) -> list[Recorded]:
     path = folder / RECORDINGS_FOLDER
     found = [file for file in recording_files(path) if file.name.startswith(TRAINING_MONTH)] if path.is_dir() else []
     if not found:
-        raise InputError(f"{RECORDED_STUDY}: {path} has no drives; download them: https://doi.org/10.5281/zenodo.6366761")
+        raise InputError(
+            f"{RECORDED_STUDY}: {path} has no drives; download them: https://doi.org/10.5281/zenodo.6366761"
+        )
     return [Recorded(recordings=str(file)) for file in found]
 
 

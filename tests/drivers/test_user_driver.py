@@ -184,7 +184,7 @@ class Simulator:
         raise NotImplementedError
 """
 STATE = random_state(np.random.default_rng(0), 3)
-OUTCOME = Outcome(np.ones((3, 2)), np.ones((3, 1)), np.ones((3, 1)), np.zeros(3, bool), np.zeros(3))
+OUTCOME = Outcome(np.ones((3, 2)), np.ones((3, 1)), np.ones((3, 1)), np.zeros(3, bool), np.zeros(3), np.ones((3, 1)))
 
 
 def number_of_feature(file: str) -> Any:

@@ -227,6 +227,7 @@ def test_user_reward_is_called_with_numpy_arrays(my_drivers: Path) -> None:
         torch.ones(2, 1),
         torch.zeros(2, dtype=torch.bool),
         torch.zeros(2),
+        torch.ones(2, 1),
     )
     found = tensor_reward(f"{my_drivers}:calm")(outcome)
     assert_close(found["speed"], torch.tensor([2.0, 3.0]))

@@ -56,7 +56,7 @@ class ToyDynamics(ModelDynamics):
         )
         speeds = stack_columns((speed, leader_speed, follower_speed))
         time_gaps = as_column(leader_gap / speed.clip(1e-3, None))
-        terms = released_reward(Outcome(speeds, as_column(acceleration), time_gaps, crashed, 0.0 * acceleration))
+        terms = released_reward(Outcome(speeds, as_column(acceleration), time_gaps, crashed, 0.0 * acceleration, None))
         reward = sum(terms.values()) + self.bonus * 0.1 * (state.leader_gap / 20.0) * ~crashed
         xp = namespace(speed)
         zeros = xp.zeros_like(speed)

@@ -31,9 +31,10 @@ def outcomes(draw: st.DrawFn) -> Outcome:
     accelerations = draw(hnp.arrays(np.float64, (rows, cavs), elements=st.floats(-3, 3)))
     headways = draw(hnp.arrays(np.float64, (rows, cavs), elements=st.floats(-1, 1e5)))
     away = draw(hnp.arrays(np.bool_, (rows, cavs)))
-    accelerations[away] = headways[away] = np.nan
+    own_speeds = draw(hnp.arrays(np.float64, (rows, cavs), elements=st.floats(0, 70)))
+    accelerations[away] = headways[away] = own_speeds[away] = np.nan
     waiting = draw(hnp.arrays(np.float64, rows, elements=st.integers(0, 50).map(float)))
-    return Outcome(speeds, accelerations, headways, draw(hnp.arrays(np.bool_, rows)), waiting)
+    return Outcome(speeds, accelerations, headways, draw(hnp.arrays(np.bool_, rows)), waiting, own_speeds)
 
 
 def there(values: np.ndarray) -> list[float]:
@@ -47,7 +48,9 @@ def mean(values: list[float]) -> float:
 
 def one(speeds: list[float], accelerations: list[float], crashed: bool = False) -> Outcome:
     headways = np.full((1, len(accelerations)), 10.0)
-    return Outcome(np.array([speeds]), np.array([accelerations]), headways, np.array([crashed]), np.zeros(1))
+    own_speeds = np.full(headways.shape, 5.0)
+    numbers = np.array([speeds]), np.array([accelerations]), headways, np.array([crashed]), np.zeros(1)
+    return Outcome(*numbers, own_speeds)
 
 
 def total(terms: dict[str, Any]) -> Any:
@@ -109,7 +112,8 @@ def test_released_merge_is_one_minus_speed_errors_and_short_time_gaps(outcome: O
     ],
 )
 def test_released_merge_by_hand(speeds: list[float], headways: list[float], crashed: bool, expected: float) -> None:
-    outcome = Outcome(np.array([speeds]), np.zeros((1, 1)), np.array([headways]), np.array([crashed]), np.zeros(1))
+    numbers = np.array([speeds]), np.zeros((1, 1)), np.array([headways]), np.array([crashed]), np.zeros(1)
+    outcome = Outcome(*numbers, cav_speeds=None)
     assert total(REWARDS["released-merge"](outcome))[0] == pytest.approx(expected)
 
 
@@ -141,6 +145,7 @@ def test_vehicles_that_are_not_on_the_road_are_left_out(outcome: Outcome, name: 
             speeds=alone.speeds[:, ~np.isnan(alone.speeds[0])],
             accelerations=alone.accelerations[:, on_road],
             time_gaps=alone.time_gaps[:, on_road],
+            cav_speeds=alone.cav_speeds[:, on_road],
         )
         for term, values in REWARDS[name](present).items():
             assert values[0] == pytest.approx(found[term][row], abs=1e-12)
@@ -202,7 +207,7 @@ def test_a_time_gap_is_gap_over_speed_and_very_long_for_a_standing_vehicle() -> 
 
 
 def test_rewards_are_found_by_name() -> None:
-    names = "released", "released-merge", "eq16", "eq16-as-printed", "power", "travel-time", "smooth-following"
+    names = "released", "released-merge", "eq16", "eq16-as-printed", "power", "travel-time", "fuel"
     assert set(REWARDS) == set(names)
     assert make_reward("released") is released_reward
 
@@ -214,6 +219,7 @@ def test_a_users_reward_is_loaded_from_a_file(my_drivers: Path) -> None:
         np.full((2, 2), 9.0),
         np.array([False, False]),
         np.zeros(2),
+        np.ones((2, 2)),
     )
     terms = make_reward(f"{my_drivers}:calm")(outcome)
     assert {name: values.tolist() for name, values in terms.items()} == {"speed": [2.0, 3.0], "push": [-2.0, -0.5]}
@@ -253,6 +259,18 @@ def test_an_error_in_a_users_reward_is_reported_with_its_line(tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", ["fame", "", "Released", "released "])
 def test_an_unknown_reward_lists_the_known_ones(name: str) -> None:
-    known = "released, released-merge, eq16, eq16-as-printed, power, travel-time, smooth-following, path.py:name"
+    known = "released, released-merge, eq16, eq16-as-printed, power, travel-time, fuel, path.py:name"
     with pytest.raises(InputError, match=f"reward: {name!r} is not allowed; allowed: {known}"):
         make_reward(name)
+
+
+def test_fuel_is_saved_by_coasting_and_wasted_by_braking() -> None:
+    def reward(acceleration: float, time_gap: float = 2.0) -> float:
+        numbers = np.zeros((1, 2)), np.array([[acceleration]]), np.array([[time_gap]]), np.zeros(1, bool), np.zeros(1)
+        return float(total(REWARDS["fuel"](Outcome(*numbers, np.array([[20.0]]))))[0])
+
+    assert reward(0.0) == pytest.approx(0.0, abs=0.15)
+    assert reward(-0.2) - reward(0.0) == pytest.approx(reward(0.0) - reward(0.2))  # coasting gives back speed's fuel
+    assert reward(-3.0) == reward(-0.5)  # braking harder saves nothing more
+    assert reward(0.0, 0.5) == pytest.approx(reward(0.0) - 0.05)
+    assert reward(0.0, 7.0) == pytest.approx(reward(0.0) - 0.2)

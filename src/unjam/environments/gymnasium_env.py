@@ -179,6 +179,7 @@ class RoadStepper:
             time_gap(state.leader_gap, state.speed)[: len(remaining)][None],
             np.array([world.has_crashed]),
             np.array([float(world.backlog)]),
+            state.speed[: len(remaining)][None],
         )
         step = slice(world.control_steps - 1, world.control_steps)
         if world.control_steps == 1:  # a constant of one number would be right for one step only

@@ -112,7 +112,9 @@ def base_reward(base: str, reward: Reward, next_state: LocalState, acceleration:
     follower_speed = xp.where(no_follower, nan, next_state.follower_speed)
     speeds = stack_columns((next_state.speed, leader_speed, follower_speed))
     gap = as_column(time_gap(next_state.leader_gap, next_state.speed))
-    return sum(reward(Outcome(speeds, as_column(acceleration), gap, crashed, 0.0 * acceleration)).values())
+    own_speed, no_backlog = as_column(next_state.speed), 0.0 * acceleration
+    outcome = Outcome(speeds, as_column(acceleration), gap, crashed, no_backlog, own_speed)
+    return sum(reward(outcome).values())
 
 
 @dataclass(frozen=True)

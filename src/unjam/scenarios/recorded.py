@@ -48,7 +48,7 @@ class Recorded(Scenario):
     """
 
     title: ClassVar[str] = "recorded"
-    reward: ClassVar[str] = "smooth-following"
+    reward: ClassVar[str] = "fuel"
     is_closed: ClassVar[bool] = False
     size_parameter: ClassVar[str] = "recordings"
     """the parameter in which the roads of a batch may differ"""

@@ -12,6 +12,7 @@ from unjam.drivers.user_driver import FileReference, UserFunction, is_file_refer
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import split_parameters
 from unjam.physics.arrays import Array, Floats, clamp_min, namespace, square_root
+from unjam.physics.fuel import fuel_rate
 from unjam.worlds.record import Trajectory
 
 DESIRED_SPEED = 30.0
@@ -30,6 +31,8 @@ MIN_CRASH_BACKLOG = 200
 """minimum number of vehicles that a crash stops, as more would enter: about 160 (3,700 veh/h for 154 s) drive there"""
 MAX_CALM_TIME_GAP, STANDING_TIME_GAP = 5.0, 60.0
 """time gap beyond which a CAV lags behind, and that of a vehicle that practically stands [s]"""
+STEADY_FUEL = 0.05
+"""fuel of a mid-size car at a constant speed of 10 to 25 m/s [ml/m]"""
 STANDSTILL_SPEED = 1e-3
 """lower limit of the speed in time gaps [m/s]"""
 MAX_REWARD_CELLS = 4_000_000
@@ -48,6 +51,8 @@ class Outcome(NamedTuple):
     has_crashed: Array
     backlog: Array
     """insertion backlog [vehicles], shape (rows,)"""
+    cav_speeds: Array
+    """speeds of the CAVs after the step [m/s], shape (rows, CAVs); NaN if absent"""
 
 
 Reward = Callable[[Outcome], dict[str, Array]]
@@ -109,16 +114,18 @@ def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
     return {"speed": speed, "time_gap": gaps, "lower_bound": clamp_min(-speed - gaps, 0.0)}
 
 
-def smooth_following_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward calm driving of CAVs in a platoon: minus their mean squared acceleration, and -10 at a crash.
+def fuel_reward(outcome: Outcome) -> dict[str, Array]:
+    """Reward little fuel of the CAVs for their distance [ml/s]: about 0 in steady driving, less with braking.
 
-    Time gaps below 1 s, and the part of those beyond 5 s, count as much as 0.1 m2/s4 for each second.
+    Fuel is that of the power at the wheels, see `unjam.physics.fuel`. Time gaps below 1 s, and the part of those beyond
+    5 s, cost 0.1 for each second: a CAV must not save fuel by being late. A crash costs 10.
     """
+    saved = STEADY_FUEL * outcome.cav_speeds - fuel_rate(outcome.cav_speeds, outcome.accelerations)
     late = clamp_min(outcome.time_gaps - MAX_CALM_TIME_GAP, 0.0) * (outcome.time_gaps < STANDING_TIME_GAP)
     return {
-        "comfort": acceleration_penalty(outcome),
-        "time_gap": 0.1 * time_gap_penalty(outcome),
-        "late": -0.1 * _nan_sum(late),
+        "fuel": _nan_mean(saved),
+        "time_gap": TIME_GAP_WEIGHT * time_gap_penalty(outcome),
+        "late": -TIME_GAP_WEIGHT * _nan_sum(late),
         "crash": -10.0 * outcome.has_crashed,
     }
 
@@ -175,7 +182,7 @@ REWARDS: dict[str, Reward] = {
     "eq16-as-printed": printed_eq16_reward,
     "power": power_reward,
     "travel-time": travel_time_reward,
-    "smooth-following": smooth_following_reward,
+    "fuel": fuel_reward,
 }
 
 
@@ -247,7 +254,8 @@ def _random_outcome(rows: slice, vehicles: int = 6, cavs: int = 2) -> Outcome:
     generator = np.random.default_rng(0)
     speeds, accelerations = generator.uniform(0, 20, (PROBE_ROWS, vehicles)), generator.normal(size=(PROBE_ROWS, cavs))
     time_gaps, crashed = generator.uniform(0.5, 3, (PROBE_ROWS, cavs)), np.arange(PROBE_ROWS) == 1
-    return Outcome(*(each[rows] for each in (speeds, accelerations, time_gaps, crashed, 10 * speeds[:, 0])))
+    numbers = speeds, accelerations, time_gaps, crashed, 10 * speeds[:, 0], speeds[:, :cavs]
+    return Outcome(*(each[rows] for each in numbers))
 
 
 def episode_reward_terms(
@@ -275,18 +283,20 @@ def _step_outcomes(
     first, end = step_range.start, step_range.stop
     size = end - first
     cavs = [each for each in trajectories if each.step_slice.start < end and first < each.step_slice.stop]
-    accelerations, time_gaps = (np.full((size, len(cavs)), np.nan) for _ in range(2))
+    accelerations, time_gaps, cav_speeds = (np.full((size, len(cavs)), np.nan) for _ in range(3))
     for column, cav in enumerate(cavs):
         start, stop = max(cav.start_step, first), min(cav.step_slice.stop, end)
         rows, steps = slice(start - first, stop - first), slice(start - cav.start_step, stop - cav.start_step)
         accelerations[rows, column] = cav.applied_acceleration[steps]
         after = slice(steps.start + 1, steps.stop + 1)
         time_gaps[rows, column] = time_gap(cav.states.leader_gap[after], cav.states.speed[after])
+        cav_speeds[rows, column] = cav.states.speed[after]
     crashed = np.zeros(size, bool)
     crashed[-1:] = has_crashed
     waiting = backlog[1:][step_range] if len(backlog) else np.zeros(size)
     # Column-major: the rounding of sums over vehicles depends on the order in memory.
-    return Outcome(np.asfortranarray(speeds[1:][step_range]), accelerations, time_gaps, crashed, waiting)
+    all_speeds = np.asfortranarray(speeds[1:][step_range])
+    return Outcome(all_speeds, accelerations, time_gaps, crashed, waiting, cav_speeds)
 
 
 def validate_reward_terms(reward: Reward, outcome: Outcome, start: int = 0) -> dict[str, Floats]:
