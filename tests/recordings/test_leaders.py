@@ -63,7 +63,9 @@ def test_other_steps_are_interpolated(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("columns", "reason"),
     [
-        ({"time": TIMES, "pace": SPEEDS}, "no column 'pair'"),
+        ({"time": TIMES, "pace": SPEEDS}, "its columns are pace, time; required: time, and one of speed, speed_kmh"),
+        ({"time": TIMES, "speed": SPEEDS, "speed_kmh": SPEEDS}, "its columns are speed, speed_kmh, time; required"),
+        ({"time": 1000.0 * TIMES, "speed": SPEEDS}, "time: steps of 100 s are not allowed; .* in seconds"),
         ({"time": TIMES, "speed": np.where(TIMES == 3.0, np.nan, SPEEDS)}, "line 32: speed: nan is not allowed"),
         ({"time": TIMES[:50], "speed": SPEEDS[:50]}, "no trajectory lasts 20 s"),
     ],

@@ -46,7 +46,7 @@ def test_an_episode_has_a_random_part_of_a_random_recording(tmp_path: Path) -> N
         write_drive(tmp_path / f"{number}.csv", mean)
     scenario = Recorded(recordings=str(tmp_path), window=30.0)
     roads = [scenario.draw(np.random.default_rng(seed)) for seed in range(40)]
-    assert {road.drawn_values["recording"] for road in roads} == {0.0, 1.0}
+    assert {road.drawn_values["file"] for road in roads} == {0.0, 1.0}
     starts = [road.drawn_values["begin"] for road in roads]
     assert 0.0 <= min(starts) < 10.0 < 45.0 < max(starts) <= 60.0
     assert all(len(road.replayed_speeds) == 301 for road in roads)
@@ -57,6 +57,21 @@ def test_parts_of_the_recordings_are_strata(tmp_path: Path) -> None:
         write_drive(tmp_path / f"{number}.csv")
     parts = [Recorded(recordings=str(tmp_path)).stratum(index, 4) for index in range(4)]
     assert [Path(part.recordings).name for part in parts] == ["0.csv", "1.csv", "2.csv", "3.csv"]
+
+
+def test_a_window_longer_than_the_recording_is_refused(tmp_path: Path) -> None:
+    scenario = Recorded(recordings=str(write_drive(tmp_path / "a.csv")), window=100.0)
+    with pytest.raises(InputError, match=r"window: 100 s is not allowed; allowed: <= 89.9 s"):
+        scenario.draw(np.random.default_rng(0))
+
+
+def test_notes_say_what_was_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    times = np.where(TIMES < 30.0, TIMES, TIMES + 9.0)
+    pd.DataFrame({"time": times, "speed": 2.0 + 0.1 * TIMES}).to_csv(path, index=False)
+    note, _ = Recorded(recordings=str(path)).notes
+    assert note == "recordings: a.csv has 2 parts of 30 to 60 s with speeds of 2.0 to 11.0 m/s"
+    assert Recorded(recordings=str(tmp_path)).notes[0].startswith("recordings: 1 files of")
 
 
 def test_a_begin_after_the_end_is_refused(tmp_path: Path) -> None:

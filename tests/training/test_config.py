@@ -136,7 +136,7 @@ def test_merging_does_not_change_its_arguments() -> None:
         ),
         (
             {"backend": "batch", "tasks": [{"scenario": "figure-eight"}, {"scenario": "merge"}]},
-            "backend: batch is not allowed; allowed: sumo (figure-eight is not a ring)",
+            "backend: batch is not allowed; allowed: sumo (figure-eight is neither a ring nor a recorded road)",
         ),
         (
             {"evaluation.patience": 5, "evaluation.validation_interval": 0},

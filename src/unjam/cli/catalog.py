@@ -21,6 +21,7 @@ from unjam.errors import InputError
 from unjam.files import atomic_write, check_parent_folder
 from unjam.measures.gain import MEAN_GAIN
 from unjam.scenarios import SCENARIOS, example_scenario, scenario_recipe
+from unjam.scenarios.road import format_drawn_values
 from unjam.worlds.backend import WorldOptions
 from unjam.worlds.sumo.backend import SumoBackend
 
@@ -81,7 +82,7 @@ def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
             world.advance(None)
         scene, drawn_values = world.scene(), world.road.drawn_values
     max_speed = max(1.0, float(scene.speeds.max(initial=0.0)))
-    caption = "\n".join([name, *(f"{key} {value:g} m" for key, value in drawn_values.items())])
+    caption = "\n".join([name, *format_drawn_values(drawn_values)])
     content = BytesIO()
     draw_road(scene, max_speed, caption).save(content, "PNG")
     atomic_write(path, content.getvalue())

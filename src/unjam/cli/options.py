@@ -25,7 +25,8 @@ RewardOption = Annotated[
     str, Option("--reward", help="Name of a reward, or your own: path.py:name.", show_default="the scenario's")
 ]
 BackendOption = Annotated[
-    str, Option(help="Simulator: sumo, batch (equal on rings, elsewhere in distribution), or your own: path.py:name.")
+    str,
+    Option(help="Simulator: sumo, batch (equal on rings and recorded roads, else alike), or your own: path.py:name."),
 ]
 SeedOption = Annotated[int, Option("--seed", min=0, help="First seed.")]
 OptunaSeedOption = Annotated[int, Option("--seed", min=0, max=2**32 - 1, help="First seed.")]
@@ -118,7 +119,7 @@ def scenario_changes(
     penetration_rate: Annotated[float | None, Option(help="Share of CAVs, on open roads.")] = None,
     cav_types: Annotated[str | None, Option(help="Vehicle types of CAVs on your own network: car,truck.")] = None,
     recordings: Annotated[str | None, Option(help="Recorded speeds: a file or a folder, on the road recorded.")] = None,
-    platoon: Annotated[str | None, Option(help="Vehicles behind the recorded one: 'human*2 cav human*20'.")] = None,
+    platoon: Annotated[str | None, Option(help="Vehicles behind the recorded one: `human*2 cav human*20`.")] = None,
     network: dict[str, Any],
 ) -> dict[str, Any]:
     """Return the scenario settings that the options of a command set."""

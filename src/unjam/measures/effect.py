@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import nan
+from math import isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ SMALLEST_EFFECT = 0.005
 """difference of travel time below which there is neither gain nor harm, as a share of the baseline's travel time"""
 
 TIME_METRIC, FLOW_METRIC, FUEL_METRIC = "travel_time", "outflow_veh_per_h", "fuel_ml_per_km"
+POWER_FUEL_METRIC = "fuel_by_power"
 TOO_SMALL = f"less than {100 * SMALLEST_EFFECT:g} %, which is too small to matter"
 """text for a difference of travel time below `SMALLEST_EFFECT`"""
 
@@ -41,7 +42,7 @@ class Effect:
     flow: Estimate
     """flow [veh/h]"""
     fuel: Estimate
-    """fuel of all vehicles [ml/km]"""
+    """fuel of all vehicles [ml/km]; behind a recorded vehicle by power, elsewhere by the scenario's emission class"""
     hard_braking: Estimate
     """vehicle-steps in which human drivers brake beyond 4.5 m/s2 [per million]"""
     collisions: float
@@ -118,7 +119,8 @@ def effect_of(
     seeds = {str(row["seed"]) for row in rows}
     baseline = [row for row in baseline if str(row["seed"]) in seeds]
     ran, baseline_ran = ([row for row in each if row["status"] != "failed"] for each in (rows, baseline))
-    metrics = TIME_METRIC, FLOW_METRIC, FUEL_METRIC, HARD_BRAKING_METRIC
+    is_recorded = any(isfinite(row.get("time_behind_leader", nan)) for row in ran)
+    metrics = TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC if is_recorded else FUEL_METRIC, HARD_BRAKING_METRIC
     differences = (paired_difference(rows, baseline, name, confidence) for name in metrics)
     teleports, baseline_teleports = (sum(row.get("teleports", 0) for row in each) for each in (rows, baseline))
     return Effect(

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from unjam.errors import InputError
+from unjam.errors import InputError, shorten_list
 from unjam.recordings.leaders import LeaderRecording
-from unjam.recordings.loaders import ReadOptions, split_trajectories, to_numeric, trajectories_of_table
+from unjam.recordings.loaders import ReadOptions, detect_format, split_trajectories, to_numeric, trajectories_of_table
 from unjam.recordings.tables import read_table
 from unjam.sumo_files import file_stamp
 
@@ -16,6 +16,8 @@ SPEED_UNITS = {"speed": 1.0, "speed_kmh": 1.0 / 3.6, "speed_mph": 0.44704}
 """columns of a table of speeds, one of them, and their unit in m/s"""
 I24_COLUMNS = ("Time", "Velocity", "SpaceGap", "DrivingDir")
 """columns by which drives of the CIRCLES experiment on I-24 are recognized; their speeds are in km/h"""
+MAX_TIME_STEP = 1.5
+"""longest time between two samples [s]: waves of a few seconds must be visible"""
 MIN_SECONDS = 20.0
 """shortest recording [s]"""
 MAX_ACCELERATION = 8.0
@@ -34,19 +36,31 @@ def read_leaders(path: Path) -> list[LeaderRecording]:
 
 @lru_cache(64)
 def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, ...]:
-    frame, options = read_table(path), ReadOptions(min_seconds=MIN_SECONDS)
+    frame, options = read_table(path), ReadOptions(min_seconds=MIN_SECONDS, bad_row_hint="")
     names = set(map(str, frame.columns))
     if names.issuperset(I24_COLUMNS):
         frame = pd.DataFrame({"line": frame["line"], "time": frame["Time"], "speed_kmh": frame["Velocity"]})
         names = set(frame.columns)
     frame = frame.rename(columns={name: "time" for name in ("t", "Time") if "time" not in names and name in names})
-    column = next((name for name in SPEED_UNITS if name in names), "")
-    if column and "time" in frame and "leader_speed" not in names:
-        read = split_trajectories(_follower_table(frame, column, path.stem), path, options)
-    else:
+    columns = [name for name in SPEED_UNITS if name in names]
+    has_leaders = detect_format(frame) != "table" or names & {"leader_speed", "v_lead"}
+    if not has_leaders and (len(columns) != 1 or "time" not in frame):
+        shown = shorten_list(sorted(names - {"line"}))
+        raise InputError(
+            f"{path.name}: its columns are {shown}; required: time, and one of {', '.join(SPEED_UNITS)}; or a format "
+            "of unjam fit-drivers"
+        )
+    if has_leaders:
         read = trajectories_of_table(frame, path, options)
+    else:
+        read = split_trajectories(_follower_table(frame, columns[0], path.stem), path, options)
     found = tuple(LeaderRecording(each.name, each.time_step, each.leader_speed) for each in read.trajectories)
     for each in found:
+        if each.time_step > MAX_TIME_STEP:
+            raise InputError(
+                f"{path.name}: time: steps of {each.time_step:g} s are not allowed; allowed: <= {MAX_TIME_STEP:g} s; "
+                "are its times in seconds?"
+            )
         changes = np.abs(np.diff(each.speed)) / each.time_step
         if float(np.mean(changes > MAX_ACCELERATION)) > RARE_SHARE:
             raise InputError(

@@ -59,6 +59,8 @@ class ReadOptions:
 
     drop_bad_rows: bool = False
     """whether to drop bad rows, each of which ends a trajectory, instead of refusing the file"""
+    bad_row_hint: str = "; --drop-bad-rows leaves them out"
+    """end of the message about a bad row"""
     min_seconds: float = 20.0
     """minimum duration of a trajectory [s]; shorter ones are skipped and counted"""
     driver_columns: tuple[str, ...] = ()
@@ -102,7 +104,7 @@ def read_trajectories(path: Path, format: str = "", options: ReadOptions | None 
 
 def trajectories_of_table(frame: pd.DataFrame, path: Path, options: ReadOptions, format: str = "") -> ReadResult:
     """Return the trajectories of the table of a file; `format` as in `read_trajectories`."""
-    return FILE_FORMATS[format or _detect_format(frame)](frame, path, options)
+    return FILE_FORMATS[format or detect_format(frame)](frame, path, options)
 
 
 def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
@@ -226,7 +228,8 @@ FILE_FORMATS: dict[str, Callable[[pd.DataFrame, Path, ReadOptions], ReadResult]]
 }
 
 
-def _detect_format(frame: pd.DataFrame) -> str:
+def detect_format(frame: pd.DataFrame) -> str:
+    """Return the name in `FILE_FORMATS` of a table, by its columns."""
     names = set(map(str, frame.columns))
     if {name.lower() for name in names}.issuperset(NGSIM_COLUMNS):
         return "ngsim"
@@ -302,11 +305,11 @@ def split_trajectories(
     if bad_rows and not options.drop_bad_rows:
         more = f" ({len(bad_rows)} bad rows)" if len(bad_rows) > 1 else ""
         line, reason = next(iter(bad_rows.items()))
-        raise InputError(f"{path.name}: line {line}: {reason}{more}; --drop-bad-rows leaves them out")
+        raise InputError(f"{path.name}: line {line}: {reason}{more}{options.bad_row_hint}")
     good = frame.loc[~is_bad].sort_values(by=["pair", "time"], kind="stable")
     groups = [rows for _, rows in good.groupby("pair", sort=False, dropna=False) if len(rows) > 1]
     if not groups:
-        raise InputError("time: no pair has two rows")
+        raise InputError(f"{path.name}: time: there are no two rows of one vehicle")
     intervals = [np.diff(rows["time"].to_numpy(np.float64)) for rows in groups]
     has_missing = [each > MISSING_ROW_INTERVAL * np.median(each) for each in intervals]
     regular = [each[~missing] for each, missing in zip(intervals, has_missing, strict=True)]

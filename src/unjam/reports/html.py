@@ -22,6 +22,7 @@ from unjam.reports import figures, space_time, summary
 from unjam.reports.model import error_figure, example_figure, model_section, rollout_figure, wave_figure
 from unjam.reports.results import PlotEpisode, Results, damaged_results_error, original_command, read_results
 from unjam.reports.video import split_lines
+from unjam.scenarios.road import format_drawn_values
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.record import assign_columns
 
@@ -89,7 +90,7 @@ def render_report(results: Sequence[Results]) -> str:
     counts = [len(column.rows) for column in columns]
     rows, baseline = {column.name: column.rows for column in columns}, summary.common_baseline(results)
     headings, table = metric_table(rows, baseline)
-    roads = (", ".join(f"{key} {value:g} m" for key, value in episode.drawn_values.items()) for episode in panels)
+    roads = (", ".join(format_drawn_values(episode.drawn_values)) for episode in panels)
     return render_template(
         "report.html",
         title=summary.report_title(results),

@@ -82,9 +82,8 @@ class Recorded(Scenario):
         if self.warmup:
             raise ValueError(f"warmup: {self.warmup} is not allowed on a recorded road; allowed: 0")
         if not self.cavs or len(kinds) > MAX_VEHICLES:
-            raise ValueError(
-                f"platoon: {self.platoon!r} is not allowed; allowed: a CAV, and <= {MAX_VEHICLES} vehicles"
-            )
+            allowed = f"at least one cav, and <= {MAX_VEHICLES} vehicles"
+            raise ValueError(f"platoon: {self.platoon!r} is not allowed; allowed: {allowed}")
         try:
             _ = self.user_files
         except InputError as error:
@@ -130,8 +129,21 @@ class Recorded(Scenario):
     @property
     def notes(self) -> list[str]:
         """What a replay cannot know."""
-        made = [] if self.recordings else ["artificial waves, no recording: name one with --set recordings=FILE"]
-        return [*made, "the recorded vehicle does not react, and nobody changes lanes or cuts in"]
+        source = self._recordings_note() if self.recordings else "artificial waves; --recordings names a recording"
+        return [source, "the recorded vehicle does not react, and vehicles do not change lanes"]
+
+    def _recordings_note(self) -> str:
+        """What was read of the recordings, so that a wrong unit or a gap in time is seen."""
+        from unjam.recordings.leader_files import read_leaders
+
+        path = Path(self.recordings)
+        if path.is_dir():
+            return f"recordings: {len(recording_files(path))} files of {path.name}, drawn at random"
+        found = read_leaders(path)
+        seconds, speeds = [each.seconds for each in found], np.concatenate([each.speed for each in found])
+        parts = f"{len(found)} parts of {min(seconds):.0f} to" if len(found) > 1 else ""
+        text = f"{parts} {max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
+        return f"recordings: {path.name} has {text.strip()}"
 
     def stratum(self, index: int, count: int) -> Self:
         """Return this road with the recordings of one of `count` equal parts, if there are as many files."""
@@ -141,7 +153,7 @@ class Recorded(Scenario):
 
     def draw(self, generator: np.random.Generator) -> RecordedRoad:
         """Return the road with the speeds of a random recording, or of a random part of it."""
-        number, recording = self._draw_recording(generator)
+        drawn, recording = self._draw_recording(generator)
         room = recording.seconds - self.begin
         if room < self.control_step:
             raise InputError(
@@ -149,11 +161,16 @@ class Recorded(Scenario):
                 f"{recording.name}"
             )
         start, seconds = self.begin, min(room, self.horizon * self.control_step)
-        if self.window and self.window < room:
+        if self.window > room:
+            raise InputError(
+                f"window: {self.window:g} s is not allowed; allowed: <= {room:g} s, the duration of {recording.name} "
+                "from begin"
+            )
+        if self.window:
             start += float(generator.uniform(0.0, room - self.window))
             seconds = min(self.window, seconds)
         speeds = recording.speeds_at(start, seconds, self.simulation_step)
-        return self.build(speeds, {"recording": float(number), "begin": start}, generator)
+        return self.build(speeds, {**drawn, "begin": start}, generator)
 
     def build(self, speeds: Floats, drawn_values: dict[str, float], generator: np.random.Generator) -> RecordedRoad:
         """Return the road behind a vehicle with given speeds in all simulation steps [m/s], shape (S + 1,)."""
@@ -183,16 +200,17 @@ class Recorded(Scenario):
         names = (f"{kind}_{number}" for number, kind in enumerate(self.vehicle_kinds))
         return tuple(name for name in names if name.startswith("cav"))[::-1]
 
-    def _draw_recording(self, generator: np.random.Generator) -> tuple[int, LeaderRecording]:
-        """Return a random recording and the number of its file; all files are equally likely."""
+    def _draw_recording(self, generator: np.random.Generator) -> tuple[dict[str, float], LeaderRecording]:
+        """Return the numbers of a random file and of a part of it, and this recording; all files are equally likely."""
         if not self.recordings:
-            return 0, artificial_waves(generator)
+            return {}, artificial_waves(generator)
         from unjam.recordings.leader_files import read_leaders  # pandas takes half a second
 
         files = recording_files(Path(self.recordings))
         number = int(generator.integers(len(files)))
         found = read_leaders(files[number])
-        return number, found[int(generator.integers(len(found)))]
+        part = int(generator.integers(len(found)))
+        return {"file": float(number), "part": float(part)}, found[part]
 
     def _start_gap(self, speed: float, human: IDMParameters) -> float:
         return equilibrium_gap(min(speed, MAX_FREE_SPEED_SHARE * human.desired_speed), human)

@@ -1,6 +1,6 @@
 """One episode's road and traffic, as a scenario draws it: geometry, vehicles, demand."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import inf
 from typing import Literal, NamedTuple
@@ -94,6 +94,15 @@ class Entry(NamedTuple):
     lane: int = 0
     vehicle_type: str = ""
     """one of the road's `vehicle_types`; empty: a human driver as the scenario says"""
+
+
+DRAWN_UNITS = {"file": "", "part": "", "begin": "s"}
+"""units of values that episodes draw, by name; of others meters"""
+
+
+def format_drawn_values(values: Mapping[str, float]) -> list[str]:
+    """Return values that an episode has drawn as texts for captions."""
+    return [f"{name} {value:g} {DRAWN_UNITS.get(name, 'm')}".strip() for name, value in values.items()]
 
 
 @dataclass(frozen=True, kw_only=True)
