@@ -20,7 +20,7 @@ from unjam.reports.summary import (
 )
 
 USUAL: dict[str, Any] = {"status": "completed", "reason": "", **dict.fromkeys(METRICS, 1.0), "min_time_gap": 2.0}
-USUAL |= {"shield_override_share": 0.0, "collisions": 0.0}
+USUAL |= {"shield_override_share": 0.0, "collisions": 0.0, "time_behind_leader": float("nan")}
 
 
 def rows_of(returns: list[float], **changes: Any) -> list[dict[str, Any]]:
@@ -44,6 +44,12 @@ def drive_results(folder: str = "runs/drive-001", scenario: str = "ring", **rows
 
 
 EXPERT = [100.0, 140.0, 180.0, 120.0]
+
+
+def test_behind_a_recorded_vehicle_fuel_is_that_by_power() -> None:
+    undefined: dict[str, Any] = {"travel_time": float("nan"), "time_behind_leader": 20.0}
+    result = trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT, fuel_by_power=0.7, **undefined)
+    assert "fuel -0.3" in main_finding(result)
 
 
 def test_finding_compares_with_the_human_baseline_and_then_with_the_expert() -> None:
