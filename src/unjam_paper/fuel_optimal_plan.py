@@ -6,7 +6,7 @@ accelerations out of their limits. The problem is not convex: this is a referenc
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ PLAN_STEP_KEY = "step"
 
 @dataclass(frozen=True)
 class PlanLimits:
-    """Limits of a plan."""
+    """Limits of a plan: the gaps are those of the published controller of the I-24 experiment."""
 
     largest_gap: float = 105.0
     """[m]"""
@@ -104,7 +104,6 @@ def _interpolation(count: int, knot_steps: int) -> Tensor:
 class PlannedDriver(Driver):
     """Drives each CAV, on a road of its own, as planned; for vehicles without delay."""
 
-    name: ClassVar[str] = ""
     speeds: tuple[Floats, ...] = field(repr=False)
     time_step: float = 0.1
     """control step [s]"""

@@ -16,13 +16,14 @@ from unjam.physics.fuel import fuel_rate
 from unjam.scenarios import Recorded
 from unjam.worlds.batch.ring.recorded import RecordedBatch
 from unjam.worlds.batch.run import start_batch_drive
+from unjam_paper.fuel_optimal_plan import PlanLimits
 
 GENERATION_SIZE, GENERATIONS = 32, 20
 ELITE_SHARE, KEPT_SHARE, SMALLEST_SPREAD = 0.2, 0.3, 0.03
 """share of candidates that define the next generation; share of the last distribution that stays; smallest standard
 deviation of a parameter, relative to its range"""
-MAX_MEAN_GAP, LARGEST_GAP, SMALLEST_TIME_GAP = 73.0, 105.0, 1.0
-"""limits of a candidate: the gaps of the published controller [m], and a time gap [s]"""
+LIMITS = PlanLimits()
+"""limits of a candidate"""
 MEAN_GAP_PRICE, MAX_GAP_PRICE, TIME_GAP_PRICE = 0.3, 0.2, 20.0
 """fuel [%] that each meter and each second beyond them counts"""
 MARGIN = 0.5
@@ -98,9 +99,9 @@ def search_parameters(
         mean_gap, max_gap, time_gap = scores.mean_gap.mean(1), scores.max_gap.max(1), scores.min_time_gap.min(1)
         total = (
             fuel
-            + MEAN_GAP_PRICE * np.maximum(mean_gap - MAX_MEAN_GAP + MARGIN, 0.0)
-            + MAX_GAP_PRICE * np.maximum(max_gap - LARGEST_GAP + MARGIN, 0.0)
-            + TIME_GAP_PRICE * np.maximum(SMALLEST_TIME_GAP - time_gap, 0.0)
+            + MEAN_GAP_PRICE * np.maximum(mean_gap - LIMITS.largest_mean_gap + MARGIN, 0.0)
+            + MAX_GAP_PRICE * np.maximum(max_gap - LIMITS.largest_gap + MARGIN, 0.0)
+            + TIME_GAP_PRICE * np.maximum(LIMITS.time_gap - time_gap, 0.0)
         )
         order = np.argsort(total)
         elite = points[order[: round(ELITE_SHARE * GENERATION_SIZE)]]

@@ -7,7 +7,7 @@ drives, which no part of this study reads yet.
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -71,22 +71,26 @@ DRIVE_METRICS = (
     *("mean_abs_jerk", "filter_override_share", "feasibility"),
 )
 SEARCH_SEED = 0
-PLAN_LABEL = "plan that knows the recording"
+PUBLISHED_LABEL, PLAN_LABEL = "published", "plan that knows the recording"
 SEARCH_PART, DRIVES_PART = "search", "training drives"
 
 
 @dataclass(frozen=True)
 class PublishedController(Driver):
-    """The published controller of the CIRCLES experiment: a network whose acceleration a FollowerStopper limits."""
+    """The published controller of the CIRCLES experiment: a FollowerStopper limits the acceleration of a network."""
 
-    name: ClassVar[str] = "published"
     file: str
-    """its ONNX graph, with a description beside it"""
+    """its ONNX graph; the same folder has the description"""
 
     @cached_property
     def network(self) -> Driver:
         """The graph, which has no memory."""
         return make_driver(self.file, TIME_STEP)
+
+    @cached_property
+    def stopper(self) -> FollowerStopper:
+        """The version for motorways."""
+        return FollowerStopper(boundary_time_gaps=MOTORWAY_TIME_GAPS, time_constant=SPEED_CONTROL_TIME)
 
     def initial_memory(self, n: int) -> Memory:
         """Return no memory."""
@@ -95,8 +99,7 @@ class PublishedController(Driver):
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the FollowerStopper towards the speed that the network commands."""
         acceleration, _ = self.network.act(state, self.network.initial_memory(len(state.speed)))
-        stopper = FollowerStopper(boundary_time_gaps=MOTORWAY_TIME_GAPS, time_constant=SPEED_CONTROL_TIME)
-        return stopper.acceleration(state, state.speed + SPEED_CONTROL_TIME * acceleration), memory
+        return self.stopper.acceleration(state, state.speed + SPEED_CONTROL_TIME * acceleration), memory
 
 
 def training_drives(folder: Path) -> list[Recorded]:
@@ -111,7 +114,7 @@ def training_drives(folder: Path) -> list[Recorded]:
 
 
 def untuned_driver(method: str) -> Driver:
-    """Return the driver whose parameters are searched."""
+    """Return a driver before the search of its parameters."""
     return SmoothACC(time_step=TIME_STEP) if method == "smooth-acc" else ACC(set_speed=TUNED_SET_SPEED)
 
 
@@ -136,7 +139,7 @@ def measure_driver(folder: str, name: str, workers: int) -> Table:
         ideal = {"actuator": Actuator(), "safety": SafetyFilter(active=False), "actuation": "raw"}
         scenarios = [replace(each, **ideal) for each in scenarios]
         driver = plan_driver(scenarios)
-    elif name == PublishedController.name:
+    elif name == PUBLISHED_LABEL:
         driver = PublishedController(str(Path(folder) / PUBLISHED_FILE))
     made = driver or make_driver(name, TIME_STEP)
     rows = [measure(episode) for episode in run_batches([EpisodeTask(each, made, (0,)) for each in scenarios])]
@@ -163,21 +166,17 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
     tuned = [tuned_name(read_part(folder, f"{SEARCH_PART} {method}"), method) for method in SEARCH_SPACES]
     gaps = ",".join(map(str, MOTORWAY_TIME_GAPS))
     stopper = f"follower-stopper:window={TIME_STEP:g},boundary_time_gaps=[{gaps}],time_constant={SPEED_CONTROL_TIME:g}"
-    names = (HUMAN_LABEL, stopper, PublishedController.name, *tuned, PLAN_LABEL)
+    names = (HUMAN_LABEL, stopper, PUBLISHED_LABEL, *tuned, PLAN_LABEL)
     return parts | {f"{DRIVES_PART}/{name.partition(':')[0]}": (measure_driver, (root, name)) for name in names}
 
 
 def drivers_table(folder: Path) -> pd.DataFrame:
     """Return fuel, gaps, lost time and flow of the drivers behind the training drives, compared with human drivers."""
     rows = read_part(folder, DRIVES_PART)
-    by_driver = {name: pd.DataFrame([row for row in rows if row["driver"] == name]) for name in _drivers(rows)}
+    names = dict.fromkeys(row["driver"] for row in rows)
+    by_driver = {name: pd.DataFrame([row for row in rows if row["driver"] == name]) for name in names}
     human = by_driver[HUMAN_LABEL]
     return pd.DataFrame([_table_row(name, own, human) for name, own in by_driver.items()])
-
-
-def _drivers(rows: Table) -> list[str]:
-    """Return the drivers in the order in which they are measured."""
-    return sorted({row["driver"] for row in rows}, key=lambda name: [row["driver"] for row in rows].index(name))
 
 
 def _table_row(name: str, own: pd.DataFrame, human: pd.DataFrame) -> dict[str, str]:

@@ -34,7 +34,7 @@ def test_other_platoons_are_refused(platoon: str) -> None:
         make_scenario("recorded", {"platoon": platoon})
 
 
-def test_everybody_starts_in_equilibrium_behind_the_recorded_vehicle() -> None:
+def test_all_vehicles_start_in_equilibrium_behind_the_recorded_vehicle() -> None:
     scenario = Recorded()
     road = scenario.draw(np.random.default_rng(3))
     gaps, speed = np.diff(road.start_positions) - 5.0, road.start_speed

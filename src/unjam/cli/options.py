@@ -26,7 +26,10 @@ RewardOption = Annotated[
 ]
 BackendOption = Annotated[
     str,
-    Option(help="Simulator: sumo, batch (equal on rings and recorded roads, else alike), or your own: path.py:name."),
+    Option(
+        help="Simulator: sumo, batch (the same episodes on rings and recorded roads, elsewhere in distribution), or "
+        "your own: path.py:name."
+    ),
 ]
 SeedOption = Annotated[int, Option("--seed", min=0, help="First seed.")]
 OptunaSeedOption = Annotated[int, Option("--seed", min=0, max=2**32 - 1, help="First seed.")]

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
-from unjam.physics.arrays import Array, clamp_max, clamp_min
+from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
 from unjam.physics.kinematics import max_speed_to_stop, next_speed, stopping_distance
 
 
@@ -151,8 +151,8 @@ class SafetyFilter(Subclassable):
             return acceleration
         if type(acceleration) is float and actuation is None and self._is_clearly_safe(acceleration, state, step):
             return acceleration
-        if actuation is not None and not _is_torch(acceleration):
-            return self._limit_unclear(acceleration, state, step, *actuation)
+        if actuation is not None and (type(acceleration) is float or namespace(acceleration) is np):
+            return self._limit_by_plan_if_needed(acceleration, state, step, *actuation)
         return clamp_max(acceleration, self.max_acceleration(state, step, actuation))
 
     def max_acceleration(
@@ -219,7 +219,7 @@ class SafetyFilter(Subclassable):
         far = max_speed_to_stop(end - braking * (time_gap + step / 2.0) ** 2 / 2.0, braking, step)
         return clamp_max(near, clamp_min(far, matters))
 
-    def _limit_unclear(
+    def _limit_by_plan_if_needed(
         self, acceleration: Array, state: FollowingState, step: float, actuator: Actuator, actuator_state: ActuatorState
     ) -> Array:
         """Return the allowed part of an acceleration, for which plans of braking are only made where they matter.
@@ -230,12 +230,12 @@ class SafetyFilter(Subclassable):
         """
         speed, leader, gap = state
         gap = gap - (self.gap_error + self.standstill_gap)
-        leader, rest = clamp_min(leader - self.speed_error, 0.0), clamp_min(acceleration, 0.0)
+        leader, commands = clamp_min(leader - self.speed_error, 0.0), clamp_min(acceleration, 0.0)
         for pending in actuator_state.pending:
-            rest = rest + clamp_min(pending, 0.0)
+            commands = commands + clamp_min(pending, 0.0)
         standing = actuator.equivalent_speed(0.0 * speed, ActuatorState(0.0 * speed), self.braking, step)
         top = speed + clamp_min(actuator.equivalent_speed(0.0 * speed, actuator_state, self.braking, step), 0.0)
-        top = clamp_min(top, standing) + step * rest
+        top = clamp_min(top, standing) + step * commands
         first = step * (len(actuator_state.pending) + 1) * top
 
         def margin(braking: float, leader_braking: float) -> Array:
@@ -246,10 +246,9 @@ class SafetyFilter(Subclassable):
         with_time_gap = gap + clamp_max(margin(braking, braking), 0.0) - self.time_gap * top
         is_unclear = (at_end < 0.0) | (with_time_gap < 0.0)
         if type(acceleration) is float:
-            actuation = actuator, actuator_state
-            return (
-                clamp_max(acceleration, self.max_acceleration(state, step, actuation)) if is_unclear else acceleration
-            )
+            if not is_unclear:
+                return acceleration
+            return clamp_max(acceleration, self.max_acceleration(state, step, (actuator, actuator_state)))
         rows = np.flatnonzero(is_unclear)
         if len(rows) == 0:
             return acceleration
@@ -275,10 +274,6 @@ class SafetyFilter(Subclassable):
             and speed * (speed / own + step) / 2.0 + own * step * step / 8.0
             <= gap + leader * (leader / others - step) / 2.0
         )
-
-
-def _is_torch(array: Array) -> bool:
-    return type(array) is not float and not isinstance(array, (np.ndarray, np.generic))
 
 
 def _steps_to_standstill(speed: Array, change: float) -> int:

@@ -88,14 +88,11 @@ class SmoothACC(FormulaDriver):
             acceleration = clamp_max(acceleration, self.acceleration_limit)
         if self.braking_limit is not None:
             room = clamp_min(gap - self.standstill_gap - FREE_TIME_GAP * speed, MIN_ROOM)
-            needed = clamp_min(speed - leader_speed, 0.0) ** 2 / (2.0 * room)
-            needed = xp.where(needed > self.braking_limit, needed, needed * 0.0 + self.braking_limit)
-            acceleration = xp.maximum(acceleration, -needed)
+            braking = clamp_min(speed - leader_speed, 0.0) ** 2 / (2.0 * room)
+            acceleration = xp.maximum(acceleration, -clamp_min(braking, self.braking_limit))
         if self.largest_gap is not None:
-            needed = (2.0 * (leader_speed - speed) + (gap - self.largest_gap) / GAP_LIMIT_TIME) / GAP_LIMIT_TIME
-            acceleration = xp.where(
-                needed > acceleration, xp.minimum(needed, 0.0 * needed + MAX_CATCH_UP), acceleration
-            )
+            catch_up = (2.0 * (leader_speed - speed) + (gap - self.largest_gap) / GAP_LIMIT_TIME) / GAP_LIMIT_TIME
+            acceleration = xp.maximum(acceleration, clamp_max(catch_up, MAX_CATCH_UP))
         return acceleration
 
     def memory_features(self, memory: Memory) -> Array:

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from unjam.measures.averages import mean_over_cavs, per_kilometer
+from unjam.measures.averages import mean_over_cavs, per_kilometer, row_chunks
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.record import Episode
-from unjam.worlds.reward import MAX_REWARD_CELLS
 
 
 def fuel_by_power(episode: Episode) -> float:
@@ -31,10 +30,11 @@ def human_fuel_by_power(episode: Episode) -> float:
 
 def _fuel_by_power(episode: Episode, columns: Any) -> float:
     """Return the fuel of the vehicles in some columns; acceleration is the change of speed in a control step."""
-    speeds, fuel, rows = episode.speeds[:, columns], 0.0, max(1, MAX_REWARD_CELLS // max(1, episode.speeds.shape[1]))
-    for start in range(0, len(speeds) - 1, rows):
-        part = speeds[start : start + rows + 1]
-        fuel += float(np.nansum(fuel_rate(part[1:], np.diff(part, axis=0) / episode.control_step)))
+    speeds = episode.speeds[:, columns]
+    fuel = sum(
+        float(np.nansum(fuel_rate(after, (after - before) / episode.control_step)))
+        for before, after in zip(row_chunks(speeds[:-1]), row_chunks(speeds[1:]), strict=True)
+    )
     return per_kilometer(episode, fuel, speeds)
 
 

@@ -1,6 +1,6 @@
 """Fuel of a car from the power at its wheels: a model without maps of an engine, with a realistic idle rate.
 
-Source: Treiber and Kesting 2013, Traffic Flow Dynamics, section 20.4: F = m a + (c_r + slope) m g + 1/2 c_d rho A v^2,
+Source: Treiber and Kesting 2013, Traffic Flow Dynamics, section 20.4: F = m a + c_r m g + 1/2 c_d rho A v^2,
 power P_0 + v F, 300 ml/kWh, and no fuel while the car brakes with its engine. Numbers of a mid-size petrol car.
 """
 

@@ -71,7 +71,7 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
 
 
 def _follower_table(frame: pd.DataFrame, column: str, pair: str) -> pd.DataFrame:
-    """Return a table of speeds as one of trajectories, whose leader is the recorded vehicle."""
+    """Return a table of speeds as one of trajectories with the recorded vehicle as the leader."""
     table = to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])
     speed = table[column] * SPEED_UNITS[column]
     return table.assign(pair=pair, speed=speed, leader_speed=speed, gap=0.0)

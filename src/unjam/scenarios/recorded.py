@@ -1,7 +1,7 @@
 """The recorded road: a platoon on one lane behind a vehicle that drives as a real one was recorded.
 
 Source of the idea: Lichtlé et al. 2022, Deploying traffic smoothing cruise controllers learned from trajectory data,
-ICRA, whose drives on I-24 are the usual recordings.
+ICRA; the drives on I-24 of that experiment are the usual recordings.
 """
 
 import re
@@ -43,7 +43,7 @@ ARTIFICIAL_SPEEDS, ARTIFICIAL_PERIODS = (6.0, 20.0), (40.0, 200.0)
 class Recorded(Scenario):
     """A platoon on one lane behind a vehicle that repeats recorded speeds; each episode draws a recording.
 
-    The recorded vehicle does not react, nobody changes lanes, and nobody cuts in. All vehicles start with its speed
+    The recorded vehicle does not react, and vehicles do not change lanes. All vehicles start with its speed
     and the gaps of steady driving. Without recordings, it drives through artificial waves.
     """
 

@@ -234,7 +234,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
 
 
 class RecordedTraffic(OrderedTraffic):
-    """The SUMO environment of a recorded road, whose first vehicle replays a recording."""
+    """The SUMO environment of a recorded road: the first vehicle on it replays a recording."""
 
     def _prepare(self) -> None:
         *_, self._replayed_id = self.road.vehicle_ids

@@ -17,7 +17,7 @@ from unjam.worlds.ordered_road import without_loop
 class RecordedBatch(RingBatch):
     """W recorded roads of one platoon, each with its own seed and recording; they equal SUMO's except for rounding.
 
-    A road whose recording has ended is still simulated, behind a vehicle of constant speed, but no longer counted.
+    After the end of its recording, a road is simulated behind a vehicle of constant speed, and no longer counted.
     """
 
     def __init__(
@@ -75,8 +75,7 @@ class RecordedBatch(RingBatch):
         replayed = self._replayed_speeds[self._next_sample : self._next_sample + 1]
         self._next_sample = min(self._next_sample + 1, len(self._replayed_speeds) - 1)
         xp = namespace(replayed)
-        moved, speeds = (xp.concatenate([each[:-1], replayed]) for each in (moved, speeds))
-        return moved, speeds
+        return xp.concatenate([moved[:-1], replayed]), xp.concatenate([speeds[:-1], replayed])
 
 
 def platoon_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
