@@ -266,7 +266,9 @@ def drivers_to_compare(config: RunConfig, folder: Path) -> dict[str, Driver]:
 
 def evaluation_steps(config: RunConfig, folder: Path) -> int:
     """Return the largest number of control steps of `evaluate_run`."""
-    return len(drivers_to_compare(config, folder)) * config.evaluation.episodes * config.make_scenario().horizon
+    return (
+        len(drivers_to_compare(config, folder)) * config.evaluation.episodes * config.make_scenario().max_episode_steps
+    )
 
 
 def evaluate_run(
