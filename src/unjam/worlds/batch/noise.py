@@ -62,6 +62,15 @@ class SeededNoise:
             generator.bit_generator.state = dict(state.generator)
         self._remaining_steps = list(self._to_array(np.stack([state.remaining_block for state in states], 2)))
 
+    def replace_worlds(self, worlds: Sequence[int], source: "SeededNoise", source_worlds: Sequence[int]) -> None:
+        """Continue with the generators of other worlds, which have no rest of a block."""
+        for world, other in zip(worlds, source_worlds, strict=True):
+            generator = self._human_generators[world] = source._human_generators[other]
+            self._exploration_seeds[world] = source._exploration_seeds[other]
+            draws = self._to_array(generator.standard_normal((len(self._remaining_steps), self._block.shape[2])))
+            for step, values in zip(reversed(self._remaining_steps), draws, strict=True):
+                step[:, world] = values
+
     def drop_block(self) -> None:
         """Drop the rest of a block, as SUMO's episodes do when CAVs take over."""
         self._remaining_steps = []
@@ -94,6 +103,9 @@ class QuickNoise:
     def human_noise(self) -> Array:
         """Return a number for each vehicle in this step, shape (vehicles, W)."""
         return self._draw(self._human_shape)
+
+    def replace_worlds(self, worlds: Sequence[int], source: "QuickNoise", source_worlds: Sequence[int]) -> None:
+        """Do nothing: all worlds have the same generator."""
 
     def drop_block(self) -> None:
         """Do nothing: nothing is drawn in advance."""
